@@ -1,0 +1,55 @@
+# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES may be set.
+PYTHON ?= python3
+PRESET ?= quick
+POLICY ?= learned
+EPISODES ?= 50
+RUN ?= $(firstword $(shell ls -1dt runs/*/ 2>/dev/null))
+ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: help setup train eval test test-slow lint format bench doctor clean
+
+help:  ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: $(STAMP)  ## make .venv and install everything, pinned
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+train: $(STAMP)  ## train PRESET (quick) into a new folder under runs/
+	$(BIN)/csac-jax train $(PRESET) $(ARGS)
+
+eval: $(STAMP)  ## evaluate RUN (the newest) with POLICY (learned) over EPISODES (50)
+	@test -n "$(RUN)" || { echo "eval: there is no run under runs/; run 'make train' first or set RUN=DIR" >&2; exit 1; }
+	$(BIN)/csac-jax eval $(RUN) --policy $(POLICY) --episodes $(EPISODES) --json $(RUN:/=)/eval-$(POLICY).json $(ARGS)
+
+test: $(STAMP)  ## fast tests
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-slow: $(STAMP)  ## slow tests
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: $(STAMP)  ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP)  ## rewrite the sources in ruff's format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)  ## speed of this machine
+	$(BIN)/python -m experiments.bench $(ARGS)
+
+doctor: $(STAMP)  ## versions, devices, numerics self-test
+	$(BIN)/csac-jax doctor $(ARGS)
+
+clean:  ## remove .venv and caches; runs/ stays
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

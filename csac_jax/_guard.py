@@ -1,0 +1,50 @@
+"""Protection against faults of JAX on the CPU; imports nothing of JAX, so that it acts before JAX starts.
+
+1. jax 0.10.2 computes wrong rows for `vmap(M @ row)` followed by a reduction (jax issue 39103), without a word.
+2. So do 0.10.1 and earlier, in the plainer case: with M 3 x 3, `vmap(sum(M @ row))` is wrong in every row beyond the
+   32,768th, up to some 40,000 rows. The fault lies in a fusion, which an XLA flag switches off.
+3. Batched Cholesky factorisations, which batched MJX runs many of, wait for one another in the thread pool of
+   jaxlib 0.10 and hang for ever if the pool is small: on 2 cores, two at once are enough. A pool with more threads
+   than factorisations at once cures it and costs no speed. Its size is read from the environment, once, when the CPU
+   client starts.
+"""
+
+import importlib.metadata
+import os
+
+BROKEN_JAX = ("0.10.2",)
+FUSION_FLAG = "--xla_cpu_experimental_ynn_fusion_type"  # given no types, it switches that kind of fusion off
+FUSION_SERIES = "0.10."  # versions of jaxlib that are known to have the flag: XLA ends the process on one it lacks
+POOL_VARIABLE = "PJRT_NPROC"  # goes before NPROC
+USER_VARIABLES = (POOL_VARIABLE, "NPROC")  # what a user may have set
+MIN_THREADS = 8  # ours: 2 hangs and 8 does not, on 2 cores with batches of 4 and 8 scenes
+
+
+def refuse_broken_jax() -> None:
+    """Raises ImportError if the installed JAX is known to compute wrong numbers."""
+    version = importlib.metadata.version("jax")
+    if version in BROKEN_JAX:
+        raise ImportError(
+            f"jax {version} computes wrong results on the CPU (jax issue 39103); run: pip install 'jax!={version}'"
+        )
+
+
+def switch_off_broken_fusion() -> None:
+    """Adds the flag to XLA's, unless the user has given it or this jaxlib may not know it."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if importlib.metadata.version("jaxlib").startswith(FUSION_SERIES) and FUSION_FLAG not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {FUSION_FLAG}=".lstrip()
+
+
+def widen_thread_pool() -> None:
+    """Sets the pool's size to at least `MIN_THREADS`, unless the user has chosen one."""
+    if not any(name in os.environ for name in USER_VARIABLES):
+        os.environ[POOL_VARIABLE] = str(max(MIN_THREADS, os.cpu_count() or 1))
+
+
+def pool_setting() -> tuple[str, int]:
+    """The variable that decides the size of the pool and its value, as JAX will read them."""
+    for name in USER_VARIABLES:
+        if os.environ.get(name, "").isdigit():
+            return name, int(os.environ[name])
+    return "number of cores", os.cpu_count() or 1

@@ -1,0 +1,228 @@
+"""Networks and their updates: the critic towards the TD target, the actor up the critic, targets after both."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+
+from csac_jax.agent import actor, losses, maps, rewards, softmax
+from csac_jax.agent.maps import DenseMaps, Frames
+from csac_jax.config import Config
+from csac_jax.nets import dense
+from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.vision import heightmap, rotate
+from csac_jax.vision.heightmap import Observation, PackedObservation
+
+
+@struct.dataclass
+class Transition:
+    """What one action showed. All leaves of one transition; a batch has a leading axis B."""
+
+    obs: PackedObservation
+    action: Action
+    reward: jax.Array  # [] float32, R of eq. 12
+    next_obs: PackedObservation
+    terminated: jax.Array  # [] bool, a true end: nothing follows
+
+
+@struct.dataclass
+class Params:
+    """Network parameters: theta^Q and theta^mu."""
+
+    critic: Any
+    actor: Any
+
+
+@struct.dataclass
+class LearnerState:
+    """Online and target networks and their optimisers."""
+
+    online: Params
+    target: Params
+    critic_optimiser: optax.OptState
+    actor_optimiser: optax.OptState
+    updates: jax.Array  # [] int32, critic updates so far
+
+
+class UpdateInfo(NamedTuple):
+    """What one update saw."""
+
+    critic_loss: jax.Array  # []
+    q: jax.Array  # [] mean of Q(s, a)
+    error: jax.Array  # [B] y - Q(s, a)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Learner:
+    """Static part: closed over by the compiled step."""
+
+    cfg: Config
+    frames: Frames
+    critic: dense.Critic
+    actor: dense.Head
+    critic_optimiser: optax.GradientTransformation
+    actor_optimiser: optax.GradientTransformation
+    bounds: tuple[float, float]  # smallest and largest possible return
+
+
+def make(cfg: Config) -> Learner:
+    """The learner of a config."""
+    return Learner(
+        cfg,
+        maps.frames(cfg),
+        dense.Critic(cfg.net),
+        dense.Head(cfg.net),
+        _optimiser(cfg, cfg.learn.learning_rate),
+        _optimiser(cfg, cfg.learn.actor_learning_rate),
+        rewards.bounds(cfg.reward, cfg.target.gamma),
+    )
+
+
+def _optimiser(cfg: Config, rate: float) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(cfg.learn.gradient_clip), optax.adam(rate))
+
+
+def init(key: jax.Array, learner: Learner) -> LearnerState:
+    """Fresh networks; targets are copies (Algorithm 1 lines 1-2)."""
+    key_critic, key_actor = jax.random.split(key)
+    side = learner.frames.tables.canvas
+    blank = jnp.zeros((1, side, side, dense.CHANNELS))
+    (_, features), critic = learner.critic.init_with_output(key_critic, blank)
+    online = Params(critic, learner.actor.init(key_actor, features))
+    return LearnerState(
+        online=online,
+        target=jax.tree.map(jnp.copy, online),
+        critic_optimiser=learner.critic_optimiser.init(online.critic),
+        actor_optimiser=learner.actor_optimiser.init(online.actor),
+        updates=jnp.int32(0),
+    )
+
+
+def look(learner: Learner, params: Params, obs: Observation) -> DenseMaps:
+    """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
+    q, features = _critic_maps(learner, params, obs)
+    return _with_actor(learner, params.actor, obs, q, features)
+
+
+def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
+    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, h, w, F] of a batch, in the frames of the passes."""
+    fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
+    outputs: Any = learner.critic.apply(params.critic, fed.reshape(-1, *fed.shape[2:]))
+    q, features = (leaf.reshape(*fed.shape[:2], *leaf.shape[1:]) for leaf in outputs)
+    return q, features
+
+
+def _with_actor(learner: Learner, actor_params: Any, obs: Observation, q: jax.Array, features: jax.Array) -> DenseMaps:
+    correction: Any = learner.actor.apply(actor_params, features)
+    unfold = jax.vmap(maps.unfold)
+    return DenseMaps(
+        q=unfold(q),
+        logits=unfold(actor.logits(q, correction)),
+        valid=jax.vmap(maps.actionable, (None, 0))(learner.frames, obs),
+    )
+
+
+def best_grasp(state: DenseMaps) -> jax.Array:
+    """phi_g(s) of eq. 16, []: the largest valid grasp value; 0 if there is nothing to grasp."""
+    valid = state.valid[Primitive.GRASP]
+    best = jnp.max(jnp.where(valid, state.q[Primitive.GRASP], -jnp.inf))
+    return jnp.where(jnp.any(valid), best, 0.0)
+
+
+def next_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
+    """softmax_beta(Q'(s', .)) [] over noisy target actions of both primitives, Algorithm 1 line 17.
+
+    Samples above nothing do not count, unless all are; a state's two primitives count alike.
+    """
+    cfg, frames = learner.cfg.target, learner.frames
+
+    def of(primitive: Primitive) -> tuple[jax.Array, jax.Array, jax.Array]:
+        mean = maps.normalise(frames, actor.pose(frames, state, primitive))
+        noisy, log_density = softmax.noisy_actions(jax.random.fold_in(key, primitive), cfg, mean, cfg.samples)
+        poses = jax.vmap(maps.denormalise, (None, 0))(frames, noisy)
+        which = jnp.int32(primitive)
+        q = jax.vmap(maps.read, (None, None, None, 0))(frames, state.q, which, poses)
+        return q, log_density, jax.vmap(maps.is_valid, (None, None, None, 0))(frames, state.valid, which, poses)
+
+    q, log_density, valid = (jnp.concatenate(leaves) for leaves in zip(*(of(p) for p in Primitive), strict=True))
+    low, high = learner.bounds
+    shown = valid | ~jnp.any(valid)
+    inverse_temperature = softmax.scaled_inverse_temperature(cfg, high - low)
+    return softmax.expectation(jnp.where(shown, q, low), jnp.where(shown, log_density, jnp.inf), inverse_temperature)
+
+
+def _value(learner: Learner, critic_params: Any, obs: Observation, action: Action) -> jax.Array:
+    """Q(s, a) of a batch [B], from two passes per state: the frames next to the action's yaw."""
+    frames = learner.frames
+    num = frames.yaws.shape[0]
+    turns = action.pose[:, 2] * (num / (2.0 * np.pi))
+    lower = jnp.floor(turns)
+    k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([0, 1], np.int32), num)  # [B, 2]
+    half = jnp.mod(k, num // 2)
+    fed = dense.inputs(obs.colour, obs.height)
+    one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(frames.tables, fed, half)
+    outputs: Any = learner.critic.apply(critic_params, one.reshape(-1, *one.shape[2:]))
+    q = outputs[0].reshape(*k.shape, *outputs[0].shape[1:])  # [B, 2, h, w, OUTPUTS]
+    push_output = (k >= num // 2).astype(jnp.int32)
+    output = jnp.where((action.primitive == Primitive.GRASP)[:, None], dense.OUTPUTS - 1, push_output)
+
+    def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
+        position = rotate.frame_position(jnp.asarray(frames.yaws)[half], xy)
+        return rotate.bilinear(q[..., output], rotate.to_cell(frames.side, frames.cell, position))
+
+    near = jax.vmap(jax.vmap(at, (0, 0, 0, None)))(q, output, half, action.pose[:, :2])  # [B, 2]
+    share = turns - lower
+    return (1.0 - share) * near[:, 0] + share * near[:, 1]
+
+
+def update_critic(
+    key: jax.Array, learner: Learner, state: LearnerState, batch: Transition
+) -> tuple[LearnerState, UpdateInfo]:
+    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines 17-26."""
+    cfg = learner.cfg
+    next_maps = look(learner, state.target, heightmap.unpack(batch.next_obs))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(batch.reward.shape[0]))
+    values = jax.vmap(next_value, (None, 0, 0))(learner, keys, next_maps)
+    low, high = learner.bounds
+    target = losses.td_target(batch.reward, cfg.target.gamma, batch.terminated, jnp.clip(values, low, high))
+    obs = heightmap.unpack(batch.obs)
+
+    def loss(params: Any) -> tuple[jax.Array, jax.Array]:
+        q = _value(learner, params, obs, batch.action)
+        return jnp.mean(losses.huber(target - q, cfg.learn.huber)), q
+
+    (critic_loss, q), gradient = jax.value_and_grad(loss, has_aux=True)(state.online.critic)
+    step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)
+    online = state.online.replace(critic=optax.apply_updates(state.online.critic, step))
+    state = state.replace(
+        online=online,
+        target=losses.polyak(online, state.target, cfg.learn.tau),
+        critic_optimiser=optimiser,
+        updates=state.updates + 1,
+    )
+    return state, UpdateInfo(critic_loss, jnp.mean(q), target - q)
+
+
+def update_actor(learner: Learner, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
+    """One step of theta^mu up the critic, Algorithm 1 lines 22-23; returns the loss [], minus the mean of Q(s, mu(s)).
+
+    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for both primitives.
+    """
+    q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online, obs))
+
+    def value(dense_maps: DenseMaps, primitive: Primitive) -> jax.Array:
+        pose = actor.pose(learner.frames, dense_maps, primitive)
+        return maps.read(learner.frames, dense_maps.q, jnp.int32(primitive), pose)
+
+    def loss(params: Any) -> jax.Array:
+        dense_maps = _with_actor(learner, params, obs, q, features)
+        return -jnp.mean(jnp.stack([jax.vmap(lambda one, p=p: value(one, p))(dense_maps) for p in Primitive]))
+
+    actor_loss, gradient = jax.value_and_grad(loss)(state.online.actor)
+    step, optimiser = learner.actor_optimiser.update(gradient, state.actor_optimiser)
+    online = state.online.replace(actor=optax.apply_updates(state.online.actor, step))
+    return state.replace(online=online, actor_optimiser=optimiser), actor_loss

@@ -1,0 +1,146 @@
+"""Dense maps of one state: Q and actor logits for every primitive, yaw and cell, and reading them at an action.
+
+Map k lies in frame k, the workspace turned so that yaw_k points along +column; it stays there, since turning it back
+would blur it once more. Q at a continuous action is trilinear: bilinear in the two frames next to its yaw, linear
+between them.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from csac_jax import geometry
+from csac_jax.agent import box
+from csac_jax.config import Config
+from csac_jax.nets import dense
+from csac_jax.sim.outcome import BARE
+from csac_jax.sim.primitives import Primitive
+from csac_jax.vision import rotate
+from csac_jax.vision.heightmap import Observation
+
+NUM_PRIMITIVES = len(Primitive)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Frames:
+    """Where the cells of the dense maps lie. K = yaws, h = w = rows and columns of a map."""
+
+    tables: rotate.RotationTables  # of the first K / 2 frames: the others are the same pictures upside down
+    yaws: np.ndarray  # [K] rad
+    side: int  # h = w, cells
+    cell: float  # side of a cell, m
+    extent: float  # side of the workspace, m
+    push_length: float  # m
+    xy: np.ndarray  # [K, h, w, 2] m, workspace position of every cell
+    inside: np.ndarray  # [K, h, w] bool, above the workspace
+
+
+def frames(cfg: Config) -> Frames:
+    """Frames of a config's heightmap and net."""
+    size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
+    tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
+    side, cell = tables.canvas // dense.STRIDE, tables.cell * dense.STRIDE
+    yaws = 2.0 * np.pi * np.arange(rotations) / rotations
+    along = (np.arange(side) - 0.5 * (side - 1)) * cell
+    x, y = along[None, None, :], along[None, :, None]
+    cos, sin = np.cos(yaws)[:, None, None], np.sin(yaws)[:, None, None]
+    xy = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1).astype(np.float32)
+    inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
+    return Frames(tables, yaws.astype(np.float32), side, cell, extent, cfg.sim.push_length, xy, inside)
+
+
+@struct.dataclass
+class DenseMaps:
+    """Maps of one state. P = primitives, K = yaws; each [h, w] in its own frame."""
+
+    q: jax.Array  # [P, K, h, w] float32, the critic's value
+    logits: jax.Array  # [P, K, h, w] float32, the actor's
+    valid: jax.Array  # [P, K, h, w] bool, there is something to act on
+
+
+def net_inputs(frames: Frames, obs: Observation) -> jax.Array:
+    """The observation in the first K / 2 frames, as the net is fed: [K / 2, C, C, CHANNELS]."""
+    return rotate.rotate(frames.tables, dense.inputs(obs.colour, obs.height))
+
+
+def unfold(halves: jax.Array) -> jax.Array:
+    """Net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] to the maps of all K, [P, K, h, w]."""
+    ahead, back, grasp = (halves[..., output] for output in range(dense.OUTPUTS))
+    return jnp.stack([jnp.concatenate([ahead, _half_turn(back)]), jnp.concatenate([grasp, _half_turn(grasp)])])
+
+
+def _half_turn(maps: jax.Array) -> jax.Array:
+    """Maps [..., h, w] upside down: frame k as frame k + K / 2."""
+    return maps[..., ::-1, ::-1]
+
+
+def actionable(frames: Frames, obs: Observation) -> jax.Array:
+    """Cells where an action can have an effect, [P, K, h, w] bool.
+
+    Grasp: something higher than 1 cm lies under the cell. Push: something does within the push's length ahead. Masking
+    what is bare is SPOT's dynamic action space (arXiv:1909.04730).
+    """
+    side = frames.side
+    height = rotate.rotate(frames.tables, obs.height[..., None])[..., 0]
+    cells = height.reshape(-1, side, dense.STRIDE, side, dense.STRIDE).max(axis=(2, 4)) > BARE  # [K / 2, h, w]
+    under = jnp.concatenate([cells, _half_turn(cells)])
+    reach = int(np.ceil(frames.push_length / frames.cell))
+    ahead = jax.lax.reduce_window(
+        under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
+    )
+    return jnp.stack([ahead & frames.inside, under & frames.inside])
+
+
+def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
+    """Value [] of `maps` [P, K, h, w] at a pose [3] (x m, y m, yaw rad); trilinear, yaw wraps.
+
+    Differentiable in the maps and in the pose.
+    """
+    num, side = frames.yaws.shape[0], frames.side
+    turns = pose[2] * (num / (2.0 * np.pi))
+    lower = jnp.floor(turns)
+    share = turns - lower
+
+    def at(k: jax.Array) -> jax.Array:
+        k = jnp.mod(k, num)
+        position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
+        row_col = jnp.clip(rotate.to_cell(side, frames.cell, position), 0.0, side - 1.0)
+        first_row = ((primitive * num + k) * side).astype(jnp.float32)
+        return rotate.bilinear(maps.reshape(-1, side), row_col + jnp.stack([first_row, jnp.zeros_like(first_row)]))
+
+    k = lower.astype(jnp.int32)
+    return (1.0 - share) * at(k) + share * at(k + 1)
+
+
+def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
+    """Whether the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
+    num, side = frames.yaws.shape[0], frames.side
+    k = jnp.mod(jnp.round(pose[2] * (num / (2.0 * np.pi))).astype(jnp.int32), num)
+    position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
+    row, col = jnp.clip(jnp.round(rotate.to_cell(side, frames.cell, position)), 0.0, side - 1.0).astype(jnp.int32)
+    return valid[primitive, k, row, col]
+
+
+def best_cells(values: jax.Array, valid: jax.Array, num: int) -> jax.Array:
+    """Flat indices [num] int32 into [K, h, w] of the largest valid values; of the largest at all if none is valid."""
+    masked = jnp.where(valid | ~jnp.any(valid), values, -jnp.inf)
+    return jax.lax.top_k(masked.reshape(-1), num)[1].astype(jnp.int32)
+
+
+def cell_pose(frames: Frames, index: jax.Array) -> jax.Array:
+    """Pose [3] (x m, y m, yaw rad) of the cell of flat index [] into [K, h, w]."""
+    xy = jnp.asarray(frames.xy).reshape(-1, 2)[index]
+    return jnp.append(xy, jnp.asarray(frames.yaws)[index // frames.side**2])
+
+
+def normalise(frames: Frames, pose: jax.Array) -> jax.Array:
+    """Pose [3] (m, m, rad) to the box [-1, 1]^3."""
+    return box.project(jnp.append(pose[:2] / (0.5 * frames.extent), pose[2] / np.pi - 1.0), box.POSE_WRAPS)
+
+
+def denormalise(frames: Frames, u: jax.Array) -> jax.Array:
+    """Point of the box [-1, 1]^3 to a pose [3] (m, m, rad in [0, 2 pi))."""
+    return jnp.append(u[:2] * (0.5 * frames.extent), geometry.wrap_angle((u[2] + 1.0) * np.pi))

@@ -1,0 +1,446 @@
+"""The command `csac-jax`. Exit codes: 0 done, 1 failed, 2 bad arguments, 130 and 143 stopped by SIGINT and SIGTERM.
+
+JAX is imported only once the arguments are known to be good, so that help and complaints come at once.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import io
+import json
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, NoReturn, TypeVar
+
+import tyro
+
+import csac_jax
+from csac_jax import presets
+from csac_jax.config import Config
+from csac_jax.train import stop as stopping
+
+Arguments = TypeVar("Arguments")
+
+PROGRAM = "csac-jax"
+RUNS = Path("runs")
+USAGE = f"""usage: {PROGRAM} COMMAND ...
+
+A robot learns to push and grasp in clutter.
+
+  train PRESET       train with a preset: {", ".join(presets.PRESETS)}
+  train --resume DIR go on with a run that was stopped
+  eval DIR           measure what a run has learned
+  doctor             versions, devices and a self-test of this machine
+
+`{PROGRAM} COMMAND --help` lists the options of a command; --version prints the version.
+"""
+
+
+class BadArgumentsError(Exception):
+    """What was asked for cannot be done; exit code 2. The message is one line with the remedy."""
+
+
+class FailedError(Exception):
+    """What was asked for has failed; exit code 1. The message is one line with the remedy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """Trains into a new folder, or goes on with a run that was stopped. Every setting of a preset is an option."""
+
+    run_dir: Path | None = None
+    """Folder of the run, which must not exist; runs/PRESET-SEED-TIME if not given."""
+    resume: Path | None = None
+    """Folder of a run to go on with; PRESET and settings may be left out, else they must be the run's."""
+    tensorboard: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Also write TensorBoard files into the folder of the run."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+    seed: int = 0
+    """Number that all randomness of the run follows from."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalOptions:
+    """Measures a policy in scenes that training never saw."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    policy: Literal["learned", "random", "oracle"] = "learned"
+    """What acts: the run's networks; a random place with a block under it; or one that reads the blocks' poses."""
+    episodes: int = 50
+    """Episodes, each with a fresh scene."""
+    seed: int = 0
+    """Number that scenes and noise follow from; whatever it is, the scenes are none that training draws from."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DoctorOptions:
+    """Prints versions, devices and the protections in force, and checks that this machine computes right."""
+
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command in `argv` (without the program's name; the process's own if None); returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except BadArgumentsError as error:
+        return _complain(2, error)
+    except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (FailedError, OSError) as error:
+        return _complain(1, error)
+    except KeyboardInterrupt:
+        return _complain(130, "stopped")
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE, end="")
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        print(csac_jax.__version__)
+        return 0
+    if arguments[0] not in COMMANDS:
+        raise BadArgumentsError(f"unknown command '{arguments[0]}'; choose one of: {', '.join(COMMANDS)}")
+    return COMMANDS[arguments[0]](arguments[1:])
+
+
+def _complain(code: int, error: object) -> int:
+    print(f"{PROGRAM}: {' '.join(str(error).split())}", file=sys.stderr)
+    return code
+
+
+# Parsing.
+
+
+def _sections() -> list[dataclasses.Field[Any]]:
+    """The fields of Config that are groups of settings."""
+    return [field for field in dataclasses.fields(Config) if dataclasses.is_dataclass(field.type)]
+
+
+# All settings and options of `train`: TrainOptions and, as groups of flags, every section of Config.
+_Train = dataclasses.make_dataclass(
+    "_Train",
+    [(field.name, field.type, field) for field in _sections()],
+    bases=(TrainOptions,),
+    frozen=True,
+    namespace={"__doc__": TrainOptions.__doc__},
+)
+
+
+def _parse(kind: type[Arguments], arguments: list[str], prog: str, default: Any = tyro.MISSING_NONPROP) -> Arguments:
+    """`arguments` as a `kind`. Prints help and exits; bad ones raise BadArgumentsError, one line in place of a box."""
+    if {"-h", "--help"} & set(arguments):
+        tyro.cli(kind, prog=prog, args=["--help"], default=default)
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint), _wide_terminal():
+            return tyro.cli(kind, prog=prog, args=arguments, default=default)
+    except SystemExit:
+        raise BadArgumentsError(_one_line(complaint.getvalue(), prog)) from None
+    except ValueError as error:  # a range check of the outermost dataclass
+        raise BadArgumentsError(str(error)) from None
+
+
+@contextlib.contextmanager
+def _wide_terminal() -> Iterator[None]:
+    """Keeps tyro from breaking its messages into lines."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "1000"
+    try:
+        yield
+    finally:
+        del os.environ["COLUMNS"]
+        if before is not None:
+            os.environ["COLUMNS"] = before
+
+
+def _one_line(box: str, prog: str) -> str:
+    """The message in tyro's box of several lines, with its first suggestion."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    lines = [line.strip("│ ") for line in plain.splitlines() if not line.startswith(("╭", "╰"))]
+    rules = [i for i, line in enumerate(lines) if re.fullmatch("[─-]{3,}", line)]
+    if "╭" not in plain and rules:  # drawn without corners: the title stands on a line of its own, over a rule
+        lines, rules = lines[rules[0] + 1 :], [i - rules[0] - 1 for i in rules[1:]]
+    message = " ".join(lines[: rules[0] if rules else None]).strip().rstrip(".")
+    message = re.sub(r"^Error parsing [\w.]+: (?=[\w.]+: )", "", message)
+    hint = lines[lines.index("Perhaps you meant:") + 1].split()[0] if "Perhaps you meant:" in lines else None
+    meant = f"; perhaps you meant {hint}" if hint else ""
+    return f"{message or 'the arguments cannot be read'}{meant}; see {prog} --help"
+
+
+# train.
+
+
+def train(arguments: list[str]) -> int:
+    """`csac-jax train`."""
+    stop = stopping.install()
+    options, cfg = _read_train(arguments)
+    run_dir = options.resume or options.run_dir or _new_run_dir(cfg)
+    begun = time.time()
+    summary = _train(options, cfg, run_dir, stop)
+    result = {"run_dir": str(run_dir), **summary._asdict(), "wall_seconds": round(time.time() - begun, 1)}
+    _write_json(options.json, result, cfg)
+    return stop.exit_code
+
+
+def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
+    """Options and config of a run, from the command line and, if it is resumed, from its checkpoint."""
+    prog = f"{PROGRAM} train"
+    named = bool(arguments) and not arguments[0].startswith("-")
+    preset, flags = (arguments[0], arguments[1:]) if named else (None, arguments)
+    base = _preset(preset or "quick")
+    resumed = _resumed(flags) if not {"-h", "--help"} & set(flags) else None
+    stored = None if resumed is None else _stored_config(resumed)
+    base = stored or base
+    sections = {field.name: getattr(base, field.name) for field in _sections()}
+    options: Any = _parse(_Train, flags, f"{prog} {preset or 'PRESET'}", _Train(seed=base.seed, **sections))
+    asked = _build_config(preset or base.preset, options)
+    if stored is not None:
+        _check_resume(options, stored, asked)
+    elif preset is None:
+        raise BadArgumentsError(f"train: give a preset first, one of: {', '.join(presets.PRESETS)}")
+    elif options.run_dir is not None and options.run_dir.exists():
+        raise BadArgumentsError(f"{options.run_dir} exists; give another --run-dir, or go on with it by --resume")
+    if options.tensorboard:
+        _require_tensorboard()
+    return options, asked
+
+
+def _preset(name: str) -> Config:
+    try:
+        return presets.get(name)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+
+
+def _resumed(flags: list[str]) -> Path | None:
+    """The folder after --resume, needed before the rest can be read: its config is what flags are compared with."""
+    for i, flag in enumerate(flags):
+        if flag == "--resume" and i + 1 < len(flags):
+            return Path(flags[i + 1])
+        if flag.startswith("--resume="):
+            return Path(flag.removeprefix("--resume="))
+    return None
+
+
+def _stored_config(run_dir: Path) -> Config:
+    from csac_jax.train import checkpoint
+
+    if not run_dir.is_dir():
+        raise FailedError(f"there is no folder {run_dir}; give the folder of a run")
+    try:
+        return checkpoint.load_config(run_dir)
+    except checkpoint.CheckpointError as error:
+        raise FailedError(str(error)) from None
+
+
+def _build_config(preset: str, options: Any) -> Config:
+    sections = {field.name: getattr(options, field.name) for field in _sections()}
+    try:
+        return Config(preset=preset, seed=options.seed, **sections)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+
+
+def _check_resume(options: TrainOptions, stored: Config, asked: Config) -> None:
+    from csac_jax.train import config_json
+
+    if options.run_dir is not None:
+        raise BadArgumentsError("--run-dir and --resume exclude one another; a resumed run stays in its folder")
+    if names := config_json.differences(stored, asked):
+        raise BadArgumentsError(
+            f"{options.resume} was trained with other values of {', '.join(names)}; leave them out, or begin a new run"
+        )
+
+
+def _require_tensorboard() -> None:
+    import importlib.util
+
+    if importlib.util.find_spec("tensorboardX") is None:
+        raise BadArgumentsError("--tensorboard needs an extra; run: pip install 'csac-jax[tensorboard]'")
+
+
+def _new_run_dir(cfg: Config) -> Path:
+    """A folder that does not exist yet."""
+    stem = RUNS / f"{cfg.preset}-{cfg.seed}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
+    return next(path for path in candidates if not path.exists())
+
+
+def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop) -> Any:
+    from rich.console import Console
+
+    from csac_jax.show.progress import Group, Terminal
+    from csac_jax.train import checkpoint, loop, step
+
+    with Terminal(Console()) as terminal:
+        terminal.say(f"run {run_dir}")
+        program = step.make(cfg)
+        reporters: list[loop.Reporter] = [terminal]
+        if options.tensorboard:
+            from csac_jax.show.tensorboard import TensorBoard
+
+            first = checkpoint.latest_step(run_dir) if options.resume else None
+            reporters.append(TensorBoard(run_dir, (first or 0) * cfg.train.scenes))
+        try:
+            return loop.run(
+                cfg,
+                run_dir,
+                lambda: step.init(program),
+                lambda num_steps: step.compile_chunk(program, num_steps),
+                Group(reporters),
+                stop,
+                resume=options.resume is not None,
+            )
+        except FileExistsError:
+            raise BadArgumentsError(f"{run_dir} exists; give another --run-dir, or go on with it by --resume") from None
+        except (loop.TrainingError, checkpoint.CheckpointError) as error:
+            raise FailedError(str(error)) from None
+
+
+# eval.
+
+
+def evaluate(arguments: list[str]) -> int:
+    """`csac-jax eval`."""
+    options = _parse(EvalOptions, arguments, f"{PROGRAM} eval")
+    if options.episodes < 1:
+        raise BadArgumentsError("--episodes: at least 1")
+    if not 0 <= options.seed < 2**31 - 1:
+        raise BadArgumentsError("--seed: must lie in 0 .. 2147483646")
+    cfg = _stored_config(options.run_dir)
+    begun = time.time()
+    summary = _evaluate(options, cfg)
+    seconds = round(time.time() - begun, 1)
+    result = {"policy": options.policy, "seed": options.seed, "seconds": seconds, **summary}
+    _print_summary(options, summary, seconds)
+    _write_json(options.json, result, cfg)
+    return 0
+
+
+def _evaluate(options: EvalOptions, cfg: Config) -> dict[str, Any]:
+    import jax
+
+    from csac_jax import env as environment
+    from csac_jax.train import checkpoint, evaluate, metrics, step
+
+    params = None
+    if options.policy == "learned":
+        program = step.make(cfg)
+        try:
+            state, _ = checkpoint.restore(options.run_dir, jax.eval_shape(lambda: step.init(program)))
+        except checkpoint.CheckpointError as error:
+            raise FailedError(str(error)) from None
+        params = state.learner.online
+    env = environment.make(cfg, stream=1 + options.seed, scenes=options.episodes)  # stream 0 is the training's
+    return metrics.summarise(evaluate.rollout(cfg, env, options.policy, params, options.episodes, options.seed))
+
+
+def _print_summary(options: EvalOptions, summary: dict[str, Any], seconds: float) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    title = f"{options.policy} in {options.episodes} episodes, seed {options.seed}, {seconds:.0f} s"
+    table = Table("metric", "value", "95 % interval", "n", title=title)
+    for name, entry in summary.items():
+        if "value" in entry:
+            shown = ("-", "-") if entry["n"] == 0 else (_percent(entry["value"]), _interval(entry))
+            table.add_row(name, *shown, str(entry["n"]))
+    console = Console()
+    console.print(table)
+    for name in ("outcomes", "counts"):
+        console.print(
+            f"{name}: " + ", ".join(f"{key} {count}" for key, count in summary[name].items()), highlight=False
+        )
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.1f} %"
+
+
+def _interval(entry: dict[str, Any]) -> str:
+    return f"{100 * entry['low']:.1f} .. {100 * entry['high']:.1f} %"
+
+
+# doctor.
+
+
+def doctor(arguments: list[str]) -> int:
+    """`csac-jax doctor`."""
+    options = _parse(DoctorOptions, arguments, f"{PROGRAM} doctor")
+    with _watchdog(90.0, "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8 and try again"):
+        from csac_jax import _guard
+        from csac_jax.train import provenance, selftest
+
+        record = provenance.record()
+        print(f"device     {record['device']}")
+        print("versions   " + ", ".join(f"{name} {version}" for name, version in provenance.versions().items()))
+        print(f"commit     {record['commit'] or 'none'}")
+        variable, threads = _guard.pool_setting()
+        guarded = threads >= _guard.MIN_THREADS
+        remedy = f"batched MJX may hang; set {_guard.POOL_VARIABLE}={_guard.MIN_THREADS}"
+        verdict = "enough for batched MJX" if guarded else remedy
+        print(f"XLA flags  {os.environ.get('XLA_FLAGS') or 'none'}")
+        print(f"threads    {threads} in JAX's pool on the CPU, by {variable}: {verdict}")
+        begun = time.perf_counter()
+        checks = selftest.run()
+    for check in checks:
+        print(
+            f"{'ok' if check.passed else 'FAILED':<10} {check.name}: error {check.error:.1e}, bound {check.bound:.0e}"
+        )
+    print(f"self-test  {time.perf_counter() - begun:.1f} s")
+    pool = {"variable": variable, "threads": threads, "guarded": guarded}
+    tests = [{**check._asdict(), "passed": check.passed} for check in checks]
+    guard = {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", "")}
+    _write_json(options.json, {**guard, "self_test": tests}, None)
+    failed = [check.name for check in checks if not check.passed]
+    if failed:
+        raise FailedError(f"self-test failed: {'; '.join(failed)}; do not trust results of these versions here")
+    return 0
+
+
+@contextlib.contextmanager
+def _watchdog(seconds: float, message: str) -> Iterator[None]:
+    """Ends the process with `message` if the block takes longer than `seconds`."""
+    import threading
+
+    def bark() -> NoReturn:
+        _complain(1, message)
+        os._exit(1)
+
+    timer = threading.Timer(seconds, bark)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _write_json(path: Path | None, result: dict[str, Any], cfg: Config | None) -> None:
+    """Writes a result with its provenance; the file appears all at once."""
+    if path is None:
+        return
+    from csac_jax.train import config_json, provenance
+
+    config = {} if cfg is None else {"config": config_json.to_dict(cfg)}
+    text = json.dumps({**result, **config, **provenance.record()}, indent=2) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text)
+    temporary.replace(path)
+
+
+COMMANDS: dict[str, Callable[[list[str]], int]] = {"train": train, "eval": evaluate, "doctor": doctor}

@@ -1,0 +1,367 @@
+"""Every setting of a run, as frozen dataclasses: hashable, so that they are closed over by compiled programs.
+
+Lengths are metres, angles radians, times seconds unless a name says otherwise. A value out of range raises
+`ValueError` with the field's name when the config is built. Numbers marked (ours) are measured choices; the
+others name their source.
+"""
+
+import dataclasses
+import math
+from typing import Literal
+
+SlotKind = Literal["box", "prism", "cylinder"]
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneConfig:
+    """What lies on the table."""
+
+    slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
+    """Shape family of each block slot; a box slot draws cube, cuboid, plank or tile anew in every scene."""
+    min_blocks: int = 5
+    """Fewest blocks in play in a scene; the most is the number of slots."""
+    pool: int = 1024
+    """Distinct settled scenes that resets draw from; each is turned by a random yaw as it is drawn."""
+    drop_extent: float = 0.248
+    """Side of the square in which blocks are dropped, m (VPG)."""
+    drop_height: float = 0.15
+    """Height of the first drop, m (VPG); later blocks of a scene start higher, so that none overlap."""
+    settle_time: float = 2.5
+    """Time the blocks are given to come to rest, s (ours)."""
+
+    def __post_init__(self) -> None:
+        _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
+        _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
+        _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")
+        _require(0.05 <= self.drop_extent <= 0.448, "scene.drop_extent: must lie in 0.05 .. 0.448 m")
+        _require(0.05 <= self.drop_height <= 1.0, "scene.drop_height: must lie in 0.05 .. 1 m")
+        _require(0.5 <= self.settle_time <= 20.0, "scene.settle_time: must lie in 0.5 .. 20 s")
+
+
+@dataclasses.dataclass(frozen=True)
+class SimConfig:
+    """Physics and the two motion primitives; one primitive is `substeps` physics steps, whatever it does."""
+
+    timestep: float = 0.004
+    """Length of a physics step, s."""
+    grasp_phases: tuple[int, int, int] = (60, 50, 80)
+    """Substeps of a grasp: descend, close the fingers, lift."""
+    push_phases: tuple[int, int, int] = (50, 90, 50)
+    """Substeps of a push: descend, push, lift; their sum is that of `grasp_phases`."""
+    iterations: int = 4
+    """Newton iterations of the constraint solver; fewer break grasps."""
+    line_search: int = 8
+    """Line-search steps of one Newton iteration."""
+    geom_pairs: int = 12
+    """Pairs of geoms examined per collision function, nearest first."""
+    contacts: int = 48
+    """Contacts kept per step, deepest first."""
+    approach: float = 0.10
+    """Height above the place at which a primitive starts and ends, m."""
+    grasp_depth: float = 0.035
+    """How far below the surface seen at the place the finger tips go, m."""
+    clearance: float = 0.012
+    """Lowest height of the finger tips above the table, m."""
+    push_length: float = 0.10
+    """Length of a push, m (VPG)."""
+    push_depth: float = 0.02
+    """How far below the local top the tips push, m."""
+    window: float = 0.02
+    """Side of the window whose highest surface counts as the local top, m (a finger's width)."""
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps of one primitive."""
+        return sum(self.grasp_phases)
+
+    def __post_init__(self) -> None:
+        _require(0.0005 <= self.timestep <= 0.01, "sim.timestep: must lie in 0.0005 .. 0.01 s")
+        _require(
+            min(*self.grasp_phases, *self.push_phases) >= 1, "sim.grasp_phases, push_phases: at least 1 substep each"
+        )
+        _require(
+            sum(self.grasp_phases) == sum(self.push_phases),
+            "sim.push_phases: must add up to as many substeps as sim.grasp_phases",
+        )
+        _require(self.iterations >= 1, "sim.iterations: at least 1")
+        _require(self.line_search >= 1, "sim.line_search: at least 1")
+        _require(self.geom_pairs >= 1 and self.contacts >= 1, "sim.geom_pairs, sim.contacts: at least 1")
+        _require(0.02 <= self.approach <= 0.3, "sim.approach: must lie in 0.02 .. 0.3 m")
+        _require(0.0 < self.grasp_depth <= 0.05, "sim.grasp_depth: must lie in 0 .. 0.05 m")
+        _require(0.0 < self.clearance <= 0.05, "sim.clearance: must lie in 0 .. 0.05 m")
+        _require(0.0 < self.push_length <= 0.3, "sim.push_length: must lie in 0 .. 0.3 m")
+        _require(0.0 < self.push_depth <= 0.05, "sim.push_depth: must lie in 0 .. 0.05 m")
+        _require(0.0 < self.window <= 0.1, "sim.window: must lie in 0 .. 0.1 m")
+
+
+@dataclasses.dataclass(frozen=True)
+class HeightmapConfig:
+    """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
+
+    size: int = 64
+    """H = W, cells."""
+    extent: float = 0.448
+    """Side of the square workspace, m (VPG)."""
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell, m."""
+        return self.extent / self.size
+
+    def __post_init__(self) -> None:
+        _require(self.size >= 16 and self.size % 8 == 0, "heightmap.size: must be a multiple of 8, at least 16")
+        _require(0.1 <= self.extent <= 1.0, "heightmap.extent: must lie in 0.1 .. 1 m")
+
+
+@dataclasses.dataclass(frozen=True)
+class NetConfig:
+    """The small dense net: densely connected, group norm, fully convolutional, at half the map's resolution."""
+
+    rotations: int = 16
+    """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
+    growth: int = 16
+    """Channels that each dense layer adds."""
+    dilations: tuple[int, ...] = (1, 2, 4)
+    """Dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
+    stem: int = 16
+    """Channels of the first convolution."""
+    head: int = 32
+    """Channels of the 1 x 1 convolution before each head."""
+    margin: float = 0.125
+    """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
+
+    def __post_init__(self) -> None:
+        _require(self.rotations >= 4 and self.rotations % 2 == 0, "net.rotations: must be even, at least 4")
+        _require(min(self.growth, self.stem, self.head) >= 4, "net.growth, stem, head: at least 4 channels")
+        _require(len(self.dilations) >= 1 and min(self.dilations) >= 1, "net.dilations: at least one layer, each >= 1")
+        _require(0.0 <= self.margin <= 0.5, "net.margin: must lie in 0 .. 0.5")
+
+
+@dataclasses.dataclass(frozen=True)
+class CEMConfig:
+    """Cross-entropy method over (x, y, yaw), Algorithm 1 lines 8-13; numbers from QT-Opt, arXiv:1806.10293."""
+
+    candidates: int = 64
+    """J, actions sampled in a round."""
+    elites: int = 6
+    """K, best actions that the next round's distribution is fitted to."""
+    rounds: int = 3
+    """Rounds of sampling and fitting."""
+    std: float = 0.3
+    """Spread of the first round, in units of half the workspace (x, y) and half a turn (yaw)."""
+    std_min: float = 0.01
+    """Least spread, same units."""
+    spread: Literal["std", "mad"] = "std"
+    """How elites' spread is measured: standard deviation, or line 12's mean absolute deviation with 1 / (K - 1)."""
+
+    def __post_init__(self) -> None:
+        _require(2 <= self.elites <= self.candidates, "cem.elites: must lie in 2 .. cem.candidates")
+        _require(self.rounds >= 1, "cem.rounds: at least 1")
+        _require(0.0 < self.std_min <= self.std <= 2.0, "cem.std: 0 < cem.std_min <= cem.std <= 2")
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetConfig:
+    """TD target, eq. 9 and Algorithm 1 lines 17-19, softmax as in SD3 (arXiv:2010.09177)."""
+
+    gamma: float = 0.5
+    """Discount (VPG)."""
+    samples: int = 50
+    """Noisy target actions per primitive in the softmax."""
+    std: float = 0.2
+    """Spread of their noise, in CEM's units."""
+    clip: float = 0.5
+    """Bound of their noise, same units."""
+    inverse_temperature: float = 20.0
+    """beta of the softmax for a Q range of 1; divided by the range of possible returns."""
+
+    def __post_init__(self) -> None:
+        _require(0.0 <= self.gamma < 1.0, "target.gamma: must lie in 0 <= gamma < 1")
+        _require(self.samples >= 1, "target.samples: at least 1")
+        _require(self.std > 0.0 and self.clip > 0.0, "target.std, target.clip: must be positive")
+        _require(self.inverse_temperature >= 0.0, "target.inverse_temperature: must not be negative")
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardConfig:
+    """Rewards, CSAC eqs. 10-16."""
+
+    reach: float = 1.0
+    """r2 of eq. 11: the hand comes back with a block."""
+    distance: float = 0.0
+    """w: penalty per metre between the place and where the finger tips acted (eq. 10, sign turned)."""
+    eta0: float = 0.0
+    """eta_0 of eq. 13."""
+    eta1: float = 1.0
+    """eta_1 of eq. 13."""
+    nothing: float = -1.0
+    """Grasp that does nothing (eq. 15)."""
+    empty: float = -0.5
+    """Grasp that closes on air (eq. 15)."""
+    touched: float = -0.25
+    """Grasp that touches a block but holds none (eq. 15)."""
+    dropped: float = 0.0
+    """Grasp that holds a block and loses it (eq. 15)."""
+    lifted: float = 1.0
+    """Grasp that lifts a block (eq. 15)."""
+    push_better: float = 1.0
+    """Push after which the best grasp is worth more (eq. 16)."""
+    push_worse: float = -1.0
+    """Push after which it is not (eq. 16)."""
+    dead_band: float = 0.1
+    """Gain in the best grasp's value that a push must exceed (ours)."""
+
+    def __post_init__(self) -> None:
+        _require(self.distance >= 0.0, "reward.distance: a distance must not be a gain, so it must not be negative")
+        _require(self.dead_band >= 0.0, "reward.dead_band: must not be negative")
+        levels = (self.nothing, self.empty, self.touched, self.dropped, self.lifted)
+        _require(list(levels) == sorted(levels), "reward: nothing <= empty <= touched <= dropped <= lifted is needed")
+
+
+@dataclasses.dataclass(frozen=True)
+class ExploreConfig:
+    """Exploration: action noise (Algorithm 1 line 13), random primitive, random place."""
+
+    noise_std: float = 0.01
+    """delta: spread of the action noise, in CEM's units; 0.03 (7 mm, 5 degrees) costs 8 points of success (ours)."""
+    noise_clip: float = 0.03
+    """c: bound of the action noise, same units."""
+    primitive_start: float = 0.5
+    """Probability of a random primitive at first (VPG)."""
+    primitive_end: float = 0.1
+    """Probability of a random primitive in the end (VPG)."""
+    place_start: float = 0.5
+    """Probability of a random place among those with something to act on, at first (ours)."""
+    place_end: float = 0.0
+    """The same, in the end (ours)."""
+    decay: float = 0.998
+    """Factor of both probabilities per action taken, until they reach their end (ours; VPG 0.9998)."""
+    push_fraction: float = 0.25
+    """Share of pushes among random primitives (ours)."""
+
+    def __post_init__(self) -> None:
+        for name in ("primitive_start", "primitive_end", "place_start", "place_end", "push_fraction"):
+            _require(0.0 <= getattr(self, name) <= 1.0, f"explore.{name}: must be a probability")
+        _require(0.0 < self.decay <= 1.0, "explore.decay: must lie in 0 < decay <= 1")
+        _require(
+            self.noise_std >= 0.0 and self.noise_clip > 0.0, "explore.noise_std >= 0 and noise_clip > 0 are needed"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnConfig:
+    """Losses and optimiser."""
+
+    learning_rate: float = 1e-3
+    """Adam's step size, critic (ours; CSAC and VPG 1e-4 on a pretrained DenseNet-121)."""
+    actor_learning_rate: float = 3e-4
+    """Adam's step size, actor head (ours)."""
+    batch: int = 32
+    """B, transitions per update (N of Algorithm 1)."""
+    updates: int = 2
+    """Updates of the critic per training step, that is, per `train.scenes` actions; the actor has one per step."""
+    augment: bool = True
+    """Show each drawn transition under a random symmetry of the square."""
+    tau: float = 0.02
+    """Share of the online network in each soft update of the target (Algorithm 1 lines 24-26)."""
+    gradient_clip: float = 10.0
+    """Bound of the gradient's global norm."""
+    huber: float = 1.0
+    """Width of the quadratic part of the Huber loss (CSAC sec. 4)."""
+
+    def __post_init__(self) -> None:
+        _require(self.learning_rate > 0.0, "learn.learning_rate: must be positive")
+        _require(self.actor_learning_rate > 0.0, "learn.actor_learning_rate: must be positive")
+        _require(self.batch >= 1 and self.updates >= 1, "learn.batch and learn.updates: at least 1")
+        _require(0.0 < self.tau <= 1.0, "learn.tau: must lie in 0 < tau <= 1")
+        _require(self.gradient_clip > 0.0 and self.huber > 0.0, "learn.gradient_clip, learn.huber: must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayConfig:
+    """Ring of transitions and how it is sampled."""
+
+    capacity: int = 4096
+    """C, transitions kept."""
+    sampler: Literal["uniform", "beta"] = "beta"
+    """`uniform` is CSAC, `beta` CSAC-beta (sec. 3.5): ranks by abs(TD error), rank / n ~ Beta(a, b)."""
+    beta_start: tuple[float, float] = (0.5, 0.5)
+    """(a, b) at first (CSAC sec. 4.3)."""
+    beta_end: tuple[float, float] = (1.0, 12.0)
+    """(a, b) in the end (CSAC sec. 4.3); a and b pass through (1, 1) on the way."""
+    beta_uniform_at: float = 0.4
+    """Share of all updates after which (a, b) is (1, 1) (ours)."""
+
+    def __post_init__(self) -> None:
+        _require(self.capacity >= 2, "replay.capacity: at least 2 transitions")
+        _require(min(*self.beta_start, *self.beta_end) > 0.0, "replay.beta_start, beta_end: (a, b) must be positive")
+        _require(0.0 < self.beta_uniform_at < 1.0, "replay.beta_uniform_at: must lie between 0 and 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """Length and shape of a run."""
+
+    scenes: int = 8
+    """E, scenes simulated side by side; each takes one action per training step."""
+    actions: int = 3200
+    """Actions of the whole run over all scenes."""
+    warmup: int = 64
+    """Actions before the first update."""
+    chunk: int = 10
+    """Training steps in one call of the compiled program; between calls the host logs, saves and stops."""
+    save_every: int = 50
+    """Chunks between checkpoints; the last chunk and a stop are always saved."""
+    max_actions: int = 15
+    """Actions after which an episode is cut off."""
+    max_idle: int = 10
+    """Actions in a row without visible change after which an episode is cut off (VPG)."""
+
+    @property
+    def steps(self) -> int:
+        """Training steps of the whole run."""
+        return math.ceil(self.actions / self.scenes)
+
+    def __post_init__(self) -> None:
+        for name in ("scenes", "actions", "warmup", "chunk", "save_every", "max_actions", "max_idle"):
+            _require(getattr(self, name) >= 1, f"train.{name}: at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """A run: everything that decides its result, together with `seed`."""
+
+    preset: str = "quick"
+    """Name of the preset that this config was made from."""
+    seed: int = 0
+    """Number that all randomness of the run follows from."""
+    scene: SceneConfig = SceneConfig()
+    sim: SimConfig = SimConfig()
+    heightmap: HeightmapConfig = HeightmapConfig()
+    net: NetConfig = NetConfig()
+    cem: CEMConfig = CEMConfig()
+    target: TargetConfig = TargetConfig()
+    reward: RewardConfig = RewardConfig()
+    explore: ExploreConfig = ExploreConfig()
+    learn: LearnConfig = LearnConfig()
+    replay: ReplayConfig = ReplayConfig()
+    train: TrainConfig = TrainConfig()
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.seed < 2**31, "seed: must lie in 0 .. 2147483647")
+        _require(
+            self.learn.batch <= self.train.warmup,
+            f"learn.batch: {self.learn.batch} transitions cannot be drawn after train.warmup = {self.train.warmup}; "
+            "raise train.warmup or lower learn.batch",
+        )
+        _require(
+            self.train.scenes <= self.replay.capacity and self.learn.batch <= self.replay.capacity,
+            "replay.capacity: must hold train.scenes and learn.batch transitions",
+        )
+        side = round(self.heightmap.size * (1 + self.net.margin) / 2) * 2
+        _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little")

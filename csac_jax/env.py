@@ -1,0 +1,150 @@
+"""The environment by itself: one scene, pure `reset` and `step`; the caller vmaps and jits.
+
+env = make(Config())
+state = env.reset(jax.random.key(0))
+state = env.step(state, Action(primitive=jnp.int32(1), pose=jnp.array([0.0, 0.0, 0.5])))
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from csac_jax import geometry
+from csac_jax.config import Config
+from csac_jax.scene import blocks, layout, model, pool
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import mjx_physics, outcome
+from csac_jax.sim.mjx_physics import Physics
+from csac_jax.sim.outcome import Outcome
+from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.vision import heightmap
+from csac_jax.vision.heightmap import Observation
+from csac_jax.vision.raycast import Polytopes
+
+CHANGE_AREA = 12.0  # cm^2 that must move for an action to count as a change (VPG)
+
+
+@struct.dataclass
+class Info:
+    """What the last action did."""
+
+    outcome: jax.Array  # [] int32, Outcome of a grasp by ground truth; NOTHING after a push
+    outcome_by_gap: jax.Array  # [] int32, the same as finger gap and height map suggest
+    moved: jax.Array  # [] cm^2 of the height map that moved
+    distance: jax.Array  # [] m, between the place aimed at and the nearest block lifted; 0 if none was
+    cleared: jax.Array  # [] int32, blocks taken from the table
+    left: jax.Array  # [] int32, blocks that left the workspace
+    saturated: jax.Array  # [] int32, substeps in which contacts may have been dropped
+    ill: jax.Array  # [] bool, physics failed: the transition is void
+
+
+@struct.dataclass
+class State:
+    """One scene between two actions."""
+
+    scene: Scene
+    obs: Observation
+    reward: jax.Array  # [] 1 if the last action took a block from the table, else 0 (r2 of CSAC eq. 11)
+    terminated: jax.Array  # [] bool, no block is left
+    truncated: jax.Array  # [] bool, action cap or no-change cap reached, or the scene is ill
+    actions: jax.Array  # [] int32, taken in this episode
+    idle: jax.Array  # [] int32, actions in a row without visible change
+    info: Info
+
+    @property
+    def done(self) -> jax.Array:
+        """[] bool, the episode is over."""
+        return self.terminated | self.truncated
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Env:
+    """Physics, eyes and the pool of settled scenes; closed over by whoever compiles."""
+
+    cfg: Config
+    physics: Physics
+    scenes: Scene  # NumPy leaves [P, N, ...], settled
+
+    def reset(self, key: jax.Array) -> State:
+        """A fresh settled scene of the pool, turned by a random yaw."""
+        key_scene, key_yaw = jax.random.split(key)
+        index = jax.random.randint(key_scene, (), 0, self.scenes.position.shape[0])
+        yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
+        return self.begin(layout.turn(jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes), yaw))
+
+    def begin(self, scene: Scene) -> State:
+        """The first state of an episode that starts with this scene."""
+        no, none = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        zero = jnp.zeros((), jnp.float32)
+        info = Info(none, none, zero, zero, none, none, none, no)
+        return State(scene, self.look(scene), zero, no, no, none, none, info)
+
+    def look(self, scene: Scene) -> Observation:
+        """The top view of a scene."""
+        normals, offsets = blocks.half_spaces(self.cfg.scene.slots, scene.half_size)
+        shapes = Polytopes(
+            normal=normals,
+            offset=offsets,
+            position=scene.position,
+            rotation=jax.vmap(geometry.quat_to_matrix)(scene.quaternion),
+            colour=jnp.asarray(blocks.COLOURS)[scene.colour],
+        )
+        return heightmap.orthographic(self.cfg.heightmap, shapes, jnp.asarray(blocks.TABLE_COLOUR))
+
+    def step(self, state: State, action: Action) -> State:
+        """Runs one primitive; blocks lifted or out of the workspace leave the scene."""
+        cfg, before = self.cfg, state.scene
+        after, trace, plan = mjx_physics.execute(self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action)
+        ill = ~mjx_physics.healthy(after)
+        after = jax.tree.map(lambda good, bad: jnp.where(ill, good, bad), before, after)
+
+        grasped = action.primitive == Primitive.GRASP
+        hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
+        lifted = outcome.lifted_blocks(trace, hand_rise) & grasped & ~ill
+        gone = after.in_play & ~layout.inside(after.position, cfg.heightmap.extent) & ~lifted
+        after = layout.park(after, ~lifted & ~gone)
+        obs = self.look(after)
+
+        moved = heightmap.moved_area(cfg.heightmap, state.obs.height, obs.height)
+        changed = moved > CHANGE_AREA
+        idle = jnp.where(changed, 0, state.idle + 1)
+        actions = state.actions + 1
+        terminated = ~jnp.any(after.in_play)
+        capped = (actions >= cfg.train.max_actions) | (idle >= cfg.train.max_idle)
+        off = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
+        nothing = jnp.int32(Outcome.NOTHING)
+        info = Info(
+            outcome=jnp.where(grasped, outcome.grasp_outcome(trace, plan.surface, hand_rise), nothing),
+            outcome_by_gap=jnp.where(grasped, outcome.grasp_outcome_by_gap(trace, plan.surface, changed), nothing),
+            moved=moved,
+            distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, off, jnp.inf)), 0.0),
+            cleared=jnp.sum(lifted, dtype=jnp.int32),
+            left=jnp.sum(gone, dtype=jnp.int32),
+            saturated=trace.saturated,
+            ill=ill,
+        )
+        return State(
+            scene=after,
+            obs=obs,
+            reward=jnp.any(lifted).astype(jnp.float32),
+            terminated=terminated & ~ill,
+            truncated=(capped & ~terminated) | ill,
+            actions=actions,
+            idle=idle,
+            info=info,
+        )
+
+
+def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None) -> Env:
+    """The environment of a config; settles (or reads from the cache) the scenes that resets draw from.
+
+    Args: stream, the stream of random numbers that drops follow: training takes 0, evaluation others;
+    scenes, size of the pool, `cfg.scene.pool` if None.
+    """
+    world = model.build(cfg.scene, cfg.sim)
+    count = cfg.scene.pool if scenes is None else scenes
+    settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, stream, count)
+    return Env(cfg, mjx_physics.make(world), settled)

@@ -1,0 +1,74 @@
+"""Poses, angles, and the map from heightmap cells to metres and back.
+
+Quaternions are (w, x, y, z), of unit length. Heightmap rows run along y and columns along x; row 0 and column 0 lie at
+the lowest y and x; a whole-numbered (row, col) is the centre of a cell. Shapes `[..., n]` may have any leading axes.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax.config import HeightmapConfig
+
+_TURN = 2.0 * np.pi
+
+
+def quat_to_matrix(quat: jax.Array) -> jax.Array:
+    """Rotation matrix [3, 3], body to world, of the unit quaternion `quat` [4]."""
+    w, x, y, z = quat
+    return jnp.stack([
+        jnp.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)]),
+        jnp.stack([2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)]),
+        jnp.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]),
+    ])  # fmt: skip
+
+
+def quat_multiply(left: jax.Array, right: jax.Array) -> jax.Array:
+    """Hamilton product [4] of two quaternions [4]: the rotation `right` first, then `left`."""
+    w0, x0, y0, z0 = left
+    w1, x1, y1, z1 = right
+    return jnp.stack([
+        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
+        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
+    ])  # fmt: skip
+
+
+def quat_from_yaw(yaw: jax.Array) -> jax.Array:
+    """Quaternion [4] of a turn by `yaw` [] rad about z, counter-clockwise seen from above."""
+    zero = jnp.zeros_like(yaw)
+    return jnp.stack([jnp.cos(0.5 * yaw), zero, zero, jnp.sin(0.5 * yaw)])
+
+
+def rotate2d(yaw: jax.Array, xy: jax.Array) -> jax.Array:
+    """Points `xy` [..., 2] m turned by `yaw` [] rad about the origin, counter-clockwise seen from above."""
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    x, y = xy[..., 0], xy[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def wrap_angle(angle: jax.Array) -> jax.Array:
+    """The same direction in [0, 2 pi) rad, any shape.
+
+    The remainder of a tiny negative angle rounds to 2 pi itself in float32, and that of a denormal stays negative: both
+    are turned into 0.
+    """
+    wrapped = jnp.mod(angle, _TURN)
+    return jnp.where((wrapped >= _TURN) | (wrapped <= 0.0), 0.0, wrapped)
+
+
+def to_pixel(cfg: HeightmapConfig, xy: jax.Array) -> jax.Array:
+    """Heightmap position (row, col) [..., 2] of the points `xy` [..., 2] m; cell centres are whole numbers."""
+    return xy[..., ::-1] / cfg.cell + 0.5 * (cfg.size - 1)
+
+
+def from_pixel(cfg: HeightmapConfig, row_col: jax.Array) -> jax.Array:
+    """Points xy [..., 2] m of the heightmap positions `row_col` [..., 2]: x = (col + 0.5) cell - extent / 2."""
+    return (row_col[..., ::-1] - 0.5 * (cfg.size - 1)) * cfg.cell
+
+
+def cell_centres(cfg: HeightmapConfig) -> jax.Array:
+    """Centre xy of every cell, [H, W, 2] m."""
+    index = jnp.arange(cfg.size, dtype=jnp.float32)
+    return from_pixel(cfg, jnp.stack(jnp.meshgrid(index, index, indexing="ij"), axis=-1))

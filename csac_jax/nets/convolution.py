@@ -1,0 +1,68 @@
+"""2-D convolution whose gradient stays fast inside `lax.scan` on a CPU.
+
+XLA's CPU back end runs the convolutions that autodiff makes, whose batch and channels are swapped, up to 50 times
+slower inside a while loop than outside (jaxlib 0.10.1). Here the swap is a transpose, and every convolution plain.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+_LAYOUT = ("NHWC", "HWIO", "NHWC")
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+def conv2d(maps: jax.Array, kernel: jax.Array, stride: int, dilation: int, padding: int) -> jax.Array:
+    """Convolution of maps [B, H, W, I] with a kernel [k, k, I, O], zeros around: [B, H', W', O]."""
+    pad = [(padding, padding)] * 2
+    return jax.lax.conv_general_dilated(
+        maps, kernel, (stride, stride), pad, rhs_dilation=(dilation, dilation), dimension_numbers=_LAYOUT
+    )
+
+
+def _forward(maps: jax.Array, kernel: jax.Array, stride: int, dilation: int, padding: int):
+    return conv2d(maps, kernel, stride, dilation, padding), (maps, kernel)
+
+
+def _backward(stride: int, dilation: int, padding: int, saved: tuple[jax.Array, jax.Array], gradient: jax.Array):
+    maps, kernel = saved
+    return (
+        _maps_gradient(maps, kernel, gradient, stride, dilation, padding),
+        _kernel_gradient(maps, kernel, gradient, stride, dilation, padding),
+    )
+
+
+def _maps_gradient(maps, kernel, gradient, stride, dilation, padding) -> jax.Array:
+    """d loss / d maps [B, H, W, I]: the gradient [B, H', W', O], its cells `stride` apart, with the turned kernel."""
+    turned = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
+    low = dilation * (kernel.shape[0] - 1) - padding
+    pad = [
+        (low, size - (out - 1) * stride - 1 + padding)
+        for size, out in zip(maps.shape[1:3], gradient.shape[1:3], strict=True)
+    ]
+    return jax.lax.conv_general_dilated(
+        gradient,
+        turned,
+        (1, 1),
+        pad,
+        lhs_dilation=(stride, stride),
+        rhs_dilation=(dilation, dilation),
+        dimension_numbers=_LAYOUT,
+    )
+
+
+def _kernel_gradient(maps, kernel, gradient, stride, dilation, padding) -> jax.Array:
+    """d loss / d kernel [k, k, I, O]: the maps, with channels as batch, convolved with the gradient as a kernel."""
+    taps = jax.lax.conv_general_dilated(
+        jnp.transpose(maps, (3, 1, 2, 0)),  # [I, H, W, B]
+        jnp.transpose(gradient, (1, 2, 0, 3)),  # [H', W', B, O]
+        (dilation, dilation),
+        [(padding, padding)] * 2,
+        rhs_dilation=(stride, stride),
+        dimension_numbers=_LAYOUT,
+    )  # [I, >= k, >= k, O]
+    return jnp.transpose(taps, (1, 2, 0, 3))[: kernel.shape[0], : kernel.shape[1]]
+
+
+conv2d.defvjp(_forward, _backward)

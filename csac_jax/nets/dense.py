@@ -1,0 +1,89 @@
+"""The small dense net: densely connected convolutions with group norm, at half the resolution of its input.
+
+It sees maps already turned to a frame, so that what it must know of a push is "ahead" and of a grasp "across". The
+frame of yaw + pi shows the same picture upside down: each pass gives three maps, push ahead, push back and grasp (a parallel
+gripper is symmetric), and K / 2 passes give all K yaws of both primitives.
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from csac_jax.config import NetConfig
+from csac_jax.nets.convolution import conv2d
+
+STRIDE = 2  # cells of the input per cell of the output, along each axis
+CHANNELS = 4  # colour, height
+OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
+_HEIGHT_SCALE = 0.05  # m, a block's height: brings heights near 1
+_GROUP = 8  # channels per group of the norm
+
+
+def inputs(colour: jax.Array, height: jax.Array) -> jax.Array:
+    """Maps that the net is fed [..., H, W, CHANNELS] from colour [..., H, W, 3] in 0..1 and height [..., H, W] m.
+
+    Bare table is 0, like what lies outside of a turned map.
+    """
+    seen = (colour - 0.5) * (height[..., None] > 0.002)
+    return jnp.concatenate([seen, height[..., None] / _HEIGHT_SCALE], axis=-1)
+
+
+class Convolution(nn.Module):
+    """Convolution without bias: [B, H, W, I] -> [B, H', W', features]."""
+
+    features: int
+    size: int  # cells, side of the kernel
+    padding: int  # cells of zeros around the maps
+    stride: int = 1
+    dilation: int = 1
+
+    @nn.compact
+    def __call__(self, maps: jax.Array) -> jax.Array:
+        shape = (self.size, self.size, maps.shape[-1], self.features)
+        kernel = self.param("kernel", nn.initializers.he_normal(), shape)
+        return conv2d(maps, kernel, self.stride, self.dilation, self.padding)
+
+
+class Trunk(nn.Module):
+    """Dense features of turned maps: [B, C, C, CHANNELS] -> [B, C / 2, C / 2, stem + layers * growth]."""
+
+    cfg: NetConfig
+
+    @nn.compact
+    def __call__(self, maps: jax.Array) -> jax.Array:
+        features = Convolution(self.cfg.stem, size=4, stride=STRIDE, padding=1)(maps)
+        features = nn.relu(_norm(self.cfg.stem)(features))
+        for dilation in self.cfg.dilations:
+            new = Convolution(self.cfg.growth, size=3, dilation=dilation, padding=dilation)(features)
+            features = jnp.concatenate([features, nn.relu(_norm(self.cfg.growth)(new))], axis=-1)
+        return features
+
+
+class Head(nn.Module):
+    """Dense maps from features: [..., F] -> [..., OUTPUTS], two 1 x 1 convolutions."""
+
+    cfg: NetConfig
+
+    @nn.compact
+    def __call__(self, features: jax.Array) -> jax.Array:
+        hidden = nn.relu(nn.Dense(self.cfg.head)(features))
+        return nn.Dense(OUTPUTS, kernel_init=nn.initializers.variance_scaling(0.01, "fan_in", "normal"))(hidden)
+
+
+def _norm(channels: int) -> nn.GroupNorm:
+    return nn.GroupNorm(num_groups=max(channels // _GROUP, 1))
+
+
+class Critic(nn.Module):
+    """Q in three maps per frame, and the features that the actor reads."""
+
+    cfg: NetConfig
+
+    def setup(self) -> None:
+        self.trunk = Trunk(self.cfg)
+        self.head = Head(self.cfg)
+
+    def __call__(self, maps: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """[B, C, C, CHANNELS] -> Q [B, C / 2, C / 2, OUTPUTS], features [B, C / 2, C / 2, F]."""
+        features = self.trunk(maps)
+        return self.head(features), features

@@ -1,0 +1,51 @@
+"""The state of the blocks of one scene, and where blocks that are not in play wait."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from csac_jax import geometry
+
+
+@struct.dataclass
+class Scene:
+    """Blocks of one scene. N = block slots; a slot that is not in play is parked beside the table, out of view."""
+
+    position: jax.Array  # [N, 3] float32 m, centre of the bounding box
+    quaternion: jax.Array  # [N, 4] float32 (w, x, y, z), body -> world
+    velocity: jax.Array  # [N, 6] float32 linear m/s (world), angular rad/s (body)
+    half_size: jax.Array  # [N, 3] float32 m, half of the bounding box
+    colour: jax.Array  # [N] int32, row of blocks.COLOURS
+    in_play: jax.Array  # [N] bool
+
+
+def parking(num_slots: int) -> np.ndarray:
+    """Parking places [N, 3] m: in the air, so that they make no contact, and far enough apart."""
+    return np.stack([3.0 + 0.3 * np.arange(num_slots), np.zeros(num_slots), np.ones(num_slots)], 1).astype(np.float32)
+
+
+def park(scene: Scene, keep: jax.Array) -> Scene:
+    """The scene with every block outside `keep` [N] bool taken out of play and parked."""
+    keep = scene.in_play & keep
+    upright = jnp.zeros_like(scene.quaternion).at[:, 0].set(1.0)
+    return scene.replace(
+        position=jnp.where(keep[:, None], scene.position, parking(keep.shape[0])),
+        quaternion=jnp.where(keep[:, None], scene.quaternion, upright),
+        velocity=jnp.where(keep[:, None], scene.velocity, 0.0),
+        in_play=keep,
+    )
+
+
+def turn(scene: Scene, yaw: jax.Array) -> Scene:
+    """The scene's blocks in play, at rest, turned about the workspace centre by `yaw` [] rad."""
+    turned = scene.replace(
+        position=scene.position.at[:, :2].set(geometry.rotate2d(yaw, scene.position[:, :2])),
+        quaternion=jax.vmap(geometry.quat_multiply, (None, 0))(geometry.quat_from_yaw(yaw), scene.quaternion),
+    )
+    return park(turned, scene.in_play)
+
+
+def inside(position: jax.Array, extent: float) -> jax.Array:
+    """True where a block's centre [N, 3] lies above the workspace square, [N] bool."""
+    return jnp.all(jnp.abs(position[:, :2]) <= 0.5 * extent, axis=1)

@@ -1,0 +1,156 @@
+"""A pool of settled scenes: blocks dropped one above the other and left to come to rest, once per configuration.
+
+Settling runs in C MuJoCo on all cores, bit-identical for any number of threads, and is cached by content.
+"""
+
+import concurrent.futures
+import dataclasses
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from csac_jax.config import SceneConfig
+from csac_jax.scene import blocks, layout
+from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import HAND_PARK_HEIGHT, BoxFields, World, assets, box_fields, box_slots, with_boxes
+
+TRAIN_STREAM = 0  # stream of random numbers of the training pool; evaluation takes 1 + its seed
+_VERSION = 2  # raise when the meaning of a cached pool changes
+_SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
+_STILL = 0.02  # m/s: slower counts as at rest
+_ROUND = 128  # scenes dropped per round
+
+
+def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: int) -> Scene:
+    """`count` distinct settled scenes, leaves [count, N, ...], from the cache or settled now.
+
+    Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
+    by any yaw. The same arguments give the same scenes on every machine of one kind.
+    """
+    path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count)}.npz"
+    cached = _read(path)
+    if cached is not None:
+        return cached
+    scenes = _settle(world, cfg, extent, np.random.default_rng([stream, 20221]), count)
+    _write(path, scenes)
+    return scenes
+
+
+def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Generator, count: int) -> Scene:
+    found: list[Scene] = []
+    kept = dropped = 0
+    with concurrent.futures.ThreadPoolExecutor() as threads:
+        while kept < count:
+            drops = [_drop(cfg, rng) for _ in range(_ROUND)]
+            fields: Any = jax.vmap(box_fields)(jnp.stack([scene.half_size[box_slots(world)] for scene in drops]))
+            fields = jax.tree.map(np.asarray, fields)
+            rows = [BoxFields(*(leaf[i] for leaf in fields)) for i in range(_ROUND)]
+            ended = threads.map(lambda scene, row: _rest(world, cfg, extent, scene, row), drops, rows)
+            good = [scene for scene in ended if scene is not None]
+            found, kept, dropped = found + good, kept + len(good), dropped + _ROUND
+            if dropped >= 20 * _ROUND and kept < dropped / 50:
+                raise RuntimeError(
+                    f"only {kept} of {dropped} dropped scenes came to rest inside the workspace; "
+                    "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
+                )
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *found[:count])
+
+
+def _drop(cfg: SceneConfig, rng: np.random.Generator) -> Scene:
+    """A random scene before its blocks fall: dropped as in VPG, one above the other."""
+    num = len(cfg.slots)
+    in_play = rng.permutation(num) < rng.integers(cfg.min_blocks, num + 1)
+    quaternion = rng.normal(size=(num, 4))
+    choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
+    position = np.concatenate(
+        [
+            rng.uniform(-0.5 * cfg.drop_extent, 0.5 * cfg.drop_extent, (num, 2)),
+            cfg.drop_height + _SPACING * rng.permutation(num)[:, None],
+        ],
+        axis=1,
+    )
+    leaves: dict[str, Any] = {
+        "position": np.where(in_play[:, None], position, layout.parking(num)).astype(np.float32),
+        "quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).astype(np.float32),
+        "velocity": np.zeros((num, 6), np.float32),
+        "half_size": np.stack([kind[rng.integers(len(kind))] for kind in choices]),
+        "colour": rng.permutation(max(num, len(blocks.COLOURS)))[:num].astype(np.int32) % len(blocks.COLOURS),
+        "in_play": in_play,
+    }
+    return Scene(**leaves)
+
+
+def _rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BoxFields) -> Scene | None:
+    """The scene after its blocks fell, None where a block is not at rest or left the workspace."""
+    model = with_boxes(world, fields)
+    model.opt.iterations, model.opt.ls_iterations = 20, 20  # quality over speed: this runs once
+    data = mujoco.MjData(model)
+    data.qpos[world.hand_qpos] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0, 0.0]
+    data.ctrl[:] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0]
+    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    parked = ~scene.in_play
+    model.body_gravcomp[world.block_bodies[parked]] = 1.0
+    model.opt.timestep = 0.5 * world.model.opt.timestep
+    mujoco.mj_step(model, data, nstep=round(cfg.settle_time / model.opt.timestep))
+    pose = data.qpos[world.block_qpos].astype(np.float32)
+    position, quaternion = pose[:, :3], pose[:, 3:]
+    speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
+    ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * extent
+    ok &= (speed.max(axis=1) < _STILL) & (position[:, 2] > 0.0) & np.isfinite(pose).all(axis=1)
+    if not np.all(ok | parked):
+        return None
+    upright = np.array([1, 0, 0, 0], np.float32)
+    rest: dict[str, Any] = {
+        "position": np.where(parked[:, None], scene.position, position),
+        "quaternion": np.where(parked[:, None], upright, quaternion),
+    }
+    return dataclasses.replace(scene, **rest)
+
+
+def _cache_folder() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "csac_jax" / "pools"
+
+
+def _digest(world: World, cfg: SceneConfig, extent: float, stream: int, count: int) -> str:
+    """Name of a pool: hash of everything that decides its content."""
+    relevant = (_VERSION, mujoco.__version__, repr(cfg), float(extent), stream, count, world.model.opt.timestep)
+    content = hashlib.sha256(repr(relevant).encode())
+    for name in ("table.xml", "hand.xml", "blocks.xml"):
+        content.update((assets() / name).read_bytes())
+    return content.hexdigest()[:32]
+
+
+def _checksum(arrays: dict[str, np.ndarray]) -> str:
+    return hashlib.sha256(b"".join(np.ascontiguousarray(arrays[name]).tobytes() for name in sorted(arrays))).hexdigest()
+
+
+def _read(path: Path) -> Scene | None:
+    """The cached scenes, None where there are none or they are damaged (they are then settled anew)."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        if str(arrays.pop("sha256")) != _checksum(arrays):
+            return None
+        return Scene(**arrays)
+    except Exception:  # a damaged archive raises nearly anything: BadZipFile, NotImplementedError, ValueError, KeyError
+        return None
+
+
+def _write(path: Path, scenes: Scene) -> None:
+    """Saves the scenes for the next run; a cache that cannot be written is no error."""
+    names = [field.name for field in dataclasses.fields(scenes)]
+    arrays: dict[str, Any] = {name: np.asarray(getattr(scenes, name)) for name in names}
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+            np.savez(file, sha256=_checksum(arrays), **arrays)
+        os.replace(file.name, path)
+    except OSError:
+        return

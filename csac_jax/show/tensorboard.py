@@ -1,0 +1,30 @@
+"""A run in TensorBoard; needs the extra `tensorboard`."""
+
+import dataclasses
+from pathlib import Path
+
+from tensorboardX import SummaryWriter
+
+from csac_jax.train.loop import Record
+
+
+class TensorBoard:
+    """Reporter that writes each number of a record as a scalar over actions, into RUN/tensorboard."""
+
+    def __init__(self, run_dir: Path, first_action: int = 0) -> None:
+        # Points of a part of the run that was lost with a killed process are dropped.
+        self._writer = SummaryWriter(str(run_dir / "tensorboard"), purge_step=first_action)
+
+    def say(self, text: str) -> None:
+        """Events are not written."""
+
+    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+        """Writes one point per number."""
+        for name, value in dataclasses.asdict(record).items():
+            group = (
+                {f"outcomes/{key}": count for key, count in value.items()} if isinstance(value, dict) else {name: value}
+            )
+            for tag, number in group.items():
+                if number is not None:
+                    self._writer.add_scalar(tag, number, record.actions)
+        self._writer.flush()

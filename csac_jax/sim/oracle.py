@@ -1,0 +1,58 @@
+"""A grasp planner that reads block poses: the ceiling that physics allows, and the scripted hand of the tests."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
+from csac_jax.scene import blocks
+from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import MAX_OPENING
+from csac_jax.sim.primitives import Action, Primitive, local_top
+
+YAWS = 32  # over half a turn: the hand is symmetric
+FINGER_HALF = (0.008, 0.012)  # m, half footprint of a finger tip across and along its pad, with a little room
+ALIGNED = 0.05  # 1 - cosine between a face and the pad that is as good as parallel
+
+
+def _support(normals: jax.Array, offsets: jax.Array, axis: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """How well the best faces on both sides are square to `axis` [3] (cosine), and the block's width between them, m.
+
+    Args: normals [F, 3] world frame, offsets [F] m from the block's centre.
+    """
+    cosine = normals @ axis
+    low, high = jnp.argmin(cosine), jnp.argmax(cosine)
+    return jnp.minimum(cosine[high], -cosine[low]), offsets[high] + offsets[low]
+
+
+def grasp(cfg: SimConfig, heightmap: HeightmapConfig, slots: tuple, scene: Scene, height: jax.Array) -> Action:
+    """The grasp of the block and yaw with room for both fingers, faces square to the pads, high and narrow.
+
+    Args: slots, kinds of the block slots; height [H, W] m.
+    """
+    normals, offsets = blocks.half_spaces(slots, scene.half_size)
+    world_normals = jnp.einsum("nij,nfj->nfi", jax.vmap(quat_to_matrix)(scene.quaternion), normals)
+    yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
+    cells = cell_centres(heightmap)
+
+    def score(slot, yaw):
+        axis = jnp.append(rotate2d(yaw, jnp.array([1.0, 0.0])), 0.0)
+        square, width = _support(world_normals[slot], offsets[slot], axis)
+        centre = scene.position[slot, :2]
+        top = local_top(heightmap, height, centre, cfg.window)
+        tip = jnp.maximum(top - cfg.grasp_depth, cfg.clearance)
+        local = jnp.abs(rotate2d(-yaw, cells - centre))
+        finger = (jnp.abs(local[..., 0] - 0.5 * MAX_OPENING - 0.006) < FINGER_HALF[0]) & (
+            local[..., 1] < FINGER_HALF[1]
+        )
+        blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
+        fits = width < MAX_OPENING - 0.02
+        cost = 4.0 * blocked + 4.0 * ~fits + 20.0 * jnp.maximum(1.0 - square - ALIGNED, 0.0) + 10.0 * width
+        return jnp.where(scene.in_play[slot], 5.0 * scene.position[slot, 2] - cost, -jnp.inf)
+
+    every = jax.vmap(jax.vmap(score, (None, 0)), (0, None))
+    scores = every(jnp.arange(len(slots)), yaws)  # [N, YAWS]
+    slot, yaw = jnp.unravel_index(jnp.argmax(scores), scores.shape)
+    pose = jnp.append(scene.position[slot, :2], yaws[yaw])
+    return Action(primitive=jnp.int32(Primitive.GRASP), pose=pose)

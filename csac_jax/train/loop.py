@@ -1,0 +1,258 @@
+"""The host's side of a run: call the compiled chunk, log, save, stop.
+
+RUN/config.json     the config, for people; the checkpoint holds its own copy
+RUN/metrics.jsonl   one `Record` per chunk
+RUN/checkpoints/    see `checkpoint`
+"""
+
+import collections
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from csac_jax.config import Config
+from csac_jax.train import checkpoint, config_json
+from csac_jax.train.metrics import GRASP, LIFTED, OUTCOMES
+from csac_jax.train.stop import Stop
+
+WINDOW = 200  # grasps that the running success is taken over (CSAC sec. 4.2)
+METRICS = "metrics.jsonl"
+CONFIG = "config.json"
+
+
+class TrainingError(Exception):
+    """A run that cannot go on; the message is one line with the remedy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """One line of metrics.jsonl: what a chunk did, and how far the run is. Means are over the chunk."""
+
+    step: int  # training steps done
+    actions: int  # actions done, over all scenes
+    seconds: float  # spent in chunks since the run began, resumed parts included, compilation not
+    actions_per_second: float  # of this chunk
+    grasp_success: float | None  # share of the last `grasps_counted` grasps that lifted a block; None before the first
+    grasps_counted: int  # min(grasps so far, WINDOW)
+    pushes: int
+    grasps: int
+    outcomes: dict[str, int]  # grasps by what came of them
+    pushes_better: int  # pushes that made the best grasp worth more
+    cleared: int  # blocks taken from the table
+    left: int  # blocks that left the workspace
+    terminated: int  # episodes that ended with a cleared table
+    truncated: int  # episodes that were cut off
+    reward: float
+    gap_disagrees: int  # grasps whose outcome the finger gap alone names differently
+    saturated: int  # substeps in which contacts may have been dropped
+    ill: int  # scenes whose physics failed
+    critic_loss: float | None  # None during the warm-up, as the next three
+    actor_loss: float | None
+    td_error: float | None
+    q_mean: float | None
+
+
+class Summary(NamedTuple):
+    """How a run ended."""
+
+    step: int
+    actions: int
+    seconds: float  # as in `Record`
+    compile_seconds: float  # 0 if nothing was compiled
+    grasp_success: float | None  # as in `Record`
+    grasps_counted: int
+    stopped_by: int | None  # number of the signal; None if the run is complete
+
+
+class Reporter(Protocol):
+    """Shows a run to somebody."""
+
+    def say(self, text: str) -> None:
+        """One line about something that happened."""
+
+    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+        """After each chunk; `eta` is the time the rest will take, s."""
+
+
+class Progress(NamedTuple):
+    """What the host carries from chunk to chunk, and the checkpoint in its JSON."""
+
+    seconds: float  # spent in chunks
+    grasps: list[int]  # 1 for a lift, 0 for another outcome, of the last WINDOW grasps, oldest first
+
+
+def total_steps(cfg: Config) -> int:
+    """Training steps of a run: those of the config, rounded up to whole chunks, so that one program serves all."""
+    return math.ceil(cfg.train.steps / cfg.train.chunk) * cfg.train.chunk
+
+
+def run(
+    cfg: Config,
+    run_dir: Path,
+    init: Callable[[], Any],
+    compile_chunk: Callable[[int], Any],
+    reporter: Reporter,
+    stop: Stop,
+    resume: bool = False,
+) -> Summary:
+    """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
+
+    The number of steps is rounded up to whole chunks: there is one compilation only.
+
+    Args: run_dir, exists if `resume`, else is made; init, gives the first state, a pytree with `step` [] int32;
+    compile_chunk, takes the number of steps and gives a jitted function state -> (state, StepMetrics [T, ...]) that may
+    use up its argument.
+    Raises TrainingError on a loss that is not finite, CheckpointError if there is nothing sound to resume from.
+    """
+    state, progress, step = _resume(cfg, run_dir, init) if resume else _begin(cfg, run_dir, init)
+    if resume:
+        reporter.say(f"resumed {run_dir} at step {step} ({step * cfg.train.scenes} actions)")
+    compile_seconds = 0.0
+    chunk = None
+    with (run_dir / METRICS).open("a") as log:
+        while step < total_steps(cfg) and stop.signal is None:
+            if chunk is None:
+                chunk, compile_seconds = _compile(cfg, compile_chunk, state, reporter)
+                continue  # a signal may have come meanwhile
+            begun = time.perf_counter()
+            state, metrics = chunk(state)
+            metrics = jax.device_get(metrics)
+            step += cfg.train.chunk
+            _check_finite(run_dir, metrics, step)
+            progress, record = _record(cfg, step, metrics, progress, time.perf_counter() - begun)
+            log.write(json.dumps(dataclasses.asdict(record)) + "\n")
+            log.flush()
+            reporter.progress(record, total_steps(cfg) * cfg.train.scenes, _eta(cfg, record))
+            if step % (cfg.train.save_every * cfg.train.chunk) == 0:
+                _save(cfg, run_dir, step, state, progress)
+    if checkpoint.latest_step(run_dir) != step:
+        _save(cfg, run_dir, step, state, progress)
+    reporter.say(_ending(run_dir, step, cfg, stop))
+    success = _share(progress.grasps)
+    actions = step * cfg.train.scenes
+    return Summary(step, actions, progress.seconds, compile_seconds, success, len(progress.grasps), stop.signal)
+
+
+def _begin(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
+    run_dir.mkdir(parents=True)
+    _replace(run_dir / CONFIG, json.dumps(config_json.to_dict(cfg), indent=2) + "\n")
+    return init(), Progress(0.0, []), 0
+
+
+def _resume(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
+    """State of the newest checkpoint; lines of the log that are newer than it are dropped."""
+    stored = checkpoint.load_config(run_dir)
+    if names := config_json.differences(stored, cfg):
+        raise TrainingError(f"{run_dir} was trained with other values of {', '.join(names)}; resume it with its own")
+    state, extra = checkpoint.restore(run_dir, jax.eval_shape(init))
+    step = int(state.step)
+    _truncate_log(run_dir / METRICS, step)
+    return state, Progress(extra["seconds"], extra["grasps"]), step
+
+
+def _compile(cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter) -> tuple[Any, float]:
+    reporter.say("compiling the training program; this takes a while, once")
+    begun = time.perf_counter()
+    program = compile_chunk(cfg.train.chunk).lower(state).compile()
+    seconds = time.perf_counter() - begun
+    reporter.say(f"compiled in {seconds:.1f} s")
+    return program, seconds
+
+
+def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress) -> None:
+    checkpoint.save(run_dir, step, state, cfg, progress._asdict())
+
+
+def _check_finite(run_dir: Path, metrics: Any, step: int) -> None:
+    """Raises TrainingError if a loss of the chunk that ended at `step` is not finite. Nothing is saved then."""
+    learned = np.asarray(metrics.learned)
+    for name in ("critic_loss", "actor_loss"):
+        if not np.all(np.isfinite(np.asarray(getattr(metrics, name))[learned])):
+            last = checkpoint.latest_step(run_dir)
+            kept = "no checkpoint was saved before" if last is None else f"the checkpoint of step {last} is kept"
+            raise TrainingError(
+                f"{name} is not finite in the chunk that ended at step {step}; {kept}; "
+                "lower learn.learning_rate or learn.gradient_clip and train anew"
+            )
+
+
+def _record(cfg: Config, step: int, metrics: Any, before: Progress, seconds: float) -> tuple[Progress, Record]:
+    """The log's line for a chunk with `metrics` [T, E] that took `seconds`."""
+    grasped = metrics.primitive == GRASP
+    outcomes = metrics.outcome[grasped]  # in order of time, then of scene
+    window = collections.deque(before.grasps, maxlen=WINDOW)
+    window.extend((outcomes == LIFTED).astype(int).tolist())
+    after = Progress(before.seconds + seconds, list(window))
+    counts = np.bincount(outcomes, minlength=len(OUTCOMES)).tolist()
+    sums = ("cleared", "left", "terminated", "truncated", "gap_disagrees", "saturated", "ill")
+    means = ("critic_loss", "actor_loss", "td_error", "q_mean")
+    totals: dict[str, Any] = {name: int(getattr(metrics, name).sum()) for name in sums}
+    averages: dict[str, Any] = {name: _mean(getattr(metrics, name)[metrics.learned]) for name in means}
+    record = Record(
+        step=step,
+        actions=step * cfg.train.scenes,
+        seconds=round(after.seconds, 3),
+        actions_per_second=round(grasped.size / seconds, 3),
+        grasp_success=_share(after.grasps),
+        grasps_counted=len(after.grasps),
+        pushes=int((~grasped).sum()),
+        grasps=int(grasped.sum()),
+        outcomes=dict(zip(OUTCOMES, counts, strict=True)),
+        pushes_better=int(metrics.push_better.sum()),
+        reward=float(metrics.reward.mean()),
+        **totals,
+        **averages,
+    )
+    return after, record
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(values.mean()) if values.size else None
+
+
+def _share(values: list[int]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _eta(cfg: Config, record: Record) -> float:
+    """Time that the rest of the run will take, s, at the speed of this chunk."""
+    return (total_steps(cfg) - record.step) * cfg.train.scenes / max(record.actions_per_second, 1e-9)
+
+
+def _ending(run_dir: Path, step: int, cfg: Config, stop: Stop) -> str:
+    if stop.signal is None:
+        return f"done: {step * cfg.train.scenes} actions; saved in {run_dir}"
+    return f"stopped and saved at step {step}; go on with: csac-jax train --resume {run_dir}"
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics.jsonl; one that was cut off while being written is left out."""
+    return list(_complete_lines(path))
+
+
+def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
+    for line in path.read_text().splitlines():
+        with contextlib.suppress(ValueError):
+            yield json.loads(line)
+
+
+def _truncate_log(path: Path, step: int) -> None:
+    """Keeps the lines of steps up to `step`."""
+    kept = [json.dumps(line) + "\n" for line in _complete_lines(path) if line["step"] <= step] if path.exists() else []
+    _replace(path, "".join(kept))
+
+
+def _replace(path: Path, text: str) -> None:
+    """Writes a file such that it is never seen half-written."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)

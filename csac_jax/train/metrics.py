@@ -1,0 +1,102 @@
+"""What an evaluation reports, from arrays of episodes; NumPy only.
+
+Every metric is `{"value", "low", "high", "n"}`: the value, its 95 % interval and the number of cases it is taken over.
+Where there are none, `n` is 0 and the others are None.
+
+`grasp_success`                lifted / grasps. Wilson interval over grasps.
+`completion`                   episodes in which the hand took every block from the table within the caps / episodes.
+                               A block that left the square was not taken. Wilson interval over episodes.
+`completion_reachable`         episodes that ended with no block in the square / episodes: blocks that left the square
+                               do not count. Wilson interval over episodes.
+`action_efficiency`            blocks taken / actions (pushes and grasps), summed over all episodes. Bootstrap interval
+                               over episodes, since the actions of one episode depend on one another.
+`action_efficiency_completed`  mean of blocks in play at the start / actions, over the episodes that `completion`
+                               counts: VPG's "action efficiency" (Zeng et al. 2018, sec. VI). Bootstrap interval over
+                               those episodes.
+
+Beside them `outcomes` counts grasps by what came of them (nothing, empty, touched, dropped, lifted), and `counts` holds
+episodes, blocks, pushes, grasps, and blocks that were taken and that left the square.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+OUTCOMES = ("nothing", "empty", "touched", "dropped", "lifted")  # numbers 0 to 4
+LIFTED = OUTCOMES.index("lifted")
+GRASP = 1  # number of the primitive
+Z_95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
+RESAMPLES = 2000
+
+
+class Episodes(NamedTuple):
+    """Finished episodes, as arrays. M = episodes, T = most actions of one; beyond its end `valid` is False."""
+
+    valid: np.ndarray  # [M, T] bool, an action was taken
+    primitive: np.ndarray  # [M, T] int32, 0 push, 1 grasp
+    outcome: np.ndarray  # [M, T] int32, number in OUTCOMES; only of grasps
+    cleared: np.ndarray  # [M, T] int32, blocks taken from the table by the action
+    blocks: np.ndarray  # [M] int32, in play at the start
+    completed: np.ndarray  # [M] bool, no block was in the square at the end
+    left: np.ndarray  # [M] int32, blocks that left the square
+
+
+def wilson(successes: int, n: int) -> dict[str, Any]:
+    """A share with Wilson's 95 % interval, which holds for few cases and near 0 and 1 (Wilson 1927).
+
+    centre = (p + z^2 / 2n) / (1 + z^2 / n),  half width = z sqrt(p (1 - p) / n + z^2 / 4n^2) / (1 + z^2 / n).
+    """
+    if n == 0:
+        return _empty()
+    share, z2 = successes / n, Z_95**2
+    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = Z_95 * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
+    return {"value": share, "low": max(0.0, centre - half), "high": min(1.0, centre + half), "n": n}
+
+
+def bootstrap_ratio(above: np.ndarray, below: np.ndarray, n: int, seed: int = 0) -> dict[str, Any]:
+    """sum(above) / sum(below) over cases [M], with the 95 % percentile interval of resampled cases.
+
+    `n` is what is reported as the number of cases. `seed` makes the interval repeatable.
+    """
+    if below.sum() == 0:
+        return _empty()
+    drawn = np.random.default_rng(seed).integers(0, above.size, (RESAMPLES, above.size))
+    total = below[drawn].sum(axis=1)
+    ratios = above[drawn].sum(axis=1)[total > 0] / total[total > 0]
+    low, high = np.percentile(ratios, [2.5, 97.5])
+    return {"value": float(above.sum() / below.sum()), "low": float(low), "high": float(high), "n": n}
+
+
+def _empty() -> dict[str, Any]:
+    return {"value": None, "low": None, "high": None, "n": 0}
+
+
+def summarise(episodes: Any) -> dict[str, Any]:
+    """Every metric of the module's docstring, ready for JSON. `episodes` has the fields of `Episodes`."""
+    valid, primitive, outcome, cleared, blocks, completed, left = (
+        np.asarray(value) for value in Episodes(*(getattr(episodes, name) for name in Episodes._fields))
+    )
+    grasps = valid & (primitive == GRASP)
+    actions = valid.sum(axis=1)
+    taken = np.where(valid, cleared, 0).sum(axis=1)
+    counts = np.bincount(outcome[grasps], minlength=len(OUTCOMES))
+    cleared_all = completed & (taken == blocks)
+    per_episode = blocks[cleared_all] / np.maximum(actions[cleared_all], 1)
+    return {
+        "grasp_success": wilson(int(counts[LIFTED]), int(grasps.sum())),
+        "completion": wilson(int(cleared_all.sum()), completed.size),
+        "completion_reachable": wilson(int(completed.sum()), completed.size),
+        "action_efficiency": bootstrap_ratio(taken, actions, int(actions.sum())),
+        "action_efficiency_completed": bootstrap_ratio(per_episode, np.ones(per_episode.size), per_episode.size),
+        "outcomes": {name: int(count) for name, count in zip(OUTCOMES, counts, strict=True)},
+        "counts": {
+            "episodes": int(completed.size),
+            "blocks": int(blocks.sum()),
+            "pushes": int((valid & ~grasps).sum()),
+            "grasps": int(grasps.sum()),
+            "taken": int(taken.sum()),
+            "left": int(left.sum()),
+        },
+    }

@@ -1,0 +1,205 @@
+"""The algorithm: one training step of all scenes, CSAC Algorithm 1, compiled as a chunk of many.
+
+Look, act, simulate, remember, learn, replace finished scenes. E = scenes, B = batch, P = primitives.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from csac_jax import env as environment
+from csac_jax.agent import augment, learner as learning, policy, rewards
+from csac_jax.agent.learner import Learner, LearnerState, Transition
+from csac_jax.config import Config
+from csac_jax.env import Env
+from csac_jax.replay import ring, samplers
+from csac_jax.replay.ring import ReplayState
+from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.vision import heightmap
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that a run carries from step to step: a checkpoint is this and the config."""
+
+    key: jax.Array  # [] typed key, root of all randomness, never consumed
+    step: jax.Array  # [] int32, training steps done
+    scenes: environment.State  # leaves [E, ...]
+    learner: LearnerState
+    replay: ReplayState
+
+
+class StepMetrics(NamedTuple):
+    """What one training step did; a chunk stacks them along a leading axis T."""
+
+    primitive: jax.Array  # [E] int32, 0 push, 1 grasp
+    outcome: jax.Array  # [E] int32, Outcome; only of grasps
+    push_better: jax.Array  # [E] bool, the push made the best grasp worth more; False for grasps
+    cleared: jax.Array  # [E] int32, blocks taken from the table
+    left: jax.Array  # [E] int32, blocks that left the workspace
+    terminated: jax.Array  # [E] bool
+    truncated: jax.Array  # [E] bool
+    reward: jax.Array  # [E] float32
+    gap_disagrees: jax.Array  # [E] bool, finger gap and ground truth name different outcomes
+    saturated: jax.Array  # [E] int32, substeps with every contact slot in use
+    ill: jax.Array  # [E] bool, physics failed: transition dropped, scene replaced
+    learned: jax.Array  # [] bool, False during the warm-up
+    critic_loss: jax.Array  # [] float32
+    actor_loss: jax.Array  # [] float32
+    td_error: jax.Array  # [] float32, mean of abs(y - Q)
+    q_mean: jax.Array  # [] float32
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Program:
+    """The static parts of a run, closed over by what is compiled."""
+
+    cfg: Config
+    env: Env
+    learner: Learner
+
+
+def make(cfg: Config) -> Program:
+    """Environment and learner of a config."""
+    return Program(cfg, environment.make(cfg), learning.make(cfg))
+
+
+def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+    """One action in each of the E scenes and the updates that belong to it."""
+    cfg, env, learner = program.cfg, program.env, program.learner
+    key_act, key_learn, key_reset = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
+    scenes = state.scenes
+
+    # Look and act: CEM on the critic's maps from the actor's mean, plus noise (lines 8-13).
+    maps = learning.look(learner, state.learner.online, scenes.obs)
+    act = jax.vmap(policy.act, (0, None, None, 0, None, None))
+    taken = state.step * cfg.train.scenes
+    span = learner.bounds[1] - learner.bounds[0]
+    action = act(_keys(key_act, cfg.train.scenes), cfg, learner.frames, maps, span, taken)
+
+    # Simulate.
+    after = jax.vmap(env.step)(scenes, action)
+
+    # Reward and remember (lines 14-15).
+    phi_before, phi_after = (_best_grasps(learner, state.learner, obs) for obs in (scenes.obs, after.obs))
+    info = after.info
+    reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0))(
+        cfg.reward, action.primitive, info.outcome, info.distance, phi_before, phi_after
+    )
+    seen = Transition(
+        obs=heightmap.pack(scenes.obs),
+        action=action,
+        reward=reward,
+        next_obs=heightmap.pack(after.obs),
+        terminated=after.terminated,
+    )
+    replay = ring.add(state.replay, seen, ~info.ill)
+
+    # Learn (lines 16-26). During the warm-up the result is dropped: a branch would cost more than those few updates.
+    ready = taken + cfg.train.scenes >= cfg.train.warmup
+    learned, errors, losses = _learn(program, key_learn, state.learner, replay)
+    learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
+    errors = jnp.where(ready, errors, replay.error)
+
+    # Replace finished scenes.
+    fresh = jax.vmap(env.reset)(_keys(key_reset, cfg.train.scenes))
+    scenes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
+
+    pushed = action.primitive == Primitive.PUSH
+    metrics = StepMetrics(
+        primitive=action.primitive,
+        outcome=info.outcome,
+        push_better=pushed & (phi_after > phi_before + cfg.reward.dead_band),
+        cleared=info.cleared,
+        left=info.left,
+        terminated=after.terminated,
+        truncated=after.truncated,
+        reward=reward,
+        gap_disagrees=~pushed & (info.outcome != info.outcome_by_gap),
+        saturated=info.saturated,
+        ill=info.ill,
+        learned=ready,
+        **losses,
+    )
+    state = TrainState(state.key, state.step + 1, scenes, learned, replay.replace(error=errors))
+    return state, metrics
+
+
+def _learn(
+    program: Program, key: jax.Array, state: LearnerState, replay: ReplayState
+) -> tuple[LearnerState, jax.Array, dict[str, jax.Array]]:
+    """The critic's updates, each on a batch drawn anew, then one of the actor on the last batch."""
+    cfg, learner = program.cfg, program.learner
+    total = max(cfg.train.steps * cfg.learn.updates, 1)
+
+    def update(carry, i):
+        state, errors = carry
+        key_sample, key_augment, key_target = jax.random.split(jax.random.fold_in(key, i), 3)
+        progress = state.updates.astype(jnp.float32) / total
+        current = replay.replace(error=errors)
+        slots = samplers.sample(key_sample, cfg.replay, current, progress, cfg.learn.batch)
+        batch = ring.gather(replay, slots)
+        if cfg.learn.augment:
+            batch = jax.vmap(augment.randomly)(_keys(key_augment, cfg.learn.batch), batch)
+        state, info = learning.update_critic(key_target, learner, state, batch)
+        return (state, ring.set_errors(current, slots, info.error).error), (info, batch.obs)
+
+    numbers = jnp.arange(cfg.learn.updates)
+    (state, errors), (info, observations) = jax.lax.scan(update, (state, replay.error), numbers)
+    last = heightmap.unpack(jax.tree.map(lambda leaf: leaf[-1], observations))
+    state, actor_loss = learning.update_actor(learner, state, last)
+    losses = {
+        "critic_loss": jnp.mean(info.critic_loss),
+        "actor_loss": actor_loss,
+        "td_error": jnp.mean(jnp.abs(info.error)),
+        "q_mean": jnp.mean(info.q),
+    }
+    return state, errors, losses
+
+
+def _best_grasps(learner: Learner, state: LearnerState, obs: heightmap.Observation) -> jax.Array:
+    """phi_g of E states [E] by the target critic, eq. 16."""
+    return jax.vmap(learning.best_grasp)(learning.look(learner, state.target, obs))
+
+
+def _keys(key: jax.Array, num: int) -> jax.Array:
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
+
+
+def init(program: Program) -> TrainState:
+    """The state before the first step: fresh scenes and networks, an empty ring (lines 1-4). A fixed point of types."""
+    cfg = program.cfg
+
+    def build() -> TrainState:
+        key = jax.random.key(cfg.seed)
+        key_scenes, key_nets = jax.random.split(jax.random.fold_in(key, np.uint32(2**32 - 1)))
+        scenes = jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes))
+        packed = jax.tree.map(lambda leaf: leaf[0], heightmap.pack(scenes.obs))
+        zero = jnp.zeros((), jnp.float32)
+        action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
+        example = Transition(packed, action, zero, packed, jnp.zeros((), bool))
+        return TrainState(
+            key=key,
+            step=jnp.int32(0),
+            scenes=scenes,
+            learner=learning.init(key_nets, program.learner),
+            replay=ring.init(cfg.replay, example),
+        )
+
+    return jax.jit(build)()
+
+
+def compile_chunk(program: Program, num_steps: int):
+    """A compiled function state -> (state, StepMetrics [T, ...]) of `num_steps` training steps.
+
+    The state is donated: what goes in is used up, and the replay is updated in place.
+    """
+
+    def chunk(state: TrainState) -> tuple[TrainState, StepMetrics]:
+        return jax.lax.scan(lambda carry, _: train_step(program, carry), state, length=num_steps)
+
+    return jax.jit(chunk, donate_argnums=0)

@@ -1,0 +1,57 @@
+"""Losses, targets and target networks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from csac_jax.agent import losses
+
+
+@pytest.mark.parametrize("width", [0.5, 1.0])
+def test_huber_is_optax_huber(width):
+    """Claim: the Huber loss and its gradient are Optax's."""
+    error = jnp.array([-1e6, -3.0, -0.5, -0.1, 0.0, 0.2, 0.999, 2.0, 1e6])
+    np.testing.assert_allclose(losses.huber(error, width), optax.huber_loss(error, delta=width), rtol=1e-6)
+    ours, theirs = (
+        jax.grad(lambda e, f=f: jnp.sum(f(e)))(error)
+        for f in (lambda e: losses.huber(e, width), lambda e: optax.huber_loss(e, delta=width))
+    )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+def test_huber_by_hand():
+    """Claim: e^2 / 2 inside the width, width (|e| - width / 2) beyond."""
+    np.testing.assert_allclose(losses.huber(jnp.array([0.5, -3.0]), 2.0), [0.125, 4.0])
+
+
+def test_huber_gradient_is_bounded():
+    """Claim: the gradient is finite, at most the width, for every finite error."""
+    gradient = jax.vmap(jax.grad(lambda e: losses.huber(e, 1.0)))(jnp.array([1e30, -3e38, 1.0, 0.0]))
+    np.testing.assert_allclose(gradient, [1.0, -1.0, 1.0, 0.0])
+
+
+def test_td_target_by_hand():
+    """Claim: y = r + gamma V, without V after a true end, even if V is NaN there."""
+    value = jnp.array([4.0, 4.0, jnp.nan])
+    target = losses.td_target(jnp.array([1.0, 1.0, -0.5]), 0.5, jnp.array([False, True, True]), value)
+    np.testing.assert_array_equal(target, [3.0, 1.0, -0.5])
+
+
+def test_td_target_has_no_gradient():
+    """Claim: nothing is learned through the target."""
+    gradient = jax.grad(lambda v: losses.td_target(jnp.float32(1.0), 0.5, jnp.array(False), v))(jnp.float32(2.0))
+    assert gradient == 0.0
+
+
+def test_polyak_by_hand():
+    """Claim: each leaf moves by tau of the way; tau = 1 copies bit for bit; the structure stays."""
+    online, target = (
+        {"a": jnp.array([1.0, 0.1]), "b": jnp.float32(3.0)},
+        {"a": jnp.array([0.0, 7.3]), "b": jnp.float32(5.0)},
+    )
+    moved = losses.polyak(online, target, 0.25)
+    np.testing.assert_allclose(moved["a"], [0.25, 5.5], rtol=1e-6)
+    np.testing.assert_allclose(moved["b"], 4.5)
+    jax.tree.map(np.testing.assert_array_equal, losses.polyak(online, target, 1.0), online)

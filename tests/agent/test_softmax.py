@@ -1,0 +1,161 @@
+"""The softmax value and the noisy actions it is estimated from."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from csac_jax.agent import box, softmax
+from csac_jax.config import TargetConfig
+
+CFG = TargetConfig()
+NUM = 20_000
+
+noisy_actions = jax.jit(softmax.noisy_actions, static_argnums=(1, 3))
+
+MEANS = [(0.0, 0.0, 0.0), (0.95, -1.0, 0.98), (-0.7, 0.6, -1.0), (1.0, 1.0, 0.3)]
+CONFIGS = [CFG, TargetConfig(std=5.0, clip=0.5), TargetConfig(std=1.0, clip=3.0)]
+
+
+def reference(cfg: TargetConfig, mean: tuple[float, ...], dim: int):
+    """SciPy's law of the noise of one dimension, and its bounds."""
+    low, high = -min(cfg.clip, 1.0), min(cfg.clip, 1.0)  # yaw: half a turn at most
+    if dim < 2:
+        low, high = max(-cfg.clip, -1.0 - mean[dim]), min(cfg.clip, 1.0 - mean[dim])
+    return stats.truncnorm(low / cfg.std, high / cfg.std, scale=cfg.std), low, high
+
+
+def sampled_noise(cfg: TargetConfig, mean: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Noise [NUM, 3] recovered from the actions, and their log density."""
+    actions, log_density = noisy_actions(jax.random.key(0), cfg, jnp.array(mean), NUM)
+    assert np.all(np.abs(actions) <= 1.0)
+    noise = np.asarray(actions, np.float64) - np.array(mean)[None]
+    noise[:, 2] = (noise[:, 2] + 1.0) % 2.0 - 1.0
+    return noise, np.asarray(log_density)
+
+
+@pytest.mark.parametrize("cfg", CONFIGS)
+@pytest.mark.parametrize("mean", MEANS)
+def test_noise_is_truncated_normal(cfg, mean):
+    """Claim: noise follows SciPy's truncated normal, between its bounds, also at the walls and over half a turn."""
+    noise, _ = sampled_noise(cfg, mean)
+    for dim in range(3):
+        law, low, high = reference(cfg, mean, dim)
+        assert low - 1e-6 <= noise[:, dim].min()
+        assert noise[:, dim].max() <= high + 1e-6
+        assert stats.kstest(noise[:, dim], law.cdf).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("cfg", CONFIGS)
+@pytest.mark.parametrize("mean", MEANS)
+def test_log_density_is_that_of_the_samples(cfg, mean):
+    """Claim: the log density is SciPy's, and 1 / p averages to the volume of the support: p integrates to 1."""
+    noise, log_density = sampled_noise(cfg, mean)
+    laws = [reference(cfg, mean, dim) for dim in range(3)]
+    inside = [np.clip(noise[:, dim], low, high) for dim, (_, low, high) in enumerate(laws)]
+    expected = sum(law.logpdf(x) for (law, _, _), x in zip(laws, inside, strict=True))
+    np.testing.assert_allclose(log_density, expected, atol=1e-4)
+    inverse, volume = np.exp(-log_density), np.prod([high - low for _, low, high in laws])
+    assert abs(inverse.mean() - volume) <= 4 * inverse.std() / np.sqrt(NUM) + 1e-5 * volume
+
+
+def test_no_atoms_at_the_bounds():
+    """Claim: no two noisy actions share the bound, as the clipped normals of line 13 would."""
+    noise, _ = sampled_noise(TargetConfig(std=0.5, clip=0.5), (0.0, 0.9, 0.0))
+    for dim in range(3):
+        assert np.sum(noise[:, dim] == noise[:, dim].max()) <= 2
+
+
+def test_mean_outside_the_box_is_brought_in():
+    """Claim: a proposal beyond the walls counts as one on them."""
+    outside, inside = (
+        noisy_actions(jax.random.key(0), CFG, jnp.array(mean), 10) for mean in ([1.3, 0.0, 1.5], [1.0, 0.0, -0.5])
+    )
+    np.testing.assert_allclose(outside[0], inside[0], atol=1e-6)
+    np.testing.assert_allclose(outside[1], inside[1], atol=1e-5)
+
+
+def test_keys_differ():
+    """Claim: two keys give two sets of actions."""
+    first, other = (noisy_actions(jax.random.key(i), CFG, jnp.zeros(3), 10)[0] for i in range(2))
+    assert np.all(first != other)
+
+
+def test_expectation_by_hand():
+    """Claim: q = 0, 1 at beta = ln 3 gives 3/4; with p = 1/2, 1/4 the weights are 2 and 12: 12/14."""
+    q, beta = jnp.array([0.0, 1.0]), float(np.log(3.0))
+    np.testing.assert_allclose(softmax.expectation(q, jnp.zeros(2), beta), 0.75, rtol=1e-6)
+    np.testing.assert_allclose(softmax.expectation(q, jnp.log(jnp.array([0.5, 0.25])), beta), 12.0 / 14.0, rtol=1e-6)
+
+
+def test_expectation_lies_between_mean_and_maximum():
+    """Claim: beta = 0 is the mean weighted by 1 / p, large beta the maximum, all others lie between, in order."""
+    key_q, key_density = jax.random.split(jax.random.key(0))
+    q, log_density = jax.random.normal(key_q, (50,)), jax.random.normal(key_density, (50,))
+    weight = np.exp(-np.asarray(log_density, np.float64))
+    betas = [0.0, 0.05, 1.0, 5.0, 20.0, 100.0, 1e5]
+    values = np.array([softmax.expectation(q, log_density, beta) for beta in betas])
+    np.testing.assert_allclose(values[0], np.sum(weight * np.asarray(q)) / weight.sum(), atol=1e-5)
+    np.testing.assert_allclose(values[-1], np.max(q), atol=1e-6)
+    assert np.all(np.diff(values) >= 0.0)
+    assert np.all(values <= np.max(q))
+
+
+def test_expectation_does_not_overflow():
+    """Claim: exponents of a million overflow nothing, up or down."""
+    q = jnp.array([1e5, -1e5, 9e4])
+    assert softmax.expectation(q, jnp.zeros(3), 20.0) == 1e5
+    assert softmax.expectation(-q, jnp.zeros(3), 20.0) == 1e5
+    assert softmax.exact(q, 20.0, jnp.array([True, True, True])) == 1e5
+
+
+def test_exact_by_hand():
+    """Claim: only valid cells count: q = 0, 1 of [0, 1, 5] at beta = ln 3 give 3/4."""
+    value = softmax.exact(jnp.array([[0.0, 1.0, 5.0]]), float(np.log(3.0)), jnp.array([[True, True, False]]))
+    np.testing.assert_allclose(value, 0.75, rtol=1e-6)
+
+
+@pytest.mark.parametrize("beta", [0.0, 2.0, 10.0])
+def test_expectation_is_that_of_the_continuous_softmax(beta):
+    """Claim: the estimate's mean is the softmax over all actions in reach, found by summing over a fine grid."""
+    cfg, mean = TargetConfig(std=0.2, clip=0.5), (0.8, -0.3, 0.9)
+    key_wave, key_phase, key_sample = jax.random.split(jax.random.key(5), 3)
+    waves = 6.0 * jax.random.normal(key_wave, (8, 2))
+    phases = jax.random.uniform(key_phase, (8,), maxval=6.0)
+
+    def q(action):
+        plane = jnp.sum(waves * action[None, :2], axis=-1)
+        return jnp.mean(jnp.sin(plane + phases + jnp.pi * action[2]))
+
+    axes = []
+    for dim in range(3):
+        _, low, high = reference(cfg, mean, dim)
+        axes.append(mean[dim] + low + (high - low) * (np.arange(48) + 0.5) / 48)
+    grid = jnp.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), jnp.float32)
+    true = softmax.exact(jax.vmap(q)(grid), beta, jnp.ones(48**3, bool))
+
+    def estimate(i):
+        actions, log_density = softmax.noisy_actions(jax.random.fold_in(key_sample, i), cfg, jnp.array(mean), 4096)
+        return softmax.expectation(jax.vmap(q)(actions), log_density, beta)
+
+    estimates = np.asarray(jax.lax.map(estimate, jnp.arange(200)))
+    assert abs(estimates.mean() - true) <= 4 * estimates.std() / np.sqrt(200) + 1e-4
+    assert estimates.std() < 0.02
+
+
+def test_inverse_temperature_follows_the_range_of_q():
+    """Claim: ten times the rewards at ten times the range give ten times the softmax value."""
+    q = jax.random.normal(jax.random.key(0), (50,))
+    small, large = (
+        softmax.expectation(k * q, jnp.zeros(50), softmax.scaled_inverse_temperature(CFG, 6.0 * k)) for k in (1.0, 10.0)
+    )
+    np.testing.assert_allclose(10.0 * small, large, rtol=1e-5)
+    assert softmax.scaled_inverse_temperature(dataclasses.replace(CFG, inverse_temperature=12.0), 6.0) == 2.0
+
+
+def test_only_yaw_wraps():
+    """Claim: of a pose (x, y, yaw), yaw alone wraps."""
+    assert box.POSE_WRAPS.tolist() == [False, False, True]

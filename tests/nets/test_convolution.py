@@ -1,0 +1,69 @@
+"""The convolution against NumPy, and its two gradients against JAX's own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax.nets.convolution import conv2d
+
+SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first four are the net's
+    (12, 16, 4, 2, 1, 1),
+    (9, 8, 3, 1, 1, 1),
+    (9, 8, 3, 1, 2, 2),
+    (9, 12, 3, 1, 4, 4),
+    (11, 8, 3, 2, 1, 1),
+    (12, 13, 3, 3, 2, 0),
+]
+
+
+def _drawn(rows: int, cols: int, size: int) -> tuple[jax.Array, jax.Array]:
+    rng = np.random.default_rng(0)
+    return (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((2, rows, cols, 3), (size, size, 3, 5)))
+
+
+def _numpy(maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int) -> np.ndarray:
+    """The sum over taps, cell by cell, in float64."""
+    padded = np.pad(np.asarray(maps, np.float64), ((0, 0), (padding,) * 2, (padding,) * 2, (0, 0)))
+    reach = dilation * (kernel.shape[0] - 1) + 1
+    rows, cols = ((length - reach) // stride + 1 for length in padded.shape[1:3])
+    out = np.zeros((maps.shape[0], rows, cols, kernel.shape[3]))
+    for row in range(rows):
+        for col in range(cols):
+            top, left = row * stride, col * stride
+            seen = padded[:, top : top + reach : dilation, left : left + reach : dilation]
+            out[:, row, col] = np.einsum("bijc,ijco->bo", seen, kernel)
+    return out
+
+
+def _plain(maps, kernel, stride, dilation, padding):
+    return jax.lax.conv_general_dilated(
+        maps,
+        kernel,
+        (stride, stride),
+        [(padding, padding)] * 2,
+        rhs_dilation=(dilation, dilation),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_forward_is_numpys(setting):
+    """Claim: the value is the sum over the kernel's taps, zeros around."""
+    maps, kernel = _drawn(*setting[:3])
+    np.testing.assert_allclose(conv2d(maps, kernel, *setting[3:]), _numpy(maps, kernel, *setting[3:]), atol=2e-5)
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_gradients_are_jaxs(setting):
+    """Claim: the gradients in maps and kernel are those that JAX derives from its own convolution, also inside scan."""
+    maps, kernel = _drawn(*setting[:3])
+
+    def loss(conv):
+        return lambda maps, kernel: jnp.sum(jnp.sin(conv(maps, kernel, *setting[3:])))
+
+    wanted = jax.jit(jax.grad(loss(_plain), argnums=(0, 1)))(maps, kernel)
+    ours = jax.grad(loss(conv2d), argnums=(0, 1))
+    _, scanned = jax.jit(lambda m, k: jax.lax.scan(lambda c, _: (c, ours(m, k)), 0, length=2))(maps, kernel)
+    for name, got, want in zip(("maps", "kernel"), scanned, wanted, strict=True):
+        np.testing.assert_allclose(got[1], want, atol=3e-5, err_msg=name)

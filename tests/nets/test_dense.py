@@ -1,0 +1,90 @@
+"""The dense net against a second implementation in NumPy, and how its maps follow the picture."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax.config import NetConfig
+from csac_jax.nets import dense
+
+CFG = NetConfig(growth=8, dilations=(1, 2), stem=16, head=8)
+EPSILON = 1e-6  # of Flax's group norm
+GROUP = 8  # channels per group
+
+
+@pytest.fixture(scope="module")
+def params() -> dict:
+    """Parameters that are all random: scales and biases too, which start at 1 and 0."""
+    rng = np.random.default_rng(1)
+    fresh = dense.Critic(CFG).init(jax.random.key(0), jnp.zeros((1, 16, 16, dense.CHANNELS)))
+    return jax.tree.map(lambda leaf: leaf + jnp.asarray(rng.normal(scale=0.2, size=leaf.shape), leaf.dtype), fresh)
+
+
+def _apply(params: dict, maps: np.ndarray) -> np.ndarray:
+    return np.asarray(jax.jit(dense.Critic(CFG).apply)(params, jnp.asarray(maps, jnp.float32))[0])
+
+
+def _convolve(maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int) -> np.ndarray:
+    padded = np.pad(maps, ((0, 0), (padding,) * 2, (padding,) * 2, (0, 0)))
+    size = kernel.shape[0]
+    rows, cols = ((length - dilation * (size - 1) - 1) // stride + 1 for length in padded.shape[1:3])
+    out = np.zeros((*maps.shape[:1], rows, cols, kernel.shape[3]))
+    for i in range(size):
+        for j in range(size):
+            top, left = i * dilation, j * dilation
+            out += padded[:, top : top + rows * stride : stride, left : left + cols * stride : stride] @ kernel[i, j]
+    return out
+
+
+def _norm(maps: np.ndarray, weights: dict) -> np.ndarray:
+    """Group norm, then the positive part."""
+    batch, rows, cols, channels = maps.shape
+    grouped = maps.reshape(batch, rows * cols, max(channels // GROUP, 1), -1)
+    mean, variance = (f(grouped, axis=(1, 3), keepdims=True) for f in (np.mean, np.var))
+    normal = ((grouped - mean) / np.sqrt(variance + EPSILON)).reshape(maps.shape)
+    return np.maximum(normal * weights["scale"] + weights["bias"], 0.0)
+
+
+def _numpy_net(params: dict, maps: np.ndarray) -> np.ndarray:
+    """The critic's maps, in float64."""
+    weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params["params"])
+    trunk, head = weights["trunk"], weights["head"]
+    features = _norm(_convolve(maps, trunk["Convolution_0"]["kernel"], 2, 1, 1), trunk["GroupNorm_0"])
+    for layer, dilation in enumerate(CFG.dilations, start=1):
+        new = _convolve(features, trunk[f"Convolution_{layer}"]["kernel"], 1, dilation, dilation)
+        features = np.concatenate([features, _norm(new, trunk[f"GroupNorm_{layer}"])], axis=-1)
+    hidden = np.maximum(features @ head["Dense_0"]["kernel"] + head["Dense_0"]["bias"], 0.0)
+    return hidden @ head["Dense_1"]["kernel"] + head["Dense_1"]["bias"]
+
+
+def test_net_is_numpys(params):
+    """Claim: densely connected, group norm over the whole map, half the resolution, three maps."""
+    maps = np.random.default_rng(0).normal(size=(2, 16, 24, dense.CHANNELS))
+    got = _apply(params, maps)
+    assert got.shape == (2, 8, 12, dense.OUTPUTS)
+    np.testing.assert_allclose(got, _numpy_net(params, maps), rtol=1e-3, atol=1e-4)
+
+
+def test_maps_follow_the_picture(params):
+    """Claim: a picture moved by whole cells of the maps, far from the edges, moves its maps with it and changes no value.
+
+    Group norm looks at the whole map: this holds since bare table is 0 and moving the picture changes no mean. The
+    nearest 8 cells to the edges see them and are left out.
+    """
+    picture = np.random.default_rng(2).normal(size=(12, 12, dense.CHANNELS))
+    here, there = np.zeros((2, 1, 80, 80, dense.CHANNELS))
+    here[0, 28:40, 30:42], there[0, 36:48, 34:46] = picture, picture
+    before, after = _apply(params, here)[0], _apply(params, there)[0]
+    inner = slice(8, -8)
+    np.testing.assert_allclose(np.roll(before, (4, 2), axis=(0, 1))[inner, inner], after[inner, inner], atol=2e-5)
+    assert np.abs(before - after)[inner, inner].max() > 0.1  # it is not the same everywhere
+
+
+def test_bare_table_is_zero():
+    """Claim: where nothing lies the net is fed 0, whatever the table's colour; a block's height comes out near 1."""
+    height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
+    fed = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height))
+    np.testing.assert_array_equal(fed[0, 0], 0.0)
+    np.testing.assert_array_equal(fed[0, 1, :3], 0.0)
+    np.testing.assert_allclose(fed[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)

@@ -1,0 +1,159 @@
+"""The ring against a model in NumPy."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import settings, strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from csac_jax.config import ReplayConfig
+from csac_jax.replay import ring
+
+CAPACITY, NUM, BATCH = 7, 3, 5
+CFG = ReplayConfig(capacity=CAPACITY)
+EXAMPLE = {"id": jnp.int32(0), "map": jnp.zeros((2, 2), jnp.uint16)}
+
+add, set_errors, gather = jax.jit(ring.add), jax.jit(ring.set_errors), jax.jit(ring.gather)
+
+
+def items(ids) -> dict[str, jax.Array]:
+    """Items numbered `ids`; id 0 is an unwritten slot."""
+    ids = jnp.asarray(ids, jnp.int32)
+    return {"id": ids, "map": jnp.broadcast_to(ids[:, None, None], (ids.size, 2, 2)).astype(jnp.uint16)}
+
+
+def filled_ring(ids) -> ring.ReplayState:
+    state = ring.init(CFG, EXAMPLE)
+    for i in ids:
+        state = add(state, items([i]), jnp.array([True]))
+    return state
+
+
+class RingModel(RuleBasedStateMachine):
+    """Claim: after any sequence of adds and errors, the ring holds what a list of slots would."""
+
+    def __init__(self):
+        super().__init__()
+        self.state = ring.init(CFG, EXAMPLE)
+        self.ids, self.error = np.zeros(CAPACITY, int), np.ones(CAPACITY, np.float32)
+        self.head = self.stored = self.last_id = 0
+
+    @property
+    def size(self):
+        return min(self.stored, CAPACITY)
+
+    @rule(valid=st.lists(st.booleans(), min_size=NUM, max_size=NUM))
+    def add(self, valid):
+        ids = self.last_id + 1 + np.arange(NUM)
+        self.last_id += NUM
+        self.state = add(self.state, items(ids), jnp.array(valid))
+        largest = self.error[: self.size].max(initial=0.0) if self.size else 1.0
+        for i in ids[np.array(valid)]:
+            self.ids[self.head], self.error[self.head] = i, largest
+            self.head, self.stored = (self.head + 1) % CAPACITY, self.stored + 1
+
+    @rule(
+        slots=st.lists(st.integers(0, CAPACITY - 1), min_size=BATCH, max_size=BATCH),
+        errors=st.lists(
+            st.sampled_from([0.0, -0.25, 0.5, -2.0, 8.0, np.nan, np.inf, -np.inf]), min_size=BATCH, max_size=BATCH
+        ),
+    )
+    def set_errors(self, slots, errors):
+        if self.size == 0:
+            return
+        slots = [slot % self.size for slot in slots]
+        self.state = set_errors(self.state, jnp.array(slots), jnp.array(errors, jnp.float32))
+        finite = [abs(e) for e in errors if np.isfinite(e)]
+        largest = max([self.error[: self.size].max(), *finite])
+        sizes = [abs(e) if np.isfinite(e) else largest for e in errors]
+        for slot in set(slots):
+            self.error[slot] = max(size for s, size in zip(slots, sizes, strict=True) if s == slot)
+
+    @invariant()
+    def same(self):
+        assert (int(self.state.head), int(self.state.size)) == (self.head, self.size)
+        np.testing.assert_array_equal(self.state.items["id"], self.ids)
+        np.testing.assert_array_equal(self.state.items["map"][:, 1, 0], self.ids)
+        np.testing.assert_array_equal(self.state.error[: self.size], self.error[: self.size])
+
+
+TestRingModel = RingModel.TestCase
+TestRingModel.settings = settings(max_examples=40, stateful_step_count=20, deadline=None)
+
+
+def test_valid_items_are_packed():
+    """Claim: invalid items leave no gap: ids 1 _ 3, then _ 5 6 fill slots 0 to 3; the rest stays unwritten."""
+    state = add(ring.init(CFG, EXAMPLE), items([1, 2, 3]), jnp.array([True, False, True]))
+    state = add(state, items([4, 5, 6]), jnp.array([False, True, True]))
+    assert state.items["id"].tolist() == [1, 3, 5, 6, 0, 0, 0]
+    assert (int(state.head), int(state.size)) == (4, 4)
+
+
+def test_oldest_is_overwritten():
+    """Claim: the ring wraps around: of items 1 to 9, 3 to 9 remain, the newest in slot (head - 1) % C."""
+    state = filled_ring(range(1, 10))
+    assert state.items["id"].tolist() == [8, 9, 3, 4, 5, 6, 7]
+    assert int(gather(state, (state.head - 1)[None] % CAPACITY)["id"][0]) == 9
+
+
+def test_new_items_rank_with_the_largest_error():
+    """Claim: a new item's error is the largest stored, that of the item which it overwrites included."""
+    state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([0.3, -0.7]))
+    assert add(state, items([3]), jnp.array([True])).error[2] == np.float32(0.7)
+
+
+def test_twice_the_same_slot_keeps_the_larger_error():
+    """Claim: of two errors for one slot the larger in size is kept, in either order, and old errors are forgotten."""
+    state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([9.0, 9.0]))
+    for errors in ([0.1, -0.5, 0.2], [-0.5, 0.1, 0.2]):
+        updated = set_errors(state, jnp.array([1, 1, 0]), jnp.array(errors))
+        np.testing.assert_allclose(updated.error[:2], [0.2, 0.5])
+
+
+def test_errors_that_are_not_numbers():
+    """Claim: NaN counts as the largest error known, and the ring never holds one that is not finite."""
+    state = set_errors(filled_ring([1, 2, 3]), jnp.array([0, 1, 2]), jnp.array([0.5, 4.0, 0.1]))
+    np.testing.assert_allclose(set_errors(state, jnp.array([0]), jnp.array([jnp.nan])).error[:3], [4.0, 4.0, 0.1])
+    updated = set_errors(state, jnp.array([0, 2]), jnp.array([-jnp.inf, 6.0]))
+    np.testing.assert_allclose(updated.error[:3], [6.0, 4.0, 6.0])
+
+
+def test_gather_returns_the_items_of_its_slots():
+    """Claim: slots may repeat, and every leaf comes from the same slot."""
+    batch = gather(filled_ring([1, 2, 3]), jnp.array([2, 0, 2]))
+    assert batch["id"].tolist() == [3, 1, 3]
+    assert batch["map"][:, 0, 0].tolist() == [3, 1, 3]
+
+
+def test_types_are_those_of_the_example():
+    """Claim: add and set_errors return a state of the same types and shapes, so that a compiled loop takes it again."""
+    state = ring.init(CFG, EXAMPLE)
+    added = add(state, items([1]), jnp.array([True]))
+    updated = set_errors(added, jnp.array([0]), jnp.array([1.0]))
+    signature = functools.partial(jax.tree.map, lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type))
+    assert signature(state) == signature(added) == signature(updated)
+
+
+def test_too_many_items_at_once():
+    """Claim: more items than slots is an error that names the setting."""
+    with pytest.raises(ValueError, match=r"replay\.capacity"):
+        ring.add(ring.init(CFG, EXAMPLE), items(range(1, 9)), jnp.ones(8, bool))
+
+
+def test_donated_ring_is_not_copied():
+    """Claim: with the state donated, a compiled loop of adds and error updates copies no replay memory."""
+    state = ring.init(ReplayConfig(capacity=512), {"id": jnp.int32(0), "map": jnp.zeros((64, 64), jnp.uint16)})
+    new = {"id": jnp.arange(1, 9), "map": jnp.ones((8, 64, 64), jnp.uint16)}
+
+    def step(state, i):
+        state = ring.add(state, new, jnp.arange(8) != i)
+        slots = (jnp.arange(4) * i) % state.size
+        return ring.set_errors(state, slots, ring.gather(state, slots)["id"].astype(jnp.float32)), None
+
+    compiled = jax.jit(lambda s: jax.lax.scan(step, s, jnp.arange(4))[0], donate_argnums=0).lower(state).compile()
+    memory, replay_bytes = compiled.memory_analysis(), state.items["map"].nbytes
+    assert memory.alias_size_in_bytes >= replay_bytes
+    assert memory.temp_size_in_bytes < replay_bytes / 2

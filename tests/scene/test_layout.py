@@ -1,0 +1,81 @@
+"""Parked blocks and turned scenes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from csac_jax.scene import layout
+from csac_jax.scene.layout import Scene
+from csac_jax.vision.heightmap import VIEW_HEIGHT
+
+N = 5
+PARKED = np.array([1, 3])
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Blocks 0, 2 and 4 in play at random poses, 1 and 3 parked."""
+    rng = np.random.default_rng(0)
+    quaternion = rng.normal(size=(N, 4))
+    loose = Scene(
+        position=jnp.asarray(rng.uniform(-0.2, 0.2, (N, 3)), jnp.float32),
+        quaternion=jnp.asarray(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), jnp.float32),
+        velocity=jnp.asarray(rng.normal(size=(N, 6)), jnp.float32),
+        half_size=jnp.full((N, 3), 0.025, jnp.float32),
+        colour=jnp.arange(N),
+        in_play=jnp.ones(N, bool),
+    )
+    return layout.park(loose, jnp.ones(N, bool).at[PARKED].set(False))
+
+
+def _rotations(scene: Scene) -> Rotation:
+    return Rotation.from_quat(np.asarray(scene.quaternion), scalar_first=True)
+
+
+def test_park_touches_only_what_leaves(scene: Scene):
+    """Claim: park puts what is not kept at rest at its place, never brings a block back, and leaves the others as is."""
+    again = layout.park(scene, jnp.ones(N, bool).at[0].set(False))
+    np.testing.assert_array_equal(again.in_play, [False, False, True, False, True])
+    out = np.array([0, 1, 3])
+    np.testing.assert_array_equal(again.position[out], layout.parking(N)[out])
+    np.testing.assert_array_equal(again.quaternion[out], np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)))
+    assert not np.any(again.velocity[out])
+    for leaf in ("position", "quaternion", "velocity"):
+        kept = np.array([2, 4])
+        np.testing.assert_array_equal(getattr(again, leaf)[kept], getattr(scene, leaf)[kept])
+
+
+def test_turn_keeps_parked_blocks_parked(scene: Scene):
+    """Claim: turning a scene leaves what is parked where it is."""
+    turned = layout.turn(scene, jnp.float32(2.0))
+    for leaf in ("position", "quaternion", "velocity", "in_play"):
+        np.testing.assert_array_equal(getattr(turned, leaf)[PARKED], getattr(scene, leaf)[PARKED])
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, 3.0, 6.0])
+def test_turn_is_a_rotation_about_z(scene: Scene, yaw: float):
+    """Claim: turning keeps heights and distances, and turns places and blocks by the same angle."""
+    turned = layout.turn(scene, jnp.float32(yaw))
+    play = np.flatnonzero(scene.in_play)
+    about_z = Rotation.from_rotvec([0.0, 0.0, yaw])
+    before, after = np.asarray(scene.position)[play], np.asarray(turned.position)[play]
+    np.testing.assert_array_equal(after[:, 2], before[:, 2])
+    distances = [np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (before, after)]
+    np.testing.assert_allclose(*distances, atol=1e-6)
+    np.testing.assert_allclose(after, about_z.apply(before), atol=1e-6)
+    expected = (about_z * _rotations(scene)).as_matrix()
+    np.testing.assert_allclose(_rotations(turned).as_matrix()[play], expected[play], atol=1e-5)
+
+
+def test_parking_is_out_of_reach_and_out_of_view():
+    """Claim: parked blocks of any size are apart from one another, beside the square and wholly above the camera."""
+    place, radius = layout.parking(10), np.linalg.norm([0.05, 0.025, 0.025])
+    assert np.linalg.norm(place[:, None] - place[None], axis=-1)[~np.eye(10, dtype=bool)].min() > 2 * radius
+    assert place[:, 0].min() > 0.5 and place[:, 2].min() - radius > VIEW_HEIGHT
+
+
+def test_inside_is_the_square():
+    """Claim: a block is inside while its centre lies above the workspace square, edges included."""
+    position = jnp.array([[0.2, -0.2, 5.0], [0.201, 0.0, 0.0], [0.0, -0.201, 0.0], [-0.1, 0.1, -1.0]])
+    np.testing.assert_array_equal(layout.inside(position, 0.4), [True, False, False, True])

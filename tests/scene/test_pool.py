@@ -1,0 +1,166 @@
+"""Settled scenes in C MuJoCo, and their cache."""
+
+import dataclasses
+import stat
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from csac_jax.config import SceneConfig, SimConfig
+from csac_jax.scene import blocks, model, pool
+from csac_jax.scene.layout import Scene, parking
+
+CONFIG = SceneConfig(slots=("box", "box", "prism", "cylinder"), min_blocks=2)
+EXTENT = 0.448
+COUNT = 48
+
+
+@pytest.fixture(scope="module")
+def world() -> model.World:
+    return model.build(CONFIG, SimConfig())
+
+
+@pytest.fixture(scope="module")
+def scenes(world: model.World, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """COUNT settled scenes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
+        return pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> model.World:
+    """A world of one block, a cache of its own and small rounds, so that settling takes no time."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(pool, "_ROUND", 8)
+    return model.build(ONE, SimConfig())
+
+
+ONE = SceneConfig(slots=("box",), min_blocks=1)
+
+
+def _placed(world: model.World, scenes: Scene, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Scene `index` in C MuJoCo, parked blocks without weight."""
+    scene = jax.tree.map(lambda leaf: leaf[index], scenes)
+    fields = model.box_fields(jnp.asarray(scene.half_size[model.box_slots(world)]))
+    exact = model.with_boxes(world, jax.tree.map(np.asarray, fields))
+    exact.opt.iterations, exact.opt.ls_iterations = 50, 50
+    exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
+    data = mujoco.MjData(exact)
+    data.qpos[world.hand_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
+    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    mujoco.mj_forward(exact, data)
+    return exact, data
+
+
+def test_settled_blocks_are_at_rest(world: model.World, scenes: Scene):
+    """Claim: blocks of a settled scene lie still: half a second later none has moved by 2 mm."""
+    for index in range(COUNT):
+        exact, data = _placed(world, scenes, index)
+        mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
+        moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
+        assert moved.max() < 0.002, f"scene {index}: {moved}"
+
+
+def test_settled_blocks_do_not_overlap(world: model.World, scenes: Scene):
+    """Claim: no two blocks of a settled scene, and no block and the table, overlap deeper than 2 mm."""
+    touching = 0
+    for index in range(COUNT):
+        _, data = _placed(world, scenes, index)
+        assert data.ncon > 0 and data.contact.dist.min() > -0.002, f"scene {index}"
+        touching += np.sum(np.isin(data.contact.geom, world.block_geoms).all(axis=1))
+    assert touching > 0  # some lie on others, else there was nothing to see
+
+
+def test_settled_blocks_lie_within_the_radius(scenes: Scene):
+    """Claim: blocks in play lie within extent / 2 of the centre, above the table; the others are parked."""
+    play = scenes.in_play
+    assert np.hypot(*scenes.position[play][:, :2].T).max() <= 0.5 * EXTENT
+    assert scenes.position[play][:, 2].min() > 0.0
+    assert set(play.sum(axis=1)) == {2, 3, 4}  # min_blocks .. number of slots
+    places = np.broadcast_to(parking(4), scenes.position.shape)
+    np.testing.assert_array_equal(scenes.position[~play], places[~play])
+
+
+def test_every_size_of_box_is_drawn(scenes: Scene):
+    """Claim: a box slot draws cube, cuboid, plank or tile anew in every scene."""
+    drawn = {tuple(half) for half in scenes.half_size[:, 0]}
+    assert drawn == {tuple(half) for half in blocks.BOX_HALF_SIZES}
+
+
+def test_same_arguments_same_scenes(world: model.World, scenes: Scene, monkeypatch, tmp_path: Path):
+    """Claim: the same arguments give the same scenes, bit for bit, settled anew or read from the cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    anew = pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
+    monkeypatch.setattr(pool, "_settle", None)  # must not be called
+    cached = pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
+    for other in (anew, cached):
+        jax.tree.map(np.testing.assert_array_equal, scenes, other)
+        assert jax.tree.map(lambda leaf: leaf.dtype, scenes) == jax.tree.map(lambda leaf: leaf.dtype, other)
+
+
+def test_streams_share_no_scene(small: model.World):
+    """Claim: training and evaluation draw from pools that have no scene in common, nor has one pool a scene twice."""
+    both = [pool.settled(small, ONE, EXTENT, stream, 16).position for stream in (pool.TRAIN_STREAM, 1)]
+    assert len({scene.tobytes() for scenes in both for scene in scenes}) == 32
+
+
+@pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
+def test_damaged_cache_is_settled_anew(small: model.World, tmp_path: Path, damage: str):
+    """Claim: a cache file that was cut short or changed is noticed, and its scenes are settled anew."""
+    good = pool.settled(small, ONE, EXTENT, 0, 4)
+    (path,) = tmp_path.rglob("*.npz")
+    raw = path.read_bytes()
+    if damage == "flipped":
+        damaged = []
+        for place in range(0, len(raw), 29):
+            changed = bytearray(raw)
+            changed[place] ^= 0xFF
+            damaged.append(bytes(changed))
+    else:
+        damaged = [raw[: len(raw) // 2] if damage == "cut" else b""]
+    for content in damaged:
+        path.write_bytes(content)
+        read = pool._read(path)
+        if read is not None:  # a byte that carries nothing
+            jax.tree.map(np.testing.assert_array_equal, good, read)
+    path.write_bytes(damaged[len(damaged) // 2])
+    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, ONE, EXTENT, 0, 4))
+    assert pool._read(path) is not None
+
+
+def test_replaced_content_is_noticed(small: model.World, tmp_path: Path):
+    """Claim: a well-formed cache file whose arrays do not belong to its checksum is not used."""
+    good = pool.settled(small, ONE, EXTENT, 0, 4)
+    (path,) = tmp_path.rglob("*.npz")
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(path, **(arrays | {"position": arrays["position"] + np.float32(0.01)}))
+    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, ONE, EXTENT, 0, 4))
+
+
+def test_cache_folder_is_private(small: model.World, tmp_path: Path):
+    """Claim: the cache folder is its owner's alone."""
+    pool.settled(small, ONE, EXTENT, 0, 4)
+    (path,) = tmp_path.rglob("*.npz")
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    assert list(path.parent.iterdir()) == [path]  # nothing half-written stays
+
+
+def test_unwritable_cache_is_no_error(small: model.World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: where the cache cannot be written, scenes are settled all the same."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert pool.settled(small, ONE, EXTENT, 0, 4).position.shape == (4, 1, 3)
+
+
+def test_hopeless_configuration_is_one_line(small: model.World):
+    """Claim: a configuration whose blocks never come to rest ends with one line that names what to change."""
+    falling = dataclasses.replace(ONE, drop_height=1.0, settle_time=0.5)  # lands after 0.45 s
+    with pytest.raises(RuntimeError, match=r"scene\.settle_time") as error:
+        pool.settled(small, falling, EXTENT, 0, 4)
+    assert "\n" not in str(error.value)

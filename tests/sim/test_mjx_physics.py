@@ -1,0 +1,136 @@
+"""Primitives in MJX: scripted scenes, health, and agreement with C MuJoCo."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax.scene import layout
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import mjx_physics, outcome
+from csac_jax.sim.outcome import Outcome
+
+pytestmark = pytest.mark.mjx
+
+
+def _outcomes(run, trace=None) -> np.ndarray:
+    """Outcomes by ground truth of a batch of runs, or of other traces of the same plans."""
+    return np.asarray(jax.vmap(outcome.grasp_outcome)(trace or run.trace, run.plan.surface, run.hand_rise))
+
+
+@pytest.mark.parametrize("level", list(Outcome), ids=lambda level: level.name.lower())
+def test_every_outcome_is_reached(executed, level: Outcome):
+    """Claim: physics reaches all five levels of a grasp (CSAC eq. 15), with the block set as it is."""
+    run = executed.case(level.name.lower())
+    assert mjx_physics.healthy(run.after)
+    assert outcome.grasp_outcome(run.trace, run.plan.surface, run.hand_rise) == level
+
+
+def test_lifted_block_alone_hangs_in_the_hand(executed):
+    """Claim: after a grasp the lifted block is still in play and hangs at the hand's height; the other one lies."""
+    run = executed.case("lifted")
+    np.testing.assert_array_equal(run.after.in_play, [True, True, False])
+    np.testing.assert_array_equal(outcome.lifted_blocks(run.trace, run.hand_rise), [True, False, False])
+    rise = run.after.position[:, 2] - run.scene.position[:, 2]
+    np.testing.assert_allclose(rise[:2], [run.hand_rise, 0.0], atol=0.005)
+    assert abs(run.trace.gap_end - 0.05) < 0.005  # the cube's width
+
+
+def test_dropped_block_lies_again(executed):
+    """Claim: a dropped block rose by more than a centimetre and ends on the table."""
+    run = executed.case("dropped")
+    assert run.trace.held_rise[2] >= outcome.GRIP_RISE
+    assert abs(run.trace.rise[2]) < 0.01 and not run.trace.held[2]
+
+
+def test_push_moves_a_block_with_the_hand(executed):
+    """Claim: a push shoves what stands in its way as far as the finger goes beyond first contact, straight ahead."""
+    run = executed.case("push")
+    moved = run.after.position[0] - run.scene.position[0]
+    finger, face = 0.012, 0.06 - 0.025  # m ahead of the place: closed fingers' front, the cube's near face
+    np.testing.assert_allclose(moved, [0.10 - (face - finger), 0.0, 0.0], atol=0.006)
+    np.testing.assert_allclose(run.after.position[2], run.scene.position[2], atol=0.001)
+    assert run.trace.touched
+
+
+def test_push_that_misses_moves_nothing(executed):
+    """Claim: a push beside a block leaves it where it is."""
+    run = executed.case("miss")
+    assert not run.trace.touched
+    np.testing.assert_allclose(run.after.position, run.scene.position, atol=0.001)
+
+
+def test_parked_blocks_never_move(executed):
+    """Claim: a block that is out of play stays at its place, at rest, whatever happens in the scene, and stays out."""
+    parked = ~executed.scene.in_play
+    assert parked.sum() > 10
+    np.testing.assert_array_equal(executed.after.in_play, executed.scene.in_play)
+    places = np.broadcast_to(layout.parking(3), executed.scene.position.shape)
+    np.testing.assert_array_equal(executed.after.position[parked], places[parked])
+    assert not executed.after.velocity[parked].any()
+    sane = np.isfinite(executed.trace.rise).all(axis=1)
+    assert not executed.trace.rise[parked & sane[:, None]].any()  # nor on the way
+
+
+def test_failed_physics_is_flagged_alone(executed):
+    """Claim: `healthy` is false for a scene that went NaN or exploded, and true for every other one of the batch."""
+    health = np.asarray(jax.vmap(mjx_physics.healthy)(executed.after))
+    names = ["nan", "exploded"]
+    assert np.isfinite(executed.case("exploded").after.position).all()  # bounds, not isnan
+    for name in names:
+        assert not mjx_physics.healthy(executed.case(name).after)
+    assert health.sum() == len(health) - len(names)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "slot", "good"),
+    [
+        ("position", np.nan, 0, False),
+        ("position", 1.1, 0, False),
+        ("position", 3.0, 1, True),  # parked
+        ("velocity", 25.0, 0, False),
+        ("velocity", -25.0, 0, False),
+        ("velocity", 15.0, 0, True),
+        ("velocity", np.inf, 0, False),
+        ("quaternion", np.nan, 0, False),
+    ],
+)
+def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
+    """Claim: healthy = finite, slower than MAX_SPEED and, if in play, within MAX_HEIGHT of the origin."""
+    zeros, ones = jnp.zeros((2, 3)), jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (2, 1))
+    scene = Scene(zeros, ones, jnp.zeros((2, 6)), zeros + 0.02, jnp.zeros(2, jnp.int32), jnp.array([True, False]))
+    assert mjx_physics.healthy(scene)
+    changed = getattr(scene, field).at[slot, 2].set(value)
+    assert mjx_physics.healthy(dataclasses.replace(scene, **{field: changed})) == good
+
+
+def test_no_contact_was_dropped(executed):
+    """Claim: with few blocks the contact slots are never all in use."""
+    assert not executed.trace.saturated.any()
+
+
+def test_grasps_agree_with_c(grasped, grasped_in_c):
+    """Claim: the same grasp of the same scene ends the same in C MuJoCo, in at least 95 of 100."""
+    ours, theirs = _outcomes(grasped), _outcomes(grasped, grasped_in_c[1])
+    assert len(set(theirs.tolist())) >= 3  # else agreement is cheap
+    assert np.mean(ours == theirs) >= 0.95, np.stack([ours, theirs])
+
+
+def test_displacements_agree_with_c(grasped, grasped_in_c):
+    """Claim: blocks move as far as in C MuJoCo: within 1 mm in the median scene, within 5 mm on average."""
+    play, before = grasped.scene.in_play, grasped.scene.position
+    ours, theirs = (np.linalg.norm(end - before, axis=-1) for end in (grasped.after.position, grasped_in_c[0]))
+    worst = np.where(play, np.abs(ours - theirs), 0.0).max(axis=1)
+    assert np.median(worst) < 0.001
+    assert abs(ours[play].mean() - theirs[play].mean()) < 0.005
+
+
+@pytest.mark.slow
+def test_contact_caps_are_wide_enough(doubled_caps):
+    """Claim: twice the contact caps of the default configuration give the same outcomes, and no slot was wanting."""
+    capped, wide = doubled_caps
+    np.testing.assert_array_equal(capped.scene.position, wide.scene.position)
+    np.testing.assert_array_equal(_outcomes(capped), _outcomes(wide))
+    assert not capped.trace.saturated.any()

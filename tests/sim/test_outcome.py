@@ -1,0 +1,82 @@
+"""Outcomes of hand-made traces."""
+
+import jax.numpy as jnp
+import pytest
+
+from csac_jax.sim import outcome
+from csac_jax.sim.outcome import Outcome, Trace
+
+RISE = 0.10  # m, of the hand
+
+
+def _trace(touched=False, held_rise=0.0, held=False, rise=0.0, gap_closed=0.0, gap_end=0.0) -> Trace:
+    """A trace in which block 1 of 2 has these values and block 0 lies untouched."""
+    return Trace(
+        touched=jnp.array(touched),
+        held_rise=jnp.array([0.0, held_rise]),
+        held=jnp.array([False, held]),
+        rise=jnp.array([0.0, rise]),
+        gap_closed=jnp.array(gap_closed),
+        gap_end=jnp.array(gap_end),
+        saturated=jnp.int32(0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("trace", "surface", "expected"),
+    [
+        (_trace(), 0.0, Outcome.NOTHING),
+        (_trace(), 0.009, Outcome.NOTHING),
+        (_trace(), 0.011, Outcome.EMPTY),
+        (_trace(touched=True), 0.0, Outcome.TOUCHED),
+        (_trace(touched=True), 0.05, Outcome.TOUCHED),
+        (_trace(touched=True, rise=0.06), 0.05, Outcome.TOUCHED),  # rose by itself, or on a finger
+        (_trace(touched=True, held_rise=0.009), 0.05, Outcome.TOUCHED),
+        (_trace(touched=True, held_rise=0.011), 0.05, Outcome.DROPPED),
+        (_trace(touched=True, held_rise=0.09), 0.05, Outcome.DROPPED),
+        (_trace(touched=True, held_rise=0.09, rise=0.09), 0.05, Outcome.DROPPED),  # in free fall, no longer held
+        (_trace(touched=True, held_rise=0.04, held=True, rise=0.04), 0.05, Outcome.DROPPED),  # held, far too low
+        (_trace(touched=True, held_rise=0.06, held=True, rise=0.06), 0.05, Outcome.LIFTED),
+        (_trace(touched=True, held_rise=0.06, held=True, rise=0.06), 0.0, Outcome.LIFTED),
+    ],
+)
+def test_outcome_by_ground_truth(trace: Trace, surface: float, expected: Outcome):
+    """Claim: nothing, empty, touched, dropped and lifted follow from contacts and rises as grasp_outcome says."""
+    assert outcome.grasp_outcome(trace, jnp.array(surface), jnp.array(RISE)) == expected
+
+
+@pytest.mark.parametrize(
+    ("gap_closed", "gap_end", "surface", "changed", "expected"),
+    [
+        (0.0, 0.0, 0.0, False, Outcome.NOTHING),
+        (0.0, 0.0, 0.05, False, Outcome.EMPTY),
+        (0.0, 0.0, 0.05, True, Outcome.TOUCHED),
+        (0.0, 0.0, 0.0, True, Outcome.TOUCHED),
+        (0.004, 0.004, 0.05, True, Outcome.TOUCHED),  # a closed hand, give or take the control error
+        (0.05, 0.0, 0.05, True, Outcome.DROPPED),
+        (0.05, 0.0, 0.05, False, Outcome.DROPPED),
+        (0.05, 0.05, 0.05, True, Outcome.LIFTED),
+        (0.05, 0.05, 0.0, False, Outcome.LIFTED),
+    ],
+)
+def test_outcome_by_gap(gap_closed: float, gap_end: float, surface: float, changed: bool, expected: Outcome):
+    """Claim: the robot's own judgement takes the finger gap and the change of the map, and no ground truth."""
+    for truth in (False, True):
+        trace = _trace(truth, 0.09 * truth, truth, 0.09 * truth, gap_closed, gap_end)
+        assert outcome.grasp_outcome_by_gap(trace, jnp.array(surface), jnp.array(changed)) == expected
+
+
+@pytest.mark.parametrize(
+    ("held", "rise", "lifted"), [(True, 0.051, True), (True, 0.049, False), (False, 0.09, False), (False, 0.0, False)]
+)
+def test_lifted_blocks(held: bool, rise: float, lifted: bool):
+    """Claim: a block is lifted when it is between the pads in the end and rose by half of the hand's rise."""
+    assert outcome.lifted_blocks(_trace(held=held, rise=rise), jnp.array(RISE)).tolist() == [False, lifted]
+
+
+def test_gap_agrees_with_the_truth_where_it_can(executed):
+    """Claim: in physics the finger gap tells a lifted from a missed block."""
+    for name in ("nothing", "empty", "dropped", "lifted"):
+        run = executed.case(name)
+        judged = outcome.grasp_outcome_by_gap(run.trace, run.plan.surface, jnp.array(False))
+        assert judged == Outcome[name.upper()], name

@@ -1,0 +1,264 @@
+"""The command line: bad input is one line and an exit code, and nothing is overwritten."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import csac_jax
+from csac_jax import cli, presets
+from csac_jax.config import Config
+from csac_jax.train import checkpoint
+
+ROOT = Path(csac_jax.__file__).parents[1]
+SMOKE = presets.smoke()
+
+
+@pytest.fixture(autouse=True)
+def no_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Bad input must be seen before anything is trained; no test of this file trains or takes over signals."""
+
+    def forbidden(*_):
+        raise AssertionError("training began")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "_train", forbidden)
+    monkeypatch.setattr(cli.stopping, "install", cli.stopping.Stop)
+
+
+def _fails(capsys: pytest.CaptureFixture, *arguments: str) -> tuple[int, str]:
+    """Exit code and the one line on stderr."""
+    code = cli.main(arguments)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("csac-jax: ")
+    assert captured.err.count("\n") == 1, captured.err
+    return code, captured.err
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    """A run of `smoke` with one checkpoint."""
+    folder = tmp_path / "runs" / "one"
+    checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, SMOKE, {"seconds": 1.0, "grasps": []})
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("trian quick", "unknown command 'trian'; choose one of: train, eval, doctor"),
+        ("train", "give a preset first, one of: smoke, quick"),
+        ("train --seed 3", "give a preset first, one of: smoke, quick"),
+        ("train quik", "unknown preset 'quik'; choose one of: smoke, quick"),
+        (
+            "train quick --learn.bath 3",
+            "--learn.bath, 3; perhaps you meant --learn.batch; see csac-jax train quick --help",
+        ),
+        ("train quick --preset smoke", "--preset"),
+        ("train quick --learn.batch", "--learn.batch"),
+        ("train quick --learn.batch many", "--learn.batch: invalid literal for int"),
+        ("train quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("train quick --learn.batch 65", "learn.batch: 65 transitions cannot be drawn"),
+        ("train quick --scene.slots box ball", "invalid choice 'ball' for argument '--scene.slots'"),
+        ("train quick --replay.sampler best", "invalid choice 'best' for argument '--replay.sampler'"),
+        ("train quick --seed -1", "seed: must lie in 0 .. 2147483647"),
+        ("train quick smoke", "Unrecognized options: smoke"),
+        ("train quick --run-dir .", ". exists; give another --run-dir, or go on with it by --resume"),
+        ("eval", "Folder of the run"),
+        ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
+        ("eval . --episodes 0", "--episodes: at least 1"),
+        ("eval . --seed -2", "--seed: must lie in"),
+        ("doctor --fix", "Unrecognized options: --fix"),
+    ],
+)
+def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
+    """Claim: bad arguments are one line that names the thing, and exit code 2."""
+    code, line = _fails(capsys, *arguments.split())
+    assert code == 2
+    assert message in line
+
+
+@pytest.mark.parametrize("command", ["train --resume", "eval"])
+def test_missing_run(capsys: pytest.CaptureFixture, tmp_path: Path, command: str):
+    """Claim: a run that is not there, or has no checkpoint, is one line and exit code 1."""
+    code, line = _fails(capsys, *command.split(), "nowhere")
+    assert (code, "there is no folder nowhere" in line) == (1, True)
+    (tmp_path / "empty").mkdir()
+    code, line = _fails(capsys, *command.split(), "empty")
+    assert (code, "there is no checkpoint" in line) == (1, True)
+
+
+@pytest.mark.parametrize("command", ["train --resume", "eval"])
+def test_damaged_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path, command: str):
+    """Claim: a damaged checkpoint is one line and exit code 1."""
+    (run_dir / "checkpoints/4" / checkpoint.MANIFEST).unlink()
+    code, line = _fails(capsys, *command.split(), str(run_dir))
+    assert (code, "half-written" in line) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("flags", "names"),
+    [
+        (["--learn.tau", "0.5", "--seed", "3"], "seed, learn.tau"),
+        (["--cem.rounds", "4"], "cem.rounds"),
+    ],
+)
+def test_resume_with_other_settings(capsys: pytest.CaptureFixture, run_dir: Path, flags: list[str], names: str):
+    """Claim: to resume with settings that are not the run's is exit code 2, and every one that differs is named."""
+    code, line = _fails(capsys, "train", "--resume", str(run_dir), *flags)
+    assert (code, f"other values of {names};" in line) == (2, True)
+
+
+def test_resume_with_another_preset(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: to resume with a preset that is not the run's is exit code 2."""
+    code, line = _fails(capsys, "train", "quick", "--resume", str(run_dir))
+    assert (code, "other values of preset;" in line) == (2, True)
+
+
+def test_resume_excludes_run_dir(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: --resume and --run-dir exclude one another."""
+    code, line = _fails(capsys, "train", "--resume", str(run_dir), "--run-dir", "x")
+    assert (code, "exclude one another" in line) == (2, True)
+
+
+def test_nothing_is_overwritten(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: refused arguments change no file of the run."""
+    before = {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
+    _fails(capsys, "train", "smoke", "--run-dir", str(run_dir))
+    _fails(capsys, "train", "--resume", str(run_dir), "--seed", "9")
+    assert {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("flag", ["--resume {}", "--resume={}"])
+@pytest.mark.parametrize("preset", ["", "smoke "])
+def test_resume_takes_the_config_of_the_run(run_dir: Path, flag: str, preset: str):
+    """Claim: a resumed run needs no settings, and may be given its own."""
+    own = "--learn.batch 8 --seed 0"
+    for arguments in (preset + flag.format(run_dir), f"{preset}{flag.format(run_dir)} {own}"):
+        options, cfg = cli._read_train(arguments.split())
+        assert cfg == SMOKE
+        assert options.resume == run_dir
+
+
+def test_flags_reach_the_config():
+    """Claim: settings on the command line reach the config, the rest is the preset's."""
+    flags = "--seed 3 --learn.batch 4 --scene.slots box prism --replay.beta-end 2 3"
+    _, cfg = cli._read_train(["smoke", *flags.split()])
+    assert cfg == dataclasses.replace(
+        SMOKE,
+        seed=3,
+        learn=dataclasses.replace(SMOKE.learn, batch=4),
+        scene=dataclasses.replace(SMOKE.scene, slots=("box", "prism")),
+        replay=dataclasses.replace(SMOKE.replay, beta_end=(2.0, 3.0)),
+    )
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: every setting of a config is a flag of `train`, and none but these and the options."""
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["train", "quick", "--help"])
+    assert ended.value.code in (0, None)
+    shown = capsys.readouterr().out
+    for field in dataclasses.fields(Config):
+        if dataclasses.is_dataclass(field.type):
+            for setting in dataclasses.fields(field.type):
+                assert f"{_flag(f'{field.name}.{setting.name}')}" in shown
+    assert "--seed" in shown
+    assert "--preset" not in shown
+
+
+def test_default_run_dirs_do_not_collide(tmp_path: Path):
+    """Claim: two runs begun in the same second get folders of their own."""
+    first = cli._new_run_dir(SMOKE)
+    assert first.name.startswith("smoke-0-20")
+    first.mkdir(parents=True)
+    assert cli._new_run_dir(SMOKE) != first
+
+
+def test_help_comes_without_jax():
+    """Claim: help and complaints do not wait for JAX."""
+    source = """
+import contextlib, io, sys
+from csac_jax import cli
+for line in ("", "--help", "train --help", "eval --help", "train quick --learn.bath 3", "eval x -y"):
+    nothing = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(nothing), contextlib.redirect_stderr(nothing):
+        cli.main(line.split())
+print("jax" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert done.stdout == "False\n", done.stderr
+
+
+def test_reader_that_stops_reading_is_no_error():
+    """Claim: `csac-jax --help | head -1` prints no traceback and no complaint."""
+    command = f"{sys.executable} -m csac_jax train --help | head -1"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert done.stdout.startswith("usage: csac-jax train")
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("code", [0, 130, 143])
+def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int):
+    """Claim: a stopped run exits with 128 + the signal; --json has the result, the config and where it comes from."""
+    from csac_jax.train import loop
+
+    def train(options, cfg, run_dir, stop):
+        stop.signal = code - 128 if code else None
+        return loop.Summary(4, 8, 1.5, 0.5, None, 0, stop.signal)
+
+    monkeypatch.setattr(cli, "_train", train)
+    assert cli.main(["train", "smoke", "--seed", "3", "--json", "out/result.json"]) == code
+    result = json.loads((tmp_path / "out/result.json").read_text())
+    assert (result["actions"], result["config"]["seed"], result["config"]["preset"]) == (8, 3, "smoke")
+    assert {"device", "versions", "commit", "run_dir", "wall_seconds"} <= result.keys()
+
+
+@pytest.mark.mjx
+def test_doctor_passes(capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Claim: on a sound machine `doctor` exits with 0 and names what it checked."""
+    assert cli.main(["doctor", "--json", "doctor.json"]) == 0
+    shown = capsys.readouterr().out
+    assert "jax 0." in shown
+    assert shown.count("ok  ") == 3
+    result = json.loads((tmp_path / "doctor.json").read_text())
+    assert result["thread_pool"]["guarded"]
+    assert all(check["passed"] for check in result["self_test"])
+
+
+@pytest.mark.parametrize("error", [1.0, float("nan")])
+def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, error: float):
+    """Claim: a check that fails, or gives NaN, is exit code 1 and one line that names it."""
+    from csac_jax.train import selftest
+
+    monkeypatch.setattr(selftest, "CHECKS", (("sums", lambda: error, 0.5), ("products", lambda: 0.0, 0.5)))
+    assert cli.main(["doctor"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert "self-test failed: sums;" in captured.err
+
+
+def test_summary_is_printed(capsys: pytest.CaptureFixture):
+    """Claim: `eval` prints every metric, and a dash for one without cases."""
+    from csac_jax.train import metrics
+
+    summary = {
+        "grasp_success": metrics.wilson(9, 10),
+        "completion": metrics.wilson(0, 0),
+        "outcomes": {"lifted": 9},
+        "counts": {"grasps": 10},
+    }
+    cli._print_summary(cli.EvalOptions(Path("x")), summary, 1.0)
+    shown = capsys.readouterr().out
+    assert "90.0 %" in shown
+    assert "lifted 9" in shown
+    assert "-" in next(line for line in shown.splitlines() if "completion" in line)

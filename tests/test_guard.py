@@ -1,0 +1,111 @@
+"""The run-time guard, in fresh processes: it acts before JAX starts."""
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from csac_jax import _guard
+
+# Ten free boxes and six hinges: 66 degrees of freedom, in contact, eight scenes at a time.
+BATCHED_STEPS = """
+import csac_jax.sim
+import jax, jax.numpy as jnp, mujoco
+from mujoco import mjx
+
+box = '<body pos="{} 0 0.019"><freejoint/><geom type="box" size=".02 .02 .02"/></body>'
+link = '<body pos="{} 1 1"><joint axis="0 1 0"/><geom type="sphere" size=".02" pos=".05 0 0"/></body>'
+boxes = "".join(box.format(0.1 * i) for i in range(10))
+links = "".join(link.format(0.1 * i) for i in range(6))
+model = mujoco.MjModel.from_xml_string(f'''<mujoco>
+  <option solver="Newton" iterations="4" ls_iterations="8" jacobian="dense"/>
+  <custom><numeric name="max_geom_pairs" data="4"/><numeric name="max_contact_points" data="16"/></custom>
+  <worldbody><geom type="plane" size="2 2 .1"/>{boxes}{links}</worldbody></mujoco>''')
+assert model.nv == 66, model.nv
+put, data = mjx.put_model(model), mjx.make_data(model)
+
+def scene(height):
+    first = data.replace(qpos=data.qpos.at[2].add(height))
+    return jax.lax.fori_loop(0, 300, lambda _, d: mjx.step(put, d), first).qpos
+
+qpos = jax.block_until_ready(jax.vmap(scene)(jnp.linspace(0.0, 0.01, 8)))
+assert bool(jnp.isfinite(qpos).all())
+print("stepped")
+"""
+
+
+ROOT = Path(_guard.__file__).parents[1]
+
+
+def _python(source: str, timeout: float = 60.0, **variables: str) -> subprocess.CompletedProcess:
+    """Runs `source` in a fresh Python, with no variable of the guard but `variables`."""
+    guarded = (*_guard.USER_VARIABLES, "XLA_FLAGS")
+    inherited = {name: value for name, value in os.environ.items() if name not in guarded}
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(source)],
+        env={**inherited, **variables},
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        cwd=ROOT,
+    )
+
+
+def test_batched_mjx_does_not_hang():
+    """Claim: with the package imported, batched MJX runs to its end on any number of cores."""
+    done = _python(BATCHED_STEPS, timeout=180.0)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "stepped\n"  # nor does MJX print about Warp
+
+
+def test_import_widens_the_pool_and_leaves_jax_alone():
+    """Claim: importing the package sets the pool's size without importing JAX."""
+    done = _python("import csac_jax, os, sys; print(os.environ['PJRT_NPROC'], 'jax' in sys.modules)")
+    threads, jax_imported = done.stdout.split()
+    assert int(threads) >= 8
+    assert jax_imported == "False"
+
+
+@pytest.mark.parametrize("name", ["PJRT_NPROC", "NPROC"])
+def test_user_setting_is_kept(name: str):
+    """Claim: what the user has set decides."""
+    source = (
+        "import csac_jax, os; from csac_jax import _guard; print(os.environ.get('PJRT_NPROC'), *_guard.pool_setting())"
+    )
+    done = _python(source, **{name: "3"})
+    assert done.stdout.split() == ["3" if name == "PJRT_NPROC" else "None", name, "3"]
+
+
+def test_rows_are_right():
+    """Claim: with the package imported, `vmap(sum(M @ row))` is right in every row."""
+    done = _python("from csac_jax.train import selftest; print(selftest.rows_error())")
+    assert float(done.stdout) < 1e-5, done.stderr
+
+
+def test_flags_of_the_user_are_kept():
+    """Claim: the user's XLA flags stay, and the guard's own is not repeated."""
+    source = "import csac_jax, os; print(os.environ['XLA_FLAGS'])"
+    done = _python(source, XLA_FLAGS="--xla_cpu_multi_thread_eigen=false")
+    assert done.stdout.split() == ["--xla_cpu_multi_thread_eigen=false", f"{_guard.FUSION_FLAG}="]
+    own = f"{_guard.FUSION_FLAG}=INDIVIDUAL_DOT"
+    assert _python(source, XLA_FLAGS=own).stdout.split() == [own]
+
+
+def test_unknown_jaxlib_gets_no_flag(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a jaxlib that may lack the flag is not given it: XLA ends the process on a flag it does not know."""
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.11.0")
+    _guard.switch_off_broken_fusion()
+    assert os.environ["XLA_FLAGS"] == ""
+
+
+def test_broken_jax_is_refused(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a JAX known to compute wrong numbers is an ImportError of one line with the remedy."""
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.10.2")
+    with pytest.raises(ImportError, match=r"0\.10\.2 computes wrong .* pip install") as caught:
+        _guard.refuse_broken_jax()
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,207 @@
+"""The import contract: who may import what, read off the sources.
+
+Imports point back along the data path: a module imports from its own stage and from those below it.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import csac_jax
+
+PACKAGE = Path(csac_jax.__file__).parent
+
+# Top first. Stages in one row do not import each other.
+ORDER = (
+    ("__main__",),
+    ("cli",),
+    ("show",),
+    ("train",),
+    ("env",),
+    ("replay", "agent"),
+    ("nets",),
+    ("vision",),
+    ("sim",),
+    ("scene",),
+    ("geometry",),
+    ("presets",),
+    ("config",),
+    ("__init__",),
+    ("_guard",),
+)
+RANK = {stage: rank for rank, row in enumerate(ORDER) for stage in row}
+
+# Module -> where it may be imported, as a stage or a file.
+ONLY_IN = {
+    "mujoco": ("scene", "sim", "show"),
+    "flax.linen": ("nets",),
+    "flax.nnx": (),
+    "optax": ("agent",),
+    "orbax": ("train/checkpoint.py",),
+    "tyro": ("cli.py",),
+    "rich": ("show", "cli.py"),
+}
+JIT_IN = ("train", "env.py")
+PURE = ("vision", "nets", "agent", "replay", "sim")  # no printing, no files
+NOT_PURE = ("sim/__init__.py",)  # passes on what MJX prints as it is imported
+
+
+def violations(root: Path) -> list[str]:
+    """Every breach of the contract under `root`, as `file:line: what`."""
+    files = sorted(path for path in root.rglob("*.py"))
+    return [
+        breach for path in files for breach in _file_violations(path.relative_to(root).as_posix(), path.read_text())
+    ]
+
+
+def _file_violations(name: str, source: str) -> Iterator[str]:
+    stage = name.split("/")[0].removesuffix(".py")
+    if stage not in RANK:
+        yield f"{name}:1: stage '{stage}' has no place in the order"
+        return
+    aliases = {}
+    for node in ast.walk(ast.parse(source)):
+        for module in _imported(node):
+            if fault := _import_fault(name, stage, module):
+                yield f"{name}:{node.lineno}: {fault}"
+        aliases |= _aliases(node)
+    for node in ast.walk(ast.parse(source)):
+        if fault := _use_fault(name, stage, node, aliases):
+            yield f"{name}:{node.lineno}: {fault}"
+
+
+def _imported(node: ast.AST) -> list[str]:
+    """Full names of what an import statement brings in; for `from a import b` both `a` and `a.b`."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if isinstance(node, ast.ImportFrom):
+        if node.level:
+            return ["." * node.level]
+        return [f"{node.module}.{alias.name}" for alias in node.names]
+    return []
+
+
+def _aliases(node: ast.AST) -> dict[str, str]:
+    """Local name -> full name, of an import statement."""
+    if isinstance(node, ast.Import):
+        return {alias.asname: alias.name for alias in node.names if alias.asname}
+    if isinstance(node, ast.ImportFrom) and node.module:
+        return {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    return {}
+
+
+def _within(module: str, parent: str) -> bool:
+    return module == parent or module.startswith(parent + ".")
+
+
+def _allowed(name: str, stage: str, places: tuple[str, ...]) -> bool:
+    return stage in places or name in places
+
+
+def _import_fault(name: str, stage: str, module: str) -> str | None:
+    if module.startswith("."):
+        return "relative import"
+    for parent, places in ONLY_IN.items():
+        if _within(module, parent) and not _allowed(name, stage, places):
+            return f"{parent} is imported"
+    if _within(module, "pathlib") and _is_pure(name, stage):
+        return "pathlib is imported"
+    if not _within(module, "csac_jax") or module.count(".") == 0:
+        return None
+    other = module.split(".")[1]
+    if other not in RANK:  # a name of the package itself, such as csac_jax.__version__
+        return None
+    if other != stage and RANK[other] <= RANK[stage]:
+        return f"{other} is imported, which does not lie below {stage}"
+    return None
+
+
+def _is_pure(name: str, stage: str) -> bool:
+    return stage in PURE and name not in NOT_PURE
+
+
+def _full_name(node: ast.AST, aliases: dict[str, str]) -> str:
+    """`jax.jit` of such an expression, through the file's aliases; empty for anything else."""
+    if isinstance(node, ast.Name):
+        return aliases.get(node.id, node.id)
+    if isinstance(node, ast.Attribute):
+        return f"{_full_name(node.value, aliases)}.{node.attr}"
+    return ""
+
+
+def _use_fault(name: str, stage: str, node: ast.AST, aliases: dict[str, str]) -> str | None:
+    full = _full_name(node, aliases) if isinstance(node, ast.Name | ast.Attribute) else ""
+    if full in ("jax.jit", "jax.pmap") and not _allowed(name, stage, JIT_IN):
+        return f"{full} is used"
+    if full == "flax.linen" and not _allowed(name, stage, ONLY_IN["flax.linen"]):
+        return "flax.linen is used"
+    if full in ("print", "open", "jax.debug.print", "jax.debug.callback") and _is_pure(name, stage):
+        return f"{full} is used"
+    return None
+
+
+def test_package_keeps_the_contract():
+    """Claim: imports point back along the data path, and each library is used in its stage only."""
+    assert violations(PACKAGE) == []
+
+
+def test_checker_reads_the_package():
+    """Claim: the test above looks at every source file."""
+    assert {"cli.py", "train/loop.py", "env.py", "config.py"} <= {
+        path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py")
+    }
+
+
+@pytest.mark.parametrize(
+    ("file", "source", "fault"),
+    [
+        ("vision/a.py", "from csac_jax.train import loop", "train is imported"),
+        ("vision/a.py", "def f():\n    import csac_jax.env", "env is imported"),
+        ("agent/a.py", "from csac_jax import replay", "replay is imported"),
+        ("replay/a.py", "from csac_jax.agent.cem import maximise", "agent is imported"),
+        ("config.py", "from csac_jax import geometry", "geometry is imported"),
+        ("train/a.py", "from csac_jax.show import progress", "show is imported"),
+        ("train/a.py", "from . import loop", "relative import"),
+        ("agent/a.py", "from mujoco import mjx", "mujoco is imported"),
+        ("train/a.py", "import mujoco.mjx as m", "mujoco is imported"),
+        ("agent/a.py", "from flax import linen as nn", "flax.linen is imported"),
+        ("agent/a.py", "import flax\nx = flax.linen.Dense", "flax.linen is used"),
+        ("train/a.py", "import optax", "optax is imported"),
+        ("train/loop.py", "import orbax.checkpoint as ocp", "orbax is imported"),
+        ("agent/a.py", "import jax\n@jax.jit\ndef f(x): return x", "jax.jit is used"),
+        ("scene/a.py", "from jax import jit\nf = jit(abs)", "jax.jit is used"),
+        ("scene/a.py", "import jax as j\nf = j.jit(abs)", "jax.jit is used"),
+        ("sim/a.py", "print(1)", "print is used"),
+        ("nets/a.py", "import jax\njax.debug.print('x')", "jax.debug.print is used"),
+        ("replay/a.py", "open('x')", "open is used"),
+        ("vision/a.py", "from pathlib import Path", "pathlib is imported"),
+        ("extra/a.py", "", "stage 'extra' has no place"),
+    ],
+)
+def test_checker_sees_a_breach(tmp_path: Path, file: str, source: str, fault: str):
+    """Claim: each rule of the contract can fail."""
+    path = tmp_path / file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(source)
+    found = violations(tmp_path)
+    assert len(found) == 1, found
+    assert fault in found[0]
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("agent/a.py", "from flax import struct\nimport optax\nfrom csac_jax.nets import dense"),
+        ("train/checkpoint.py", "import orbax.checkpoint as ocp\nimport jax\nf = jax.jit(abs)"),
+        ("env.py", "from csac_jax import geometry\nfrom csac_jax.sim import mjx_physics\nimport csac_jax.config"),
+        ("scene/a.py", "import mujoco\nfrom pathlib import Path\nprint(Path('x'))"),
+    ],
+)
+def test_checker_lets_the_rest_pass(tmp_path: Path, file: str, source: str):
+    """Claim: the checker forbids no more than the contract."""
+    path = tmp_path / file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(source)
+    assert violations(tmp_path) == []

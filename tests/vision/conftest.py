@@ -1,0 +1,98 @@
+"""One scene in two forms: a MuJoCo model, which is the reference, and the half-spaces that the raycaster takes."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from csac_jax.vision import raycast
+
+_OCTAGON = [(np.cos(a), np.sin(a)) for a in np.pi / 4 * (np.arange(8) + 0.5)]
+_MESHES = {
+    "prism": [(x, y, z) for x, z in ((-0.0467, -0.0243), (0.0467, -0.0243), (0.0, 0.0243)) for y in (-0.025, 0.025)],
+    "octagon": [(0.0242 * x, 0.0242 * y, z) for x, y in _OCTAGON for z in (-0.025, 0.025)],
+}
+_GEOMS = (  # attributes, position, rotation vector in degrees
+    ('type="box" size="0.05 0.025 0.025"', "0.02 0.01 0.025", "0 0 30"),
+    ('type="box" size="0.025 0.025 0.025"', "0.03 0.015 0.085", "20 35 10"),
+    ('type="mesh" mesh="prism"', "-0.08 0.05 0.0243", "0 0 -50"),
+    ('type="mesh" mesh="prism"', "-0.06 -0.09 0.05", "70 20 15"),
+    ('type="mesh" mesh="octagon"', "0.11 -0.07 0.025", "0 0 12"),
+    ('type="mesh" mesh="octagon"', "-0.14 -0.02 0.04", "80 10 40"),
+)
+_FACES = 10
+
+
+class Reference(NamedTuple):
+    """The same scene for C MuJoCo (geom 0 is the table) and for the raycaster (geom i is MuJoCo's i + 1)."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    polytopes: raycast.Polytopes
+
+    def ray(self, origin: np.ndarray, direction: np.ndarray) -> tuple[float, int, np.ndarray]:
+        """Distance, geom (-2 for a miss) and normal of one ray, from C MuJoCo."""
+        geom, normal = np.zeros((1, 1), np.int32), np.zeros((3, 1))
+        start, along = origin[:, None], direction[:, None]
+        distance = mujoco.mj_ray(self.model, self.data, start, along, None, 1, -1, geom, normal)
+        return distance, int(geom[0, 0]) - 1, normal[:, 0]
+
+    def rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances [R], geoms [R] and normals [R, 3] of many rays."""
+        distance, geom, normal = zip(*map(self.ray, origins, directions), strict=True)
+        return np.array(distance), np.array(geom), np.array(normal)
+
+    def near_edge(self, origins: np.ndarray, directions: np.ndarray, shift: float) -> np.ndarray:
+        """[R] True where a ray that runs `shift` m beside this one meets another face or nothing."""
+        _, geom, normal = self.rays(origins, directions)
+        helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        side = np.cross(directions, helper)
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        edge = np.zeros(len(origins), bool)
+        for step in (side, -side, np.cross(directions, side), -np.cross(directions, side)):
+            _, other_geom, other_normal = self.rays(origins + shift * step, directions)
+            edge |= (other_geom != geom) | (np.abs(other_normal - normal).max(1) > 0.01)  # both 0 for a miss
+        return edge
+
+
+def _half_spaces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Normals [F, 3] and offsets [F] of one geom in its own frame, from the convex hull of its corners."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        corners = model.geom_size[geom] * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
+    else:
+        mesh = model.geom_dataid[geom]
+        start = model.mesh_vertadr[mesh]
+        corners = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+    equations = ConvexHull(corners).equations
+    _, kept = np.unique(equations.round(4), axis=0, return_index=True)  # the hull is triangulated
+    return equations[kept, :3], -equations[kept, 3]
+
+
+@pytest.fixture(scope="session")
+def reference() -> Reference:
+    """Two boxes, two triangular and two octagonal prisms, standing, lying and tilted, on the table."""
+    meshes = "".join(
+        f'<mesh name="{name}" vertex="{" ".join(str(v) for p in points for v in p)}"/>'
+        for name, points in _MESHES.items()
+    )
+    geoms = "".join(f'<geom {kind} pos="{pos}" euler="{euler}"/>' for kind, pos, euler in _GEOMS)
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><asset>{meshes}</asset><worldbody><geom type="plane" size="0 0 1"/>{geoms}</worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    normal, offset = np.zeros((len(_GEOMS), _FACES, 3)), np.ones((len(_GEOMS), _FACES))
+    for geom in range(len(_GEOMS)):
+        faces, offsets = _half_spaces(model, geom + 1)
+        normal[geom, : len(faces)], offset[geom, : len(faces)] = faces, offsets
+    polytopes = raycast.Polytopes(
+        normal=jnp.asarray(normal, jnp.float32),
+        offset=jnp.asarray(offset, jnp.float32),
+        position=jnp.asarray(data.geom_xpos[1:], jnp.float32),
+        rotation=jnp.asarray(data.geom_xmat[1:].reshape(-1, 3, 3), jnp.float32),
+        colour=jnp.asarray(np.random.default_rng(0).uniform(size=(len(_GEOMS), 3)), jnp.float32),
+    )
+    return Reference(model, data, polytopes)

@@ -1,0 +1,110 @@
+"""The top view against C MuJoCo, its packed form, and areas against hand counts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from csac_jax import geometry
+from csac_jax.config import HeightmapConfig
+from csac_jax.vision import heightmap, raycast
+
+_TABLE = np.array([0.5, 0.4, 0.3], np.float32)
+
+
+def test_heights_agree_with_mujoco(reference):
+    """Claim: height and block of every cell, but those within 0.1 mm of an edge, are C MuJoCo's to 0.1 mm."""
+    cfg = HeightmapConfig(64)
+    obs = heightmap.orthographic(cfg, reference.polytopes, jnp.asarray(_TABLE))
+    origin = np.asarray(geometry.cell_centres(cfg), np.float64).reshape(-1, 2)
+    origin = np.concatenate([origin, np.full((len(origin), 1), 0.5)], axis=1)
+    down = np.tile([0.0, 0.0, -1.0], (len(origin), 1))
+    distance, geom, normal = reference.rays(origin, down)
+    clear = ~reference.near_edge(origin, down, shift=1e-4)
+    assert clear.mean() > 0.98
+    assert set(geom[clear]) == {-1, 0, 1, 2, 3, 4, 5}
+    height = np.asarray(obs.height).reshape(-1)
+    np.testing.assert_allclose(height[clear], 0.5 - distance[clear], rtol=0, atol=1e-4)
+    assert np.all(height[clear & (geom == raycast.TABLE)] == 0.0)
+    albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[geom]  # -1 is the last row
+    brightness = 0.4 + 0.6 * np.maximum(normal @ heightmap._LIGHT, 0.0)
+    colour = np.asarray(obs.colour).reshape(-1, 3)
+    np.testing.assert_allclose(colour[clear], (albedo * brightness[:, None])[clear], atol=1e-3)
+    assert obs.height.dtype == obs.colour.dtype == jnp.float32
+    assert obs.target.dtype == jnp.bool_
+
+
+def test_target_mask_shows_the_target(reference):
+    """Claim: the target mask is all ones if there is no target, and else True just where the target is seen."""
+    cfg = HeightmapConfig(64)
+    look = jax.jit(lambda geom: heightmap.orthographic(cfg, reference.polytopes, jnp.asarray(_TABLE), geom))
+    clearing = heightmap.orthographic(cfg, reference.polytopes, jnp.asarray(_TABLE))
+    assert np.all(clearing.target)
+    assert np.all(look(jnp.array(-1, jnp.int32)).target)
+    masks = np.stack([look(jnp.array(g, jnp.int32)).target for g in range(6)])
+    assert np.all(masks.sum((1, 2)) > 10)
+    np.testing.assert_array_equal(masks.sum(0), np.asarray(clearing.height) > 0.0)  # each raised cell is one block's
+    row, col = np.argwhere(masks[4]).mean(0)  # the octagon that stands at x = 0.11, y = -0.07
+    np.testing.assert_allclose(geometry.from_pixel(cfg, jnp.array([row, col])), [0.11, -0.07], atol=0.003)
+
+
+def test_blocks_above_the_view_are_not_seen(reference):
+    """Claim: what is parked above VIEW_HEIGHT leaves no trace."""
+    parked = reference.polytopes.replace(position=reference.polytopes.position + jnp.array([[0.0, 0.0, 0.6]]))
+    obs = heightmap.orthographic(HeightmapConfig(64), parked, jnp.asarray(_TABLE))
+    assert np.all(np.asarray(obs.height) == 0.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_packing_rounds(seed):
+    """Claim: packing changes a height by at most 0.05 mm, a colour by half a level; packing again, nothing."""
+    rng = np.random.default_rng(seed)
+    obs = heightmap.Observation(
+        colour=jnp.asarray(rng.uniform(size=(8, 8, 3)), jnp.float32),
+        height=jnp.asarray(rng.uniform(0.0, 0.5, (8, 8)), jnp.float32),
+        target=jnp.asarray(rng.uniform(size=(8, 8)) < 0.5),
+    )
+    packed = heightmap.pack(obs)
+    assert (packed.colour.dtype, packed.height.dtype, packed.target.dtype) == (jnp.uint8, jnp.uint16, jnp.bool_)
+    back = heightmap.unpack(packed)
+    np.testing.assert_allclose(back.height, obs.height, rtol=0, atol=0.05e-3 + 1e-7)
+    np.testing.assert_allclose(back.colour, obs.colour, rtol=0, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_array_equal(back.target, obs.target)
+    for again, once in zip(jax.tree.leaves(heightmap.pack(back)), jax.tree.leaves(packed), strict=True):
+        np.testing.assert_array_equal(again, once)
+
+
+def test_packing_cuts_off():
+    """Claim: values beyond the packed range are cut off, not wrapped round."""
+    obs = heightmap.Observation(
+        colour=jnp.array([[[-0.1, 1.2, 1.0]]]), height=jnp.array([[-0.01, 7.0]]), target=jnp.ones((1, 2), bool)
+    )
+    packed = heightmap.pack(obs)
+    np.testing.assert_array_equal(packed.height, [[0, 65535]])
+    np.testing.assert_array_equal(packed.colour, [[[0, 255, 255]]])
+
+
+@pytest.mark.parametrize("size", [64, 224])
+def test_areas_survive_another_resolution(size):
+    """Claim: a block 6 cm square that moves by its own length occupies 36 cm^2 and moves 72 cm^2 at any resolution."""
+    cfg = HeightmapConfig(size)
+    x, y = np.moveaxis(np.asarray(geometry.cell_centres(cfg)), -1, 0)
+    before = jnp.asarray(np.where((np.abs(x) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32)
+    after = jnp.asarray(np.where((np.abs(x - 0.06) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32)
+    edge = 4 * 6 * cfg.cell * 100 / 2  # half a cell along the outline, cm^2
+    assert abs(float(heightmap.occupied_area(cfg, before)) - 36.0) <= edge
+    assert abs(float(heightmap.moved_area(cfg, before, after)) - 72.0) <= 2 * edge
+
+
+def test_area_bounds():
+    """Claim: changes count from 1 cm to 30 cm either way, and cells are occupied above 2 cm."""
+    cfg = HeightmapConfig(16)
+    change = np.zeros((16, 16), np.float32)
+    change[0, :6] = [0.009, 0.011, -0.011, 0.299, 0.301, -0.301]
+    area = heightmap.moved_area(cfg, jnp.full((16, 16), 0.4), jnp.asarray(0.4 + change))
+    np.testing.assert_allclose(area, 3 * 2.8**2, rtol=1e-5)
+    height = np.zeros((16, 16), np.float32)
+    height[0, :3] = [0.019, 0.021, 0.05]
+    np.testing.assert_allclose(heightmap.occupied_area(cfg, jnp.asarray(height)), 2 * 2.8**2, rtol=1e-5)
