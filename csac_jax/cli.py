@@ -292,8 +292,7 @@ def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Sto
         if options.tensorboard:
             from csac_jax.show.tensorboard import TensorBoard
 
-            first = checkpoint.latest_step(run_dir) if options.resume else None
-            reporters.append(TensorBoard(run_dir, (first or 0) * cfg.train.scenes))
+            reporters.append(TensorBoard(run_dir))
         try:
             return loop.run(
                 cfg,

@@ -124,9 +124,9 @@ class NetConfig:
 
     rotations: int = 16
     """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
-    growth: int = 16
+    growth: int = 24
     """Channels that each dense layer adds."""
-    dilations: tuple[int, ...] = (1, 2, 4)
+    dilations: tuple[int, ...] = (1, 2, 4, 1)
     """Dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
     stem: int = 16
     """Channels of the first convolution."""
@@ -261,6 +261,8 @@ class LearnConfig:
     """Adam's step size, critic (ours; CSAC and VPG 1e-4 on a pretrained DenseNet-121)."""
     actor_learning_rate: float = 3e-4
     """Adam's step size, actor head (ours)."""
+    rate_end: float = 0.05
+    """Both step sizes fall linearly to this share of themselves over the run (ours)."""
     batch: int = 32
     """B, transitions per update (N of Algorithm 1)."""
     updates: int = 2
@@ -277,6 +279,7 @@ class LearnConfig:
     def __post_init__(self) -> None:
         _require(self.learning_rate > 0.0, "learn.learning_rate: must be positive")
         _require(self.actor_learning_rate > 0.0, "learn.actor_learning_rate: must be positive")
+        _require(0.0 < self.rate_end <= 1.0, "learn.rate_end: must lie in 0 < rate_end <= 1")
         _require(self.batch >= 1 and self.updates >= 1, "learn.batch and learn.updates: at least 1")
         _require(0.0 < self.tau <= 1.0, "learn.tau: must lie in 0 < tau <= 1")
         _require(self.gradient_clip > 0.0 and self.huber > 0.0, "learn.gradient_clip, learn.huber: must be positive")
@@ -309,7 +312,7 @@ class TrainConfig:
 
     scenes: int = 8
     """E, scenes simulated side by side; each takes one action per training step."""
-    actions: int = 3200
+    actions: int = 2800
     """Actions of the whole run over all scenes."""
     warmup: int = 64
     """Actions before the first update."""

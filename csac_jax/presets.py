@@ -18,8 +18,12 @@ from csac_jax.config import (
 
 
 def quick() -> Config:
-    """Learns to clear five blocks on a 2-core CPU."""
-    return Config(preset="quick", target=TargetConfig(gamma=0.2))
+    """Learns to clear five blocks on a 2-core CPU; what was measured is in experiments/results.
+
+    Away from the literature's defaults where that learned better in as many actions: a small discount, and a Beta law
+    that ends at (1, 4), since (1, 12) replays little but noise late in so short a run.
+    """
+    return Config(preset="quick", target=TargetConfig(gamma=0.2), replay=ReplayConfig(beta_end=(1.0, 4.0)))
 
 
 def smoke() -> Config:

@@ -3,7 +3,6 @@
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import Config
 from csac_jax.train import loop
 
 
@@ -12,11 +11,6 @@ def test_preset_knows_its_name(name: str):
     """Claim: a run's config names the preset it was made from."""
     assert presets.get(name).preset == name
     assert presets.PRESETS[name]().preset == name
-
-
-def test_quick_is_the_defaults():
-    """Claim: `quick` is the defaults of every setting."""
-    assert presets.quick() == Config()
 
 
 @pytest.mark.parametrize("name", list(presets.PRESETS))

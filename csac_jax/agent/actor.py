@@ -39,7 +39,6 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
 
     step = 2.0 * np.pi / num
     yaws = jnp.asarray(frames.yaws)[k] + step * np.array([-1, 0, 1], np.float32)
-    here = jax.lax.stop_gradient(xy)
-    read = jax.vmap(lambda yaw: maps.read(frames, state.logits, jnp.int32(primitive), jnp.append(here, yaw)))
+    read = jax.vmap(lambda yaw: maps.read(frames, state.logits, jnp.int32(primitive), jnp.append(xy, yaw)))
     turn = jnp.sum(jax.nn.softmax(read(geometry.wrap_angle(yaws))) * np.array([-step, 0.0, step], np.float32))
     return jnp.append(xy, geometry.wrap_angle(jnp.asarray(frames.yaws)[k] + turn))

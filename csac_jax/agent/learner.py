@@ -76,14 +76,16 @@ def make(cfg: Config) -> Learner:
         maps.frames(cfg),
         dense.Critic(cfg.net),
         dense.Head(cfg.net),
-        _optimiser(cfg, cfg.learn.learning_rate),
-        _optimiser(cfg, cfg.learn.actor_learning_rate),
+        _optimiser(cfg, cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates),
+        _optimiser(cfg, cfg.learn.actor_learning_rate, cfg.train.steps),
         rewards.bounds(cfg.reward, cfg.target.gamma),
     )
 
 
-def _optimiser(cfg: Config, rate: float) -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(cfg.learn.gradient_clip), optax.adam(rate))
+def _optimiser(cfg: Config, rate: float, updates: int) -> optax.GradientTransformation:
+    """Adam on clipped gradients, its step size falling linearly over the run's `updates`."""
+    schedule = optax.linear_schedule(rate, rate * cfg.learn.rate_end, updates)
+    return optax.chain(optax.clip_by_global_norm(cfg.learn.gradient_clip), optax.adam(schedule))
 
 
 def init(key: jax.Array, learner: Learner) -> LearnerState:
@@ -161,7 +163,7 @@ def _value(learner: Learner, critic_params: Any, obs: Observation, action: Actio
     num = frames.yaws.shape[0]
     turns = action.pose[:, 2] * (num / (2.0 * np.pi))
     lower = jnp.floor(turns)
-    k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([0, 1], np.int32), num)  # [B, 2]
+    k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
     fed = dense.inputs(obs.colour, obs.height)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(frames.tables, fed, half)

@@ -30,7 +30,7 @@ def greedy(key: jax.Array, cfg: CEMConfig, frames: Frames, state: DenseMaps, pen
         def score(u: jax.Array) -> jax.Array:
             pose = maps.denormalise(frames, u)
             value = maps.read(frames, state.q, jnp.int32(primitive), pose)
-            return value - penalty * ~maps.is_valid(frames, state.valid, jnp.int32(primitive), pose)
+            return jnp.where(maps.is_valid(frames, state.valid, jnp.int32(primitive), pose), value, value - penalty)
 
         mean = maps.normalise(frames, actor.pose(frames, state, primitive))
         cells = maps.best_cells(state.q[primitive], state.valid[primitive], cfg.elites)

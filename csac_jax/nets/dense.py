@@ -24,7 +24,7 @@ def inputs(colour: jax.Array, height: jax.Array) -> jax.Array:
 
     Bare table is 0, like what lies outside of a turned map.
     """
-    seen = (colour - 0.5) * (height[..., None] > 0.002)
+    seen = jnp.where(height[..., None] > 0.002, colour - 0.5, 0.0)
     return jnp.concatenate([seen, height[..., None] / _HEIGHT_SCALE], axis=-1)
 
 

@@ -11,15 +11,17 @@ from csac_jax.train.loop import Record
 class TensorBoard:
     """Reporter that writes each number of a record as a scalar over actions, into RUN/tensorboard."""
 
-    def __init__(self, run_dir: Path, first_action: int = 0) -> None:
-        # Points of a part of the run that was lost with a killed process are dropped.
-        self._writer = SummaryWriter(str(run_dir / "tensorboard"), purge_step=first_action)
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._writer: SummaryWriter | None = None  # made with the first record: a new run makes its folder itself
 
     def say(self, text: str) -> None:
         """Events are not written."""
 
     def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        """Writes one point per number."""
+        """Writes one point per number. What a killed process wrote from here on is marked as void."""
+        if self._writer is None:
+            self._writer = SummaryWriter(str(self._run_dir / "tensorboard"), purge_step=record.actions)
         for name, value in dataclasses.asdict(record).items():
             group = (
                 {f"outcomes/{key}": count for key, count in value.items()} if isinstance(value, dict) else {name: value}

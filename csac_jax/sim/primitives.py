@@ -41,7 +41,7 @@ class Plan:
 
 def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: float) -> jax.Array:
     """Highest surface [] m in a square window of `side` m about `xy` [2] m of the height map [H, W] m."""
-    distance = jnp.max(jnp.abs(geometry.cell_centres(cfg) - xy), axis=-1)
+    distance = jnp.max(jnp.abs(geometry.cell_centres(cfg) - xy[None, None]), axis=-1)
     return jnp.max(jnp.where(distance <= 0.5 * max(side, cfg.cell), height, 0.0))
 
 

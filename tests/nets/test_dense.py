@@ -67,7 +67,7 @@ def test_net_is_numpys(params):
 
 
 def test_maps_follow_the_picture(params):
-    """Claim: a picture moved by whole cells of the maps, far from the edges, moves its maps with it and changes no value.
+    """Claim: a picture moved by whole cells of the maps, far from the edges, moves its maps with it.
 
     Group norm looks at the whole map: this holds since bare table is 0 and moving the picture changes no mean. The
     nearest 8 cells to the edges see them and are left out.

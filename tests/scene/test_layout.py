@@ -34,7 +34,7 @@ def _rotations(scene: Scene) -> Rotation:
 
 
 def test_park_touches_only_what_leaves(scene: Scene):
-    """Claim: park puts what is not kept at rest at its place, never brings a block back, and leaves the others as is."""
+    """Claim: park parks what is not kept, at rest, never brings a block back, and leaves the others as they are."""
     again = layout.park(scene, jnp.ones(N, bool).at[0].set(False))
     np.testing.assert_array_equal(again.in_play, [False, False, True, False, True])
     out = np.array([0, 1, 3])
@@ -72,7 +72,8 @@ def test_parking_is_out_of_reach_and_out_of_view():
     """Claim: parked blocks of any size are apart from one another, beside the square and wholly above the camera."""
     place, radius = layout.parking(10), np.linalg.norm([0.05, 0.025, 0.025])
     assert np.linalg.norm(place[:, None] - place[None], axis=-1)[~np.eye(10, dtype=bool)].min() > 2 * radius
-    assert place[:, 0].min() > 0.5 and place[:, 2].min() - radius > VIEW_HEIGHT
+    assert place[:, 0].min() > 0.5
+    assert place[:, 2].min() - radius > VIEW_HEIGHT
 
 
 def test_inside_is_the_square():

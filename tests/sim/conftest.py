@@ -64,7 +64,7 @@ CASES: dict[str, tuple[Scene, Action]] = {
 
 
 class Run(NamedTuple):
-    """What a batch of primitives started from and came to, NumPy leaves [E, ...]: CASES in order, then settled scenes."""
+    """What a batch of primitives started from and came to, leaves [E, ...]: CASES in order, then settled scenes."""
 
     scene: Scene
     height: np.ndarray
@@ -86,9 +86,9 @@ class Run(NamedTuple):
 
 
 def _noisy(actions: Action) -> Action:
-    """Grasps of the oracle, every other one beside its place and turned, so that outcomes differ."""
-    noise = np.random.default_rng(0).normal(size=(SETTLED, 3)) * [0.015, 0.015, 0.4]
-    noise[::2] = 0.0
+    """Grasps of the oracle, one in four beside its place and turned, so that outcomes differ."""
+    noise = np.random.default_rng(0).normal(size=(SETTLED, 3)) * [0.03, 0.03, 0.5]
+    noise[np.arange(SETTLED) % 4 > 0] = 0.0
     return actions.replace(pose=np.asarray(actions.pose) + noise.astype(np.float32))
 
 
@@ -136,7 +136,7 @@ def grasped(executed: Run) -> Run:
 
 
 def in_c(world: model.World, closed_at: int, run: Run) -> tuple[np.ndarray, Trace]:
-    """Ends [N, 3] m and trace of one primitive in C MuJoCo, by the plan of `run`; `closed_at`, substep of `gap_closed`."""
+    """Ends [N, 3] m and trace of one primitive in C MuJoCo, by the plan of `run`; `closed_at`: when the hand closed."""
     scene, slots = run.scene, model.box_slots(world)
     fields = jax.tree.map(np.asarray, model.box_fields(jnp.asarray(scene.half_size[slots])))
     exact = model.with_boxes(world, fields)

@@ -33,7 +33,8 @@ def _plan(primitive: Primitive, height: jnp.ndarray, x: float = 0.0, y: float = 
 def test_both_primitives_take_as_many_substeps(primitive: Primitive):
     """Claim: push and grasp have the same length, that of the config, so that both run in one scan."""
     plan = _plan(primitive, _height())
-    assert plan.control.shape == (SIM.substeps, 5) and plan.start.shape == (5,)
+    assert plan.control.shape == (SIM.substeps, 5)
+    assert plan.start.shape == (5,)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +50,7 @@ def test_both_primitives_take_as_many_substeps(primitive: Primitive):
     ],
 )
 def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
-    """Claim: tips go to grasp_depth or push_depth below the local top, never below the clearance, from `approach` up."""
+    """Claim: tips go to grasp_depth or push_depth below the local top, never below the clearance."""
     plan = _plan(primitive, _height((0.0, 0.0, 0.05, top)), yaw=0.3)
     z = np.asarray(plan.control[:, Z])
     assert plan.surface == pytest.approx(top)
@@ -60,7 +61,7 @@ def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_descent_and_lift(primitive: Primitive):
-    """Claim: the descent is uniform, the tips stay low while the primitive acts, and the lift starts and ends gently."""
+    """Claim: the descent is uniform, the tips stay low while the primitive acts, the lift starts and ends gently."""
     phases = SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases
     plan = _plan(primitive, _height())
     z, high, low = np.asarray(plan.control[:, Z]), float(plan.start[Z]), SIM.clearance
@@ -78,8 +79,10 @@ def test_grasp_closes_in_place():
     down, close, _ = SIM.grasp_phases
     fingers = np.asarray(plan.control[:, FINGERS])
     np.testing.assert_allclose(fingers[:down], 0.5 * MAX_OPENING)
-    assert (np.diff(fingers) <= 0.0).all() and fingers[down + close - 1] == 0.0
-    np.testing.assert_allclose(plan.start, plan.control[0] * [1, 1, 0, 1, 1] + [0, 0, plan.start[Z], 0, 0], atol=1e-6)
+    assert (np.diff(fingers) <= 0.0).all()
+    assert fingers[down + close - 1] == 0.0
+    kept = np.array([X, Y, YAW, FINGERS])
+    np.testing.assert_allclose(plan.start[kept], plan.control[0, kept], atol=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, 3.5, 5.5])
@@ -103,7 +106,7 @@ def test_push_ends_in_the_workspace(yaw: float, end: tuple[float, float]):
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_starts_above_whatever_is_under_the_hand(primitive: Primitive):
-    """Claim: the hand starts a centimetre above the highest thing within its reach, and ignores what stands farther off."""
+    """Claim: the hand starts a centimetre above the highest thing within its reach, whatever stands farther off."""
     near, far = (_plan(primitive, _height((x, 0.0, 0.04, 0.2))) for x in (0.09, 0.13))
     assert near.start[Z] == pytest.approx(0.21, abs=1e-6)
     assert far.start[Z] == pytest.approx(0.112, abs=1e-6)

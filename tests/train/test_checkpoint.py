@@ -114,7 +114,7 @@ def test_last_two_are_kept(run_dir: Path):
 
 def test_temporary_folders_are_removed(run_dir: Path):
     """Claim: what a killed save left behind is no step, and the next save removes it."""
-    left = run_dir / "checkpoints" / "12.orbax-checkpoint-tmp"
+    left = run_dir / "checkpoints" / "10.orbax-checkpoint-tmp"
     left.mkdir()
     assert checkpoint.latest_step(run_dir) == 8
     assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(8))

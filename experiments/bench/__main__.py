@@ -1,0 +1,92 @@
+"""Speed of this machine, as JSON: `python -m experiments.bench [PRESET]`, PRESET smoke or quick (default).
+
+The training step is timed beside a bare `mjx.step` loop of the same model and number of scenes in the same process, and
+each part is the median of several calls; machines are noisy, so trust ratios.
+"""
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from csac_jax import presets
+from csac_jax.agent import learner as learning
+from csac_jax.sim.primitives import Action
+from csac_jax.train import provenance, step
+
+REPEATS = 5
+
+
+def _median_seconds(call: Callable[[], Any]) -> float:
+    jax.block_until_ready(call())
+    seconds = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - begun)
+    return statistics.median(seconds)
+
+
+def _bare_loop(program: step.Program, scenes: int) -> Callable[[], Any]:
+    """As many plain `mjx.step`s as one primitive has, from the model's initial state."""
+    physics, substeps = program.env.physics, program.cfg.sim.substeps
+    data = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * scenes), physics.data)
+
+    def loop(data: mjx.Data) -> mjx.Data:
+        advance = jax.vmap(lambda one: mjx.step(physics.model, one))
+        return jax.lax.fori_loop(0, substeps, lambda _, data: advance(data), data).qpos
+
+    compiled = jax.jit(loop)
+    return lambda: compiled(data)
+
+
+def measure(preset: str) -> dict[str, Any]:
+    """Timings of one preset, s and actions/s."""
+    cfg = presets.get(preset)
+    program = step.make(cfg)
+    scenes, learner = cfg.train.scenes, program.learner
+    begun = time.perf_counter()
+    chunk = step.compile_chunk(program, 1).lower(step.init(program)).compile()
+    compile_seconds = time.perf_counter() - begun
+    state = step.init(program)
+
+    actions = Action(primitive=jnp.ones(scenes, jnp.int32), pose=jnp.zeros((scenes, 3)))
+    simulate = jax.jit(jax.vmap(program.env.step))
+    look = jax.jit(lambda params, obs: learning.look(learner, params, obs))
+    parts = {
+        "simulate": _median_seconds(lambda: simulate(state.scenes, actions)),
+        "look": _median_seconds(lambda: look(state.learner.online, state.scenes.obs)),
+        "bare_mjx_loop": _median_seconds(_bare_loop(program, scenes)),
+    }
+
+    def train() -> Any:
+        nonlocal state
+        state, metrics = chunk(state)
+        return metrics
+
+    parts["train_step"] = _median_seconds(train)
+    return {
+        "preset": preset,
+        "scenes": scenes,
+        "substeps": cfg.sim.substeps,
+        "compile_seconds": compile_seconds,
+        "median_seconds": parts,
+        "actions_per_second": scenes / parts["train_step"],
+        "physics_share": parts["simulate"] / parts["train_step"],
+        "simulate_over_bare_loop": parts["bare_mjx_loop"] / parts["simulate"],
+    }
+
+
+def main() -> None:
+    preset = sys.argv[1] if len(sys.argv) > 1 else "quick"
+    print(json.dumps(measure(preset) | provenance.record(), indent=2))
+
+
+if __name__ == "__main__":
+    main()

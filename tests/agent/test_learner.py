@@ -1,0 +1,239 @@
+"""Updates of critic and actor, by what they report and change."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from csac_jax.agent import actor, learner as learning, maps
+from csac_jax.agent.learner import Learner, LearnerState, Params, Transition
+from csac_jax.agent.maps import DenseMaps
+from csac_jax.config import TargetConfig
+from csac_jax.nets import dense
+from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.vision import heightmap
+
+pytestmark = pytest.mark.optax
+B = 6
+
+
+@pytest.fixture(scope="module")
+def state(learner, randomised) -> LearnerState:
+    """Random online networks, and others as targets."""
+    with jax.numpy_dtype_promotion("standard"):
+        return randomised(jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)))
+
+
+@pytest.fixture(scope="module")
+def batch(observations) -> Transition:
+    """B transitions: actions of both primitives anywhere in the workspace and at yaws all round; none terminated."""
+    rng = np.random.default_rng(5)
+    pose = np.concatenate([rng.uniform(-0.2, 0.2, (B, 2)), rng.uniform(0.0, 2.0 * np.pi, (B, 1))], axis=1)
+    return Transition(
+        obs=heightmap.pack(observations(B, 1)),
+        action=Action(primitive=jnp.arange(B, dtype=jnp.int32) % 2, pose=jnp.asarray(pose, jnp.float32)),
+        reward=jnp.asarray(rng.uniform(-1.0, 2.0, B), jnp.float32),
+        next_obs=heightmap.pack(observations(B, 2)),
+        terminated=jnp.zeros(B, bool),
+    )
+
+
+@pytest.fixture(scope="module")
+def update(learner):
+    """(state, batch) -> state, info of one update of the critic."""
+    return jax.jit(lambda state, batch: learning.update_critic(jax.random.key(3), learner, state, batch))
+
+
+def _ended(batch: Transition) -> Transition:
+    return batch.replace(terminated=jnp.ones_like(batch.terminated))
+
+
+def _constant(params: Params, value: float) -> Params:
+    """The same networks, whose every map is `value`: all is 0 but the bias of the outputs."""
+    zero = jax.tree.map(jnp.zeros_like, params.critic)
+    constant = jax.tree.map(lambda leaf: jnp.full_like(leaf, value) if leaf.shape == (dense.OUTPUTS,) else leaf, zero)
+    return params.replace(critic=constant)
+
+
+def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
+    """Claim: Q(s, a) of the loss, from two passes, is the dense maps of the same parameters read at the action.
+
+    Where everything ends the target is the reward, so that the error tells Q. Both primitives, poses all over.
+    """
+    look = jax.jit(lambda params, obs: learning.look(learner, params, heightmap.unpack(obs)).q)
+    read = jax.jit(jax.vmap(lambda q, p, pose: maps.read(learner.frames, q, p, pose)))
+    q = look(state.online, batch.obs)
+    rng = np.random.default_rng(0)
+    for trial in range(12):
+        pose = np.concatenate([rng.uniform(-0.224, 0.224, (B, 2)), rng.uniform(0.0, 2.0 * np.pi, (B, 1))], axis=1)
+        action = Action(primitive=(batch.action.primitive + trial) % 2, pose=jnp.asarray(pose, jnp.float32))
+        tried = _ended(batch).replace(action=action)
+        got = tried.reward - update(state, tried)[1].error
+        np.testing.assert_allclose(got, read(q, action.primitive, action.pose), atol=2e-5)
+    assert np.std(q) > 0.05
+
+
+def test_update_reports_its_loss(learner, state, batch, update):
+    """Claim: the loss is the mean Huber loss of the errors, `q` the mean value; an update is counted."""
+    after, info = update(state, batch)
+    width = learner.cfg.learn.huber
+    np.testing.assert_allclose(info.critic_loss, np.mean(optax.huber_loss(info.error, delta=width)), rtol=1e-5)
+    ended = update(state, _ended(batch))[1]
+    np.testing.assert_allclose(ended.q, np.mean(batch.reward - ended.error), atol=1e-6)
+    assert after.updates == state.updates + 1
+
+
+def test_target_carries_no_gradient(learner, state, batch):
+    """Claim: the critic's loss has exactly no gradient in the target networks and the reward, but one in its own."""
+
+    def loss(online, target, reward):
+        before = state.replace(online=online, target=target)
+        return learning.update_critic(jax.random.key(3), learner, before, batch.replace(reward=reward))[1].critic_loss
+
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(state.online, state.target, batch.reward)
+    online, target, reward = gradient
+    for leaf in jax.tree.leaves((target, reward, online.actor)):
+        np.testing.assert_array_equal(leaf, 0.0)
+    assert all(np.any(np.asarray(leaf) != 0.0) for leaf in jax.tree.leaves(online.critic))
+
+
+def test_critic_gradient_is_that_of_its_loss(learner, state, batch):
+    """Claim: along the gradient, the reported loss changes as fast as finite differences say."""
+    plain = dataclasses.replace(learner, critic_optimiser=optax.sgd(1.0))
+    run = jax.jit(lambda state: learning.update_critic(jax.random.key(3), plain, state, _ended(batch)))
+    after, _ = run(state)
+    gradient = jax.tree.map(jnp.subtract, state.online.critic, after.online.critic)
+    _check_slope(lambda critic: run(state.replace(online=state.online.replace(critic=critic)))[1].critic_loss,
+                 state.online.critic, gradient)  # fmt: skip
+
+
+def _check_slope(loss, params, gradient, relative: float = 1e-2) -> None:
+    """Along the gradient g, scaled to the unit vector g / |g|, the slope is |g|."""
+    size = float(optax.tree.norm(gradient))
+    assert size > 1e-4
+    step = 2e-3
+    above, below = (
+        loss(jax.tree.map(lambda p, g, s=sign: p + s * step / size * g, params, gradient)) for sign in (1.0, -1.0)
+    )
+    np.testing.assert_allclose((above - below) / (2.0 * step), size, rtol=relative)
+
+
+def test_actor_gradient_is_that_of_its_loss(learner, state, batch):
+    """Claim: the policy gradient through the interpolated map is that of finite differences."""
+    plain = dataclasses.replace(learner, actor_optimiser=optax.sgd(1.0))
+    run = jax.jit(lambda state: learning.update_actor(plain, state, heightmap.unpack(batch.obs)))
+    after, _ = run(state)
+    gradient = jax.tree.map(jnp.subtract, state.online.actor, after.online.actor)
+    _check_slope(
+        lambda actor: run(state.replace(online=state.online.replace(actor=actor)))[1], state.online.actor, gradient
+    )
+
+
+def test_actor_climbs_the_critic(learner, state, batch):
+    """Claim: updates of the actor raise Q(s, mu(s)) and leave the critic and both targets as they are."""
+    run = jax.jit(lambda state: learning.update_actor(learner, state, heightmap.unpack(batch.obs)))
+
+    @jax.jit
+    def value(online: Params) -> jax.Array:
+        """Mean of Q(s, mu(s)) over states and primitives."""
+        seen = learning.look(learner, online, heightmap.unpack(batch.obs))
+        poses = [jax.vmap(lambda one, p=p: actor.pose(learner.frames, one, p))(seen) for p in Primitive]
+        read = jax.vmap(maps.read, (None, 0, None, 0))
+        return jnp.mean(jnp.stack([read(learner.frames, seen.q, jnp.int32(p), poses[p]) for p in Primitive]))
+
+    current, first = run(state)
+    for _ in range(60):
+        current, _ = run(current)
+    np.testing.assert_allclose(first, -value(state.online), atol=1e-6)
+    assert value(current.online) > value(state.online) + 0.004
+    for name in ("critic_optimiser", "target", "updates"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(current, name), getattr(state, name))
+    jax.tree.map(np.testing.assert_array_equal, current.online.critic, state.online.critic)
+
+
+def test_updates_lower_the_loss(state, batch, update):
+    """Claim: on one batch with fixed targets, 120 updates of the critic take away half of the squared error."""
+    current = state
+    losses = []
+    for _ in range(120):
+        current, info = update(current, _ended(batch))
+        losses.append(float(jnp.mean(info.error**2)))
+    assert losses[-1] < 0.5 * losses[0]
+    jax.tree.map(np.testing.assert_array_equal, current.online.actor, state.online.actor)
+
+
+def test_target_moves_by_tau(learner, state, batch, update):
+    """Claim: theta' = tau theta + (1 - tau) theta' with the networks after the step, of critic and actor."""
+    after, _ = update(state, batch)
+    tau = learner.cfg.learn.tau
+    wanted = jax.tree.map(lambda new, old: tau * new + (1.0 - tau) * old, after.online, state.target)
+    jax.tree.map(lambda got, want: np.testing.assert_allclose(got, want, atol=1e-7), after.target, wanted)
+    moved = jax.tree.map(lambda new, old: float(np.abs(new - old).max()), after.online.critic, state.online.critic)
+    assert all(change > 0.0 for change in jax.tree.leaves(moved))
+
+
+@pytest.mark.parametrize("value", [1.5, 100.0, -100.0])
+def test_bootstrap(learner, state, batch, update, value):
+    """Claim: y = r + gamma V(s') by the target critic, V kept within the possible returns; y = r after a true end."""
+    known = state.replace(target=_constant(state.target, value))
+    half = jnp.arange(B) < B // 2
+    going, ended, mixed = (
+        update(known, batch.replace(terminated=t))[1].error for t in (half & False, half | True, half)
+    )
+    gain = learner.cfg.target.gamma * np.clip(value, *learner.bounds)
+    np.testing.assert_allclose(going - ended, gain, atol=1e-5)
+    np.testing.assert_allclose(mixed - ended, np.where(half, 0.0, gain), atol=1e-5)
+
+
+def _smooth(frames) -> DenseMaps:
+    """Smooth maps with a few peaks, all of whose cells are valid."""
+    x, y, yaw = frames.xy[..., 0], frames.xy[..., 1], frames.yaws[:, None, None]
+    push = np.sin(8.0 * x + 3.0) * np.cos(9.0 * y) + 0.3 * np.cos(yaw)
+    q = jnp.asarray(np.stack([push, np.cos(7.0 * x) * np.sin(8.0 * y - 1.0) - 0.2 * np.sin(yaw)]), jnp.float32)
+    return DenseMaps(q=q, logits=10.0 * q, valid=jnp.ones(q.shape, bool))
+
+
+def _with_target(learner: Learner, **settings) -> Learner:
+    cfg = dataclasses.replace(learner.cfg, target=dataclasses.replace(TargetConfig(), **settings))
+    return dataclasses.replace(learner, cfg=cfg)
+
+
+def test_next_value_lies_within_the_map(learner):
+    """Claim: the softmax value is never outside of the map's values, grows with the inverse temperature, and comes near
+    the largest value."""
+    state = _smooth(learner.frames)
+    low, high = float(state.q.min()), float(state.q.max())
+    means = []
+    for beta in (0.0, 1e5):
+        own = _with_target(learner, inverse_temperature=beta, samples=256)
+        run = jax.jit(jax.vmap(lambda key, own=own: learning.next_value(own, key, state)))
+        values = np.asarray(run(jax.random.split(jax.random.key(1), 16)))
+        assert np.all((values >= low) & (values <= high))
+        means.append(values.mean())
+    assert means[0] < means[1] - 0.2
+    assert high - means[1] < 0.05 * (high - low)
+
+
+def test_next_value_ignores_what_is_bare(learner):
+    """Claim: a primitive with nothing to act on does not count, whatever its map; if neither has, both do."""
+    q = jnp.stack([jnp.full((8, 18, 18), 3.0), jnp.full((8, 18, 18), 1.0)])
+    assert q.shape[1:] == learner.frames.xy.shape[:3]
+    value = jax.jit(lambda valid: learning.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid)))
+    grasps = jnp.zeros(q.shape, bool).at[Primitive.GRASP].set(True)
+    np.testing.assert_allclose(value(grasps), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(value(~grasps), 3.0, rtol=1e-5)
+    assert 1.0 < value(jnp.zeros(q.shape, bool)) <= 3.0
+
+
+def test_best_grasp():
+    """Claim: the largest value over valid grasps, never a push's nor an invalid one's; 0 if nothing can be grasped."""
+    q = np.random.default_rng(0).normal(size=(2, 4, 6, 6)).astype(np.float32) - 3.0
+    valid = np.random.default_rng(1).uniform(size=q.shape) < 0.2
+    q[Primitive.PUSH] += 9.0
+    best = max(q[Primitive.GRASP][valid[Primitive.GRASP]])
+    state = DenseMaps(jnp.asarray(q), jnp.asarray(q), jnp.asarray(valid))
+    assert learning.best_grasp(state) == best < 0.0
+    assert learning.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0

@@ -1,0 +1,242 @@
+"""The environment by itself: resets, ends of episodes, failed physics."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import env as environment
+from csac_jax.config import Config, SceneConfig, TrainConfig
+from csac_jax.env import Env, State
+from csac_jax.scene import layout
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import oracle
+from csac_jax.sim.outcome import Outcome
+from csac_jax.sim.primitives import Action, Primitive
+
+pytestmark = pytest.mark.mjx
+
+CONFIG = Config(
+    scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=16, settle_time=1.5),
+    train=TrainConfig(max_actions=6, max_idle=3),
+)
+SCENES = 6
+BARE = (0.15, 0.15, 0.0)  # a place where nothing lies
+
+
+class Lab(NamedTuple):
+    """An environment and its compiled functions, each over SCENES scenes."""
+
+    env: Env
+    reset: Callable[[jax.Array], State]
+    begin: Callable[[Scene], State]
+    step: Callable[[State, Action], State]
+    oracle: Callable[[State], Action]
+    into_step: State  # shapes and dtypes that go into step,
+    out_of_step: State  # and that come out of it
+
+
+def _types(tree: State) -> State:
+    return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), tree)
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
+        env = environment.make(CONFIG)
+    keys = jax.random.split(jax.random.key(0), SCENES)
+    plan_grasp = functools.partial(oracle.grasp, CONFIG.sim, CONFIG.heightmap, CONFIG.scene.slots)
+
+    def look_and_plan(state: State) -> Action:
+        return plan_grasp(state.scene, state.obs.height)
+
+    reset = jax.jit(jax.vmap(env.reset)).trace(keys)
+    state = reset.lower().compile()(keys)
+    plan = jax.jit(jax.vmap(look_and_plan)).lower(state).compile()
+    begin = jax.jit(jax.vmap(env.begin)).lower(state.scene).compile()
+    step = jax.jit(jax.vmap(env.step)).trace(state, plan(state))
+    into, out = (jax.tree.unflatten(jax.tree.structure(state), traced.jaxpr.out_avals) for traced in (reset, step))
+    return Lab(env, reset.lower().compile(), begin, step.lower().compile(), plan, _types(into), _types(out))
+
+
+def _cube(x: float, y: float) -> Scene:
+    """A scene of one cube at (x, y) m."""
+    scene = Scene(
+        position=jnp.array([[x, y, 0.025], [0, 0, 0], [0, 0, 0]], jnp.float32),
+        quaternion=jnp.zeros((3, 4)).at[:, 0].set(1.0),
+        velocity=jnp.zeros((3, 6)),
+        half_size=jnp.array([[0.025, 0.025, 0.025]] * 2 + [[0.0467, 0.025, 0.0243]], jnp.float32),
+        colour=jnp.arange(3, dtype=jnp.int32),
+        in_play=jnp.ones(3, bool),
+    )
+    return layout.park(scene, jnp.array([True, False, False]))
+
+
+def _stack(*trees):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def _actions(*actions: tuple[Primitive, tuple[float, float, float]]) -> Action:
+    kinds, poses = zip(*actions, strict=True)
+    return Action(primitive=jnp.array(kinds, jnp.int32), pose=jnp.array(poses, jnp.float32))
+
+
+def _at(tree, index: int):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+
+
+@pytest.fixture(scope="module")
+def stepped(lab: Lab) -> State:
+    """One step of six scenes of one cube each, see `_LANES`."""
+    first = lab.begin(_stack(*(_cube(*place) for place, *_ in _LANES.values())))
+    actions, idle = (jnp.array([lane[i] for lane in _LANES.values()], jnp.int32) for i in (1, 2))
+    action = _actions(*((kind, pose) for *_, kind, pose in _LANES.values()))
+    return lab.step(dataclasses.replace(first, actions=actions, idle=idle), action)
+
+
+_LANES = {  # the cube's place, actions and idle actions so far, the action
+    "last chance": ((0.0, 0.0), 5, 2, Primitive.GRASP, (0.01, 0.0, 0.0)),
+    "cap": ((0.0, 0.0), 5, 0, Primitive.GRASP, BARE),
+    "idle": ((0.0, 0.0), 2, 2, Primitive.GRASP, BARE),
+    "on": ((0.0, 0.0), 0, 1, Primitive.PUSH, BARE),
+    "moved": ((0.06, 0.0), 0, 2, Primitive.PUSH, (0.0, 0.0, 0.0)),
+    "out": ((0.19, 0.0), 0, 0, Primitive.PUSH, (0.13, 0.0, 0.0)),
+}
+
+
+@pytest.fixture
+def lane(stepped: State) -> Callable[[str], State]:
+    return lambda name: _at(stepped, list(_LANES).index(name))
+
+
+def test_last_block_terminates(lane):
+    """Claim: taking the last block terminates the episode, is worth 1, and is no truncation even at the cap."""
+    state = lane("last chance")
+    assert (state.terminated, state.truncated, state.done) == (True, False, True)
+    assert (state.reward, state.info.cleared, state.info.left) == (1.0, 1, 0)
+    assert state.info.outcome == state.info.outcome_by_gap == Outcome.LIFTED
+    assert abs(state.info.distance - 0.01) < 1e-6  # the place aimed at lay 1 cm beside the cube
+    assert state.obs.height.max() < 0.001
+
+
+def test_action_cap_truncates(lane):
+    """Claim: an episode is cut off after max_actions actions; that does not terminate it."""
+    state = lane("cap")
+    assert (state.terminated, state.truncated, state.reward) == (False, True, 0.0)
+    assert (state.actions, state.idle, state.info.outcome) == (6, 1, Outcome.NOTHING)
+
+
+def test_idle_cap_truncates(lane):
+    """Claim: an episode is cut off after max_idle actions in a row without visible change."""
+    state = lane("idle")
+    assert (state.terminated, state.truncated, state.actions, state.idle) == (False, True, 3, 3)
+
+
+def test_episode_goes_on(lane):
+    """Claim: below both caps the episode goes on, and an action without visible change counts as idle."""
+    state = lane("on")
+    assert (state.done, state.actions, state.idle) == (False, 1, 2)
+
+
+def test_visible_change_ends_idleness(lane):
+    """Claim: an action that moves a block more than CHANGE_AREA starts the idle count anew."""
+    state = lane("moved")
+    assert state.info.moved > environment.CHANGE_AREA
+    assert (state.done, state.idle, state.reward) == (False, 0, 0.0)
+    assert 0.05 < state.scene.position[0, 0] - 0.06 < 0.1
+
+
+def test_block_pushed_out_leaves(lane):
+    """Claim: a block pushed out of the square is counted as left, not as cleared, and is out of play and of sight."""
+    state = lane("out")
+    assert (state.info.left, state.info.cleared, state.reward) == (1, 0, 0.0)
+    np.testing.assert_array_equal(state.scene.position, layout.parking(3))
+    assert not state.scene.in_play.any()
+    assert state.obs.height.max() < 0.001
+
+
+def test_oracle_clears_scenes(lab: Lab):
+    """Claim: grasp by grasp a settled scene empties, each lift is worth 1, and the last one terminates the episode."""
+    state = lab.reset(jax.random.split(jax.random.key(3), SCENES))
+    blocks, taken = np.asarray(state.scene.in_play.sum(axis=1)), np.zeros(SCENES, int)
+    cleared = np.zeros(SCENES, bool)
+    for _ in range(5):
+        before = np.asarray(state.scene.in_play.sum(axis=1))
+        state = lab.step(state, lab.oracle(state))
+        after, info = np.asarray(state.scene.in_play.sum(axis=1)), jax.tree.map(np.asarray, state.info)
+        np.testing.assert_array_equal(before - after, info.cleared + info.left)
+        np.testing.assert_array_equal(state.reward, (info.cleared > 0).astype(np.float32))
+        np.testing.assert_array_equal(state.terminated, after == 0)
+        assert not np.any(state.terminated & state.truncated)
+        np.testing.assert_array_equal(state.scene.velocity[~np.asarray(state.scene.in_play)], 0.0)
+        taken, cleared = taken + np.where(cleared, 0, info.cleared), cleared | np.asarray(state.terminated)
+    assert cleared.mean() > 0.7
+    np.testing.assert_array_equal(taken[cleared], blocks[cleared])
+
+
+def _leaves(state: State) -> list[bytes]:
+    return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state)]
+
+
+@pytest.mark.parametrize("where", ["action", "scene"])
+def test_failed_physics_stays_in_its_scene(lab: Lab, where: str):
+    """Claim: NaN in one scene marks that scene ill and truncates it; the others' results are the same, bit for bit."""
+    state = lab.reset(jax.random.split(jax.random.key(4), SCENES))
+    action, sick = lab.oracle(state), 2
+    good = lab.step(state, action)
+    if where == "action":
+        action = dataclasses.replace(action, pose=action.pose.at[sick, 0].set(jnp.nan))
+    else:
+        spoilt = dataclasses.replace(state.scene, velocity=state.scene.velocity.at[sick, :, 0].set(jnp.nan))
+        state = dataclasses.replace(state, scene=spoilt)
+    bad = lab.step(state, action)
+    np.testing.assert_array_equal(bad.info.ill, np.arange(SCENES) == sick)
+    assert not good.info.ill.any()
+    for index in range(SCENES):
+        assert (_leaves(_at(good, index)) == _leaves(_at(bad, index))) == (index != sick)
+    ill = _at(bad, sick)
+    assert (ill.truncated, ill.terminated, ill.reward, ill.info.cleared, ill.info.left) == (True, False, 0.0, 0, 0)
+    assert np.isfinite(ill.obs.height).all()
+    if where == "action":  # the scene is as it was before
+        jax.tree.map(np.testing.assert_array_equal, ill.scene, _at(state.scene, sick))
+
+
+def test_step_is_a_fixed_point_of_types(lab: Lab):
+    """Claim: what comes out of step has the shapes, dtypes and weak types of what went in: it can be scanned."""
+    assert lab.into_step == lab.out_of_step
+    assert not any(weak for _, _, weak in jax.tree.leaves(lab.into_step, is_leaf=lambda leaf: isinstance(leaf, tuple)))
+
+
+def test_resets_differ(lab: Lab):
+    """Claim: every reset gives another scene, none of them the pool's first as it lies."""
+    states = [lab.reset(jax.random.split(jax.random.key(seed), SCENES)) for seed in range(8)]
+    positions = np.concatenate([state.scene.position for state in states])
+    assert len({position.tobytes() for position in positions}) == len(positions)
+    play = np.concatenate([state.scene.in_play for state in states])
+    heights = [tuple(np.where(valid, p[:, 2], -1.0)) for p, valid in zip(positions, play, strict=True)]
+    pool = lab.env.scenes
+    drawn = [
+        next(i for i in range(CONFIG.scene.pool) if tuple(np.where(pool.in_play[i], pool.position[i, :, 2], -1)) == h)
+        for h in heights
+    ]
+    assert len(set(drawn)) >= 12  # of 16, in 48 draws
+    yaws = [np.arctan2(*(p[v][0, :2] @ [[0, 1], [1, 0]])) for p, v in zip(positions, play, strict=True)]
+    raw = [np.arctan2(*(pool.position[i][pool.in_play[i]][0, :2] @ [[0, 1], [1, 0]])) for i in drawn]
+    turned = np.mod(np.array(yaws) - raw, 2 * np.pi)
+    assert np.histogram(turned, bins=4, range=(0, 2 * np.pi))[0].min() >= 4  # any yaw: 12 expected in each quarter
+
+
+def test_same_key_same_scene(lab: Lab):
+    """Claim: a reset is a function of its key, and its state has no history."""
+    keys = jax.random.key_data(jax.random.split(jax.random.key(5), SCENES))
+    first, second = (lab.reset(jax.random.wrap_key_data(keys)) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    assert not np.any(first.actions)
+    assert not np.any(first.done)
+    assert np.asarray(first.obs.height).max(axis=(1, 2)).min() > 0.02

@@ -1,0 +1,136 @@
+"""Episodes of fixed policies."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import env as environment, presets
+from csac_jax.agent import learner as learning
+from csac_jax.config import TrainConfig
+from csac_jax.env import Env, State
+from csac_jax.scene import layout
+from csac_jax.sim.outcome import Outcome
+from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.train import evaluate
+from csac_jax.train.metrics import Episodes
+
+pytestmark = pytest.mark.mjx
+
+CFG = dataclasses.replace(
+    presets.smoke(), train=TrainConfig(scenes=2, actions=64, warmup=8, chunk=4, max_actions=6, max_idle=3)
+)
+EPISODES = 5
+REACH = 0.012  # m
+
+
+class Magnet(Env):
+    """No physics: a grasp within REACH of a block's centre takes it, all else does nothing."""
+
+    def step(self, state: State, action: Action) -> State:
+        off = jnp.linalg.norm(state.scene.position[:, :2] - action.pose[None, :2], axis=1)
+        taken = state.scene.in_play & (off < REACH) & (action.primitive == Primitive.GRASP)
+        scene = layout.park(state.scene, ~taken)
+        actions, idle = state.actions + 1, jnp.where(jnp.any(taken), 0, state.idle + 1)
+        terminated = ~jnp.any(scene.in_play)
+        capped = (actions >= self.cfg.train.max_actions) | (idle >= self.cfg.train.max_idle)
+        outcome = jnp.where(jnp.any(taken), jnp.int32(Outcome.LIFTED), jnp.int32(Outcome.EMPTY))
+        return state.replace(
+            scene=scene,
+            obs=self.look(scene),
+            terminated=terminated,
+            truncated=capped & ~terminated,
+            actions=actions,
+            idle=idle,
+            info=state.info.replace(outcome=outcome, cleared=jnp.sum(taken, dtype=jnp.int32)),
+        )
+
+
+@pytest.fixture(scope="module")
+def magnet() -> Magnet:
+    made = environment.make(CFG, stream=1, scenes=EPISODES)
+    return Magnet(made.cfg, made.physics, made.scenes)
+
+
+@pytest.fixture(scope="module")
+def random(magnet) -> Episodes:
+    with jax.debug_key_reuse(True):
+        return evaluate.rollout(CFG, magnet, "random", None, EPISODES, 0)
+
+
+def assert_consistent(episodes: Episodes, max_actions: int) -> None:
+    """What holds of every record of episodes."""
+    actions = episodes.valid.sum(axis=1)
+    np.testing.assert_array_equal(episodes.valid, np.arange(max_actions)[None] < actions[:, None])  # a prefix
+    assert np.all(actions >= 1)
+    assert not np.any(episodes.cleared[~episodes.valid])
+    taken = episodes.cleared.sum(axis=1)
+    np.testing.assert_array_equal((taken + episodes.left == episodes.blocks), episodes.completed)
+    assert np.all(taken + episodes.left <= episodes.blocks)
+    grasps = episodes.valid & (episodes.primitive == Primitive.GRASP)
+    np.testing.assert_array_equal((episodes.cleared > 0), grasps & (episodes.outcome == Outcome.LIFTED))
+
+
+def test_oracle_by_hand(magnet):
+    """Claim: where a grasp above a block always takes it, the oracle takes one block with each action, and all."""
+    episodes = evaluate.rollout(CFG, magnet, "oracle", None, EPISODES, 0)
+    assert_consistent(episodes, CFG.train.max_actions)
+    np.testing.assert_array_equal(episodes.blocks, magnet.scenes.in_play.sum(axis=1))
+    assert np.all(episodes.completed)
+    np.testing.assert_array_equal(episodes.valid.sum(axis=1), episodes.blocks)
+    np.testing.assert_array_equal(episodes.cleared[episodes.valid], 1)
+
+
+def test_random_episodes_end_at_the_caps(magnet, random):
+    """Claim: records are consistent; an episode that is not completed ran to the action cap or the no-change cap."""
+    assert_consistent(random, CFG.train.max_actions)
+    assert random.valid.shape == (EPISODES, CFG.train.max_actions)
+    assert not np.all(random.completed)
+    for cleared, valid, completed in zip(random.cleared, random.valid, random.completed, strict=True):
+        num = valid.sum()
+        idle = num >= CFG.train.max_idle and not np.any(cleared[num - CFG.train.max_idle : num])
+        assert completed or idle or num == CFG.train.max_actions
+
+
+def test_same_seed_same_episodes(magnet, random):
+    """Claim: the same seed gives the same episodes, another seed others; in parts too, all of them are run."""
+    again, other = (evaluate.rollout(CFG, magnet, "random", None, EPISODES, seed) for seed in (0, 1))
+    for a, b in zip(random, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert any(not np.array_equal(a, b) for a, b in zip(random, other, strict=True))
+
+
+def test_more_episodes_than_run_at_once(magnet, monkeypatch):
+    """Claim: episodes beyond those that run side by side follow in order, each from its own scene."""
+    monkeypatch.setattr(evaluate, "SIDE_BY_SIDE", 3)
+    episodes = evaluate.rollout(CFG, magnet, "oracle", None, EPISODES, 0)
+    np.testing.assert_array_equal(episodes.blocks, magnet.scenes.in_play.sum(axis=1))
+    assert np.all(episodes.completed)
+
+
+def test_learned_needs_its_networks_only(magnet):
+    """Claim: the learned policy runs from parameters alone and gives consistent records."""
+    learner = learning.make(CFG)
+    params = jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)).online
+    assert_consistent(evaluate.rollout(CFG, magnet, "learned", params, EPISODES, 0), CFG.train.max_actions)
+
+
+def test_unknown_policy(magnet):
+    """Claim: a policy that there is not is a ValueError that names those that there are."""
+    with pytest.raises(ValueError, match="'best' is not one of: learned, random, oracle"):
+        evaluate.rollout(CFG, magnet, "best", None, 1, 0)
+
+
+@pytest.mark.slow
+def test_oracle_beats_random_in_physics():
+    """Claim: in physics too the oracle clears more blocks per action than random grasps above blocks."""
+    cfg = presets.smoke()
+    env = environment.make(cfg, stream=1, scenes=12)
+    oracle, random = (evaluate.rollout(cfg, env, name, None, 12, 0) for name in ("oracle", "random"))
+    for episodes in (oracle, random):
+        assert_consistent(episodes, cfg.train.max_actions)
+    efficiency = [e.cleared.sum() / e.valid.sum() for e in (oracle, random)]
+    assert efficiency[0] > 1.3 * efficiency[1]
+    assert oracle.completed.mean() >= 0.75
