@@ -1,8 +1,8 @@
 """The small dense net: densely connected convolutions with group norm, at half the resolution of its input.
 
 It sees maps already turned to a frame, so that what it must know of a push is "ahead" and of a grasp "across". The
-frame of yaw + pi shows the same picture upside down: each pass gives three maps, push ahead, push back and grasp (a parallel
-gripper is symmetric), and K / 2 passes give all K yaws of both primitives.
+frame of yaw + pi shows the same picture upside down: each pass gives three maps, push ahead, push back and grasp (a
+parallel gripper is symmetric), and K / 2 passes give all K yaws of both primitives.
 """
 
 import flax.linen as nn
