@@ -312,7 +312,7 @@ class TrainConfig:
 
     scenes: int = 8
     """E, scenes simulated side by side; each takes one action per training step."""
-    actions: int = 2800
+    actions: int = 2000
     """Actions of the whole run over all scenes."""
     warmup: int = 64
     """Actions before the first update."""
