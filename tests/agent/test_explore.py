@@ -40,7 +40,9 @@ def test_probability(actions, expected):
 @pytest.mark.parametrize("taken", [0, 300, 10**6])
 def test_shares_of_primitives_and_places(taken):
     """Claim: pushes come with eps push_fraction, random places with their own eps, both as of the actions taken."""
-    cfg = ExploreConfig()
+    cfg = ExploreConfig(
+        primitive_start=0.5, primitive_end=0.1, place_start=0.5, place_end=0.02, decay=0.998, push_fraction=0.25
+    )
     primitives, poses = choices(cfg, taken)
     assert_share(primitives == 0, max(0.1, 0.5 * 0.998**taken) * 0.25)
     random_place = np.all(poses == np.asarray(RANDOM_PLACES)[primitives], axis=-1)
