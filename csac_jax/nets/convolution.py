@@ -1,7 +1,8 @@
 """2-D convolution whose gradient stays fast inside `lax.scan` on a CPU.
 
-XLA's CPU back end runs the convolutions that autodiff makes, whose batch and channels are swapped, many times
-slower inside a while loop than outside (jaxlib 0.10.1; `experiments/bench` times both ways). Here the swap is a transpose, and every convolution plain.
+XLA's CPU back end runs the convolutions that autodiff makes, whose batch and channels are swapped, many times slower
+inside a while loop than outside (jaxlib 0.10.1; `experiments/bench` times both ways). Here the swap is a transpose, and
+every convolution plain.
 """
 
 import functools
