@@ -9,7 +9,7 @@ import dataclasses
 import math
 from typing import Literal
 
-SlotKind = Literal["box", "prism", "cylinder"]
+SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 
 
 def _require(condition: bool, message: str) -> None:
@@ -22,11 +22,17 @@ class SceneConfig:
     """What lies on the table."""
 
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
-    """Shape family of each block slot; a box slot draws cube, cuboid, plank or tile anew in every scene."""
+    """Kind of each block slot; a box slot draws cube, cuboid, plank or tile anew in every scene."""
     min_blocks: int = 5
     """Fewest blocks in play in a scene; the most is the number of slots."""
     pool: int = 1024
-    """Distinct settled scenes that resets draw from; each is turned by a random yaw as it is drawn."""
+    """Distinct settled scenes per number of blocks that resets draw from; each is turned by a random yaw then."""
+    size_spread: float = 0.1
+    """Block sizes differ from nominal by up to this share, from scene to scene."""
+    density: tuple[float, float] = (450.0, 900.0)
+    """Range of block densities, kg/m^3 (ours: woods; about 0.1 kg a block)."""
+    friction: tuple[float, float] = (0.5, 1.0)
+    """Range of the sliding friction between blocks and table."""
     drop_extent: float = 0.248
     """Side of the square in which blocks are dropped, m (VPG)."""
     drop_height: float = 0.15
@@ -38,6 +44,11 @@ class SceneConfig:
         _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
         _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
         _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")
+        _require(0.0 <= self.size_spread <= 0.25, "scene.size_spread: must lie in 0 .. 0.25")
+        _require(
+            100.0 <= self.density[0] <= self.density[1] <= 3000.0, "scene.density: 100 <= low <= high <= 3000 kg/m^3"
+        )
+        _require(0.1 <= self.friction[0] <= self.friction[1] <= 2.0, "scene.friction: 0.1 <= low <= high <= 2")
         _require(0.05 <= self.drop_extent <= 0.448, "scene.drop_extent: must lie in 0.05 .. 0.448 m")
         _require(0.05 <= self.drop_height <= 1.0, "scene.drop_height: must lie in 0.05 .. 1 m")
         _require(0.5 <= self.settle_time <= 20.0, "scene.settle_time: must lie in 0.5 .. 20 s")
@@ -47,6 +58,8 @@ class SceneConfig:
 class SimConfig:
     """Physics and the two motion primitives; one primitive is `substeps` physics steps, whatever it does."""
 
+    physics: Literal["mjx", "c"] = "mjx"
+    """`mjx`: compiled with everything else. `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
     timestep: float = 0.004
     """Length of a physics step, s."""
     grasp_phases: tuple[int, int, int] = (60, 50, 80)

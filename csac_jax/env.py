@@ -16,9 +16,9 @@ from csac_jax import geometry
 from csac_jax.config import Config
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import mjx_physics, outcome
-from csac_jax.sim.mjx_physics import Physics
+from csac_jax.sim import outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
+from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
@@ -84,21 +84,24 @@ class Env:
 
     def look(self, scene: Scene) -> Observation:
         """The top view of a scene."""
-        normals, offsets = blocks.half_spaces(self.cfg.scene.slots, scene.half_size)
+        slots = self.cfg.scene.slots
+        normals, offsets = blocks.half_spaces(slots, scene.half_size)
+        slot = blocks.parts(slots).slot
         shapes = Polytopes(
             normal=normals,
             offset=offsets,
-            position=scene.position,
-            rotation=jax.vmap(geometry.quat_to_matrix)(scene.quaternion),
-            colour=jnp.asarray(blocks.COLOURS)[scene.colour],
+            position=scene.position[slot],
+            rotation=jax.vmap(geometry.quat_to_matrix)(scene.quaternion)[slot],
+            colour=jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
         )
-        return heightmap.orthographic(self.cfg.heightmap, shapes, jnp.asarray(blocks.TABLE_COLOUR))
+        wanted = (slot == scene.target) | (scene.target == layout.ANY)
+        return heightmap.orthographic(self.cfg.heightmap, shapes, jnp.asarray(blocks.TABLE_COLOUR), wanted)
 
     def step(self, state: State, action: Action) -> State:
         """Runs one primitive; blocks lifted or out of the workspace leave the scene."""
         cfg, before = self.cfg, state.scene
-        after, trace, plan = mjx_physics.execute(self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action)
-        ill = ~mjx_physics.healthy(after)
+        after, trace, plan = simulation.execute(self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action)
+        ill = ~simulation.healthy(after)
         after = jax.tree.map(lambda good, bad: jnp.where(ill, good, bad), before, after)
 
         grasped = action.primitive == Primitive.GRASP
@@ -147,4 +150,4 @@ def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None
     world = model.build(cfg.scene, cfg.sim)
     count = cfg.scene.pool if scenes is None else scenes
     settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, stream, count)
-    return Env(cfg, mjx_physics.make(world), settled)
+    return Env(cfg, simulation.make(world, cfg.sim), settled)
