@@ -58,7 +58,7 @@ def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Genera
             drops = [_drop(cfg, rng, in_play) for _ in range(_ROUND)]
             fields = jax.device_get(fields_of(jax.tree.map(lambda *leaves: np.stack(leaves), *drops)))
             rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(_ROUND)]
-            ended = threads.map(lambda scene, row: _rest(world, cfg, extent, scene, row), drops, rows)
+            ended = threads.map(lambda scene, row: rest(world, cfg, extent, scene, row), drops, rows)
             good = [scene for scene in ended if scene is not None]
             found, kept, dropped = found + good, kept + len(good), dropped + _ROUND
             if dropped >= 20 * _ROUND and kept < dropped / 50:
@@ -104,7 +104,7 @@ def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
     return (sizes * scales[shared][:, None]).astype(np.float32)
 
 
-def _rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
+def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
     """The scene after its blocks fell, None where a block is not at rest or left the workspace."""
     model = with_blocks(world, fields)
     model.opt.iterations, model.opt.ls_iterations = 20, 20  # quality over speed: this runs once

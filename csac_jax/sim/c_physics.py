@@ -49,11 +49,11 @@ def _blank(num: int) -> Trace:
 def _run_batch(world: World, closed_at: int, scene: Scene, fields: BlockFields, plan: Plan) -> Any:
     """Every scene of a batch, leaves [..., N, ...], in a thread of its own; same axes come back."""
     axes = np.shape(plan.surface)
-    rows = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *np.shape(leaf)[len(axes) :]), (scene, fields, plan))
+    rows = jax.tree.map(lambda leaf: np.reshape(leaf, (-1, *np.shape(leaf)[len(axes) :])), (scene, fields, plan))
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(len(rows[2].surface))]
     with concurrent.futures.ThreadPoolExecutor() as threads:
         done = list(threads.map(lambda row: _run(world, closed_at, *row), each))
-    return jax.tree.map(lambda *leaves: np.stack(leaves).reshape(*axes, *np.shape(leaves[0])), *done)
+    return jax.tree.map(lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *done)
 
 
 def _run(world: World, closed_at: int, scene: Scene, fields: BlockFields, plan: Plan) -> tuple[Any, Any, Trace]:

@@ -13,7 +13,7 @@ from csac_jax.sim.primitives import Action, Primitive, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric
 FINGER_HALF = (0.008, 0.012)  # m, half footprint of a finger tip across and along its pad, with a little room
-ALIGNED = 0.05  # 1 - cosine between a face and the pad that is as good as parallel
+ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
 
 def _support(normals: jax.Array, offsets: jax.Array, axis: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -49,7 +49,7 @@ CASES: dict[str, tuple[Scene, Action]] = {
     # The window sees the corner of a cube beside the pads: 9 mm left of and above the place, 13 mm off their path.
     "empty": (place(cube=(-0.0205, 0.0275, 0.0)), grasp(0.0125, -0.0055, np.pi / 4)),
     "touched": (place(cube=(0.05, 0.0, 0.0)), grasp(0.0, 0.0)),  # a finger comes down on the cube
-    "dropped": (place(prism=(0.0, 0.02, 0.0)), grasp(0.0, 0.0)),  # across the slopes, off the middle: it slips out
+    "dropped": (place(prism=(0.0, 0.014, 0.0)), grasp(0.0, 0.0)),  # across the slopes, off the middle: it slips out
     "lifted": (place(cube=(0.0, 0.0, 0.0), other=(0.15, 0.1, 0.5)), grasp(0.0, 0.0)),
     "push": (place(cube=(0.06, 0.0, 0.0), prism=(-0.1, 0.1, 0.0)), push(0.0, 0.0)),
     "miss": (place(cube=(0.06, 0.06, 0.0)), push(0.0, 0.0)),
