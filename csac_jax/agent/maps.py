@@ -14,7 +14,7 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.agent import box
-from csac_jax.config import Config
+from csac_jax.config import Config, PolicyConfig
 from csac_jax.nets import dense
 from csac_jax.sim.outcome import BARE
 from csac_jax.sim.primitives import Primitive
@@ -22,6 +22,11 @@ from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation
 
 NUM_PRIMITIVES = len(Primitive)
+
+
+def allowed(cfg: PolicyConfig) -> tuple[Primitive, ...]:
+    """Primitives that a policy ever takes: its values and its actor concern no others."""
+    return (Primitive.GRASP,) if cfg.primitive == "grasp" else tuple(Primitive)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,6 +97,11 @@ def actionable(frames: Frames, obs: Observation) -> jax.Array:
         under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
     )
     return jnp.stack([ahead & frames.inside, under & frames.inside])
+
+
+def everywhere(frames: Frames, obs: Observation) -> jax.Array:
+    """Cells above the workspace for each primitive, [P, K, h, w] bool, whatever is seen: no masking."""
+    return jnp.broadcast_to(frames.inside, (NUM_PRIMITIVES, *frames.inside.shape))
 
 
 def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:

@@ -90,7 +90,8 @@ def _policy(cfg: Config, env: Env, name: str) -> Policy:
 
     def learned(key: jax.Array, params: Params, states: State) -> Action:
         dense_maps = learning.look(learner, params, states.obs)
-        return jax.vmap(policy.best_action, (0, None, None, 0, None))(_keys(key, states), cfg, frames, dense_maps, span)
+        act = jax.vmap(policy.best_action, (0, None, None, 0, None, 0))
+        return act(_keys(key, states), cfg, frames, dense_maps, span, states.idle)
 
     def random(key: jax.Array, params: Params, states: State) -> Action:
         valid = jax.vmap(maps.actionable, (None, 0))(frames, states.obs)
