@@ -19,8 +19,8 @@ from typing import Any, Literal, NoReturn, TypeVar
 import tyro
 
 import csac_jax
-from csac_jax import presets
-from csac_jax.config import Config
+from csac_jax import algorithms, presets
+from csac_jax.config import Algo, Config
 from csac_jax.train import stop as stopping
 
 Arguments = TypeVar("Arguments")
@@ -32,6 +32,7 @@ USAGE = f"""usage: {PROGRAM} COMMAND ...
 A robot learns to push and grasp in clutter.
 
   train PRESET       train with a preset: {", ".join(presets.PRESETS)}
+                     --algo NAME: {", ".join(algorithms.ALGORITHMS)}
   train --resume DIR go on with a run that was stopped
   eval DIR           measure what a run has learned
   doctor             versions, devices and a self-test of this machine
@@ -62,6 +63,8 @@ class TrainOptions:
     """File to write the result to, as JSON."""
     seed: int = 0
     """Number that all randomness of the run follows from."""
+    algo: Algo = "csac_beta"
+    """The algorithm: it changes settings of the preset, and settings given as options win over it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,12 +203,13 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
     prog = f"{PROGRAM} train"
     named = bool(arguments) and not arguments[0].startswith("-")
     preset, flags = (arguments[0], arguments[1:]) if named else (None, arguments)
-    base = _preset(preset or "quick")
-    resumed = _resumed(flags) if not {"-h", "--help"} & set(flags) else None
-    stored = None if resumed is None else _stored_config(resumed)
+    base = _preset(preset or "quick", _value_of(flags, "--algo"))
+    resumed = _value_of(flags, "--resume") if not {"-h", "--help"} & set(flags) else None
+    stored = None if resumed is None else _stored_config(Path(resumed))
     base = stored or base
     sections = {field.name: getattr(base, field.name) for field in _sections()}
-    options: Any = _parse(_Train, flags, f"{prog} {preset or 'PRESET'}", _Train(seed=base.seed, **sections))
+    defaults = _Train(seed=base.seed, algo=base.algo, **sections)
+    options: Any = _parse(_Train, flags, f"{prog} {preset or 'PRESET'}", defaults)
     asked = _build_config(preset or base.preset, options)
     if stored is not None:
         _check_resume(options, stored, asked)
@@ -218,21 +222,23 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
     return options, asked
 
 
-def _preset(name: str) -> Config:
+def _preset(name: str, algo: str | None) -> Config:
     try:
-        return presets.get(name)
+        cfg = presets.get(name)
+        return cfg if algo is None else algorithms.configure(cfg, algo)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
 
 
-def _resumed(flags: list[str]) -> Path | None:
-    """The folder after --resume, needed before the rest can be read: its config is what flags are compared with."""
+def _value_of(flags: list[str], name: str) -> str | None:
+    """What follows the option `name` on the command line: --resume and --algo decide the defaults of all the rest."""
+    found = None
     for i, flag in enumerate(flags):
-        if flag == "--resume" and i + 1 < len(flags):
-            return Path(flags[i + 1])
-        if flag.startswith("--resume="):
-            return Path(flag.removeprefix("--resume="))
-    return None
+        if flag == name and i + 1 < len(flags):
+            found = flags[i + 1]
+        elif flag.startswith(f"{name}="):
+            found = flag.removeprefix(f"{name}=")
+    return found  # the last one, as the parser takes it
 
 
 def _stored_config(run_dir: Path) -> Config:
@@ -249,7 +255,7 @@ def _stored_config(run_dir: Path) -> Config:
 def _build_config(preset: str, options: Any) -> Config:
     sections = {field.name: getattr(options, field.name) for field in _sections()}
     try:
-        return Config(preset=preset, seed=options.seed, **sections)
+        return Config(preset=preset, algo=options.algo, seed=options.seed, **sections)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
 

@@ -7,14 +7,25 @@ others name their source.
 
 import dataclasses
 import math
-from typing import Literal
+import typing
+from typing import Any, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
+Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
 
 
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise ValueError(message)
+
+
+def _require_choices(cfg: Any, section: str) -> None:
+    """Every field of a Literal type has one of its values: a typing mistake must not pass for the other branch."""
+    for field in dataclasses.fields(cfg):
+        if typing.get_origin(field.type) is Literal:
+            choices, value = typing.get_args(field.type), getattr(cfg, field.name)
+            names = ", ".join(map(str, choices))
+            _require(value in choices, f"{section}{field.name}: {value!r} is not one of: {names}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +63,23 @@ class SceneConfig:
         _require(0.05 <= self.drop_extent <= 0.448, "scene.drop_extent: must lie in 0.05 .. 0.448 m")
         _require(0.05 <= self.drop_height <= 1.0, "scene.drop_height: must lie in 0.05 .. 1 m")
         _require(0.5 <= self.settle_time <= 20.0, "scene.settle_time: must lie in 0.5 .. 20 s")
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskConfig:
+    """What an episode asks for, and when it is cut off."""
+
+    kind: Literal["clear", "target"] = "clear"
+    """`clear`: take every block. `target`: get one marked block, then the next one (CSAC sec. 4.4)."""
+    max_actions: int = 15
+    """Actions after which an episode is cut off."""
+    max_idle: int = 10
+    """Actions in a row without visible change after which an episode is cut off (VPG)."""
+
+    def __post_init__(self) -> None:
+        _require_choices(self, "task.")
+        _require(self.max_actions >= 1, "task.max_actions: at least 1")
+        _require(self.max_idle >= 1, "task.max_idle: at least 1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +121,7 @@ class SimConfig:
         return sum(self.grasp_phases)
 
     def __post_init__(self) -> None:
+        _require_choices(self, "sim.")
         _require(0.0005 <= self.timestep <= 0.01, "sim.timestep: must lie in 0.0005 .. 0.01 s")
         _require(
             min(*self.grasp_phases, *self.push_phases) >= 1, "sim.grasp_phases, push_phases: at least 1 substep each"
@@ -171,17 +200,39 @@ class CEMConfig:
     """Least spread, same units."""
     spread: Literal["std", "mad"] = "std"
     """How elites' spread is measured: standard deviation, or line 12's mean absolute deviation with 1 / (K - 1)."""
+    start: Literal["both", "actor", "cells"] = "both"
+    """W of the first round: about the actor's mean, with the map's best cells among the samples; or without those; or
+    about the best cell, with no use of the actor."""
 
     def __post_init__(self) -> None:
+        _require_choices(self, "cem.")
         _require(2 <= self.elites <= self.candidates, "cem.elites: must lie in 2 .. cem.candidates")
         _require(self.rounds >= 1, "cem.rounds: at least 1")
         _require(0.0 < self.std_min <= self.std <= 2.0, "cem.std: 0 < cem.std_min <= cem.std <= 2")
 
 
 @dataclasses.dataclass(frozen=True)
+class PolicyConfig:
+    """How an action is chosen from the dense maps."""
+
+    place: Literal["cem", "argmax"] = "cem"
+    """Pose of each primitive: the cross-entropy method, between cells and yaws, or the best cell as it is (VPG)."""
+    primitive: Literal["argmax", "rule", "grasp"] = "argmax"
+    """Which primitive: that of larger value; a push after an action without visible change, else a grasp (CSAC sec.
+    3.4); or always a grasp."""
+    mask: bool = True
+    """Leave out cells with nothing to act on (SPOT, arXiv:1909.04730); else every cell above the workspace counts."""
+
+    def __post_init__(self) -> None:
+        _require_choices(self, "policy.")
+
+
+@dataclasses.dataclass(frozen=True)
 class TargetConfig:
     """TD target, eq. 9 and Algorithm 1 lines 17-19, softmax as in SD3 (arXiv:2010.09177)."""
 
+    value: Literal["softmax", "max"] = "softmax"
+    """V(s'): softmax over noisy target actions (line 17), or its limit, the largest value of the dense map (eq. 9)."""
     gamma: float = 0.5
     """Discount (VPG)."""
     samples: int = 50
@@ -194,6 +245,7 @@ class TargetConfig:
     """beta of the softmax for a Q range of 1; divided by the range of possible returns."""
 
     def __post_init__(self) -> None:
+        _require_choices(self, "target.")
         _require(0.0 <= self.gamma < 1.0, "target.gamma: must lie in 0 <= gamma < 1")
         _require(self.samples >= 1, "target.samples: at least 1")
         _require(self.std > 0.0 and self.clip > 0.0, "target.std, target.clip: must be positive")
@@ -208,10 +260,16 @@ class RewardConfig:
     """r2 of eq. 11: the hand comes back with a block."""
     distance: float = 0.0
     """w: penalty per metre between the place and where the finger tips acted (eq. 10, sign turned)."""
+    farthest: float = 1.0
+    """Distance beyond which that penalty grows no more, m (ours: so that returns are bounded)."""
     eta0: float = 0.0
     """eta_0 of eq. 13."""
     eta1: float = 1.0
     """eta_1 of eq. 13."""
+    push_level: float = 0.0
+    """s_c of eq. 13, the push's level."""
+    grasp_level: float = 1.0
+    """s_g of eq. 13, the grasp's level, which is s_max."""
     nothing: float = -1.0
     """Grasp that does nothing (eq. 15)."""
     empty: float = -0.5
@@ -222,15 +280,20 @@ class RewardConfig:
     """Grasp that holds a block and loses it (eq. 15)."""
     lifted: float = 1.0
     """Grasp that lifts a block (eq. 15)."""
+    push_effect: Literal["value", "change"] = "value"
+    """What makes a push a good one: that the best grasp is worth more (eq. 16), or that the map has changed (VPG)."""
     push_better: float = 1.0
-    """Push after which the best grasp is worth more (eq. 16)."""
+    """Good push (eq. 16)."""
     push_worse: float = -1.0
-    """Push after which it is not (eq. 16)."""
+    """Any other push (eq. 16)."""
     dead_band: float = 0.1
     """Gain in the best grasp's value that a push must exceed (ours)."""
 
     def __post_init__(self) -> None:
+        _require_choices(self, "reward.")
         _require(self.distance >= 0.0, "reward.distance: a distance must not be a gain, so it must not be negative")
+        _require(self.farthest > 0.0, "reward.farthest: must be positive")
+        _require(self.push_level <= self.grasp_level, "reward.push_level: must not exceed reward.grasp_level, s_max")
         _require(self.dead_band >= 0.0, "reward.dead_band: must not be negative")
         levels = (self.nothing, self.empty, self.touched, self.dropped, self.lifted)
         _require(list(levels) == sorted(levels), "reward: nothing <= empty <= touched <= dropped <= lifted is needed")
@@ -282,19 +345,32 @@ class LearnConfig:
     """Updates of the critic per training step, that is, per `train.scenes` actions; the actor has one per step."""
     augment: bool = True
     """Show each drawn transition under a random symmetry of the square."""
+    critics: int = 1
+    """Critics, 1 or 2; of two, the lower Q counts in each cell (TD3's twin, arXiv:1802.09477)."""
+    actor: bool = True
+    """Learn the policy network; without it, mu(s) is read off the critic's own map."""
+    target_update: Literal["soft", "hard"] = "soft"
+    """How targets follow: by the share `tau` after each update (lines 24-26), or as a copy now and then (sec. 3.4)."""
     tau: float = 0.02
     """Share of the online network in each soft update of the target (Algorithm 1 lines 24-26)."""
+    copy_every: int = 100
+    """C, updates between two copies if `target_update` is hard (ours; sec. 3.4 gives no number)."""
     gradient_clip: float = 10.0
     """Bound of the gradient's global norm."""
+    loss: Literal["huber", "squared"] = "huber"
+    """Of the TD error: Huber (CSAC sec. 4) or squared (Algorithm 1 line 21)."""
     huber: float = 1.0
     """Width of the quadratic part of the Huber loss (CSAC sec. 4)."""
 
     def __post_init__(self) -> None:
+        _require_choices(self, "learn.")
         _require(self.learning_rate > 0.0, "learn.learning_rate: must be positive")
         _require(self.actor_learning_rate > 0.0, "learn.actor_learning_rate: must be positive")
         _require(0.0 < self.rate_end <= 1.0, "learn.rate_end: must lie in 0 < rate_end <= 1")
         _require(self.batch >= 1 and self.updates >= 1, "learn.batch and learn.updates: at least 1")
+        _require(self.critics in (1, 2), "learn.critics: must be 1 or 2")
         _require(0.0 < self.tau <= 1.0, "learn.tau: must lie in 0 < tau <= 1")
+        _require(self.copy_every >= 1, "learn.copy_every: at least 1 update")
         _require(self.gradient_clip > 0.0 and self.huber > 0.0, "learn.gradient_clip, learn.huber: must be positive")
 
 
@@ -304,7 +380,7 @@ class ReplayConfig:
 
     capacity: int = 4096
     """C, transitions kept."""
-    sampler: Literal["uniform", "beta"] = "beta"
+    sampler: Literal["uniform", "prioritised", "beta"] = "beta"
     """`uniform` is CSAC, `beta` CSAC-beta (sec. 3.5): ranks by abs(TD error), rank / n ~ Beta(a, b)."""
     beta_start: tuple[float, float] = (0.5, 0.5)
     """(a, b) at first (CSAC sec. 4.3)."""
@@ -333,10 +409,6 @@ class TrainConfig:
     """Training steps in one call of the compiled program; between calls the host logs, saves and stops."""
     save_every: int = 50
     """Chunks between checkpoints; the last chunk and a stop are always saved."""
-    max_actions: int = 15
-    """Actions after which an episode is cut off."""
-    max_idle: int = 10
-    """Actions in a row without visible change after which an episode is cut off (VPG)."""
 
     @property
     def steps(self) -> int:
@@ -344,7 +416,7 @@ class TrainConfig:
         return math.ceil(self.actions / self.scenes)
 
     def __post_init__(self) -> None:
-        for name in ("scenes", "actions", "warmup", "chunk", "save_every", "max_actions", "max_idle"):
+        for name in ("scenes", "actions", "warmup", "chunk", "save_every"):
             _require(getattr(self, name) >= 1, f"train.{name}: at least 1")
 
 
@@ -354,13 +426,17 @@ class Config:
 
     preset: str = "quick"
     """Name of the preset that this config was made from."""
+    algo: Algo = "csac_beta"
+    """Name of the algorithm that was asked for; what it is made of stands in the sections."""
     seed: int = 0
     """Number that all randomness of the run follows from."""
     scene: SceneConfig = SceneConfig()
+    task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()
     heightmap: HeightmapConfig = HeightmapConfig()
     net: NetConfig = NetConfig()
     cem: CEMConfig = CEMConfig()
+    policy: PolicyConfig = PolicyConfig()
     target: TargetConfig = TargetConfig()
     reward: RewardConfig = RewardConfig()
     explore: ExploreConfig = ExploreConfig()
@@ -369,7 +445,12 @@ class Config:
     train: TrainConfig = TrainConfig()
 
     def __post_init__(self) -> None:
+        _require_choices(self, "")
         _require(0 <= self.seed < 2**31, "seed: must lie in 0 .. 2147483647")
+        _require(
+            self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0,
+            "explore.push_fraction: must be 0 where policy.primitive is grasp, which never pushes",
+        )
         _require(
             self.learn.batch <= self.train.warmup,
             f"learn.batch: {self.learn.batch} transitions cannot be drawn after train.warmup = {self.train.warmup}; "

@@ -26,7 +26,7 @@ ORDER = (
     ("sim",),
     ("scene",),
     ("geometry",),
-    ("presets",),
+    ("presets", "algorithms"),
     ("config",),
     ("__init__",),
     ("_guard",),

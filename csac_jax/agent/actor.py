@@ -39,6 +39,23 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
 
     step = 2.0 * np.pi / num
     yaws = jnp.asarray(frames.yaws)[k] + step * np.array([-1, 0, 1], np.float32)
-    read = jax.vmap(lambda yaw: maps.read(frames, state.logits, jnp.int32(primitive), jnp.append(xy, yaw)))
-    turn = jnp.sum(jax.nn.softmax(read(geometry.wrap_angle(yaws))) * np.array([-step, 0.0, step], np.float32))
+    heights = _along_yaw(frames, state, primitive, xy, geometry.wrap_angle(yaws))
+    turn = jnp.sum(jax.nn.softmax(heights) * np.array([-step, 0.0, step], np.float32))
     return jnp.append(xy, geometry.wrap_angle(jnp.asarray(frames.yaws)[k] + turn))
+
+
+def _along_yaw(frames: Frames, state: DenseMaps, primitive: int, xy: jax.Array, yaws: jax.Array) -> jax.Array:
+    """Logits [3] at one place [2] m and three yaws [3], the middle one the best cell's; -inf where it is not valid.
+
+    Between cells only the valid ones are mixed: sum w_i l_i / sum w_i, w_i the bilinear weight of a valid cell, 0 of
+    any other. The middle one stands for all if none of the three is valid.
+    """
+    valid = state.valid[primitive]
+    valid |= ~jnp.any(valid)
+    grids = jnp.stack([jnp.where(valid, state.logits[primitive], 0.0), valid.astype(jnp.float32)])
+    poses = jax.vmap(jnp.append, (None, 0))(xy, yaws)
+    read = jax.vmap(jax.vmap(maps.read, (None, None, 0, None)), (None, None, None, 0))
+    total, weight = read(frames, grids, jnp.arange(2), poses).T  # [3] each
+    shown = jax.vmap(lambda pose: maps.is_valid(frames, valid[None], jnp.int32(0), pose))(poses)
+    middle = np.array([False, True, False]) & ~jnp.any(shown)
+    return jnp.where(shown | middle, total / jnp.where(shown, weight, 1.0), -jnp.inf)

@@ -1,4 +1,8 @@
-"""Networks and their updates: the critic towards the TD target, the actor up the critic, targets after both."""
+"""Networks and their updates: the critic towards the TD target, the actor up the critic, targets after both.
+
+M = critics, one or two of the same shape: their parameters are stacked and the net is vmapped over them. Everything
+but the loss sees the lower of their values in each cell.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -33,7 +37,7 @@ class Transition:
 class Params:
     """Network parameters: theta^Q and theta^mu."""
 
-    critic: Any
+    critic: Any  # leaves [M, ...]
     actor: Any
 
 
@@ -53,7 +57,7 @@ class UpdateInfo(NamedTuple):
 
     critic_loss: jax.Array  # []
     q: jax.Array  # [] mean of Q(s, a)
-    error: jax.Array  # [B] y - Q(s, a)
+    error: jax.Array  # [B] y - Q(s, a), mean over critics
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,9 +96,12 @@ def init(key: jax.Array, learner: Learner) -> LearnerState:
     """Fresh networks; targets are copies (Algorithm 1 lines 1-2)."""
     key_critic, key_actor = jax.random.split(key)
     side = learner.frames.tables.canvas
-    blank = jnp.zeros((1, side, side, dense.CHANNELS))
-    (_, features), critic = learner.critic.init_with_output(key_critic, blank)
-    online = Params(critic, learner.actor.init(key_actor, features))
+    size = learner.cfg.heightmap.size
+    blank_obs = Observation(jnp.zeros((size, size, 3)), jnp.zeros((size, size)), jnp.zeros((size, size), bool))
+    blank = jnp.zeros((1, side, side, maps.seen(learner.frames, blank_obs).shape[-1]))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key_critic, jnp.arange(learner.cfg.learn.critics))
+    (_, features), critic = jax.vmap(learner.critic.init_with_output, (0, None))(keys, blank)
+    online = Params(critic, learner.actor.init(key_actor, features[0]))
     return LearnerState(
         online=online,
         target=jax.tree.map(jnp.copy, online),
@@ -111,20 +118,30 @@ def look(learner: Learner, params: Params, obs: Observation) -> DenseMaps:
 
 
 def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
-    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, h, w, F] of a batch, in the frames of the passes."""
+    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, h, w, F] of a batch, in the frames of the passes.
+
+    Q is the lower of both critics in each cell, before anything is read between cells; features are the first one's.
+    """
     fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
-    outputs: Any = learner.critic.apply(params.critic, fed.reshape(-1, *fed.shape[2:]))
-    q, features = (leaf.reshape(*fed.shape[:2], *leaf.shape[1:]) for leaf in outputs)
+    q, features = _apply_critics(learner, params.critic, fed.reshape(-1, *fed.shape[2:]))
+    q, features = (leaf.reshape(*fed.shape[:2], *leaf.shape[1:]) for leaf in (jnp.min(q, axis=0), features[0]))
     return q, features
 
 
+def _apply_critics(learner: Learner, critic_params: Any, fed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q [M, n, h, w, OUTPUTS] and features [M, n, h, w, F] of all critics for `fed` [n, C, C, CHANNELS]."""
+    outputs: Any = jax.vmap(learner.critic.apply, (0, None))(critic_params, fed)
+    return outputs
+
+
 def _with_actor(learner: Learner, actor_params: Any, obs: Observation, q: jax.Array, features: jax.Array) -> DenseMaps:
-    correction: Any = learner.actor.apply(actor_params, features)
-    unfold = jax.vmap(maps.unfold)
+    cfg, unfold = learner.cfg, jax.vmap(maps.unfold)
+    correction: Any = learner.actor.apply(actor_params, features) if cfg.learn.actor else jnp.zeros_like(q)
+    find = maps.actionable if cfg.policy.mask else maps.everywhere
     return DenseMaps(
         q=unfold(q),
         logits=unfold(actor.logits(q, correction)),
-        valid=jax.vmap(maps.actionable, (None, 0))(learner.frames, obs),
+        valid=jax.vmap(find, (None, 0))(learner.frames, obs),
     )
 
 
@@ -136,7 +153,27 @@ def best_grasp(state: DenseMaps) -> jax.Array:
 
 
 def next_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
-    """softmax_beta(Q'(s', .)) [] over noisy target actions of both primitives, Algorithm 1 line 17.
+    """V(s') [] over the primitives that the policy takes, as `target.value` says."""
+    value = learner.cfg.target.value
+    if value == "softmax":
+        return _softmax_value(learner, key, state)
+    if value == "max":
+        return _max_value(learner, state)
+    raise ValueError(f"target.value: {value!r} is neither 'softmax' nor 'max'")
+
+
+def _max_value(learner: Learner, state: DenseMaps) -> jax.Array:
+    """max Q'(s', .) [] over the dense map's valid cells, eq. 9 and VPG; over all if none is valid.
+
+    The limit of the softmax over the map: samples would miss the highest cell, and a trilinear map is highest in one.
+    """
+    chosen = np.array(maps.allowed(learner.cfg.policy))
+    valid = state.valid[chosen]
+    return jnp.max(jnp.where(valid | ~jnp.any(valid), state.q[chosen], -jnp.inf))
+
+
+def _softmax_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
+    """softmax_beta(Q'(s', .)) [] over noisy target actions, Algorithm 1 line 17.
 
     Samples above nothing do not count, unless all are; a state's two primitives count alike.
     """
@@ -150,7 +187,8 @@ def next_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
         q = jax.vmap(maps.read, (None, None, None, 0))(frames, state.q, which, poses)
         return q, log_density, jax.vmap(maps.is_valid, (None, None, None, 0))(frames, state.valid, which, poses)
 
-    q, log_density, valid = (jnp.concatenate(leaves) for leaves in zip(*(of(p) for p in Primitive), strict=True))
+    sampled = map(of, maps.allowed(learner.cfg.policy))
+    q, log_density, valid = (jnp.concatenate(leaves) for leaves in zip(*sampled, strict=True))
     low, high = learner.bounds
     shown = valid | ~jnp.any(valid)
     inverse_temperature = softmax.scaled_inverse_temperature(cfg, high - low)
@@ -158,17 +196,17 @@ def next_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
 
 
 def _value(learner: Learner, critic_params: Any, obs: Observation, action: Action) -> jax.Array:
-    """Q(s, a) of a batch [B], from two passes per state: the frames next to the action's yaw."""
+    """Q(s, a) of a batch by each critic [M, B], from two passes per state: the frames next to the action's yaw."""
     frames = learner.frames
     num = frames.yaws.shape[0]
     turns = action.pose[:, 2] * (num / (2.0 * np.pi))
     lower = jnp.floor(turns)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
-    fed = dense.inputs(obs.colour, obs.height)
+    fed = maps.seen(frames, obs)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(frames.tables, fed, half)
-    outputs: Any = learner.critic.apply(critic_params, one.reshape(-1, *one.shape[2:]))
-    q = outputs[0].reshape(*k.shape, *outputs[0].shape[1:])  # [B, 2, h, w, OUTPUTS]
+    q, _ = _apply_critics(learner, critic_params, one.reshape(-1, *one.shape[2:]))
+    q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
     push_output = (k >= num // 2).astype(jnp.int32)
     output = jnp.where((action.primitive == Primitive.GRASP)[:, None], dense.OUTPUTS - 1, push_output)
 
@@ -176,9 +214,10 @@ def _value(learner: Learner, critic_params: Any, obs: Observation, action: Actio
         position = rotate.frame_position(jnp.asarray(frames.yaws)[half], xy)
         return rotate.bilinear(q[..., output], rotate.to_cell(frames.side, frames.cell, position))
 
-    near = jax.vmap(jax.vmap(at, (0, 0, 0, None)))(q, output, half, action.pose[:, :2])  # [B, 2]
-    share = turns - lower
-    return (1.0 - share) * near[:, 0] + share * near[:, 1]
+    read = jax.vmap(jax.vmap(at, (0, 0, 0, None)))
+    near = jax.vmap(read, (0, None, None, None))(q, output, half, action.pose[:, :2])  # [M, B, 2]
+    share = (turns - lower)[None]
+    return (1.0 - share) * near[..., 0] + share * near[..., 1]
 
 
 def update_critic(
@@ -194,15 +233,15 @@ def update_critic(
     obs = heightmap.unpack(batch.obs)
 
     def loss(params: Any) -> tuple[jax.Array, jax.Array]:
-        q = _value(learner, params, obs, batch.action)
-        return jnp.mean(losses.huber(target - q, cfg.learn.huber)), q
+        q = _value(learner, params, obs, batch.action)  # [M, B]
+        return jnp.mean(jnp.sum(losses.of_error(cfg.learn, target[None] - q), axis=0)), jnp.mean(q, axis=0)
 
     (critic_loss, q), gradient = jax.value_and_grad(loss, has_aux=True)(state.online.critic)
     step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)
     online = state.online.replace(critic=optax.apply_updates(state.online.critic, step))
     state = state.replace(
         online=online,
-        target=losses.polyak(online, state.target, cfg.learn.tau),
+        target=losses.follow(cfg.learn, online, state.target, state.updates + 1),
         critic_optimiser=optimiser,
         updates=state.updates + 1,
     )
@@ -212,8 +251,12 @@ def update_critic(
 def update_actor(learner: Learner, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
     """One step of theta^mu up the critic, Algorithm 1 lines 22-23; returns the loss [], minus the mean of Q(s, mu(s)).
 
-    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for both primitives.
+    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for each primitive that the
+    policy takes. Without an actor (`learn.actor`) nothing changes and the loss is 0.
     """
+    if not learner.cfg.learn.actor:
+        return state, jnp.zeros(())
+    chosen = maps.allowed(learner.cfg.policy)
     q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online, obs))
 
     def value(dense_maps: DenseMaps, primitive: Primitive) -> jax.Array:
@@ -222,7 +265,7 @@ def update_actor(learner: Learner, state: LearnerState, obs: Observation) -> tup
 
     def loss(params: Any) -> jax.Array:
         dense_maps = _with_actor(learner, params, obs, q, features)
-        return -jnp.mean(jnp.stack([jax.vmap(lambda one, p=p: value(one, p))(dense_maps) for p in Primitive]))
+        return -jnp.mean(jnp.stack([jax.vmap(lambda one, p=p: value(one, p))(dense_maps) for p in chosen]))
 
     actor_loss, gradient = jax.value_and_grad(loss)(state.online.actor)
     step, optimiser = learner.actor_optimiser.update(gradient, state.actor_optimiser)

@@ -1,4 +1,4 @@
-"""From dense maps to an action: CEM per primitive, then the better one, with or without exploration."""
+"""From dense maps to an action: a pose per primitive, then one of them, with or without exploration."""
 
 from typing import NamedTuple
 
@@ -8,39 +8,81 @@ import jax.numpy as jnp
 from csac_jax.agent import actor, box, cem, explore, maps
 from csac_jax.agent.explore import Greedy
 from csac_jax.agent.maps import DenseMaps, Frames
-from csac_jax.config import CEMConfig, Config
+from csac_jax.config import Config, PolicyConfig
 from csac_jax.sim.primitives import Action, Primitive
 
 
 class Choice(NamedTuple):
-    """The best pose of each primitive and which primitive is better."""
+    """The best pose of each primitive and which primitive is chosen."""
 
     greedy: Greedy  # poses in the box
     values: jax.Array  # [P] Q of the poses
 
 
-def greedy(key: jax.Array, cfg: CEMConfig, frames: Frames, state: DenseMaps, penalty: float) -> Choice:
-    """Maximises Q over the pose of each primitive, then over primitives (CSAC sec. 3.4, argmax of both results).
+def greedy(key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, idle: jax.Array) -> Choice:
+    """The best pose of each primitive by `policy.place`, then a primitive by `policy.primitive`.
 
-    CEM starts at the actor's mean and at the map's best cells, as many as there are elites; `penalty`, the span of
-    possible returns, keeps it off cells with nothing to act on.
+    Args: penalty, the span of possible returns; idle [] int32, actions in a row without visible change.
     """
 
     def best(primitive: Primitive) -> cem.CEMResult:
-        def score(u: jax.Array) -> jax.Array:
-            pose = maps.denormalise(frames, u)
-            value = maps.read(frames, state.q, jnp.int32(primitive), pose)
-            return jnp.where(maps.is_valid(frames, state.valid, jnp.int32(primitive), pose), value, value - penalty)
-
-        mean = maps.normalise(frames, actor.pose(frames, state, primitive))
-        cells = maps.best_cells(state.q[primitive], state.valid[primitive], cfg.elites)
-        start = jax.vmap(lambda cell: maps.normalise(frames, maps.cell_pose(frames, cell)))(cells)
-        return cem.maximise(jax.random.fold_in(key, primitive), cfg, score, mean, start, box.POSE_WRAPS)
+        if cfg.policy.place == "cem":
+            return _search(jax.random.fold_in(key, primitive), cfg, frames, state, penalty, primitive)
+        if cfg.policy.place == "argmax":
+            return _best_pixel(frames, state, primitive)
+        raise ValueError(f"policy.place: {cfg.policy.place!r} is neither 'cem' nor 'argmax'")
 
     results = [best(primitive) for primitive in Primitive]
     values = jnp.stack([result.value for result in results])
     poses = jnp.stack([result.action for result in results])
-    return Choice(Greedy(jnp.argmax(values).astype(jnp.int32), poses), values)
+    return Choice(Greedy(choose_primitive(cfg.policy, values, idle), poses), values)
+
+
+def _search(
+    key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, primitive: Primitive
+) -> cem.CEMResult:
+    """Maximises Q over the pose of a primitive by the cross-entropy method, Algorithm 1 lines 8-13.
+
+    It starts, by `cem.start`, at the actor's mean, at the map's best cells, as many as there are elites, or at both;
+    `penalty` keeps it off cells with nothing to act on.
+    """
+
+    def score(u: jax.Array) -> jax.Array:
+        pose = maps.denormalise(frames, u)
+        value = maps.read(frames, state.q, jnp.int32(primitive), pose)
+        return jnp.where(maps.is_valid(frames, state.valid, jnp.int32(primitive), pose), value, value - penalty)
+
+    mean = maps.normalise(frames, actor.pose(frames, state, primitive))
+    cells = maps.best_cells(state.q[primitive], state.valid[primitive], cfg.cem.elites)
+    start = jax.vmap(lambda cell: maps.normalise(frames, maps.cell_pose(frames, cell)))(cells)
+    if cfg.cem.start == "actor":
+        start = start[:0]
+    elif cfg.cem.start == "cells":
+        mean = start[0]
+    elif cfg.cem.start != "both":
+        raise ValueError(f"cem.start: {cfg.cem.start!r} is none of 'both', 'actor', 'cells'")
+    return cem.maximise(key, cfg.cem, score, mean, start, box.POSE_WRAPS)
+
+
+def _best_pixel(frames: Frames, state: DenseMaps, primitive: Primitive) -> cem.CEMResult:
+    """The valid cell of largest Q as it is (VPG)."""
+    cell = maps.best_cells(state.q[primitive], state.valid[primitive], 1)[0]
+    return cem.CEMResult(maps.normalise(frames, maps.cell_pose(frames, cell)), state.q[primitive].reshape(-1)[cell])
+
+
+def choose_primitive(cfg: PolicyConfig, values: jax.Array, idle: jax.Array) -> jax.Array:
+    """Primitive [] int32 from the values [P] of the best poses and the number of actions without change, idle [].
+
+    `argmax`, the larger value; `rule`, a push if the last action changed nothing, else a grasp (CSAC sec. 3.4);
+    `grasp`, always that.
+    """
+    if cfg.primitive == "argmax":
+        return jnp.argmax(values).astype(jnp.int32)
+    if cfg.primitive == "rule":
+        return jnp.where(idle > 0, jnp.int32(Primitive.PUSH), jnp.int32(Primitive.GRASP))
+    if cfg.primitive == "grasp":
+        return jnp.int32(Primitive.GRASP)
+    raise ValueError(f"policy.primitive: {cfg.primitive!r} is none of 'argmax', 'rule', 'grasp'")
 
 
 def random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array:
@@ -53,19 +95,27 @@ def random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array
 
 
 def act(
-    key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, actions_taken: jax.Array
+    key: jax.Array,
+    cfg: Config,
+    frames: Frames,
+    state: DenseMaps,
+    penalty: float,
+    idle: jax.Array,
+    actions_taken: jax.Array,
 ) -> Action:
     """The action to try while learning: greedy with exploration, Algorithm 1 lines 8-13."""
     key_cem, key_places, key_choose = jax.random.split(key, 3)
-    choice = greedy(key_cem, cfg.cem, frames, state, penalty)
+    choice = greedy(key_cem, cfg, frames, state, penalty, idle)
     places = random_places(key_places, frames, state.valid)
     primitive, u = explore.choose(key_choose, cfg.explore, actions_taken, choice.greedy, places)
     return Action(primitive=primitive, pose=maps.denormalise(frames, u))
 
 
-def best_action(key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float) -> Action:
+def best_action(
+    key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, idle: jax.Array
+) -> Action:
     """The action of the learned policy, without exploration."""
-    choice = greedy(key, cfg.cem, frames, state, penalty)
+    choice = greedy(key, cfg, frames, state, penalty, idle)
     u = choice.greedy.poses[choice.greedy.primitive]
     return Action(primitive=choice.greedy.primitive, pose=maps.denormalise(frames, u))
 

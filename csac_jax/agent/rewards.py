@@ -9,16 +9,12 @@ import jax.numpy as jnp
 from csac_jax.config import RewardConfig
 
 PUSH, GRASP = 0, 1
-PUSH_LEVEL, GRASP_LEVEL = 0, 1
-"""s of eq. 13; the grasp's is s_max."""
 LIFTED = 4
-FARTHEST = 1.0
-"""Distance beyond which the penalty of eq. 10 grows no more, m (ours: so that returns are bounded)."""
 
 
-def scale(cfg: RewardConfig, level: int, level_max: int) -> float:
-    """Gamma = eta0 + eta1 2^(s - s_max), eq. 13: with the default etas, 0.5 for a push and 1 for a grasp."""
-    return cfg.eta0 + cfg.eta1 * 2.0 ** (level - level_max)
+def scale(cfg: RewardConfig, level: float) -> float:
+    """Gamma = eta0 + eta1 2^(s - s_max), eq. 13: by default 0.5 for a push and 1 for a grasp, whose level is s_max."""
+    return cfg.eta0 + cfg.eta1 * 2.0 ** (level - cfg.grasp_level)
 
 
 def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array:
@@ -28,7 +24,7 @@ def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array
 
     Args: lifted [] bool, the hand came back with a block; distance [] m, from the chosen place to where the tips acted.
     """
-    return jnp.where(lifted, cfg.reach, 0.0) - cfg.distance * jnp.minimum(distance, FARTHEST)
+    return jnp.where(lifted, cfg.reach, 0.0) - cfg.distance * jnp.minimum(distance, cfg.farthest)
 
 
 def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
@@ -37,12 +33,21 @@ def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
     return levels.at[outcome].get(mode="clip")
 
 
-def push_effect(cfg: RewardConfig, phi_before: jax.Array, phi_after: jax.Array) -> jax.Array:
-    """I_c [], eq. 16: `push_better` if phi(s') > phi(s) + dead band, else `push_worse`, also for NaN.
+def push_effect(cfg: RewardConfig, phi_before: jax.Array, phi_after: jax.Array, changed: jax.Array) -> jax.Array:
+    """I_c []: `push_better` after a good push, else `push_worse`.
 
-    Args: phi_before, phi_after [] best grasp's value before and after the push, of one and the same critic.
+    Good is, by `value`, phi(s') > phi(s) + dead band, eq. 16, never NaN; by `change`, that the map has changed (VPG).
+
+    Args: phi_before, phi_after [] best grasp's value before and after the push, of one and the same critic; changed []
+    bool, more of the map moved than counts as a change.
     """
-    return jnp.where(phi_after > phi_before + cfg.dead_band, cfg.push_better, cfg.push_worse)
+    if cfg.push_effect == "value":
+        good = phi_after > phi_before + cfg.dead_band
+    elif cfg.push_effect == "change":
+        good = changed
+    else:
+        raise ValueError(f"reward.push_effect: {cfg.push_effect!r} is neither 'value' nor 'change'")
+    return jnp.where(good, cfg.push_better, cfg.push_worse)
 
 
 def reward(
@@ -52,6 +57,7 @@ def reward(
     distance: jax.Array,
     phi_before: jax.Array,
     phi_after: jax.Array,
+    changed: jax.Array,
 ) -> jax.Array:
     """R = r + Gamma(phi) I [], eqs. 12 and 14; a push earns no r2.
 
@@ -62,8 +68,8 @@ def reward(
     grasped = primitive == GRASP
     effect = jnp.where(
         grasped,
-        scale(cfg, GRASP_LEVEL, GRASP_LEVEL) * grasp_effect(cfg, outcome),
-        scale(cfg, PUSH_LEVEL, GRASP_LEVEL) * push_effect(cfg, phi_before, phi_after),
+        scale(cfg, cfg.grasp_level) * grasp_effect(cfg, outcome),
+        scale(cfg, cfg.push_level) * push_effect(cfg, phi_before, phi_after, changed),
     )
     return base(cfg, grasped & (outcome == LIFTED), distance) + effect
 
@@ -74,10 +80,10 @@ def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:
     r + gamma r' + ... with every reward in [r_min, r_max]: r_min / (1 - gamma) if r_min is a loss, else r_min alone,
     from an episode that ends at once; likewise above.
     """
-    grasp = [scale(cfg, GRASP_LEVEL, GRASP_LEVEL) * level for level in _grasp_levels(cfg)]
+    grasp = [scale(cfg, cfg.grasp_level) * level for level in _grasp_levels(cfg)]
     grasp[LIFTED] += cfg.reach
-    push = [scale(cfg, PUSH_LEVEL, GRASP_LEVEL) * effect for effect in (cfg.push_better, cfg.push_worse)]
-    lowest, highest = min(grasp + push) - cfg.distance * FARTHEST, max(grasp + push)
+    push = [scale(cfg, cfg.push_level) * effect for effect in (cfg.push_better, cfg.push_worse)]
+    lowest, highest = min(grasp + push) - cfg.distance * cfg.farthest, max(grasp + push)
     return min(lowest, lowest / (1.0 - gamma)), max(highest, highest / (1.0 - gamma))
 
 

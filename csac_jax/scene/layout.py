@@ -79,6 +79,12 @@ def turn(scene: Scene, yaw: jax.Array) -> Scene:
     return park(turned, scene.in_play)
 
 
+def mark(key: jax.Array, scene: Scene) -> Scene:
+    """The scene with one of its blocks in play, each equally likely, as the target; ANY if none is in play."""
+    slot = jax.random.categorical(key, jnp.where(scene.in_play, 0.0, -jnp.inf)).astype(jnp.int32)
+    return scene.replace(target=jnp.where(jnp.any(scene.in_play), slot, ANY))
+
+
 def inside(position: jax.Array, extent: float) -> jax.Array:
     """True where a block's centre [N, 3] lies above the workspace square, [N] bool."""
     return jnp.all(jnp.abs(position[:, :2]) <= 0.5 * extent, axis=1)

@@ -74,12 +74,12 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     key_act, key_learn, key_reset = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
     scenes = state.scenes
 
-    # Look and act: CEM on the critic's maps from the actor's mean, plus noise (lines 8-13).
+    # Look and act: by default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13).
     maps = learning.look(learner, state.learner.online, scenes.obs)
-    act = jax.vmap(policy.act, (0, None, None, 0, None, None))
+    act = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
     taken = state.step * cfg.train.scenes
     span = learner.bounds[1] - learner.bounds[0]
-    action = act(_keys(key_act, cfg.train.scenes), cfg, learner.frames, maps, span, taken)
+    action = act(_keys(key_act, cfg.train.scenes), cfg, learner.frames, maps, span, scenes.idle, taken)
 
     # Simulate.
     after = jax.vmap(env.step)(scenes, action)
@@ -87,8 +87,9 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     # Reward and remember (lines 14-15).
     phi_before, phi_after = (_best_grasps(learner, state.learner, obs) for obs in (scenes.obs, after.obs))
     info = after.info
-    reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0))(
-        cfg.reward, action.primitive, info.outcome, info.distance, phi_before, phi_after
+    changed = info.moved > environment.CHANGE_AREA
+    reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))(
+        cfg.reward, action.primitive, info.outcome, info.distance, phi_before, phi_after, changed
     )
     seen = Transition(
         obs=heightmap.pack(scenes.obs),
@@ -106,7 +107,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     errors = jnp.where(ready, errors, replay.error)
 
     # Replace finished scenes.
-    fresh = jax.vmap(env.reset)(_keys(key_reset, cfg.train.scenes))
+    fresh = jax.vmap(env.restart)(_keys(key_reset, cfg.train.scenes), after)
     scenes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
     pushed = action.primitive == Primitive.PUSH

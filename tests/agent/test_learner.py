@@ -54,7 +54,8 @@ def _ended(batch: Transition) -> Transition:
 def _constant(params: Params, value: float) -> Params:
     """The same networks, whose every map is `value`: all is 0 but the bias of the outputs."""
     zero = jax.tree.map(jnp.zeros_like, params.critic)
-    constant = jax.tree.map(lambda leaf: jnp.full_like(leaf, value) if leaf.shape == (dense.OUTPUTS,) else leaf, zero)
+    is_bias = lambda leaf: leaf.shape[1:] == (dense.OUTPUTS,)  # noqa: E731  (axis 0 is the critics')
+    constant = jax.tree.map(lambda leaf: jnp.full_like(leaf, value) if is_bias(leaf) else leaf, zero)
     return params.replace(critic=constant)
 
 

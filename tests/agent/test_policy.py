@@ -20,7 +20,7 @@ KEYS = 20
 @pytest.fixture(scope="module")
 def best(cfg, frames):
     """Actions of DenseMaps for KEYS keys."""
-    run = jax.vmap(lambda key, state: policy.best_action(key, cfg, frames, state, PENALTY), (0, None))
+    run = jax.vmap(lambda key, state: policy.best_action(key, cfg, frames, state, PENALTY, jnp.int32(0)), (0, None))
     return jax.jit(lambda state: run(jax.random.split(jax.random.key(0), KEYS), state))
 
 
@@ -81,7 +81,7 @@ def test_without_exploration_it_acts_greedily(cfg, frames):
     state = _state(frames, 7)
     calm = ExploreConfig(noise_std=0.0, primitive_start=0.0, primitive_end=0.0, place_start=0.0, place_end=0.0)
     own = dataclasses.replace(cfg, explore=calm)
-    act = jax.jit(jax.vmap(lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(0))))
+    act = jax.jit(jax.vmap(lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(0), jnp.int32(0))))
     action = act(jax.random.split(jax.random.key(2), KEYS))
     values = jax.vmap(lambda p, pose: maps.read(frames, state.q, p, pose))(action.primitive, action.pose)
     valid = jax.vmap(lambda p, pose: maps.is_valid(frames, state.valid, p, pose))(action.primitive, action.pose)

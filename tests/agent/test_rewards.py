@@ -1,11 +1,13 @@
 """Rewards of one action."""
 
+import dataclasses
 import itertools
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from csac_jax import algorithms
 from csac_jax.agent import rewards
 from csac_jax.config import RewardConfig
 from csac_jax.sim.outcome import Outcome
@@ -13,9 +15,9 @@ from csac_jax.sim.outcome import Outcome
 CFG = RewardConfig()
 
 
-def reward(cfg, primitive, outcome=0, distance=0.0, before=0.0, after=0.0):
+def reward(cfg, primitive, outcome=0, distance=0.0, before=0.0, after=0.0, changed=False):
     values = (jnp.float32(v) for v in (distance, before, after))
-    return float(rewards.reward(cfg, jnp.int32(primitive), jnp.int32(outcome), *values))
+    return float(rewards.reward(cfg, jnp.int32(primitive), jnp.int32(outcome), *values, jnp.asarray(changed)))
 
 
 @pytest.mark.parametrize(("outcome", "expected"), list(zip(Outcome, (-1.0, -0.5, -0.25, 0.0, 2.0), strict=True)))
@@ -47,16 +49,18 @@ def test_push_ignores_the_outcome_of_a_grasp(outcome):
 def test_distance_is_a_loss():
     """Claim: r = r2 - w r1: 0.2 m at w = 2 cost 0.4, of a push and of a grasp, and beyond 1 m no more than at 1 m."""
     cfg = RewardConfig(distance=2.0)
+    near = RewardConfig(distance=2.0, farthest=0.1)
     np.testing.assert_allclose(reward(cfg, rewards.GRASP, Outcome.LIFTED, 0.2), 1.6, rtol=1e-6)
     np.testing.assert_allclose(reward(cfg, rewards.PUSH, distance=0.2, after=1.0), 0.1, rtol=1e-5)
     assert rewards.base(cfg, jnp.array(False), jnp.float32(7.0)) == -2.0
+    np.testing.assert_allclose(rewards.base(near, jnp.array(False), jnp.float32(7.0)), -0.2, rtol=1e-6)
 
 
 def test_scale():
     """Claim: eq. 13 by hand: eta0 + eta1 2^(s - s_max)."""
-    assert rewards.scale(CFG, 0, 1) == 0.5
-    assert rewards.scale(CFG, 1, 1) == 1.0
-    assert rewards.scale(RewardConfig(eta0=0.25, eta1=3.0), 0, 2) == 1.0
+    assert rewards.scale(CFG, CFG.push_level) == 0.5
+    assert rewards.scale(CFG, CFG.grasp_level) == 1.0
+    assert rewards.scale(RewardConfig(eta0=0.25, eta1=3.0, grasp_level=2.0), 0.0) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -67,14 +71,19 @@ def test_scale():
         RewardConfig(push_better=9.0, push_worse=2.0, nothing=1.0, empty=1.0, touched=1.0, dropped=1.0, reach=0.0),
         RewardConfig(lifted=0.0, reach=-3.0, push_better=-0.5),
         RewardConfig(eta1=-2.0),
+        RewardConfig(distance=3.0, farthest=0.5, push_level=-2.0, grasp_level=0.5, eta0=0.1),
+        algorithms.VPG_REWARD,
+        dataclasses.replace(algorithms.VPG_REWARD, push_worse=-3.0, push_better=5.0),
     ],
 )
 @pytest.mark.parametrize("gamma", [0.0, 0.5, 0.9])
 def test_bounds_hold_and_are_reached(cfg, gamma):
     """Claim: every discounted return of one action done 1 to 200 times lies within, and some reach both ends."""
     single = [
-        reward(cfg, primitive, outcome, distance, 0.0, after)
-        for primitive, outcome, distance, after in itertools.product((0, 1), Outcome, (0.0, 1.0, 3.0), (0.0, 1.0))
+        reward(cfg, primitive, outcome, distance, 0.0, after, changed)
+        for primitive, outcome, distance, after, changed in itertools.product(
+            (0, 1), Outcome, (0.0, 1.0, 3.0), (0.0, 1.0), (False, True)
+        )
     ]
     lengths = np.cumsum(gamma ** np.arange(200))  # 1, 1 + gamma, ...
     returns = np.outer(single, lengths)
@@ -85,5 +94,29 @@ def test_bounds_hold_and_are_reached(cfg, gamma):
 
 
 def test_default_bounds():
-    """Claim: with the default rewards and gamma 0.5, returns lie between -2 and 4."""
+    """Claim: with the default rewards and gamma 0.5, returns lie between -2 and 4, with VPG's between 0 and 2."""
     assert rewards.bounds(CFG, 0.5) == (-2.0, 4.0)
+    assert rewards.bounds(algorithms.VPG_REWARD, 0.5) == (0.0, 2.0)
+
+
+@pytest.mark.parametrize("outcome", Outcome)
+def test_vpg_grasp_rewards(outcome):
+    """Claim: VPG by hand: 1 for a grasp that lifts, 0 for any other, whatever changed."""
+    for changed in (False, True):
+        assert reward(algorithms.VPG_REWARD, rewards.GRASP, outcome, changed=changed) == float(
+            outcome == Outcome.LIFTED
+        )
+
+
+@pytest.mark.parametrize(("changed", "expected"), [(True, 0.5), (False, 0.0)])
+def test_vpg_push_rewards(changed, expected):
+    """Claim: VPG by hand: 0.5 for a push that changed the map, else 0, whatever grasps are worth."""
+    for after in (0.0, 9.0):
+        assert reward(algorithms.VPG_REWARD, rewards.PUSH, after=after, changed=changed) == expected
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_value_and_change_are_apart(changed):
+    """Claim: by `value`, a change of the map alone earns a push nothing."""
+    assert reward(CFG, rewards.PUSH, before=0.5, after=0.5, changed=changed) == -0.5
+    assert reward(CFG, rewards.PUSH, before=0.5, after=0.7, changed=changed) == 0.5
