@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import csac_jax
-from csac_jax import cli, presets
+from csac_jax import algorithms, cli, presets
 from csac_jax.config import Config
 from csac_jax.train import checkpoint
 
@@ -67,6 +67,16 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --replay.sampler best", "invalid choice 'best' for argument '--replay.sampler'"),
         ("train quick --seed -1", "seed: must lie in 0 .. 2147483647"),
         ("train quick smoke", "Unrecognized options: smoke"),
+        (
+            "train quick --algo dqn",
+            "unknown algorithm 'dqn'; choose one of: csac, csac_per, csac_beta, vpg, grasp_only",
+        ),
+        ("train quick --algo=", "unknown algorithm ''"),
+        ("train quick --algo", "Missing value for argument '--algo'"),
+        ("train quick --algo grasp_only --explore.push-fraction 0.2", "explore.push_fraction: must be 0 where"),
+        ("train quick --learn.critics 3", "learn.critics: must be 1 or 2"),
+        ("train quick --learn.loss mse", "invalid choice 'mse' for argument '--learn.loss'"),
+        ("train quick --cem.elites 65", "cem.elites: must lie in 2 .. cem.candidates"),
         ("train quick --run-dir .", ". exists; give another --run-dir, or go on with it by --resume"),
         ("eval", "Folder of the run"),
         ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
@@ -157,6 +167,34 @@ def test_flags_reach_the_config():
     )
 
 
+@pytest.mark.parametrize("flag", ["--algo vpg", "--algo=vpg", "--algo csac --algo vpg"])
+def test_algorithm_reaches_the_config(flag: str):
+    """Claim: --algo makes the preset one of that algorithm, and settings given as well win over it, before or after."""
+    wanted = algorithms.configure(SMOKE, "vpg")
+    assert cli._read_train(["smoke", *flag.split()])[1] == wanted
+    own = dataclasses.replace(wanted, target=dataclasses.replace(wanted.target, gamma=0.3))
+    for arguments in (f"smoke {flag} --target.gamma 0.3", f"smoke --target.gamma 0.3 {flag}"):
+        assert cli._read_train(arguments.split())[1] == own
+    assert cli._read_train(["smoke"])[1] == SMOKE
+
+
+def test_resumed_run_keeps_its_algorithm(capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Claim: a run goes on with the algorithm it was begun with; to ask for another is exit code 2."""
+    cfg, folder = algorithms.configure(SMOKE, "vpg"), tmp_path / "runs" / "two"
+    checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []})
+    for flags in ([], ["--algo", "vpg"]):
+        assert cli._read_train(["--resume", str(folder), *flags])[1] == cfg
+    code, line = _fails(capsys, "train", "--resume", str(folder), "--algo", "csac")
+    assert (code, "other values of algo;" in line) == (2, True)
+
+
+def test_help_names_the_algorithms(capsys: pytest.CaptureFixture):
+    """Claim: every algorithm is named by the help of the program."""
+    assert cli.main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in algorithms.ALGORITHMS)
+
+
 def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
@@ -173,6 +211,7 @@ def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pyt
             for setting in dataclasses.fields(field.type):
                 assert f"{_flag(f'{field.name}.{setting.name}')}" in shown
     assert "--seed" in shown
+    assert "--algo {csac,csac_per,csac_beta,vpg,grasp_only,reactive}" in shown
     assert "--preset" not in shown
 
 

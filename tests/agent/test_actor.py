@@ -108,3 +108,34 @@ def test_critic_gets_no_gradient_through_the_actor():
     q, correction = jnp.array([1.0, -2.0]), jnp.array([0.5, 0.0])
     np.testing.assert_allclose(actor.logits(q, correction), [10.5, -20.0])
     np.testing.assert_array_equal(jax.grad(lambda q: jnp.sum(actor.logits(q, correction)))(q), [0.0, 0.0])
+
+
+@pytest.mark.parametrize("beside", [1, -1])
+def test_yaw_does_not_turn_to_what_is_not_valid(frames, pose, beside):
+    """Claim: the next yaw draws the mean's yaw by its valid cells only, however high the others are."""
+    best = (2, 8, 9)
+    logits, valid = _flat(frames), np.ones((frames.yaws.size, frames.side, frames.side), bool)
+    logits[best] = 1.0
+    plain = pose(jnp.asarray(logits), jnp.asarray(valid))
+    near = np.linalg.norm(frames.xy[2 + beside] - frames.xy[best], axis=-1) < 2.0 * frames.cell
+    logits[2 + beside][near] = 30.0
+    assert abs(pose(jnp.asarray(logits), jnp.asarray(valid))[2] - plain[2]) > 0.3  # valid, it would draw
+    valid[2 + beside][near] = False
+    got = pose(jnp.asarray(logits), jnp.asarray(valid))
+    away = valid.copy()
+    away[2 + beside] = False
+    np.testing.assert_allclose(got, pose(jnp.asarray(logits), jnp.asarray(away)), atol=1e-5)
+    assert (got[2] - frames.yaws[2]) * beside < 0.0  # the only other yaw is on the other side
+
+
+def test_cells_beside_do_not_leak_into_the_yaw(frames, pose):
+    """Claim: an invalid cell next to the one read in the neighbouring yaw does not count, however high it is."""
+    best = (2, 8, 9)
+    logits, valid = _flat(frames), np.ones((frames.yaws.size, frames.side, frames.side), bool)
+    logits[best] = 20.0
+    where = np.unravel_index(np.argsort(np.linalg.norm(frames.xy[3] - frames.xy[best], axis=-1), axis=None), (18, 18))
+    second = 3, where[0][1], where[1][1]  # the second nearest cell: it has a share in what is read
+    before = pose(jnp.asarray(logits), jnp.asarray(valid))
+    valid[second] = False
+    logits[second] = 19.0
+    np.testing.assert_allclose(pose(jnp.asarray(logits), jnp.asarray(valid)), before, atol=1e-3)

@@ -7,6 +7,7 @@ import optax
 import pytest
 
 from csac_jax.agent import losses
+from csac_jax.config import LearnConfig
 
 
 @pytest.mark.parametrize("width", [0.5, 1.0])
@@ -55,3 +56,26 @@ def test_polyak_by_hand():
     np.testing.assert_allclose(moved["a"], [0.25, 5.5], rtol=1e-6)
     np.testing.assert_allclose(moved["b"], 4.5)
     jax.tree.map(np.testing.assert_array_equal, losses.polyak(online, target, 1.0), online)
+
+
+@pytest.mark.parametrize(("loss", "expected"), [("huber", [0.125, 4.0]), ("squared", [0.25, 9.0])])
+def test_loss_of_error_by_hand(loss, expected):
+    """Claim: errors 0.5 and -3 cost 0.125 and 4 by Huber of width 2, and their squares by line 21."""
+    got = losses.of_error(LearnConfig(loss=loss, huber=2.0), jnp.array([0.5, -3.0]))
+    np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize("updates", [1, 2, 3, 4, 6, 7])
+def test_hard_targets_are_copied_every_c_updates(updates):
+    """Claim: targets are the online network after every third update if C = 3, bit for bit, and untouched otherwise."""
+    online, target = {"a": jnp.array([0.1, 7.0])}, {"a": jnp.array([3.0, -1.0])}
+    cfg = LearnConfig(target_update="hard", copy_every=3, tau=0.5)
+    got = losses.follow(cfg, online, target, jnp.int32(updates))
+    np.testing.assert_array_equal(got["a"], (online if updates % 3 == 0 else target)["a"])
+
+
+def test_soft_targets_follow_each_update():
+    """Claim: soft targets move by tau at every update, whatever C is."""
+    online, target = {"a": jnp.array([1.0])}, {"a": jnp.array([0.0])}
+    cfg = LearnConfig(target_update="soft", copy_every=3, tau=0.25)
+    assert [float(losses.follow(cfg, online, target, jnp.int32(n))["a"][0]) for n in (1, 2, 3)] == [0.25] * 3
