@@ -182,9 +182,12 @@ def _value(learner: Learner, critic_params: Any, obs: Observation, action: Actio
 
 
 def update_critic(
-    key: jax.Array, learner: Learner, state: LearnerState, batch: Transition
+    key: jax.Array, learner: Learner, state: LearnerState, batch: Transition, weights: jax.Array
 ) -> tuple[LearnerState, UpdateInfo]:
-    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines 17-26."""
+    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines 17-26.
+
+    L = mean_i w_i huber(y_i - Q(s_i, a_i)) with `weights` w [B], 1 but for a prioritised replay.
+    """
     cfg = learner.cfg
     next_maps = look(learner, state.target, heightmap.unpack(batch.next_obs))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(batch.reward.shape[0]))
@@ -195,7 +198,7 @@ def update_critic(
 
     def loss(params: Any) -> tuple[jax.Array, jax.Array]:
         q = _value(learner, params, obs, batch.action)
-        return jnp.mean(losses.huber(target - q, cfg.learn.huber)), q
+        return jnp.mean(weights * losses.huber(target - q, cfg.learn.huber)), q
 
     (critic_loss, q), gradient = jax.value_and_grad(loss, has_aux=True)(state.online.critic)
     step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)
