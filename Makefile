@@ -1,8 +1,9 @@
-# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES may be set.
+# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, NAME may be set.
 PYTHON ?= python3
 PRESET ?= quick
 POLICY ?= learned
 EPISODES ?= 50
+NAME ?= step
 RUN ?= $(firstword $(shell ls -1dt runs/*/ 2>/dev/null))
 ARGS ?=
 
@@ -19,7 +20,7 @@ setup: $(STAMP)  ## make .venv and install everything, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench,dev]'
 	touch $@
 
 train: $(STAMP)  ## train PRESET (quick) into a new folder under runs/
@@ -44,8 +45,8 @@ format: $(STAMP)  ## rewrite the sources in ruff's format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP)  ## speed of this machine
-	$(BIN)/python -m experiments.bench $(ARGS)
+bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke for another preset
+	$(BIN)/csac-jax bench $(NAME) $(ARGS)
 
 doctor: $(STAMP)  ## versions, devices, numerics self-test
 	$(BIN)/csac-jax doctor $(ARGS)

@@ -62,7 +62,7 @@ def vpg(cfg: Config) -> Config:
         target={"value": "max", "gamma": 0.5},
         explore={"noise_std": 0.0, "primitive_start": 0.5, "primitive_end": 0.1, "push_fraction": 0.5},
         learn={"actor": False, "critics": 1, "loss": "huber", "target_update": "hard", "copy_every": 1},
-        replay={"sampler": "beta", "beta_start": (1.0, 2.0), "beta_end": (1.0, 2.0)},
+        replay={"sampler": "beta", "beta_start": (1.0, 2.0), "beta_middle": (1.0, 2.0), "beta_end": (1.0, 2.0)},
     )
 
 

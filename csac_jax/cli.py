@@ -10,6 +10,7 @@ import io
 import json
 import os
 import re
+import runpy
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +28,7 @@ Arguments = TypeVar("Arguments")
 
 PROGRAM = "csac-jax"
 RUNS = Path("runs")
+BENCHMARKS = Path(csac_jax.__file__).parents[1] / "experiments" / "bench"
 USAGE = f"""usage: {PROGRAM} COMMAND ...
 
 A robot learns to push and grasp in clutter.
@@ -36,6 +38,7 @@ A robot learns to push and grasp in clutter.
   train --resume DIR go on with a run that was stopped
   eval DIR           measure what a run has learned
   doctor             versions, devices and a self-test of this machine
+  bench NAME         speed of a part, as JSON; needs a checkout of the sources
 
 `{PROGRAM} COMMAND --help` lists the options of a command; --version prints the version.
 """
@@ -190,6 +193,7 @@ def train(arguments: list[str]) -> int:
     """`csac-jax train`."""
     stop = stopping.install()
     options, cfg = _read_train(arguments)
+    _check_memory(cfg)
     run_dir = options.resume or options.run_dir or _new_run_dir(cfg)
     begun = time.time()
     summary = _train(options, cfg, run_dir, stop)
@@ -269,6 +273,15 @@ def _check_resume(options: TrainOptions, stored: Config, asked: Config) -> None:
         raise BadArgumentsError(
             f"{options.resume} was trained with other values of {', '.join(names)}; leave them out, or begin a new run"
         )
+
+
+def _check_memory(cfg: Config) -> None:
+    from csac_jax.train import memory
+
+    try:
+        memory.check_replay(cfg)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
 
 
 def _require_tensorboard() -> None:
@@ -416,6 +429,25 @@ def doctor(arguments: list[str]) -> int:
     return 0
 
 
+# bench.
+
+
+def bench(arguments: list[str]) -> int:
+    """`csac-jax bench`: runs `main` of a script in the checkout."""
+    scripts = {path.stem: path for path in BENCHMARKS.glob("[!_]*.py")}
+    if not scripts:
+        raise BadArgumentsError(f"bench: there is nothing in {BENCHMARKS}; benchmarks come with a checkout")
+    names = ", ".join(sorted(scripts))
+    if arguments[:1] in (["-h"], ["--help"]):
+        print(f"usage: {PROGRAM} bench NAME ..., with NAME one of: {names}")
+        return 0
+    name, *rest = arguments or [""]
+    if name not in scripts:
+        raise BadArgumentsError(f"bench: unknown benchmark '{name}'; choose one of: {names}")
+    runpy.run_path(str(scripts[name]))["main"](rest)
+    return 0
+
+
 @contextlib.contextmanager
 def _watchdog(seconds: float, message: str) -> Iterator[None]:
     """Ends the process with `message` if the block takes longer than `seconds`."""
@@ -448,4 +480,4 @@ def _write_json(path: Path | None, result: dict[str, Any], cfg: Config | None) -
     temporary.replace(path)
 
 
-COMMANDS: dict[str, Callable[[list[str]], int]] = {"train": train, "eval": evaluate, "doctor": doctor}
+COMMANDS: dict[str, Callable[[list[str]], int]] = {"train": train, "eval": evaluate, "doctor": doctor, "bench": bench}

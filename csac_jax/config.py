@@ -381,18 +381,37 @@ class ReplayConfig:
     capacity: int = 4096
     """C, transitions kept."""
     sampler: Literal["uniform", "prioritised", "beta"] = "beta"
-    """`uniform` is CSAC, `beta` CSAC-beta (sec. 3.5): ranks by abs(TD error), rank / n ~ Beta(a, b)."""
+    """`uniform` is CSAC; `prioritised` CSAC-PER: probability ~ (abs(TD error) + floor)^alpha, losses weighted against
+    it; `beta` CSAC-beta (sec. 3.5): ranks by abs(TD error), rank / n ~ Beta(a, b)."""
+    alpha: float = 0.6
+    """Prioritised: 0 is uniform, 1 proportional to the priority (Schaul et al., arXiv:1511.05952, sec. 4)."""
+    floor: float = 0.01
+    """Prioritised: added to abs(TD error), so that no transition is out of reach (ours)."""
+    weight_start: float = 0.4
+    """Prioritised: exponent of the importance weights at first (Schaul et al.), 0 for none."""
+    weight_end: float = 1.0
+    """Prioritised: the same in the end, reached in a straight line (Schaul et al.); 1 takes the whole bias away."""
+    rank_by: Literal["error", "reward"] = "error"
+    """Beta: rank 0 is the largest abs(TD error) (CSAC sec. 3.5) or the largest reward (Algorithm 1 line 15)."""
     beta_start: tuple[float, float] = (0.5, 0.5)
-    """(a, b) at first (CSAC sec. 4.3)."""
+    """Beta: (a, b) at first (CSAC sec. 4.3). One law for the whole run: give start, middle and end the same."""
+    beta_middle: tuple[float, float] = (1.0, 1.0)
+    """Beta: (a, b) on the way (CSAC sec. 3.5: uniform)."""
+    beta_middle_at: float = 0.4
+    """Beta: share of all updates after which (a, b) is `beta_middle` (ours)."""
     beta_end: tuple[float, float] = (1.0, 12.0)
-    """(a, b) in the end (CSAC sec. 4.3); a and b pass through (1, 1) on the way."""
-    beta_uniform_at: float = 0.4
-    """Share of all updates after which (a, b) is (1, 1) (ours)."""
+    """Beta: (a, b) in the end (CSAC sec. 4.3)."""
 
     def __post_init__(self) -> None:
-        _require(self.capacity >= 2, "replay.capacity: at least 2 transitions")
-        _require(min(*self.beta_start, *self.beta_end) > 0.0, "replay.beta_start, beta_end: (a, b) must be positive")
-        _require(0.0 < self.beta_uniform_at < 1.0, "replay.beta_uniform_at: must lie between 0 and 1")
+        _require_choices(self, "replay.")
+        _require(2 <= self.capacity <= 2**30, "replay.capacity: must lie in 2 .. 2^30 transitions")
+        _require(0.0 <= self.alpha <= 1.0, "replay.alpha: must lie in 0 .. 1")
+        _require(1e-9 <= self.floor <= 1.0, "replay.floor: must lie in 1e-9 .. 1")
+        for name in ("weight_start", "weight_end"):
+            _require(0.0 <= getattr(self, name) <= 1.0, f"replay.{name}: must lie in 0 .. 1")
+        for name in ("beta_start", "beta_middle", "beta_end"):
+            _require(min(getattr(self, name)) > 0.0, f"replay.{name}: a and b must be positive")
+        _require(0.0 < self.beta_middle_at < 1.0, "replay.beta_middle_at: must lie between 0 and 1")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -43,7 +43,7 @@ def fast() -> Config:
         explore=ExploreConfig(decay=0.9998),
         learn=LearnConfig(batch=256, updates=16),
         replay=ReplayConfig(capacity=16384, beta_end=(1.0, 4.0)),
-        train=TrainConfig(scenes=256, actions=30000, warmup=1024, chunk=4, save_every=10),
+        train=TrainConfig(scenes=256, actions=30720, warmup=1024, chunk=4, save_every=10),
     )
 
 

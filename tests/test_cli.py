@@ -1,7 +1,10 @@
 """The command line: bad input is one line and an exit code, and nothing is overwritten."""
 
+import contextlib
 import dataclasses
 import json
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +68,8 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --learn.batch 65", "learn.batch: 65 transitions cannot be drawn"),
         ("train quick --scene.slots box ball", "invalid choice 'ball' for argument '--scene.slots'"),
         ("train quick --replay.sampler best", "invalid choice 'best' for argument '--replay.sampler'"),
+        ("train quick --replay.alpha 1.5", "replay.alpha: must lie in 0 .. 1"),
+        ("train quick --replay.capacity 0", "replay.capacity: must lie in 2 .. 2^30"),
         ("train quick --seed -1", "seed: must lie in 0 .. 2147483647"),
         ("train quick smoke", "Unrecognized options: smoke"),
         (
@@ -83,6 +88,11 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
         ("doctor --fix", "Unrecognized options: --fix"),
+        ("bench", "choose one of: replay, step"),
+        ("bench spet", "bench: unknown benchmark 'spet'; choose one of: replay, step"),
+        ("bench step fast", "bench step: give one preset of: smoke, quick"),
+        ("bench replay 12", "bench replay: give two exponents of 2"),
+        ("bench replay 14 12", "bench replay: exponents must lie in 1 .. 24"),
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
@@ -213,6 +223,67 @@ def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pyt
     assert "--seed" in shown
     assert "--algo {csac,csac_per,csac_beta,vpg,grasp_only,reactive}" in shown
     assert "--preset" not in shown
+
+
+def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Claim: a ring that memory cannot hold is refused before anything is compiled or written: one line with the
+    setting and the largest capacity that would do, exit code 2; that capacity passes."""
+    from csac_jax.train import memory
+
+    code, line = _fails(capsys, "train", "quick", "--replay.capacity", str(2**30))
+    assert code == 2
+    match = re.fullmatch(r"csac-jax: replay.capacity: .* GiB, .*; lower --replay.capacity to (\d+) .*\n", line)
+    assert match
+    assert list(tmp_path.iterdir()) == []
+    quick = presets.quick()
+    for extra in (0, 1):
+        capacity = int(match[1]) + extra
+        cfg = dataclasses.replace(quick, replay=dataclasses.replace(quick.replay, capacity=capacity))
+        with pytest.raises(ValueError, match=r"replay\.capacity") if extra else contextlib.nullcontext():
+            memory.check_replay(cfg)
+
+
+def test_limit_of_the_device_goes_first(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a device that states its memory is believed, this machine's own counts for one that does not."""
+    from csac_jax.train import memory
+
+    class Device:
+        def __init__(self, stats):
+            self.memory_stats = lambda: stats
+
+    for stats in (None, {}, {"bytes_limit": 10**9}):
+        monkeypatch.setattr(memory.jax, "devices", lambda stats=stats: [Device(stats)])
+        own = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        assert memory.limit() == (10**9 if stats else own)
+
+
+def test_benchmark_is_run_with_its_arguments(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Claim: `bench NAME ...` calls `main` of that file of the checkout; without a checkout it is one line."""
+    monkeypatch.setattr(cli, "BENCHMARKS", tmp_path / "bench")
+    code, line = _fails(capsys, "bench", "one")
+    assert (code, "come with a checkout" in line) == (2, True)
+    (tmp_path / "bench").mkdir()
+    (tmp_path / "bench/one.py").write_text("import json\ndef main(arguments):\n    print(json.dumps(arguments))\n")
+    (tmp_path / "bench/_helper.py").write_text("")
+    assert cli.main(["bench", "one", "a", "--b"]) == 0
+    assert json.loads(capsys.readouterr().out) == ["a", "--b"]
+    assert cli.main(["bench", "--help"]) == 0
+    assert capsys.readouterr().out == "usage: csac-jax bench NAME ..., with NAME one of: one\n"
+
+
+@pytest.mark.slow
+def test_replay_benchmark(capsys: pytest.CaptureFixture):
+    """Claim: `bench replay` prints JSON with the times of every sampler and where they come from."""
+    pytest.importorskip("flashbax")
+    assert cli.main(["bench", "replay", "6", "7"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [row["capacity"] for row in result["capacities"]] == [64, 128]
+    for row in result["capacities"]:
+        assert row["median_seconds"].keys() == {"uniform", "prioritised", "beta", "flashbax"}
+        assert min(row["median_seconds"].values()) > 0.0
+    assert {"device", "versions", "commit", "item", "batch", "repeats"} <= result.keys()
 
 
 def test_default_run_dirs_do_not_collide(tmp_path: Path):

@@ -221,9 +221,12 @@ def _value(learner: Learner, critic_params: Any, obs: Observation, action: Actio
 
 
 def update_critic(
-    key: jax.Array, learner: Learner, state: LearnerState, batch: Transition
+    key: jax.Array, learner: Learner, state: LearnerState, batch: Transition, weights: jax.Array
 ) -> tuple[LearnerState, UpdateInfo]:
-    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines 17-26."""
+    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines 17-26.
+
+    L = mean_i w_i huber(y_i - Q(s_i, a_i)) with `weights` w [B], 1 but for a prioritised replay.
+    """
     cfg = learner.cfg
     next_maps = look(learner, state.target, heightmap.unpack(batch.next_obs))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(batch.reward.shape[0]))
@@ -234,7 +237,8 @@ def update_critic(
 
     def loss(params: Any) -> tuple[jax.Array, jax.Array]:
         q = _value(learner, params, obs, batch.action)  # [M, B]
-        return jnp.mean(jnp.sum(losses.of_error(cfg.learn, target[None] - q), axis=0)), jnp.mean(q, axis=0)
+        each = jnp.sum(losses.of_error(cfg.learn, target[None] - q), axis=0)
+        return jnp.mean(weights * each), jnp.mean(q, axis=0)
 
     (critic_loss, q), gradient = jax.value_and_grad(loss, has_aux=True)(state.online.critic)
     step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)

@@ -1,6 +1,7 @@
 """The ring of transitions: R1 of CSAC Algorithm 1 line 14. R2, its ranked view, is the sampler's."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -9,30 +10,38 @@ from flax import struct
 
 from csac_jax.config import ReplayConfig
 
+LARGEST = 1e28  # larger priorities are cut off here, so that the sum over any ring is finite
+
 
 @struct.dataclass
 class ReplayState:
     """Ring of transitions. C = capacity. Slot `(head - 1) % C` is the newest."""
 
-    items: Any  # pytree, leaves [C, ...]
+    items: Any  # pytree, leaves [C, ...]; it has a field `reward` [C] if that is what the sampler ranks by
     head: jax.Array  # [] int32, next slot written
     size: jax.Array  # [] int32, filled slots, <= C
-    error: jax.Array  # [C] float32, last abs TD error, finite; any value beyond `size`
+    priority: jax.Array  # [C] float32, what `samplers.priority` made of the last TD error; 0 beyond `size`
 
 
 def init(cfg: ReplayConfig, example_item: Any) -> ReplayState:
-    """An empty ring for items of the types and shapes of `example_item`; errors start at 1."""
+    """An empty ring for items of the types and shapes of `example_item`."""
     items = jax.tree.map(lambda leaf: jnp.zeros((cfg.capacity, *leaf.shape), leaf.dtype), example_item)
-    return ReplayState(items, jnp.int32(0), jnp.int32(0), jnp.ones(cfg.capacity, jnp.float32))
+    return ReplayState(items, jnp.int32(0), jnp.int32(0), jnp.zeros(cfg.capacity, jnp.float32))
+
+
+def bytes_needed(capacity: int, example_item: Any) -> int:
+    """Memory of a ring of `capacity` items like `example_item`, whose leaves need no more than `shape` and `dtype`."""
+    item = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(example_item))
+    return capacity * (item + jnp.dtype(jnp.float32).itemsize)  # and its priority
 
 
 def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
     """Stores the `valid` [E] bool ones of `items` (leaves [E, ...], E <= C) in consecutive slots, in their order.
 
-    The oldest give way. New items take the largest error stored, so that none is ranked above them. A scatter to slots
-    that are all different, never a copy of the ring: with the state donated, XLA writes in place.
+    The oldest give way. New items take the largest priority stored, so that none is ranked above them. A scatter to
+    slots that are all different, never a copy of the ring: with the state donated, XLA writes in place.
     """
-    capacity, num = state.error.shape[0], valid.shape[0]
+    capacity, num = state.priority.shape[0], valid.shape[0]
     if num > capacity:
         raise ValueError(f"replay.capacity: {capacity} slots cannot take {num} transitions at once; raise it")
     position = jnp.cumsum(valid, dtype=jnp.int32)  # [E], 1 for the first valid item
@@ -47,7 +56,7 @@ def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
         items=jax.tree.map(write, state.items, items),
         head=(state.head + count) % capacity,
         size=jnp.minimum(state.size + count, capacity),
-        error=write(state.error, jnp.full(num, largest_error(state))),
+        priority=write(state.priority, jnp.full(num, largest_priority(state))),
     )
 
 
@@ -56,21 +65,21 @@ def gather(state: ReplayState, slots: jax.Array) -> Any:
     return jax.tree.map(lambda ring: ring.at[slots].get(mode="clip"), state.items)
 
 
-def largest_error(state: ReplayState) -> jax.Array:
-    """Largest abs TD error stored, [] float32; 1 in an empty ring."""
-    filled = jnp.arange(state.error.shape[0]) < state.size
-    return jnp.where(state.size > 0, jnp.max(jnp.where(filled, state.error, 0.0)), 1.0)
+def largest_priority(state: ReplayState) -> jax.Array:
+    """Largest priority stored, [] float32; 1 in an empty ring."""
+    return jnp.where(state.size > 0, jnp.max(state.priority), 1.0)
 
 
-def set_errors(state: ReplayState, slots: jax.Array, errors: jax.Array) -> ReplayState:
-    """Replaces the errors of `slots` [B] int32 by the sizes of `errors` [B], signed TD errors.
+def set_priorities(state: ReplayState, slots: jax.Array, priorities: jax.Array) -> ReplayState:
+    """Replaces the priorities of `slots` [B] int32, all filled, by `priorities` [B], at least 0.
 
     A slot that occurs twice keeps the larger one: two order-free scatters, `min` to 0 and `max`, as the order of
-    conflicting `set`s is undefined. An error that is not finite counts as the largest one known, as a new item's does:
-    the transition is looked at again, and no NaN gets into the ranking.
+    conflicting `set`s is undefined. One that is not finite counts as the largest that these slots have or had: the
+    transition is looked at again, no NaN gets into the ranking, and the rest of the ring need not be searched.
     """
-    size = jnp.abs(errors).astype(jnp.float32)
-    finite = jnp.isfinite(size)
-    largest = jnp.maximum(largest_error(state), jnp.max(jnp.where(finite, size, 0.0)))
-    cleared = state.error.at[slots].min(0.0, mode="drop")
-    return dataclasses.replace(state, error=cleared.at[slots].max(jnp.where(finite, size, largest), mode="drop"))
+    finite = jnp.isfinite(priorities)
+    known = jnp.where(finite, jnp.minimum(priorities, LARGEST), 0.0)
+    largest = jnp.max(jnp.maximum(known, state.priority.at[slots].get(mode="clip")))
+    new = jnp.where(finite, known, largest)
+    cleared = state.priority.at[slots].min(0.0, mode="drop")
+    return dataclasses.replace(state, priority=cleared.at[slots].max(new, mode="drop"))

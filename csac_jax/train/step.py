@@ -20,6 +20,7 @@ from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.vision import heightmap
+from csac_jax.vision.heightmap import Observation
 
 
 @struct.dataclass
@@ -102,9 +103,9 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Learn (lines 16-26). During the warm-up the result is dropped: a branch would cost more than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.warmup
-    learned, errors, losses = _learn(program, key_learn, state.learner, replay)
+    learned, priority, losses = _learn(program, key_learn, state.learner, replay)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
-    errors = jnp.where(ready, errors, replay.error)
+    priority = jnp.where(ready, priority, replay.priority)
 
     # Replace finished scenes.
     fresh = jax.vmap(env.restart)(_keys(key_reset, cfg.train.scenes), after)
@@ -126,7 +127,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
         learned=ready,
         **losses,
     )
-    state = TrainState(state.key, state.step + 1, scenes, learned, replay.replace(error=errors))
+    state = TrainState(state.key, state.step + 1, scenes, learned, replay.replace(priority=priority))
     return state, metrics
 
 
@@ -138,19 +139,20 @@ def _learn(
     total = max(cfg.train.steps * cfg.learn.updates, 1)
 
     def update(carry, i):
-        state, errors = carry
+        state, priority = carry
         key_sample, key_augment, key_target = jax.random.split(jax.random.fold_in(key, i), 3)
         progress = state.updates.astype(jnp.float32) / total
-        current = replay.replace(error=errors)
-        slots = samplers.sample(key_sample, cfg.replay, current, progress, cfg.learn.batch)
+        current = replay.replace(priority=priority)
+        slots, weights = samplers.sample(key_sample, cfg.replay, current, progress, cfg.learn.batch)
         batch = ring.gather(replay, slots)
         if cfg.learn.augment:
             batch = jax.vmap(augment.randomly)(_keys(key_augment, cfg.learn.batch), batch)
-        state, info = learning.update_critic(key_target, learner, state, batch)
-        return (state, ring.set_errors(current, slots, info.error).error), (info, batch.obs)
+        state, info = learning.update_critic(key_target, learner, state, batch, weights)
+        current = ring.set_priorities(current, slots, samplers.priority(cfg.replay, info.error))
+        return (state, current.priority), (info, batch.obs)
 
     numbers = jnp.arange(cfg.learn.updates)
-    (state, errors), (info, observations) = jax.lax.scan(update, (state, replay.error), numbers)
+    (state, priority), (info, observations) = jax.lax.scan(update, (state, replay.priority), numbers)
     last = heightmap.unpack(jax.tree.map(lambda leaf: leaf[-1], observations))
     state, actor_loss = learning.update_actor(learner, state, last)
     losses = {
@@ -159,10 +161,10 @@ def _learn(
         "td_error": jnp.mean(jnp.abs(info.error)),
         "q_mean": jnp.mean(info.q),
     }
-    return state, errors, losses
+    return state, priority, losses
 
 
-def _best_grasps(learner: Learner, state: LearnerState, obs: heightmap.Observation) -> jax.Array:
+def _best_grasps(learner: Learner, state: LearnerState, obs: Observation) -> jax.Array:
     """phi_g of E states [E] by the target critic, eq. 16."""
     return jax.vmap(learning.best_grasp)(learning.look(learner, state.target, obs))
 
@@ -179,19 +181,28 @@ def init(program: Program) -> TrainState:
         key = jax.random.key(cfg.seed)
         key_scenes, key_nets = jax.random.split(jax.random.fold_in(key, np.uint32(2**32 - 1)))
         scenes = jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes))
-        packed = jax.tree.map(lambda leaf: leaf[0], heightmap.pack(scenes.obs))
-        zero = jnp.zeros((), jnp.float32)
-        action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
-        example = Transition(packed, action, zero, packed, jnp.zeros((), bool))
         return TrainState(
             key=key,
             step=jnp.int32(0),
             scenes=scenes,
             learner=learning.init(key_nets, program.learner),
-            replay=ring.init(cfg.replay, example),
+            replay=ring.init(cfg.replay, example(cfg)),
         )
 
     return jax.jit(build)()
+
+
+def example(cfg: Config) -> Transition:
+    """Shapes and types of a stored transition; no arrays."""
+
+    def build() -> Transition:
+        rows = (cfg.heightmap.size, cfg.heightmap.size)
+        seen = Observation(colour=jnp.zeros((*rows, 3)), height=jnp.zeros(rows), target=jnp.zeros(rows, bool))
+        action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
+        packed = heightmap.pack(seen)
+        return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool))
+
+    return jax.eval_shape(build)
 
 
 def compile_chunk(program: Program, num_steps: int):

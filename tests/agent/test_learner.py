@@ -43,8 +43,13 @@ def batch(observations) -> Transition:
 
 @pytest.fixture(scope="module")
 def update(learner):
-    """(state, batch) -> state, info of one update of the critic."""
-    return jax.jit(lambda state, batch: learning.update_critic(jax.random.key(3), learner, state, batch))
+    """(state, batch, weights, all 1 if not given) -> state, info of one update of the critic."""
+
+    @jax.jit
+    def one(state, batch, weights):
+        return learning.update_critic(jax.random.key(3), learner, state, batch, weights)
+
+    return lambda state, batch, weights=None: one(state, batch, jnp.ones(B) if weights is None else weights)
 
 
 def _ended(batch: Transition) -> Transition:
@@ -87,12 +92,27 @@ def test_update_reports_its_loss(learner, state, batch, update):
     assert after.updates == state.updates + 1
 
 
+def test_losses_are_weighted(learner, state, batch, update):
+    """Claim: the loss is mean(weight * Huber loss), and a transition of weight 0 changes no network; errors and q are
+    those of the transitions, whatever their weights."""
+    weights = jnp.array([0.0, 0.25, 1.0, 0.5, 0.0, 1.0])
+    after, info = update(state, batch, weights)
+    loss = optax.huber_loss(info.error, delta=learner.cfg.learn.huber)
+    np.testing.assert_allclose(info.critic_loss, np.mean(np.asarray(weights) * np.asarray(loss)), rtol=1e-5)
+    _, plain = update(state, batch)
+    np.testing.assert_array_equal(info.error, plain.error)
+    np.testing.assert_array_equal(info.q, plain.q)
+    other, _ = update(state, batch.replace(reward=batch.reward.at[jnp.array([0, 4])].add(3.0)), weights)
+    jax.tree.map(np.testing.assert_array_equal, after.online, other.online)
+
+
 def test_target_carries_no_gradient(learner, state, batch):
     """Claim: the critic's loss has exactly no gradient in the target networks and the reward, but one in its own."""
 
     def loss(online, target, reward):
         before = state.replace(online=online, target=target)
-        return learning.update_critic(jax.random.key(3), learner, before, batch.replace(reward=reward))[1].critic_loss
+        seen = batch.replace(reward=reward)
+        return learning.update_critic(jax.random.key(3), learner, before, seen, jnp.ones(B))[1].critic_loss
 
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(state.online, state.target, batch.reward)
     online, target, reward = gradient
@@ -104,7 +124,8 @@ def test_target_carries_no_gradient(learner, state, batch):
 def test_critic_gradient_is_that_of_its_loss(learner, state, batch):
     """Claim: along the gradient, the reported loss changes as fast as finite differences say."""
     plain = dataclasses.replace(learner, critic_optimiser=optax.sgd(1.0))
-    run = jax.jit(lambda state: learning.update_critic(jax.random.key(3), plain, state, _ended(batch)))
+    weights = jnp.linspace(0.2, 1.0, B)
+    run = jax.jit(lambda state: learning.update_critic(jax.random.key(3), plain, state, _ended(batch), weights))
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.critic, after.online.critic)
     _check_slope(lambda critic: run(state.replace(online=state.online.replace(critic=critic)))[1].critic_loss,

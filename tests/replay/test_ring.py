@@ -1,4 +1,4 @@
-"""The ring against a model in NumPy."""
+"""The ring and its priorities against a model in NumPy."""
 
 import functools
 
@@ -10,13 +10,21 @@ from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from csac_jax.config import ReplayConfig
-from csac_jax.replay import ring
+from csac_jax.replay import ring, samplers
 
 CAPACITY, NUM, BATCH = 7, 3, 5
-CFG = ReplayConfig(capacity=CAPACITY)
+CFG = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=0.7, floor=0.05)
+PLAIN = ReplayConfig(capacity=CAPACITY)  # its priorities are abs(error)
 EXAMPLE = {"id": jnp.int32(0), "map": jnp.zeros((2, 2), jnp.uint16)}
 
-add, set_errors, gather = jax.jit(ring.add), jax.jit(ring.set_errors), jax.jit(ring.gather)
+add, gather = jax.jit(ring.add), jax.jit(ring.gather)
+sample = jax.jit(samplers.sample, static_argnums=(1, 4))
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def set_errors(state, slots, errors, cfg=PLAIN):
+    """Stores abs(errors), or what a prioritised sampler makes of them."""
+    return ring.set_priorities(state, slots, samplers.priority(cfg, errors))
 
 
 def items(ids) -> dict[str, jax.Array]:
@@ -33,12 +41,13 @@ def filled_ring(ids) -> ring.ReplayState:
 
 
 class RingModel(RuleBasedStateMachine):
-    """Claim: after any sequence of adds and errors, the ring holds what a list of slots would."""
+    """Claim: after any sequence of adds and errors, the ring holds what a list of slots would, with the priorities
+    (abs(error) + floor)^alpha; draws are of filled slots, their weights (n P)^-beta over the batch's largest."""
 
     def __init__(self):
         super().__init__()
         self.state = ring.init(CFG, EXAMPLE)
-        self.ids, self.error = np.zeros(CAPACITY, int), np.ones(CAPACITY, np.float32)
+        self.ids, self.priority = np.zeros(CAPACITY, int), np.zeros(CAPACITY)
         self.head = self.stored = self.last_id = 0
 
     @property
@@ -50,9 +59,9 @@ class RingModel(RuleBasedStateMachine):
         ids = self.last_id + 1 + np.arange(NUM)
         self.last_id += NUM
         self.state = add(self.state, items(ids), jnp.array(valid))
-        largest = self.error[: self.size].max(initial=0.0) if self.size else 1.0
+        largest = self.priority.max() if self.size else 1.0
         for i in ids[np.array(valid)]:
-            self.ids[self.head], self.error[self.head] = i, largest
+            self.ids[self.head], self.priority[self.head] = i, largest
             self.head, self.stored = (self.head + 1) % CAPACITY, self.stored + 1
 
     @rule(
@@ -65,23 +74,38 @@ class RingModel(RuleBasedStateMachine):
         if self.size == 0:
             return
         slots = [slot % self.size for slot in slots]
-        self.state = set_errors(self.state, jnp.array(slots), jnp.array(errors, jnp.float32))
-        finite = [abs(e) for e in errors if np.isfinite(e)]
-        largest = max([self.error[: self.size].max(), *finite])
-        sizes = [abs(e) if np.isfinite(e) else largest for e in errors]
+        self.state = set_errors(self.state, jnp.array(slots), jnp.array(errors, jnp.float32), CFG)
+        finite = [(abs(e) + 0.05) ** 0.7 for e in errors if np.isfinite(e)]
+        largest = max([*self.priority[slots], *finite])
+        new = [(abs(e) + 0.05) ** 0.7 if np.isfinite(e) else largest for e in errors]
         for slot in set(slots):
-            self.error[slot] = max(size for s, size in zip(slots, sizes, strict=True) if s == slot)
+            self.priority[slot] = max(value for s, value in zip(slots, new, strict=True) if s == slot)
+
+    @rule(seed=st.integers(0, 2**31 - 1), progress=st.sampled_from([0.0, 0.25, 1.0]))
+    def sample(self, seed, progress):
+        if self.size == 0:
+            return
+        slots, weights = sample(jax.random.key(seed), CFG, self.state, jnp.float32(progress), BATCH)
+        assert set(np.asarray(slots)) <= set(range(self.size))
+        probability = self.priority[np.asarray(slots)] / self.priority.sum()
+        expected = (self.size * probability) ** -(0.4 + 0.6 * progress)
+        np.testing.assert_allclose(weights, expected / expected.max(), rtol=1e-5)
 
     @invariant()
     def same(self):
         assert (int(self.state.head), int(self.state.size)) == (self.head, self.size)
         np.testing.assert_array_equal(self.state.items["id"], self.ids)
         np.testing.assert_array_equal(self.state.items["map"][:, 1, 0], self.ids)
-        np.testing.assert_array_equal(self.state.error[: self.size], self.error[: self.size])
+        np.testing.assert_allclose(self.state.priority, self.priority, rtol=1e-5)
 
 
-TestRingModel = RingModel.TestCase
-TestRingModel.settings = settings(max_examples=40, stateful_step_count=20, deadline=None)
+class TestRingModel(RingModel.TestCase):
+    settings = settings(max_examples=40, stateful_step_count=20, deadline=None)
+
+
+@pytest.mark.slow
+class TestRingModelLong(RingModel.TestCase):
+    settings = settings(max_examples=10_000, stateful_step_count=20, deadline=None)
 
 
 def test_valid_items_are_packed():
@@ -100,9 +124,10 @@ def test_oldest_is_overwritten():
 
 
 def test_new_items_rank_with_the_largest_error():
-    """Claim: a new item's error is the largest stored, that of the item which it overwrites included."""
+    """Claim: a new item's priority is the largest stored, that of the item which it overwrites included; 1 at first."""
+    assert filled_ring([1]).priority.tolist() == [1.0] + [0.0] * (CAPACITY - 1)
     state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([0.3, -0.7]))
-    assert add(state, items([3]), jnp.array([True])).error[2] == np.float32(0.7)
+    assert add(state, items([3]), jnp.array([True])).priority[2] == np.float32(0.7)
 
 
 def test_twice_the_same_slot_keeps_the_larger_error():
@@ -110,15 +135,22 @@ def test_twice_the_same_slot_keeps_the_larger_error():
     state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([9.0, 9.0]))
     for errors in ([0.1, -0.5, 0.2], [-0.5, 0.1, 0.2]):
         updated = set_errors(state, jnp.array([1, 1, 0]), jnp.array(errors))
-        np.testing.assert_allclose(updated.error[:2], [0.2, 0.5])
+        np.testing.assert_allclose(updated.priority[:2], [0.2, 0.5])
 
 
 def test_errors_that_are_not_numbers():
-    """Claim: NaN counts as the largest error known, and the ring never holds one that is not finite."""
+    """Claim: NaN and infinity count as the largest that the slots of the batch have or had; huge errors are cut off, so
+    that sums are finite: the ring never holds anything else."""
     state = set_errors(filled_ring([1, 2, 3]), jnp.array([0, 1, 2]), jnp.array([0.5, 4.0, 0.1]))
-    np.testing.assert_allclose(set_errors(state, jnp.array([0]), jnp.array([jnp.nan])).error[:3], [4.0, 4.0, 0.1])
-    updated = set_errors(state, jnp.array([0, 2]), jnp.array([-jnp.inf, 6.0]))
-    np.testing.assert_allclose(updated.error[:3], [6.0, 4.0, 6.0])
+    for slots, errors, expected in (
+        ([1, 2], [jnp.nan, 0.2], [0.5, 4.0, 0.2]),
+        ([1, 2], [-jnp.inf, 6.0], [0.5, 6.0, 6.0]),
+        ([0, 2], [0.2, jnp.nan], [0.2, 4.0, 0.5]),
+        ([0, 2], [jnp.nan, jnp.nan], [0.5, 4.0, 0.5]),
+        ([1, 0], [3e38, jnp.nan], [1e28, 1e28, 0.1]),
+    ):
+        updated = set_errors(state, jnp.array(slots), jnp.array(errors))
+        np.testing.assert_allclose(updated.priority[:3], expected)
 
 
 def test_gather_returns_the_items_of_its_slots():
@@ -129,7 +161,7 @@ def test_gather_returns_the_items_of_its_slots():
 
 
 def test_types_are_those_of_the_example():
-    """Claim: add and set_errors return a state of the same types and shapes, so that a compiled loop takes it again."""
+    """Claim: add and set_priorities return a state of the same types and shapes: a compiled loop takes it again."""
     state = ring.init(CFG, EXAMPLE)
     added = add(state, items([1]), jnp.array([True]))
     updated = set_errors(added, jnp.array([0]), jnp.array([1.0]))
@@ -151,7 +183,7 @@ def test_donated_ring_is_not_copied():
     def step(state, i):
         state = ring.add(state, new, jnp.arange(8) != i)
         slots = (jnp.arange(4) * i) % state.size
-        return ring.set_errors(state, slots, ring.gather(state, slots)["id"].astype(jnp.float32)), None
+        return ring.set_priorities(state, slots, ring.gather(state, slots)["id"].astype(jnp.float32)), None
 
     compiled = jax.jit(lambda s: jax.lax.scan(step, s, jnp.arange(4))[0], donate_argnums=0).lower(state).compile()
     memory, replay_bytes = compiled.memory_analysis(), state.items["map"].nbytes

@@ -1,6 +1,7 @@
-"""Which transitions are drawn."""
+"""Which transitions are drawn, against the laws by SciPy."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,31 +14,132 @@ from csac_jax.replay import ring, samplers
 
 NUM = 20_000
 CAPACITY = 1000
+P = 1e-3  # tests of fit: keys are fixed, so that one passes always or never
 
 beta_slots = jax.jit(samplers.beta_slots, static_argnums=5)
+proportional_slots = jax.jit(samplers.proportional_slots, static_argnums=2)
 sample = jax.jit(samplers.sample, static_argnums=(1, 4))
 
 
-def ranks(errors: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    """Rank of each slot's error among all, 0 = largest."""
-    order = np.argsort(-np.abs(errors))
+def stored(cfg: ReplayConfig, errors, size: int | None = None) -> ring.ReplayState:
+    """A ring with these errors in its first slots."""
+    errors = jnp.asarray(errors, jnp.float32)
+    size = errors.size if size is None else size
+    filled = jnp.arange(errors.size) < size
+    priority = jnp.where(filled, samplers.priority(cfg, errors), 0.0)
+    return dataclasses.replace(ring.init(cfg, jnp.int32(0)), size=jnp.int32(size), priority=priority)
+
+
+def ranks(values: np.ndarray, slots: np.ndarray) -> np.ndarray:
+    """Rank of each slot's value among all, 0 = largest."""
+    order = np.argsort(-values)
     rank = np.empty_like(order)
     rank[order] = np.arange(order.size)
     return rank[slots]
 
 
-@pytest.mark.parametrize(("a", "b"), [(1.0, 1.0), (0.5, 0.5), (1.0, 2.0), (1.0, 12.0), (2.0, 5.0)])
+def assert_fits(cells: np.ndarray, probability: np.ndarray) -> None:
+    """Chi-square over groups of cells expected at least 20 times, and Kolmogorov over all in their order."""
+    expected = probability / probability.sum() * cells.size
+    count = np.bincount(cells, minlength=expected.size)
+    assert np.all(count[expected == 0.0] == 0)
+    group = np.minimum(np.cumsum(expected) // 20.0, cells.size // 20 - 1).astype(int)
+    group = np.unique(group, return_inverse=True)[1]
+    grouped, wanted = (np.bincount(group, weights) for weights in (count, expected))
+    assert stats.chisquare(grouped, wanted).pvalue > P
+    spread = cells + np.random.default_rng(0).uniform(size=cells.size)  # evenly within its cell
+    edges = np.concatenate([[0.0], np.cumsum(expected)]) / cells.size
+    assert stats.kstest(spread, lambda x: np.interp(x, np.arange(edges.size), edges)).pvalue > P
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [(1.0, 1.0), (0.5, 0.5), (1.0, 2.0), (1.0, 12.0), (2.0, 5.0), (12.0, 1.0), (0.5, 3.0), (3.0, 3.0), (1.0, 4.0),
+     (0.75, 0.75)],
+)  # fmt: skip
 @pytest.mark.parametrize("size", [CAPACITY, 400])
 def test_ranks_follow_the_beta_law(a, b, size):
-    """Claim: rank / n ~ Beta(a, b), rank 0 the largest abs error, in a ring that is full or partly filled."""
-    errors = np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)  # signed, and garbage beyond `size`
-    errors[size:] *= 100.0
-    slots = np.asarray(beta_slots(jax.random.key(0), jnp.array(errors), jnp.int32(size), a, b, NUM))
+    """Claim: rank / n ~ Beta(a, b), rank 0 the largest value, in a ring that is full or partly filled."""
+    values = np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)  # and garbage beyond `size`
+    values[size:] *= 100.0
+    slots = np.asarray(beta_slots(jax.random.key(0), jnp.array(values), jnp.int32(size), a, b, NUM))
     assert slots.min() >= 0
     assert slots.max() < size
-    decile = ranks(errors[:size], slots) * 10 // size
-    expected = np.diff(special.betainc(a, b, np.linspace(0, 1, 11))) * NUM
-    assert stats.chisquare(np.bincount(decile, minlength=10), expected).pvalue > 1e-4
+    probability = np.diff(special.betainc(a, b, np.linspace(0.0, 1.0, size + 1)))
+    assert_fits(ranks(values[:size], slots), probability)
+
+
+LAWS = {
+    "normal": lambda rng: rng.normal(size=CAPACITY),
+    "twelve decades": lambda rng: 10.0 ** rng.uniform(-6.0, 6.0, CAPACITY),
+    "one giant": lambda rng: np.where(np.arange(CAPACITY) == 617, 1e3, rng.uniform(size=CAPACITY)),
+}
+
+
+@pytest.mark.parametrize(
+    ("law", "alpha", "size"),
+    [("normal", 0.0, CAPACITY), ("normal", 0.3, CAPACITY), ("normal", 0.6, CAPACITY), ("normal", 1.0, CAPACITY),
+     ("normal", 0.6, 400), ("twelve decades", 0.2, CAPACITY), ("twelve decades", 0.6, CAPACITY),
+     ("twelve decades", 1.0, CAPACITY), ("one giant", 0.6, CAPACITY), ("one giant", 1.0, 700)],
+)  # fmt: skip
+def test_prioritised_draws_follow_the_priorities(law, alpha, size):
+    """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + floor, in a ring that is full or partly filled."""
+    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=alpha, floor=1e-6)
+    errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
+    slots, _ = sample(jax.random.key(0), cfg, stored(cfg, errors, size), jnp.float32(0.0), NUM)
+    assert slots.max() < size
+    assert_fits(np.asarray(slots), (np.abs(errors[:size].astype(float)) + 1e-6) ** alpha)
+
+
+@pytest.mark.parametrize("size", [2, 3, 7, 50, 64, 100, 400, 512, 999, 1000])
+def test_uniform_slots_are_uniform(size):
+    """Claim: the uniform sampler draws each filled slot equally often, no other."""
+    slots = np.asarray(samplers.uniform_slots(jax.random.key(0), jnp.int32(size), NUM))
+    assert slots.min() >= 0
+    assert slots.max() < size
+    assert_fits(slots, np.ones(size))
+
+
+def test_alpha_zero_is_uniform_over_what_is_stored():
+    """Claim: alpha = 0 draws every filled slot alike, whatever its error."""
+    cfg = ReplayConfig(capacity=8, sampler="prioritised", alpha=0.0)
+    assert stored(cfg, [1e-3, 1.0, 1e6, 0.0, 5.0, 5.0, 5.0, 5.0], 4).priority.tolist() == [1.0] * 4 + [0.0] * 4
+
+
+@pytest.mark.parametrize("capacity", [2, 7, 8, 9, 64, 65, 1000, 4096])
+def test_every_capacity_has_its_pyramid(capacity):
+    """Claim: whatever the capacity, the law holds: P(slot) grows with its number here; the last slot is drawn most."""
+    masses = np.arange(1, capacity + 1)
+    assert_fits(np.asarray(proportional_slots(jax.random.key(1), jnp.asarray(masses, jnp.float32), NUM)), masses)
+
+
+def test_large_rings_are_drawn_evenly():
+    """Claim: neighbours in a ring of 2^17 equal priorities, 2^-17 of the whole each, are drawn alike to 0.1 %: no
+    slot pays for the 2^23 steps of a float32 uniform. By all 2^23 of them in the lower half of the way."""
+    masses = jnp.ones(2**17)
+    levels = samplers._pyramid(masses)
+    below = 8 ** len(samplers._halves(levels)[1])  # slots that the second uniform number decides between
+    assert below <= 8**3
+    count = np.bincount(np.arange(2**23) * below >> 23)
+    np.testing.assert_allclose(count / count.mean(), 1.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("zeros", [0.0, 0.5, 0.95, 1.0])
+def test_what_has_no_mass_is_never_picked(zeros):
+    """Claim: of masses over twelve decades with zeros among them, none that is 0 is picked, at either end of the
+    uniform numbers too, unless all are; what is left of the number lies in 0 <= u < 1."""
+    rng = np.random.default_rng(0)
+    num = 100_000
+    masses = 10.0 ** rng.uniform(-6.0, 6.0, (samplers.RADIX, num)) * (rng.uniform(size=(samplers.RADIX, num)) >= zeros)
+    masses = masses.astype(np.float32)
+    uniform = np.concatenate([np.zeros(num // 4), np.full(num // 4, samplers.BELOW_ONE), rng.uniform(size=num // 2)])
+    row, left = jax.jit(samplers._pick)(
+        jnp.asarray(masses), jnp.minimum(uniform, samplers.BELOW_ONE).astype(jnp.float32)
+    )
+    picked = np.take_along_axis(masses, np.asarray(row)[None], axis=0)[0]
+    assert np.all((picked > 0.0) | (masses.sum(axis=0) == 0.0))
+    assert np.all((left >= 0.0) & (left < 1.0))
+    assert np.all((row >= 0) & (row < samplers.RADIX))
 
 
 def test_top_decile_shares():
@@ -48,62 +150,138 @@ def test_top_decile_shares():
         np.testing.assert_allclose(np.mean(np.asarray(slots) < CAPACITY // 10), share, atol=0.012)
 
 
-def test_ranked_items_are_those_with_large_errors():
+@pytest.mark.parametrize("sampler", ["prioritised", "beta"])
+def test_items_with_large_errors_are_drawn_most(sampler):
     """Claim: through the ring, with items numbered from 1 and wrapped, the largest error is drawn most."""
-    cfg = ReplayConfig(capacity=8, beta_start=(1.0, 12.0))
+    cfg = ReplayConfig(capacity=8, sampler=sampler, beta_start=(1.0, 12.0), alpha=1.0, floor=1e-3)
     state = ring.init(cfg, {"id": jnp.int32(0)})
     for i in range(1, 12):
         state = ring.add(state, {"id": jnp.array([i])}, jnp.array([True]))
     ids = np.asarray(state.items["id"])
-    state = ring.set_errors(state, jnp.arange(8), jnp.array(np.where(ids == 7, 5.0, 0.1 * ids), jnp.float32))
-    slots = sample(jax.random.key(0), cfg, state, jnp.float32(0.0), NUM)
+    errors = np.where(ids == 7, -5.0, 0.1 * ids)
+    state = ring.set_priorities(state, jnp.arange(8), samplers.priority(cfg, jnp.array(errors, jnp.float32)))
+    slots, _ = sample(jax.random.key(0), cfg, state, jnp.float32(0.0), NUM)
     count = np.bincount(ring.gather(state, slots)["id"], minlength=12)
     assert count[:4].sum() == 0
     assert count.argmax() == 7
-    np.testing.assert_allclose(count[7] / NUM, special.betainc(1.0, 12.0, 1 / 8), atol=0.01)
+    share = special.betainc(1.0, 12.0, 1 / 8) if sampler == "beta" else 5.001 / (np.abs(errors).sum() + 8e-3)
+    np.testing.assert_allclose(count[7] / NUM, share, atol=0.01)
 
 
-def test_uniform_slots_are_uniform():
-    """Claim: the uniform sampler draws each filled slot equally often (chi-square), no other."""
-    slots = np.asarray(samplers.uniform_slots(jax.random.key(0), jnp.int32(50), NUM))
-    assert slots.min() >= 0
-    assert slots.max() < 50
-    assert stats.chisquare(np.bincount(slots)).pvalue > 1e-4
+def test_ranking_by_reward():
+    """Claim: by `rank_by` reward, rank 0 is the largest reward, signed, whatever the errors."""
+    cfg = ReplayConfig(capacity=CAPACITY, rank_by="reward", beta_start=(1.0, 12.0))
+    rewards = np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)
+
+    @dataclasses.dataclass
+    class Items:
+        reward: jax.Array
+
+    state = stored(cfg, np.random.default_rng(1).normal(size=CAPACITY), 400)
+    state = dataclasses.replace(state, items=Items(jnp.asarray(rewards)))
+    slots, _ = samplers.sample(jax.random.key(0), cfg, state, jnp.float32(0.0), NUM)
+    probability = np.diff(special.betainc(1.0, 12.0, np.linspace(0.0, 1.0, 401)))
+    assert_fits(ranks(rewards[:400], np.asarray(slots)), probability)
 
 
-def test_equal_errors_are_drawn_equally():
-    """Claim: ranks of equal errors are shared at random: no slot is preferred, whatever the Beta law."""
-    keys = jax.random.split(jax.random.key(0), 2000)
-    errors = jnp.ones(20)
-    draw = jax.jit(jax.vmap(lambda key: samplers.beta_slots(key, errors, jnp.int32(10), 1.0, 12.0, 1)))
-    count = np.bincount(np.asarray(draw(keys)).ravel(), minlength=20)
-    assert count[10:].sum() == 0
-    assert stats.chisquare(count[:10]).pvalue > 1e-4
+@pytest.mark.parametrize("sampler", ["prioritised", "beta"])
+def test_equal_errors_are_drawn_equally(sampler):
+    """Claim: slots of equal errors are drawn alike: none is preferred, by either law."""
+    cfg = ReplayConfig(capacity=20, sampler=sampler, beta_start=(1.0, 12.0))
+    state = stored(cfg, jnp.ones(20), 10)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    slots = jax.jit(jax.vmap(lambda key: samplers.sample(key, cfg, state, jnp.float32(0.0), 1).slots))(keys)
+    assert_fits(np.asarray(slots).ravel(), np.ones(10))
 
 
 def test_nan_is_ranked_first():
-    """Claim: NaN errors are ranked first and never let an unfilled slot in."""
-    errors = jnp.array([1.0, jnp.nan, 3.0, jnp.nan, 9.0, jnp.nan])
-    slots = np.asarray(beta_slots(jax.random.key(0), errors, jnp.int32(4), 1.0, 2.0, NUM))
+    """Claim: values that are NaN are ranked first and never let an unfilled slot in."""
+    values = jnp.array([1.0, jnp.nan, 3.0, jnp.nan, 9.0, jnp.nan])
+    slots = np.asarray(beta_slots(jax.random.key(0), values, jnp.int32(4), 1.0, 2.0, NUM))
     count = np.bincount(slots, minlength=6)
     assert count[4:].sum() == 0
     assert min(count[1], count[3]) > count[2] > count[0] > 0
-    slots = np.asarray(beta_slots(jax.random.key(0), errors, jnp.int32(4), 12.0, 1.0, NUM))
+    slots = np.asarray(beta_slots(jax.random.key(0), values, jnp.int32(4), 12.0, 1.0, NUM))
     assert slots.max() < 4
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "beta"])
+@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
+def test_errors_that_are_not_numbers(sampler):
+    """Claim: after updates with NaN and infinite errors, slots are inside, weights positive and at most 1."""
+    cfg = ReplayConfig(capacity=8, sampler=sampler)
+    state = stored(cfg, [0.5, 2.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0], 4)
+    for errors in ([jnp.nan, 1.0, -2.0], [jnp.inf, -jnp.inf, jnp.nan], [jnp.nan] * 3):
+        state = ring.set_priorities(state, jnp.array([0, 2, 3]), samplers.priority(cfg, jnp.array(errors)))
+        slots, weights = sample(jax.random.key(0), cfg, state, jnp.float32(0.5), NUM)
+        assert np.all((slots >= 0) & (slots < 4))
+        assert np.all((weights > 0.0) & (weights <= 1.0))
+
+
+@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
 @pytest.mark.parametrize("size", [0, 1, 2, 7, 8])
 @pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
 def test_slots_are_always_inside(sampler, size, progress):
-    """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots."""
+    """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots. Weights are at most 1."""
     cfg = ReplayConfig(capacity=8, sampler=sampler)
-    state = dataclasses.replace(ring.init(cfg, jnp.int32(0)), size=jnp.int32(size))
-    slots = np.asarray(sample(jax.random.key(0), cfg, state, jnp.float32(progress), 500))
+    slots, weights = sample(jax.random.key(0), cfg, stored(cfg, jnp.ones(8), size), jnp.float32(progress), 500)
     assert slots.dtype == np.int32
     assert slots.min() >= 0
     assert slots.max() < (size or 8)
-    assert size == 0 or progress == 1.0 or np.unique(slots).size == size  # Beta(1, 12) seldom does
+    assert (weights.shape, weights.dtype, weights.min(), weights.max()) == ((500,), np.float32, 1.0, 1.0)
+    seldom = sampler == "beta" and progress == 1.0  # Beta(1, 12)
+    assert size == 0 or seldom or np.unique(slots).size == size
+
+
+@pytest.mark.parametrize("progress", [-1.0, 0.0, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("law", LAWS)
+def test_weights_by_formula(progress, law):
+    """Claim: w_i = (n P(i))^-beta / max_j w_j over the batch, beta from `weight_start` to `weight_end` in a line."""
+    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", weight_start=0.2, weight_end=0.8)
+    errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
+    slots, weights = sample(jax.random.key(0), cfg, stored(cfg, errors, 900), jnp.float32(progress), 64)
+    mass = (np.abs(errors[:900].astype(float)) + cfg.floor) ** cfg.alpha
+    expected = (900 * mass / mass.sum())[np.asarray(slots)] ** -(0.2 + 0.6 * np.clip(progress, 0.0, 1.0))
+    np.testing.assert_allclose(weights, expected / expected.max(), rtol=2e-5)
+    assert np.unique(weights).size > 1
+
+
+def test_full_weights_take_the_bias_away():
+    """Claim: with exponent 1, a weighted mean over prioritised draws is the mean over what is stored."""
+    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", weight_start=1.0)
+    values = np.random.default_rng(0).uniform(1.0, 2.0, CAPACITY).astype(np.float32)
+    slots, weights = sample(jax.random.key(0), cfg, stored(cfg, values**3), jnp.float32(0.0), NUM)
+    plain = values[np.asarray(slots)].mean()
+    weighted = np.average(values[np.asarray(slots)], weights=weights)
+    assert plain > values.mean() + 0.05
+    np.testing.assert_allclose(weighted, values.mean(), atol=0.01)
+
+
+@pytest.mark.parametrize("sampler", ["uniform", "beta"])
+def test_other_samplers_do_not_weight(sampler):
+    """Claim: weights of uniform and beta draws are ones, whatever the errors."""
+    cfg = ReplayConfig(capacity=CAPACITY, sampler=sampler)
+    state = stored(cfg, np.random.default_rng(0).normal(size=CAPACITY))
+    np.testing.assert_array_equal(sample(jax.random.key(0), cfg, state, jnp.float32(0.3), 64).weights, 1.0)
+
+
+@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
+def test_batched_seeds_are_each_by_itself(sampler):
+    """Claim: draws and updates of three seeds under vmap are those of each seed alone."""
+    cfg = ReplayConfig(capacity=100, sampler=sampler)
+    states = [stored(cfg, np.random.default_rng(seed).normal(size=100), 70 + seed) for seed in range(3)]
+    keys = jax.random.split(jax.random.key(0), 3)
+
+    def step(key, state):
+        slots, weights = samplers.sample(key, cfg, state, jnp.float32(0.3), 32)
+        errors = jnp.sin(slots.astype(jnp.float32))
+        return slots, weights, ring.set_priorities(state, slots, samplers.priority(cfg, errors)).priority
+
+    together = jax.jit(jax.vmap(step))(keys, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    for i, (key, state) in enumerate(zip(keys, states, strict=True)):
+        alone = jax.jit(step)(key, state)
+        np.testing.assert_array_equal(together[0][i], alone[0])
+        np.testing.assert_allclose(together[1][i], alone[1], rtol=1e-6)
+        np.testing.assert_allclose(together[2][i], alone[2], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -116,23 +294,28 @@ def test_schedule_by_hand(progress, expected):
     np.testing.assert_allclose(samplers.beta_schedule(ReplayConfig(), jnp.float32(progress)), expected, rtol=1e-5)
 
 
+def test_one_law_for_the_whole_run():
+    """Claim: with start, middle and end the same, (a, b) never changes: VPG's Beta(1, 2)."""
+    cfg = ReplayConfig(beta_start=(1.0, 2.0), beta_middle=(1.0, 2.0), beta_end=(1.0, 2.0))
+    for progress in np.linspace(-0.5, 1.5, 21):
+        np.testing.assert_array_equal(samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0])
+
+
 def test_sampler_follows_the_schedule():
     """Claim: the share of the worst tenth falls from 20.5 % over 10 % to none as training goes on."""
     cfg = ReplayConfig(capacity=CAPACITY)
-    state = dataclasses.replace(
-        ring.init(cfg, jnp.int32(0)), size=jnp.int32(CAPACITY), error=jnp.arange(CAPACITY, 0, -1).astype(jnp.float32)
-    )
+    state = stored(cfg, jnp.arange(CAPACITY, 0, -1))
     for progress, share in ((0.0, 0.205), (0.4, 0.10), (1.0, 0.0)):
-        slots = np.asarray(sample(jax.random.key(0), cfg, state, jnp.float32(progress), NUM))
+        slots = np.asarray(sample(jax.random.key(0), cfg, state, jnp.float32(progress), NUM).slots)
         np.testing.assert_allclose(np.mean(slots >= 0.9 * CAPACITY), share, atol=0.012)
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "beta"])
+@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
 def test_keys_differ(sampler):
     """Claim: two keys give two draws, one key one."""
     cfg = ReplayConfig(capacity=CAPACITY, sampler=sampler)
-    state = dataclasses.replace(ring.init(cfg, jnp.int32(0)), size=jnp.int32(CAPACITY))
-    first, again, other = (sample(jax.random.key(i), cfg, state, jnp.float32(0.3), 32) for i in (0, 0, 1))
+    state = stored(cfg, jnp.ones(CAPACITY))
+    first, again, other = (sample(jax.random.key(i), cfg, state, jnp.float32(0.3), 32).slots for i in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert np.any(first != other)
 
@@ -142,3 +325,38 @@ def test_unknown_sampler():
     cfg = dataclasses.replace(ReplayConfig(capacity=8), sampler="rank")
     with pytest.raises(ValueError, match="rank"):
         samplers.sample(jax.random.key(0), cfg, ring.init(cfg, jnp.int32(0)), jnp.float32(0.0), 4)
+
+
+@pytest.mark.slow
+def test_as_a_sum_tree_after_a_million_updates():
+    """Claim: after 1,000,000 updates with priorities from 1e-6 to 1e6, the sum of all masses and the probabilities are
+    those of flashbax's sum tree to 1e-4, and those of NumPy in float64 to 1e-5."""
+    sum_tree = pytest.importorskip("flashbax.buffers.sum_tree")
+    capacity, batch, updates = 2**12, 64, 2**20
+    cfg = ReplayConfig(capacity=capacity, sampler="prioritised", floor=1e-9)
+    rng = np.random.default_rng(0)
+    priorities = (10.0 ** rng.uniform(-6.0, 6.0, (updates // batch, batch))).astype(np.float32)
+    slots = np.stack([rng.choice(capacity, batch, replace=False) for _ in range(updates // batch)]).astype(np.int32)
+
+    def update(carry, given):
+        state, tree = carry
+        masses = samplers.priority(cfg, given[1])
+        return (ring.set_priorities(state, given[0], masses), sum_tree.set_batch_scan(tree, given[0], masses)), None
+
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        begun = (
+            stored(cfg, jnp.ones(capacity)),
+            sum_tree.set_batch_scan(
+                sum_tree.init(capacity), jnp.arange(capacity), samplers.priority(cfg, jnp.ones(capacity))
+            ),
+        )
+        state, tree = jax.jit(functools.partial(jax.lax.scan, update))(begun, (slots, priorities))[0]
+        theirs = np.asarray(jax.vmap(functools.partial(sum_tree.get_probability, tree))(jnp.arange(capacity)), float)
+    truth = np.ones(capacity)
+    for these, new in zip(slots, priorities, strict=True):
+        truth[these] = (new.astype(float) + 1e-9) ** cfg.alpha
+    top, ours = samplers._pyramid(state.priority)[0].sum(), np.asarray(state.priority, float)
+    np.testing.assert_allclose(top, truth.sum(), rtol=1e-5)
+    np.testing.assert_allclose(top, tree.nodes[0], rtol=1e-4)
+    np.testing.assert_allclose(ours / float(top), truth / truth.sum(), rtol=1e-5)
+    assert np.abs(ours / float(top) - theirs).sum() < 1e-4

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
+from csac_jax.agent import learner as learning
 from csac_jax.config import ReplayConfig
 from csac_jax.env import Env
+from csac_jax.replay import ring, samplers
 from csac_jax.train import checkpoint, step
 from csac_jax.train.step import Program, StepMetrics, TrainState
 
@@ -275,3 +277,29 @@ def test_ill_scenes_leave_no_trace(run):
     assert int(state.replay.size) == NUM_SEEN - int(np.sum(metrics.ill))
     for name, leaf in leaves(state):
         assert np.issubdtype(leaf.dtype, np.integer) or np.all(np.isfinite(leaf)), name
+
+
+@pytest.mark.parametrize("sampler", ["prioritised", "beta"])
+def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
+    """Claim: the sampler's weights are those of the critic's loss, and what a batch's errors make of priorities is
+    stored in the slots that were drawn, and nowhere else. Sampler and networks stand in."""
+    num = CFG.learn.batch
+    weights, error = jnp.linspace(0.5, 1.0, num), jnp.linspace(-1.0, 1.0, num)
+
+    def draw(key, cfg, state, progress, num):
+        return samplers.Sample(2 * jnp.arange(num, dtype=jnp.int32), weights)
+
+    def update(key, learner, state, batch, given):
+        return state, learning.UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
+
+    monkeypatch.setattr(samplers, "sample", draw)
+    monkeypatch.setattr(learning, "update_critic", update)
+    monkeypatch.setattr(learning, "update_actor", lambda learner, state, obs: (state, jnp.float32(0.0)))
+    cfg = dataclasses.replace(CFG, replay=ReplayConfig(capacity=64, sampler=sampler, alpha=0.5, floor=0.25))
+    replay = ring.init(cfg.replay, step.example(cfg)).replace(size=jnp.int32(64), priority=jnp.full(64, 7.0))
+    learner_state = learning.LearnerState(None, None, None, None, jnp.int32(0))
+    _, priority, losses = step._learn(Program(cfg, None, None), jax.random.key(0), learner_state, replay)
+    np.testing.assert_allclose(losses["critic_loss"], np.sum(weights * error), rtol=1e-5)
+    expected = np.full(64, 7.0)
+    expected[: 2 * num : 2] = np.sqrt(np.abs(error) + 0.25) if sampler == "prioritised" else np.abs(error)
+    np.testing.assert_allclose(priority, expected, rtol=1e-6)

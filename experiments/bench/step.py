@@ -1,4 +1,4 @@
-"""Speed of this machine, as JSON: `python -m experiments.bench [PRESET]`, PRESET smoke or quick (default).
+"""Speed of this machine, as JSON: `csac-jax bench step [PRESET]`, with PRESET `quick` if none is given.
 
 The training step is timed beside a bare `mjx.step` loop of the same model and number of scenes in the same process, and
 each part is the median of several calls; machines are noisy, so trust ratios.
@@ -6,7 +6,6 @@ each part is the median of several calls; machines are noisy, so trust ratios.
 
 import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +16,7 @@ from mujoco import mjx
 
 from csac_jax import presets
 from csac_jax.agent import learner as learning
+from csac_jax.cli import BadArgumentsError
 from csac_jax.nets.convolution import conv2d
 from csac_jax.sim.primitives import Action
 from csac_jax.train import provenance, step
@@ -105,10 +105,8 @@ def measure(preset: str) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    preset = sys.argv[1] if len(sys.argv) > 1 else "quick"
-    print(json.dumps(measure(preset) | provenance.record(), indent=2))
-
-
-if __name__ == "__main__":
-    main()
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    if len(arguments) > 1 or not presets.PRESETS.keys() >= set(arguments):
+        raise BadArgumentsError(f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick")
+    print(json.dumps(measure(*arguments or ["quick"]) | provenance.record(), indent=2))

@@ -1,0 +1,148 @@
+"""Speed of the replay, as JSON: `csac-jax bench replay [SMALLEST LARGEST]`, capacities 2^SMALLEST (12) to
+2^LARGEST (20).
+
+One step draws 64 transitions from a full ring with their weights, gathers them and replaces their priorities. The
+samplers of this package stand beside flashbax's prioritised item buffer, with the same items and exponents. Each is a
+compiled loop of steps, its state donated; calls of all take turns, so that what else the machine does hits all alike,
+and the median is reported. An item is 21 numbers: the loops time the sampling, not the copying of images.
+"""
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from csac_jax.cli import BadArgumentsError
+from csac_jax.config import ReplayConfig
+from csac_jax.replay import ring, samplers
+from csac_jax.train import provenance
+
+BATCH = 64
+REPEATS = 15
+STEPS = 100  # in one call
+SORTED = 2**18  # items that one call of the beta sampler sorts at least
+ITEM = {"obs": jnp.zeros(16), "action": jnp.zeros(3), "reward": jnp.zeros(()), "terminated": jnp.zeros((), bool)}
+
+Step = Callable[[Any, jax.Array], Any]
+
+
+def _new_errors(slots: jax.Array, items: Any, weights: jax.Array) -> jax.Array:
+    """Stands for the learner: errors [B] that need everything that was drawn."""
+    noise = jnp.sin(slots.astype(jnp.float32)) + 0.5 * jnp.cos(3.0 * slots.astype(jnp.float32))
+    return noise + 0.0 * (weights + items["reward"] + jnp.sum(items["obs"], axis=-1))
+
+
+def _ours(sampler: Any, capacity: int) -> tuple[Any, Step]:
+    """A full ring and its step."""
+    cfg = ReplayConfig(capacity=capacity, sampler=sampler)
+    state = ring.init(cfg, ITEM)
+    errors = jnp.exp(jax.random.normal(jax.random.key(0), (capacity,)))
+    state = state.replace(size=jnp.int32(capacity), priority=samplers.priority(cfg, errors))
+
+    def step(state: ring.ReplayState, key: jax.Array) -> ring.ReplayState:
+        slots, weights = samplers.sample(key, cfg, state, jnp.float32(0.5), BATCH)
+        errors = _new_errors(slots, ring.gather(state, slots), weights)
+        return ring.set_priorities(state, slots, samplers.priority(cfg, errors))
+
+    return state, step
+
+
+def _flashbax(capacity: int) -> tuple[Any, Step]:
+    """The same by flashbax, which leaves weights and the floor to its user."""
+    import flashbax
+
+    cfg = ReplayConfig()
+    exponent = 0.5 * (cfg.weight_start + cfg.weight_end)
+    buffer = flashbax.make_prioritised_item_buffer(
+        max_length=capacity,
+        min_length=1,
+        sample_batch_size=BATCH,
+        add_batches=True,
+        priority_exponent=cfg.alpha,
+        device=jax.default_backend(),
+    )
+    items = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), ITEM)
+    state = buffer.add(buffer.init(ITEM), items)
+    errors = jnp.exp(jax.random.normal(jax.random.key(0), (capacity,)))
+    state = buffer.set_priorities(state, jnp.arange(capacity), errors + cfg.floor)
+
+    def step(state: Any, key: jax.Array) -> Any:
+        drawn = buffer.sample(state, key)
+        weights = (capacity * drawn.probabilities) ** -exponent
+        errors = _new_errors(drawn.indices, drawn.experience, weights / jnp.max(weights))
+        return buffer.set_priorities(state, drawn.indices, jnp.abs(errors) + cfg.floor)
+
+    return state, step
+
+
+def _timer(state: Any, step: Step, steps: int) -> Callable[[], float]:
+    """A function that runs `steps` steps, going on from the last call's state, and returns the seconds per step."""
+
+    def loop(state: Any, key: jax.Array) -> Any:
+        return jax.lax.scan(lambda s, i: (step(s, jax.random.fold_in(key, i)), None), state, jnp.arange(steps))[0]
+
+    compiled = jax.jit(loop, donate_argnums=0)
+    current = jax.block_until_ready(compiled(jax.tree.map(jnp.copy, state), jax.random.key(1)))
+    calls = 0
+
+    def call() -> float:
+        nonlocal current, calls
+        calls += 1
+        key = jax.random.key(1 + calls)
+        begun = time.perf_counter()
+        current = jax.block_until_ready(compiled(current, key))
+        return (time.perf_counter() - begun) / steps
+
+    return call
+
+
+def measure(capacity: int) -> dict[str, Any]:
+    """Median seconds per step for one capacity."""
+    timers = {
+        "uniform": _timer(*_ours("uniform", capacity), STEPS),
+        "prioritised": _timer(*_ours("prioritised", capacity), STEPS),
+        "beta": _timer(*_ours("beta", capacity), max(SORTED // capacity, 1)),
+        "flashbax": _timer(*_flashbax(capacity), STEPS),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in timers}
+    for _ in range(REPEATS):
+        for name, timer in timers.items():
+            seconds[name].append(timer())
+    median = {name: statistics.median(values) for name, values in seconds.items()}
+    return {
+        "capacity": capacity,
+        "median_seconds": median,
+        "least_seconds": {name: min(values) for name, values in seconds.items()},
+        "flashbax_over_prioritised": median["flashbax"] / median["prioritised"],
+    }
+
+
+def _exponents(arguments: list[str]) -> range:
+    if not arguments:
+        return range(12, 21)
+    if len(arguments) != 2 or not all(word.isdigit() for word in arguments):
+        raise BadArgumentsError("bench replay: give two exponents of 2, the smallest and the largest capacity, or none")
+    smallest, largest = map(int, arguments)
+    if not 1 <= smallest <= largest <= 24:
+        raise BadArgumentsError("bench replay: exponents must lie in 1 .. 24, the smaller first")
+    return range(smallest, largest + 1)
+
+
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    exponents = _exponents(arguments)
+    try:
+        import flashbax  # noqa: F401
+    except ImportError:
+        raise BadArgumentsError("bench replay needs flashbax; run: pip install 'csac-jax[bench]'") from None
+    result = {
+        "batch": BATCH,
+        "item": {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in ITEM.items()},
+        "repeats": REPEATS,
+        "capacities": [measure(2**exponent) for exponent in exponents],
+    }
+    print(json.dumps(result | provenance.record(), indent=2))
