@@ -1,0 +1,398 @@
+"""UR5 kinematics against C MuJoCo, against itself, and at the ends of its reach."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.geometry import cell_centres
+from csac_jax.scene.model import assets
+from csac_jax.sim import kinematics, primitives
+from csac_jax.sim.kinematics import Pose
+from csac_jax.sim.primitives import Action
+
+SIM, MAP = SimConfig(), HeightmapConfig()
+HALF = 0.5 * MAP.extent
+POSITION, ANGLE = 2e-6, 5e-6  # m, rad: a few times what float32 leaves, 7e-7 and 1.3e-6
+
+forward = jax.jit(jax.vmap(kinematics.forward))
+inverse = jax.jit(jax.vmap(kinematics.inverse))
+top_down = jax.jit(jax.vmap(kinematics.top_down))
+clearance = jax.jit(jax.vmap(kinematics.clearance))
+clear = jax.jit(jax.vmap(jax.vmap(kinematics.clear)))
+trajectory = jax.jit(kinematics.trajectory)
+gradients = jax.jit(jax.grad(lambda *pose: jnp.sum(kinematics.inverse(*pose)[0]), argnums=(0, 1)))
+trajectories = jax.jit(jax.vmap(kinematics.trajectory, (None, 0)))
+
+
+def _random_joints(num: int, seed: int = 0) -> np.ndarray:
+    """Joint angles [num, 6] rad, uniform within the limits."""
+    return (np.random.default_rng(seed).uniform(-1, 1, (num, 6)) * kinematics.LIMITS).astype(np.float32)
+
+
+def _errors(pose: Pose, other: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [...] m and angles [...] rad between poses [..., 3], [..., 3, 3]."""
+    turn = np.einsum("...ij,...ik->...jk", np.asarray(pose.rotation, np.float64), np.asarray(other.rotation))
+    sine = np.stack([turn[..., i, j] - turn[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=-1)
+    angle = np.arctan2(np.linalg.norm(sine, axis=-1), np.trace(turn, axis1=-2, axis2=-1) - 1.0)
+    return np.linalg.norm(np.asarray(pose.position) - np.asarray(other.position), axis=-1), angle
+
+
+def _angles_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Greatest difference of joint angles [..., 6], whole turns aside."""
+    return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi).max(axis=-1)
+
+
+@functools.cache
+def _arm() -> mujoco.MjModel:
+    """The arm with the capsules of the gripper, which `ur5.xml` leaves to `rg2.xml`."""
+    spec = mujoco.MjSpec.from_file(str(assets() / "ur5.xml"))
+    wrist3 = spec.body("wrist3")
+    tip = kinematics.D6 + kinematics.TOOL
+    for name, start, end, radius in (("tool", 0.0, tip - 0.115, 0.045), ("fingers", tip - 0.115, tip - 0.07, 0.07)):
+        geom = wrist3.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, 0, 0], mass=0)
+        geom.fromto = [0, 0, start, 0, 0, end]
+    return spec.compile()
+
+
+def _plans(num: int, seed: int = 0) -> primitives.Plan:
+    """Plans [num, ...] of pushes and grasps over flat surfaces; the first eight stand in the corners."""
+    rng = np.random.default_rng(seed)
+    pose = rng.uniform([-HALF, -HALF, 0], [HALF, HALF, 2 * np.pi], (num, 3)).astype(np.float32)
+    pose[:8, :2] = np.repeat(HALF * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], np.float32), 2, axis=0)
+    actions = Action(primitive=jnp.arange(num, dtype=jnp.int32) % 2, pose=jnp.asarray(pose))
+    top = rng.choice(np.float32([0.0, 0.05, 0.15]), num)
+    height = jnp.asarray(np.broadcast_to(top[:, None, None], (num, MAP.size, MAP.size)))
+    return jax.jit(jax.vmap(functools.partial(primitives.plan, SIM, MAP)))(height, actions)
+
+
+@functools.cache
+def _moves(num: int = 64) -> tuple[np.ndarray, kinematics.Trajectory]:
+    """Set-points [num, 1 + T, 5] of plans, from their start on, and the trajectories through them."""
+    plan = _plans(num)
+    control = jnp.concatenate([plan.start[:, None], plan.control], axis=1)
+    return np.asarray(control), trajectories(jnp.asarray(kinematics.HOME), control)
+
+
+def test_forward_agrees_with_c():
+    """Claim: the tips are where C MuJoCo has them in the arm of `ur5.xml`, which is built of the same parameters."""
+    model, joints = _arm(), _random_joints(1000)
+    data, position, rotation = mujoco.MjData(model), [], []
+    for q in joints:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        position.append(data.site("tip").xpos.copy())
+        rotation.append(data.site("tip").xmat.reshape(3, 3).copy())
+    distance, angle = _errors(forward(joints), Pose(np.array(position), np.array(rotation)))
+    assert distance.max() < POSITION
+    assert angle.max() < ANGLE
+
+
+def test_inverse_returns_to_the_pose():
+    """Claim: every branch that counts leads back to the pose, to rounding, in float32 and unrefined; one of them is the
+    joint angles that the pose was made from."""
+    joints = _random_joints(10_000)
+    pose = forward(joints)
+    solutions, valid = map(np.asarray, inverse(*pose))
+    again = jax.jit(jax.vmap(jax.vmap(kinematics.forward)))(solutions)
+    distance, angle = _errors(again, Pose(*(np.asarray(leaf)[:, None] for leaf in pose)))
+    assert valid.any(axis=1).mean() > 0.99  # else singular
+    assert distance[valid].max() < POSITION
+    assert angle[valid].max() < ANGLE
+    apart = np.where(valid, _angles_apart(solutions, joints[:, None]), np.inf).min(axis=1)
+    sines = np.abs(np.stack([np.sin(joints[:, 2]), np.sin(joints[:, 4])]))
+    generic = (sines > 0.05).all(axis=0) & valid.all(axis=1)
+    assert generic.sum() > 5000
+    assert apart[generic].max() < 5e-4  # near where two branches meet, an angle is worth the root of an error
+
+
+def test_eight_branches_are_distinct():
+    """Claim: where all eight branches count, no two are the same posture, and each has the signs that name it."""
+    solutions, valid = map(np.asarray, inverse(*forward(_random_joints(2000, 1))))
+    solutions = solutions[valid.all(axis=1)]
+    assert len(solutions) > 1000
+    assert (np.abs(solutions) <= np.pi + 1e-6).all()
+    for first in range(8):
+        for second in range(first):
+            assert _angles_apart(solutions[:, first], solutions[:, second]).min() > 0.5 * kinematics.SINGULAR
+    assert (np.sign(solutions[..., [2, 4]]) == kinematics.BRANCHES[:, 1:]).all()
+
+
+CENTRE, ABOVE_BASE = (0.0, 0.0, 0.1), kinematics.BASE[2] + 0.5
+NOWHERE = {
+    "beyond": ((-0.6, 0.0, 0.1), 0.0),
+    "very far": ((1e30, 0.0, 0.1), 0.0),
+    "nearer to the axis than the wrist is wide": ((kinematics.BASE[0] + 0.5 * kinematics.D4, 0.0, ABOVE_BASE), 0.0),
+    "straight beside the axis": ((kinematics.BASE[0], kinematics.D4, ABOVE_BASE), 0.0),  # both shoulders meet
+    "nan": ((0.0, np.nan, 0.1), 0.0),
+    "nan yaw": (CENTRE, np.nan),
+    "infinite": ((0.0, 0.0, -np.inf), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", NOWHERE)
+def test_poses_without_an_answer(name: str):
+    """Claim: poses out of reach, singular or not finite have no valid branch, and finite angles and gradients."""
+    xyz, yaw = NOWHERE[name]
+    pose = kinematics.top_down(jnp.array(xyz), jnp.array(yaw))
+    solutions, valid = jax.jit(kinematics.inverse)(*pose)
+    assert not valid.any()
+    assert np.isfinite(solutions).all()
+    assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
+
+
+def test_a_matrix_that_turns_nothing():
+    """Claim: what is no rotation has no valid branch, and finite angles and gradients."""
+    pose = Pose(jnp.array(CENTRE), jnp.zeros((3, 3)))
+    solutions, valid = jax.jit(kinematics.inverse)(*pose)
+    assert not valid.any()
+    assert np.isfinite(solutions).all()
+    assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
+
+
+@pytest.mark.parametrize(("joint", "angle"), [(2, 0.0), (2, 0.005), (4, 0.0), (4, -0.005), (4, np.pi)])
+def test_singular_branches_are_flagged(joint: int, angle: float):
+    """Claim: of a pose with a straight elbow or wrist, the branches that meet there do not count; all stay finite."""
+    pose = kinematics.forward(jnp.array([0.3, -0.5, 1.0, -1.0, 1.0, 0.2]).at[joint].set(angle))
+    solutions, valid = map(np.asarray, jax.jit(kinematics.inverse)(*pose))
+    assert np.isfinite(solutions).all()
+    assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
+    assert not valid.all()
+    sines = np.abs(np.sin(solutions[valid][:, [2, 4]]))
+    assert (sines > 0.9 * kinematics.SINGULAR).all()
+
+
+def test_wrist_at_its_very_singularity():
+    """Claim: where the wrist leaves nothing to tell its angles from, they and their gradients are finite."""
+    zero, one = jnp.zeros(()), jnp.ones(())
+    for output in range(2):
+        angle, slopes = jax.value_and_grad(lambda *z, output=output: kinematics._wrist(*z)[output], (0, 1, 2))(
+            zero, zero, one, one
+        )
+        assert np.isfinite([angle, *slopes]).all()
+    assert not kinematics._wrist(zero, zero, one, one)[2]
+
+
+def test_gradient_of_inverse():
+    """Claim: the derivative of a branch is the inverse of that of the tips' position and heading."""
+    xyz, yaw = jnp.array([0.1, -0.05, 0.1]), jnp.array(0.4)
+
+    def there_and_back(xyz, yaw):
+        pose = kinematics.forward(kinematics.inverse(*kinematics.top_down(xyz, yaw))[0][1])
+        return jnp.append(pose.position, jnp.arctan2(pose.rotation[1, 0], pose.rotation[0, 0]))
+
+    by_xyz, by_yaw = jax.jit(jax.jacobian(there_and_back, (0, 1)))(xyz, yaw)
+    np.testing.assert_allclose(np.column_stack([by_xyz, by_yaw]), np.eye(4), atol=1e-4)
+
+
+def test_top_down_is_the_floating_hand():
+    """Claim: a hand that points down at a yaw stands as the floating hand of `hand.xml` does at that yaw."""
+    model = mujoco.MjModel.from_xml_path(str(assets() / "hand.xml"))
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for values in rng.uniform([-0.2, -0.2, 0, 0], [0.2, 0.2, 0.3, 2 * np.pi], (20, 4)).astype(np.float32):
+        data.qpos[:4] = values
+        mujoco.mj_kinematics(model, data)
+        pose = kinematics.top_down(jnp.asarray(values[:3]), jnp.asarray(values[3]))
+        np.testing.assert_allclose(pose.position, data.body("hand").xpos, atol=1e-6)
+        np.testing.assert_allclose(pose.rotation, data.body("hand").xmat.reshape(3, 3), atol=1e-6)
+
+
+def test_whole_workspace_is_reachable():
+    """Claim: over every cell, with the tips 0.01 to 0.35 m above the table and at 16 yaws, a clear branch counts."""
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(0, None, None))
+    def reachable(xy, z, yaw):
+        solutions, valid = kinematics.inverse(*kinematics.top_down(jnp.append(xy, z), yaw))
+        return jnp.any(valid & jax.vmap(kinematics.clear)(solutions))
+
+    centres = cell_centres(MAP).reshape(-1, 2)
+    for z in np.float32([0.01, 0.12, 0.23, 0.35]):
+        for yaw in np.float32(np.arange(16) * np.pi / 8):
+            assert reachable(centres, z, yaw).all(), (z, yaw)
+
+
+def test_home_is_above_the_centre():
+    """Claim: at HOME the tips are 0.2 m above the workspace centre, and the arm is clear."""
+    np.testing.assert_allclose(kinematics.forward(jnp.asarray(kinematics.HOME)).position, [0, 0, 0.2], atol=2e-3)
+    assert kinematics.clear(jnp.asarray(kinematics.HOME))
+
+
+CAPSULES = ("base", "shoulder", "upper_arm", "elbow", "forearm", "wrist1", "wrist2", "tool", "fingers")
+
+
+def _distances(q: np.ndarray) -> np.ndarray:
+    """Distances [9, 9] m between the capsules by C MuJoCo."""
+    model = _arm()
+    data, ids = mujoco.MjData(model), [model.geom(name).id for name in CAPSULES]
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    return np.array([[mujoco.mj_geomDistance(model, data, a, b, 2.0, None) if a != b else 0 for b in ids] for a in ids])
+
+
+def test_clearance_agrees_with_c():
+    """Claim: the room between links is that between the capsules of `ur5.xml`, above the table that below them."""
+    model, joints = _arm(), _random_joints(200, 2)
+    above, apart = map(np.asarray, clearance(joints))
+    first, second = kinematics._PAIRS.T
+    expected = np.array([_distances(q)[first, second].min() for q in joints])
+    free = expected > 0
+    assert 20 < free.sum() < 180
+    np.testing.assert_allclose(apart[free], expected[free], atol=1e-5)
+    assert (apart[~free] < 1e-5).all()
+    data, links = mujoco.MjData(model), [model.geom(name).id for name in CAPSULES[2:8]]
+    for q, room in zip(joints, above, strict=True):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        radius, half = model.geom_size[links, :2].T
+        lowest = data.geom_xpos[links, 2] - half * np.abs(data.geom_xmat[links, 8]) - radius
+        assert abs(room - lowest.min()) < 1e-5
+
+
+def test_links_left_out_never_change():
+    """Claim: pairs of links that are not checked always touch, or never."""
+    signs = np.array([_distances(q) for q in _random_joints(300, 3)]) > 0
+    checked = np.zeros((9, 9), bool)
+    checked[tuple(kinematics._PAIRS.T)] = True
+    changes = signs.any(axis=0) & ~signs.all(axis=0)
+    assert not (changes & ~checked & ~checked.T).any()
+    assert changes.sum() > 20
+
+
+@pytest.mark.parametrize("turns", [(0, 0, 0, 0, 0, 0), (-1, 1, 0, 1, 1, -1)])
+def test_nearest_turns_least(turns: tuple[int, ...]):
+    """Claim: the nearest solution is the branch that the arm is in, each joint by the turn that it is in."""
+    q = jnp.array([0.4, -1.0, 1.7, -2.2, -1.5, 1.2]) + 2 * np.pi * jnp.array(turns, jnp.float32)
+    found, reachable = kinematics.nearest(q + 0.05, *kinematics.inverse(*kinematics.forward(q)))
+    assert reachable
+    np.testing.assert_allclose(found, q, atol=1e-4)
+
+
+@pytest.mark.parametrize(("joint", "limit"), [(0, 2 * np.pi), (2, np.pi), (5, -2 * np.pi)])
+def test_nearest_keeps_the_limits(joint: int, limit: float):
+    """Claim: where the nearest turn lies beyond a joint's limit, the one before it is taken."""
+    q = jnp.array([0.4, -1.0, 1.7, -2.2, -1.5, 1.2])
+    solution = q.at[joint].set(limit + 0.1 * np.sign(limit))
+    solution = solution - 2 * np.pi * jnp.round(solution / (2 * np.pi))
+    solutions, valid = jnp.tile(solution, (8, 1)), jnp.arange(8) == 3
+    found, reachable = kinematics.nearest(q.at[joint].set(0.99 * limit), solutions, valid)
+    assert reachable
+    np.testing.assert_allclose(found[joint], limit + 0.1 * np.sign(limit) - np.sign(limit) * 2 * np.pi, atol=1e-5)
+
+
+def test_nearest_without_a_choice_stays():
+    """Claim: without a valid solution the arm stays; with one, it is taken however far it is."""
+    q = jnp.asarray(kinematics.HOME)
+    solutions, valid = kinematics.inverse(*kinematics.forward(q))
+    found, reachable = kinematics.nearest(q, solutions, jnp.zeros_like(valid))
+    np.testing.assert_array_equal(found, q)
+    assert not reachable
+    for branch in np.flatnonzero(valid):
+        found, reachable = kinematics.nearest(q, solutions, jnp.arange(8) == branch)
+        assert reachable
+        assert _angles_apart(found, solutions[branch]) < 1e-5
+
+
+def test_trajectory_hits_the_set_points():
+    """Claim: the joint targets put the tips on every set-point of a plan, and hand on the fingers."""
+    control, (target, reachable) = _moves()
+    assert reachable.all()
+    tips = jax.jit(jax.vmap(jax.vmap(kinematics.forward)))(target[..., :6])
+    wanted = jax.jit(jax.vmap(jax.vmap(kinematics.top_down)))(control[..., :3], control[..., 3])
+    distance, angle = _errors(tips, wanted)
+    assert distance.max() < POSITION
+    assert angle.max() < ANGLE
+    np.testing.assert_array_equal(target[..., 6], control[..., 4])
+
+
+def test_trajectory_is_continuous():
+    """Claim: over flat surfaces no joint turns faster between set-points than the maker's 180 degrees per second, none
+    leaves its limits, and the arm is clear all the way."""
+    joints = np.asarray(_moves()[1].target[..., :6])
+    assert np.abs(np.diff(joints, axis=1)).max() < kinematics.MAX_SPEED * SIM.timestep
+    assert (np.abs(joints) <= kinematics.LIMITS).all()
+    assert clear(joints).all()
+
+
+def _line(start: tuple[float, ...], end: tuple[float, ...], num: int = 50) -> jax.Array:
+    """Set-points [num, 5] on a straight line."""
+    return jnp.asarray(np.linspace(start, end, num), jnp.float32)
+
+
+def test_trajectory_keeps_to_one_branch():
+    """Claim: the branch is one that reaches every set-point, even if the arm starts in one that does not."""
+    control = _line((0.2, 0.0, 0.1, 0.0, 0.0), (-0.2, 0.2, 0.1, 0.0, 0.0))
+    solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
+    valid = np.asarray(valid & clear(solutions))
+    partly = np.flatnonzero(valid[0] & ~valid.all(axis=0))
+    assert partly.size
+    for branch in partly:
+        target, reachable = trajectory(solutions[0, branch], control)
+        assert reachable
+        apart = _angles_apart(np.asarray(solutions), np.asarray(target)[:, None, :6]).max(axis=0)
+        assert (apart < 1e-4).sum() == 1
+        assert valid.all(axis=0)[apart.argmin()]
+
+
+def test_trajectory_takes_the_branch_it_is_in():
+    """Claim: of branches that reach every set-point, the one with the least motion is taken: the one the arm is in."""
+    control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
+    solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
+    whole = np.flatnonzero(np.asarray(valid & clear(solutions)).all(axis=0))
+    assert whole.size >= 2
+    for branch in whole:
+        target, _ = trajectory(solutions[0, branch], control)
+        np.testing.assert_allclose(target[0, :6], solutions[0, branch], atol=1e-5)
+
+
+def test_trajectory_leaves_a_branch_that_is_not_clear():
+    """Claim: a branch that reaches every set-point, but through the table or the arm itself, is not taken."""
+    control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
+    solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
+    blocked = np.flatnonzero(np.asarray(valid).all(axis=0) & ~np.asarray(clear(solutions)).any(axis=0))
+    assert blocked.size
+    for branch in blocked:
+        target, reachable = trajectory(solutions[0, branch], control)
+        assert reachable
+        assert clear(target[None, :, :6]).all()
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+def test_trajectory_stays_within_limits_as_the_hand_turns(turn: float):
+    """Claim: a hand that turns a full circle is followed without a jump, and without passing a joint's limit."""
+    start = (0.0, 0.0, 0.1, 0.0, 0.0)
+    control = _line(start, (0.0, 0.0, 0.1, 2 * np.pi * turn, 0.0), 400)
+    for wrist3 in (-5.0, 0.0, 5.0):
+        target, reachable = trajectory(jnp.asarray(kinematics.HOME).at[5].set(wrist3), control)
+        assert reachable
+        assert np.abs(np.diff(target[:, :6], axis=0)).max() < 0.02
+        assert (np.abs(target[:, :6]) <= kinematics.LIMITS).all()
+
+
+@pytest.mark.parametrize("lost", [(-0.6, 0.0, 0.1, 0.0, 0.0), (np.nan, 0.0, 0.1, 0.0, 0.0)])
+def test_trajectory_stops_where_reach_ends(lost: tuple[float, ...]):
+    """Claim: from the first set-point out of reach the arm holds the last good target, and this is flagged."""
+    control = _line((0.0, 0.0, 0.1, 0.0, 0.05), (-0.1, 0.0, 0.1, 0.0, 0.05))
+    target, reachable = trajectory(jnp.asarray(kinematics.HOME), control.at[30:40].set(jnp.array(lost)))
+    whole, _ = trajectory(jnp.asarray(kinematics.HOME), control)
+    assert not reachable
+    np.testing.assert_array_equal(target[:30], whole[:30])
+    np.testing.assert_array_equal(target[30:, :6], np.broadcast_to(whole[29, :6], (20, 6)))
+    nowhere, reachable = trajectory(jnp.asarray(kinematics.HOME), control.at[0].set(jnp.array(lost)))
+    assert not reachable
+    np.testing.assert_array_equal(nowhere[:, :6], np.broadcast_to(kinematics.HOME, (50, 6)))
+
+
+def test_one_scene_is_not_the_others_matter():
+    """Claim: a trajectory in a batch of 32, one of them out of reach, is the one that it is alone."""
+    control, expected = _moves()
+    control = jnp.asarray(control[:32]).at[7, :, 0].set(-5.0)
+    batch = trajectories(jnp.asarray(kinematics.HOME), control)
+    np.testing.assert_array_equal(batch.reachable, np.arange(32) != 7)
+    alone = trajectory(jnp.asarray(kinematics.HOME), control[3])
+    np.testing.assert_allclose(batch.target[3], alone.target, atol=1e-5)
+    np.testing.assert_allclose(batch.target[3], expected.target[3], atol=1e-5)

@@ -1,0 +1,171 @@
+"""The arm of `ur5.xml` with the hand of `rg2.xml`: follows plans, grasps, and presses no harder than it should."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.scene.model import assets
+from csac_jax.sim import kinematics, primitives
+from csac_jax.sim.primitives import Action, Primitive
+
+SIM, MAP = SimConfig(), HeightmapConfig()
+CUBE = 0.025  # m, half its side
+FINGER = 6  # address in qpos of the first finger, after the six joints
+BLOCK = 8  # address in qpos of the block
+
+_target = jax.jit(functools.partial(kinematics.trajectory, kinematics.HOME))
+
+
+def _part(name: str) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(assets() / f"{name}.xml"))
+
+
+@functools.cache
+def _model(with_block: bool = False) -> mujoco.MjModel:
+    """Table, arm, hand and at will a cube, with the solver as in training."""
+    spec = _part("table")
+    spec.attach(_part("ur5"), prefix="ur5/", frame=spec.worldbody.add_frame())
+    spec.attach(_part("rg2"), prefix="hand/", site=spec.site("ur5/tip"))
+    spec.attach(_part("blocks"), prefix="blocks/", frame=spec.worldbody.add_frame())
+    if with_block:
+        body = spec.worldbody.add_body(name="block")
+        body.add_freejoint()
+        geom = body.add_geom(spec.find_default("blocks/block"), name="block", size=[CUBE] * 3)
+        geom.type = mujoco.mjtGeom.mjGEOM_BOX
+    spec.option.timestep, spec.option.iterations = SIM.timestep, SIM.iterations
+    spec.option.ls_iterations = SIM.line_search
+    return spec.compile()
+
+
+@functools.cache
+def _plan(primitive: Primitive, x: float, y: float, yaw: float, top: float) -> tuple[np.ndarray, np.ndarray]:
+    """Set-points [1 + T, 5] of a primitive over a flat surface, from its start on, and joint targets [1 + T, 7]."""
+    action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
+    plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(jnp.full((MAP.size, MAP.size), top), action)
+    control = jnp.concatenate([plan.start[None], plan.control])
+    target, reachable = _target(control)
+    assert reachable
+    return np.asarray(control), np.asarray(target)
+
+
+def _start(model: mujoco.MjModel, target: np.ndarray, block: tuple[float, float] = (9.0, 9.0)) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    data.qpos[:FINGER] = target[0, :6]
+    data.qpos[FINGER : FINGER + 2] = target[0, 6]
+    if model.nq > BLOCK:
+        data.qpos[BLOCK : BLOCK + 7] = [*block, CUBE, 1, 0, 0, 0]
+    return data
+
+
+CORNERS = [(x, y, yaw, 0.0) for x in (-0.224, 0.224) for y in (-0.224, 0.224) for yaw in (0.0, 2.0)]
+PLACES = [*CORNERS, (0.0, 0.0, 1.0, 0.05), (0.224, 0.0, 3.0, 0.1), (-0.1, 0.1, 4.0, 0.15)]
+
+
+@pytest.mark.parametrize("primitive", list(Primitive))
+def test_arm_follows_the_plan(primitive: Primitive):
+    """Claim: as each phase of a primitive ends, the tips are within 3 mm of the set-point, whatever the place."""
+    model = _model()
+    ends = np.cumsum(SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases)
+    for place in PLACES:
+        control, target = _plan(primitive, *place)
+        data = _start(model, target)
+        for index in range(1, len(target)):
+            data.ctrl[:] = target[index]
+            mujoco.mj_step(model, data)
+            if index in ends:
+                mujoco.mj_kinematics(model, data)
+                error = data.site("ur5/tip").xpos - control[index, :3]
+                assert np.linalg.norm(error) < 0.003, (place, index)
+
+
+@pytest.mark.parametrize("x", [-0.2, 0.0, 0.2])
+def test_arm_lifts_a_cube(x: float):
+    """Claim: a grasp of the arm lifts a cube by as much as the hand, at the gap of its width."""
+    model = _model(with_block=True)
+    control, target = _plan(Primitive.GRASP, x, 0.1, 0.0, 2 * CUBE)
+    data = _start(model, target, (x, 0.1))
+    for command in target[1:]:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+    rise = control[:, 2].max() - control[:, 2].min()
+    assert abs(data.qpos[BLOCK + 2] - CUBE - rise) < 0.01
+    assert abs(2 * data.qpos[FINGER] - 2 * CUBE) < 0.005
+
+
+@pytest.mark.parametrize(("x", "side"), [(-0.2, 1), (0.0, 1), (0.2, -1)])
+def test_arm_presses_within_reason(x: float, side: int):
+    """Claim: a finger that comes down on a cube neither sinks 15 mm into it nor carries it off: the arm gives way."""
+    model = _model(with_block=True)
+    _, target = _plan(Primitive.GRASP, x, 0.0, 0.0, 2 * CUBE)
+    data = _start(model, target, (x + side * 0.055, 0.0))
+    for command in target[1:]:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        assert data.contact.dist.min(initial=0.0) > -0.015
+    assert data.qpos[BLOCK + 2] < 2 * CUBE
+
+
+def test_hand_is_the_floating_one():
+    """Claim: palm, pads, fingers and finger drive of `rg2.xml` are those of `hand.xml`."""
+    ours, floating = (mujoco.MjModel.from_xml_path(str(assets() / name)) for name in ("rg2.xml", "hand.xml"))
+    for name in ("palm", "pad_low", "pad_high"):
+        for field in ("size", "pos", "friction", "solref", "priority", "contype", "conaffinity", "condim"):
+            np.testing.assert_array_equal(*(getattr(model.geom(name), field) for model in (ours, floating)), field)
+    for name in ("finger_low", "finger_high"):
+        for field in ("axis", "range", "limited", "damping", "pos"):
+            theirs, mine = (getattr(model.joint(name), field, None) for model in (ours, floating))
+            np.testing.assert_array_equal(theirs, mine, field)
+        for field in ("mass", "inertia", "pos"):
+            np.testing.assert_array_equal(*(getattr(model.body(name), field) for model in (ours, floating)), field)
+    for field in ("gainprm", "biasprm", "forcerange"):
+        np.testing.assert_array_equal(*(getattr(model.actuator("finger"), field) for model in (ours, floating)), field)
+    np.testing.assert_array_equal(ours.eq_data, floating.eq_data)
+    np.testing.assert_array_equal(ours.eq_solref, floating.eq_solref)
+
+
+def test_gripper_ends_at_the_flange():
+    """Claim: the tip frame is TOOL below the flange, where the visible body of the gripper ends; nothing of the arm
+    collides, and gravity is compensated in all of it."""
+    model = _model()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    flange, tip = data.site("ur5/flange"), data.site("ur5/tip")
+    height = (flange.xpos - tip.xpos) @ tip.xmat.reshape(3, 3)[:, 2]
+    assert height == pytest.approx(kinematics.TOOL, abs=1e-6)
+    body = model.geom("hand/body")
+    assert body.pos[2] + body.size[2] == pytest.approx(kinematics.TOOL)
+    assert (model.geom("hand/palm").pos + model.geom("hand/palm").size)[2] == pytest.approx(body.pos[2] - body.size[2])
+    arm = [index for index in range(model.ngeom) if model.geom(index).name.startswith("ur5/")]
+    assert len(arm) == 8
+    assert not model.geom_contype[arm].any()
+    assert not model.geom_conaffinity[arm].any()
+    assert (model.body_gravcomp[model.jnt_bodyid] == 1.0).all()
+
+
+@pytest.mark.mjx
+def test_arm_follows_the_plan_in_mjx():
+    """Claim: in MJX, too, the tips are within 3 mm of the set-point as each phase of a push ends. Only there: while an
+    actuator is at its limit, MJX's implicit integrator still counts its damping, and C MuJoCo does not."""
+    model = _model()
+    device, blank = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+
+    @jax.jit
+    def run(qpos, commands):
+        def substep(data, command):
+            data = mjx.step(device, data.replace(ctrl=command))
+            return data, data.qpos[:FINGER]
+
+        return jax.lax.scan(substep, blank.replace(qpos=qpos), commands)[1]
+
+    ends = np.cumsum(SIM.push_phases)
+    for place in ((-0.224, -0.224, 0.0, 0.0), (0.224, 0.0, 3.0, 0.1)):
+        control, target = _plan(Primitive.PUSH, *place)
+        joints = run(jnp.asarray(_start(model, target).qpos, jnp.float32), jnp.asarray(target[1:]))
+        tips = jax.vmap(kinematics.forward)(joints[ends - 1]).position
+        assert np.linalg.norm(tips - control[ends, :3], axis=1).max() < 0.003, place
