@@ -11,6 +11,7 @@ import typing
 from typing import Any, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
+RobotKind = Literal["hand", "ur5"]
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
 
 
@@ -88,6 +89,8 @@ class SimConfig:
 
     physics: Literal["mjx", "c"] = "mjx"
     """`mjx`: compiled with everything else. `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
+    robot: RobotKind = "hand"
+    """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
     timestep: float = 0.004
     """Length of a physics step, s."""
     grasp_phases: tuple[int, int, int] = (60, 50, 80)

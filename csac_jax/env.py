@@ -173,7 +173,8 @@ def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None
     scenes, size of the pool at least, as many with each number of blocks; `cfg.scene.pool` of each if None.
     """
     world = model.build(cfg.scene, cfg.sim)
+    floating = model.build(cfg.scene, dataclasses.replace(cfg.sim, robot="hand"))
     numbers = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     count = cfg.scene.pool if scenes is None else -(-scenes // numbers)
-    settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, stream, count)
+    settled = pool.settled(floating, cfg.scene, cfg.heightmap.extent, stream, count)
     return Env(cfg, simulation.make(world, cfg.sim), settled)

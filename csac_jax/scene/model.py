@@ -10,12 +10,17 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from csac_jax.config import SceneConfig, SimConfig, SlotKind
+from csac_jax.config import RobotKind, SceneConfig, SimConfig, SlotKind
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.blocks import Parts
 from csac_jax.scene.layout import Scene
 
-HAND_JOINTS = ("x", "y", "z", "yaw", "finger_low", "finger_high")
+FINGERS = ("hand/finger_low", "hand/finger_high")
+ROBOT_JOINTS: dict[RobotKind, tuple[str, ...]] = {
+    "hand": ("hand/x", "hand/y", "hand/z", "hand/yaw", *FINGERS),
+    "ur5": tuple(f"ur5/{name}" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3"))
+    + FINGERS,
+}
 LARGEST = 1.25  # size of compiled blocks relative to nominal: C culls pairs by the bounds it was compiled with
 MAX_OPENING = 0.110  # m, RG2 data sheet
 HAND_PARK_HEIGHT = 1.0  # m, where the hand waits while blocks settle
@@ -33,8 +38,7 @@ class World:
     block_qpos: np.ndarray  # [N, 7] addresses in qpos: position, quaternion
     block_dofs: np.ndarray  # [N, 6] addresses in qvel
     slot_of_geom: np.ndarray  # [geoms] slot that a geom belongs to, -1 if it is no block's
-    hand_qpos: np.ndarray  # [6] addresses in qpos, order of HAND_JOINTS
-    hand_dofs: np.ndarray  # [6] addresses in qvel
+    robot_qpos: np.ndarray  # [Q] addresses in qpos, order of ROBOT_JOINTS; the last two are the fingers
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
 
 
@@ -53,11 +57,11 @@ def assets() -> Path:
 def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     folder = assets()
     spec = mujoco.MjSpec.from_file(str(folder / "table.xml"))
-    for name in ("hand", "blocks"):
-        part = mujoco.MjSpec.from_file(str(folder / f"{name}.xml"))
-        for mesh in part.meshes:
-            mesh.scale = [LARGEST] * 3
-        spec.attach(part, prefix=f"{name}/", frame=spec.worldbody.add_frame())
+    _add_robot(spec, sim.robot)
+    part = mujoco.MjSpec.from_file(str(folder / "blocks.xml"))
+    for mesh in part.meshes:
+        mesh.scale = [LARGEST] * 3
+    spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
     for slot, (kind, place) in enumerate(zip(scene.slots, layout.parking(len(scene.slots)), strict=True)):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
@@ -68,6 +72,16 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     spec.add_numeric(name="max_geom_pairs", data=[sim.geom_pairs])
     spec.add_numeric(name="max_contact_points", data=[sim.contacts])
     return spec
+
+
+def _add_robot(spec: mujoco.MjSpec, kind: RobotKind) -> None:
+    """The floating hand, or the arm with the same hand at its flange."""
+    part = {name: mujoco.MjSpec.from_file(str(assets() / f"{name}.xml")) for name in ("hand", "ur5", "rg2")}
+    if kind == "ur5":
+        spec.attach(part["ur5"], prefix="ur5/", frame=spec.worldbody.add_frame())
+        spec.attach(part["rg2"], prefix="hand/", site=spec.site("ur5/tip"))
+    else:
+        spec.attach(part["hand"], prefix="hand/", frame=spec.worldbody.add_frame())
 
 
 def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> None:
@@ -83,13 +97,12 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
 
 
 def build(scene: SceneConfig, sim: SimConfig) -> World:
-    """The world of table, hand and block slots; blocks parked, at the largest size of their kind."""
+    """The world of table, robot and block slots; blocks parked, at the largest size of their kind."""
     model = _spec(scene, sim).compile()
     _align_inertia(model)
     names = [f"block{slot}" for slot in range(len(scene.slots))]
     bodies = np.array([model.body(name).id for name in names])
     block_joints = [model.joint(name) for name in names]
-    hand_joints = [model.joint(f"hand/{name}") for name in HAND_JOINTS]
     slot_of_body = np.full(model.nbody, -1)
     slot_of_body[bodies] = np.arange(len(names))
     slot_of_geom = slot_of_body[model.geom_bodyid]
@@ -102,8 +115,7 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         block_qpos=np.array([joint.qposadr[0] + np.arange(7) for joint in block_joints]),
         block_dofs=np.array([joint.dofadr[0] + np.arange(6) for joint in block_joints]),
         slot_of_geom=slot_of_geom,
-        hand_qpos=np.array([joint.qposadr[0] for joint in hand_joints]),
-        hand_dofs=np.array([joint.dofadr[0] for joint in hand_joints]),
+        robot_qpos=np.array([model.joint(name).qposadr[0] for name in ROBOT_JOINTS[sim.robot]]),
         hand_geoms=np.array([model.geom(f"hand/{name}").id for name in ("palm", "pad_low", "pad_high")]),
     )
 

@@ -34,7 +34,8 @@ def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: i
     P = count for each number from `min_blocks` to N, fewest first.
 
     Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
-    by any yaw. The same arguments give the same scenes on every machine of one kind.
+    by any yaw. `world` is one with the floating hand, which waits high above. The same arguments give the same scenes on
+    every machine of one kind.
     """
     path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count)}.npz"
     cached = _read(path)
@@ -109,7 +110,7 @@ def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: Bl
     model = with_blocks(world, fields)
     model.opt.iterations, model.opt.ls_iterations = 20, 20  # quality over speed: this runs once
     data = mujoco.MjData(model)
-    data.qpos[world.hand_qpos] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0, 0.0]
+    data.qpos[world.robot_qpos] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0, 0.0]
     data.ctrl[:] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0]
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
     parked = ~scene.in_play

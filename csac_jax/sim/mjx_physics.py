@@ -13,7 +13,7 @@ from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World, scene_fields
 from csac_jax.sim import outcome
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import Plan
+from csac_jax.sim.robot import Drive
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,9 +25,9 @@ class MjxPhysics:
     model: mjx.Model
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
 
-    def run(self, scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
+    def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
         """See `physics.Physics`."""
-        return _run(self, scene, plan)
+        return _run(self, scene, drive)
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
@@ -58,14 +58,14 @@ def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     )
 
 
-def _initial_data(physics: MjxPhysics, scene: Scene, start: jax.Array) -> mjx.Data:
-    """Data with the scene's blocks and the hand at `start` [5], at rest."""
+def _initial_data(physics: MjxPhysics, scene: Scene, drive: Drive) -> mjx.Data:
+    """Data with the scene's blocks and the robot where the drive starts, at rest."""
     world = physics.world
     poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
-    qpos = physics.data.qpos.at[world.hand_qpos].set(jnp.append(start, start[4]))
+    qpos = physics.data.qpos.at[world.robot_qpos].set(drive.start)
     qpos = qpos.at[world.block_qpos].set(poses)
     qvel = physics.data.qvel.at[world.block_dofs].set(scene.velocity)
-    return physics.data.replace(qpos=qpos, qvel=qvel, ctrl=start)
+    return physics.data.replace(qpos=qpos, qvel=qvel, ctrl=drive.control[0])
 
 
 def _pin(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data) -> mjx.Data:
@@ -87,13 +87,13 @@ def _pad_contacts(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
     return jnp.any(is_hand[:, None] & is_block[None], axis=-1), jnp.all(active)
 
 
-def _run(physics: MjxPhysics, scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
+def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
     """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the hand is."""
     world, cfg = physics.world, physics.cfg
     model = _scene_model(physics, scene)
-    initial = _initial_data(physics, scene, plan.start)
+    initial = _initial_data(physics, scene, drive)
     z_address = world.block_qpos[:, 2]
-    finger = world.hand_qpos[4]
+    finger = world.robot_qpos[-2]
     close_end = sum(cfg.grasp_phases[:2])
 
     def substep(carry, x):
@@ -116,7 +116,7 @@ def _run(physics: MjxPhysics, scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
         return (data, trace), None
 
     (data, trace), _ = jax.lax.scan(
-        substep, (initial, outcome.blank(len(world.slots))), (jnp.arange(cfg.substeps), plan.control)
+        substep, (initial, outcome.blank(len(world.slots))), (jnp.arange(cfg.substeps), drive.control)
     )
     pose = data.qpos[world.block_qpos]
     moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=data.qvel[world.block_dofs])

@@ -6,21 +6,23 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World
-from csac_jax.sim import c_physics, mjx_physics, primitives
+from csac_jax.sim import c_physics, mjx_physics, outcome, primitives, robot
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, Plan
+from csac_jax.sim.robot import Drive
 
 MAX_SPEED = 20.0  # m/s and rad/s / 10; a faster block has left physics behind
 MAX_HEIGHT = 1.0  # m, likewise
 
 
 class Physics(Protocol):
-    """A world in which a hand can be moved."""
+    """A world in which a robot can be moved."""
 
-    def run(self, scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
-        """Moves the hand through a plan, one set-point per substep; blocks that are not in play stay where they are.
+    def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
+        """Moves the robot, one set-point per substep; blocks that are not in play stay where they are.
 
         Blocks that end up in the hand are still in play, hanging where the hand is. One scene; callers vmap.
         """
@@ -38,13 +40,16 @@ def make(world: World, cfg: SimConfig) -> Physics:
 def execute(
     physics: Physics, cfg: SimConfig, heightmap: HeightmapConfig, scene: Scene, height: jax.Array, action: Action
 ) -> tuple[Scene, Trace, Plan]:
-    """Runs one primitive.
+    """Runs one primitive; one that the robot cannot follow is not begun: nothing moves, nothing is touched.
 
     Args: height [H, W] m, the map the action was chosen from.
     """
     plan = primitives.plan(cfg, heightmap, height, action)
-    after, trace = physics.run(scene, plan)
-    return after, trace, plan
+    drive = robot.drive(cfg.robot, plan)
+    after, trace = physics.run(scene, drive)
+    still = (layout.park(scene, scene.in_play), outcome.blank(len(scene.colour)))
+    after, trace = jax.tree.map(lambda new, old: jnp.where(drive.reachable, new, old), (after, trace), still)
+    return after, trace, plan.replace(surface=jnp.where(drive.reachable, plan.surface, 0.0))
 
 
 def healthy(scene: Scene) -> jax.Array:

@@ -107,7 +107,6 @@ def test_addresses_name_what_they_say(world: model.World):
     np.testing.assert_array_equal(world.model.geom_bodyid[world.block_geoms], world.block_bodies[world.parts.slot])
     np.testing.assert_array_equal(world.slot_of_geom[world.block_geoms], world.parts.slot)
     assert np.all(np.delete(world.slot_of_geom, world.block_geoms) == -1)
-    for name, qpos, dof in zip(model.HAND_JOINTS, world.hand_qpos, world.hand_dofs, strict=True):
-        joint = world.model.joint(f"hand/{name}")
-        assert (joint.qposadr[0], joint.dofadr[0]) == (qpos, dof)
+    for name, qpos in zip(model.ROBOT_JOINTS["hand"], world.robot_qpos, strict=True):
+        assert world.model.joint(name).qposadr[0] == qpos
     assert [world.model.geom(i).name for i in world.hand_geoms] == ["hand/palm", "hand/pad_low", "hand/pad_high"]

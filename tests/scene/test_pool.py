@@ -49,7 +49,7 @@ def _placed(world: model.World, scenes: Scene, index: int) -> tuple[mujoco.MjMod
     exact.opt.iterations, exact.opt.ls_iterations = 50, 50
     exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
     data = mujoco.MjData(exact)
-    data.qpos[world.hand_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
+    data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
     mujoco.mj_forward(exact, data)
     return exact, data

@@ -12,7 +12,7 @@ from csac_jax.config import Config, SceneConfig
 from csac_jax.env import Env
 from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, primitives
+from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, primitives, robot
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, Plan
 
@@ -134,7 +134,8 @@ def grasped(executed: Run) -> Run:
 @pytest.fixture(scope="session")
 def grasped_in_c(world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]:
     """The settled scenes' grasps in C MuJoCo, by the same plans: ends [E, N, 3] m and traces."""
-    run = jax.jit(jax.vmap(c_physics.CPhysics(world, CONFIG.sim).run))
+    engine = c_physics.CPhysics(world, CONFIG.sim)
+    run = jax.jit(jax.vmap(lambda scene, plan: engine.run(scene, robot.drive("hand", plan))))
     after, trace = jax.tree.map(np.asarray, run(grasped.scene, grasped.plan))
     return after.position, trace
 
