@@ -132,7 +132,7 @@ def test_cells_beside_do_not_leak_into_the_yaw(frames, pose):
     """Claim: an invalid cell next to the one read in the neighbouring yaw does not count, however high it is."""
     best = (2, 8, 9)
     logits, valid = _flat(frames), np.ones((frames.yaws.size, frames.side, frames.side), bool)
-    logits[best] = 20.0
+    logits[best] = 1.0
     where = np.unravel_index(np.argsort(np.linalg.norm(frames.xy[3] - frames.xy[best], axis=-1), axis=None), (18, 18))
     second = 3, where[0][1], where[1][1]  # the second nearest cell: it has a share in what is read
     before = pose(jnp.asarray(logits), jnp.asarray(valid))
