@@ -129,6 +129,11 @@ _FACES = {
 }
 
 
+def normals(kind: SlotKind) -> np.ndarray:
+    """Outward face normals [F, 3] of every part of a block of this kind, in the block's frame."""
+    return _FACES[kind]()[0]
+
+
 def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Faces of every part in its block's frame: a point p lies inside a part where n . p <= offset for all its faces.
 

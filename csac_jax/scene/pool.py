@@ -34,8 +34,8 @@ def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: i
     P = count for each number from `min_blocks` to N, fewest first.
 
     Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
-    by any yaw. `world` is one with the floating hand, which waits high above. The same arguments give the same scenes on
-    every machine of one kind.
+    by any yaw. `world` is one with the floating hand, which waits high above. The same arguments give the same scenes
+    on every machine of one kind.
     """
     path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count)}.npz"
     cached = _read(path)

@@ -1,0 +1,202 @@
+"""Families of ordered arrangements: for each, an ordered list of roles and where the blocks in them go.
+
+Each role takes a random free slot of its kinds. The shipped cases are held out by construction: no family packs two
+arches together, as `row`, `pinwheel` and `hole` do, and two packed prisms, as in `ridge`, always have a third block
+beside them. R = the 5 roles, N = block slots.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax.config import SlotKind
+from csac_jax.scene import blocks
+
+ROLES = 5  # of every family
+STACKED_GAP = 0.008  # m, widest gap that a block may bridge
+IN_HOLE = (0.001, 0.005)  # m, least and widest room about a block in another
+ASKEW = 0.003  # m, how far off the middle a stacked block may lie
+OUT_OF_LINE = 0.008  # m, likewise along the sides of blocks in a row
+
+
+class Role(NamedTuple):
+    """What a block of a family may be."""
+
+    kinds: tuple[SlotKind, ...]
+    long: bool = False  # a box is a cuboid or a plank
+    on_side: float = 0.0  # probability that a box or an arch lies on its side: a quarter turn about its long axis
+
+
+class Placed(NamedTuple):
+    """Where the blocks of a family go, before the arrangement as a whole is turned and shifted."""
+
+    centre: jax.Array  # [R, 3] m, z that of what the block stands on
+    turned: jax.Array  # [R] bool, by a quarter about z
+    target: jax.Array  # [] int32, role of the block that is hardest to get at
+
+
+class Family(NamedTuple):
+    """A way of packing. The kinds of a role are those of a role before it, more, or wholly others."""
+
+    roles: tuple[Role, Role, Role, Role, Role]
+    least: int  # roles without which there is no such arrangement, first ones
+    place: Callable[["Draws", jax.Array, jax.Array, jax.Array], Placed]  # draws, feet [R, 3] m, used [R], gap [] m
+    resize: Callable[[jax.Array], jax.Array] = lambda half: half  # [R, 3] m -> [R, 3] m, to make them fit
+
+
+class Draws(NamedTuple):
+    """The randomness of a packing, uniform; drawn once, whatever family will use it."""
+
+    preference: jax.Array  # [N] 0..1, slots with more are taken first
+    more: jax.Array  # [] 0..1, of the roles that may be left out
+    gap: jax.Array  # [] 0..1
+    lying: jax.Array  # [R] 0..1
+    order: jax.Array  # [R] 0..1, along a line
+    turned: jax.Array  # [R] bool
+    jitter: jax.Array  # [R, 2] -1..1
+    mirrored: jax.Array  # [] bool
+
+
+def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
+    """The families that these slots allow. Raises ValueError where they allow none."""
+    found = {name: family for name, family in FAMILIES.items() if _is_possible(family, slots)}
+    if not found:
+        raise ValueError("scene.slots: too few for an arrangement; three boxes, for one, are enough")
+    return found
+
+
+def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
+    """Whether every needed role finds a slot: roles with fewer kinds choose first, so any choice of theirs will do."""
+    free = list(slots)
+    for role in family.roles[: family.least]:
+        fitting = [kind for kind in free if kind in role.kinds]
+        if not fitting:
+            return False
+        free.remove(fitting[0])
+    return True
+
+
+def draw(key: jax.Array, num_slots: int) -> Draws:
+    """One call of the generator, in pieces: each call is a good deal of code to compile."""
+    noise = jax.random.uniform(key, (num_slots + 3 + 5 * ROLES,))
+    preference, one, roles = jnp.split(noise, [num_slots, num_slots + 3])
+    roles = roles.reshape(5, ROLES)
+    return Draws(
+        preference=preference,
+        more=one[0],
+        gap=one[1],
+        lying=roles[0],
+        order=roles[1],
+        turned=roles[2] < 0.5,
+        jitter=2.0 * roles[3:].T - 1.0,
+        mirrored=one[2] < 0.5,
+    )
+
+
+# Where the blocks of a family go.
+
+
+def _flat(feet: jax.Array, turned: jax.Array) -> jax.Array:
+    """Half extents [R, 2] m along x and y after the quarter turns `turned` [R]."""
+    return jnp.where(turned[:, None], feet[:, 1::-1], feet[:, :2])
+
+
+def _line(noise: jax.Array, width: jax.Array, used: jax.Array, gap: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Blocks of half widths `width` [R] m along a line, by `noise` [R]: centres [R] m about 0, and the middle one."""
+    index = np.arange(ROLES)
+    is_tie = (noise[None] == noise[:, None]) & (index[None] < index[:, None])  # one scene in a million has one
+    before = used[None] & ((noise[None] < noise[:, None]) | is_tie)  # [i, j]: j comes before i
+    step = jnp.where(used, 2.0 * width + gap, 0.0)
+    start = jnp.sum(jnp.where(before, step[None], 0.0), axis=1)
+    is_middle = used & (jnp.sum(before, axis=1) == jnp.sum(used) // 2)
+    return start + 0.5 * (step - jnp.sum(step)), jnp.argmax(is_middle).astype(jnp.int32)
+
+
+def _place_row(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Long side to long side, not quite in line."""
+    y, middle = _line(draws.order, feet[:, 1], used, gap)
+    return Placed(jnp.stack([OUT_OF_LINE * draws.jitter[:, 0], y, jnp.zeros_like(y)], 1), jnp.zeros_like(used), middle)
+
+
+def _place_ring(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """The last block enclosed by the four others: each ends at the side of the next, as the arms of a pinwheel do."""
+    quarter = np.arange(5)
+    turned = quarter % 2 == 1  # the fifth, in the middle, is not
+    inner = jnp.where(turned[:, None], feet[4, 1::-1][None], feet[4, :2][None])  # [5, 2] the middle one, seen by each
+    arm = jnp.stack([feet[:, 0] - inner[:, 0], inner[:, 1] + gap + feet[:, 1]], axis=1)
+    cos, sin = np.cos(0.5 * np.pi * quarter).astype(np.float32), np.sin(0.5 * np.pi * quarter).astype(np.float32)
+    x, y = cos * arm[:, 0] - sin * arm[:, 1], sin * arm[:, 0] + cos * arm[:, 1]
+    mirrored = jnp.where(draws.mirrored, -1.0, 1.0)
+    around = jnp.stack([mirrored * x, y, jnp.zeros_like(x)], axis=1)
+    return Placed(around.at[4].set(0.0), jnp.asarray(turned), jnp.int32(4))
+
+
+def _place_wall(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """The first two end to end, the others side by side along their faces, which are flush."""
+    is_wall = np.arange(used.shape[0]) < 2
+    turned = draws.turned & ~is_wall
+    flat = _flat(feet, turned)
+    x, middle = _line(draws.order, flat[:, 0], used & ~is_wall, gap)
+    end_to_end = np.where(np.arange(used.shape[0]) == 0, -1.0, 1.0).astype(np.float32) * (flat[:, 0] + 0.5 * gap)
+    x, y = jnp.where(is_wall, end_to_end, x), jnp.where(is_wall, -flat[:, 1], gap + flat[:, 1])
+    return Placed(jnp.stack([x, y, jnp.zeros_like(y)], axis=1), turned, middle)
+
+
+def _place_nest(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """An arch on its side, its mouth towards +y; a block in the mouth; one that shuts it; two at the arch's ends."""
+    arch, inner, lid = feet[0], feet[1], feet[2]
+    y_inner = jnp.minimum(gap, IN_HOLE[1]) + inner[1]  # the mouth is half as deep as the arch is high
+    front = jnp.maximum(y_inner + inner[1], jnp.max(feet[np.array([0, 3, 4]), 1]))
+    zero = jnp.zeros_like(gap)
+    x_ends = arch[0] + gap + feet[3:, 0]
+    x = jnp.stack([zero, zero, OUT_OF_LINE * draws.jitter[2, 0], x_ends[0], -x_ends[1]])
+    y = jnp.stack([zero, y_inner, front + gap + lid[1], zero, zero])
+    return Placed(jnp.stack([x, y, jnp.zeros_like(x)], axis=1), jnp.zeros_like(used), jnp.int32(1))
+
+
+def _resize_nest(half: jax.Array) -> jax.Array:
+    """An arch wide enough for the block in its mouth, which is half as wide as the arch."""
+    return half.at[0].multiply(jnp.maximum(1.0, 2.0 * (half[1, 0] + IN_HOLE[0]) / half[0, 0]))
+
+
+def _place_pile(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Two like blocks side by side, one across both, one on top of that, one at their ends."""
+    turned = draws.turned & ~np.array([True, True, False, False, False])
+    flat, near = _flat(feet, turned), jnp.minimum(gap, STACKED_GAP)
+    zero = jnp.zeros_like(gap)
+    aside = flat[0, 1] + 0.5 * near
+    end = jnp.maximum(flat[0, 0], jnp.maximum(flat[2, 0], flat[3, 0]) + ASKEW)  # what is stacked may reach farther
+    floor = jnp.stack([zero, zero, 2.0 * feet[0, 2], 2.0 * (feet[0, 2] + feet[2, 2]), zero])
+    x = jnp.stack([zero, zero, zero, zero, end + gap + flat[4, 0]])
+    y = jnp.stack([-aside, aside, zero, zero, zero])
+    stacked = np.array([0.0, 0.0, 1.0, 1.0, 0.0], np.float32)[:, None]
+    xy = jnp.stack([x, y], axis=1) + stacked * ASKEW * draws.jitter
+    return Placed(jnp.concatenate([xy, floor[:, None]], axis=1), turned, jnp.int32(0))
+
+
+def _resize_pile(half: jax.Array) -> jax.Array:
+    """The second of the two lowest blocks like the first, so that what lies across them lies flat."""
+    return half.at[1].set(half[0])
+
+
+_NOT_ARCH: tuple[SlotKind, ...] = ("box", *blocks.MESH_KINDS)
+_ANY: tuple[SlotKind, ...] = ("arch", *_NOT_ARCH)
+_NO_ARCH, _BOX, _PRISM = Role(_NOT_ARCH, on_side=0.3), Role(("box",)), Role(("prism",))
+_BASE, _BRICK = Role(("box",), long=True), Role(("box",), long=True, on_side=0.5)
+_ARM = Role(("box", "prism"), long=True, on_side=1.0)
+FAMILIES = {
+    "row": Family((_NO_ARCH, _NO_ARCH, Role(_ANY, on_side=0.3), _NO_ARCH, _NO_ARCH), 3, _place_row),
+    "ridge": Family((_PRISM, _PRISM, Role(_ANY, on_side=0.3), _NO_ARCH, _NO_ARCH), 3, _place_row),
+    "ring": Family((_ARM, _ARM, _ARM, _ARM, Role(_NOT_ARCH)), 5, _place_ring),
+    "wall": Family((_BRICK, _BRICK, _NO_ARCH, _NO_ARCH, Role(_ANY)), 3, _place_wall),
+    "nest": Family(
+        (Role(("arch",), on_side=1.0), Role(("cylinder",)), _BRICK, _NO_ARCH, _NO_ARCH),
+        3,
+        _place_nest,
+        _resize_nest,
+    ),
+    "pile": Family((_BASE, _BASE, _BOX, Role(_NOT_ARCH), Role(_ANY)), 3, _place_pile, _resize_pile),
+}

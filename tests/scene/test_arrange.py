@@ -1,0 +1,280 @@
+"""Drawn arrangements against C MuJoCo: contacts, distances, and half a second of physics."""
+
+import dataclasses
+import functools
+from collections import Counter
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from csac_jax.config import HeightmapConfig, SceneConfig, SimConfig
+from csac_jax.scene import arrange, blocks, cases, families, layout, model, overlap
+from csac_jax.scene.layout import Scene
+
+COUNT = 200  # keys per level
+LEVELS = (0.0, 0.5, 1.0)
+MANY = SceneConfig(
+    slots=("box", "box", "box", "box", "box", "box", "arch", "arch", "prism", "prism", "cylinder", "cylinder"),
+    min_blocks=5,
+)
+BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_spread=0.25)
+EXTENT = {MANY: HeightmapConfig().extent, BOXES: 2.0 * (arrange.REACH + 0.001)}  # the usual square, the smallest
+FAR = 0.05  # m, distances are measured up to here
+TOGETHER = 0.012  # m, blocks closer than this make a cluster; loose ones keep 15 mm
+
+
+class Drawn(NamedTuple):
+    """Arrangements, COUNT for each level in turn, and what C MuJoCo says of them. P = 3 COUNT."""
+
+    cfg: SceneConfig
+    scenes: Scene  # leaves [P, N, ...], NumPy
+    reach: np.ndarray  # [P] m, largest |x| or |y| of a corner
+    lowest: np.ndarray  # [P] m, of a corner
+    overlap: np.ndarray  # [P] m, deepest contact
+    distance: np.ndarray  # [P, N, N] m between blocks in play, FAR where farther or not in play
+    moved: np.ndarray  # [P] m, farthest that a block has moved after half a second
+
+    def at(self, level: float) -> slice:
+        """The scenes of this level."""
+        first = LEVELS.index(level) * COUNT
+        return slice(first, first + COUNT)
+
+
+def _many(cfg: SceneConfig, extent: float, keys: jax.Array, levels: jax.Array) -> Scene:
+    drawn = jax.jit(jax.vmap(lambda key, level: arrange.arrange(key, cfg, extent, level)))(keys, levels)
+    return jax.device_get(drawn)
+
+
+def _measured(world: model.World, scene: Scene, fields: model.BlockFields) -> tuple:
+    """Reach, lowest, overlap, distance and moved of one scene."""
+    exact = model.with_blocks(world, fields)
+    exact.opt.iterations, exact.opt.ls_iterations = 20, 20
+    exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
+    data = mujoco.MjData(exact)
+    data.qpos[world.hand_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
+    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    mujoco.mj_forward(exact, data)
+    geoms = [(g, s) for g, s in zip(world.block_geoms, world.parts.slot, strict=True) if scene.in_play[s]]
+    corners = np.concatenate([cases._corners(exact, data, geom) for geom, _ in geoms])
+    deepest = max(0.0, -data.contact.dist.min()) if data.ncon else 0.0
+    distance = _distances(exact, data, geoms, len(world.slots))
+    mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
+    moved = np.linalg.norm((data.qpos[world.block_qpos[:, :3]] - scene.position)[scene.in_play], axis=1).max()
+    return np.abs(corners[:, :2]).max(), corners[:, 2].min(), deepest, distance, moved
+
+
+def _distances(exact: mujoco.MjModel, data: mujoco.MjData, geoms: list, num: int) -> np.ndarray:
+    distance = np.full((num, num), FAR)
+    for i, (one, slot) in enumerate(geoms):
+        for two, other in geoms[:i]:
+            if slot != other:
+                gap = mujoco.mj_geomDistance(exact, data, one, two, FAR, None)
+                distance[slot, other] = distance[other, slot] = min(distance[slot, other], gap)
+    return distance
+
+
+def _examined(cfg: SceneConfig, scenes: Scene) -> Drawn:
+    world = model.build(cfg, SimConfig())
+    fields = jax.device_get(jax.jit(jax.vmap(functools.partial(model.scene_fields, world)))(scenes))
+    rows = [jax.tree.map(lambda leaf, i=i: leaf[i], (scenes, fields)) for i in range(len(scenes.target))]
+    return Drawn(
+        cfg, scenes, *(np.stack(column) for column in zip(*(_measured(world, *row) for row in rows), strict=True))
+    )
+
+
+@pytest.fixture(scope="module", params=["many", pytest.param("boxes", marks=pytest.mark.slow)])
+def drawn(request: pytest.FixtureRequest) -> Drawn:
+    """Arrangements of many kinds in the usual square, and of five boxes of very different size in the smallest."""
+    cfg = MANY if request.param == "many" else BOXES
+    keys = jax.random.split(jax.random.key(0), len(LEVELS) * COUNT)
+    return _examined(cfg, _many(cfg, EXTENT[cfg], keys, jnp.repeat(jnp.float32(LEVELS), COUNT)))
+
+
+def test_blocks_do_not_overlap(drawn: Drawn):
+    """Claim: no two blocks, and no block and the table, overlap deeper than 1 mm."""
+    assert drawn.overlap.max() < 0.001
+    assert drawn.lowest.min() > -0.001
+
+
+def test_blocks_are_inside_the_square(drawn: Drawn):
+    """Claim: no corner of a block in play is outside the square; the others are parked."""
+    assert drawn.reach.max() <= 0.5 * EXTENT[drawn.cfg]
+    assert drawn.reach.max() > 0.48 * EXTENT[drawn.cfg]  # and the square is made use of
+    out = ~drawn.scenes.in_play
+    places = np.broadcast_to(layout.parking(out.shape[1]), drawn.scenes.position.shape)
+    np.testing.assert_array_equal(drawn.scenes.position[out], places[out])
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_blocks_are_at_rest(drawn: Drawn, level: float):
+    """Claim: after half a second of physics, no block has moved by 5 mm in at least 97 % of the arrangements."""
+    share = np.mean(drawn.moved[drawn.at(level)] < 0.005)
+    assert share >= 0.97, share
+
+
+def test_level_packs_more_and_closer(drawn: Drawn):
+    """Claim: the level closes the gaps from at most 30 mm to 1 mm, and adds blocks where there are more."""
+    nearest = drawn.distance[np.arange(len(drawn.reach)), drawn.scenes.target].min(axis=1)
+    for level, low, high in ((0.0, 0.014, 0.031), (0.5, 0.007, 0.017), (1.0, 0.0, 0.004)):
+        assert low < np.median(nearest[drawn.at(level)]) < high, level
+    number = [drawn.scenes.in_play[drawn.at(level)].sum(axis=1).mean() for level in LEVELS]
+    assert drawn.cfg is BOXES or number[0] + 0.4 < number[1] < number[2] - 0.4, number
+
+
+def test_target_has_neighbours_on_two_sides(drawn: Drawn):
+    """Claim: the target is in play, and two other blocks at least are within 35 mm of it."""
+    rows = np.arange(len(drawn.reach))
+    assert drawn.scenes.in_play[rows, drawn.scenes.target].all()
+    assert ((drawn.distance[rows, drawn.scenes.target] < 0.035).sum(axis=1) >= 2).all()
+
+
+def test_no_fewer_blocks_than_asked_for(drawn: Drawn):
+    """Claim: with room in the square, `min_blocks` are in play."""
+    assert (drawn.scenes.in_play.sum(axis=1) >= drawn.cfg.min_blocks).mean() > 0.99
+
+
+def test_every_family_is_drawn_as_often(drawn: Drawn):
+    """Claim: families are equally likely; seen on piles, the only ones with a block well above the table."""
+    low = drawn.scenes.position[..., 2] - np.linalg.norm(drawn.scenes.half_size, axis=2)
+    stacked = np.any((low > 0.0) & drawn.scenes.in_play, axis=1)
+    share = 1.0 / len(families.available(drawn.cfg.slots))
+    assert np.mean(stacked) <= share + 0.06  # 0.06: three sigma of 600 draws
+    assert np.mean(stacked) > 0.3 * share  # a flat block on flat ones does not stand out
+
+
+def test_what_is_drawn_spreads_over_its_range(drawn: Drawn):
+    """Claim: box slots draw every shape, sizes, densities and frictions keep to their ranges and fill them."""
+    cfg, scenes = drawn.cfg, drawn.scenes
+    box = np.array(cfg.slots) == "box"
+    scale = scenes.half_size[:, box, None] / blocks.half_size_choices("box")
+    shape = np.argmin(np.ptp(scale, axis=3), axis=2)
+    assert np.ptp(scale, axis=3).min(axis=2).max() < 1e-5  # each is a shape of the set, as a whole larger or smaller
+    assert np.bincount(shape.ravel(), minlength=4).min() > 0.1 * shape.size
+    nominal = np.array([blocks.half_size_choices(kind)[0][2] for kind in cfg.slots])
+    others = (scenes.half_size[..., 2] / nominal)[:, ~box]
+    for values, (low, high) in (
+        (
+            np.concatenate([scale.mean(axis=3).min(axis=2, initial=9.9, where=_is(shape)).ravel(), others.ravel()]),
+            _sizes(cfg),
+        ),
+        (scenes.density, cfg.density),
+        (scenes.friction, cfg.friction),
+    ):
+        slack = 1e-5 * high
+        assert low - slack <= values.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < values.max() <= high + slack
+    alike = max(np.bincount(row).max() for row in scenes.colour)
+    assert alike == np.ceil(len(cfg.slots) / len(blocks.COLOURS))
+
+
+def _is(shape: np.ndarray) -> np.ndarray:
+    return np.arange(4) == shape[..., None]
+
+
+def _sizes(cfg: SceneConfig) -> tuple[float, float]:
+    return 1.0 - cfg.size_spread, 1.0 + cfg.size_spread
+
+
+def test_mesh_blocks_of_one_kind_are_alike(drawn: Drawn):
+    """Claim: prisms share their size in a scene, and so do cylinders, as the physics asks."""
+    for kind in blocks.MESH_KINDS:
+        height = drawn.scenes.half_size[:, np.array(drawn.cfg.slots) == kind, 2]
+        assert height.size == 0 or np.ptp(height, axis=1).max() == 0.0
+
+
+def _clusters(slots: tuple, distance: np.ndarray) -> list[Counter]:
+    """Kinds of the blocks in every cluster of blocks closer than TOGETHER to one another."""
+    near = distance < TOGETHER
+    reached = np.eye(len(slots), dtype=bool)
+    for _ in slots:
+        reached = reached | (reached @ near)
+    return [Counter(slots[i] for i in np.flatnonzero(row)) for row in np.unique(reached, axis=0) if row.sum() > 1]
+
+
+def test_shipped_cases_are_held_out(drawn: Drawn):
+    """Claim: what a shipped case packs together is packed together in no drawn arrangement, not even the kinds."""
+    slots = MANY.slots
+    if drawn.cfg.slots != slots:
+        pytest.skip("five boxes cannot make a shipped case")
+    shipped = [cases.fit(cases.load(cases.shipped(name)), slots) for name in cases.names()]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *shipped)
+    held_out = [max(_clusters(slots, row), key=Counter.total) for row in _examined(MANY, stacked).distance]
+    assert sorted(cluster.total() for cluster in held_out) == [2, 3, 4, 5]
+    found = [cluster for row in drawn.distance for cluster in _clusters(slots, row)]
+    assert sum(cluster.total() >= 3 for cluster in found) > COUNT
+    assert not [cluster for cluster in found if cluster in held_out]
+    assert max(cluster["arch"] for cluster in found) == 1
+
+
+@pytest.mark.parametrize(
+    ("slots", "names"),
+    [
+        (("box", "box", "box"), {"row", "wall", "pile"}),
+        (("box",) * 5, {"row", "wall", "pile", "ring"}),
+        (("box", "box", "prism", "box", "cylinder"), {"row", "wall", "pile", "ring"}),
+        (("prism", "prism", "arch"), {"row", "ridge"}),
+        (("arch", "box", "cylinder"), {"row", "nest"}),
+        (("box", "box", "half_cylinder"), {"row", "wall"}),
+        (("box",) * 6 + ("arch", "prism", "prism", "cylinder"), set(families.FAMILIES)),
+    ],
+)
+def test_families_follow_from_the_slots(slots: tuple, names: set):
+    """Claim: a family is drawn exactly where the slots have the kinds that it needs."""
+    assert set(families.available(slots)) == names
+
+
+@pytest.mark.parametrize("slots", [("box",), ("box", "box"), ("arch", "arch", "arch"), ("arch", "arch", "box")])
+def test_too_few_slots_are_an_error(slots: tuple):
+    """Claim: slots that allow no family are an error that names the field."""
+    with pytest.raises(ValueError, match=r"scene\.slots: too few for an arrangement"):
+        families.available(slots)
+
+
+def test_too_small_a_square_is_an_error():
+    """Claim: a square that an arrangement might not fit into is an error that names the field."""
+    with pytest.raises(ValueError, match=r"heightmap\.extent: arrangements need a square of at least 0\.412 m"):
+        arrange.arrange(jax.random.key(0), MANY, 0.4, jnp.float32(0.5))
+
+
+def test_key_decides():
+    """Claim: the same key gives the same scene, alone or in a batch; another key, another scene."""
+    cfg = SceneConfig(slots=("box", "arch", "cylinder"), min_blocks=3)
+    levels = jnp.linspace(0.0, 1.0, 8)
+    batch, again = (_many(cfg, 0.448, jax.random.split(jax.random.key(1), 8), levels) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, batch, again)
+    single = jax.jit(lambda key, level: arrange.arrange(key, cfg, 0.448, level))
+    for i in range(8):
+        alone = jax.device_get(single(jax.random.split(jax.random.key(1), 8)[i], levels[i]))
+        jax.tree.map(lambda one, row, i=i: np.testing.assert_allclose(one, row[i], atol=1e-6), alone, batch)
+        assert jax.tree.map(lambda leaf: leaf.dtype, alone) == jax.tree.map(
+            lambda leaf: leaf.dtype, layout.parked(cfg.slots)
+        )
+    for leaf in dataclasses.fields(Scene):
+        if leaf.name in ("position", "half_size", "density", "friction", "colour"):
+            assert len({row.tobytes() for row in getattr(batch, leaf.name)}) == 8, leaf.name
+
+
+def test_gap_between_rectangles_is_that_of_tall_boxes():
+    """Claim: two rectangles are apart by no less than the gap, and overlap where it is negative."""
+    rng = np.random.default_rng(0)
+    xy, yaw, half = (
+        rng.uniform(-0.1, 0.1, (300, 2, 2)),
+        rng.uniform(0.0, 7.0, (300, 2)),
+        rng.uniform(0.01, 0.05, (300, 2, 2)),
+    )
+    ours = jax.vmap(arrange.rectangle_gap)(*(jnp.float32(v[:, i]) for i in range(2) for v in (xy, yaw, half)))
+    square = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    for i in range(300):
+        corners, normals = [], []
+        for j in range(2):
+            cos, sin = np.cos(yaw[i, j]), np.sin(yaw[i, j])
+            turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+            flat = (square * half[i, j]) @ turn[:2, :2].T + xy[i, j]
+            corners.append(np.concatenate([np.insert(flat, 2, z, axis=1) for z in (-9.0, 9.0)]))
+            normals.append(np.concatenate([turn.T, -turn.T]))
+        assert -ours[i] == pytest.approx(overlap.depth(tuple(corners), tuple(normals)), abs=1e-6)
+    assert 50 < np.sum(ours > 0.0) < 250
