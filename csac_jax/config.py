@@ -10,7 +10,7 @@ import math
 import typing
 from typing import Any, Literal
 
-SlotKind = Literal["box", "prism", "cylinder"]
+SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
 
 
@@ -33,11 +33,17 @@ class SceneConfig:
     """What lies on the table."""
 
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
-    """Shape family of each block slot; a box slot draws cube, cuboid, plank or tile anew in every scene."""
+    """Kind of each block slot; a box slot draws cube, cuboid, plank or tile anew in every scene."""
     min_blocks: int = 5
     """Fewest blocks in play in a scene; the most is the number of slots."""
     pool: int = 1024
-    """Distinct settled scenes that resets draw from; each is turned by a random yaw as it is drawn."""
+    """Distinct settled scenes per number of blocks that resets draw from; each is turned by a random yaw then."""
+    size_spread: float = 0.1
+    """Block sizes differ from nominal by up to this share, from scene to scene."""
+    density: tuple[float, float] = (450.0, 900.0)
+    """Range of block densities, kg/m^3 (ours: woods; about 0.1 kg a block)."""
+    friction: tuple[float, float] = (0.5, 1.0)
+    """Range of the sliding friction between blocks and table."""
     drop_extent: float = 0.248
     """Side of the square in which blocks are dropped, m (VPG)."""
     drop_height: float = 0.15
@@ -49,15 +55,39 @@ class SceneConfig:
         _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
         _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
         _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")
+        _require(0.0 <= self.size_spread <= 0.25, "scene.size_spread: must lie in 0 .. 0.25")
+        _require(
+            100.0 <= self.density[0] <= self.density[1] <= 3000.0, "scene.density: 100 <= low <= high <= 3000 kg/m^3"
+        )
+        _require(0.1 <= self.friction[0] <= self.friction[1] <= 2.0, "scene.friction: 0.1 <= low <= high <= 2")
         _require(0.05 <= self.drop_extent <= 0.448, "scene.drop_extent: must lie in 0.05 .. 0.448 m")
         _require(0.05 <= self.drop_height <= 1.0, "scene.drop_height: must lie in 0.05 .. 1 m")
         _require(0.5 <= self.settle_time <= 20.0, "scene.settle_time: must lie in 0.5 .. 20 s")
 
 
 @dataclasses.dataclass(frozen=True)
+class TaskConfig:
+    """What an episode asks for, and when it is cut off."""
+
+    kind: Literal["clear", "target"] = "clear"
+    """`clear`: take every block. `target`: get one marked block, then the next one (CSAC sec. 4.4)."""
+    max_actions: int = 15
+    """Actions after which an episode is cut off."""
+    max_idle: int = 10
+    """Actions in a row without visible change after which an episode is cut off (VPG)."""
+
+    def __post_init__(self) -> None:
+        _require_choices(self, "task.")
+        _require(self.max_actions >= 1, "task.max_actions: at least 1")
+        _require(self.max_idle >= 1, "task.max_idle: at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
 class SimConfig:
     """Physics and the two motion primitives; one primitive is `substeps` physics steps, whatever it does."""
 
+    physics: Literal["mjx", "c"] = "mjx"
+    """`mjx`: compiled with everything else. `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
     timestep: float = 0.004
     """Length of a physics step, s."""
     grasp_phases: tuple[int, int, int] = (60, 50, 80)
@@ -91,6 +121,7 @@ class SimConfig:
         return sum(self.grasp_phases)
 
     def __post_init__(self) -> None:
+        _require_choices(self, "sim.")
         _require(0.0005 <= self.timestep <= 0.01, "sim.timestep: must lie in 0.0005 .. 0.01 s")
         _require(
             min(*self.grasp_phases, *self.push_phases) >= 1, "sim.grasp_phases, push_phases: at least 1 substep each"
@@ -378,10 +409,6 @@ class TrainConfig:
     """Training steps in one call of the compiled program; between calls the host logs, saves and stops."""
     save_every: int = 50
     """Chunks between checkpoints; the last chunk and a stop are always saved."""
-    max_actions: int = 15
-    """Actions after which an episode is cut off."""
-    max_idle: int = 10
-    """Actions in a row without visible change after which an episode is cut off (VPG)."""
 
     @property
     def steps(self) -> int:
@@ -389,7 +416,7 @@ class TrainConfig:
         return math.ceil(self.actions / self.scenes)
 
     def __post_init__(self) -> None:
-        for name in ("scenes", "actions", "warmup", "chunk", "save_every", "max_actions", "max_idle"):
+        for name in ("scenes", "actions", "warmup", "chunk", "save_every"):
             _require(getattr(self, name) >= 1, f"train.{name}: at least 1")
 
 
@@ -404,6 +431,7 @@ class Config:
     seed: int = 0
     """Number that all randomness of the run follows from."""
     scene: SceneConfig = SceneConfig()
+    task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()
     heightmap: HeightmapConfig = HeightmapConfig()
     net: NetConfig = NetConfig()

@@ -16,9 +16,9 @@ from csac_jax import geometry
 from csac_jax.config import Config
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import mjx_physics, outcome
-from csac_jax.sim.mjx_physics import Physics
+from csac_jax.sim import outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
+from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
@@ -31,7 +31,7 @@ CHANGE_AREA = 12.0  # cm^2 that must move for an action to count as a change (VP
 class Info:
     """What the last action did."""
 
-    outcome: jax.Array  # [] int32, Outcome of a grasp by ground truth; NOTHING after a push
+    outcome: jax.Array  # [] int32, Outcome of a grasp by ground truth; NOTHING after a push; of a wrong block TOUCHED
     outcome_by_gap: jax.Array  # [] int32, the same as finger gap and height map suggest
     moved: jax.Array  # [] cm^2 of the height map that moved
     distance: jax.Array  # [] m, between the place aimed at and the nearest block lifted; 0 if none was
@@ -47,8 +47,8 @@ class State:
 
     scene: Scene
     obs: Observation
-    reward: jax.Array  # [] 1 if the last action took a block from the table, else 0 (r2 of CSAC eq. 11)
-    terminated: jax.Array  # [] bool, no block is left
+    reward: jax.Array  # [] 1 if the last action took a block that was asked for, else 0 (r2 of CSAC eq. 11)
+    terminated: jax.Array  # [] bool, nothing is left to get
     truncated: jax.Array  # [] bool, action cap or no-change cap reached, or the scene is ill
     actions: jax.Array  # [] int32, taken in this episode
     idle: jax.Array  # [] int32, actions in a row without visible change
@@ -70,10 +70,28 @@ class Env:
 
     def reset(self, key: jax.Array) -> State:
         """A fresh settled scene of the pool, turned by a random yaw."""
-        key_scene, key_yaw = jax.random.split(key)
+        return self.begin(self._fresh(key))
+
+    def restart(self, key: jax.Array, state: State) -> State:
+        """What follows an episode: a fresh scene; or, after a target was got, the same one with the next target."""
+        key_fresh, key_target = jax.random.split(key)
+        scene = self._fresh(key_fresh)
+        if self.cfg.task.kind == "target":
+            goes_on = (state.reward > 0.0) & jnp.any(state.scene.in_play)
+            again = layout.mark(key_target, state.scene)
+            scene = jax.tree.map(lambda new, old: jnp.where(goes_on, old, new), scene, again)
+        return self.begin(scene)
+
+    def _fresh(self, key: jax.Array) -> Scene:
+        key_scene, key_enter = jax.random.split(key)
         index = jax.random.randint(key_scene, (), 0, self.scenes.position.shape[0])
-        yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
-        return self.begin(layout.turn(jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes), yaw))
+        return self.vary(key_enter, jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes))
+
+    def vary(self, key: jax.Array, scene: Scene) -> Scene:
+        """A settled scene as an episode meets it: turned by a random yaw, with a random target if the task has one."""
+        key_yaw, key_target = jax.random.split(key)
+        turned = layout.turn(scene, jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi))
+        return layout.mark(key_target, turned) if self.cfg.task.kind == "target" else turned
 
     def begin(self, scene: Scene) -> State:
         """The first state of an episode that starts with this scene."""
@@ -84,27 +102,31 @@ class Env:
 
     def look(self, scene: Scene) -> Observation:
         """The top view of a scene."""
-        normals, offsets = blocks.half_spaces(self.cfg.scene.slots, scene.half_size)
+        slots = self.cfg.scene.slots
+        normals, offsets = blocks.half_spaces(slots, scene.half_size)
+        slot = blocks.parts(slots).slot
         shapes = Polytopes(
             normal=normals,
             offset=offsets,
-            position=scene.position,
-            rotation=jax.vmap(geometry.quat_to_matrix)(scene.quaternion),
-            colour=jnp.asarray(blocks.COLOURS)[scene.colour],
+            position=scene.position[slot],
+            rotation=jax.vmap(geometry.quat_to_matrix)(scene.quaternion)[slot],
+            colour=jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
         )
-        return heightmap.orthographic(self.cfg.heightmap, shapes, jnp.asarray(blocks.TABLE_COLOUR))
+        wanted = (slot == scene.target) | (scene.target == layout.ANY)
+        return heightmap.orthographic(self.cfg.heightmap, shapes, jnp.asarray(blocks.TABLE_COLOUR), wanted)
 
     def step(self, state: State, action: Action) -> State:
         """Runs one primitive; blocks lifted or out of the workspace leave the scene."""
         cfg, before = self.cfg, state.scene
-        after, trace, plan = mjx_physics.execute(self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action)
-        ill = ~mjx_physics.healthy(after)
+        after, trace, plan = simulation.execute(self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action)
+        ill = ~simulation.healthy(after)
         after = jax.tree.map(lambda good, bad: jnp.where(ill, good, bad), before, after)
 
         grasped = action.primitive == Primitive.GRASP
         hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
         lifted = outcome.lifted_blocks(trace, hand_rise) & grasped & ~ill
         gone = after.in_play & ~layout.inside(after.position, cfg.heightmap.extent) & ~lifted
+        got = lifted & self._wanted(before)
         after = layout.park(after, ~lifted & ~gone)
         obs = self.look(after)
 
@@ -112,12 +134,14 @@ class Env:
         changed = moved > CHANGE_AREA
         idle = jnp.where(changed, 0, state.idle + 1)
         actions = state.actions + 1
-        terminated = ~jnp.any(after.in_play)
-        capped = (actions >= cfg.train.max_actions) | (idle >= cfg.train.max_idle)
+        terminated = ~jnp.any(after.in_play & self._wanted(after))
+        capped = (actions >= cfg.task.max_actions) | (idle >= cfg.task.max_idle)
         off = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
         nothing = jnp.int32(Outcome.NOTHING)
+        judged = outcome.grasp_outcome(trace, plan.surface, hand_rise)
+        judged = jnp.where(jnp.any(lifted) & ~jnp.any(got), jnp.int32(Outcome.TOUCHED), judged)
         info = Info(
-            outcome=jnp.where(grasped, outcome.grasp_outcome(trace, plan.surface, hand_rise), nothing),
+            outcome=jnp.where(grasped, judged, nothing),
             outcome_by_gap=jnp.where(grasped, outcome.grasp_outcome_by_gap(trace, plan.surface, changed), nothing),
             moved=moved,
             distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, off, jnp.inf)), 0.0),
@@ -129,7 +153,7 @@ class Env:
         return State(
             scene=after,
             obs=obs,
-            reward=jnp.any(lifted).astype(jnp.float32),
+            reward=jnp.any(got).astype(jnp.float32),
             terminated=terminated & ~ill,
             truncated=(capped & ~terminated) | ill,
             actions=actions,
@@ -137,14 +161,19 @@ class Env:
             info=info,
         )
 
+    def _wanted(self, scene: Scene) -> jax.Array:
+        """Slots [N] bool of the blocks that the task asks for."""
+        return (scene.target == layout.ANY) | (np.arange(len(self.cfg.scene.slots)) == scene.target)
+
 
 def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None) -> Env:
     """The environment of a config; settles (or reads from the cache) the scenes that resets draw from.
 
     Args: stream, the stream of random numbers that drops follow: training takes 0, evaluation others;
-    scenes, size of the pool, `cfg.scene.pool` if None.
+    scenes, size of the pool at least, as many with each number of blocks; `cfg.scene.pool` of each if None.
     """
     world = model.build(cfg.scene, cfg.sim)
-    count = cfg.scene.pool if scenes is None else scenes
+    numbers = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
+    count = cfg.scene.pool if scenes is None else -(-scenes // numbers)
     settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, stream, count)
-    return Env(cfg, mjx_physics.make(world), settled)
+    return Env(cfg, simulation.make(world, cfg.sim), settled)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from csac_jax.config import (
     CEMConfig,
     Config,
+    ExploreConfig,
     HeightmapConfig,
     LearnConfig,
     NetConfig,
@@ -13,6 +14,7 @@ from csac_jax.config import (
     SceneConfig,
     SimConfig,
     TargetConfig,
+    TaskConfig,
     TrainConfig,
 )
 
@@ -24,6 +26,25 @@ def quick() -> Config:
     needed.
     """
     return Config(preset="quick", target=TargetConfig(gamma=0.2), replay=ReplayConfig(beta_end=(1.0, 4.0)))
+
+
+def fast() -> Config:
+    """Ten blocks of all eight shapes, 256 scenes side by side, for one GPU."""
+    return Config(
+        preset="fast",
+        scene=SceneConfig(
+            slots=("box", "box", "arch", "prism", "box", "cylinder", "half_cylinder", "box", "box", "box"),
+            min_blocks=10,
+            pool=4096,
+        ),
+        task=TaskConfig(max_actions=25),
+        sim=SimConfig(geom_pairs=24, contacts=64),
+        target=TargetConfig(gamma=0.2),
+        explore=ExploreConfig(decay=0.9998),
+        learn=LearnConfig(batch=256, updates=16),
+        replay=ReplayConfig(capacity=16384, beta_end=(1.0, 4.0)),
+        train=TrainConfig(scenes=256, actions=30000, warmup=1024, chunk=4, save_every=10),
+    )
 
 
 def smoke() -> Config:
@@ -42,7 +63,7 @@ def smoke() -> Config:
     )
 
 
-PRESETS: dict[str, Callable[[], Config]] = {"smoke": smoke, "quick": quick}
+PRESETS: dict[str, Callable[[], Config]] = {"smoke": smoke, "quick": quick, "fast": fast}
 
 
 def get(name: str) -> Config:

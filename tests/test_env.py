@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment
-from csac_jax.config import Config, SceneConfig, TrainConfig
+from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.env import Env, State
 from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
@@ -23,9 +23,9 @@ pytestmark = pytest.mark.mjx
 
 CONFIG = Config(
     scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=16, settle_time=1.5),
-    train=TrainConfig(max_actions=6, max_idle=3),
+    task=TaskConfig(max_actions=6, max_idle=3),
 )
-SCENES = 6
+SCENES = 8
 BARE = (0.15, 0.15, 0.0)  # a place where nothing lies
 
 
@@ -65,17 +65,13 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     return Lab(env, reset.lower().compile(), begin, step.lower().compile(), plan, _types(into), _types(out))
 
 
-def _cube(x: float, y: float) -> Scene:
-    """A scene of one cube at (x, y) m."""
-    scene = Scene(
-        position=jnp.array([[x, y, 0.025], [0, 0, 0], [0, 0, 0]], jnp.float32),
-        quaternion=jnp.zeros((3, 4)).at[:, 0].set(1.0),
-        velocity=jnp.zeros((3, 6)),
-        half_size=jnp.array([[0.025, 0.025, 0.025]] * 2 + [[0.0467, 0.025, 0.0243]], jnp.float32),
-        colour=jnp.arange(3, dtype=jnp.int32),
-        in_play=jnp.ones(3, bool),
-    )
-    return layout.park(scene, jnp.array([True, False, False]))
+def _cube(x: float, y: float, target: int = layout.ANY) -> Scene:
+    """A scene of one cube at (x, y) m; with a target, of a second one far off."""
+    scene = jax.tree.map(jnp.asarray, layout.parked(CONFIG.scene.slots))
+    places = jnp.array([[x, y, 0.025], [-0.15, 0.15, 0.025]])
+    in_play = jnp.array([True, target != layout.ANY, False])
+    position = jnp.where(in_play[:, None], scene.position.at[:2].set(places), scene.position)
+    return scene.replace(position=position, in_play=in_play, target=jnp.int32(target))
 
 
 def _stack(*trees):
@@ -93,8 +89,8 @@ def _at(tree, index: int):
 
 @pytest.fixture(scope="module")
 def stepped(lab: Lab) -> State:
-    """One step of six scenes of one cube each, see `_LANES`."""
-    first = lab.begin(_stack(*(_cube(*place) for place, *_ in _LANES.values())))
+    """One step of the scenes of `_LANES`."""
+    first = lab.begin(_stack(*(_cube(*place, _TARGETS.get(name, layout.ANY)) for name, (place, *_) in _LANES.items())))
     actions, idle = (jnp.array([lane[i] for lane in _LANES.values()], jnp.int32) for i in (1, 2))
     action = _actions(*((kind, pose) for *_, kind, pose in _LANES.values()))
     return lab.step(dataclasses.replace(first, actions=actions, idle=idle), action)
@@ -107,7 +103,10 @@ _LANES = {  # the cube's place, actions and idle actions so far, the action
     "on": ((0.0, 0.0), 0, 1, Primitive.PUSH, BARE),
     "moved": ((0.06, 0.0), 0, 2, Primitive.PUSH, (0.0, 0.0, 0.0)),
     "out": ((0.19, 0.0), 0, 0, Primitive.PUSH, (0.13, 0.0, 0.0)),
+    "got": ((0.0, 0.0), 0, 0, Primitive.GRASP, (0.0, 0.0, 0.0)),
+    "wrong": ((0.0, 0.0), 0, 0, Primitive.GRASP, (0.0, 0.0, 0.0)),
 }
+_TARGETS = {"got": 0, "wrong": 1}  # slots
 
 
 @pytest.fixture
@@ -123,6 +122,34 @@ def test_last_block_terminates(lane):
     assert state.info.outcome == state.info.outcome_by_gap == Outcome.LIFTED
     assert abs(state.info.distance - 0.01) < 1e-6  # the place aimed at lay 1 cm beside the cube
     assert state.obs.height.max() < 0.001
+
+
+def test_target_ends_the_episode(lane):
+    """Claim: in the target task the episode ends when the target is got, though another block is left."""
+    state = lane("got")
+    assert (state.terminated, state.reward, state.info.outcome) == (True, 1.0, Outcome.LIFTED)
+    np.testing.assert_array_equal(state.scene.in_play, [False, True, False])
+
+
+def test_wrong_block_is_no_success(lane):
+    """Claim: lifting another block than the target takes it away, counts as `touched` and is worth nothing."""
+    state = lane("wrong")
+    assert (state.done, state.reward, state.info.cleared, state.info.outcome) == (False, 0.0, 1, Outcome.TOUCHED)
+    assert state.obs.target.any()
+    np.testing.assert_array_equal(state.obs.target, state.obs.height > 0.001)  # the target alone is left
+
+
+def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
+    """Claim: after a target was got the scene goes on with another target; after any other end comes a fresh scene."""
+    env = dataclasses.replace(lab.env, cfg=dataclasses.replace(CONFIG, task=TaskConfig(kind="target")))
+    restart = jax.jit(jax.vmap(env.restart))(jax.random.split(jax.random.key(0), SCENES), stepped)
+    for name, stays in (("got", True), ("wrong", False), ("last chance", False)):
+        new, old = (_at(state, list(_LANES).index(name)) for state in (restart, stepped))
+        assert np.array_equal(new.scene.position, old.scene.position) == stays, name
+        assert new.scene.in_play[new.scene.target], name
+        assert (new.done, new.reward, new.actions) == (False, 0.0, 0)
+        assert new.obs.target.any()
+        assert not new.obs.target.all()
 
 
 def test_action_cap_truncates(lane):
@@ -222,10 +249,10 @@ def test_resets_differ(lab: Lab):
     heights = [tuple(np.where(valid, p[:, 2], -1.0)) for p, valid in zip(positions, play, strict=True)]
     pool = lab.env.scenes
     drawn = [
-        next(i for i in range(CONFIG.scene.pool) if tuple(np.where(pool.in_play[i], pool.position[i, :, 2], -1)) == h)
+        next(i for i in range(len(pool.position)) if tuple(np.where(pool.in_play[i], pool.position[i, :, 2], -1)) == h)
         for h in heights
     ]
-    assert len(set(drawn)) >= 12  # of 16, in 48 draws
+    assert len(set(drawn)) >= 20  # of 32, in 48 draws
     yaws = [np.arctan2(*(p[v][0, :2] @ [[0, 1], [1, 0]])) for p, v in zip(positions, play, strict=True)]
     raw = [np.arctan2(*(pool.position[i][pool.in_play[i]][0, :2] @ [[0, 1], [1, 0]])) for i in drawn]
     turned = np.mod(np.array(yaws) - raw, 2 * np.pi)

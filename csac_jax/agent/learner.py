@@ -96,7 +96,9 @@ def init(key: jax.Array, learner: Learner) -> LearnerState:
     """Fresh networks; targets are copies (Algorithm 1 lines 1-2)."""
     key_critic, key_actor = jax.random.split(key)
     side = learner.frames.tables.canvas
-    blank = jnp.zeros((1, side, side, dense.CHANNELS))
+    size = learner.cfg.heightmap.size
+    blank_obs = Observation(jnp.zeros((size, size, 3)), jnp.zeros((size, size)), jnp.zeros((size, size), bool))
+    blank = jnp.zeros((1, side, side, maps.seen(learner.frames, blank_obs).shape[-1]))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key_critic, jnp.arange(learner.cfg.learn.critics))
     (_, features), critic = jax.vmap(learner.critic.init_with_output, (0, None))(keys, blank)
     online = Params(critic, learner.actor.init(key_actor, features[0]))
@@ -201,7 +203,7 @@ def _value(learner: Learner, critic_params: Any, obs: Observation, action: Actio
     lower = jnp.floor(turns)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
-    fed = dense.inputs(obs.colour, obs.height)
+    fed = maps.seen(frames, obs)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(frames.tables, fed, half)
     q, _ = _apply_critics(learner, critic_params, one.reshape(-1, *one.shape[2:]))
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]

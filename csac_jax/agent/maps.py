@@ -39,6 +39,7 @@ class Frames:
     cell: float  # side of a cell, m
     extent: float  # side of the workspace, m
     push_length: float  # m
+    marked: bool  # one block is the target: the net sees its mask
     xy: np.ndarray  # [K, h, w, 2] m, workspace position of every cell
     inside: np.ndarray  # [K, h, w] bool, above the workspace
 
@@ -54,7 +55,8 @@ def frames(cfg: Config) -> Frames:
     cos, sin = np.cos(yaws)[:, None, None], np.sin(yaws)[:, None, None]
     xy = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1).astype(np.float32)
     inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
-    return Frames(tables, yaws.astype(np.float32), side, cell, extent, cfg.sim.push_length, xy, inside)
+    marked = cfg.task.kind == "target"
+    return Frames(tables, yaws.astype(np.float32), side, cell, extent, cfg.sim.push_length, marked, xy, inside)
 
 
 @struct.dataclass
@@ -66,9 +68,14 @@ class DenseMaps:
     valid: jax.Array  # [P, K, h, w] bool, there is something to act on
 
 
+def seen(frames: Frames, obs: Observation) -> jax.Array:
+    """What the net is to see of an observation, [..., H, W, I]; see `dense.inputs`."""
+    return dense.inputs(obs.colour, obs.height, obs.target if frames.marked else None)
+
+
 def net_inputs(frames: Frames, obs: Observation) -> jax.Array:
-    """The observation in the first K / 2 frames, as the net is fed: [K / 2, C, C, CHANNELS]."""
-    return rotate.rotate(frames.tables, dense.inputs(obs.colour, obs.height))
+    """The observation in the first K / 2 frames, as the net is fed: [K / 2, C, C, I]."""
+    return rotate.rotate(frames.tables, seen(frames, obs))
 
 
 def unfold(halves: jax.Array) -> jax.Array:
@@ -85,18 +92,24 @@ def _half_turn(maps: jax.Array) -> jax.Array:
 def actionable(frames: Frames, obs: Observation) -> jax.Array:
     """Cells where an action can have an effect, [P, K, h, w] bool.
 
-    Grasp: something higher than 1 cm lies under the cell. Push: something does within the push's length ahead. Masking
-    what is bare is SPOT's dynamic action space (arXiv:1909.04730).
+    Grasp: something to get, higher than 1 cm, lies under the cell. Push: something does within the push's length ahead,
+    whatever it is. Masking what is bare is SPOT's dynamic action space (arXiv:1909.04730).
     """
-    side = frames.side
-    height = rotate.rotate(frames.tables, obs.height[..., None])[..., 0]
-    cells = height.reshape(-1, side, dense.STRIDE, side, dense.STRIDE).max(axis=(2, 4)) > BARE  # [K / 2, h, w]
-    under = jnp.concatenate([cells, _half_turn(cells)])
+    under = _under(frames, obs.height)
+    wanted = _under(frames, jnp.where(obs.target, obs.height, 0.0)) if frames.marked else under
     reach = int(np.ceil(frames.push_length / frames.cell))
     ahead = jax.lax.reduce_window(
         under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
     )
-    return jnp.stack([ahead & frames.inside, under & frames.inside])
+    return jnp.stack([ahead & frames.inside, wanted & frames.inside])
+
+
+def _under(frames: Frames, height: jax.Array) -> jax.Array:
+    """Cells [K, h, w] bool under which the height map [H, W] m shows something."""
+    side = frames.side
+    turned = rotate.rotate(frames.tables, height[..., None])[..., 0]
+    cells = turned.reshape(-1, side, dense.STRIDE, side, dense.STRIDE).max(axis=(2, 4)) > BARE  # [K / 2, h, w]
+    return jnp.concatenate([cells, _half_turn(cells)])
 
 
 def everywhere(frames: Frames, obs: Observation) -> jax.Array:

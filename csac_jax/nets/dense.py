@@ -13,19 +13,19 @@ from csac_jax.config import NetConfig
 from csac_jax.nets.convolution import conv2d
 
 STRIDE = 2  # cells of the input per cell of the output, along each axis
-CHANNELS = 4  # colour, height
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 _HEIGHT_SCALE = 0.05  # m, a block's height: brings heights near 1
 _GROUP = 8  # channels per group of the norm
 
 
-def inputs(colour: jax.Array, height: jax.Array) -> jax.Array:
-    """Maps that the net is fed [..., H, W, CHANNELS] from colour [..., H, W, 3] in 0..1 and height [..., H, W] m.
+def inputs(colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:
+    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [..., H, W] m.
 
-    Bare table is 0, like what lies outside of a turned map.
+    I = 4, or 5 with a target mask [..., H, W] bool. Bare table is 0, like what lies outside of a turned map.
     """
     seen = jnp.where(height[..., None] > 0.002, colour - 0.5, 0.0)
-    return jnp.concatenate([seen, height[..., None] / _HEIGHT_SCALE], axis=-1)
+    maps = [seen, height[..., None] / _HEIGHT_SCALE]
+    return jnp.concatenate(maps if target is None else [*maps, target[..., None].astype(seen.dtype)], axis=-1)
 
 
 class Convolution(nn.Module):
@@ -45,7 +45,7 @@ class Convolution(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Dense features of turned maps: [B, C, C, CHANNELS] -> [B, C / 2, C / 2, stem + layers * growth]."""
+    """Dense features of turned maps: [B, C, C, I] -> [B, C / 2, C / 2, stem + layers * growth]."""
 
     cfg: NetConfig
 
@@ -84,6 +84,6 @@ class Critic(nn.Module):
         self.head = Head(self.cfg)
 
     def __call__(self, maps: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, CHANNELS] -> Q [B, C / 2, C / 2, OUTPUTS], features [B, C / 2, C / 2, F]."""
+        """[B, C, C, I] -> Q [B, C / 2, C / 2, OUTPUTS], features [B, C / 2, C / 2, F]."""
         features = self.trunk(maps)
         return self.head(features), features

@@ -1,4 +1,11 @@
-"""The block set: sizes, faces and colours. Shapes that are no boxes have a fixed size; box sizes differ per scene."""
+"""The block set of VPG (arXiv:1803.09956): eight shapes in ten colours.
+
+A slot of kind `box` may hold cube, cuboid, plank or tile; every other kind is one shape. A block's frame has its origin
+at the centre of the bounding box; what differs between scenes is `half_size`, half of that box. Boxes and arches scale
+along each axis, the other shapes as a whole. An arch is three convex parts, every other shape one.
+"""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -6,10 +13,25 @@ import numpy as np
 
 from csac_jax.config import SlotKind
 
-BOX_HALF_SIZES = np.array(
-    [[0.025, 0.025, 0.025], [0.05, 0.025, 0.025], [0.05, 0.025, 0.0125], [0.025, 0.025, 0.0125]], np.float32
-)  # [4, 3] m: cube, cuboid, plank, tile (block set of VPG, arXiv:1803.09956)
-FIXED_HALF_SIZES = {"prism": (0.0467, 0.025, 0.0243), "cylinder": (0.0224, 0.0224, 0.025)}  # m, bounding boxes
+
+class Shape(NamedTuple):
+    """A block of the set."""
+
+    kind: SlotKind
+    half_size: tuple[float, float, float]  # m, half of the bounding box
+
+
+SHAPES = {
+    "cube": Shape("box", (0.025, 0.025, 0.025)),
+    "cuboid": Shape("box", (0.05, 0.025, 0.025)),
+    "plank": Shape("box", (0.05, 0.025, 0.0125)),
+    "tile": Shape("box", (0.025, 0.025, 0.0125)),
+    "arch": Shape("arch", (0.05, 0.025, 0.025)),
+    "prism": Shape("prism", (0.0467, 0.025, 0.0243)),
+    "half_cylinder": Shape("half_cylinder", (0.025, 0.025, 0.0125)),
+    "cylinder": Shape("cylinder", (0.0224, 0.0224, 0.025)),
+}
+MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 MAX_FACES = 10
 PADDING_OFFSET = 1e3  # m, offset of a face that is not there: every point lies inside it
 
@@ -28,7 +50,41 @@ COLOURS = np.array(
     ],
     np.float32,
 ) / np.float32(255)  # [10, 3] sRGB in 0..1 (Tableau's ten, as in VPG)
+COLOUR_NAMES = ("blue", "green", "brown", "orange", "yellow", "grey", "red", "purple", "cyan", "pink")
 TABLE_COLOUR = np.array([0.35, 0.33, 0.31], np.float32)
+
+
+def half_size_choices(kind: SlotKind) -> np.ndarray:
+    """Nominal half sizes [choices, 3] m of the shapes that a slot of this kind may hold."""
+    return np.array([shape.half_size for shape in SHAPES.values() if shape.kind == kind], np.float32)
+
+
+# Parts: centre and half size of every convex part, in units of the block's half size.
+
+_WHOLE = (((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),)
+_ARCH = (  # two posts and a lintel: the half-round tunnel of radius 25 mm as a square one, 50 x 25 mm
+    ((-0.75, 0.0, 0.0), (0.25, 1.0, 1.0)),
+    ((0.75, 0.0, 0.0), (0.25, 1.0, 1.0)),
+    ((0.0, 0.0, 0.5), (0.5, 1.0, 0.5)),
+)
+
+
+class Parts(NamedTuple):
+    """The convex parts of all slots. G = parts."""
+
+    slot: np.ndarray  # [G] int, slot that the part belongs to
+    centre: np.ndarray  # [G, 3] in units of the slot's half size
+    half: np.ndarray  # [G, 3] likewise
+
+
+def parts(slots: tuple[SlotKind, ...]) -> Parts:
+    """The parts of the slots, slot by slot."""
+    each = [(slot, *part) for slot, kind in enumerate(slots) for part in (_ARCH if kind == "arch" else _WHOLE)]
+    slot, centre, half = zip(*each, strict=True)
+    return Parts(np.array(slot), np.array(centre, np.float32), np.array(half, np.float32))
+
+
+# Faces: outward normals and offsets of a part of nominal size.
 
 
 def _box_faces() -> tuple[np.ndarray, np.ndarray]:
@@ -39,40 +95,61 @@ def _box_faces() -> tuple[np.ndarray, np.ndarray]:
 
 def _prism_faces() -> tuple[np.ndarray, np.ndarray]:
     """Triangular prism: base down, two ends across y, two slopes that meet at the apex."""
-    x, y, z = FIXED_HALF_SIZES["prism"]
+    x, y, z = SHAPES["prism"].half_size
     slope = np.array([2 * z, 0.0, x]) / np.hypot(2 * z, x)
     normals = np.array([[0, 0, -1], [0, 1, 0], [0, -1, 0], slope, slope * [-1, 1, 1]])
     return normals, np.array([z, y, y, slope[2] * z, slope[2] * z])
 
 
+def _half_cylinder_faces() -> tuple[np.ndarray, np.ndarray]:
+    """Six chords of a half circle about y, its flat face down."""
+    radius, y, z = SHAPES["half_cylinder"].half_size
+    angle = (np.arange(6) + 0.5) * np.pi / 6
+    round_ = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
+    normals = np.concatenate([round_, [[0, 0, -1], [0, 1, 0], [0, -1, 0]]])
+    chord = radius * np.cos(np.pi / 12) - z * round_[:, 2]  # the circle's centre lies at -z
+    return normals, np.concatenate([chord, [z, y, y]])
+
+
 def _cylinder_faces() -> tuple[np.ndarray, np.ndarray]:
     """Octagonal prism through a circle about z."""
-    radius, _, z = FIXED_HALF_SIZES["cylinder"]
+    radius, _, z = SHAPES["cylinder"].half_size
     angle = (np.arange(8) + 0.5) * np.pi / 4
     sides = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=1)
     normals = np.concatenate([sides, [[0, 0, 1], [0, 0, -1]]])
     return normals, np.concatenate([np.full(8, radius * np.cos(np.pi / 8)), [z, z]])
 
 
-_FACES = {"box": _box_faces, "prism": _prism_faces, "cylinder": _cylinder_faces}
+_FACES = {
+    "box": _box_faces,
+    "arch": _box_faces,
+    "prism": _prism_faces,
+    "half_cylinder": _half_cylinder_faces,
+    "cylinder": _cylinder_faces,
+}
 
 
 def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Faces of every slot in the block's frame: a point p lies inside where n . p <= offset for all of them.
+    """Faces of every part in its block's frame: a point p lies inside a part where n . p <= offset for all its faces.
 
-    Args: half_size [N, 3] m, which box slots take their offsets from.
-    Returns: normals [N, F, 3], outward unit vectors, 0 where there is no face; offsets [N, F] m.
+    Args: half_size [N, 3] m.
+    Returns: normals [G, F, 3], outward unit vectors, 0 where there is no face; offsets [G, F] m. G as in `parts`.
     """
-    normals = np.zeros((len(slots), MAX_FACES, 3), np.float32)
-    offsets = np.full((len(slots), MAX_FACES), PADDING_OFFSET, np.float32)
-    for slot, kind in enumerate(slots):
-        normal, offset = _FACES[kind]()
-        normals[slot, : len(normal)], offsets[slot, : len(offset)] = normal, offset
-    is_box_face = np.array([kind == "box" for kind in slots])[:, None] & (offsets < PADDING_OFFSET)
-    reach = jnp.sum(jnp.abs(normals) * half_size[:, None], axis=-1)
-    return jnp.asarray(normals), jnp.where(is_box_face, reach, offsets)
+    every = parts(slots)
+    normals = np.zeros((len(every.slot), MAX_FACES, 3), np.float32)
+    nominal = np.full((len(every.slot), MAX_FACES), PADDING_OFFSET, np.float32)
+    for part, slot in enumerate(every.slot):
+        normal, offset = _FACES[slots[slot]]()
+        normals[part, : len(normal)], nominal[part, : len(offset)] = normal, offset
+    present = nominal < PADDING_OFFSET
+    is_mesh = np.array([slots[slot] in MESH_KINDS for slot in every.slot])[:, None]
+    size = half_size[every.slot]  # [G, 3]
+    reach = jnp.sum(np.abs(normals) * (every.half * size)[:, None] + normals * (every.centre * size)[:, None], axis=-1)
+    offsets = jnp.where(is_mesh, nominal * mesh_scale(slots, half_size)[every.slot][:, None], reach)
+    return jnp.asarray(normals), jnp.where(present, offsets, PADDING_OFFSET)
 
 
-def half_size_choices(kind: SlotKind) -> np.ndarray:
-    """Half sizes [choices, 3] m that a slot of this kind may take."""
-    return BOX_HALF_SIZES if kind == "box" else np.array([FIXED_HALF_SIZES[kind]], np.float32)
+def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:
+    """How much larger than nominal every slot's block is [N], by its height; of use for kinds that scale as a whole."""
+    nominal = np.array([half_size_choices(kind)[0][2] for kind in slots], np.float32)
+    return half_size[:, 2] / nominal

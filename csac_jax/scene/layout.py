@@ -1,11 +1,22 @@
 """The state of the blocks of one scene, and where blocks that are not in play wait."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from csac_jax import geometry
+from csac_jax.config import SlotKind
+from csac_jax.scene import blocks
+
+NOMINAL_DENSITY = 600.0  # kg/m^3, wood
+NOMINAL_FRICTION = 0.8
+
+
+ANY = -1
+"""`Scene.target` in the clearing task."""
 
 
 @struct.dataclass
@@ -16,13 +27,35 @@ class Scene:
     quaternion: jax.Array  # [N, 4] float32 (w, x, y, z), body -> world
     velocity: jax.Array  # [N, 6] float32 linear m/s (world), angular rad/s (body)
     half_size: jax.Array  # [N, 3] float32 m, half of the bounding box
+    density: jax.Array  # [N] float32 kg/m^3
+    friction: jax.Array  # [N] float32, sliding friction against table and blocks; the pads' own rules a grasp
     colour: jax.Array  # [N] int32, row of blocks.COLOURS
     in_play: jax.Array  # [N] bool
+    target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
 
 
 def parking(num_slots: int) -> np.ndarray:
     """Parking places [N, 3] m: in the air, so that they make no contact, and far enough apart."""
     return np.stack([3.0 + 0.3 * np.arange(num_slots), np.zeros(num_slots), np.ones(num_slots)], 1).astype(np.float32)
+
+
+def parked(slots: tuple[SlotKind, ...]) -> Scene:
+    """A scene of NumPy arrays with every slot parked: shapes, sizes, densities and frictions nominal."""
+    num = len(slots)
+    quaternion = np.zeros((num, 4), np.float32)
+    quaternion[:, 0] = 1.0
+    leaves: dict[str, Any] = {
+        "position": parking(num),
+        "quaternion": quaternion,
+        "velocity": np.zeros((num, 6), np.float32),
+        "half_size": np.stack([blocks.half_size_choices(kind)[0] for kind in slots]),
+        "density": np.full(num, NOMINAL_DENSITY, np.float32),
+        "friction": np.full(num, NOMINAL_FRICTION, np.float32),
+        "colour": np.arange(num, dtype=np.int32) % len(blocks.COLOURS),
+        "in_play": np.zeros(num, bool),
+        "target": np.int32(ANY),
+    }
+    return Scene(**leaves)
 
 
 def park(scene: Scene, keep: jax.Array) -> Scene:
@@ -44,6 +77,12 @@ def turn(scene: Scene, yaw: jax.Array) -> Scene:
         quaternion=jax.vmap(geometry.quat_multiply, (None, 0))(geometry.quat_from_yaw(yaw), scene.quaternion),
     )
     return park(turned, scene.in_play)
+
+
+def mark(key: jax.Array, scene: Scene) -> Scene:
+    """The scene with one of its blocks in play, each equally likely, as the target; ANY if none is in play."""
+    slot = jax.random.categorical(key, jnp.where(scene.in_play, 0.0, -jnp.inf)).astype(jnp.int32)
+    return scene.replace(target=jnp.where(jnp.any(scene.in_play), slot, ANY))
 
 
 def inside(position: jax.Array, extent: float) -> jax.Array:

@@ -3,32 +3,36 @@
 import copy
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from flax import struct
 
 from csac_jax.config import SceneConfig, SimConfig, SlotKind
 from csac_jax.scene import blocks, layout
+from csac_jax.scene.blocks import Parts
+from csac_jax.scene.layout import Scene
 
 HAND_JOINTS = ("x", "y", "z", "yaw", "finger_low", "finger_high")
-DENSITY = 600.0  # kg/m^3, as in scenes/blocks.xml
+LARGEST = 1.25  # size of compiled blocks relative to nominal: C culls pairs by the bounds it was compiled with
 MAX_OPENING = 0.110  # m, RG2 data sheet
 HAND_PARK_HEIGHT = 1.0  # m, where the hand waits while blocks settle
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class World:
-    """A compiled model and the addresses in it. N = block slots."""
+    """A compiled model and the addresses in it. N = block slots, G = their convex parts."""
 
     model: mujoco.MjModel
     slots: tuple[SlotKind, ...]
+    parts: Parts
     block_bodies: np.ndarray  # [N] body ids
-    block_geoms: np.ndarray  # [N] geom ids
+    block_geoms: np.ndarray  # [G] geom ids
     block_qpos: np.ndarray  # [N, 7] addresses in qpos: position, quaternion
     block_dofs: np.ndarray  # [N, 6] addresses in qvel
+    slot_of_geom: np.ndarray  # [geoms] slot that a geom belongs to, -1 if it is no block's
     hand_qpos: np.ndarray  # [6] addresses in qpos, order of HAND_JOINTS
     hand_dofs: np.ndarray  # [6] addresses in qvel
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
@@ -51,15 +55,13 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_file(str(folder / "table.xml"))
     for name in ("hand", "blocks"):
         part = mujoco.MjSpec.from_file(str(folder / f"{name}.xml"))
+        for mesh in part.meshes:
+            mesh.scale = [LARGEST] * 3
         spec.attach(part, prefix=f"{name}/", frame=spec.worldbody.add_frame())
     for slot, (kind, place) in enumerate(zip(scene.slots, layout.parking(len(scene.slots)), strict=True)):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
-        geom = body.add_geom(spec.find_default("blocks/block"), name=f"block{slot}")
-        if kind == "box":
-            geom.type, geom.size = mujoco.mjtGeom.mjGEOM_BOX, blocks.BOX_HALF_SIZES.max(axis=0)
-        else:
-            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"blocks/{kind}"
+        _add_parts(spec, body, kind)
     spec.option.timestep = sim.timestep
     spec.option.iterations = sim.iterations
     spec.option.ls_iterations = sim.line_search
@@ -68,61 +70,182 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     return spec
 
 
+def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> None:
+    """The geoms of one slot, at the largest size of its kind."""
+    largest = LARGEST * blocks.half_size_choices(kind).max(axis=0)
+    every = blocks.parts((kind,))
+    for centre, half in zip(every.centre, every.half, strict=True):
+        geom = body.add_geom(spec.find_default("blocks/block"))
+        if kind in blocks.MESH_KINDS:
+            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"blocks/{kind}"
+        else:
+            geom.type, geom.size, geom.pos = mujoco.mjtGeom.mjGEOM_BOX, half * largest, centre * largest
+
+
 def build(scene: SceneConfig, sim: SimConfig) -> World:
-    """The world of table, hand and block slots; blocks parked, boxes at the largest box size."""
+    """The world of table, hand and block slots; blocks parked, at the largest size of their kind."""
     model = _spec(scene, sim).compile()
+    _align_inertia(model)
     names = [f"block{slot}" for slot in range(len(scene.slots))]
+    bodies = np.array([model.body(name).id for name in names])
     block_joints = [model.joint(name) for name in names]
     hand_joints = [model.joint(f"hand/{name}") for name in HAND_JOINTS]
+    slot_of_body = np.full(model.nbody, -1)
+    slot_of_body[bodies] = np.arange(len(names))
+    slot_of_geom = slot_of_body[model.geom_bodyid]
     return World(
         model=model,
         slots=scene.slots,
-        block_bodies=np.array([model.body(name).id for name in names]),
-        block_geoms=np.array([model.geom(name).id for name in names]),
+        parts=blocks.parts(scene.slots),
+        block_bodies=bodies,
+        block_geoms=np.flatnonzero(slot_of_geom >= 0),
         block_qpos=np.array([joint.qposadr[0] + np.arange(7) for joint in block_joints]),
         block_dofs=np.array([joint.dofadr[0] + np.arange(6) for joint in block_joints]),
+        slot_of_geom=slot_of_geom,
         hand_qpos=np.array([joint.qposadr[0] for joint in hand_joints]),
         hand_dofs=np.array([joint.dofadr[0] for joint in hand_joints]),
         hand_geoms=np.array([model.geom(f"hand/{name}").id for name in ("palm", "pad_low", "pad_high")]),
     )
 
 
-class BoxFields(NamedTuple):
-    """Model fields of the box slots of one scene. M = box slots."""
-
-    size: jax.Array  # [M, 3] m, half sizes
-    rbound: jax.Array  # [M] m, radius of the bounding sphere
-    mass: jax.Array  # [M] kg
-    inertia: jax.Array  # [M, 3] kg m^2, about the centre
-    invweight: jax.Array  # [M, 2] 1/kg, 1/(kg m^2)
-
-
-def box_slots(world: World) -> np.ndarray:
-    """Indices [M] of the slots whose size differs per scene."""
-    return np.flatnonzero([kind == "box" for kind in world.slots])
+def _align_inertia(model: mujoco.MjModel) -> None:
+    """Turns inertial frames that are body frames with their axes swapped (the compiler sorts by size) back."""
+    for body in range(model.nbody):
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+        if np.allclose(np.abs(turn).max(axis=0), 1.0):
+            model.body_inertia[body] = np.abs(turn.reshape(3, 3).round()) @ model.body_inertia[body]
+            model.body_iquat[body] = [1.0, 0.0, 0.0, 0.0]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def box_fields(half: jax.Array) -> BoxFields:
-    """Fields that follow from the half sizes [M, 3] m: closed forms of what MuJoCo's compiler derives.
+@struct.dataclass
+class BlockFields:
+    """Model fields that differ per scene. N = slots, G = parts, M = meshes."""
 
-    m = 8 rho a b c, I_x = m (b^2 + c^2) / 3; for a free body invweight is 1 / m and mean(1 / I).
+    size: jax.Array  # [G, 3] m, half sizes of boxes; of meshes as MuJoCo keeps them
+    centre: jax.Array  # [G, 3] m, geom in body frame
+    rbound: jax.Array  # [G] m, radius of the bounding sphere
+    friction: jax.Array  # [G] sliding friction
+    mass: jax.Array  # [N] kg
+    inertia: jax.Array  # [N, 3] kg m^2, about the centre of mass
+    com: jax.Array  # [N, 3] m, centre of mass in body frame
+    body_invweight: jax.Array  # [N, 2] 1/kg, 1/(kg m^2)
+    dof_invweight: jax.Array  # [N, 6] the same for the six dofs
+    mesh_scale: jax.Array  # [M] relative to the compiled mesh
+
+
+def block_fields(world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array) -> BlockFields:
+    """Fields that follow from half sizes [N, 3] m, densities [N] kg/m^3 and sliding frictions [N].
+
+    Closed forms of what MuJoCo's compiler derives. Boxes: m = 8 rho a b c, I_x = m (b^2 + c^2) / 3, parts about their
+    common centre of mass by the parallel axis theorem. Meshes by their scale s: m ~ rho s^3, I ~ rho s^5. Blocks of one
+    mesh kind in a scene share their size.
     """
-    square = half**2
-    mass = 8.0 * DENSITY * jnp.prod(half, axis=1)
-    inertia = mass[:, None] * (jnp.sum(square, axis=1, keepdims=True) - square) / 3.0
-    invweight = jnp.stack([1.0 / mass, jnp.mean(1.0 / inertia, axis=1)], axis=1)
-    return BoxFields(half, jnp.sqrt(jnp.sum(square, axis=1)), mass, inertia, invweight)
+    boxes, meshes = _box_fields(world, half_size, density, friction), _mesh_fields(world, half_size, density, friction)
+    is_mesh = np.array([kind in blocks.MESH_KINDS for kind in world.slots])
+
+    def choose(mesh: jax.Array, box: jax.Array, which: np.ndarray) -> jax.Array:
+        return jnp.where(which.reshape(-1, *[1] * (box.ndim - 1)), mesh, box)
+
+    per_part = ("size", "centre", "rbound", "friction")
+    chosen = {
+        field.name: choose(
+            getattr(meshes, field.name),
+            getattr(boxes, field.name),
+            is_mesh[world.parts.slot] if field.name in per_part else is_mesh,
+        )
+        for field in dataclasses.fields(BlockFields)
+        if field.name != "mesh_scale"
+    }
+    return BlockFields(**chosen, mesh_scale=meshes.mesh_scale)
 
 
-def with_boxes(world: World, fields: BoxFields) -> mujoco.MjModel:
-    """A copy of the world's model whose box slots have these fields (NumPy arrays).
+def _box_fields(world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array) -> BlockFields:
+    """As if every slot were made of boxes."""
+    slot, num = world.parts.slot, len(world.slots)
+    half = jnp.asarray(world.parts.half) * half_size[slot]
+    centre = jnp.asarray(world.parts.centre) * half_size[slot]
+    part_mass = 8.0 * density[slot] * jnp.prod(half, axis=1)
+
+    def add(values: jax.Array) -> jax.Array:
+        return jnp.zeros((num, *values.shape[1:])).at[slot].add(values)
+
+    mass = add(part_mass)
+    com = add(part_mass[:, None] * centre) / mass[:, None]
+    square = half**2 / 3.0 + (centre - com[slot]) ** 2  # [G, 3], second moment of a part along each axis, per mass
+    inertia = add(part_mass[:, None] * (jnp.sum(square, axis=1, keepdims=True) - square))
+    turning = jnp.mean(1.0 / inertia, axis=1)
+    # A free joint sits at the body's origin: pushing there also turns the block, about axes square to its lever.
+    lever = jnp.sum(com**2, axis=1, keepdims=True) - com**2
+    moving = 1.0 / mass + jnp.sum(lever / inertia, axis=1) / 3.0
+    return BlockFields(
+        size=half,
+        centre=centre,
+        rbound=jnp.sqrt(jnp.sum(half**2, axis=1)),
+        friction=friction[slot],
+        mass=mass,
+        inertia=inertia,
+        com=com,
+        body_invweight=jnp.stack([1.0 / mass, turning], axis=1),
+        dof_invweight=jnp.repeat(jnp.stack([moving, turning], axis=1), 3, axis=1),
+        mesh_scale=jnp.zeros(0),
+    )
+
+
+def _mesh_fields(world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array) -> BlockFields:
+    """As if every slot held a mesh: the compiled fields, scaled."""
+    model, slot = world.model, world.parts.slot
+    scale = blocks.mesh_scale(world.slots, half_size) / LARGEST  # [N]
+    heavier = density / layout.NOMINAL_DENSITY  # that of scenes/blocks.xml
+    of_part, of_slot = scale[slot][:, None], scale[:, None]
+    by_mass, by_inertia = heavier[:, None] * of_slot**3, heavier[:, None] * of_slot**5
+    powers = jnp.concatenate([jnp.repeat(1.0 / by_mass, 3, axis=1), jnp.repeat(1.0 / by_inertia, 3, axis=1)], axis=1)
+
+    def base(field: np.ndarray) -> jax.Array:
+        return jnp.asarray(field, jnp.float32)
+
+    return BlockFields(
+        size=base(model.geom_size[world.block_geoms]) * of_part,
+        centre=base(model.geom_pos[world.block_geoms]) * of_part,
+        rbound=base(model.geom_rbound[world.block_geoms]) * of_part[:, 0],
+        friction=friction[slot],
+        mass=base(model.body_mass[world.block_bodies]) * by_mass[:, 0],
+        inertia=base(model.body_inertia[world.block_bodies]) * by_inertia,
+        com=base(model.body_ipos[world.block_bodies]) * of_slot,
+        body_invweight=base(model.body_invweight0[world.block_bodies]) * powers[:, [0, 3]],
+        dof_invweight=base(model.dof_invweight0[world.block_dofs]) * powers,
+        mesh_scale=_scale_of_meshes(world, scale),
+    )
+
+
+def _scale_of_meshes(world: World, scale: jax.Array) -> jax.Array:
+    """Scale of every mesh of the model [M]: that of the first slot that uses it, 1 where none does."""
+    users = [
+        np.flatnonzero(world.model.geom_dataid[world.block_geoms] == mesh)[:1] for mesh in range(world.model.nmesh)
+    ]
+    one = jnp.ones(())
+    return jnp.stack([scale[world.parts.slot[user[0]]] if user.size else one for user in users] or [one])
+
+
+def with_blocks(world: World, fields: BlockFields) -> mujoco.MjModel:
+    """A copy of the world's model whose blocks have these fields (NumPy arrays).
 
     MuJoCo derives the rest: C takes the mass matrix of a free body from `dof_M0`, not from its mass.
     """
     model = copy.copy(world.model)
-    slots = box_slots(world)
-    geoms, bodies = world.block_geoms[slots], world.block_bodies[slots]
-    model.geom_size[geoms], model.geom_rbound[geoms] = fields.size, fields.rbound
-    model.body_mass[bodies], model.body_inertia[bodies] = fields.mass, fields.inertia
+    model.geom_size[world.block_geoms], model.geom_rbound[world.block_geoms] = fields.size, fields.rbound
+    model.geom_pos[world.block_geoms] = fields.centre
+    model.geom_friction[world.block_geoms, 0] = fields.friction
+    model.body_mass[world.block_bodies], model.body_inertia[world.block_bodies] = fields.mass, fields.inertia
+    model.body_ipos[world.block_bodies] = fields.com
+    for mesh, scale in zip(range(model.nmesh), fields.mesh_scale, strict=False):
+        start = model.mesh_vertadr[mesh]
+        model.mesh_vert[start : start + model.mesh_vertnum[mesh]] *= scale
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def scene_fields(world: World, scene: Scene) -> BlockFields:
+    """The fields of one scene."""
+    return block_fields(world, *(jnp.asarray(leaf) for leaf in (scene.half_size, scene.density, scene.friction)))

@@ -5,6 +5,7 @@ Settling runs in C MuJoCo on all cores, bit-identical for any number of threads,
 
 import concurrent.futures
 import dataclasses
+import functools
 import hashlib
 import os
 import tempfile
@@ -12,24 +13,25 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from csac_jax.config import SceneConfig
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import HAND_PARK_HEIGHT, BoxFields, World, assets, box_fields, box_slots, with_boxes
+from csac_jax.scene.model import HAND_PARK_HEIGHT, BlockFields, World, assets, scene_fields, with_blocks
 
 TRAIN_STREAM = 0  # stream of random numbers of the training pool; evaluation takes 1 + its seed
-_VERSION = 2  # raise when the meaning of a cached pool changes
+_VERSION = 3  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
-_STILL = 0.02  # m/s: slower counts as at rest
+_STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round
 
 
 def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: int) -> Scene:
-    """`count` distinct settled scenes, leaves [count, N, ...], from the cache or settled now.
+    """`count` distinct settled scenes per number of blocks, leaves [P, N, ...], from the cache or settled now.
+
+    P = count for each number from `min_blocks` to N, fewest first.
 
     Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
     by any yaw. The same arguments give the same scenes on every machine of one kind.
@@ -38,21 +40,25 @@ def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: i
     cached = _read(path)
     if cached is not None:
         return cached
-    scenes = _settle(world, cfg, extent, np.random.default_rng([stream, 20221]), count)
+    rng = np.random.default_rng([stream, 20221])
+    numbers = range(cfg.min_blocks, len(cfg.slots) + 1)
+    each = [_settle(world, cfg, extent, rng, in_play, count) for in_play in numbers]
+    scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each)
     _write(path, scenes)
     return scenes
 
 
-def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Generator, count: int) -> Scene:
+def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Generator, in_play: int, count: int) -> Scene:
+    """`count` settled scenes of `in_play` blocks."""
+    fields_of = jax.vmap(functools.partial(scene_fields, world))
     found: list[Scene] = []
     kept = dropped = 0
     with concurrent.futures.ThreadPoolExecutor() as threads:
         while kept < count:
-            drops = [_drop(cfg, rng) for _ in range(_ROUND)]
-            fields: Any = jax.vmap(box_fields)(jnp.stack([scene.half_size[box_slots(world)] for scene in drops]))
-            fields = jax.tree.map(np.asarray, fields)
-            rows = [BoxFields(*(leaf[i] for leaf in fields)) for i in range(_ROUND)]
-            ended = threads.map(lambda scene, row: _rest(world, cfg, extent, scene, row), drops, rows)
+            drops = [_drop(cfg, rng, in_play) for _ in range(_ROUND)]
+            fields = jax.device_get(fields_of(jax.tree.map(lambda *leaves: np.stack(leaves), *drops)))
+            rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(_ROUND)]
+            ended = threads.map(lambda scene, row: rest(world, cfg, extent, scene, row), drops, rows)
             good = [scene for scene in ended if scene is not None]
             found, kept, dropped = found + good, kept + len(good), dropped + _ROUND
             if dropped >= 20 * _ROUND and kept < dropped / 50:
@@ -63,12 +69,11 @@ def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Genera
     return jax.tree.map(lambda *leaves: np.stack(leaves), *found[:count])
 
 
-def _drop(cfg: SceneConfig, rng: np.random.Generator) -> Scene:
-    """A random scene before its blocks fall: dropped as in VPG, one above the other."""
+def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
+    """A random scene of `count` blocks before they fall: dropped as in VPG, one above the other."""
     num = len(cfg.slots)
-    in_play = rng.permutation(num) < rng.integers(cfg.min_blocks, num + 1)
+    in_play = rng.permutation(num) < count
     quaternion = rng.normal(size=(num, 4))
-    choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
     position = np.concatenate(
         [
             rng.uniform(-0.5 * cfg.drop_extent, 0.5 * cfg.drop_extent, (num, 2)),
@@ -80,16 +85,28 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator) -> Scene:
         "position": np.where(in_play[:, None], position, layout.parking(num)).astype(np.float32),
         "quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).astype(np.float32),
         "velocity": np.zeros((num, 6), np.float32),
-        "half_size": np.stack([kind[rng.integers(len(kind))] for kind in choices]),
+        "half_size": _half_sizes(cfg, rng),
+        "density": rng.uniform(*cfg.density, num).astype(np.float32),
+        "friction": rng.uniform(*cfg.friction, num).astype(np.float32),
         "colour": rng.permutation(max(num, len(blocks.COLOURS)))[:num].astype(np.int32) % len(blocks.COLOURS),
         "in_play": in_play,
+        "target": np.int32(layout.ANY),
     }
     return Scene(**leaves)
 
 
-def _rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BoxFields) -> Scene | None:
+def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
+    """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; mesh blocks of one kind alike."""
+    choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
+    scales = rng.uniform(1.0 - cfg.size_spread, 1.0 + cfg.size_spread, len(cfg.slots))
+    shared = [cfg.slots.index(kind) if kind in blocks.MESH_KINDS else slot for slot, kind in enumerate(cfg.slots)]
+    sizes = np.stack([kind[rng.integers(len(kind))] for kind in choices])
+    return (sizes * scales[shared][:, None]).astype(np.float32)
+
+
+def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
     """The scene after its blocks fell, None where a block is not at rest or left the workspace."""
-    model = with_boxes(world, fields)
+    model = with_blocks(world, fields)
     model.opt.iterations, model.opt.ls_iterations = 20, 20  # quality over speed: this runs once
     data = mujoco.MjData(model)
     data.qpos[world.hand_qpos] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0, 0.0]

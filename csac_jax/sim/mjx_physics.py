@@ -1,56 +1,64 @@
-"""One primitive of one scene in MJX: a fixed-length scan of physics steps."""
+"""Primitives in MJX: a fixed-length scan of physics steps per scene; callers vmap."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from mujoco import mjx
 
-from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.config import SimConfig
 from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import World, box_fields, box_slots
-from csac_jax.sim import primitives
+from csac_jax.scene.model import World, scene_fields
+from csac_jax.sim import outcome
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import Action
-
-MAX_SPEED = 20.0  # m/s and rad/s / 10; a faster block has left physics behind
-MAX_HEIGHT = 1.0  # m, likewise
+from csac_jax.sim.primitives import Plan
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Physics:
+class MjxPhysics:
     """A world on the device: closed over by the compiled step."""
 
     world: World
+    cfg: SimConfig
     model: mjx.Model
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
 
+    def run(self, scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
+        """See `physics.Physics`."""
+        return _run(self, scene, plan)
 
-def make(world: World) -> Physics:
+
+def make(world: World, cfg: SimConfig) -> MjxPhysics:
     """Physics of a world, MJX with its JAX implementation."""
-    return Physics(world, mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax"))
+    return MjxPhysics(world, cfg, mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax"))
 
 
-def _scene_model(physics: Physics, scene: Scene) -> mjx.Model:
-    """The model with this scene's box sizes, masses and inertias."""
+def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
+    """The model with this scene's block sizes, masses and frictions."""
     world, model = physics.world, physics.model
-    slots = box_slots(world)
-    if slots.size == 0:
-        return model
-    fields = box_fields(scene.half_size[slots])
-    geoms, bodies, dofs = world.block_geoms[slots], world.block_bodies[slots], world.block_dofs[slots]
+    fields = scene_fields(world, scene)
+    geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
+    meshes = [  # None for a mesh that no slot uses
+        mesh and mesh.replace(vert=mesh.vert * fields.mesh_scale[number])
+        for number, mesh in enumerate(model._impl.mesh_convex)
+    ]
     return model.replace(
         geom_size=model.geom_size.at[geoms].set(fields.size),
+        geom_pos=model.geom_pos.at[geoms].set(fields.centre),
         geom_rbound=model.geom_rbound.at[geoms].set(fields.rbound),
+        geom_friction=model.geom_friction.at[geoms, 0].set(fields.friction),
         body_mass=model.body_mass.at[bodies].set(fields.mass),
         body_inertia=model.body_inertia.at[bodies].set(fields.inertia),
-        body_invweight0=model.body_invweight0.at[bodies].set(fields.invweight),
-        dof_invweight0=model.dof_invweight0.at[dofs].set(jnp.repeat(fields.invweight, 3, axis=1)),
+        body_ipos=model.body_ipos.at[bodies].set(fields.com),
+        body_invweight0=model.body_invweight0.at[bodies].set(fields.body_invweight),
+        dof_invweight0=model.dof_invweight0.at[dofs].set(fields.dof_invweight),
+        _impl=model._impl.replace(mesh_convex=tuple(meshes)),
     )
 
 
-def _initial_data(physics: Physics, scene: Scene, start: jax.Array) -> mjx.Data:
+def _initial_data(physics: MjxPhysics, scene: Scene, start: jax.Array) -> mjx.Data:
     """Data with the scene's blocks and the hand at `start` [5], at rest."""
     world = physics.world
     poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
@@ -74,21 +82,16 @@ def _pad_contacts(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
     active = contact.dist < 0.0  # [C]
     pair = contact.geom  # [C, 2]
     is_hand = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1) & active[None]  # [3, C]
-    is_block = jnp.any(pair[None] == world.block_geoms[:, None, None], axis=-1)  # [N, C]
+    slots = jnp.asarray(world.slot_of_geom)[pair]  # [C, 2]
+    is_block = jnp.any(slots[None] == np.arange(len(world.slots))[:, None, None], axis=-1)  # [N, C]
     return jnp.any(is_hand[:, None] & is_block[None], axis=-1), jnp.all(active)
 
 
-def execute(
-    physics: Physics, cfg: SimConfig, heightmap: HeightmapConfig, scene: Scene, height: jax.Array, action: Action
-) -> tuple[Scene, Trace, primitives.Plan]:
-    """Runs one primitive; blocks that end up in the hand are still in play, hanging where the hand is.
-
-    Args: height [H, W] m, the map the action was chosen from.
-    """
-    world = physics.world
+def _run(physics: MjxPhysics, scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
+    """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the hand is."""
+    world, cfg = physics.world, physics.cfg
     model = _scene_model(physics, scene)
-    motion = primitives.plan(cfg, heightmap, height, action)
-    initial = _initial_data(physics, scene, motion.start)
+    initial = _initial_data(physics, scene, plan.start)
     z_address = world.block_qpos[:, 2]
     finger = world.hand_qpos[4]
     close_end = sum(cfg.grasp_phases[:2])
@@ -112,28 +115,9 @@ def execute(
         )
         return (data, trace), None
 
-    zeros = jnp.zeros_like(scene.position[:, 2])
-    blank = Trace(
-        touched=jnp.zeros((), bool),
-        held_rise=zeros,
-        held=jnp.zeros_like(scene.in_play),
-        rise=zeros,
-        gap_closed=jnp.zeros(()),
-        gap_end=jnp.zeros(()),
-        saturated=jnp.zeros((), jnp.int32),
+    (data, trace), _ = jax.lax.scan(
+        substep, (initial, outcome.blank(len(world.slots))), (jnp.arange(cfg.substeps), plan.control)
     )
-    (data, trace), _ = jax.lax.scan(substep, (initial, blank), (jnp.arange(cfg.substeps), motion.control))
     pose = data.qpos[world.block_qpos]
     moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=data.qvel[world.block_dofs])
-    return layout.park(moved, scene.in_play), trace, motion
-
-
-def healthy(scene: Scene) -> jax.Array:
-    """True where every block is finite, slow enough and near the table, [] bool. Bounds, since a lane may explode and
-    stay finite."""
-    speed = jnp.abs(scene.velocity) * jnp.array([1, 1, 1, 0.1, 0.1, 0.1])
-    finite = jnp.all(jnp.isfinite(scene.position)) & jnp.all(jnp.isfinite(scene.quaternion))
-    bounded = jnp.all(speed < MAX_SPEED) & jnp.all(
-        jnp.where(scene.in_play[:, None], jnp.abs(scene.position), 0) < MAX_HEIGHT
-    )
-    return finite & bounded
+    return layout.park(moved, scene.in_play), trace

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.config import HeightmapConfig, SimConfig, SlotKind
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
 from csac_jax.scene import blocks
 from csac_jax.scene.layout import Scene
@@ -13,7 +13,7 @@ from csac_jax.sim.primitives import Action, Primitive, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric
 FINGER_HALF = (0.008, 0.012)  # m, half footprint of a finger tip across and along its pad, with a little room
-ALIGNED = 0.05  # 1 - cosine between a face and the pad that is as good as parallel
+ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
 
 def _support(normals: jax.Array, offsets: jax.Array, axis: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -26,12 +26,15 @@ def _support(normals: jax.Array, offsets: jax.Array, axis: jax.Array) -> tuple[j
     return jnp.minimum(cosine[high], -cosine[low]), offsets[high] + offsets[low]
 
 
-def grasp(cfg: SimConfig, heightmap: HeightmapConfig, slots: tuple, scene: Scene, height: jax.Array) -> Action:
+def grasp(
+    cfg: SimConfig, heightmap: HeightmapConfig, slots: tuple[SlotKind, ...], scene: Scene, height: jax.Array
+) -> Action:
     """The grasp of the block and yaw with room for both fingers, faces square to the pads, high and narrow.
 
     Args: slots, kinds of the block slots; height [H, W] m.
     """
-    normals, offsets = blocks.half_spaces(slots, scene.half_size)
+    hulls: tuple[SlotKind, ...] = tuple("box" if kind == "arch" else kind for kind in slots)
+    normals, offsets = blocks.half_spaces(hulls, scene.half_size)
     world_normals = jnp.einsum("nij,nfj->nfi", jax.vmap(quat_to_matrix)(scene.quaternion), normals)
     yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
     cells = cell_centres(heightmap)

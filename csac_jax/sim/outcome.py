@@ -35,6 +35,12 @@ class Trace:
     saturated: jax.Array  # [] int32, substeps in which every contact slot was in use
 
 
+def blank(num: int) -> Trace:
+    """The trace of a primitive over `num` block slots before its first substep."""
+    no, zero, zeros = jnp.zeros((), bool), jnp.zeros(()), jnp.zeros(num)
+    return Trace(no, zeros, jnp.zeros(num, bool), zeros, zero, zero, jnp.zeros((), jnp.int32))
+
+
 def lifted_blocks(trace: Trace, hand_rise: jax.Array) -> jax.Array:
     """True for blocks [N] that hang in the hand after it rose by `hand_rise` [] m."""
     return trace.held & (trace.rise >= LIFT_SHARE * hand_rise)

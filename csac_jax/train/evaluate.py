@@ -10,7 +10,6 @@ from csac_jax.agent import learner as learning, maps, policy
 from csac_jax.agent.learner import Params
 from csac_jax.config import Config
 from csac_jax.env import Env, State
-from csac_jax.scene import layout
 from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
 from csac_jax.train.metrics import Episodes
@@ -22,7 +21,7 @@ Policy = Callable[[jax.Array, Params, State], Action]  # key [], params, leaves 
 
 
 def rollout(cfg: Config, env: Env, name: str, params: Params | None, episodes: int, seed: int) -> Episodes:
-    """Runs `episodes` episodes of a policy, one from each scene of the environment's pool.
+    """Runs `episodes` episodes of a policy, each from another scene of the environment's pool, spread evenly over it.
 
     Args: name, one of POLICIES; params, the networks that `learned` needs; seed of the policy's and the scenes' turns.
     Episodes end as in training: table cleared, action cap, no-change cap.
@@ -32,7 +31,7 @@ def rollout(cfg: Config, env: Env, name: str, params: Params | None, episodes: i
     key = jax.random.key(seed)
     parts = []
     for first in range(0, episodes, SIDE_BY_SIDE):
-        rows = np.arange(first, min(first + SIDE_BY_SIDE, episodes))
+        rows = np.arange(first, min(first + SIDE_BY_SIDE, episodes)) * env.scenes.position.shape[0] // episodes
         parts.append(_run(cfg, env, step, params, jax.random.fold_in(key, first), rows))
     return Episodes(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
 
@@ -40,15 +39,16 @@ def rollout(cfg: Config, env: Env, name: str, params: Params | None, episodes: i
 def _run(cfg: Config, env: Env, step: Callable, params: Params | None, key: jax.Array, rows: np.ndarray) -> Episodes:
     """The episodes that begin with the scenes `rows` of the pool."""
     states = jax.jit(lambda key: _begin(env, key, rows))(jax.random.fold_in(key, 0))
-    blocks = np.asarray(states.scene.in_play.sum(axis=1))
+    one = cfg.task.kind == "target"
+    blocks = np.ones(len(rows), np.int32) if one else np.asarray(states.scene.in_play.sum(axis=1))
     records = []
-    for number in range(1, cfg.train.max_actions + 1):
+    for number in range(1, cfg.task.max_actions + 1):
         states, record = step(jax.random.fold_in(key, number), params, states)
         records.append(jax.device_get(record))
         if np.all(states.done):
             break
     valid, primitive, outcome, cleared, left = (np.stack(leaves, axis=1) for leaves in zip(*records, strict=True))
-    pad = ((0, 0), (0, cfg.train.max_actions - valid.shape[1]))
+    pad = ((0, 0), (0, cfg.task.max_actions - valid.shape[1]))
     return Episodes(
         valid=np.pad(valid, pad),
         primitive=np.pad(primitive, pad),
@@ -62,8 +62,8 @@ def _run(cfg: Config, env: Env, step: Callable, params: Params | None, key: jax.
 
 def _begin(env: Env, key: jax.Array, rows: np.ndarray) -> State:
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), env.scenes)
-    yaws = jax.random.uniform(key, rows.shape, maxval=2.0 * np.pi)
-    return jax.vmap(env.begin)(jax.vmap(layout.turn)(scenes, yaws))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.asarray(rows))
+    return jax.vmap(env.begin)(jax.vmap(env.vary)(keys, scenes))
 
 
 def _step(env: Env, act: Policy, key: jax.Array, params: Params, states: State):
@@ -71,13 +71,14 @@ def _step(env: Env, act: Policy, key: jax.Array, params: Params, states: State):
     going = ~states.done
     action = act(key, params, states)
     after = jax.vmap(env.step)(states, action)
-    info = after.info
+    info, one = after.info, env.cfg.task.kind == "target"
+    lost = (after.terminated & (after.reward == 0.0)).astype(jnp.int32)
     record = (
         going,
         action.primitive,
         info.outcome,
-        jnp.where(going, info.cleared, 0),
-        jnp.where(going, info.left, 0),
+        jnp.where(going, after.reward.astype(jnp.int32) if one else info.cleared, 0),
+        jnp.where(going, lost if one else info.left, 0),
     )
     keep = jax.vmap(jnp.where)
     return jax.tree.map(lambda new, old: keep(going, new, old), after, states), record

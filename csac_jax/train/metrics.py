@@ -1,7 +1,8 @@
 """What an evaluation reports, from arrays of episodes; NumPy only.
 
 Every metric is `{"value", "low", "high", "n"}`: the value, its 95 % interval and the number of cases it is taken over.
-Where there are none, `n` is 0 and the others are None.
+Where there are none, `n` is 0 and the others are None. In the target task only the target counts as a
+block, and a grasp that brings another one counts as `touched`.
 
 `grasp_success`                lifted / grasps. Wilson interval over grasps.
 `completion`                   episodes in which the hand took every block from the table within the caps / episodes.

@@ -107,7 +107,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     errors = jnp.where(ready, errors, replay.error)
 
     # Replace finished scenes.
-    fresh = jax.vmap(env.reset)(_keys(key_reset, cfg.train.scenes))
+    fresh = jax.vmap(env.restart)(_keys(key_reset, cfg.train.scenes), after)
     scenes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
     pushed = action.primitive == Primitive.PUSH

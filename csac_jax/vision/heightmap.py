@@ -39,22 +39,21 @@ def orthographic(
     cfg: HeightmapConfig,
     polytopes: raycast.Polytopes,
     table_colour: jax.Array,
-    target_geom: jax.Array | None = None,
+    wanted: jax.Array,
 ) -> Observation:
     """Top view of one scene: one ray straight down from VIEW_HEIGHT through every cell centre.
 
     The direction has no ray axis under vmap, so what a plane costs per ray is one scalar product.
 
-    Args: table_colour [3] in 0 .. 1; target_geom [] int32, the geom to get, -1 or None for any.
+    Args: table_colour [3] in 0 .. 1; wanted [G] bool, geoms of the block to get; all of them if any block will do.
     """
     origin = jnp.concatenate(
         [geometry.cell_centres(cfg), jnp.full((cfg.size, cfg.size, 1), VIEW_HEIGHT, jnp.float32)], axis=-1
     )
     down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
     hit = jax.vmap(raycast.cast, in_axes=(None, 0, None))(polytopes, origin.reshape(-1, 3), down)
-    if target_geom is None:
-        target_geom = jnp.array(-1, jnp.int32)
-    target = (target_geom < 0) | (hit.geom == target_geom)
+    wanted = jnp.concatenate([jnp.all(wanted, keepdims=True), wanted])  # row 0 is geom TABLE = -1
+    target = wanted.at[hit.geom - raycast.TABLE].get(mode="promise_in_bounds")
     return Observation(
         colour=_shade(polytopes.colour, table_colour, hit).reshape(cfg.size, cfg.size, 3),
         height=jnp.maximum(VIEW_HEIGHT - hit.distance, 0.0).reshape(cfg.size, cfg.size),

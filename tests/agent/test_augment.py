@@ -13,7 +13,7 @@ from csac_jax import geometry, presets
 from csac_jax.agent import augment, maps
 from csac_jax.agent.learner import Transition
 from csac_jax.env import Env
-from csac_jax.scene.blocks import BOX_HALF_SIZES, FIXED_HALF_SIZES
+from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.vision import heightmap, rotate
@@ -37,14 +37,14 @@ def _turn(flags, transition: Transition) -> Transition:
 
 
 def _scene(rotation: Rotation, position: np.ndarray) -> Scene:
-    slots = len(CFG.scene.slots)
-    return Scene(
+    scene = layout.parked(CFG.scene.slots)
+    half_size = np.stack([blocks.SHAPES[name].half_size for name in ("cuboid", "plank", "prism")])
+    return jax.tree.map(jnp.asarray, scene).replace(
         position=jnp.asarray(position, jnp.float32),
         quaternion=jnp.asarray(rotation.as_quat(scalar_first=True), jnp.float32),
-        velocity=jnp.zeros((slots, 6)),
-        half_size=jnp.asarray(np.stack([BOX_HALF_SIZES[1], BOX_HALF_SIZES[2], np.float32(FIXED_HALF_SIZES["prism"])])),
+        half_size=jnp.asarray(half_size, jnp.float32),
         colour=jnp.array([1, 4, 7], jnp.int32),
-        in_play=jnp.ones(slots, bool),
+        in_play=jnp.ones(len(CFG.scene.slots), bool),
     )
 
 

@@ -63,7 +63,7 @@ def _play(toy: Toy, learner: Learner, key: jax.Array, params: Params):
         return jax.tree.map(lambda old, new: jax.vmap(jnp.where)(state.done, old, new), state, after), action.primitive
 
     first = jax.vmap(lambda i: toy.reset(jax.random.fold_in(key, i)))(1000 + jnp.arange(EPISODES))
-    last, primitives = jax.lax.scan(act, first, jnp.arange(cfg.train.max_actions))
+    last, primitives = jax.lax.scan(act, first, jnp.arange(cfg.task.max_actions))
     return learning.look(learner, params, first.obs), last, primitives
 
 

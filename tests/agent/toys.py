@@ -20,6 +20,7 @@ from csac_jax.config import (
     NetConfig,
     ReplayConfig,
     TargetConfig,
+    TaskConfig,
     TrainConfig,
 )
 from csac_jax.env import CHANGE_AREA, Info, State
@@ -73,6 +74,10 @@ class Toy:
             target=jnp.ones((size, size), bool),
         )
 
+    def restart(self, key: jax.Array, state: State) -> State:
+        """A new problem, whatever came of the last one."""
+        return self.reset(key)
+
     def step(self, state: State, action: Action) -> State:
         """What the action does to the block at its place; nothing where there is none."""
         extent = self.cfg.heightmap.extent
@@ -91,7 +96,7 @@ class Toy:
             scene=layout,
             obs=self.look(layout),
             terminated=lifted,
-            truncated=(actions >= self.cfg.train.max_actions) & ~lifted,
+            truncated=(actions >= self.cfg.task.max_actions) & ~lifted,
             actions=actions,
             idle=idle,
             info=state.info.replace(
@@ -122,7 +127,8 @@ def config(algo: str, actions: int, max_actions: int, push: float | None = None)
         explore=ExploreConfig(push_fraction=0.5, place_end=0.1),
         learn=LearnConfig(learning_rate=5e-3, batch=32, updates=2, tau=0.1),
         replay=ReplayConfig(capacity=1024),
-        train=TrainConfig(scenes=8, actions=actions, warmup=64, max_actions=max_actions),
+        task=TaskConfig(max_actions=max_actions),
+        train=TrainConfig(scenes=8, actions=actions, warmup=64),
     )
     cfg = algorithms.configure(small, algo)
     if push is None:

@@ -10,6 +10,7 @@ from csac_jax.nets import dense
 
 CFG = NetConfig(growth=8, dilations=(1, 2), stem=16, head=8)
 EPSILON = 1e-6  # of Flax's group norm
+CHANNELS = 4
 GROUP = 8  # channels per group
 
 
@@ -17,7 +18,7 @@ GROUP = 8  # channels per group
 def params() -> dict:
     """Parameters that are all random: scales and biases too, which start at 1 and 0."""
     rng = np.random.default_rng(1)
-    fresh = dense.Critic(CFG).init(jax.random.key(0), jnp.zeros((1, 16, 16, dense.CHANNELS)))
+    fresh = dense.Critic(CFG).init(jax.random.key(0), jnp.zeros((1, 16, 16, CHANNELS)))
     return jax.tree.map(lambda leaf: leaf + jnp.asarray(rng.normal(scale=0.2, size=leaf.shape), leaf.dtype), fresh)
 
 
@@ -60,7 +61,7 @@ def _numpy_net(params: dict, maps: np.ndarray) -> np.ndarray:
 
 def test_net_is_numpys(params):
     """Claim: densely connected, group norm over the whole map, half the resolution, three maps."""
-    maps = np.random.default_rng(0).normal(size=(2, 16, 24, dense.CHANNELS))
+    maps = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS))
     got = _apply(params, maps)
     assert got.shape == (2, 8, 12, dense.OUTPUTS)
     np.testing.assert_allclose(got, _numpy_net(params, maps), rtol=1e-3, atol=1e-4)
@@ -72,8 +73,8 @@ def test_maps_follow_the_picture(params):
     Group norm looks at the whole map: this holds since bare table is 0 and moving the picture changes no mean. The
     nearest 8 cells to the edges see them and are left out.
     """
-    picture = np.random.default_rng(2).normal(size=(12, 12, dense.CHANNELS))
-    here, there = np.zeros((2, 1, 80, 80, dense.CHANNELS))
+    picture = np.random.default_rng(2).normal(size=(12, 12, CHANNELS))
+    here, there = np.zeros((2, 1, 80, 80, CHANNELS))
     here[0, 28:40, 30:42], there[0, 36:48, 34:46] = picture, picture
     before, after = _apply(params, here)[0], _apply(params, there)[0]
     inner = slice(8, -8)
@@ -84,7 +85,7 @@ def test_maps_follow_the_picture(params):
 def test_bare_table_is_zero():
     """Claim: where nothing lies the net is fed 0, whatever the table's colour; a block's height comes out near 1."""
     height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
-    fed = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height))
+    fed = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, None))
     np.testing.assert_array_equal(fed[0, 0], 0.0)
     np.testing.assert_array_equal(fed[0, 1, :3], 0.0)
     np.testing.assert_allclose(fed[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)

@@ -18,12 +18,10 @@ def scene() -> Scene:
     """Blocks 0, 2 and 4 in play at random poses, 1 and 3 parked."""
     rng = np.random.default_rng(0)
     quaternion = rng.normal(size=(N, 4))
-    loose = Scene(
+    loose = layout.parked(("box",) * N).replace(
         position=jnp.asarray(rng.uniform(-0.2, 0.2, (N, 3)), jnp.float32),
         quaternion=jnp.asarray(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), jnp.float32),
         velocity=jnp.asarray(rng.normal(size=(N, 6)), jnp.float32),
-        half_size=jnp.full((N, 3), 0.025, jnp.float32),
-        colour=jnp.arange(N),
         in_play=jnp.ones(N, bool),
     )
     return layout.park(loose, jnp.ones(N, bool).at[PARKED].set(False))

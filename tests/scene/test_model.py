@@ -1,16 +1,17 @@
 """The model against MuJoCo's own compiler."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from csac_jax.config import SceneConfig, SimConfig
-from csac_jax.scene import blocks, model
+from csac_jax.scene import blocks, layout, model
+from csac_jax.scene.layout import Scene
 
-SLOTS = ("box", "box", "prism")
+SLOTS = ("box", "box", "arch", "prism", "half_cylinder", "cylinder")
 CONFIG = SceneConfig(slots=SLOTS, min_blocks=1)
+BOXES = [name for name, shape in blocks.SHAPES.items() if shape.kind == "box"]
 
 
 @pytest.fixture(scope="module")
@@ -18,54 +19,80 @@ def world() -> model.World:
     return model.build(CONFIG, SimConfig())
 
 
-def _fields(half: np.ndarray) -> model.BoxFields:
-    return jax.tree.map(np.asarray, model.box_fields(jnp.asarray(half)))
-
-
-@pytest.mark.parametrize("half", blocks.BOX_HALF_SIZES, ids=("cube", "cuboid", "plank", "tile"))
-def test_box_fields_are_those_of_the_compiler(half: np.ndarray):
-    """Claim: box_fields gives what MuJoCo's compiler derives from a box's size, for each size of the set."""
-    size = " ".join(map(str, half))
-    compiled = mujoco.MjModel.from_xml_string(
-        f'<mujoco><worldbody><body pos="0 0 1"><freejoint/><geom type="box" size="{size}" density="{model.DENSITY}"/>'
-        "</body></worldbody></mujoco>"
+def _scene(box: str = "plank", other: str = "tile", scale: float = 0.9, density: float = 800.0) -> Scene:
+    """One of each kind, not of nominal size, density or friction."""
+    scene = layout.parked(SLOTS)
+    half = scene.half_size.copy()
+    half[0], half[1] = blocks.SHAPES[box].half_size, blocks.SHAPES[other].half_size
+    return scene.replace(
+        half_size=half * np.float32(scale),
+        density=np.full_like(scene.density, density),
+        friction=np.linspace(0.5, 1.0, len(SLOTS), dtype=np.float32),
     )
-    fields = _fields(half[None])
+
+
+def _compiled(monkeypatch: pytest.MonkeyPatch, scene: Scene, scale: float) -> mujoco.MjModel:
+    """The same scene as MuJoCo compiles it: sizes, densities and frictions written into the spec."""
+    with monkeypatch.context() as patch:
+        patch.setattr(model, "LARGEST", scale)
+        spec = model._spec(CONFIG, SimConfig())
+    for slot in range(len(SLOTS)):
+        for geom in spec.body(f"block{slot}").geoms:
+            geom.density = scene.density[slot]
+            geom.friction[0] = scene.friction[slot]
+            if slot < 2:
+                geom.size = scene.half_size[slot]
+    return spec.compile()
+
+
+def _fields(world: model.World, scene: Scene) -> model.BlockFields:
+    return jax.tree.map(np.asarray, model.scene_fields(world, scene))
+
+
+@pytest.mark.parametrize("box", BOXES)
+def test_block_fields_are_those_of_the_compiler(world: model.World, monkeypatch: pytest.MonkeyPatch, box: str):
+    """Claim: block_fields gives what MuJoCo's compiler derives, for every shape of the set, larger or smaller."""
+    scale = 1.07
+    scene = _scene(box, scale=scale)
+    ours, theirs = _fields(world, scene), _compiled(monkeypatch, scene, scale)
+    bodies, geoms = world.block_bodies, world.block_geoms
+    is_box = theirs.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_BOX
     pairs = (
-        (fields.size, compiled.geom_size),
-        (fields.rbound, compiled.geom_rbound),
-        (fields.mass, compiled.body_mass[1:]),
-        (fields.inertia, compiled.body_inertia[1:]),
-        (fields.invweight, compiled.body_invweight0[1:]),
-        (np.repeat(fields.invweight, 3, axis=1)[0], compiled.dof_invweight0),
+        (ours.size[is_box], theirs.geom_size[geoms[is_box]], 0.0),
+        (ours.rbound, theirs.geom_rbound[geoms], 0.0),
+        (ours.centre, theirs.geom_pos[geoms], 1e-8),
+        (ours.friction, theirs.geom_friction[geoms, 0], 0.0),
+        (ours.mass, theirs.body_mass[bodies], 0.0),
+        (ours.com, theirs.body_ipos[bodies], 1e-8),
+        (np.sort(ours.inertia), np.sort(theirs.body_inertia[bodies]), 0.0),
+        (ours.body_invweight, theirs.body_invweight0[bodies], 0.0),
+        (ours.dof_invweight, theirs.dof_invweight0[world.block_dofs], 0.0),
     )
-    for ours, theirs in pairs:
-        np.testing.assert_allclose(ours, theirs, rtol=1e-5)  # float32
+    for mine, reference, atol in pairs:
+        np.testing.assert_allclose(mine, reference, rtol=1e-5, atol=atol)  # float32
 
 
-def test_model_with_boxes_moves_as_a_compiled_one(world: model.World):
-    """Claim: a world given box sizes afterwards moves as one that was compiled with them."""
-    half = blocks.BOX_HALF_SIZES[[3, 2]]
-    spec = model._spec(CONFIG, SimConfig())
-    for slot in range(2):
-        spec.geom(f"block{slot}").size = half[slot]
+def test_model_with_blocks_moves_as_a_compiled_one(world: model.World, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a world given block sizes afterwards moves as one that was compiled with them."""
+    scene = _scene(scale=0.9)
     ends = []
-    for moved in (model.with_boxes(world, _fields(half)), spec.compile()):
+    for moved in (model.with_blocks(world, _fields(world, scene)), _compiled(monkeypatch, scene, 0.9)):
         data = mujoco.MjData(moved)
-        data.qpos[world.block_qpos[0, :3]] = [0.1, 0.0, 0.05]
-        data.qpos[world.block_qpos[1]] = [-0.1, 0.05, 0.08, np.cos(0.2), 0.0, np.sin(0.2), 0.0]
-        data.qvel[world.block_dofs[:2]] = [[0.3, 0.1, 0.0, 0.5, 1.0, -0.5]] * 2
-        mujoco.mj_step(moved, data, nstep=75)  # 0.3 s: fall, tumble, first contacts
+        for slot in range(len(SLOTS)):
+            data.qpos[world.block_qpos[slot]] = [0.15 * slot - 0.4, 0.0, 0.06, np.cos(0.2), 0.0, np.sin(0.2), 0.0]
+            data.qvel[world.block_dofs[slot]] = [0.3, 0.1, 0.0, 0.5, 1.0, -0.5]
+        mujoco.mj_step(moved, data, nstep=60)  # 0.24 s: fall, tumble, first contacts
         ends.append(np.concatenate([data.qpos, data.subtree_com[world.block_bodies].ravel()]))
     np.testing.assert_allclose(*ends, atol=1e-4)
 
 
-def test_with_boxes_leaves_the_world_unchanged(world: model.World):
-    """Claim: with_boxes writes into a copy."""
+def test_with_blocks_leaves_the_world_unchanged(world: model.World):
+    """Claim: with_blocks writes into a copy."""
     names = [name for name in dir(world.model) if isinstance(getattr(world.model, name), np.ndarray)]
     before = {name: getattr(world.model, name).copy() for name in names}
-    changed = model.with_boxes(world, _fields(blocks.BOX_HALF_SIZES[[0, 3]]))
+    changed = model.with_blocks(world, _fields(world, _scene()))
     assert not np.array_equal(changed.geom_size, before["geom_size"])
+    assert not np.array_equal(changed.mesh_vert, before["mesh_vert"])
     for name in names:
         np.testing.assert_array_equal(getattr(world.model, name), before[name], err_msg=name)
 
@@ -74,10 +101,12 @@ def test_addresses_name_what_they_say(world: model.World):
     """Claim: the addresses of a world lead to its blocks, hand joints and pads, in order."""
     for slot in range(len(SLOTS)):
         assert world.model.body(world.block_bodies[slot]).name == f"block{slot}"
-        assert world.model.geom(world.block_geoms[slot]).bodyid[0] == world.block_bodies[slot]
         joint = world.model.body(world.block_bodies[slot]).jntadr[0]
         assert world.block_qpos[slot, 0] == world.model.jnt_qposadr[joint]
         assert world.block_dofs[slot, 0] == world.model.jnt_dofadr[joint]
+    np.testing.assert_array_equal(world.model.geom_bodyid[world.block_geoms], world.block_bodies[world.parts.slot])
+    np.testing.assert_array_equal(world.slot_of_geom[world.block_geoms], world.parts.slot)
+    assert np.all(np.delete(world.slot_of_geom, world.block_geoms) == -1)
     for name, qpos, dof in zip(model.HAND_JOINTS, world.hand_qpos, world.hand_dofs, strict=True):
         joint = world.model.joint(f"hand/{name}")
         assert (joint.qposadr[0], joint.dofadr[0]) == (qpos, dof)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax.scene import layout
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import mjx_physics, outcome
+from csac_jax.sim import outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
 
 pytestmark = pytest.mark.mjx
@@ -24,7 +23,7 @@ def _outcomes(run, trace=None) -> np.ndarray:
 def test_every_outcome_is_reached(executed, level: Outcome):
     """Claim: physics reaches all five levels of a grasp (CSAC eq. 15), with the block set as it is."""
     run = executed.case(level.name.lower())
-    assert mjx_physics.healthy(run.after)
+    assert simulation.healthy(run.after)
     assert outcome.grasp_outcome(run.trace, run.plan.surface, run.hand_rise) == level
 
 
@@ -77,11 +76,11 @@ def test_parked_blocks_never_move(executed):
 
 def test_failed_physics_is_flagged_alone(executed):
     """Claim: `healthy` is false for a scene that went NaN or exploded, and true for every other one of the batch."""
-    health = np.asarray(jax.vmap(mjx_physics.healthy)(executed.after))
+    health = np.asarray(jax.vmap(simulation.healthy)(executed.after))
     names = ["nan", "exploded"]
     assert np.isfinite(executed.case("exploded").after.position).all()  # bounds, not isnan
     for name in names:
-        assert not mjx_physics.healthy(executed.case(name).after)
+        assert not simulation.healthy(executed.case(name).after)
     assert health.sum() == len(health) - len(names)
 
 
@@ -100,11 +99,11 @@ def test_failed_physics_is_flagged_alone(executed):
 )
 def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
     """Claim: healthy = finite, slower than MAX_SPEED and, if in play, within MAX_HEIGHT of the origin."""
-    zeros, ones = jnp.zeros((2, 3)), jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (2, 1))
-    scene = Scene(zeros, ones, jnp.zeros((2, 6)), zeros + 0.02, jnp.zeros(2, jnp.int32), jnp.array([True, False]))
-    assert mjx_physics.healthy(scene)
+    scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
+    scene = scene.replace(position=jnp.zeros((2, 3)), in_play=jnp.array([True, False]))
+    assert simulation.healthy(scene)
     changed = getattr(scene, field).at[slot, 2].set(value)
-    assert mjx_physics.healthy(dataclasses.replace(scene, **{field: changed})) == good
+    assert simulation.healthy(dataclasses.replace(scene, **{field: changed})) == good
 
 
 def test_no_contact_was_dropped(executed):

@@ -9,7 +9,7 @@ import pytest
 
 from csac_jax import env as environment, presets
 from csac_jax.agent import learner as learning
-from csac_jax.config import TrainConfig
+from csac_jax.config import TaskConfig
 from csac_jax.env import Env, State
 from csac_jax.scene import layout
 from csac_jax.sim.outcome import Outcome
@@ -19,9 +19,7 @@ from csac_jax.train.metrics import Episodes
 
 pytestmark = pytest.mark.mjx
 
-CFG = dataclasses.replace(
-    presets.smoke(), train=TrainConfig(scenes=2, actions=64, warmup=8, chunk=4, max_actions=6, max_idle=3)
-)
+CFG = dataclasses.replace(presets.smoke(), task=TaskConfig(max_actions=6, max_idle=3))
 EPISODES = 5
 REACH = 0.012  # m
 
@@ -35,7 +33,7 @@ class Magnet(Env):
         scene = layout.park(state.scene, ~taken)
         actions, idle = state.actions + 1, jnp.where(jnp.any(taken), 0, state.idle + 1)
         terminated = ~jnp.any(scene.in_play)
-        capped = (actions >= self.cfg.train.max_actions) | (idle >= self.cfg.train.max_idle)
+        capped = (actions >= self.cfg.task.max_actions) | (idle >= self.cfg.task.max_idle)
         outcome = jnp.where(jnp.any(taken), jnp.int32(Outcome.LIFTED), jnp.int32(Outcome.EMPTY))
         return state.replace(
             scene=scene,
@@ -76,7 +74,7 @@ def assert_consistent(episodes: Episodes, max_actions: int) -> None:
 def test_oracle_by_hand(magnet):
     """Claim: where a grasp above a block always takes it, the oracle takes one block with each action, and all."""
     episodes = evaluate.rollout(CFG, magnet, "oracle", None, EPISODES, 0)
-    assert_consistent(episodes, CFG.train.max_actions)
+    assert_consistent(episodes, CFG.task.max_actions)
     np.testing.assert_array_equal(episodes.blocks, magnet.scenes.in_play.sum(axis=1))
     assert np.all(episodes.completed)
     np.testing.assert_array_equal(episodes.valid.sum(axis=1), episodes.blocks)
@@ -85,13 +83,13 @@ def test_oracle_by_hand(magnet):
 
 def test_random_episodes_end_at_the_caps(magnet, random):
     """Claim: records are consistent; an episode that is not completed ran to the action cap or the no-change cap."""
-    assert_consistent(random, CFG.train.max_actions)
-    assert random.valid.shape == (EPISODES, CFG.train.max_actions)
+    assert_consistent(random, CFG.task.max_actions)
+    assert random.valid.shape == (EPISODES, CFG.task.max_actions)
     assert not np.all(random.completed)
     for cleared, valid, completed in zip(random.cleared, random.valid, random.completed, strict=True):
         num = valid.sum()
-        idle = num >= CFG.train.max_idle and not np.any(cleared[num - CFG.train.max_idle : num])
-        assert completed or idle or num == CFG.train.max_actions
+        idle = num >= CFG.task.max_idle and not np.any(cleared[num - CFG.task.max_idle : num])
+        assert completed or idle or num == CFG.task.max_actions
 
 
 def test_same_seed_same_episodes(magnet, random):
@@ -114,7 +112,7 @@ def test_learned_needs_its_networks_only(magnet):
     """Claim: the learned policy runs from parameters alone and gives consistent records."""
     learner = learning.make(CFG)
     params = jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)).online
-    assert_consistent(evaluate.rollout(CFG, magnet, "learned", params, EPISODES, 0), CFG.train.max_actions)
+    assert_consistent(evaluate.rollout(CFG, magnet, "learned", params, EPISODES, 0), CFG.task.max_actions)
 
 
 def test_unknown_policy(magnet):
@@ -130,7 +128,7 @@ def test_oracle_beats_random_in_physics():
     env = environment.make(cfg, stream=1, scenes=12)
     oracle, random = (evaluate.rollout(cfg, env, name, None, 12, 0) for name in ("oracle", "random"))
     for episodes in (oracle, random):
-        assert_consistent(episodes, cfg.train.max_actions)
+        assert_consistent(episodes, cfg.task.max_actions)
     efficiency = [e.cleared.sum() / e.valid.sum() for e in (oracle, random)]
     assert efficiency[0] > 1.3 * efficiency[1]
     assert oracle.completed.mean() >= 0.75

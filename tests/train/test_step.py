@@ -235,7 +235,7 @@ def test_finished_scenes_are_replaced(run):
     """Claim: a scene that is cut off gives way to a fresh one, with no actions taken; its last transition is stored as
     not terminated, so that it bootstraps. The other scene goes on."""
     scenes = run.states[0].scenes
-    near_end = scenes.replace(actions=jnp.array([CFG.train.max_actions - T, 0], jnp.int32))
+    near_end = scenes.replace(actions=jnp.array([CFG.task.max_actions - T, 0], jnp.int32))
     state, metrics = run.chunk(copy(run.states[0].replace(scenes=near_end)))
     ended = np.asarray(metrics.terminated | metrics.truncated)
     assert ended[:, 0].any()

@@ -13,10 +13,15 @@ from csac_jax.vision import heightmap, raycast
 _TABLE = np.array([0.5, 0.4, 0.3], np.float32)
 
 
+def _look(cfg: HeightmapConfig, polytopes: raycast.Polytopes, wanted: jax.Array | None = None):
+    every = jnp.ones(polytopes.offset.shape[0], bool)
+    return heightmap.orthographic(cfg, polytopes, jnp.asarray(_TABLE), every if wanted is None else wanted)
+
+
 def test_heights_agree_with_mujoco(reference):
     """Claim: height and block of every cell, but those within 0.1 mm of an edge, are C MuJoCo's to 0.1 mm."""
     cfg = HeightmapConfig(64)
-    obs = heightmap.orthographic(cfg, reference.polytopes, jnp.asarray(_TABLE))
+    obs = _look(cfg, reference.polytopes)
     origin = np.asarray(geometry.cell_centres(cfg), np.float64).reshape(-1, 2)
     origin = np.concatenate([origin, np.full((len(origin), 1), 0.5)], axis=1)
     down = np.tile([0.0, 0.0, -1.0], (len(origin), 1))
@@ -36,13 +41,12 @@ def test_heights_agree_with_mujoco(reference):
 
 
 def test_target_mask_shows_the_target(reference):
-    """Claim: the target mask is all ones if there is no target, and else True just where the target is seen."""
+    """Claim: the target mask is all ones if every block is wanted, and else True just where a wanted one is seen."""
     cfg = HeightmapConfig(64)
-    look = jax.jit(lambda geom: heightmap.orthographic(cfg, reference.polytopes, jnp.asarray(_TABLE), geom))
-    clearing = heightmap.orthographic(cfg, reference.polytopes, jnp.asarray(_TABLE))
+    look = jax.jit(lambda wanted: _look(cfg, reference.polytopes, wanted))
+    clearing = look(jnp.ones(6, bool))
     assert np.all(clearing.target)
-    assert np.all(look(jnp.array(-1, jnp.int32)).target)
-    masks = np.stack([look(jnp.array(g, jnp.int32)).target for g in range(6)])
+    masks = np.stack([look(jnp.arange(6) == g).target for g in range(6)])
     assert np.all(masks.sum((1, 2)) > 10)
     np.testing.assert_array_equal(masks.sum(0), np.asarray(clearing.height) > 0.0)  # each raised cell is one block's
     row, col = np.argwhere(masks[4]).mean(0)  # the octagon that stands at x = 0.11, y = -0.07
@@ -52,7 +56,7 @@ def test_target_mask_shows_the_target(reference):
 def test_blocks_above_the_view_are_not_seen(reference):
     """Claim: what is parked above VIEW_HEIGHT leaves no trace."""
     parked = reference.polytopes.replace(position=reference.polytopes.position + jnp.array([[0.0, 0.0, 0.6]]))
-    obs = heightmap.orthographic(HeightmapConfig(64), parked, jnp.asarray(_TABLE))
+    obs = _look(HeightmapConfig(64), parked)
     assert np.all(np.asarray(obs.height) == 0.0)
 
 

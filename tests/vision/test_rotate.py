@@ -107,7 +107,7 @@ def test_a_block_appears_where_frame_position_says(k, x, y):
 
 @jax.jit
 def _look(block):
-    return heightmap.orthographic(HeightmapConfig(64), block, jnp.zeros(3)).height
+    return heightmap.orthographic(HeightmapConfig(64), block, jnp.zeros(3), jnp.ones(1, bool)).height
 
 
 def test_an_action_points_along_the_columns():

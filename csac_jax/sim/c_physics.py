@@ -1,0 +1,98 @@
+"""Primitives in C MuJoCo: the reference, scene by scene in threads on the host.
+
+It runs behind a callback, so that the same environment, compiled, can be asked to use it. Contacts are all examined
+here: MJX keeps a fixed number of them.
+"""
+
+import concurrent.futures
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from csac_jax.config import SimConfig
+from csac_jax.scene import layout, model
+from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import BlockFields, World
+from csac_jax.sim import outcome
+from csac_jax.sim.outcome import Trace
+from csac_jax.sim.primitives import Plan
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CPhysics:
+    """A world in C MuJoCo, with the solver's effort of the config."""
+
+    world: World
+    cfg: SimConfig
+
+    def run(self, scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
+        """See `physics.Physics`."""
+        num = len(self.world.slots)
+        shapes = jax.eval_shape(lambda: (jnp.zeros((num, 7)), jnp.zeros((num, 6)), outcome.blank(num)))
+        fields = model.scene_fields(self.world, scene)
+        host = functools.partial(_run_batch, self.world, sum(self.cfg.grasp_phases[:2]) - 1)
+        pose, velocity, trace = jax.pure_callback(host, shapes, scene, fields, plan, vmap_method="broadcast_all")
+        moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
+        return layout.park(moved, scene.in_play), trace
+
+
+def _blank(num: int) -> Trace:
+    """`outcome.blank` in NumPy."""
+    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: outcome.blank(num)))
+
+
+def _run_batch(world: World, closed_at: int, scene: Scene, fields: BlockFields, plan: Plan) -> Any:
+    """Every scene of a batch, leaves [..., N, ...], in a thread of its own; same axes come back."""
+    axes = np.shape(plan.surface)
+    rows = jax.tree.map(lambda leaf: np.reshape(leaf, (-1, *np.shape(leaf)[len(axes) :])), (scene, fields, plan))
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(len(rows[2].surface))]
+    with concurrent.futures.ThreadPoolExecutor() as threads:
+        done = list(threads.map(lambda row: _run(world, closed_at, *row), each))
+    return jax.tree.map(lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *done)
+
+
+def _run(world: World, closed_at: int, scene: Scene, fields: BlockFields, plan: Plan) -> tuple[Any, Any, Trace]:
+    """Poses [N, 7], velocities [N, 6] and trace of one scene; NumPy throughout, as JAX must not run in a callback."""
+    pose = np.concatenate([scene.position, scene.quaternion], axis=1)
+    if not (np.isfinite(pose).all() and np.isfinite(scene.velocity).all()):  # MuJoCo would start anew from scratch
+        return pose, scene.velocity, _blank(len(pose))
+    exact = model.with_blocks(world, fields)
+    exact.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    data, parked = mujoco.MjData(exact), ~scene.in_play
+    data.qpos[world.hand_qpos] = np.append(plan.start, plan.start[4])
+    data.qpos[world.block_qpos], data.qvel[world.block_dofs] = pose, scene.velocity
+    trace = _blank(len(pose))
+    for index, control in enumerate(plan.control):
+        data.ctrl[:] = control
+        mujoco.mj_step(exact, data)
+        data.qpos[world.block_qpos[parked]], data.qvel[world.block_dofs[parked]] = pose[parked], 0.0
+        touching = _touching(world, data)
+        held = touching[1] & touching[2]
+        rise = (data.qpos[world.block_qpos[:, 2]] - pose[:, 2]).astype(np.float32)
+        gap = np.float32(2.0 * data.qpos[world.hand_qpos[4]])
+        seen: dict[str, Any] = {
+            "touched": trace.touched | touching.any(),
+            "held_rise": np.where(held, np.maximum(trace.held_rise, rise), trace.held_rise),
+            "held": held,
+            "rise": rise,
+            "gap_closed": gap if index == closed_at else trace.gap_closed,
+            "gap_end": gap,
+        }
+        trace = dataclasses.replace(trace, **seen)
+    return data.qpos[world.block_qpos].astype(np.float32), data.qvel[world.block_dofs].astype(np.float32), trace
+
+
+def _touching(world: World, data: mujoco.MjData) -> np.ndarray:
+    """Which hand geom touches which block, [3, N] bool."""
+    pairs = data.contact.geom[data.contact.dist < 0.0]  # [C, 2]
+    touching = np.zeros((len(world.hand_geoms), len(world.slots)), bool)
+    for hand, other in (pairs.T, pairs.T[::-1]):
+        slot = world.slot_of_geom[other]
+        for row, geom in enumerate(world.hand_geoms):
+            touching[row, slot[(hand == geom) & (slot >= 0)]] = True
+    return touching

@@ -1,0 +1,197 @@
+"""Does MJX move blocks as C MuJoCo does? As JSON: `python -m experiments.bench.parity [--primitives N] [--poses N]`.
+
+The same settled scenes and the same actions go through both. Grasps are the planner's, which reads poses: its share of
+lifts is the ceiling that physics allows. Pushes start before a random block and go through it.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax import presets
+from csac_jax.config import Config, SceneConfig, SimConfig, SlotKind
+from csac_jax.env import Env
+from csac_jax.scene import blocks, layout, model, pool
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import oracle, outcome, physics as simulation
+from csac_jax.sim.outcome import Outcome
+from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.train import provenance
+
+BATCH = 64
+STREAM = 9001  # of drops: neither training's nor an evaluation's
+PUSH_RUN_UP = 0.07  # m from the place of a push to the block's centre
+ENGINES = ("mjx", "c")
+
+
+def _config(slots: tuple[SlotKind, ...], in_play: int) -> Config:
+    base = presets.get("quick")
+    sim = SimConfig(geom_pairs=24, contacts=64)
+    return dataclasses.replace(base, scene=SceneConfig(slots=slots, min_blocks=in_play), sim=sim)
+
+
+def _batches(tree: Any, size: int) -> list[Any]:
+    count = jax.tree.leaves(tree)[0].shape[0]
+    return [jax.tree.map(lambda leaf, i=i: leaf[i : i + size], tree) for i in range(0, count - size + 1, size)]
+
+
+class Bench:
+    """Both engines over one world, compiled once each."""
+
+    def __init__(self, cfg: Config) -> None:
+        self.cfg = cfg
+        self.world = model.build(cfg.scene, cfg.sim)
+        self.look = jax.jit(jax.vmap(lambda scene: Env(cfg, None, None).look(scene).height))
+        plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
+        self.oracle = jax.jit(jax.vmap(plan))
+        self.push = jax.jit(jax.vmap(_push))
+        self.engines = {name: self._engine(name) for name in ENGINES}
+
+    def _engine(self, name: str):
+        sim = dataclasses.replace(self.cfg.sim, physics=name)
+        engine = simulation.make(self.world, sim)
+        return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, sim, self.cfg.heightmap)))
+
+    def run(self, scenes: Scene, actions: Action) -> dict[str, Any]:
+        """What both engines make of the actions, leaves [E, ...]: ends [E, N, 3], outcomes [E], saturated [E]."""
+        height = self.look(scenes)
+        result = {}
+        for name, engine in self.engines.items():
+            after, trace, plan = jax.block_until_ready(engine(scenes, height, actions))
+            rise = plan.start[:, 2] - jnp.min(plan.control[:, :, 2], axis=1)
+            judged = jax.vmap(outcome.grasp_outcome)(trace, plan.surface, rise)
+            ill = ~jax.vmap(simulation.healthy)(after)
+            result[name] = jax.device_get((after.position, judged, trace.saturated, ill))
+        return result
+
+
+def _push(key: jax.Array, scene: Scene) -> Action:
+    """A push through a random block in play, from a random side."""
+    key_slot, key_yaw = jax.random.split(key)
+    slot = jax.random.categorical(key_slot, jnp.where(scene.in_play, 0.0, -jnp.inf))
+    yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
+    place = scene.position[slot, :2] - PUSH_RUN_UP * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
+    return Action(primitive=jnp.int32(Primitive.PUSH), pose=jnp.append(place, yaw))
+
+
+def piles(in_play: int, slots: tuple[SlotKind, ...], count: int) -> dict[str, Any]:
+    """Grasps and pushes in settled piles."""
+    cfg = _config(slots, in_play)
+    bench = Bench(cfg)
+    settled = pool.settled(bench.world, cfg.scene, cfg.heightmap.extent, STREAM, count)
+    rows = []
+    for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))
+        grasps = bench.oracle(scenes, bench.look(scenes))
+        rows.append((scenes, bench.run(scenes, grasps), bench.run(scenes, bench.push(keys, scenes))))
+    starts = np.concatenate([row[0].position for row in rows])
+    grasped, pushed = (
+        {name: [np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)] for name in ENGINES}
+        for i in (1, 2)
+    )
+    lifted = {name: float(np.mean(grasped[name][1] == Outcome.LIFTED)) for name in ENGINES}
+    return {
+        "blocks": in_play,
+        "grasps": len(starts),
+        "oracle_lifts": lifted,
+        "grasp_outcome_equal": float(np.mean(grasped["mjx"][1] == grasped["c"][1])),
+        "pushed_block_apart_mm": _apart(starts, pushed),
+        "saturated_substeps_share": _saturated(cfg, grasped, pushed),
+        "ill": int(grasped["mjx"][3].sum() + pushed["mjx"][3].sum()),
+    }
+
+
+def _apart(starts: np.ndarray, pushed: dict[str, Any]) -> dict[str, float]:
+    """How far apart the two engines leave the block that C moved most, mm."""
+    moved = np.linalg.norm(pushed["c"][0] - starts, axis=2)
+    slot = moved.argmax(axis=1)
+    rows = np.arange(len(slot))
+    apart = 1e3 * np.linalg.norm(pushed["mjx"][0][rows, slot] - pushed["c"][0][rows, slot], axis=1)
+    return {
+        "median": float(np.median(apart)),
+        "p95": float(np.percentile(apart, 95)),
+        "median_moved": float(1e3 * np.median(moved[rows, slot])),
+        "pushes": len(rows),
+    }
+
+
+def _saturated(cfg: Config, *runs: dict[str, Any]) -> float:
+    return float(np.mean([run["mjx"][2].mean() for run in runs]) / cfg.sim.substeps)
+
+
+def shapes(poses: int) -> dict[str, Any]:
+    """Grasps of a single block of every shape, as it came to rest after a fall in any orientation."""
+    slots: tuple[SlotKind, ...] = ("box", "arch", "prism", "half_cylinder", "cylinder")
+    cfg = _config(slots, 1)
+    bench = Bench(cfg)
+    each = {name: _resting(bench, cfg, name, poses) for name in blocks.SHAPES}
+    scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each.values())
+    total, size = len(blocks.SHAPES) * poses, min(BATCH, poses)
+    padded = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[: -total % size]]), scenes)
+    runs = [bench.run(batch, bench.oracle(batch, bench.look(batch))) for batch in _batches(padded, size)]
+    lifted = {
+        name: np.concatenate([run[name][1] for run in runs])[:total].reshape(-1, poses) == Outcome.LIFTED
+        for name in ENGINES
+    }
+    return {
+        "poses_per_shape": poses,
+        "lifted": {
+            name: {shape: float(row.mean()) for shape, row in zip(blocks.SHAPES, rows, strict=True)}
+            for name, rows in lifted.items()
+        },
+        "lifted_over_all": {name: float(rows.mean()) for name, rows in lifted.items()},
+    }
+
+
+def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
+    """`count` scenes of one block of this shape at rest."""
+    rng = np.random.default_rng([STREAM, list(blocks.SHAPES).index(shape)])
+    slot = cfg.scene.slots.index(blocks.SHAPES[shape].kind)
+    found: list[Scene] = []
+    while len(found) < count:
+        scene = layout.parked(cfg.scene.slots)
+        half, position, quaternion = scene.half_size.copy(), scene.position.copy(), scene.quaternion.copy()
+        half[slot] = blocks.SHAPES[shape].half_size
+        position[slot] = [*rng.uniform(-0.12, 0.12, 2), cfg.scene.drop_height]
+        turn = rng.normal(size=4)
+        quaternion[slot] = turn / np.linalg.norm(turn)
+        dropped = scene.replace(
+            half_size=half,
+            position=position,
+            quaternion=quaternion,
+            in_play=np.arange(len(half)) == slot,
+        )
+        fields = jax.device_get(model.scene_fields(bench.world, dropped))
+        scene = pool.rest(bench.world, cfg.scene, cfg.heightmap.extent, dropped, fields)
+        found += [scene] if scene is not None else []
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+
+
+MIXED: tuple[SlotKind, ...] = (
+    "box", "box", "arch", "prism", "box", "cylinder", "half_cylinder", "box", "box", "box",
+)  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs all and prints one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--primitives", type=int, default=512, help="grasps, and pushes, per kind of pile")
+    parser.add_argument("--poses", type=int, default=125, help="poses of a single block per shape")
+    options = parser.parse_args(arguments)
+    begun = time.perf_counter()
+    result: dict[str, Any] = {"shapes": shapes(options.poses)}
+    result["piles_of_6"] = piles(6, MIXED[:6], options.primitives)
+    result["piles_of_10"] = piles(10, MIXED, options.primitives)
+    result["seconds"] = time.perf_counter() - begun
+    print(json.dumps(result | provenance.record(), indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Random actions without end: is every block accounted for, how often does physics fail? JSON.
+
+`python -m experiments.bench.soak [--actions N] [--scenes E]`. Half of the actions are pushes; scenes hold ten blocks of
+all shapes and are replaced as in training. Then the same actions run once more with twice as many contacts.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from csac_jax import env as environment
+from csac_jax.agent import maps, policy
+from csac_jax.config import Config
+from csac_jax.env import Env, State
+from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.train import provenance
+from experiments.bench.parity import MIXED, _config
+
+CHUNK = 10  # actions per scene in one call of the compiled program
+
+
+@struct.dataclass
+class Tally:
+    """Counts over all actions so far."""
+
+    actions: jax.Array
+    ill: jax.Array  # scenes that were quarantined
+    not_finite: jax.Array  # NaN or infinity in a state that counts as healthy
+    unaccounted: jax.Array  # actions after which in play + cleared + left is not what it was
+    cleared: jax.Array
+    left: jax.Array
+    saturated: jax.Array  # substeps with every contact slot in use
+
+
+def _random(key: jax.Array, frames: maps.Frames, state: State) -> Action:
+    """A random primitive at a random place with something to act on."""
+    key_primitive, key_place = jax.random.split(key)
+    primitive = jax.random.bernoulli(key_primitive).astype(jnp.int32)
+    places = policy.random_places(key_place, frames, maps.actionable(frames, state.obs))
+    return Action(primitive=primitive, pose=maps.denormalise(frames, places[primitive]))
+
+
+def _step(env: Env, frames: maps.Frames, key: jax.Array, state: State, tally: Tally) -> tuple[State, Tally]:
+    count = state.actions.shape[0]
+    key_act, key_reset = jax.random.split(key)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))
+    action = jax.vmap(_random, (0, None, 0))(keys(key_act, jnp.arange(count)), frames, state)
+    after = jax.vmap(env.step)(state, action)
+    info = after.info
+    finite = jax.vmap(lambda one: jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(one)])))
+    before, now = jnp.sum(state.scene.in_play, axis=1), jnp.sum(after.scene.in_play, axis=1)
+    missing = before != now + info.cleared + info.left
+
+    def total(values: jax.Array) -> jax.Array:
+        return jnp.sum(values, dtype=jnp.int32)
+
+    tally = Tally(
+        actions=tally.actions + count,
+        ill=tally.ill + total(info.ill),
+        not_finite=tally.not_finite + total(~finite((after.scene, after.obs)) & ~info.ill),
+        unaccounted=tally.unaccounted + total(missing & ~info.ill),
+        cleared=tally.cleared + total(info.cleared),
+        left=tally.left + total(info.left),
+        saturated=tally.saturated + total(info.saturated),
+    )
+    fresh = jax.vmap(env.reset)(keys(key_reset, jnp.arange(count)))
+    return jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after), tally
+
+
+def _doubled(cfg: Config) -> Config:
+    sim = dataclasses.replace(cfg.sim, geom_pairs=2 * cfg.sim.geom_pairs, contacts=2 * cfg.sim.contacts)
+    return dataclasses.replace(cfg, sim=sim)
+
+
+def soak(actions: int, scenes: int) -> dict[str, Any]:
+    """At least `actions` random actions in `scenes` scenes side by side."""
+    cfg = _config(MIXED, len(MIXED))
+    env, frames = environment.make(cfg), maps.frames(cfg)
+    key = jax.random.key(0)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, scenes))
+
+    @functools.partial(jax.jit, donate_argnums=(1, 2))
+    def chunk(key: jax.Array, state: State, tally: Tally) -> tuple[State, Tally]:
+        def body(carry, i):
+            return _step(env, frames, jax.random.fold_in(key, i), *carry), None
+
+        return jax.lax.scan(body, (state, tally), jnp.arange(CHUNK))[0]
+
+    tally = Tally(*(jnp.int32(0) for _ in dataclasses.fields(Tally)))
+    state, tally = chunk(jax.random.fold_in(key, 2**20), state, tally)  # compiles; its actions count too
+    begun, number = time.perf_counter(), 0
+    while int(tally.actions) < actions:
+        state, tally = chunk(jax.random.fold_in(key, number), state, tally)
+        number += 1
+    seconds = time.perf_counter() - begun
+    counts = {field.name: int(getattr(tally, field.name)) for field in dataclasses.fields(Tally)}
+    return {
+        **counts,
+        "scenes": scenes,
+        "quarantine_rate": counts["ill"] / counts["actions"],
+        "saturated_substeps_share": counts["saturated"] / counts["actions"] / cfg.sim.substeps,
+        "actions_per_second": number * CHUNK * scenes / seconds if number else None,
+        "outcomes_equal_with_doubled_caps": _caps(cfg, env, frames, state),
+    }
+
+
+def _caps(cfg: Config, env: Env, frames: maps.Frames, state: State) -> dict[str, Any]:
+    """The same actions from the same states with the caps of the config and with twice as many."""
+    other = environment.make(_doubled(cfg))
+    count = state.actions.shape[0]
+    keys = jax.random.split(jax.random.key(1), count)
+    action = jax.jit(jax.vmap(_random, (0, None, 0)), static_argnums=1)(keys, frames, state)
+    ends = [jax.device_get(jax.jit(jax.vmap(each.step))(state, action)) for each in (env, other)]
+    equal = np.stack([ends[0].info.outcome == ends[1].info.outcome, ends[0].info.cleared == ends[1].info.cleared])
+    grasps = np.asarray(action.primitive) == Primitive.GRASP
+    return {"share": float(equal.all(axis=0).mean()), "n": count, "grasps": int(grasps.sum())}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs all and prints one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--actions", type=int, default=100_000)
+    parser.add_argument("--scenes", type=int, default=1024)
+    options = parser.parse_args(arguments)
+    print(json.dumps(soak(options.actions, options.scenes) | provenance.record(), indent=2))
+
+
+if __name__ == "__main__":
+    main()
