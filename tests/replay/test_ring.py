@@ -105,7 +105,7 @@ class TestRingModel(RingModel.TestCase):
 
 @pytest.mark.slow
 class TestRingModelLong(RingModel.TestCase):
-    settings = settings(max_examples=10_000, stateful_step_count=20, deadline=None)
+    settings = settings(max_examples=10_000, stateful_step_count=8, deadline=None)
 
 
 def test_valid_items_are_packed():

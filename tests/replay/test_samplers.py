@@ -108,9 +108,12 @@ def test_alpha_zero_is_uniform_over_what_is_stored():
 
 @pytest.mark.parametrize("capacity", [2, 7, 8, 9, 64, 65, 1000, 4096])
 def test_every_capacity_has_its_pyramid(capacity):
-    """Claim: whatever the capacity, the law holds: P(slot) grows with its number here; the last slot is drawn most."""
+    """Claim: whatever the capacity, P(i) = m_i / sum m, here with masses 1, 2, 3 ...; with no mass at all, slots are
+    still slots."""
     masses = np.arange(1, capacity + 1)
     assert_fits(np.asarray(proportional_slots(jax.random.key(1), jnp.asarray(masses, jnp.float32), NUM)), masses)
+    nothing = np.asarray(proportional_slots(jax.random.key(1), jnp.zeros(capacity), NUM))
+    assert np.all((nothing >= 0) & (nothing < capacity))
 
 
 def test_large_rings_are_drawn_evenly():
