@@ -67,7 +67,8 @@ def test_vpg_by_hand():
     assert (cfg.target.gamma, cfg.target.value, cfg.policy.place) == (0.5, "max", "argmax")
     assert (cfg.explore.primitive_start, cfg.explore.primitive_end, cfg.explore.push_fraction) == (0.5, 0.1, 0.5)
     assert (cfg.learn.target_update, cfg.learn.copy_every, cfg.learn.actor) == ("hard", 1, False)
-    assert (cfg.replay.sampler, cfg.replay.beta_start, cfg.replay.beta_end) == ("beta", (1.0, 2.0), (1.0, 2.0))
+    assert cfg.replay.sampler == "beta"
+    assert cfg.replay.beta_start == cfg.replay.beta_middle == cfg.replay.beta_end == (1.0, 2.0)
 
 
 def test_unknown_algorithm_names_the_known():

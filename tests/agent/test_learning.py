@@ -22,7 +22,6 @@ pytestmark = pytest.mark.optax
 EPISODES = 128
 CAP = 4  # actions of an episode of the two-step problem
 SLOW = pytest.mark.slow
-NO_SAMPLER = pytest.mark.xfail(raises=ValueError, strict=True, reason="replay.sampler 'prioritised' is not built yet")
 
 
 class Learned(NamedTuple):
@@ -71,7 +70,7 @@ def _play(toy: Toy, learner: Learner, key: jax.Array, params: Params):
     ("algo", "value"),
     [
         pytest.param("csac", 2.0, marks=SLOW),
-        pytest.param("csac_per", 2.0, marks=[SLOW, NO_SAMPLER]),
+        pytest.param("csac_per", 2.0, marks=SLOW),
         pytest.param("csac_beta", 2.0, marks=SLOW),
         pytest.param("vpg", 1.0, marks=SLOW),
         pytest.param("reactive", 1.0, marks=SLOW),
@@ -90,7 +89,7 @@ def test_bandit_is_solved(algo, value):
     ("algo", "low", "high"),
     [
         pytest.param("csac", 1.2, 1.6, marks=SLOW),
-        pytest.param("csac_per", 1.2, 1.6, marks=[SLOW, NO_SAMPLER]),
+        pytest.param("csac_per", 1.2, 1.6, marks=SLOW),
         pytest.param("csac_beta", 1.2, 1.6, marks=SLOW),
         ("vpg", 0.9, 1.1),
     ],

@@ -13,12 +13,10 @@ from tests.train.test_step import assert_same, copy
 
 pytestmark = [pytest.mark.mjx, pytest.mark.slow]
 
-NO_SAMPLER = pytest.mark.xfail(raises=ValueError, strict=True, reason="replay.sampler 'prioritised' is not built yet")
-
 
 @pytest.mark.parametrize(
     "algo",
-    [pytest.param(name, marks=NO_SAMPLER if name == "csac_per" else ()) for name in algorithms.ALGORITHMS],
+    algorithms.ALGORITHMS,
 )
 def test_algorithm_runs_and_resumes(algo, tmp_path):
     """Claim: every algorithm trains in one compiled program that never compiles again, its losses are finite, it has
