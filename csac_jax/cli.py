@@ -78,8 +78,14 @@ class EvalOptions:
     """Folder of the run."""
     policy: Literal["learned", "random", "oracle"] = "learned"
     """What acts: the run's networks; a random place with a block under it; or one that reads the blocks' poses."""
+    suite: str = "own"
+    """Scenes: own (dropped like the training's), random10, cases, generated, or a case file."""
+    physics: Literal["mjx", "c"] = "mjx"
+    """What moves the blocks: MJX as in training, or C MuJoCo, the reference."""
+    robot: Literal["hand", "ur5"] = "hand"
+    """What moves the gripper: nothing, it floats as in training; or the arm."""
     episodes: int = 50
-    """Episodes, each with a fresh scene."""
+    """Episodes of every part of the suite, each with a fresh scene where the part has several."""
     seed: int = 0
     """Number that scenes and noise follow from; whatever it is, the scenes are none that training draws from."""
     json: Path | None = None
@@ -339,38 +345,43 @@ def evaluate(arguments: list[str]) -> int:
     if not 0 <= options.seed < 2**31 - 1:
         raise BadArgumentsError("--seed: must lie in 0 .. 2147483646")
     cfg = _stored_config(options.run_dir)
+    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
     begun = time.time()
-    summary = _evaluate(options, cfg)
+    parts = _evaluate(options, cfg)
     seconds = round(time.time() - begun, 1)
-    result = {"policy": options.policy, "seed": options.seed, "seconds": seconds, **summary}
-    _print_summary(options, summary, seconds)
-    _write_json(options.json, result, cfg)
+    for part, summary in parts.items():
+        _print_summary(f"{options.policy} in {options.episodes} episodes of {part}, seed {options.seed}", summary)
+    asked = {name: getattr(options, name) for name in ("policy", "suite", "seed")}
+    one = next(iter(parts.values())) if len(parts) == 1 else {"parts": parts}
+    _write_json(options.json, {**asked, "seconds": seconds, **one}, cfg)
     return 0
 
 
-def _evaluate(options: EvalOptions, cfg: Config) -> dict[str, Any]:
-    import jax
+def _evaluate(options: EvalOptions, cfg: Config) -> dict[str, dict[str, Any]]:
+    """Metrics of every part of the suite."""
+    from csac_jax.train import checkpoint, evaluate, metrics, step, suites
 
-    from csac_jax import env as environment
-    from csac_jax.train import checkpoint, evaluate, metrics, step
-
+    try:
+        parts = suites.environments(cfg, options.suite, options.episodes, options.seed)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
     params = None
     if options.policy == "learned":
-        program = step.make(cfg)
         try:
-            state, _ = checkpoint.restore(options.run_dir, jax.eval_shape(lambda: step.init(program)))
+            state, _ = checkpoint.restore(options.run_dir, step.abstract_state(cfg))
         except checkpoint.CheckpointError as error:
             raise FailedError(str(error)) from None
         params = state.learner.online
-    env = environment.make(cfg, stream=1 + options.seed, scenes=options.episodes)  # stream 0 is the training's
-    return metrics.summarise(evaluate.rollout(cfg, env, options.policy, params, options.episodes, options.seed))
+    return {
+        name: metrics.summarise(evaluate.rollout(env.cfg, env, options.policy, params, options.episodes, options.seed))
+        for name, env in parts.items()
+    }
 
 
-def _print_summary(options: EvalOptions, summary: dict[str, Any], seconds: float) -> None:
+def _print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    title = f"{options.policy} in {options.episodes} episodes, seed {options.seed}, {seconds:.0f} s"
     table = Table("metric", "value", "95 % interval", "n", title=title)
     for name, entry in summary.items():
         if "value" in entry:

@@ -66,7 +66,8 @@ class Env:
 
     cfg: Config
     physics: Physics
-    scenes: Scene  # NumPy leaves [P, N, ...], settled
+    scenes: Scene  # NumPy leaves [P, N, ...], at rest
+    any_yaw: bool = True  # scenes stay in the workspace however they are turned; else only by quarter turns
 
     def reset(self, key: jax.Array) -> State:
         """A fresh settled scene of the pool, turned by a random yaw."""
@@ -88,10 +89,14 @@ class Env:
         return self.vary(key_enter, jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes))
 
     def vary(self, key: jax.Array, scene: Scene) -> Scene:
-        """A settled scene as an episode meets it: turned by a random yaw, with a random target if the task has one."""
+        """A scene as an episode meets it: turned at random; with a target, its own or any, if the task has one."""
         key_yaw, key_target = jax.random.split(key)
-        turned = layout.turn(scene, jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi))
-        return layout.mark(key_target, turned) if self.cfg.task.kind == "target" else turned
+        yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
+        turned = layout.turn(scene, yaw if self.any_yaw else jnp.round(yaw / (0.5 * np.pi)) * (0.5 * np.pi))
+        if self.cfg.task.kind != "target":
+            return turned.replace(target=jnp.full_like(scene.target, layout.ANY))
+        own = scene.target != layout.ANY
+        return jax.tree.map(lambda a, b: jnp.where(own, a, b), turned, layout.mark(key_target, turned))
 
     def begin(self, scene: Scene) -> State:
         """The first state of an episode that starts with this scene."""

@@ -40,9 +40,9 @@ def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
     geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
-    meshes = [  # None for a mesh that no slot uses
-        mesh and mesh.replace(vert=mesh.vert * fields.mesh_scale[number])
-        for number, mesh in enumerate(model._impl.mesh_convex)
+    meshes = [  # None for a mesh that no slot uses; `face` holds the corners of the faces once more
+        mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
+        for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
     ]
     return model.replace(
         geom_size=model.geom_size.at[geoms].set(fields.size),

@@ -21,7 +21,7 @@ Policy = Callable[[jax.Array, Params, State], Action]  # key [], params, leaves 
 
 
 def rollout(cfg: Config, env: Env, name: str, params: Params | None, episodes: int, seed: int) -> Episodes:
-    """Runs `episodes` episodes of a policy, each from another scene of the environment's pool, spread evenly over it.
+    """Runs `episodes` episodes of a policy, their scenes spread evenly over the environment's pool.
 
     Args: name, one of POLICIES; params, the networks that `learned` needs; seed of the policy's and the scenes' turns.
     Episodes end as in training: table cleared, action cap, no-change cap.
@@ -62,7 +62,7 @@ def _run(cfg: Config, env: Env, step: Callable, params: Params | None, key: jax.
 
 def _begin(env: Env, key: jax.Array, rows: np.ndarray) -> State:
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), env.scenes)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.asarray(rows))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(rows)))
     return jax.vmap(env.begin)(jax.vmap(env.vary)(keys, scenes))
 
 

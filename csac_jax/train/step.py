@@ -4,7 +4,7 @@ Look, act, simulate, remember, learn, replace finished scenes. E = scenes, B = b
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from csac_jax.config import Config
 from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
+from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
@@ -203,6 +204,14 @@ def example(cfg: Config) -> Transition:
         return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool))
 
     return jax.eval_shape(build)
+
+
+def abstract_state(cfg: Config) -> Any:
+    """Shapes and types of a run's state, as `jax.eval_shape` gives them: no scene is settled, nothing is compiled."""
+    nothing: Any = None
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+    program = Program(cfg, Env(cfg, nothing, blank), learning.make(cfg))
+    return jax.eval_shape(lambda: init(program))
 
 
 def compile_chunk(program: Program, num_steps: int):

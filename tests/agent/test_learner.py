@@ -276,7 +276,7 @@ def _changed(learner: Learner, section: str, **settings) -> Learner:
 
 
 def _run(learner: Learner):
-    return jax.jit(lambda state, batch: learning.update_critic(jax.random.key(3), learner, state, batch))
+    return jax.jit(lambda state, batch: learning.update_critic(jax.random.key(3), learner, state, batch, jnp.ones(B)))
 
 
 def _random_maps(shape, seed: int = 0) -> DenseMaps:

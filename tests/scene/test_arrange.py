@@ -55,7 +55,7 @@ def _measured(world: model.World, scene: Scene, fields: model.BlockFields) -> tu
     exact.opt.iterations, exact.opt.ls_iterations = 20, 20
     exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
     data = mujoco.MjData(exact)
-    data.qpos[world.hand_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
+    data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
     mujoco.mj_forward(exact, data)
     geoms = [(g, s) for g, s in zip(world.block_geoms, world.parts.slot, strict=True) if scene.in_play[s]]

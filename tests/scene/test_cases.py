@@ -45,7 +45,7 @@ def _settled(case: cases.Case, seconds: float) -> np.ndarray:
     exact = model.with_blocks(world, jax.tree.map(np.asarray, model.scene_fields(world, case.scene)))
     exact.opt.iterations, exact.opt.ls_iterations = 50, 50
     data = mujoco.MjData(exact)
-    data.qpos[world.hand_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
+    data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
     data.qpos[world.block_qpos] = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
     mujoco.mj_step(exact, data, nstep=round(seconds / exact.opt.timestep))
     return data.qpos[world.block_qpos[:, :3]]

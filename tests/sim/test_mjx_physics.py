@@ -6,12 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from csac_jax.scene import layout
-from csac_jax.sim import outcome, physics as simulation
+from csac_jax.config import Config, SceneConfig
+from csac_jax.scene import blocks, layout, model
+from csac_jax.sim import mjx_physics, outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
 
 pytestmark = pytest.mark.mjx
+
+CONFIG = Config()
 
 
 def _outcomes(run, trace=None) -> np.ndarray:
@@ -104,6 +108,23 @@ def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
     assert simulation.healthy(scene)
     changed = getattr(scene, field).at[slot, 2].set(value)
     assert simulation.healthy(dataclasses.replace(scene, **{field: changed})) == good
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_meshes_are_as_large_as_the_blocks(scale: float):
+    """Claim: corners and faces that MJX collides span the block's bounding box, whatever its size in the scene."""
+    config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=blocks.MESH_KINDS, min_blocks=1))
+    world = model.build(config.scene, config.sim)
+    scene = layout.parked(config.scene.slots)
+    scene = scene.replace(half_size=scene.half_size * np.float32(scale))
+    scaled = mjx_physics._scene_model(mjx_physics.make(world, config.sim), scene)
+    for slot, geom in enumerate(world.block_geoms):
+        mesh = scaled._impl.mesh_convex[world.model.geom_dataid[geom]]
+        turn = Rotation.from_quat(world.model.geom_quat[geom], scalar_first=True)
+        for corners in (np.asarray(mesh.vert), np.asarray(mesh.face).reshape(-1, 3)):
+            placed = turn.apply(corners) + np.asarray(scaled.geom_pos[geom])
+            np.testing.assert_allclose(placed.max(axis=0), scene.half_size[slot], atol=1e-6)
+            np.testing.assert_allclose(placed.min(axis=0), -scene.half_size[slot], atol=1e-6)
 
 
 def test_no_contact_was_dropped(executed):
