@@ -367,7 +367,7 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
         "outcomes": {"lifted": 9},
         "counts": {"grasps": 10},
     }
-    cli._print_summary(cli.EvalOptions(Path("x")), summary, 1.0)
+    cli._print_summary("random in 1 episode", summary)
     shown = capsys.readouterr().out
     assert "90.0 %" in shown
     assert "lifted 9" in shown

@@ -43,7 +43,8 @@ def test_cases_are_the_shipped_files():
 def test_cases_are_turned_by_quarters():
     """Claim: an episode begins with the case turned by 0, 90, 180 or 270 degrees, so that it stays inside."""
     scene, turned = _varied(CFG, "row")
-    angle = np.arctan2(turned.position[..., 1], turned.position[..., 0]) - np.arctan2(*scene.position.T[[1, 0]])
+    before = np.asarray(scene.position)
+    angle = np.arctan2(turned.position[..., 1], turned.position[..., 0]) - np.arctan2(before[:, 1], before[:, 0])
     quarters = np.mod(angle / (0.5 * np.pi) + 0.5, 4.0) - 0.5
     np.testing.assert_allclose(quarters, quarters.round(), atol=1e-3)
     np.testing.assert_allclose(quarters.T, np.broadcast_to(quarters[:, 0], quarters.T.shape), atol=1e-3)
