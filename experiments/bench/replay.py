@@ -22,9 +22,9 @@ from csac_jax.replay import ring, samplers
 from csac_jax.train import provenance
 
 BATCH = 64
-REPEATS = 15
-STEPS = 100  # in one call
-SORTED = 2**18  # items that one call of the beta sampler sorts at least
+REPEATS = 101
+STEPS = 25  # in one call: short, so that most calls are not interrupted
+SORTED = 2**15  # items that one call of the beta sampler sorts at least
 ITEM = {"obs": jnp.zeros(16), "action": jnp.zeros(3), "reward": jnp.zeros(()), "terminated": jnp.zeros((), bool)}
 
 Step = Callable[[Any, jax.Array], Any]

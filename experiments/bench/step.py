@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
 
 from csac_jax import presets
 from csac_jax.agent import learner as learning
@@ -36,6 +35,8 @@ def _median_seconds(call: Callable[[], Any]) -> float:
 
 def _bare_loop(program: step.Program, scenes: int) -> Callable[[], Any]:
     """As many plain `mjx.step`s as one primitive has, from the model's initial state."""
+    from mujoco import mjx  # after csac_jax.sim, which keeps it from complaining of optional parts
+
     physics, substeps = program.env.physics, program.cfg.sim.substeps
     data = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * scenes), physics.data)
 
