@@ -227,6 +227,8 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
         raise BadArgumentsError(f"train: give a preset first, one of: {', '.join(presets.PRESETS)}")
     elif options.run_dir is not None and options.run_dir.exists():
         raise BadArgumentsError(f"{options.run_dir} exists; give another --run-dir, or go on with it by --resume")
+    if asked.sim.physics != "mjx":
+        raise BadArgumentsError("--sim.physics: training is one compiled program, which needs mjx; eval takes both")
     if options.tensorboard:
         _require_tensorboard()
     return options, asked

@@ -88,6 +88,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
         ("doctor --fix", "Unrecognized options: --fix"),
+        ("train smoke --sim.physics c", "--sim.physics: training is one compiled program, which needs mjx"),
         ("bench", "choose one of: parity, replay, soak, step"),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: parity, replay, soak, step"),
         ("bench step slow", "bench step: give one preset of: smoke, quick, fast"),

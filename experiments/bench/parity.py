@@ -31,7 +31,8 @@ PUSH_RUN_UP = 0.07  # m from the place of a push to the block's centre
 ENGINES = ("mjx", "c")
 
 
-def _config(slots: tuple[SlotKind, ...], in_play: int) -> Config:
+def pile_config(slots: tuple[SlotKind, ...], in_play: int) -> Config:
+    """Scenes of `in_play` blocks in these slots, with contacts enough for ten."""
     base = presets.get("quick")
     sim = SimConfig(geom_pairs=24, contacts=64)
     return dataclasses.replace(base, scene=SceneConfig(slots=slots, min_blocks=in_play), sim=sim)
@@ -83,7 +84,7 @@ def _push(key: jax.Array, scene: Scene) -> Action:
 
 def piles(in_play: int, slots: tuple[SlotKind, ...], count: int) -> dict[str, Any]:
     """Grasps and pushes in settled piles."""
-    cfg = _config(slots, in_play)
+    cfg = pile_config(slots, in_play)
     bench = Bench(cfg)
     settled = pool.settled(bench.world, cfg.scene, cfg.heightmap.extent, STREAM, count)
     rows = []
@@ -129,7 +130,7 @@ def _saturated(cfg: Config, *runs: dict[str, Any]) -> float:
 def shapes(poses: int) -> dict[str, Any]:
     """Grasps of a single block of every shape, as it came to rest after a fall in any orientation."""
     slots: tuple[SlotKind, ...] = ("box", "arch", "prism", "half_cylinder", "cylinder")
-    cfg = _config(slots, 1)
+    cfg = pile_config(slots, 1)
     bench = Bench(cfg)
     each = {name: _resting(bench, cfg, name, poses) for name in blocks.SHAPES}
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each.values())

@@ -22,7 +22,7 @@ from csac_jax.config import Config
 from csac_jax.env import Env, State
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.train import provenance
-from experiments.bench.parity import MIXED, _config
+from experiments.bench.parity import MIXED, pile_config
 
 CHUNK = 10  # actions per scene in one call of the compiled program
 
@@ -82,7 +82,7 @@ def _doubled(cfg: Config) -> Config:
 
 def soak(actions: int, scenes: int) -> dict[str, Any]:
     """At least `actions` random actions in `scenes` scenes side by side."""
-    cfg = _config(MIXED, len(MIXED))
+    cfg = pile_config(MIXED, len(MIXED))
     env, frames = environment.make(cfg), maps.frames(cfg)
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, scenes))
