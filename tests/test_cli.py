@@ -92,6 +92,8 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench", "choose one of: parity, replay, soak, step"),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: parity, replay, soak, step"),
         ("bench step slow", "bench step: give one preset of: smoke, quick, fast"),
+        ("bench soak --actions 0", "bench soak: --actions: must be at least 1"),
+        ("bench parity --poses x", "bench parity: argument --poses: invalid int value: 'x'"),
         ("bench replay 12", "bench replay: give two exponents of 2"),
         ("bench replay 14 12", "bench replay: exponents must lie in 1 .. 24"),
     ],

@@ -77,7 +77,7 @@ def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> Sizes:
     long = np.array([np.resize(choice[choice[:, 0] == choice[:, 0].max()], (2, 3)) for choice in choices])  # [N, 2, 3]
     num = len(cfg.slots)
     scale = jax.random.uniform(key_scale, (num,), jnp.float32, 1.0 - cfg.size_spread, 1.0 + cfg.size_spread)
-    shared = np.array([cfg.slots.index(kind) if kind in blocks.MESH_KINDS else i for i, kind in enumerate(cfg.slots)])
+    shared = blocks.size_leader(cfg.slots)
 
     def choose(table: np.ndarray, index: jax.Array) -> jax.Array:
         return jnp.asarray(table)[np.arange(num), index] * scale[shared][:, None]

@@ -154,6 +154,11 @@ def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.
     return jnp.asarray(normals), jnp.where(present, offsets, PADDING_OFFSET)
 
 
+def size_leader(slots: tuple[SlotKind, ...]) -> np.ndarray:
+    """Slot [N] whose scale each slot takes: its own, but one for all slots of a mesh kind, as MJX shares their mesh."""
+    return np.array([slots.index(kind) if kind in MESH_KINDS else slot for slot, kind in enumerate(slots)])
+
+
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:
     """How much larger than nominal every slot's block is [N], by its height; of use for kinds that scale as a whole."""
     nominal = np.array([half_size_choices(kind)[0][2] for kind in slots], np.float32)

@@ -76,12 +76,15 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
 
 def _add_robot(spec: mujoco.MjSpec, kind: RobotKind) -> None:
     """The floating hand, or the arm with the same hand at its flange."""
-    part = {name: mujoco.MjSpec.from_file(str(assets() / f"{name}.xml")) for name in ("hand", "ur5", "rg2")}
+
+    def part(name: str) -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_file(str(assets() / f"{name}.xml"))
+
     if kind == "ur5":
-        spec.attach(part["ur5"], prefix="ur5/", frame=spec.worldbody.add_frame())
-        spec.attach(part["rg2"], prefix="hand/", site=spec.site("ur5/tip"))
+        spec.attach(part("ur5"), prefix="ur5/", frame=spec.worldbody.add_frame())
+        spec.attach(part("rg2"), prefix="hand/", site=spec.site("ur5/tip"))
     else:
-        spec.attach(part["hand"], prefix="hand/", frame=spec.worldbody.add_frame())
+        spec.attach(part("hand"), prefix="hand/", frame=spec.worldbody.add_frame())
 
 
 def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> None:

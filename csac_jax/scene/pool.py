@@ -100,9 +100,8 @@ def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
     """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; mesh blocks of one kind alike."""
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
     scales = rng.uniform(1.0 - cfg.size_spread, 1.0 + cfg.size_spread, len(cfg.slots))
-    shared = [cfg.slots.index(kind) if kind in blocks.MESH_KINDS else slot for slot, kind in enumerate(cfg.slots)]
     sizes = np.stack([kind[rng.integers(len(kind))] for kind in choices])
-    return (sizes * scales[shared][:, None]).astype(np.float32)
+    return (sizes * scales[blocks.size_leader(cfg.slots)][:, None]).astype(np.float32)
 
 
 def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:

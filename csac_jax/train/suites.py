@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax import env as environment
+from csac_jax import env as environment, presets
 from csac_jax.config import Config, SceneConfig, SlotKind
 from csac_jax.env import Env
 from csac_jax.scene import arrange, cases, layout, model
@@ -22,9 +22,8 @@ from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation
 
 SUITES = ("own", "random10", "cases", "generated")
-MIXED: tuple[SlotKind, ...] = ("box",) * 6 + ("arch", "prism", "half_cylinder", "cylinder")
+TEN = presets.get("fast")  # its blocks are those of random10, its contacts enough for ten
 PACKED: tuple[SlotKind, ...] = ("box",) * 6 + ("arch",) * 2 + ("prism",) * 2 + ("cylinder",) * 2
-GEOM_PAIRS, CONTACTS = 24, 64  # at least, for ten blocks
 
 
 def environments(cfg: Config, suite: str, episodes: int, seed: int) -> dict[str, Env]:
@@ -37,7 +36,7 @@ def environments(cfg: Config, suite: str, episodes: int, seed: int) -> dict[str,
     if suite == "own":
         return {suite: environment.make(cfg, stream, episodes)}
     if suite == "random10":
-        scene = dataclasses.replace(cfg.scene, slots=MIXED, min_blocks=len(MIXED))
+        scene = dataclasses.replace(cfg.scene, slots=TEN.scene.slots, min_blocks=len(TEN.scene.slots))
         return {suite: environment.make(_wide(cfg, scene), stream, episodes)}
     if suite == "generated":
         return {suite: _generated(cfg, episodes, stream)}
@@ -51,7 +50,9 @@ def environments(cfg: Config, suite: str, episodes: int, seed: int) -> dict[str,
 def _wide(cfg: Config, scene: SceneConfig) -> Config:
     """The config with other blocks, and contacts enough for them."""
     sim = dataclasses.replace(
-        cfg.sim, geom_pairs=max(cfg.sim.geom_pairs, GEOM_PAIRS), contacts=max(cfg.sim.contacts, CONTACTS)
+        cfg.sim,
+        geom_pairs=max(cfg.sim.geom_pairs, TEN.sim.geom_pairs),
+        contacts=max(cfg.sim.contacts, TEN.sim.contacts),
     )
     return dataclasses.replace(cfg, scene=scene, sim=sim)
 

@@ -1,10 +1,10 @@
-"""Does MJX move blocks as C MuJoCo does? As JSON: `python -m experiments.bench.parity [--primitives N] [--poses N]`.
+"""Does MJX move blocks as C MuJoCo does? As JSON: `csac-jax bench parity [--primitives N] [--poses N]`,
+N grasps and N pushes in piles of 6 and of 10, and N poses of each shape alone.
 
 The same settled scenes and the same actions go through both. Grasps are the planner's, which reads poses: its share of
 lifts is the ceiling that physics allows. Pushes start before a random block and go through it.
 """
 
-import argparse
 import dataclasses
 import functools
 import json
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.config import Config, SceneConfig, SimConfig, SlotKind
+from csac_jax.config import Config, SceneConfig, SlotKind
 from csac_jax.env import Env
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
@@ -24,18 +24,19 @@ from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.train import provenance
+from experiments.bench._options import read
 
 BATCH = 64
 STREAM = 9001  # of drops: neither training's nor an evaluation's
 PUSH_RUN_UP = 0.07  # m from the place of a push to the block's centre
 ENGINES = ("mjx", "c")
+TEN = presets.get("fast")
 
 
 def pile_config(slots: tuple[SlotKind, ...], in_play: int) -> Config:
     """Scenes of `in_play` blocks in these slots, with contacts enough for ten."""
-    base = presets.get("quick")
-    sim = SimConfig(geom_pairs=24, contacts=64)
-    return dataclasses.replace(base, scene=SceneConfig(slots=slots, min_blocks=in_play), sim=sim)
+    scene = SceneConfig(slots=slots, min_blocks=in_play)
+    return dataclasses.replace(presets.get("quick"), scene=scene, sim=TEN.sim)
 
 
 def _batches(tree: Any, size: int) -> list[Any]:
@@ -175,24 +176,12 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 
 
-MIXED: tuple[SlotKind, ...] = (
-    "box", "box", "arch", "prism", "box", "cylinder", "half_cylinder", "box", "box", "box",
-)  # fmt: skip
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Runs all and prints one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--primitives", type=int, default=512, help="grasps, and pushes, per kind of pile")
-    parser.add_argument("--poses", type=int, default=125, help="poses of a single block per shape")
-    options = parser.parse_args(arguments)
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    options = read("parity", arguments, primitives=512, poses=125)
     begun = time.perf_counter()
-    result: dict[str, Any] = {"shapes": shapes(options.poses)}
-    result["piles_of_6"] = piles(6, MIXED[:6], options.primitives)
-    result["piles_of_10"] = piles(10, MIXED, options.primitives)
+    result: dict[str, Any] = {"shapes": shapes(options["poses"])}
+    result["piles_of_6"] = piles(6, TEN.scene.slots[:6], options["primitives"])
+    result["piles_of_10"] = piles(10, TEN.scene.slots, options["primitives"])
     result["seconds"] = time.perf_counter() - begun
     print(json.dumps(result | provenance.record(), indent=2))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,10 +1,9 @@
 """Random actions without end: is every block accounted for, how often does physics fail? JSON.
 
-`python -m experiments.bench.soak [--actions N] [--scenes E]`. Half of the actions are pushes; scenes hold ten blocks of
+`csac-jax bench soak [--actions N] [--scenes E]`. Half of the actions are pushes; scenes hold ten blocks of
 all shapes and are replaced as in training. Then the same actions run once more with twice as many contacts.
 """
 
-import argparse
 import dataclasses
 import functools
 import json
@@ -22,7 +21,8 @@ from csac_jax.config import Config
 from csac_jax.env import Env, State
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.train import provenance
-from experiments.bench.parity import MIXED, pile_config
+from experiments.bench._options import read
+from experiments.bench.parity import TEN, pile_config
 
 CHUNK = 10  # actions per scene in one call of the compiled program
 
@@ -82,7 +82,7 @@ def _doubled(cfg: Config) -> Config:
 
 def soak(actions: int, scenes: int) -> dict[str, Any]:
     """At least `actions` random actions in `scenes` scenes side by side."""
-    cfg = pile_config(MIXED, len(MIXED))
+    cfg = pile_config(TEN.scene.slots, len(TEN.scene.slots))
     env, frames = environment.make(cfg), maps.frames(cfg)
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, scenes))
@@ -124,14 +124,7 @@ def _caps(cfg: Config, env: Env, frames: maps.Frames, state: State) -> dict[str,
     return {"share": float(equal.all(axis=0).mean()), "n": count, "grasps": int(grasps.sum())}
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Runs all and prints one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--actions", type=int, default=100_000)
-    parser.add_argument("--scenes", type=int, default=1024)
-    options = parser.parse_args(arguments)
-    print(json.dumps(soak(options.actions, options.scenes) | provenance.record(), indent=2))
-
-
-if __name__ == "__main__":
-    main()
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    options = read("soak", arguments, actions=100_000, scenes=1024)
+    print(json.dumps(soak(options["actions"], options["scenes"]) | provenance.record(), indent=2))
