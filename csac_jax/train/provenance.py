@@ -1,6 +1,7 @@
 """Where a result comes from: versions, device, commit."""
 
 import importlib.metadata
+import os
 import platform
 import subprocess
 from pathlib import Path
@@ -28,7 +29,12 @@ def device() -> str:
 
 
 def commit() -> str | None:
-    """Commit of the checkout that the package lies in, with "-dirty" if files differ from it; None outside of one."""
+    """Commit of the checkout that the package lies in, with "-dirty" if files differ from it; None outside of one.
+
+    What CSAC_JAX_COMMIT says goes before: in a container the sources come without their history.
+    """
+    if named := os.environ.get("CSAC_JAX_COMMIT"):
+        return named
     folder = Path(__file__).resolve().parent
     root = _git(folder, "rev-parse", "--show-toplevel")
     own = Path(root or "") / "csac_jax" / "train" / "provenance.py"
