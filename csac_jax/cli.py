@@ -22,6 +22,7 @@ import tyro
 import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.config import Algo, Config
+from csac_jax.scene.errors import SceneError
 from csac_jax.train import stop as stopping
 
 Arguments = TypeVar("Arguments")
@@ -110,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (FailedError, OSError) as error:
+    except (FailedError, SceneError, OSError) as error:
         return _complain(1, error)
     except KeyboardInterrupt:
         return _complain(130, "stopped")

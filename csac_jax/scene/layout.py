@@ -14,7 +14,6 @@ from csac_jax.scene import blocks
 NOMINAL_DENSITY = 600.0  # kg/m^3, wood
 NOMINAL_FRICTION = 0.8
 
-
 ANY = -1
 """`Scene.target` in the clearing task."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 
 from csac_jax.config import RobotKind, SceneConfig, SimConfig, SlotKind
-from csac_jax.scene import blocks, layout
+from csac_jax.scene import blocks, layout, lint
 from csac_jax.scene.blocks import Parts
 from csac_jax.scene.layout import Scene
 
@@ -100,8 +100,13 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
 
 
 def build(scene: SceneConfig, sim: SimConfig) -> World:
-    """The world of table, robot and block slots; blocks parked, at the largest size of their kind."""
+    """The world of table, robot and block slots; blocks parked, at the largest size of their kind.
+
+    Raises SceneError where the physics is MJX and the MJCF has something that MJX lacks or would ignore.
+    """
     model = _spec(scene, sim).compile()
+    if sim.physics == "mjx":
+        lint.check(model)
     _align_inertia(model)
     names = [f"block{slot}" for slot in range(len(scene.slots))]
     bodies = np.array([model.body(name).id for name in names])

@@ -18,6 +18,7 @@ import numpy as np
 
 from csac_jax.config import SceneConfig
 from csac_jax.scene import blocks, layout
+from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import HAND_PARK_HEIGHT, BlockFields, World, assets, scene_fields, with_blocks
 
@@ -35,7 +36,7 @@ def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: i
 
     Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
     by any yaw. `world` is one with the floating hand, which waits high above. The same arguments give the same scenes
-    on every machine of one kind.
+    on every machine of one kind. Raises SceneError where hardly any scene comes to rest.
     """
     path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count)}.npz"
     cached = _read(path)
@@ -63,7 +64,7 @@ def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Genera
             good = [scene for scene in ended if scene is not None]
             found, kept, dropped = found + good, kept + len(good), dropped + _ROUND
             if dropped >= 20 * _ROUND and kept < dropped / 50:
-                raise RuntimeError(
+                raise SceneError(
                     f"only {kept} of {dropped} dropped scenes came to rest inside the workspace; "
                     "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
                 )
