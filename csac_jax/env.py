@@ -121,10 +121,16 @@ class Env:
         return heightmap.orthographic(self.cfg.heightmap, shapes, jnp.asarray(blocks.TABLE_COLOUR), wanted)
 
     def step(self, state: State, action: Action) -> State:
-        """Runs one primitive; blocks lifted or out of the workspace leave the scene."""
-        cfg, before = self.cfg, state.scene
+        """Runs one primitive; blocks lifted or out of the workspace leave the scene.
+
+        Where physics failed, the scene is as it was before; where it was no scene to begin with, empty.
+        """
+        cfg = self.cfg
+        sound = simulation.healthy(state.scene) & plausible(state.obs)
+        empty = layout.parked(cfg.scene.slots)
+        before = jax.tree.map(lambda given, none: jnp.where(sound, given, none), state.scene, empty)
         after, trace, plan = simulation.execute(self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action)
-        ill = ~simulation.healthy(after)
+        ill = ~(sound & simulation.healthy(after))
         after = jax.tree.map(lambda good, bad: jnp.where(ill, good, bad), before, after)
 
         grasped = action.primitive == Primitive.GRASP
@@ -169,6 +175,12 @@ class Env:
     def _wanted(self, scene: Scene) -> jax.Array:
         """Slots [N] bool of the blocks that the task asks for."""
         return (scene.target == layout.ANY) | (np.arange(len(self.cfg.scene.slots)) == scene.target)
+
+
+def plausible(obs: Observation) -> jax.Array:
+    """True where every entry of a top view is one that a view can have, [] bool; NaN is none."""
+    height = (obs.height >= 0.0) & (obs.height <= heightmap.VIEW_HEIGHT)
+    return jnp.all(height) & jnp.all((obs.colour >= 0.0) & (obs.colour <= 1.0))
 
 
 def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None) -> Env:

@@ -99,14 +99,39 @@ def test_failed_physics_is_flagged_alone(executed):
         ("velocity", 15.0, 0, True),
         ("velocity", np.inf, 0, False),
         ("quaternion", np.nan, 0, False),
+        ("quaternion", 0.2, 0, False),
+        ("quaternion", 1e-4, 1, True),
+        ("position", 101.0, 1, False),
+        ("half_size", np.nan, 1, False),
+        ("half_size", 0.0, 0, False),
+        ("half_size", 1e6, 0, False),
+        ("half_size", 0.3, 0, True),
     ],
 )
 def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
-    """Claim: healthy = finite, slower than MAX_SPEED and, if in play, within MAX_HEIGHT of the origin."""
+    """Claim: healthy = finite, slower than MAX_SPEED, within MAX_HEIGHT of the origin if in play, of unit quaternion
+    and of a block's size."""
     scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
     scene = scene.replace(position=jnp.zeros((2, 3)), in_play=jnp.array([True, False]))
     assert simulation.healthy(scene)
     changed = getattr(scene, field).at[slot, 2].set(value)
+    assert simulation.healthy(dataclasses.replace(scene, **{field: changed})) == good
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "good"),
+    [
+        *((field, value, False) for field in ("density", "friction") for value in (np.nan, np.inf, 1e6, 0.0, -1.0)),
+        ("density", 3000.0, True),
+        ("friction", 2.0, True),
+        *(("colour", value, False) for value in (-1, 10, 1_000_000)),
+        ("colour", 9, True),
+    ],
+)
+def test_healthy_materials(field: str, value: float, good: bool):
+    """Claim: a healthy scene has densities and frictions of solid things, and colours that there are."""
+    scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
+    changed = getattr(scene, field).at[1].set(value)
     assert simulation.healthy(dataclasses.replace(scene, **{field: changed})) == good
 
 
