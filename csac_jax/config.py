@@ -145,6 +145,54 @@ class SimConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CameraConfig:
+    """A pinhole camera; pixel centres are whole numbers. The default is VPG's (arXiv:1803.09956)."""
+
+    size: tuple[int, int] = (640, 480)
+    """Width and height of the image that `focal` and `centre` belong to, px."""
+    focal: tuple[float, float] = (618.62, 618.62)
+    """Focal lengths along the image's width and height, px."""
+    centre: tuple[float, float] = (319.5, 239.5)
+    """Where the optical axis meets the image, from the left and from the top, px."""
+    scale: float = 1.0
+    """The image is taken at this share of `size`; focal lengths and centre follow."""
+    position: tuple[float, float, float] = (-0.5, 0.0, 0.5)
+    """Where it stands, m."""
+    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Point in the middle of the view, m; the image is level."""
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height of the image taken, px."""
+        return round(self.size[0] * self.scale), round(self.size[1] * self.scale)
+
+    def __post_init__(self) -> None:
+        width, height = self.size
+        _require(min(width, height) >= 16 and max(width, height) <= 4096, "camera.size: must lie in 16 .. 4096 px")
+        _require(0.0 < self.scale <= 1.0 and min(self.pixels) >= 8, "camera.scale: 0 < scale <= 1, at least 8 px left")
+        _require(
+            all(abs(share * self.scale - round(share * self.scale)) < 1e-6 for share in self.size),
+            f"camera.scale: {self.scale} of {width} x {height} px is not a whole number of pixels",
+        )
+        off = max(abs(c - 0.5 * (side - 1)) / side for c, side in zip(self.centre, self.size, strict=True))
+        _require(
+            off <= 0.1,
+            f"camera.centre: {self.centre} is not near the middle of an image of {width} x {height} px: these are the "
+            "intrinsics of another image size; give camera.size as calibrated and camera.scale for fewer pixels",
+        )
+        _require(
+            all(0.3 <= focal / side <= 10.0 for focal, side in zip(self.focal, self.size, strict=True))
+            and abs(self.focal[0] / self.focal[1] - 1.0) <= 0.1,
+            f"camera.focal: {self.focal} px does not belong to an image of {width} x {height} px: 0.3 to 10 times its "
+            "sides, alike to 10 %",
+        )
+        _require(
+            math.hypot(*(p - q for p, q in zip(self.position[:2], self.look_at[:2], strict=True))) > 1e-3,
+            "camera.position: must not stand straight above or below camera.look_at",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class HeightmapConfig:
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 

@@ -6,13 +6,11 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.config import HeightmapConfig
-from csac_jax.vision import raycast
+from csac_jax.vision import raycast, shade
 
 VIEW_HEIGHT = 0.5
 """Height from which the map looks down, m: all that is in play lies below, parked blocks must lie wholly above."""
 
-_LIGHT = (0.36, 0.48, 0.8)  # unit vector towards the light; oblique, so that sloping faces differ in brightness
-_AMBIENT = 0.4  # share of the colour that a face turned away from the light keeps
 _HEIGHT_UNIT = 1e-4  # m per count of the packed height
 _CM2 = 1e4  # cm^2 in a m^2
 
@@ -55,19 +53,10 @@ def orthographic(
     wanted = jnp.concatenate([jnp.all(wanted, keepdims=True), wanted])  # row 0 is geom TABLE = -1
     target = wanted.at[hit.geom - raycast.TABLE].get(mode="promise_in_bounds")
     return Observation(
-        colour=_shade(polytopes.colour, table_colour, hit).reshape(cfg.size, cfg.size, 3),
+        colour=shade.flat(jnp.concatenate([table_colour[None], polytopes.colour]), hit).reshape(cfg.size, cfg.size, 3),
         height=jnp.maximum(VIEW_HEIGHT - hit.distance, 0.0).reshape(cfg.size, cfg.size),
         target=target.reshape(cfg.size, cfg.size),
     )
-
-
-def _shade(colour: jax.Array, table_colour: jax.Array, hit: raycast.Hit) -> jax.Array:
-    """Flat-shaded colours [R, 3] of hits [R] on geoms of `colour` [G, 3] and on the table [3]."""
-    x, y, z = _LIGHT
-    facing = hit.normal[:, 0] * x + hit.normal[:, 1] * y + hit.normal[:, 2] * z  # [R] cosine
-    brightness = _AMBIENT + (1.0 - _AMBIENT) * jnp.maximum(facing, 0.0)
-    surface = jnp.concatenate([table_colour[None], colour])  # row 0 is geom TABLE = -1
-    return brightness[:, None] * surface.at[hit.geom - raycast.TABLE].get(mode="promise_in_bounds")
 
 
 def pack(obs: Observation) -> PackedObservation:

@@ -6,11 +6,12 @@ another with running maxima and minima: under vmap no [R, G, F] array is ever fo
 (the half-spaces in the world frame) has no ray axis under `vmap(cast, in_axes=(None, 0, 0))`, so it is done once.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from csac_jax.scene.solids import Group, Solids
+from csac_jax.vision import shapes
 
 TABLE = -1
 """`Hit.geom` of the table."""
@@ -40,54 +41,11 @@ class Hit:
     valid: jax.Array  # [] bool, True if the ray meets anything
 
 
-class Entry(NamedTuple):
-    """Where one ray enters one geom."""
-
-    distance: jax.Array  # [] in lengths of the ray's direction; meaningless where not valid
-    face: jax.Array  # [] int32, face through which it enters; meaningless where not valid
-    valid: jax.Array  # [] bool, True if it enters
-
-
 def world_half_spaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
     """Half-spaces of every geom in the world frame: normals [G, F, 3] and offsets [G, F] m."""
     # Written as products and sums: a matrix product would run at reduced precision on some accelerators.
     normal = (polytopes.rotation[:, None, :, :] * polytopes.normal[:, :, None, :]).sum(-1)
     return normal, polytopes.offset + (normal * polytopes.position[:, None, :]).sum(-1)
-
-
-def ray_plane(origin: jax.Array, direction: jax.Array) -> Entry:
-    """One ray against the table z = 0, which is seen from above only. origin [3] m, direction [3]."""
-    falling = direction[2] < 0.0
-    distance = -origin[2] / jnp.where(falling, direction[2], -1.0)
-    return Entry(distance, jnp.array(0, jnp.int32), falling & (distance >= 0.0))
-
-
-def ray_polytope(normal: jax.Array, offset: jax.Array, origin: jax.Array, direction: jax.Array) -> Entry:
-    """One ray against one convex geom, which is seen from outside only: a ray that starts inside does not meet it.
-
-    t = (offset - n . o) / (n . d) at each plane; the ray enters at the largest t with n . d < 0 and leaves at the
-    smallest with n . d > 0. A plane parallel to the ray excludes the geom if the origin lies outside of it.
-    Scalars throughout: under vmap every step is one fused loop over rays, 20 times faster than carrying the normal.
-
-    Args: normal [F, 3] and offset [F] m in the world frame; origin [3] m, direction [3].
-    """
-    enter, leave = jnp.array(0.0, jnp.float32), jnp.array(jnp.inf, jnp.float32)
-    face, entered, excluded = jnp.array(0, jnp.int32), jnp.array(False), jnp.array(False)
-    for f in range(normal.shape[0]):
-        speed = _dot(normal[f], direction)
-        room = offset[f] - _dot(normal[f], origin)  # m, not negative inside
-        parallel = ~(jnp.abs(speed) > 0.0)
-        crossing = room / jnp.where(parallel, 1.0, speed)
-        later = (speed < 0.0) & (crossing >= enter)
-        enter, face, entered = jnp.where(later, crossing, enter), jnp.where(later, f, face), entered | later
-        leave = jnp.where(speed > 0.0, jnp.minimum(leave, crossing), leave)
-        excluded |= parallel & (room < 0.0)
-    return Entry(enter, face, entered & ~excluded & (enter <= leave))
-
-
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Scalar product [] of two vectors [3], in scalars."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cast(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> Hit:
@@ -97,11 +55,11 @@ def cast(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> Hit:
     """
     normal, offset = world_half_spaces(polytopes)
     geoms, faces = offset.shape
-    table = ray_plane(origin, direction)
+    table = shapes.ray_plane(jnp.zeros(3), origin, direction)
 
     def fold_geom(nearest, geom):
         distance, surface, valid = nearest
-        entry = ray_polytope(geom[0], geom[1], origin, direction)
+        entry = shapes.enter_half_spaces(geom[0], geom[1], origin, direction)
         closer = entry.valid & (entry.distance < distance)
         return (
             jnp.where(closer, entry.distance, distance),
@@ -114,3 +72,38 @@ def cast(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> Hit:
     # Surface -1 is the table, also after the floor division; then come the faces of all geoms.
     normals = jnp.concatenate([jnp.array([[0.0, 0.0, 1.0]], jnp.float32), normal.reshape(-1, 3)])
     return Hit(distance, normals.at[surface + 1].get(mode="promise_in_bounds"), surface // faces, valid)
+
+
+def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:
+    """First geom of any kind that the ray from `origin` [3] m along `direction` [3] (any length) meets, world frame.
+
+    There is no table here but what `solids` holds; `Hit.geom` is the geom's number. Kinds are folded one after another,
+    each as one loop over its geoms.
+    """
+    zero = jnp.zeros((), jnp.float32)
+    nearest: Nearest = (jnp.array(jnp.inf, jnp.float32), (zero, zero, zero), jnp.array(-1, jnp.int32))
+    for group in solids.groups:
+        nearest = _fold_group(group, origin, direction, nearest)
+    distance, normal, geom = nearest
+    return Hit(distance, jnp.stack(normal), geom, geom >= 0)
+
+
+Nearest = tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array], jax.Array]
+"""Of the nearest entry so far: distance [], normal [] x 3 in the world frame, number of the geom [] int32 or -1."""
+
+
+def _fold_group(group: Group, origin: jax.Array, direction: jax.Array, nearest: Nearest) -> Nearest:
+    ray = shapes.RAY[group.kind]
+
+    def fold(nearest: Nearest, geom: tuple[jax.Array, ...]) -> tuple[Nearest, None]:
+        shape, position, turn, number = geom
+        away = [origin[axis] - position[axis] for axis in range(3)]
+        local = [[shapes.dot(turn[:, axis], vector) for axis in range(3)] for vector in (away, direction)]
+        entry = ray(shape, *local)
+        closer = entry.valid & (entry.distance < nearest[0])
+        normal = tuple(shapes.dot(turn[axis], entry.normal) for axis in range(3))
+        return jax.tree.map(
+            lambda new, old: jnp.where(closer, new, old), (entry.distance, normal, number), nearest
+        ), None
+
+    return jax.lax.scan(fold, nearest, (group.shape, group.position, group.rotation, group.geom))[0]

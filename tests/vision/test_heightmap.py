@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 from csac_jax import geometry
 from csac_jax.config import HeightmapConfig
-from csac_jax.vision import heightmap, raycast
+from csac_jax.vision import heightmap, raycast, shade
 
 _TABLE = np.array([0.5, 0.4, 0.3], np.float32)
 
@@ -33,7 +33,7 @@ def test_heights_agree_with_mujoco(reference):
     np.testing.assert_allclose(height[clear], 0.5 - distance[clear], rtol=0, atol=1e-4)
     assert np.all(height[clear & (geom == raycast.TABLE)] == 0.0)
     albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[geom]  # -1 is the last row
-    brightness = 0.4 + 0.6 * np.maximum(normal @ heightmap._LIGHT, 0.0)
+    brightness = 0.4 + 0.6 * np.maximum(normal @ shade.LIGHT, 0.0)
     colour = np.asarray(obs.colour).reshape(-1, 3)
     np.testing.assert_allclose(colour[clear], (albedo * brightness[:, None])[clear], atol=1e-3)
     assert obs.height.dtype == obs.colour.dtype == jnp.float32
