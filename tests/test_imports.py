@@ -43,7 +43,7 @@ ONLY_IN = {
     "tyro": ("cli.py",),
     "rich": ("show", "cli.py"),
 }
-JIT_IN = ("train", "env.py")
+JIT_IN = ("train", "env.py", "show/picture.py")  # the last draws on machines without OpenGL
 PURE = ("vision", "nets", "agent", "replay", "sim")  # no printing, no files
 NOT_PURE = ("sim/__init__.py",)  # passes on what MJX prints as it is imported
 
