@@ -413,8 +413,8 @@ def play(arguments: list[str]) -> int:
     """`csac-jax play`."""
     options = _parse(PlayOptions, arguments, f"{PROGRAM} play")
     _check_play(options)
-    opengl = None
-    if options.png is not None or options.video is not None:
+    drawn, opengl = options.png is not None or options.video is not None, None
+    if drawn:
         from csac_jax.show import gl
 
         opengl = gl.choose()  # before MuJoCo is imported
@@ -426,13 +426,14 @@ def play(arguments: list[str]) -> int:
     from csac_jax.show import play as playing
 
     print(playing.summary(moments))
-    if opengl is not None or options.png is not None or options.video is not None:
+    if drawn:
         stage = playing.Stage(cfg, moments[0].before, options.size, opengl)
         playing.record(stage, moments, options.png, options.video)
     last = moments[-1].after
     result = {
         "scene": options.scene,
         "policy": options.policy,
+        "renderer": (opengl or "rays") if drawn else None,
         "actions": len(moments),
         "cleared": sum(int(moment.after.info.cleared) for moment in moments),
         "completed": bool(last.terminated),
@@ -456,7 +457,6 @@ def _check_play(options: PlayOptions) -> None:
 
 def _play(options: PlayOptions, cfg: Config, run_dir: Path | None) -> tuple[Config, list[Any]]:
     """The scene's config and the moments of the episode, each printed as it happens."""
-    from csac_jax.scene import cases
     from csac_jax.show import play as playing
     from csac_jax.train import checkpoint, evaluate, step, suites
 

@@ -1,4 +1,4 @@
-"""Which OpenGL can MuJoCo draw with on this machine? Must be asked before MuJoCo is imported, which reads the answer."""
+"""Which OpenGL can MuJoCo draw with here? To be asked before MuJoCo is imported, which reads the answer."""
 
 import os
 import subprocess
@@ -6,6 +6,7 @@ import sys
 
 VARIABLE = "MUJOCO_GL"
 BACKENDS = ("egl", "osmesa")  # neither needs a display
+OFF = ("off", "disable", "disabled", "false", "0")  # values that turn MuJoCo's drawing off
 _PROBE = """
 import mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
@@ -20,8 +21,9 @@ def choose() -> str | None:
 
     Each is tried in a process of its own: a broken driver may end the process.
     """
-    if os.environ.get(VARIABLE):
-        return os.environ[VARIABLE]
+    given = os.environ.get(VARIABLE, "").lower()
+    if given:
+        return None if given in OFF else given
     for backend in BACKENDS:
         if _draws(backend):
             os.environ[VARIABLE] = backend

@@ -1,8 +1,9 @@
-"""Pictures of a MuJoCo model: by MuJoCo's renderer where an OpenGL is found, by our rays where none is; PNG and video."""
+"""Pictures of a MuJoCo model, by its renderer where an OpenGL is found, by our rays where none is; PNG and video."""
 
 import dataclasses
-import importlib.util
+import itertools
 import struct
+import warnings
 import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,7 +17,6 @@ from csac_jax.scene import solids
 from csac_jax.vision import camera
 
 FRAMES_PER_SECOND = 25
-EXTRA = "pip install 'csac-jax[video]'"
 
 Draw = Callable[[mujoco.MjData], np.ndarray]  # a state to a picture [H, W, 3] uint8
 
@@ -44,7 +44,7 @@ def artist(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
 def _by_mujoco(model: mujoco.MjModel, view: View) -> Draw:
     model.vis.global_.fovy = view.field
     model.vis.global_.offwidth, model.vis.global_.offheight = view.size
-    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.35, 0.5
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.3, 0.35
     width, height = view.size
     renderer = mujoco.Renderer(model, height, width)
     eye, offset = mujoco.MjvCamera(), np.array(view.look_at) - np.array(view.position)
@@ -82,7 +82,7 @@ def _by_rays(model: mujoco.MjModel, view: View) -> Draw:
 
     def draw(data: mujoco.MjData) -> np.ndarray:
         picture = jax.device_get(render(data.geom_xpos.astype(np.float32), data.geom_xmat.astype(np.float32)))
-        sky = np.float32([0.92, 0.94, 0.96])
+        sky = np.array([0.92, 0.94, 0.96], np.float32)
         return np.round(255 * np.where(picture.valid[..., None], picture.colour, sky)).astype(np.uint8)
 
     return draw
@@ -104,11 +104,6 @@ def write_png(path: Path, picture: np.ndarray) -> None:
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts))
 
 
-def can_write_video() -> bool:
-    """Whether the wheel that brings ffmpeg is installed."""
-    return importlib.util.find_spec("imageio_ffmpeg") is not None
-
-
 def write_video(path: Path, pictures: Iterable[np.ndarray]) -> int:
     """Writes pictures [H, W, 3] uint8, at least one, as a video of FRAMES_PER_SECOND; returns their number.
 
@@ -117,17 +112,20 @@ def write_video(path: Path, pictures: Iterable[np.ndarray]) -> int:
     import imageio_ffmpeg
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer, count = None, 0
+    every = iter(pictures)
+    first = next(every)
+    height, width, _ = first.shape
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (width, height), fps=FRAMES_PER_SECOND, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    count = 0
+    with warnings.catch_warnings():  # the fork is replaced by ffmpeg at once
+        warnings.filterwarnings("ignore", message=".*fork", category=RuntimeWarning)
+        writer.send(None)
     try:
-        for count, picture in enumerate(pictures, 1):
-            if writer is None:
-                height, width, _ = picture.shape
-                writer = imageio_ffmpeg.write_frames(
-                    str(path), (width, height), fps=FRAMES_PER_SECOND, macro_block_size=2, ffmpeg_log_level="error"
-                )
-                writer.send(None)
+        for picture in itertools.chain([first], every):
             writer.send(np.ascontiguousarray(picture))
+            count += 1
     finally:
-        if writer is not None:
-            writer.close()
+        writer.close()
     return count

@@ -68,9 +68,9 @@ def line(number: int, moment: Moment) -> str:
         done = f"grasp {where}: {Outcome(int(info.outcome)).name.lower()}"
     if not moment.drive.reachable:
         done += ", out of the robot's reach"
-    wanted = np.flatnonzero(before.scene.in_play & ~after.scene.in_play)
-    names = [blocks.COLOUR_NAMES[before.scene.colour[slot]] for slot in wanted]
-    if names and info.cleared:
+    gone = np.flatnonzero(before.scene.in_play & ~after.scene.in_play)
+    names = [blocks.COLOUR_NAMES[before.scene.colour[slot]] for slot in gone]
+    if info.cleared:
         done += f" ({', '.join(names)})"
     lost = f", {info.left} left the square" if info.left else ""
     ill = ", physics failed" if info.ill else ""
@@ -80,12 +80,12 @@ def line(number: int, moment: Moment) -> str:
 def summary(moments: list[Moment]) -> str:
     """How the episode ended."""
     last = moments[-1].after
-    cleared = sum(int(moment.after.info.cleared) for moment in moments)
+    taken = sum(int(moment.after.info.cleared) for moment in moments)
     if last.terminated:
         how = "the target is taken" if last.scene.target != layout.ANY else "the table is clear"
     else:
-        how = "nothing moved any more" if last.idle >= len(moments) else "cut off"
-    return f"{how} after {len(moments)} actions, {cleared} blocks taken"
+        how = "physics failed" if last.info.ill else "cut off"
+    return f"{how} after {len(moments)} actions, {taken} blocks taken"
 
 
 def record(stage: Stage, moments: list[Moment], png: Path | None, video: Path | None) -> None:

@@ -95,7 +95,7 @@ def _substeps(world: World, exact: mujoco.MjModel, scene: Scene, drive: Drive) -
 
 
 def film(world: World, fields: BlockFields, scene: Scene, drive: Drive) -> np.ndarray:
-    """Positions of all joints [T, nq] after every substep of a drive of one scene, all NumPy: what `run` goes through."""
+    """Positions of all joints [T, nq] after every substep of a drive of one scene, all NumPy: how `run` goes."""
     exact = model.with_blocks(world, fields)
     if not drive.reachable:
         return np.zeros((0, exact.nq))
