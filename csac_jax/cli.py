@@ -253,8 +253,7 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
         raise BadArgumentsError(f"train: give a preset first, one of: {', '.join(presets.PRESETS)}")
     elif options.run_dir is not None and options.run_dir.exists():
         raise BadArgumentsError(f"{options.run_dir} exists; give another --run-dir, or go on with it by --resume")
-    if asked.sim.physics != "mjx":
-        raise BadArgumentsError("--sim.physics: training is one compiled program, which needs mjx; eval takes both")
+    _check_physics(asked)
     if options.tensorboard:
         _require_tensorboard()
     return options, asked
@@ -307,6 +306,16 @@ def _check_resume(options: TrainOptions, stored: Config, asked: Config) -> None:
         raise BadArgumentsError(
             f"{options.resume} was trained with other values of {', '.join(names)}; leave them out, or begin a new run"
         )
+
+
+def _check_physics(cfg: Config) -> None:
+    if cfg.sim.physics == "c":
+        raise BadArgumentsError("--sim.physics: training is one compiled program, which c is no part of; eval takes it")
+    if cfg.sim.physics == "warp":
+        import jax
+
+        if jax.default_backend() != "gpu":
+            raise BadArgumentsError("--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx")
 
 
 def _check_memory(cfg: Config) -> None:

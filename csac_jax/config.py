@@ -12,6 +12,8 @@ from typing import Any, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 RobotKind = Literal["hand", "ur5"]
+MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
+WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
 
 
@@ -40,7 +42,9 @@ class SceneConfig:
     pool: int = 1024
     """Distinct settled scenes per number of blocks that resets draw from; each is turned by a random yaw then."""
     size_spread: float = 0.1
-    """Block sizes differ from nominal by up to this share, from scene to scene."""
+    """Sizes of boxes and arches differ from nominal by up to this share, from scene to scene."""
+    mesh_spread: float = 0.1
+    """The same of the other kinds, which are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
     density: tuple[float, float] = (450.0, 900.0)
     """Range of block densities, kg/m^3 (ours: woods; about 0.1 kg a block)."""
     friction: tuple[float, float] = (0.5, 1.0)
@@ -56,7 +60,8 @@ class SceneConfig:
         _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
         _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
         _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")
-        _require(0.0 <= self.size_spread <= 0.25, "scene.size_spread: must lie in 0 .. 0.25")
+        for name in ("size_spread", "mesh_spread"):
+            _require(0.0 <= getattr(self, name) <= 0.25, f"scene.{name}: must lie in 0 .. 0.25")
         _require(
             100.0 <= self.density[0] <= self.density[1] <= 3000.0, "scene.density: 100 <= low <= high <= 3000 kg/m^3"
         )
@@ -87,8 +92,9 @@ class TaskConfig:
 class SimConfig:
     """Physics and the two motion primitives; one primitive is `substeps` physics steps, whatever it does."""
 
-    physics: Literal["mjx", "c"] = "mjx"
-    """`mjx`: compiled with everything else. `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
+    physics: Literal["mjx", "warp", "c"] = "mjx"
+    """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not repeatable bit for bit.
+    `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
     robot: RobotKind = "hand"
     """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
     timestep: float = 0.004
@@ -529,6 +535,14 @@ class Config:
         _require(
             self.train.scenes <= self.replay.capacity and self.learn.batch <= self.replay.capacity,
             "replay.capacity: must hold train.scenes and learn.batch transitions",
+        )
+        _require(
+            self.sim.physics != "warp" or self.scene.mesh_spread == 0.0 or not set(MESH_KINDS) & set(self.scene.slots),
+            "scene.mesh_spread: must be 0 where sim.physics is warp, whose meshes have one size in all scenes",
+        )
+        _require(
+            self.sim.physics != "warp" or self.train.scenes <= WARP_WORLDS,
+            f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp",
         )
         side = round(self.heightmap.size * (1 + self.net.margin) / 2) * 2
         _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little")

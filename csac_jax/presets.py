@@ -26,7 +26,7 @@ def quick() -> Config:
     Its discount and the end of its Beta law, (1, 4), are away from the literature's defaults; neither is shown to be
     needed.
     """
-    alike = SceneConfig(size_spread=0.0, density=(600.0, 600.0), friction=(0.8, 0.8))
+    alike = SceneConfig(size_spread=0.0, mesh_spread=0.0, density=(600.0, 600.0), friction=(0.8, 0.8))
     return Config(preset="quick", scene=alike, target=TargetConfig(gamma=0.2), replay=ReplayConfig(beta_end=(1.0, 4.0)))
 
 

@@ -100,7 +100,7 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
     """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; mesh blocks of one kind alike."""
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
-    scales = rng.uniform(1.0 - cfg.size_spread, 1.0 + cfg.size_spread, len(cfg.slots))
+    scales = 1.0 + blocks.spread(cfg) * rng.uniform(-1.0, 1.0, len(cfg.slots))
     sizes = np.stack([kind[rng.integers(len(kind))] for kind in choices])
     return (sizes * scales[blocks.size_leader(cfg.slots)][:, None]).astype(np.float32)
 

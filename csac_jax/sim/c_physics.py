@@ -90,6 +90,7 @@ def _substeps(world: World, exact: mujoco.MjModel, scene: Scene, drive: Drive) -
     for control in drive.control:
         data.ctrl[:] = control
         mujoco.mj_step(exact, data)
+        data.qvel[world.block_dofs] = np.clip(data.qvel[world.block_dofs], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
         data.qpos[world.block_qpos[parked]], data.qvel[world.block_dofs[parked]] = pose[parked], 0.0
         yield data
 

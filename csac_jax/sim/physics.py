@@ -9,7 +9,7 @@ from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World
-from csac_jax.sim import c_physics, mjx_physics, outcome, primitives, robot
+from csac_jax.sim import c_physics, mjx_physics, outcome, primitives, robot, warp_physics
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, Plan
 from csac_jax.sim.robot import Drive
@@ -34,12 +34,18 @@ class Physics(Protocol):
 
 
 def make(world: World, cfg: SimConfig) -> Physics:
-    """The physics that the config names: `mjx`, compiled with the rest, or `c`, the reference, on the host's cores."""
+    """The physics that the config names: `mjx`, compiled with the rest; `warp`, the same on NVIDIA's Warp; or `c`, the
+    reference, on the host's cores.
+
+    Raises SceneError where `warp` is not installed.
+    """
     if cfg.physics == "mjx":
         return mjx_physics.make(world, cfg)
+    if cfg.physics == "warp":
+        return warp_physics.make(world, cfg)
     if cfg.physics == "c":
         return c_physics.CPhysics(world, cfg)
-    raise ValueError(f"sim.physics: {cfg.physics!r} is neither 'mjx' nor 'c'")
+    raise ValueError(f"sim.physics: {cfg.physics!r} is none of mjx, warp, c")
 
 
 def execute(

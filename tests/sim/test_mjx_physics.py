@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from csac_jax.config import Config, SceneConfig
-from csac_jax.scene import blocks, layout, model
-from csac_jax.sim import mjx_physics, outcome, physics as simulation
+from csac_jax.config import MESH_KINDS, Config, SceneConfig
+from csac_jax.scene import layout, model
+from csac_jax.sim import c_physics, mjx_physics, outcome, physics as simulation, robot
 from csac_jax.sim.outcome import Outcome
 
 pytestmark = pytest.mark.mjx
@@ -88,6 +88,15 @@ def test_failed_physics_is_flagged_alone(executed):
     assert health.sum() == len(health) - len(names)
 
 
+def test_fast_spin_does_not_blow_up(executed, world):
+    """Claim: a thin block that comes in spinning at 250 rad/s is held to the speed limit, in MJX and in C."""
+    run = executed.case("spinning")
+    end, _ = c_physics.CPhysics(world, CONFIG.sim).run(run.scene, robot.drive("hand", run.plan))
+    for after in (run.after, end):
+        assert simulation.healthy(after)
+        assert (np.abs(after.velocity) <= layout.SPEED_LIMIT).all()
+
+
 @pytest.mark.parametrize(
     ("field", "value", "slot", "good"),
     [
@@ -138,7 +147,7 @@ def test_healthy_materials(field: str, value: float, good: bool):
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_meshes_are_as_large_as_the_blocks(scale: float):
     """Claim: corners and faces that MJX collides span the block's bounding box, whatever its size in the scene."""
-    config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=blocks.MESH_KINDS, min_blocks=1))
+    config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=MESH_KINDS, min_blocks=1))
     world = model.build(config.scene, config.sim)
     scene = layout.parked(config.scene.slots)
     scene = scene.replace(half_size=scene.half_size * np.float32(scale))
