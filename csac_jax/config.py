@@ -155,7 +155,8 @@ class CameraConfig:
     centre: tuple[float, float] = (319.5, 239.5)
     """Where the optical axis meets the image, from the left and from the top, px."""
     scale: float = 1.0
-    """The image is taken at this share of `size`; focal lengths and centre follow."""
+    """The image is taken at this share of `size`; focal lengths and centre follow. Half fills a map of 64 cells, the
+    whole one of 128; with fewer pixels cells far from the camera stay empty."""
     position: tuple[float, float, float] = (-0.5, 0.0, 0.5)
     """Where it stands, m."""
     look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
