@@ -161,7 +161,8 @@ class CameraConfig:
     centre: tuple[float, float] = (319.5, 239.5)
     """Where the optical axis meets the image, from the left and from the top, px."""
     scale: float = 1.0
-    """The image is taken at this share of `size`; focal lengths and centre follow."""
+    """The image is taken at this share of `size`; focal lengths and centre follow. Half fills a map of 64 cells, the
+    whole one of 128; with fewer pixels cells far from the camera stay empty."""
     position: tuple[float, float, float] = (-0.5, 0.0, 0.5)
     """Where it stands, m."""
     look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -199,6 +200,45 @@ class CameraConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SensorConfig:
+    """What a real depth camera gets wrong; all 0: nothing, and then it costs nothing.
+
+    Depth errors: sigma = depth_floor + depth_square d^2. Khoshelham and Elberink (Sensors 12, 2012, eq. 10) measured
+    depth_square 0.0014 for a structured-light camera, from disparities half a unit off.
+    """
+
+    depth_floor: float = 0.0
+    """Spread of a depth whatever its distance, m."""
+    depth_square: float = 0.0
+    """Spread that grows with the squared distance d, 1/m."""
+    dropped: float = 0.0
+    """Probability that a pixel has no depth."""
+    position: float = 0.0
+    """Spread of the camera's place about where it is believed to stand, m along each axis, anew in every view."""
+    rotation: float = 0.0
+    """Spread of its orientation, rad about each axis, likewise."""
+    colour: float = 0.0
+    """Spread of the gain of red, green and blue, likewise."""
+
+    @property
+    def active(self) -> bool:
+        """Anything is ever wrong."""
+        return any(getattr(self, field.name) > 0.0 for field in dataclasses.fields(self))
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "depth_floor": 0.1,
+            "depth_square": 0.1,
+            "dropped": 0.9,
+            "position": 0.1,
+            "rotation": 0.2,
+            "colour": 0.5,
+        }
+        for name, most in bounds.items():
+            _require(0.0 <= getattr(self, name) <= most, f"sensor.{name}: must lie in 0 .. {most}")
+
+
+@dataclasses.dataclass(frozen=True)
 class HeightmapConfig:
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 
@@ -206,6 +246,9 @@ class HeightmapConfig:
     """H = W, cells."""
     extent: float = 0.448
     """Side of the square workspace, m (VPG)."""
+    view: Literal["ortho", "oblique"] = "ortho"
+    """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image, projected; what blocks hide from
+    it is empty (CSAC sec. 3.1, VPG)."""
 
     @property
     def cell(self) -> float:
@@ -213,6 +256,7 @@ class HeightmapConfig:
         return self.extent / self.size
 
     def __post_init__(self) -> None:
+        _require_choices(self, "heightmap.")
         _require(self.size >= 16 and self.size % 8 == 0, "heightmap.size: must be a multiple of 8, at least 16")
         _require(0.1 <= self.extent <= 1.0, "heightmap.extent: must lie in 0.1 .. 1 m")
 
@@ -402,6 +446,10 @@ class LearnConfig:
     """Updates of the critic per training step, that is, per `train.scenes` actions; the actor has one per step."""
     augment: bool = True
     """Show each drawn transition under a random symmetry of the square."""
+    augment_shift: int = 0
+    """Largest shift of a drawn transition along each axis, cells; not shifted where that would cut something off."""
+    augment_turn: float = 0.0
+    """Largest turn of a drawn transition about the workspace centre, rad; likewise."""
     critics: int = 1
     """Critics, 1 or 2; of two, the lower Q counts in each cell (TD3's twin, arXiv:1802.09477)."""
     actor: bool = True
@@ -422,6 +470,8 @@ class LearnConfig:
     def __post_init__(self) -> None:
         _require_choices(self, "learn.")
         _require(self.learning_rate > 0.0, "learn.learning_rate: must be positive")
+        _require(0 <= self.augment_shift <= 64, "learn.augment_shift: must lie in 0 .. 64 cells")
+        _require(0.0 <= self.augment_turn <= math.pi, "learn.augment_turn: must lie in 0 .. pi")
         _require(self.actor_learning_rate > 0.0, "learn.actor_learning_rate: must be positive")
         _require(0.0 < self.rate_end <= 1.0, "learn.rate_end: must lie in 0 < rate_end <= 1")
         _require(self.batch >= 1 and self.updates >= 1, "learn.batch and learn.updates: at least 1")
@@ -510,6 +560,8 @@ class Config:
     task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()
     heightmap: HeightmapConfig = HeightmapConfig()
+    camera: CameraConfig = CameraConfig()
+    sensor: SensorConfig = SensorConfig()
     net: NetConfig = NetConfig()
     cem: CEMConfig = CEMConfig()
     policy: PolicyConfig = PolicyConfig()
@@ -543,6 +595,16 @@ class Config:
         _require(
             self.sim.physics != "warp" or self.train.scenes <= WARP_WORLDS,
             f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp",
+        )
+        _require(
+            self.heightmap.view == "oblique" or self.sensor.position == self.sensor.rotation == 0.0,
+            "sensor.position, sensor.rotation: must be 0 where heightmap.view is ortho, which has no camera",
+        )
+        most = 2 * math.floor(0.5 * math.pi * self.heightmap.size)
+        _require(
+            self.net.rotations <= most,
+            f"net.rotations: at most {most} for heightmap.size {self.heightmap.size}: more turn no cell at the rim to "
+            "another one",
         )
         side = round(self.heightmap.size * (1 + self.net.margin) / 2) * 2
         _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little")

@@ -95,7 +95,7 @@ def _run(cfg: Config, env: Env, step: Callable, params: Params | None, key: jax.
 def _begin(env: Env, key: jax.Array, rows: np.ndarray) -> State:
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), env.scenes)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(rows)))
-    return jax.vmap(env.begin)(jax.vmap(env.vary)(keys, scenes))
+    return jax.vmap(env.begin)(jax.vmap(env.vary)(keys, scenes), keys)
 
 
 def _step(env: Env, act: Policy, key: jax.Array, params: Params, states: State):

@@ -146,8 +146,7 @@ def _learn(
         current = replay.replace(priority=priority)
         slots, weights = samplers.sample(key_sample, cfg.replay, current, progress, cfg.learn.batch)
         batch = ring.gather(replay, slots)
-        if cfg.learn.augment:
-            batch = jax.vmap(augment.randomly)(_keys(key_augment, cfg.learn.batch), batch)
+        batch = jax.vmap(augment.vary, (0, None, 0))(_keys(key_augment, cfg.learn.batch), cfg, batch)
         state, info = learning.update_critic(key_target, learner, state, batch, weights)
         current = ring.set_priorities(current, slots, samplers.priority(cfg.replay, info.error))
         return (state, current.priority), (info, batch.obs)

@@ -8,6 +8,7 @@ the ray: the ray of a pixel is not of unit length, but advances by 1 m in depth 
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,6 @@ from flax import struct
 from csac_jax.config import CameraConfig
 from csac_jax.scene.solids import Solids
 from csac_jax.vision import raycast, shade
-from csac_jax.vision.raycast import Hit
 
 
 @struct.dataclass
@@ -76,24 +76,21 @@ def points(camera: Camera, depth: jax.Array) -> jax.Array:
     return depth[..., None] * directions(camera) + camera.position[None, None]
 
 
-def take(camera: Camera, cast: Callable[[jax.Array, jax.Array], Hit], colour: jax.Array) -> Picture:
-    """The picture of whatever `cast` meets with one ray (origin [3] m, direction [3]).
-
-    Args: colour [1 + geoms, 3] in 0 .. 1: of geom -1, the table, then of geoms 0, 1, ...
-    """
-    rays = directions(camera)
-    hit = jax.vmap(cast, in_axes=(None, 0))(camera.position, rays.reshape(-1, 3))
-    shape = (camera.height, camera.width)
-    return Picture(
-        colour=shade.flat(colour, hit).reshape(*shape, 3),
-        depth=jnp.where(hit.valid, hit.distance, 0.0).reshape(shape),
-        geom=hit.geom.reshape(shape),
-        valid=hit.valid.reshape(shape),
-    )
+def look(camera: Camera, cast: Callable[[jax.Array, jax.Array], Any]) -> Any:
+    """What `cast`, a function of one ray (origin [3] m, direction [3]), makes of every pixel: leaves [H, W, ...]."""
+    one = jax.vmap(cast, in_axes=(None, 0))
+    seen = one(camera.position, directions(camera).reshape(-1, 3))
+    return jax.tree.map(lambda leaf: leaf.reshape(camera.height, camera.width, *leaf.shape[1:]), seen)
 
 
 def render(camera: Camera, solids: Solids) -> Picture:
     """The picture of a scene of any geoms, flat shaded."""
-    nothing = jnp.zeros((1, 3), jnp.float32)
-    colour = jnp.concatenate([nothing, jnp.asarray(solids.colour)])
-    return take(camera, lambda origin, direction: raycast.cast_solids(solids, origin, direction), colour)
+    hit = look(camera, lambda origin, direction: raycast.cast_solids(solids, origin, direction))
+    own = jnp.asarray(solids.colour).at[jnp.maximum(hit.geom, 0)].get(mode="promise_in_bounds")
+    lit = shade.flat(own.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(own.shape)
+    return Picture(
+        colour=jnp.where(hit.valid[..., None], lit, shade.SKY[None, None]),
+        depth=jnp.where(hit.valid, hit.distance, 0.0),
+        geom=hit.geom,
+        valid=hit.valid,
+    )

@@ -6,8 +6,11 @@ another with running maxima and minima: under vmap no [R, G, F] array is ever fo
 (the half-spaces in the world frame) has no ray axis under `vmap(cast, in_axes=(None, 0, 0))`, so it is done once.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from csac_jax.scene.solids import Group, Solids
@@ -41,6 +44,14 @@ class Hit:
     valid: jax.Array  # [] bool, True if the ray meets anything
 
 
+class Meeting(NamedTuple):
+    """Where one ray first meets a block or the table. Surfaces: 0 is the table, 1 + g F + f face f of geom g."""
+
+    distance: jax.Array  # [] in lengths of the ray's direction; infinite where not valid
+    surface: jax.Array  # [] int32; 0 where not valid
+    valid: jax.Array  # [] bool, True if the ray meets anything
+
+
 def world_half_spaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
     """Half-spaces of every geom in the world frame: normals [G, F, 3] and offsets [G, F] m."""
     # Written as products and sums: a matrix product would run at reduced precision on some accelerators.
@@ -48,30 +59,44 @@ def world_half_spaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
     return normal, polytopes.offset + (normal * polytopes.position[:, None, :]).sum(-1)
 
 
-def cast(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> Hit:
+def surfaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
+    """Of every surface (see `Meeting`): normal [1 + G F, 3] in the world frame, and geom [1 + G F] int32 or TABLE."""
+    normal, _ = world_half_spaces(polytopes)
+    geoms, faces = normal.shape[:2]
+    up = jnp.array([[0.0, 0.0, 1.0]], jnp.float32)
+    geom = np.concatenate([[TABLE], np.repeat(np.arange(geoms), faces)])
+    return jnp.concatenate([up, normal.reshape(-1, 3)]), jnp.asarray(geom, jnp.int32)
+
+
+def meet(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> Meeting:
     """First surface that the ray from `origin` [3] m along `direction` [3] (any length) meets, world frame.
 
-    4096 rays in each of 8 scenes of 5 geoms with 10 faces: 2 ms on two CPU cores, 1 ms if the direction is shared.
+    4096 rays straight down in each of 64 scenes of 12 geoms with 10 faces: 6 ms on two CPU cores. What is known of a
+    surface, such as its colour, is better read from a table of surfaces than computed for every ray: reading the normal
+    alone takes longer than finding the surface.
     """
     normal, offset = world_half_spaces(polytopes)
     geoms, faces = offset.shape
     table = shapes.ray_plane(jnp.zeros(3), origin, direction)
 
     def fold_geom(nearest, geom):
-        distance, surface, valid = nearest
+        distance, surface = nearest
         entry = shapes.enter_half_spaces(geom[0], geom[1], origin, direction)
         closer = entry.valid & (entry.distance < distance)
-        return (
-            jnp.where(closer, entry.distance, distance),
-            jnp.where(closer, geom[2] * faces + entry.face, surface),
-            valid | closer,
-        ), None
+        surface = jnp.where(closer, geom[2] * faces + entry.face + 1, surface)
+        return (jnp.where(closer, entry.distance, distance), surface), None
 
-    start = (jnp.where(table.valid, table.distance, jnp.inf), jnp.array(-1, jnp.int32), table.valid)
-    (distance, surface, valid), _ = jax.lax.scan(fold_geom, start, (normal, offset, jnp.arange(geoms, dtype=jnp.int32)))
-    # Surface -1 is the table, also after the floor division; then come the faces of all geoms.
-    normals = jnp.concatenate([jnp.array([[0.0, 0.0, 1.0]], jnp.float32), normal.reshape(-1, 3)])
-    return Hit(distance, normals.at[surface + 1].get(mode="promise_in_bounds"), surface // faces, valid)
+    start = (jnp.where(table.valid, table.distance, jnp.inf), jnp.array(0, jnp.int32))
+    (distance, surface), _ = jax.lax.scan(fold_geom, start, (normal, offset, jnp.arange(geoms, dtype=jnp.int32)))
+    return Meeting(distance, surface, table.valid | (surface > 0))
+
+
+def cast(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> Hit:
+    """As `meet`, with the normal and the geom of what is met."""
+    normal, geom = surfaces(polytopes)
+    distance, surface, valid = meet(polytopes, origin, direction)
+    at = normal.at[surface].get(mode="promise_in_bounds"), geom.at[surface].get(mode="promise_in_bounds")
+    return Hit(distance, at[0], at[1], valid)
 
 
 def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:

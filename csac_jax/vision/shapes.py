@@ -43,22 +43,22 @@ def enter_half_spaces(normal: jax.Array, offset: jax.Array, origin: Vector, dire
     """One ray against one intersection of half-spaces (slab method, Kay and Kajiya 1986).
 
     t = (offset - n . o) / (n . d) at each plane; the ray enters at the largest t with n . d < 0 and leaves at the
-    smallest with n . d > 0. A plane parallel to the ray excludes the geom if the origin lies outside of it.
+    smallest with n . d > 0. A plane parallel to the ray is never left if the origin lies inside of it, else at once.
+    Times the reciprocal of n . d: where all rays share a direction, the division is done once per plane.
 
     Args: normal [F, 3] and offset [F] m; origin [3] m, direction [3].
     """
-    enter, leave = jnp.array(0.0, jnp.float32), jnp.array(jnp.inf, jnp.float32)
-    face, entered, excluded = jnp.array(0, jnp.int32), jnp.array(False), jnp.array(False)
+    enter, leave, face = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32), jnp.array(0, jnp.int32)
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
         room = offset[f] - dot(normal[f], origin)  # m, not negative inside
         parallel = ~(jnp.abs(speed) > 0.0)
-        crossing = room / jnp.where(parallel, 1.0, speed)
-        later = (speed < 0.0) & (crossing >= enter)
-        enter, face, entered = jnp.where(later, crossing, enter), jnp.where(later, f, face), entered | later
-        leave = jnp.where(speed > 0.0, jnp.minimum(leave, crossing), leave)
-        excluded |= parallel & (room < 0.0)
-    return Crossing(enter, face, entered & ~excluded & (enter <= leave))
+        crossing = room * (1.0 / jnp.where(parallel, 1.0, speed))
+        inwards = jnp.where(speed < 0.0, crossing, -jnp.inf)
+        outwards = jnp.where(speed > 0.0, crossing, jnp.where(parallel & (room < 0.0), -jnp.inf, jnp.inf))
+        face = jnp.where(inwards > enter, f, face)
+        enter, leave = jnp.maximum(enter, inwards), jnp.minimum(leave, outwards)
+    return Crossing(enter, face, (enter >= 0.0) & (enter <= leave))
 
 
 def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> Entry:

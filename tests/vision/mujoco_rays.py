@@ -14,6 +14,13 @@ SHAPES = tuple(blocks.SHAPES)
 SLOTS: tuple[SlotKind, ...] = tuple(blocks.SHAPES[name].kind for name in SHAPES)
 
 
+class Placed(NamedTuple):
+    """A model at a pose."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
+
 class Rays(NamedTuple):
     """What R rays meet."""
 
@@ -22,7 +29,7 @@ class Rays(NamedTuple):
     normal: np.ndarray  # [R, 3]
 
 
-def blocks_and_arm(rng: np.random.Generator) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def blocks_and_arm(rng: np.random.Generator) -> Placed:
     """The eight blocks in random poses under and about the UR5 with its hand, on the table."""
     scene = layout.parked(SLOTS)
     half_size = np.array([blocks.SHAPES[name].half_size for name in SHAPES], np.float32)
@@ -39,10 +46,10 @@ def blocks_and_arm(rng: np.random.Generator) -> tuple[mujoco.MjModel, mujoco.MjD
     data.qpos[world.block_qpos[:, :3]] = rng.uniform([-0.2, -0.2, 0.02], [0.2, 0.2, 0.2], (len(SHAPES), 3))
     data.qpos[world.block_qpos[:, 3:]] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
     mujoco.mj_kinematics(model, data)
-    return model, data
+    return Placed(model, data)
 
 
-def every_type(rng: np.random.Generator) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def every_type(rng: np.random.Generator) -> Placed:
     """Two of each type that the raycaster knows but meshes, of random sizes and poses; one plane has an end."""
     geoms = '<geom type="plane" size="0 0 1" pos="0 0 -0.3"/><geom type="plane" size="0.3 0.2 1" euler="10 20 30"/>'
     for kind in ("box", "sphere", "capsule", "cylinder") * 2:
@@ -54,7 +61,7 @@ def every_type(rng: np.random.Generator) -> tuple[mujoco.MjModel, mujoco.MjData]
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    return model, data
+    return Placed(model, data)
 
 
 def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
