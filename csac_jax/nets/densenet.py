@@ -37,7 +37,8 @@ def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None
     """
     maps = [height[..., None] / _HEIGHT_SCALE]
     if colour is not None:
-        normal = (colour - jnp.asarray(_COLOUR_MEAN)) / jnp.asarray(_COLOUR_STD)
+        mean, std = (jnp.broadcast_to(v, colour.shape) for v in (_COLOUR_MEAN, _COLOUR_STD))
+        normal = (colour - mean) / std
         maps.insert(0, jnp.where(height[..., None] > TABLE_HEIGHT, normal, 0.0))
     if target is not None:
         maps.append(target[..., None].astype(height.dtype))
@@ -85,6 +86,11 @@ def max_pool(maps: jax.Array) -> jax.Array:
     return functools.reduce(jnp.maximum, shifted)
 
 
+def average_pool(maps: jax.Array) -> jax.Array:
+    """Mean of 2 x 2 cells: [B, H, W, F], H and W even -> [B, H / 2, W / 2, F]."""
+    return 0.25 * (maps[:, ::2, ::2] + maps[:, ::2, 1::2] + maps[:, 1::2, ::2] + maps[:, 1::2, 1::2])
+
+
 class DenseLayer(nn.Module):
     """Adds `block_growth` channels to maps: [B, H, W, F] -> [B, H, W, F + block_growth]."""
 
@@ -121,7 +127,7 @@ class Transition(nn.Module):
     def __call__(self, maps: jax.Array, train: bool) -> jax.Array:
         channels = maps.shape[-1]
         maps = nn.relu(_norm(self.cfg, channels, train, "norm")(maps))
-        return nn.avg_pool(_convolution(self.cfg, channels // 2, 1, 1, "conv")(maps), (2, 2), (2, 2))
+        return average_pool(_convolution(self.cfg, channels // 2, 1, 1, "conv")(maps))
 
 
 class Trunk(nn.Module):

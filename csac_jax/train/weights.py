@@ -11,12 +11,10 @@ from csac_jax.nets import torchvision
 
 
 def read(cfg: NetConfig) -> Any:
-    """Variables of a trunk from the file `net.weights`; None if no file is asked for. Nothing in it is executed.
+    """Variables of a trunk from the file `net.weights`. Nothing in the file is executed.
 
     Raises ValueError in one line, naming the tensor if one is missing, extra or misshapen.
     """
-    if not cfg.weights:
-        return None
     path = Path(cfg.weights)
     try:
         tensors = safetensors.numpy.load_file(path)
