@@ -52,9 +52,9 @@ def fast() -> Config:
 def paper() -> Config:
     """The protocol of the paper, for one GPU: DenseNet-121 on maps of 224 cells, one scene, 2,500 actions, ten blocks.
 
-    Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per action; places are tried
-    by action noise alone, and nothing is augmented. Where the paper is silent: the batch, `policy.mask`, tau of SD3, and
-    two pixels per cell, VPG's.
+    Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per action; places are
+    explored by action noise alone, and nothing is augmented. Where the paper is silent: tau of SD3, two pixels per cell
+    as in VPG, and, ours, the batch and `policy.mask`. Its result is not recorded yet.
     """
     return Config(
         preset="paper",

@@ -56,7 +56,9 @@ def _norm(cfg: NetConfig, channels: int, train: bool, name: str) -> nn.Module:
     """Norm of maps [..., channels]; `train`: batch norm takes the batch's statistics and moves the running ones."""
     dtype = compute_dtype(cfg)
     if cfg.norm == "batch":
-        return nn.BatchNorm(not train, momentum=_MOMENTUM, epsilon=_EPSILON, dtype=dtype, name=name)
+        return nn.BatchNorm(
+            not train, use_fast_variance=False, momentum=_MOMENTUM, epsilon=_EPSILON, dtype=dtype, name=name
+        )
     groups = math.gcd(_GROUPS, channels)
     return nn.GroupNorm(groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name)
 
