@@ -226,9 +226,10 @@ def train(arguments: list[str]) -> int:
     stop = stopping.install()
     options, cfg = _read_train(arguments)
     _check_memory(cfg)
+    trunk = None if options.resume else _read_weights(cfg)
     run_dir = options.resume or options.run_dir or _new_run_dir(cfg)
     begun = time.time()
-    summary = _train(options, cfg, run_dir, stop)
+    summary = _train(options, cfg, run_dir, stop, trunk)
     result = {"run_dir": str(run_dir), **summary._asdict(), "wall_seconds": round(time.time() - begun, 1)}
     _write_json(options.json, result, cfg)
     return stop.exit_code
@@ -327,6 +328,18 @@ def _check_memory(cfg: Config) -> None:
         raise BadArgumentsError(str(error)) from None
 
 
+def _read_weights(cfg: Config) -> Any:
+    """Variables of the trunk that the networks begin with, None for random ones."""
+    if not cfg.net.weights:
+        return None
+    from csac_jax.train import weights
+
+    try:
+        return weights.read(cfg.net)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+
+
 def _require_tensorboard() -> None:
     import importlib.util
 
@@ -341,7 +354,7 @@ def _new_run_dir(cfg: Config) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
-def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop) -> Any:
+def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop, trunk: Any) -> Any:
     from rich.console import Console
 
     from csac_jax.show.progress import Group, Terminal
@@ -359,7 +372,7 @@ def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Sto
             return loop.run(
                 cfg,
                 run_dir,
-                lambda: step.init(program),
+                lambda: step.init(program, trunk),
                 lambda num_steps: step.compile_chunk(program, num_steps),
                 Group(reporters),
                 stop,

@@ -16,6 +16,8 @@ MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
 
+DENSENET_STRIDE = 32  # pixels of DenseNet-121's input per cell of its features, along each axis
+
 
 def _require(condition: bool, message: str) -> None:
     if not condition:
@@ -263,26 +265,79 @@ class HeightmapConfig:
 
 @dataclasses.dataclass(frozen=True)
 class NetConfig:
-    """The small dense net: densely connected, group norm, fully convolutional, at half the map's resolution."""
+    """The network over turned maps: a small dense net, or DenseNet-121 (CSAC sec. 3.4), both fully convolutional."""
 
+    kind: Literal["small", "densenet121"] = "small"
+    """`small`: densely connected, group norm, at half the map's resolution. `densenet121`: a trunk each for colour,
+    height and target mask, at 1/32 of the resolution of its input."""
     rotations: int = 16
     """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
-    growth: int = 24
-    """Channels that each dense layer adds."""
-    dilations: tuple[int, ...] = (1, 2, 4, 1)
-    """Dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
-    stem: int = 16
-    """Channels of the first convolution."""
-    head: int = 32
-    """Channels of the 1 x 1 convolution before each head."""
+    colour: bool = True
+    """Whether the net sees colours, or heights alone."""
     margin: float = 0.125
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
+    head: int = 32
+    """Channels of the 1 x 1 convolution before each head (VPG 64)."""
+    growth: int = 24
+    """small: channels that each dense layer adds."""
+    dilations: tuple[int, ...] = (1, 2, 4, 1)
+    """small: dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
+    stem: int = 16
+    """small: channels of the first convolution."""
+    norm: Literal["group", "batch"] = "group"
+    """densenet121: `batch`, as in the paper, or `group`, which is the same while acting and while learning."""
+    block_layers: tuple[int, int, int, int] = (6, 12, 24, 16)
+    """densenet121: dense layers of each block (Huang et al., arXiv:1608.06993, table 1)."""
+    block_growth: int = 32
+    """densenet121: channels that each dense layer adds (same table)."""
+    zoom: int = 1
+    """densenet121: pixels of its input per cell of the map, along each axis (VPG 2: features lie 16 cells apart)."""
+    output_stride: int = 4
+    """densenet121: cells of the map per cell that its outputs are upsampled to (ours; the paper 1, at 16 times the
+    memory: what is upsampled is bilinear, and so is reading it)."""
+    dtype: Literal["auto", "float32", "bfloat16"] = "auto"
+    """densenet121: what it computes in, parameters being float32; auto: bfloat16 on accelerators, float32 on a CPU."""
+    weights: str = ""
+    """densenet121: .safetensors file with ImageNet weights in torchvision's names that its trunks begin with; none if
+    empty."""
 
     def __post_init__(self) -> None:
+        _require_choices(self, "net.")
         _require(self.rotations >= 4 and self.rotations % 2 == 0, "net.rotations: must be even, at least 4")
         _require(min(self.growth, self.stem, self.head) >= 4, "net.growth, stem, head: at least 4 channels")
         _require(len(self.dilations) >= 1 and min(self.dilations) >= 1, "net.dilations: at least one layer, each >= 1")
         _require(0.0 <= self.margin <= 0.5, "net.margin: must lie in 0 .. 0.5")
+        _require(min(self.block_layers) >= 1, "net.block_layers: at least one layer in each block")
+        _require(
+            self.block_growth >= 4 and self.block_growth % 4 == 0, "net.block_growth: must be a multiple of 4 channels"
+        )
+        _require(
+            self.zoom >= 1 and self.output_stride >= 1 and DENSENET_STRIDE % (self.zoom * self.output_stride) == 0,
+            f"net.zoom, net.output_stride: their product must divide {DENSENET_STRIDE}, the stride of DenseNet-121",
+        )
+        _require(
+            self.kind == "densenet121" or (self.norm == "group" and not self.weights),
+            "net.norm batch, net.weights: only of --net.kind densenet121; the small net has group norm",
+        )
+        _require(
+            not self.weights or self.norm == "batch", "net.weights: need --net.norm batch, whose statistics they bring"
+        )
+
+    def check_canvas(self, size: int) -> None:
+        """Raises ValueError if the strides do not divide the rotated maps of a height map of `size` cells."""
+        side = round(size * (1 + self.margin) / 2) * 2
+        if self.kind == "small":
+            _require(
+                side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little"
+            )
+            return
+        step = DENSENET_STRIDE // self.zoom
+        if side % step:
+            larger = -(-size // step) * step
+            sides = [larger + i * step for i in range(3) if larger + i * step <= 1.5 * size]
+            fitting = ", ".join(f"{s / size - 1:.4f} ({s} cells)" for s in sides)
+            remedy = f"try {fitting}" if fitting else f"no margin makes it fit; take another heightmap.size than {size}"
+            raise ValueError(f"net.margin: DenseNet-121 needs maps of a multiple of {step} cells, not {side}; {remedy}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -606,5 +661,4 @@ class Config:
             f"net.rotations: at most {most} for heightmap.size {self.heightmap.size}: more turn no cell at the rim to "
             "another one",
         )
-        side = round(self.heightmap.size * (1 + self.net.margin) / 2) * 2
-        _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little")
+        self.net.check_canvas(self.heightmap.size)

@@ -173,8 +173,11 @@ def _keys(key: jax.Array, num: int) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
 
 
-def init(program: Program) -> TrainState:
-    """The state before the first step: fresh scenes and networks, an empty ring (lines 1-4). A fixed point of types."""
+def init(program: Program, trunk: Any = None) -> TrainState:
+    """The state before the first step: fresh scenes and networks, an empty ring (lines 1-4). A fixed point of types.
+
+    trunk: variables that the networks' trunks begin with, see `weights.read`; None for random ones.
+    """
     cfg = program.cfg
 
     def build() -> TrainState:
@@ -189,7 +192,8 @@ def init(program: Program) -> TrainState:
             replay=ring.init(cfg.replay, example(cfg)),
         )
 
-    return jax.jit(build)()
+    state = jax.jit(build)()
+    return state if trunk is None else state.replace(learner=learning.with_trunk(state.learner, trunk))
 
 
 def example(cfg: Config) -> Transition:
