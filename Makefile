@@ -11,7 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup train eval test test-slow lint format bench doctor clean
+.PHONY: help setup train eval test test-slow lint format bench pictures doctor clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -47,6 +47,11 @@ format: $(STAMP)  ## rewrite the sources in ruff's format
 
 bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke for another preset
 	$(BIN)/csac-jax bench $(NAME) $(ARGS)
+
+pictures: $(STAMP)  ## the pictures of README.md, anew
+	for shown in row:hand ridge:hand pinwheel:ur5 hole:ur5; do \
+	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --png docs/pictures/$${shown%:*}.png; \
+	done
 
 doctor: $(STAMP)  ## versions, devices, numerics self-test
 	$(BIN)/csac-jax doctor $(ARGS)

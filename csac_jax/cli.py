@@ -22,6 +22,7 @@ import tyro
 import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.config import Algo, Config
+from csac_jax.scene.errors import SceneError
 from csac_jax.train import stop as stopping
 
 Arguments = TypeVar("Arguments")
@@ -37,6 +38,7 @@ A robot learns to push and grasp in clutter.
                      --algo NAME: {", ".join(algorithms.ALGORITHMS)}
   train --resume DIR go on with a run that was stopped
   eval DIR           measure what a run has learned
+  play               run one episode, as text, picture and video
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 
@@ -93,6 +95,30 @@ class EvalOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class PlayOptions:
+    """Runs one episode and says what every action did; draws it, if asked to, with no display."""
+
+    scene: str = "random"
+    """What lies on the table: random (blocks dropped anew), the name of a shipped case, or a case file."""
+    robot: Literal["hand", "ur5"] = "hand"
+    """What moves the gripper: nothing, it floats; or the arm."""
+    policy: str = "oracle"
+    """What acts: oracle (reads the blocks' poses), random (a random place above a block), or the folder of a run."""
+    physics: Literal["c", "mjx"] = "c"
+    """What moves the blocks; with mjx, the motion between two states that a video shows is still C MuJoCo's."""
+    video: Path | None = None
+    """File to write a video to, such as out.mp4."""
+    png: Path | None = None
+    """File to write a picture of the first moment to."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height of picture and video, px, even numbers."""
+    seed: int = 0
+    """Number that the scene and the policy's noise follow from."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
 class DoctorOptions:
     """Prints versions, devices and the protections in force, and checks that this machine computes right."""
 
@@ -110,7 +136,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (FailedError, OSError) as error:
+    except (FailedError, SceneError, OSError) as error:
         return _complain(1, error)
     except KeyboardInterrupt:
         return _complain(130, "stopped")
@@ -200,9 +226,10 @@ def train(arguments: list[str]) -> int:
     stop = stopping.install()
     options, cfg = _read_train(arguments)
     _check_memory(cfg)
+    trunk = None if options.resume else _read_weights(cfg)
     run_dir = options.resume or options.run_dir or _new_run_dir(cfg)
     begun = time.time()
-    summary = _train(options, cfg, run_dir, stop)
+    summary = _train(options, cfg, run_dir, stop, trunk)
     result = {"run_dir": str(run_dir), **summary._asdict(), "wall_seconds": round(time.time() - begun, 1)}
     _write_json(options.json, result, cfg)
     return stop.exit_code
@@ -227,8 +254,7 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
         raise BadArgumentsError(f"train: give a preset first, one of: {', '.join(presets.PRESETS)}")
     elif options.run_dir is not None and options.run_dir.exists():
         raise BadArgumentsError(f"{options.run_dir} exists; give another --run-dir, or go on with it by --resume")
-    if asked.sim.physics != "mjx":
-        raise BadArgumentsError("--sim.physics: training is one compiled program, which needs mjx; eval takes both")
+    _check_physics(asked)
     if options.tensorboard:
         _require_tensorboard()
     return options, asked
@@ -283,11 +309,33 @@ def _check_resume(options: TrainOptions, stored: Config, asked: Config) -> None:
         )
 
 
+def _check_physics(cfg: Config) -> None:
+    if cfg.sim.physics == "c":
+        raise BadArgumentsError("--sim.physics: training is one compiled program, which c is no part of; eval takes it")
+    if cfg.sim.physics == "warp":
+        import jax
+
+        if jax.default_backend() != "gpu":
+            raise BadArgumentsError("--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx")
+
+
 def _check_memory(cfg: Config) -> None:
     from csac_jax.train import memory
 
     try:
         memory.check_replay(cfg)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+
+
+def _read_weights(cfg: Config) -> Any:
+    """Variables of the trunk that the networks begin with, None for random ones."""
+    if not cfg.net.weights:
+        return None
+    from csac_jax.train import weights
+
+    try:
+        return weights.read(cfg.net)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
 
@@ -306,7 +354,7 @@ def _new_run_dir(cfg: Config) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
-def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop) -> Any:
+def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop, trunk: Any) -> Any:
     from rich.console import Console
 
     from csac_jax.show.progress import Group, Terminal
@@ -324,7 +372,7 @@ def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Sto
             return loop.run(
                 cfg,
                 run_dir,
-                lambda: step.init(program),
+                lambda: step.init(program, trunk),
                 lambda num_steps: step.compile_chunk(program, num_steps),
                 Group(reporters),
                 stop,
@@ -378,6 +426,93 @@ def _evaluate(options: EvalOptions, cfg: Config) -> dict[str, dict[str, Any]]:
         name: metrics.summarise(evaluate.rollout(env.cfg, env, options.policy, params, options.episodes, options.seed))
         for name, env in parts.items()
     }
+
+
+# play.
+
+
+def play(arguments: list[str]) -> int:
+    """`csac-jax play`."""
+    options = _parse(PlayOptions, arguments, f"{PROGRAM} play")
+    _check_play(options)
+    drawn, opengl = options.png is not None or options.video is not None, None
+    if drawn:
+        from csac_jax.show import gl
+
+        opengl = gl.choose()  # before MuJoCo is imported
+    run_dir = None if options.policy in ("oracle", "random") else Path(options.policy)
+    cfg = presets.quick() if run_dir is None else _stored_config(run_dir)
+    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
+    begun = time.time()
+    cfg, moments = _play(options, cfg, run_dir)
+    from csac_jax.show import play as playing
+
+    print(playing.summary(moments))
+    if drawn:
+        stage = playing.Stage(cfg, moments[0].before, options.size, opengl)
+        playing.record(stage, moments, options.png, options.video)
+    last = moments[-1].after
+    result = {
+        "scene": options.scene,
+        "policy": options.policy,
+        "renderer": (opengl or "rays") if drawn else None,
+        "actions": len(moments),
+        "cleared": sum(int(moment.after.info.cleared) for moment in moments),
+        "completed": bool(last.terminated),
+        "seconds": round(time.time() - begun, 1),
+    }
+    _write_json(options.json, result, cfg)
+    return 0
+
+
+def _check_play(options: PlayOptions) -> None:
+    if not 0 <= options.seed < 2**31 - 1:
+        raise BadArgumentsError("--seed: must lie in 0 .. 2147483646")
+    if not all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size):
+        raise BadArgumentsError("--size: both numbers must be even and lie in 16 .. 4096 px")
+    if options.video is not None:
+        import importlib.util
+
+        if importlib.util.find_spec("imageio_ffmpeg") is None:
+            raise BadArgumentsError("--video needs an extra; run: pip install 'csac-jax[video]'")
+
+
+def _play(options: PlayOptions, cfg: Config, run_dir: Path | None) -> tuple[Config, list[Any]]:
+    """The scene's config and the moments of the episode, each printed as it happens."""
+    from csac_jax.show import play as playing
+    from csac_jax.train import checkpoint, evaluate, step, suites
+
+    try:
+        suite = "own" if options.scene == "random" else str(_case_file(options.scene))
+        (env,) = suites.environments(cfg, suite, 1, options.seed).values()
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    params = None
+    if run_dir is not None:
+        try:
+            params = checkpoint.restore(run_dir, step.abstract_state(cfg))[0].learner.online
+        except checkpoint.CheckpointError as error:
+            raise FailedError(str(error)) from None
+    moments: list[Any] = []
+    name = "learned" if run_dir is not None else options.policy
+    for moment in evaluate.episode(env.cfg, env, name, params, options.seed):
+        moments.append(moment)
+        print(playing.line(len(moments), moment), flush=True)
+    return env.cfg, moments
+
+
+def _case_file(scene: str) -> Path:
+    """File of a shipped case by name, or the user's own. Raises ValueError if there is neither."""
+    from csac_jax.scene import cases
+
+    if scene in cases.names():
+        return cases.shipped(scene)
+    if Path(scene).is_file():
+        return Path(scene)
+    raise ValueError(f"--scene: '{scene}' is neither a case file nor one of: random, {', '.join(cases.names())}")
+
+
+# eval, continued: how results are printed.
 
 
 def _print_summary(title: str, summary: dict[str, Any]) -> None:
@@ -493,4 +628,10 @@ def _write_json(path: Path | None, result: dict[str, Any], cfg: Config | None) -
     temporary.replace(path)
 
 
-COMMANDS: dict[str, Callable[[list[str]], int]] = {"train": train, "eval": evaluate, "doctor": doctor, "bench": bench}
+COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "train": train,
+    "eval": evaluate,
+    "play": play,
+    "doctor": doctor,
+    "bench": bench,
+}

@@ -12,7 +12,11 @@ from typing import Any, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 RobotKind = Literal["hand", "ur5"]
+MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
+WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
+
+DENSENET_STRIDE = 32  # pixels of DenseNet-121's input per cell of its features, along each axis
 
 
 def _require(condition: bool, message: str) -> None:
@@ -40,7 +44,9 @@ class SceneConfig:
     pool: int = 1024
     """Distinct settled scenes per number of blocks that resets draw from; each is turned by a random yaw then."""
     size_spread: float = 0.1
-    """Block sizes differ from nominal by up to this share, from scene to scene."""
+    """Sizes of boxes and arches differ from nominal by up to this share, from scene to scene."""
+    mesh_spread: float = 0.1
+    """The same of the other kinds, which are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
     density: tuple[float, float] = (450.0, 900.0)
     """Range of block densities, kg/m^3 (ours: woods; about 0.1 kg a block)."""
     friction: tuple[float, float] = (0.5, 1.0)
@@ -56,7 +62,8 @@ class SceneConfig:
         _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
         _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
         _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")
-        _require(0.0 <= self.size_spread <= 0.25, "scene.size_spread: must lie in 0 .. 0.25")
+        for name in ("size_spread", "mesh_spread"):
+            _require(0.0 <= getattr(self, name) <= 0.25, f"scene.{name}: must lie in 0 .. 0.25")
         _require(
             100.0 <= self.density[0] <= self.density[1] <= 3000.0, "scene.density: 100 <= low <= high <= 3000 kg/m^3"
         )
@@ -87,8 +94,9 @@ class TaskConfig:
 class SimConfig:
     """Physics and the two motion primitives; one primitive is `substeps` physics steps, whatever it does."""
 
-    physics: Literal["mjx", "c"] = "mjx"
-    """`mjx`: compiled with everything else. `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
+    physics: Literal["mjx", "warp", "c"] = "mjx"
+    """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not repeatable bit for bit.
+    `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
     robot: RobotKind = "hand"
     """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
     timestep: float = 0.004
@@ -145,6 +153,94 @@ class SimConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CameraConfig:
+    """A pinhole camera; pixel centres are whole numbers. The default is VPG's (arXiv:1803.09956)."""
+
+    size: tuple[int, int] = (640, 480)
+    """Width and height of the image that `focal` and `centre` belong to, px."""
+    focal: tuple[float, float] = (618.62, 618.62)
+    """Focal lengths along the image's width and height, px."""
+    centre: tuple[float, float] = (319.5, 239.5)
+    """Where the optical axis meets the image, from the left and from the top, px."""
+    scale: float = 1.0
+    """The image is taken at this share of `size`; focal lengths and centre follow. Half fills a map of 64 cells, the
+    whole one of 128; with fewer pixels cells far from the camera stay empty."""
+    position: tuple[float, float, float] = (-0.5, 0.0, 0.5)
+    """Where it stands, m."""
+    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Point in the middle of the view, m; the image is level."""
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height of the image taken, px."""
+        return round(self.size[0] * self.scale), round(self.size[1] * self.scale)
+
+    def __post_init__(self) -> None:
+        width, height = self.size
+        _require(min(width, height) >= 16 and max(width, height) <= 4096, "camera.size: must lie in 16 .. 4096 px")
+        _require(0.0 < self.scale <= 1.0 and min(self.pixels) >= 8, "camera.scale: 0 < scale <= 1, at least 8 px left")
+        _require(
+            all(abs(share * self.scale - round(share * self.scale)) < 1e-6 for share in self.size),
+            f"camera.scale: {self.scale} of {width} x {height} px is not a whole number of pixels",
+        )
+        off = max(abs(c - 0.5 * (side - 1)) / side for c, side in zip(self.centre, self.size, strict=True))
+        _require(
+            off <= 0.1,
+            f"camera.centre: {self.centre} is not near the middle of an image of {width} x {height} px: these are the "
+            "intrinsics of another image size; give camera.size as calibrated and camera.scale for fewer pixels",
+        )
+        _require(
+            all(0.3 <= focal / side <= 10.0 for focal, side in zip(self.focal, self.size, strict=True))
+            and abs(self.focal[0] / self.focal[1] - 1.0) <= 0.1,
+            f"camera.focal: {self.focal} px does not belong to an image of {width} x {height} px: 0.3 to 10 times its "
+            "sides, alike to 10 %",
+        )
+        _require(
+            math.hypot(*(p - q for p, q in zip(self.position[:2], self.look_at[:2], strict=True))) > 1e-3,
+            "camera.position: must not stand straight above or below camera.look_at",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorConfig:
+    """What a real depth camera gets wrong; all 0: nothing, and then it costs nothing.
+
+    Depth errors: sigma = depth_floor + depth_square d^2. Khoshelham and Elberink (Sensors 12, 2012, eq. 10) measured
+    depth_square 0.0014 for a structured-light camera, from disparities half a unit off.
+    """
+
+    depth_floor: float = 0.0
+    """Spread of a depth whatever its distance, m."""
+    depth_square: float = 0.0
+    """Spread that grows with the squared distance d, 1/m."""
+    dropped: float = 0.0
+    """Probability that a pixel has no depth."""
+    position: float = 0.0
+    """Spread of the camera's place about where it is believed to stand, m along each axis, anew in every view."""
+    rotation: float = 0.0
+    """Spread of its orientation, rad about each axis, likewise."""
+    colour: float = 0.0
+    """Spread of the gain of red, green and blue, likewise."""
+
+    @property
+    def active(self) -> bool:
+        """Anything is ever wrong."""
+        return any(getattr(self, field.name) > 0.0 for field in dataclasses.fields(self))
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "depth_floor": 0.1,
+            "depth_square": 0.1,
+            "dropped": 0.9,
+            "position": 0.1,
+            "rotation": 0.2,
+            "colour": 0.5,
+        }
+        for name, most in bounds.items():
+            _require(0.0 <= getattr(self, name) <= most, f"sensor.{name}: must lie in 0 .. {most}")
+
+
+@dataclasses.dataclass(frozen=True)
 class HeightmapConfig:
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 
@@ -152,6 +248,9 @@ class HeightmapConfig:
     """H = W, cells."""
     extent: float = 0.448
     """Side of the square workspace, m (VPG)."""
+    view: Literal["ortho", "oblique"] = "ortho"
+    """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image, projected; what blocks hide from
+    it is empty (CSAC sec. 3.1, VPG)."""
 
     @property
     def cell(self) -> float:
@@ -159,32 +258,86 @@ class HeightmapConfig:
         return self.extent / self.size
 
     def __post_init__(self) -> None:
+        _require_choices(self, "heightmap.")
         _require(self.size >= 16 and self.size % 8 == 0, "heightmap.size: must be a multiple of 8, at least 16")
         _require(0.1 <= self.extent <= 1.0, "heightmap.extent: must lie in 0.1 .. 1 m")
 
 
 @dataclasses.dataclass(frozen=True)
 class NetConfig:
-    """The small dense net: densely connected, group norm, fully convolutional, at half the map's resolution."""
+    """The network over turned maps: a small dense net, or DenseNet-121 (CSAC sec. 3.4), both fully convolutional."""
 
+    kind: Literal["small", "densenet121"] = "small"
+    """`small`: densely connected, group norm, at half the map's resolution. `densenet121`: a trunk each for colour,
+    height and target mask, at 1/32 of the resolution of its input."""
     rotations: int = 16
     """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
-    growth: int = 24
-    """Channels that each dense layer adds."""
-    dilations: tuple[int, ...] = (1, 2, 4, 1)
-    """Dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
-    stem: int = 16
-    """Channels of the first convolution."""
-    head: int = 32
-    """Channels of the 1 x 1 convolution before each head."""
+    colour: bool = True
+    """Whether the net sees colours, or heights alone."""
     margin: float = 0.125
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
+    head: int = 32
+    """Channels of the 1 x 1 convolution before each head (VPG 64)."""
+    growth: int = 24
+    """small: channels that each dense layer adds."""
+    dilations: tuple[int, ...] = (1, 2, 4, 1)
+    """small: dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
+    stem: int = 16
+    """small: channels of the first convolution."""
+    norm: Literal["group", "batch"] = "group"
+    """densenet121: `batch`, as in the paper, or `group`, which is the same while acting and while learning."""
+    block_layers: tuple[int, int, int, int] = (6, 12, 24, 16)
+    """densenet121: dense layers of each block (Huang et al., arXiv:1608.06993, table 1)."""
+    block_growth: int = 32
+    """densenet121: channels that each dense layer adds (same table)."""
+    zoom: int = 1
+    """densenet121: pixels of its input per cell of the map, along each axis (VPG 2: features lie 16 cells apart)."""
+    output_stride: int = 4
+    """densenet121: cells of the map per cell that its outputs are upsampled to (ours; the paper 1, at 16 times the
+    memory: what is upsampled is bilinear, and so is reading it)."""
+    dtype: Literal["auto", "float32", "bfloat16"] = "auto"
+    """densenet121: what it computes in, parameters being float32; auto: bfloat16 on accelerators, float32 on a CPU."""
+    weights: str = ""
+    """densenet121: .safetensors file with ImageNet weights in torchvision's names that its trunks begin with; none if
+    empty."""
 
     def __post_init__(self) -> None:
+        _require_choices(self, "net.")
         _require(self.rotations >= 4 and self.rotations % 2 == 0, "net.rotations: must be even, at least 4")
         _require(min(self.growth, self.stem, self.head) >= 4, "net.growth, stem, head: at least 4 channels")
         _require(len(self.dilations) >= 1 and min(self.dilations) >= 1, "net.dilations: at least one layer, each >= 1")
         _require(0.0 <= self.margin <= 0.5, "net.margin: must lie in 0 .. 0.5")
+        _require(min(self.block_layers) >= 1, "net.block_layers: at least one layer in each block")
+        _require(
+            self.block_growth >= 4 and self.block_growth % 4 == 0, "net.block_growth: must be a multiple of 4 channels"
+        )
+        _require(
+            self.zoom >= 1 and self.output_stride >= 1 and DENSENET_STRIDE % (self.zoom * self.output_stride) == 0,
+            f"net.zoom, net.output_stride: their product must divide {DENSENET_STRIDE}, the stride of DenseNet-121",
+        )
+        _require(
+            self.kind == "densenet121" or (self.norm == "group" and not self.weights),
+            "net.norm batch, net.weights: only of --net.kind densenet121; the small net has group norm",
+        )
+        _require(
+            not self.weights or self.norm == "batch", "net.weights: need --net.norm batch, whose statistics they bring"
+        )
+
+    def check_canvas(self, size: int) -> None:
+        """Raises ValueError if the strides do not divide the rotated maps of a height map of `size` cells."""
+        side = round(size * (1 + self.margin) / 2) * 2
+        if self.kind == "small":
+            _require(
+                side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little"
+            )
+            return
+        step = DENSENET_STRIDE // self.zoom
+        if side % step:
+            larger = -(-size // step) * step
+            sides = [larger + i * step for i in range(3) if larger + i * step <= 1.5 * size]
+            fitting = ", ".join(f"{s / size - 1:.4f} ({s} cells)" for s in sides)
+            remedy = f"try {fitting}" if fitting else f"no margin makes it fit; take another heightmap.size than {size}"
+            raise ValueError(f"net.margin: DenseNet-121 needs maps of a multiple of {step} cells, not {side}; {remedy}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -348,6 +501,10 @@ class LearnConfig:
     """Updates of the critic per training step, that is, per `train.scenes` actions; the actor has one per step."""
     augment: bool = True
     """Show each drawn transition under a random symmetry of the square."""
+    augment_shift: int = 0
+    """Largest shift of a drawn transition along each axis, cells; not shifted where that would cut something off."""
+    augment_turn: float = 0.0
+    """Largest turn of a drawn transition about the workspace centre, rad; likewise."""
     critics: int = 1
     """Critics, 1 or 2; of two, the lower Q counts in each cell (TD3's twin, arXiv:1802.09477)."""
     actor: bool = True
@@ -368,6 +525,8 @@ class LearnConfig:
     def __post_init__(self) -> None:
         _require_choices(self, "learn.")
         _require(self.learning_rate > 0.0, "learn.learning_rate: must be positive")
+        _require(0 <= self.augment_shift <= 64, "learn.augment_shift: must lie in 0 .. 64 cells")
+        _require(0.0 <= self.augment_turn <= math.pi, "learn.augment_turn: must lie in 0 .. pi")
         _require(self.actor_learning_rate > 0.0, "learn.actor_learning_rate: must be positive")
         _require(0.0 < self.rate_end <= 1.0, "learn.rate_end: must lie in 0 < rate_end <= 1")
         _require(self.batch >= 1 and self.updates >= 1, "learn.batch and learn.updates: at least 1")
@@ -456,6 +615,8 @@ class Config:
     task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()
     heightmap: HeightmapConfig = HeightmapConfig()
+    camera: CameraConfig = CameraConfig()
+    sensor: SensorConfig = SensorConfig()
     net: NetConfig = NetConfig()
     cem: CEMConfig = CEMConfig()
     policy: PolicyConfig = PolicyConfig()
@@ -482,5 +643,22 @@ class Config:
             self.train.scenes <= self.replay.capacity and self.learn.batch <= self.replay.capacity,
             "replay.capacity: must hold train.scenes and learn.batch transitions",
         )
-        side = round(self.heightmap.size * (1 + self.net.margin) / 2) * 2
-        _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little")
+        _require(
+            self.sim.physics != "warp" or self.scene.mesh_spread == 0.0 or not set(MESH_KINDS) & set(self.scene.slots),
+            "scene.mesh_spread: must be 0 where sim.physics is warp, whose meshes have one size in all scenes",
+        )
+        _require(
+            self.sim.physics != "warp" or self.train.scenes <= WARP_WORLDS,
+            f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp",
+        )
+        _require(
+            self.heightmap.view == "oblique" or self.sensor.position == self.sensor.rotation == 0.0,
+            "sensor.position, sensor.rotation: must be 0 where heightmap.view is ortho, which has no camera",
+        )
+        most = 2 * math.floor(0.5 * math.pi * self.heightmap.size)
+        _require(
+            self.net.rotations <= most,
+            f"net.rotations: at most {most} for heightmap.size {self.heightmap.size}: more turn no cell at the rim to "
+            "another one",
+        )
+        self.net.check_canvas(self.heightmap.size)

@@ -20,10 +20,11 @@ from csac_jax.sim import outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
 from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action, Primitive
-from csac_jax.vision import heightmap
+from csac_jax.vision import camera, heightmap
 from csac_jax.vision.heightmap import Observation
 from csac_jax.vision.raycast import Polytopes
 
+_NOISE = np.uint32(2**31)  # folded into an episode's key: beside its children from `split`
 CHANGE_AREA = 12.0  # cm^2 that must move for an action to count as a change (VPG)
 
 
@@ -53,6 +54,7 @@ class State:
     actions: jax.Array  # [] int32, taken in this episode
     idle: jax.Array  # [] int32, actions in a row without visible change
     info: Info
+    noise: jax.Array | None = None  # [] typed key, root of the episode's sensor errors; None without any
 
     @property
     def done(self) -> jax.Array:
@@ -71,7 +73,7 @@ class Env:
 
     def reset(self, key: jax.Array) -> State:
         """A fresh settled scene of the pool, turned by a random yaw."""
-        return self.begin(self._fresh(key))
+        return self.begin(self._fresh(key), key)
 
     def restart(self, key: jax.Array, state: State) -> State:
         """What follows an episode: a fresh scene; or, after a target was got, the same one with the next target."""
@@ -81,7 +83,7 @@ class Env:
             goes_on = (state.reward > 0.0) & jnp.any(state.scene.in_play)
             again = layout.mark(key_target, state.scene)
             scene = jax.tree.map(lambda new, old: jnp.where(goes_on, old, new), scene, again)
-        return self.begin(scene)
+        return self.begin(scene, key)
 
     def _fresh(self, key: jax.Array) -> Scene:
         key_scene, key_enter = jax.random.split(key)
@@ -98,16 +100,30 @@ class Env:
         own = scene.target != layout.ANY
         return jax.tree.map(lambda a, b: jnp.where(own, a, b), turned, layout.mark(key_target, turned))
 
-    def begin(self, scene: Scene) -> State:
-        """The first state of an episode that starts with this scene."""
+    def begin(self, scene: Scene, key: jax.Array | None = None) -> State:
+        """The first state of an episode that starts with this scene; the key is needed with a sensor model only."""
         no, none = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         zero = jnp.zeros((), jnp.float32)
         info = Info(none, none, zero, zero, none, none, none, no)
-        return State(scene, self.look(scene), zero, no, no, none, none, info)
+        noise = self._noise(key)
+        return State(scene, self._see(scene, noise, none), zero, no, no, none, none, info, noise)
 
-    def look(self, scene: Scene) -> Observation:
-        """The top view of a scene."""
-        slots = self.cfg.scene.slots
+    def _noise(self, key: jax.Array | None) -> jax.Array | None:
+        """The root of the sensor's errors in the episode that begins with this key."""
+        if not self.cfg.sensor.active:
+            return None
+        if key is None:
+            raise ValueError("begin: with a sensor model (config section `sensor`) an episode needs a key")
+        return jax.random.fold_in(key, _NOISE)
+
+    def _see(self, scene: Scene, noise: jax.Array | None, actions: jax.Array) -> Observation:
+        """What the sensor makes of a scene after so many actions."""
+        return self.look(scene, noise if noise is None else jax.random.fold_in(noise, actions))
+
+    def look(self, scene: Scene, key: jax.Array | None = None) -> Observation:
+        """The view of a scene: as it is, or with the errors of the config's sensor if a key is given."""
+        cfg = self.cfg
+        slots = cfg.scene.slots
         normals, offsets = blocks.half_spaces(slots, scene.half_size)
         slot = blocks.parts(slots).slot
         shapes = Polytopes(
@@ -118,13 +134,26 @@ class Env:
             colour=jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
         )
         wanted = (slot == scene.target) | (scene.target == layout.ANY)
-        return heightmap.orthographic(self.cfg.heightmap, shapes, jnp.asarray(blocks.TABLE_COLOUR), wanted)
+        seen = (shapes, jnp.asarray(blocks.TABLE_COLOUR), wanted)
+        if cfg.heightmap.view == "oblique":
+            eye = camera.make(cfg.camera)
+            if key is None:
+                return heightmap.oblique(cfg.heightmap, *seen, eye)
+            return heightmap.oblique_measured(key, cfg.heightmap, cfg.sensor, *seen, eye)
+        true = heightmap.orthographic(cfg.heightmap, *seen)
+        return true if key is None else heightmap.measured(key, cfg.sensor, true, wanted)
 
     def step(self, state: State, action: Action) -> State:
-        """Runs one primitive; blocks lifted or out of the workspace leave the scene."""
-        cfg, before = self.cfg, state.scene
+        """Runs one primitive; blocks lifted or out of the workspace leave the scene.
+
+        Where physics failed, the scene is as it was before; where it was no scene to begin with, empty.
+        """
+        cfg = self.cfg
+        sound = simulation.healthy(state.scene) & plausible(state.obs)
+        empty = layout.parked(cfg.scene.slots)
+        before = jax.tree.map(lambda given, none: jnp.where(sound, given, none), state.scene, empty)
         after, trace, plan = simulation.execute(self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action)
-        ill = ~simulation.healthy(after)
+        ill = ~(sound & simulation.healthy(after))
         after = jax.tree.map(lambda good, bad: jnp.where(ill, good, bad), before, after)
 
         grasped = action.primitive == Primitive.GRASP
@@ -133,12 +162,12 @@ class Env:
         gone = after.in_play & ~layout.inside(after.position, cfg.heightmap.extent) & ~lifted
         got = lifted & self._wanted(before)
         after = layout.park(after, ~lifted & ~gone)
-        obs = self.look(after)
+        actions = state.actions + 1
+        obs = self._see(after, state.noise, actions)
 
         moved = heightmap.moved_area(cfg.heightmap, state.obs.height, obs.height)
         changed = moved > CHANGE_AREA
         idle = jnp.where(changed, 0, state.idle + 1)
-        actions = state.actions + 1
         terminated = ~jnp.any(after.in_play & self._wanted(after))
         capped = (actions >= cfg.task.max_actions) | (idle >= cfg.task.max_idle)
         off = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
@@ -164,11 +193,18 @@ class Env:
             actions=actions,
             idle=idle,
             info=info,
+            noise=state.noise,
         )
 
     def _wanted(self, scene: Scene) -> jax.Array:
         """Slots [N] bool of the blocks that the task asks for."""
         return (scene.target == layout.ANY) | (np.arange(len(self.cfg.scene.slots)) == scene.target)
+
+
+def plausible(obs: Observation) -> jax.Array:
+    """True where every entry of a top view is one that a view can have, [] bool; NaN is none."""
+    height = (obs.height >= 0.0) & (obs.height <= heightmap.VIEW_HEIGHT)
+    return jnp.all(height) & jnp.all((obs.colour >= 0.0) & (obs.colour <= 1.0))
 
 
 def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None) -> Env:

@@ -13,7 +13,8 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, cli, presets
-from csac_jax.config import Config
+from csac_jax.config import Config, SceneConfig
+from csac_jax.scene import pool
 from csac_jax.train import checkpoint
 
 ROOT = Path(csac_jax.__file__).parents[1]
@@ -88,7 +89,9 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
         ("doctor --fix", "Unrecognized options: --fix"),
-        ("train smoke --sim.physics c", "--sim.physics: training is one compiled program, which needs mjx"),
+        ("train smoke --sim.physics c", "--sim.physics: training is one compiled program, which c is no part of"),
+        ("train smoke --sim.physics warp", "scene.mesh_spread: must be 0 where sim.physics is warp"),
+        ("train smoke --sim.physics warp --scene.mesh-spread 0", "--sim.physics: warp computes on CUDA"),
         ("bench", "choose one of: parity, replay, soak, step"),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: parity, replay, soak, step"),
         ("bench step slow", "bench step: give one preset of: smoke, quick, fast"),
@@ -121,6 +124,19 @@ def test_damaged_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path, comman
     (run_dir / "checkpoints/4" / checkpoint.MANIFEST).unlink()
     code, line = _fails(capsys, *command.split(), str(run_dir))
     assert (code, "half-written" in line) == (1, True)
+
+
+def test_scenes_that_never_settle(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, run_dir: Path
+):
+    """Claim: blocks that do not come to rest are a failure of one line that names what to change, not a traceback."""
+    falling = SceneConfig(slots=("box",), min_blocks=1, drop_height=1.0, settle_time=0.5)  # lands after 0.45 s
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(pool, "_ROUND", 8)
+    monkeypatch.setattr(cli, "_stored_config", lambda _: dataclasses.replace(SMOKE, scene=falling))
+    code, line = _fails(capsys, "eval", str(run_dir), "--policy", "random")
+    assert code == 1
+    assert "scene.settle_time" in line
 
 
 @pytest.mark.parametrize(

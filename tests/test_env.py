@@ -211,27 +211,64 @@ def _leaves(state: State) -> list[bytes]:
     return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state)]
 
 
-@pytest.mark.parametrize("where", ["action", "scene"])
-def test_failed_physics_stays_in_its_scene(lab: Lab, where: str):
-    """Claim: NaN in one scene marks that scene ill and truncates it; the others' results are the same, bit for bit."""
+def _spoil(state: State, action: Action, where: str, value: float, sick: int) -> tuple[State, Action]:
+    """State and action with `value` in the last entry of one leaf of scene `sick`."""
+
+    def written(tree, leaf: str):
+        old = np.array(getattr(tree, leaf))
+        with np.errstate(invalid="ignore"):
+            old[sick].flat[-1] = np.asarray(value).astype(old.dtype)
+        return dataclasses.replace(tree, **{leaf: jnp.asarray(old)})
+
+    part, leaf = where.split(".")
+    if part == "action":
+        return state, written(action, leaf)
+    return dataclasses.replace(state, **{part: written(getattr(state, part), leaf)}), action
+
+
+_ENTRIES = ("position", "quaternion", "velocity", "half_size", "density", "friction", "colour")
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        ("action.pose", np.nan),
+        *((f"scene.{leaf}", (np.nan, np.inf, 1e6)[i % 3]) for i, leaf in enumerate(_ENTRIES)),
+        *((f"scene.{leaf}", (np.nan, np.inf, 1e6)[(i + 1) % 3]) for i, leaf in enumerate(_ENTRIES[:6])),
+        ("obs.height", np.nan),
+        ("obs.height", 1e6),
+        ("obs.colour", np.inf),
+    ],
+)
+def test_failed_physics_stays_in_its_scene(lab: Lab, where: str, value: float):
+    """Claim: NaN, infinity or 1e6 in one scene marks that scene ill and truncates it; the others' results are the same,
+    bit for bit. What cannot be a scene is replaced by an empty one; a sound one stays as it was."""
     state = lab.reset(jax.random.split(jax.random.key(4), SCENES))
     action, sick = lab.oracle(state), 2
     good = lab.step(state, action)
-    if where == "action":
-        action = dataclasses.replace(action, pose=action.pose.at[sick, 0].set(jnp.nan))
-    else:
-        spoilt = dataclasses.replace(state.scene, velocity=state.scene.velocity.at[sick, :, 0].set(jnp.nan))
-        state = dataclasses.replace(state, scene=spoilt)
-    bad = lab.step(state, action)
+    bad = lab.step(*_spoil(state, action, where, value, sick))
     np.testing.assert_array_equal(bad.info.ill, np.arange(SCENES) == sick)
     assert not good.info.ill.any()
     for index in range(SCENES):
         assert (_leaves(_at(good, index)) == _leaves(_at(bad, index))) == (index != sick)
     ill = _at(bad, sick)
     assert (ill.truncated, ill.terminated, ill.reward, ill.info.cleared, ill.info.left) == (True, False, 0.0, 0, 0)
-    assert np.isfinite(ill.obs.height).all()
-    if where == "action":  # the scene is as it was before
-        jax.tree.map(np.testing.assert_array_equal, ill.scene, _at(state.scene, sick))
+    for leaf in jax.tree.leaves((ill.scene, ill.obs)):
+        assert np.isfinite(leaf).all()
+    expected = _at(state.scene, sick) if where == "action.pose" else layout.parked(CONFIG.scene.slots)
+    jax.tree.map(np.testing.assert_array_equal, ill.scene, expected)
+
+
+def test_target_that_is_no_slot_is_ill(lab: Lab):
+    """Claim: a target beyond the slots makes a scene ill; it does not pass for a table cleared of its target."""
+    scene = _stack(*[_cube(0.0, 0.0)] * SCENES)
+    wild = dataclasses.replace(scene, target=jnp.array([-1, 3, 1_000_000, -2, -(2**31), 0, -1, -1], jnp.int32))
+    action = _actions(*[(Primitive.PUSH, BARE)] * SCENES)
+    state = lab.step(dataclasses.replace(lab.begin(scene), scene=wild), action)
+    expected = np.array([False, True, True, True, True, False, False, False])
+    np.testing.assert_array_equal(state.info.ill, expected)
+    np.testing.assert_array_equal(state.truncated, expected)
+    assert not state.terminated.any()
 
 
 def test_step_is_a_fixed_point_of_types(lab: Lab):

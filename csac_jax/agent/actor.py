@@ -1,7 +1,8 @@
 """The deterministic policy: one pose per primitive from dense logits, by a soft-argmax around the highest of them.
 
-A soft-argmax over the whole map would put the mean of two peaks between them; around the highest cell it cannot, and
-its position still moves smoothly with the logits, so that the critic's gradient can shift it.
+A soft-argmax over the whole map would put the mean of two peaks between them. Around the highest cell, over what falls
+off from it, it cannot, and its position still moves smoothly with the logits, so that the critic's gradient can shift
+it.
 """
 
 import jax
@@ -14,6 +15,7 @@ from csac_jax.agent.maps import DenseMaps, Frames
 
 SHARPNESS = 10.0  # logit per unit of Q: how the critic's own map enters the actor's
 WINDOW = 2  # cells on each side of the highest one that the soft-argmax covers
+_INWARD = WINDOW + np.array([-1, -1, 0, 1, 1])  # for each row or column of the window: one step nearer to its middle
 
 
 def logits(q: jax.Array, correction: jax.Array) -> jax.Array:
@@ -34,7 +36,9 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
     window = (k, rows[:, None], cols[None, :])
     shown = state.valid[primitive][window]
     shown |= ~jnp.any(shown)
-    weight = jax.nn.softmax(jnp.where(shown, state.logits[primitive][window], -jnp.inf).reshape(-1))  # [25]
+    hill = jnp.where(shown, state.logits[primitive][window], -jnp.inf)  # [5, 5]
+    hill = jnp.minimum(hill, hill[_INWARD[:, None], _INWARD[None, :]])  # no second peak counts, behind a dip
+    weight = jax.nn.softmax(hill.reshape(-1))  # [25]
     xy = jnp.sum(weight[:, None] * jnp.asarray(frames.xy)[window].reshape(-1, 2), axis=0)
 
     step = 2.0 * np.pi / num

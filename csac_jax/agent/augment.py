@@ -1,4 +1,9 @@
-"""The eight symmetries of the square workspace, as augmentation of transitions: exact, nothing is interpolated."""
+"""Augmentation of transitions: the eight symmetries of the square workspace, shifts by whole cells, turns.
+
+Symmetries, shifts and quarter turns are exact, cell by cell. Any other turn is exact in place and yaw of the action;
+the maps are turned to the nearest cell, so that what a cell shows lies up to half a cell a side beside it. In each of
+them the light stays where it is: sloping faces keep their brightness.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +11,11 @@ import numpy as np
 
 from csac_jax import geometry
 from csac_jax.agent.learner import Transition
+from csac_jax.config import Config
+from csac_jax.sim.outcome import BARE
+from csac_jax.sim.primitives import Primitive
+from csac_jax.vision import heightmap
+from csac_jax.vision.heightmap import PackedObservation
 
 
 def turn_over(transition: Transition, mirror_x: jax.Array, mirror_y: jax.Array, swap: jax.Array) -> Transition:
@@ -31,3 +41,72 @@ def turn_over(transition: Transition, mirror_x: jax.Array, mirror_y: jax.Array, 
 def randomly(key: jax.Array, transition: Transition) -> Transition:
     """The transition under one of the eight symmetries, each equally likely."""
     return turn_over(transition, *jax.random.bernoulli(key, shape=(3,)))
+
+
+def move(cfg: Config, transition: Transition, yaw: jax.Array, cells: jax.Array) -> Transition:
+    """The transition turned about the workspace centre by `yaw` [] rad, then shifted by `cells` [2] int32 (row, col).
+
+    As it was where that would cut something off: something higher than BARE in either map, the place of the action, or
+    the end of a push, which the workspace must not have cut off before either. What comes in from beside the workspace
+    is bare table.
+    """
+    pose = transition.action.pose
+    step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
+    xy = geometry.rotate2d(yaw, pose[:2]) + step
+    turned = jnp.append(xy, geometry.wrap_angle(pose[2] + yaw))
+    whole = _reaches(cfg, transition.action.primitive, pose) & _reaches(cfg, transition.action.primitive, turned)
+    for obs in (transition.obs, transition.next_obs):
+        whole &= _stays(cfg, heightmap.unpack(obs).height, yaw, step)
+    moved = transition.replace(
+        obs=_moved_map(transition.obs, yaw, cells),
+        next_obs=_moved_map(transition.next_obs, yaw, cells),
+        action=transition.action.replace(pose=turned),
+    )
+    return jax.tree.map(lambda new, old: jnp.where(whole, new, old), moved, transition)
+
+
+def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
+    """Whether an action at a pose [3] runs its full length above the workspace, [] bool."""
+    length = jnp.where(primitive == Primitive.PUSH, cfg.sim.push_length, 0.0)
+    end = pose[:2] + length * jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+    return jnp.all(jnp.maximum(jnp.abs(pose[:2]), jnp.abs(end)) <= 0.5 * cfg.heightmap.extent)
+
+
+def _stays(cfg: Config, height: jax.Array, yaw: jax.Array, step: jax.Array) -> jax.Array:
+    """Whether all that stands on the map [H, W] m stays above the workspace, turned and shifted by `step` [2] m."""
+    place = geometry.rotate2d(yaw, geometry.cell_centres(cfg.heightmap)) + step[None, None]
+    return jnp.all((height <= BARE) | (jnp.max(jnp.abs(place), axis=-1) <= 0.5 * cfg.heightmap.extent))
+
+
+def _moved_map(obs: PackedObservation, yaw: jax.Array, cells: jax.Array) -> PackedObservation:
+    """Maps turned and then shifted, from the nearest cell; what comes in from beside looks like the lowest cell."""
+    size = obs.height.shape[0]
+    along = jnp.arange(size, dtype=jnp.float32) + 0.5 - 0.5 * size  # cells from the centre
+    y, x = (along - shift.astype(jnp.float32) for shift in cells)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    col = jnp.floor(cos * x[None] + sin * y[:, None] + 0.5 * size).astype(jnp.int32)
+    row = jnp.floor(-sin * x[None] + cos * y[:, None] + 0.5 * size).astype(jnp.int32)
+    inside = (row >= 0) & (row < size) & (col >= 0) & (col < size)
+    source = jnp.where(inside, row * size + col, jnp.argmin(obs.height).astype(jnp.int32))
+
+    def take(field: jax.Array) -> jax.Array:
+        return field.reshape(size * size, *field.shape[2:]).at[source].get(mode="promise_in_bounds")
+
+    return PackedObservation(
+        colour=take(obs.colour),
+        height=jnp.where(inside, take(obs.height), jnp.uint16(0)),
+        target=jnp.where(inside, take(obs.target), jnp.all(obs.target)),
+    )
+
+
+def vary(key: jax.Array, cfg: Config, transition: Transition) -> Transition:
+    """The transition as the learner is shown it: augmented as the config says."""
+    learn, key_move = cfg.learn, jax.random.fold_in(key, 1)
+    if learn.augment:
+        transition = randomly(key, transition)
+    if learn.augment_shift == 0 and learn.augment_turn == 0.0:
+        return transition
+    key_yaw, key_cells = jax.random.split(key_move)
+    yaw = learn.augment_turn * jax.random.uniform(key_yaw, (), minval=-1.0)
+    cells = jax.random.randint(key_cells, (2,), -learn.augment_shift, learn.augment_shift + 1)
+    return move(cfg, transition, yaw, cells)

@@ -16,7 +16,7 @@ from flax import struct
 from csac_jax.agent import actor, losses, maps, rewards, softmax
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.config import Config
-from csac_jax.nets import dense
+from csac_jax.nets import dense, networks
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.vision import heightmap, rotate
 from csac_jax.vision.heightmap import Observation, PackedObservation
@@ -35,7 +35,7 @@ class Transition:
 
 @struct.dataclass
 class Params:
-    """Network parameters: theta^Q and theta^mu."""
+    """Variables of the networks: theta^Q and theta^mu, each with the running statistics of its batch norm, if any."""
 
     critic: Any  # leaves [M, ...]
     actor: Any
@@ -66,8 +66,8 @@ class Learner:
 
     cfg: Config
     frames: Frames
-    critic: dense.Critic
-    actor: dense.Head
+    critic: networks.Critic
+    actor: networks.Head
     critic_optimiser: optax.GradientTransformation
     actor_optimiser: optax.GradientTransformation
     bounds: tuple[float, float]  # smallest and largest possible return
@@ -78,8 +78,8 @@ def make(cfg: Config) -> Learner:
     return Learner(
         cfg,
         maps.frames(cfg),
-        dense.Critic(cfg.net),
-        dense.Head(cfg.net),
+        networks.critic(cfg.net),
+        networks.head(cfg.net),
         _optimiser(cfg, cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates),
         _optimiser(cfg, cfg.learn.actor_learning_rate, cfg.train.steps),
         rewards.bounds(cfg.reward, cfg.target.gamma),
@@ -105,39 +105,42 @@ def init(key: jax.Array, learner: Learner) -> LearnerState:
     return LearnerState(
         online=online,
         target=jax.tree.map(jnp.copy, online),
-        critic_optimiser=learner.critic_optimiser.init(online.critic),
-        actor_optimiser=learner.actor_optimiser.init(online.actor),
+        critic_optimiser=learner.critic_optimiser.init(networks.learned(online.critic)),
+        actor_optimiser=learner.actor_optimiser.init(networks.learned(online.actor)),
         updates=jnp.int32(0),
     )
+
+
+def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
+    """The state before the first update, every trunk of the critics being `trunk`, see `torchvision.variables`."""
+    online, target = (
+        params.replace(critic=networks.with_trunk(params.critic, trunk)) for params in (state.online, state.target)
+    )
+    return state.replace(online=online, target=target)
 
 
 def look(learner: Learner, params: Params, obs: Observation) -> DenseMaps:
     """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
     q, features = _critic_maps(learner, params, obs)
-    return _with_actor(learner, params.actor, obs, q, features)
+    correction: Any = learner.actor.apply(params.actor, features) if learner.cfg.learn.actor else jnp.zeros_like(q)
+    return _dense_maps(learner, obs, q, correction)
 
 
 def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
-    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, h, w, F] of a batch, in the frames of the passes.
+    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, ., ., F] of a batch, in the frames of the passes.
 
     Q is the lower of both critics in each cell, before anything is read between cells; features are the first one's.
     """
     fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
-    q, features = _apply_critics(learner, params.critic, fed.reshape(-1, *fed.shape[2:]))
-    q, features = (leaf.reshape(*fed.shape[:2], *leaf.shape[1:]) for leaf in (jnp.min(q, axis=0), features[0]))
-    return q, features
+    outputs: Any = jax.vmap(learner.critic.apply, (0, None))(params.critic, fed.reshape(-1, *fed.shape[2:]))
+    q, features = jnp.min(outputs[0], axis=0), outputs[1][0]
+    return q.reshape(*fed.shape[:2], *q.shape[1:]), features.reshape(*fed.shape[:2], *features.shape[1:])
 
 
-def _apply_critics(learner: Learner, critic_params: Any, fed: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Q [M, n, h, w, OUTPUTS] and features [M, n, h, w, F] of all critics for `fed` [n, C, C, CHANNELS]."""
-    outputs: Any = jax.vmap(learner.critic.apply, (0, None))(critic_params, fed)
-    return outputs
-
-
-def _with_actor(learner: Learner, actor_params: Any, obs: Observation, q: jax.Array, features: jax.Array) -> DenseMaps:
-    cfg, unfold = learner.cfg, jax.vmap(maps.unfold)
-    correction: Any = learner.actor.apply(actor_params, features) if cfg.learn.actor else jnp.zeros_like(q)
-    find = maps.actionable if cfg.policy.mask else maps.everywhere
+def _dense_maps(learner: Learner, obs: Observation, q: jax.Array, correction: jax.Array) -> DenseMaps:
+    """The maps of all yaws from those of the passes; `correction` [B, K / 2, h, w, OUTPUTS] is the actor's."""
+    unfold = jax.vmap(maps.unfold)
+    find = maps.actionable if learner.cfg.policy.mask else maps.everywhere
     return DenseMaps(
         q=unfold(q),
         logits=unfold(actor.logits(q, correction)),
@@ -195,8 +198,11 @@ def _softmax_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Ar
     return softmax.expectation(jnp.where(shown, q, low), jnp.where(shown, log_density, jnp.inf), inverse_temperature)
 
 
-def _value(learner: Learner, critic_params: Any, obs: Observation, action: Action) -> jax.Array:
-    """Q(s, a) of a batch by each critic [M, B], from two passes per state: the frames next to the action's yaw."""
+def _value(learner: Learner, critic: Any, obs: Observation, action: Action) -> tuple[jax.Array, Any]:
+    """Q(s, a) of a batch by each critic [M, B], from two passes per state: the frames next to the action's yaw.
+
+    The nets run as in training: beside Q, the running statistics after the batch.
+    """
     frames = learner.frames
     num = frames.yaws.shape[0]
     turns = action.pose[:, 2] * (num / (2.0 * np.pi))
@@ -205,7 +211,8 @@ def _value(learner: Learner, critic_params: Any, obs: Observation, action: Actio
     half = jnp.mod(k, num // 2)
     fed = maps.seen(frames, obs)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(frames.tables, fed, half)
-    q, _ = _apply_critics(learner, critic_params, one.reshape(-1, *one.shape[2:]))
+    run = jax.vmap(networks.train, (None, 0, None))
+    (q, _), statistics = run(learner.critic, critic, one.reshape(-1, *one.shape[2:]))
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
     push_output = (k >= num // 2).astype(jnp.int32)
     output = jnp.where((action.primitive == Primitive.GRASP)[:, None], dense.OUTPUTS - 1, push_output)
@@ -217,7 +224,7 @@ def _value(learner: Learner, critic_params: Any, obs: Observation, action: Actio
     read = jax.vmap(jax.vmap(at, (0, 0, 0, None)))
     near = jax.vmap(read, (0, None, None, None))(q, output, half, action.pose[:, :2])  # [M, B, 2]
     share = (turns - lower)[None]
-    return (1.0 - share) * near[..., 0] + share * near[..., 1]
+    return (1.0 - share) * near[..., 0] + share * near[..., 1], statistics
 
 
 def update_critic(
@@ -233,16 +240,17 @@ def update_critic(
     values = jax.vmap(next_value, (None, 0, 0))(learner, keys, next_maps)
     low, high = learner.bounds
     target = losses.td_target(batch.reward, cfg.target.gamma, batch.terminated, jnp.clip(values, low, high))
-    obs = heightmap.unpack(batch.obs)
+    obs, critic = heightmap.unpack(batch.obs), state.online.critic
 
-    def loss(params: Any) -> tuple[jax.Array, jax.Array]:
-        q = _value(learner, params, obs, batch.action)  # [M, B]
+    def loss(learned: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
+        q, statistics = _value(learner, {**critic, **learned}, obs, batch.action)  # [M, B]
         each = jnp.sum(losses.of_error(cfg.learn, target[None] - q), axis=0)
-        return jnp.mean(weights * each), jnp.mean(q, axis=0)
+        return jnp.mean(weights * each), (jnp.mean(q, axis=0), statistics)
 
-    (critic_loss, q), gradient = jax.value_and_grad(loss, has_aux=True)(state.online.critic)
+    before = networks.learned(critic)
+    (critic_loss, (q, statistics)), gradient = jax.value_and_grad(loss, has_aux=True)(before)
     step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)
-    online = state.online.replace(critic=optax.apply_updates(state.online.critic, step))
+    online = state.online.replace(critic={**optax.apply_updates(before, step), **statistics})
     state = state.replace(
         online=online,
         target=losses.follow(cfg.learn, online, state.target, state.updates + 1),
@@ -267,11 +275,14 @@ def update_actor(learner: Learner, state: LearnerState, obs: Observation) -> tup
         pose = actor.pose(learner.frames, dense_maps, primitive)
         return maps.read(learner.frames, dense_maps.q, jnp.int32(primitive), pose)
 
-    def loss(params: Any) -> jax.Array:
-        dense_maps = _with_actor(learner, params, obs, q, features)
-        return -jnp.mean(jnp.stack([jax.vmap(lambda one, p=p: value(one, p))(dense_maps) for p in chosen]))
+    def loss(learned: Any) -> tuple[jax.Array, Any]:
+        correction, statistics = networks.train(learner.actor, {**state.online.actor, **learned}, features)
+        dense_maps = _dense_maps(learner, obs, q, correction)
+        values = [jax.vmap(lambda one, p=p: value(one, p))(dense_maps) for p in chosen]
+        return -jnp.mean(jnp.stack(values)), statistics
 
-    actor_loss, gradient = jax.value_and_grad(loss)(state.online.actor)
+    before = networks.learned(state.online.actor)
+    (actor_loss, statistics), gradient = jax.value_and_grad(loss, has_aux=True)(before)
     step, optimiser = learner.actor_optimiser.update(gradient, state.actor_optimiser)
-    online = state.online.replace(actor=optax.apply_updates(state.online.actor, step))
+    online = state.online.replace(actor={**optax.apply_updates(before, step), **statistics})
     return state.replace(online=online, actor_optimiser=optimiser), actor_loss

@@ -14,8 +14,8 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.agent import box
-from csac_jax.config import Config, PolicyConfig
-from csac_jax.nets import dense
+from csac_jax.config import Config, NetConfig, PolicyConfig
+from csac_jax.nets import dense, networks
 from csac_jax.sim.outcome import BARE
 from csac_jax.sim.primitives import Primitive
 from csac_jax.vision import rotate
@@ -35,6 +35,8 @@ class Frames:
 
     tables: rotate.RotationTables  # of the first K / 2 frames: the others are the same pictures upside down
     yaws: np.ndarray  # [K] rad
+    net: NetConfig
+    stride: int  # cells of a canvas per cell of a map, along each axis
     side: int  # h = w, cells
     cell: float  # side of a cell, m
     extent: float  # side of the workspace, m
@@ -48,7 +50,8 @@ def frames(cfg: Config) -> Frames:
     """Frames of a config's heightmap and net."""
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
     tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
-    side, cell = tables.canvas // dense.STRIDE, tables.cell * dense.STRIDE
+    stride = networks.stride(cfg.net)
+    side, cell = tables.canvas // stride, tables.cell * stride
     yaws = 2.0 * np.pi * np.arange(rotations) / rotations
     along = (np.arange(side) - 0.5 * (side - 1)) * cell
     x, y = along[None, None, :], along[None, :, None]
@@ -56,7 +59,8 @@ def frames(cfg: Config) -> Frames:
     xy = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1).astype(np.float32)
     inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
     marked = cfg.task.kind == "target"
-    return Frames(tables, yaws.astype(np.float32), side, cell, extent, cfg.sim.push_length, marked, xy, inside)
+    length = cfg.sim.push_length
+    return Frames(tables, yaws.astype(np.float32), cfg.net, stride, side, cell, extent, length, marked, xy, inside)
 
 
 @struct.dataclass
@@ -69,8 +73,8 @@ class DenseMaps:
 
 
 def seen(frames: Frames, obs: Observation) -> jax.Array:
-    """What the net is to see of an observation, [..., H, W, I]; see `dense.inputs`."""
-    return dense.inputs(obs.colour, obs.height, obs.target if frames.marked else None)
+    """What the net is to see of an observation, [..., H, W, I]; see `inputs` of the net."""
+    return networks.inputs(frames.net, obs.colour, obs.height, obs.target if frames.marked else None)
 
 
 def net_inputs(frames: Frames, obs: Observation) -> jax.Array:
@@ -106,9 +110,9 @@ def actionable(frames: Frames, obs: Observation) -> jax.Array:
 
 def _under(frames: Frames, height: jax.Array) -> jax.Array:
     """Cells [K, h, w] bool under which the height map [H, W] m shows something."""
-    side = frames.side
+    side, stride = frames.side, frames.stride
     turned = rotate.rotate(frames.tables, height[..., None])[..., 0]
-    cells = turned.reshape(-1, side, dense.STRIDE, side, dense.STRIDE).max(axis=(2, 4)) > BARE  # [K / 2, h, w]
+    cells = turned.reshape(-1, side, stride, side, stride).max(axis=(2, 4)) > BARE  # [K / 2, h, w]
     return jnp.concatenate([cells, _half_turn(cells)])
 
 

@@ -14,18 +14,23 @@ from csac_jax.nets.convolution import conv2d
 
 STRIDE = 2  # cells of the input per cell of the output, along each axis
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
+TABLE_HEIGHT = 0.002  # m: what is lower is bare table
 _HEIGHT_SCALE = 0.05  # m, a block's height: brings heights near 1
 _GROUP = 8  # channels per group of the norm
 
 
-def inputs(colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:
+def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
     """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [..., H, W] m.
 
-    I = 4, or 5 with a target mask [..., H, W] bool. Bare table is 0, like what lies outside of a turned map.
+    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool. Bare table is 0, like what lies outside of a turned
+    map.
     """
-    seen = jnp.where(height[..., None] > 0.002, colour - 0.5, 0.0)
-    maps = [seen, height[..., None] / _HEIGHT_SCALE]
-    return jnp.concatenate(maps if target is None else [*maps, target[..., None].astype(seen.dtype)], axis=-1)
+    maps = [height[..., None] / _HEIGHT_SCALE]
+    if colour is not None:
+        maps.insert(0, jnp.where(height[..., None] > TABLE_HEIGHT, colour - 0.5, 0.0))
+    if target is not None:
+        maps.append(target[..., None].astype(height.dtype))
+    return jnp.concatenate(maps, axis=-1)
 
 
 class Convolution(nn.Module):
@@ -65,7 +70,8 @@ class Head(nn.Module):
     cfg: NetConfig
 
     @nn.compact
-    def __call__(self, features: jax.Array) -> jax.Array:
+    def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
+        del train  # group norm is the same in both
         hidden = nn.relu(nn.Dense(self.cfg.head)(features))
         return nn.Dense(OUTPUTS, kernel_init=nn.initializers.variance_scaling(0.01, "fan_in", "normal"))(hidden)
 
@@ -83,7 +89,8 @@ class Critic(nn.Module):
         self.trunk = Trunk(self.cfg)
         self.head = Head(self.cfg)
 
-    def __call__(self, maps: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
         """[B, C, C, I] -> Q [B, C / 2, C / 2, OUTPUTS], features [B, C / 2, C / 2, F]."""
+        del train  # group norm is the same in both
         features = self.trunk(maps)
         return self.head(features), features

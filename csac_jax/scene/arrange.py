@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.config import SceneConfig, SlotKind
+from csac_jax.config import MESH_KINDS, SceneConfig, SlotKind
 from csac_jax.scene import blocks, families, layout
 from csac_jax.scene.families import ROLES, Draws, Family, Role
 from csac_jax.scene.layout import Scene
@@ -76,7 +76,7 @@ def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> Sizes:
     table = np.stack([np.resize(choice, (number.max(), 3)) for choice in choices])  # [N, choices, 3]
     long = np.array([np.resize(choice[choice[:, 0] == choice[:, 0].max()], (2, 3)) for choice in choices])  # [N, 2, 3]
     num = len(cfg.slots)
-    scale = jax.random.uniform(key_scale, (num,), jnp.float32, 1.0 - cfg.size_spread, 1.0 + cfg.size_spread)
+    scale = 1.0 + blocks.spread(cfg) * jax.random.uniform(key_scale, (num,), jnp.float32, -1.0, 1.0)
     shared = blocks.size_leader(cfg.slots)
 
     def choose(table: np.ndarray, index: jax.Array) -> jax.Array:
@@ -101,7 +101,7 @@ def _pack(
     long = np.array([role.long for role in family.roles])
     half = family.resize(jnp.where(long[:, None], sizes.long[slot], sizes.any[slot]))
     lying = draws.lying < np.array([role.on_side for role in family.roles], np.float32)
-    lying = lying & ~jnp.asarray([kind in blocks.MESH_KINDS for kind in slots])[slot]
+    lying = lying & ~jnp.asarray([kind in MESH_KINDS for kind in slots])[slot]
     feet = jnp.where(used[:, None], _feet(half, lying), 0.0)
     gap = GAPS[0] + (GAPS[1] - GAPS[0]) * (1.0 - level) * (0.5 + 0.5 * draws.gap)
     centre, turned, target = family.place(draws, feet, used, gap)

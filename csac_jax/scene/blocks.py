@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.config import SlotKind
+from csac_jax.config import MESH_KINDS, SceneConfig, SlotKind
 
 
 class Shape(NamedTuple):
@@ -31,7 +31,6 @@ SHAPES = {
     "half_cylinder": Shape("half_cylinder", (0.025, 0.025, 0.0125)),
     "cylinder": Shape("cylinder", (0.0224, 0.0224, 0.025)),
 }
-MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 MAX_FACES = 10
 PADDING_OFFSET = 1e3  # m, offset of a face that is not there: every point lies inside it
 
@@ -157,6 +156,11 @@ def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.
 def size_leader(slots: tuple[SlotKind, ...]) -> np.ndarray:
     """Slot [N] whose scale each slot takes: its own, but one for all slots of a mesh kind, as MJX shares their mesh."""
     return np.array([slots.index(kind) if kind in MESH_KINDS else slot for slot, kind in enumerate(slots)])
+
+
+def spread(cfg: SceneConfig) -> np.ndarray:
+    """By what share the size of each slot's block may differ from nominal, [N]."""
+    return np.array([cfg.mesh_spread if kind in MESH_KINDS else cfg.size_spread for kind in cfg.slots], np.float32)
 
 
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:

@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.config import SlotKind
-from csac_jax.scene import blocks
+from csac_jax.config import MESH_KINDS, SlotKind
 
 ROLES = 5  # of every family
 STACKED_GAP = 0.008  # m, widest gap that a block may bridge
@@ -182,7 +181,7 @@ def _resize_pile(half: jax.Array) -> jax.Array:
     return half.at[1].set(half[0])
 
 
-_NOT_ARCH: tuple[SlotKind, ...] = ("box", *blocks.MESH_KINDS)
+_NOT_ARCH: tuple[SlotKind, ...] = ("box", *MESH_KINDS)
 _ANY: tuple[SlotKind, ...] = ("arch", *_NOT_ARCH)
 _NO_ARCH, _BOX, _PRISM = Role(_NOT_ARCH, on_side=0.3), Role(("box",)), Role(("prism",))
 _BASE, _BRICK = Role(("box",), long=True), Role(("box",), long=True, on_side=0.5)

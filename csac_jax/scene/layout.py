@@ -13,8 +13,9 @@ from csac_jax.scene import blocks
 
 NOMINAL_DENSITY = 600.0  # kg/m^3, wood
 NOMINAL_FRICTION = 0.8
-
-
+SPEED_LIMIT = np.array([5, 5, 5, 50, 50, 50], np.float32)
+"""Fastest that a block may be after a substep, m/s and rad/s (ours). A thin one squeezed from under the hand spins
+faster; its gyroscopic torque, which the integrator takes explicitly, would then feed it until it is NaN."""
 ANY = -1
 """`Scene.target` in the clearing task."""
 

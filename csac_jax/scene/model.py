@@ -10,12 +10,13 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from csac_jax.config import RobotKind, SceneConfig, SimConfig, SlotKind
-from csac_jax.scene import blocks, layout
+from csac_jax.config import MESH_KINDS, RobotKind, SceneConfig, SimConfig, SlotKind
+from csac_jax.scene import blocks, layout, lint
 from csac_jax.scene.blocks import Parts
 from csac_jax.scene.layout import Scene
 
 FINGERS = ("hand/finger_low", "hand/finger_high")
+HAND_GEOMS = ("palm", "pad_low", "pad_high")
 ROBOT_JOINTS: dict[RobotKind, tuple[str, ...]] = {
     "hand": ("hand/x", "hand/y", "hand/z", "hand/yaw", *FINGERS),
     "ur5": tuple(f"ur5/{name}" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3"))
@@ -40,6 +41,7 @@ class World:
     slot_of_geom: np.ndarray  # [geoms] slot that a geom belongs to, -1 if it is no block's
     robot_qpos: np.ndarray  # [Q] addresses in qpos, order of ROBOT_JOINTS; the last two are the fingers
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
+    mesh_scale: float  # size of compiled meshes relative to nominal
 
 
 def assets() -> Path:
@@ -60,18 +62,36 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     _add_robot(spec, sim.robot)
     part = mujoco.MjSpec.from_file(str(folder / "blocks.xml"))
     for mesh in part.meshes:
-        mesh.scale = [LARGEST] * 3
+        mesh.scale = [_mesh_scale(sim)] * 3
     spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
     for slot, (kind, place) in enumerate(zip(scene.slots, layout.parking(len(scene.slots)), strict=True)):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
         _add_parts(spec, body, kind)
+    if sim.physics == "warp":
+        _add_touch_sensors(spec, len(scene.slots))
     spec.option.timestep = sim.timestep
     spec.option.iterations = sim.iterations
     spec.option.ls_iterations = sim.line_search
     spec.add_numeric(name="max_geom_pairs", data=[sim.geom_pairs])
     spec.add_numeric(name="max_contact_points", data=[sim.contacts])
     return spec
+
+
+def _mesh_scale(sim: SimConfig) -> float:
+    """Size of compiled meshes relative to nominal; Warp's have one size in all scenes."""
+    return 1.0 if sim.physics == "warp" else LARGEST
+
+
+def _add_touch_sensors(spec: mujoco.MjSpec, slots: int) -> None:
+    """A sensor [1] of how many contacts a hand geom has with a block, for each of HAND_GEOMS x slots, in that order."""
+    for geom in HAND_GEOMS:
+        for slot in range(slots):
+            sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
+            sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, f"hand/{geom}"
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, f"block{slot}"
+            found, unreduced, one = 1, 0, 1
+            sensor.intprm[:3] = [found, unreduced, one]
 
 
 def _add_robot(spec: mujoco.MjSpec, kind: RobotKind) -> None:
@@ -93,15 +113,20 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
     every = blocks.parts((kind,))
     for centre, half in zip(every.centre, every.half, strict=True):
         geom = body.add_geom(spec.find_default("blocks/block"))
-        if kind in blocks.MESH_KINDS:
+        if kind in MESH_KINDS:
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"blocks/{kind}"
         else:
             geom.type, geom.size, geom.pos = mujoco.mjtGeom.mjGEOM_BOX, half * largest, centre * largest
 
 
 def build(scene: SceneConfig, sim: SimConfig) -> World:
-    """The world of table, robot and block slots; blocks parked, at the largest size of their kind."""
+    """The world of table, robot and block slots; blocks parked, at the largest size of their kind.
+
+    Raises SceneError where the physics is MJX and the MJCF has something that MJX lacks or would ignore.
+    """
     model = _spec(scene, sim).compile()
+    if sim.physics == "mjx":
+        lint.check(model)
     _align_inertia(model)
     names = [f"block{slot}" for slot in range(len(scene.slots))]
     bodies = np.array([model.body(name).id for name in names])
@@ -119,7 +144,8 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         block_dofs=np.array([joint.dofadr[0] + np.arange(6) for joint in block_joints]),
         slot_of_geom=slot_of_geom,
         robot_qpos=np.array([model.joint(name).qposadr[0] for name in ROBOT_JOINTS[sim.robot]]),
-        hand_geoms=np.array([model.geom(f"hand/{name}").id for name in ("palm", "pad_low", "pad_high")]),
+        hand_geoms=np.array([model.geom(f"hand/{name}").id for name in HAND_GEOMS]),
+        mesh_scale=_mesh_scale(sim),
     )
 
 
@@ -158,7 +184,7 @@ def block_fields(world: World, half_size: jax.Array, density: jax.Array, frictio
     mesh kind in a scene share their size.
     """
     boxes, meshes = _box_fields(world, half_size, density, friction), _mesh_fields(world, half_size, density, friction)
-    is_mesh = np.array([kind in blocks.MESH_KINDS for kind in world.slots])
+    is_mesh = np.array([kind in MESH_KINDS for kind in world.slots])
 
     def choose(mesh: jax.Array, box: jax.Array, which: np.ndarray) -> jax.Array:
         return jnp.where(which.reshape(-1, *[1] * (box.ndim - 1)), mesh, box)
@@ -211,7 +237,7 @@ def _box_fields(world: World, half_size: jax.Array, density: jax.Array, friction
 def _mesh_fields(world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array) -> BlockFields:
     """As if every slot held a mesh: the compiled fields, scaled."""
     model, slot = world.model, world.parts.slot
-    scale = blocks.mesh_scale(world.slots, half_size) / LARGEST  # [N]
+    scale = blocks.mesh_scale(world.slots, half_size) / world.mesh_scale  # [N]
     heavier = density / layout.NOMINAL_DENSITY  # that of scenes/blocks.xml
     of_part, of_slot = scale[slot][:, None], scale[:, None]
     by_mass, by_inertia = heavier[:, None] * of_slot**3, heavier[:, None] * of_slot**5

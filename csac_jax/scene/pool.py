@@ -18,6 +18,7 @@ import numpy as np
 
 from csac_jax.config import SceneConfig
 from csac_jax.scene import blocks, layout
+from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import HAND_PARK_HEIGHT, BlockFields, World, assets, scene_fields, with_blocks
 
@@ -35,7 +36,7 @@ def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: i
 
     Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
     by any yaw. `world` is one with the floating hand, which waits high above. The same arguments give the same scenes
-    on every machine of one kind.
+    on every machine of one kind. Raises SceneError where hardly any scene comes to rest.
     """
     path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count)}.npz"
     cached = _read(path)
@@ -63,7 +64,7 @@ def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Genera
             good = [scene for scene in ended if scene is not None]
             found, kept, dropped = found + good, kept + len(good), dropped + _ROUND
             if dropped >= 20 * _ROUND and kept < dropped / 50:
-                raise RuntimeError(
+                raise SceneError(
                     f"only {kept} of {dropped} dropped scenes came to rest inside the workspace; "
                     "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
                 )
@@ -99,7 +100,7 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
     """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; mesh blocks of one kind alike."""
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
-    scales = rng.uniform(1.0 - cfg.size_spread, 1.0 + cfg.size_spread, len(cfg.slots))
+    scales = 1.0 + blocks.spread(cfg) * rng.uniform(-1.0, 1.0, len(cfg.slots))
     sizes = np.stack([kind[rng.integers(len(kind))] for kind in choices])
     return (sizes * scales[blocks.size_leader(cfg.slots)][:, None]).astype(np.float32)
 

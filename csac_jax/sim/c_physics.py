@@ -7,6 +7,7 @@ here: MJX keeps a fixed number of them.
 import concurrent.futures
 import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -61,16 +62,8 @@ def _run(world: World, closed_at: int, scene: Scene, fields: BlockFields, drive:
     pose = np.concatenate([scene.position, scene.quaternion], axis=1)
     if not (np.isfinite(pose).all() and np.isfinite(scene.velocity).all()):  # MuJoCo would start anew from scratch
         return pose, scene.velocity, _blank(len(pose))
-    exact = model.with_blocks(world, fields)
-    exact.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    data, parked = mujoco.MjData(exact), ~scene.in_play
-    data.qpos[world.robot_qpos] = drive.start
-    data.qpos[world.block_qpos], data.qvel[world.block_dofs] = pose, scene.velocity
     trace = _blank(len(pose))
-    for index, control in enumerate(drive.control):
-        data.ctrl[:] = control
-        mujoco.mj_step(exact, data)
-        data.qpos[world.block_qpos[parked]], data.qvel[world.block_dofs[parked]] = pose[parked], 0.0
+    for index, data in enumerate(_substeps(world, model.with_blocks(world, fields), scene, drive)):
         touching = _touching(world, data)
         held = touching[1] & touching[2]
         rise = (data.qpos[world.block_qpos[:, 2]] - pose[:, 2]).astype(np.float32)
@@ -85,6 +78,29 @@ def _run(world: World, closed_at: int, scene: Scene, fields: BlockFields, drive:
         }
         trace = dataclasses.replace(trace, **seen)
     return data.qpos[world.block_qpos].astype(np.float32), data.qvel[world.block_dofs].astype(np.float32), trace
+
+
+def _substeps(world: World, exact: mujoco.MjModel, scene: Scene, drive: Drive) -> Iterator[mujoco.MjData]:
+    """The state after every substep, one and the same object; NumPy throughout."""
+    exact.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    data, parked = mujoco.MjData(exact), ~scene.in_play
+    pose = np.concatenate([scene.position, scene.quaternion], axis=1)
+    data.qpos[world.robot_qpos] = drive.start
+    data.qpos[world.block_qpos], data.qvel[world.block_dofs] = pose, scene.velocity
+    for control in drive.control:
+        data.ctrl[:] = control
+        mujoco.mj_step(exact, data)
+        data.qvel[world.block_dofs] = np.clip(data.qvel[world.block_dofs], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
+        data.qpos[world.block_qpos[parked]], data.qvel[world.block_dofs[parked]] = pose[parked], 0.0
+        yield data
+
+
+def film(world: World, fields: BlockFields, scene: Scene, drive: Drive) -> np.ndarray:
+    """Positions of all joints [T, nq] after every substep of a drive of one scene, all NumPy: how `run` goes."""
+    exact = model.with_blocks(world, fields)
+    if not drive.reachable:
+        return np.zeros((0, exact.nq))
+    return np.stack([data.qpos.copy() for data in _substeps(world, exact, scene, drive)])
 
 
 def _touching(world: World, data: mujoco.MjData) -> np.ndarray:

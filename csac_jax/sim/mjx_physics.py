@@ -1,6 +1,7 @@
 """Primitives in MJX: a fixed-length scan of physics steps per scene; callers vmap."""
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,8 @@ class MjxPhysics:
     cfg: SimConfig
     model: mjx.Model
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
+    touch: Callable[[World, mjx.Data], tuple[jax.Array, jax.Array]]
+    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing, [] bool."""
 
     def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
         """See `physics.Physics`."""
@@ -32,7 +35,8 @@ class MjxPhysics:
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
     """Physics of a world, MJX with its JAX implementation."""
-    return MjxPhysics(world, cfg, mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax"))
+    mjx_model, data = mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax")
+    return MjxPhysics(world, cfg, mjx_model, data, _pad_contacts)
 
 
 def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
@@ -40,10 +44,12 @@ def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
     geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
-    meshes = [  # None for a mesh that no slot uses; `face` holds the corners of the faces once more
-        mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
-        for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
-    ]
+    if model.impl == mjx.Impl.JAX:
+        meshes = [  # None for a mesh that no slot uses; `face` holds the corners of the faces once more
+            mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
+            for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
+        ]
+        model = model.replace(_impl=model._impl.replace(mesh_convex=tuple(meshes)))
     return model.replace(
         geom_size=model.geom_size.at[geoms].set(fields.size),
         geom_pos=model.geom_pos.at[geoms].set(fields.centre),
@@ -54,7 +60,6 @@ def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
         body_ipos=model.body_ipos.at[bodies].set(fields.com),
         body_invweight0=model.body_invweight0.at[bodies].set(fields.body_invweight),
         dof_invweight0=model.dof_invweight0.at[dofs].set(fields.dof_invweight),
-        _impl=model._impl.replace(mesh_convex=tuple(meshes)),
     )
 
 
@@ -68,16 +73,17 @@ def _initial_data(physics: MjxPhysics, scene: Scene, drive: Drive) -> mjx.Data:
     return physics.data.replace(qpos=qpos, qvel=qvel, ctrl=drive.control[0])
 
 
-def _pin(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data) -> mjx.Data:
-    """Holds parked blocks [N] where they were."""
+def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data) -> mjx.Data:
+    """Holds parked blocks [N] where they were, the others to SPEED_LIMIT."""
     address, dofs = world.block_qpos, world.block_dofs
     qpos = jnp.where(parked[:, None], initial.qpos[address], data.qpos[address])
-    qvel = jnp.where(parked[:, None], 0.0, data.qvel[dofs])
+    limited = jnp.clip(data.qvel[dofs], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
+    qvel = jnp.where(parked[:, None], 0.0, limited)
     return data.replace(qpos=data.qpos.at[address].set(qpos), qvel=data.qvel.at[dofs].set(qvel))
 
 
 def _pad_contacts(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """Which hand geom touches which block [3, N] bool (palm, low pad, high pad), and if all contact slots are full."""
+    """See `MjxPhysics.touch`; contacts may be missing once all slots are full."""
     contact = data._impl.contact
     active = contact.dist < 0.0  # [C]
     pair = contact.geom  # [C, 2]
@@ -99,8 +105,8 @@ def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]
     def substep(carry, x):
         data, trace = carry
         index, control = x
-        data = _pin(world, ~scene.in_play, initial, mjx.step(model, data.replace(ctrl=control)))
-        touching, full = _pad_contacts(world, data)
+        data = _restrain(world, ~scene.in_play, initial, mjx.step(model, data.replace(ctrl=control)))
+        touching, full = physics.touch(world, data)
         held = touching[1] & touching[2]
         rise = data.qpos[z_address] - scene.position[:, 2]
         gap = 2.0 * data.qpos[finger]

@@ -6,16 +6,21 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import HeightmapConfig, SimConfig
-from csac_jax.scene import layout
+from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World
-from csac_jax.sim import c_physics, mjx_physics, outcome, primitives, robot
+from csac_jax.sim import c_physics, mjx_physics, outcome, primitives, robot, warp_physics
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, Plan
 from csac_jax.sim.robot import Drive
 
 MAX_SPEED = 20.0  # m/s and rad/s / 10; a faster block has left physics behind
-MAX_HEIGHT = 1.0  # m, likewise
+MAX_HEIGHT = 1.0  # m from the workspace centre, likewise; of blocks in play
+MAX_PARKED = 100.0  # m, of the others
+UNIT = 0.01  # how far the square of a quaternion's length may be from 1
+MAX_HALF_SIZE = 0.5  # m; of a block's box
+MAX_DENSITY = 1e4  # kg/m^3
+MAX_FRICTION = 10.0
 
 
 class Physics(Protocol):
@@ -29,12 +34,18 @@ class Physics(Protocol):
 
 
 def make(world: World, cfg: SimConfig) -> Physics:
-    """The physics that the config names: `mjx`, compiled with the rest, or `c`, the reference, on the host's cores."""
+    """The physics that the config names: `mjx`, compiled with the rest; `warp`, the same on NVIDIA's Warp; or `c`, the
+    reference, on the host's cores.
+
+    Raises SceneError where `warp` is not installed.
+    """
     if cfg.physics == "mjx":
         return mjx_physics.make(world, cfg)
+    if cfg.physics == "warp":
+        return warp_physics.make(world, cfg)
     if cfg.physics == "c":
         return c_physics.CPhysics(world, cfg)
-    raise ValueError(f"sim.physics: {cfg.physics!r} is neither 'mjx' nor 'c'")
+    raise ValueError(f"sim.physics: {cfg.physics!r} is none of mjx, warp, c")
 
 
 def execute(
@@ -53,11 +64,22 @@ def execute(
 
 
 def healthy(scene: Scene) -> jax.Array:
-    """True where every block is finite, slow enough and near the table, [] bool. Bounds, since a lane may explode and
-    stay finite."""
+    """True where every entry of a scene is one that a scene can have, [] bool: pose, speed, size, material, index.
+
+    Bounds, not `isfinite`, since a lane may explode and stay finite; NaN fails every comparison.
+    """
     speed = jnp.abs(scene.velocity) * jnp.array([1, 1, 1, 0.1, 0.1, 0.1])
-    finite = jnp.all(jnp.isfinite(scene.position)) & jnp.all(jnp.isfinite(scene.quaternion))
-    bounded = jnp.all(speed < MAX_SPEED) & jnp.all(
-        jnp.where(scene.in_play[:, None], jnp.abs(scene.position), 0) < MAX_HEIGHT
+    reach = jnp.where(scene.in_play[:, None], MAX_HEIGHT, MAX_PARKED)
+    length = jnp.sum(scene.quaternion**2, axis=1)
+    target, last = scene.target, len(scene.colour) - 1
+    bounded = (
+        jnp.all(jnp.abs(scene.position) < reach),
+        jnp.all(speed < MAX_SPEED),
+        jnp.all(jnp.abs(length - 1.0) < UNIT),
+        jnp.all((scene.half_size > 0.0) & (scene.half_size < MAX_HALF_SIZE)),
+        jnp.all((scene.density > 0.0) & (scene.density < MAX_DENSITY)),
+        jnp.all((scene.friction > 0.0) & (scene.friction < MAX_FRICTION)),
+        jnp.all((scene.colour >= 0) & (scene.colour < len(blocks.COLOURS))),
+        (target == layout.ANY) | ((target >= 0) & (target <= last)),
     )
-    return finite & bounded
+    return jnp.all(jnp.stack(bounded))

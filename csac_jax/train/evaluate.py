@@ -1,6 +1,7 @@
 """Episodes of a fixed policy in scenes of their own, all side by side in one compiled step."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,9 @@ from csac_jax.agent import learner as learning, maps, policy
 from csac_jax.agent.learner import Params
 from csac_jax.config import Config
 from csac_jax.env import Env, State
-from csac_jax.sim import oracle
+from csac_jax.sim import oracle, primitives, robot
 from csac_jax.sim.primitives import Action
+from csac_jax.sim.robot import Drive
 from csac_jax.train.metrics import Episodes
 
 POLICIES = ("learned", "random", "oracle")
@@ -34,6 +36,36 @@ def rollout(cfg: Config, env: Env, name: str, params: Params | None, episodes: i
         rows = np.arange(first, min(first + SIDE_BY_SIDE, episodes)) * env.scenes.position.shape[0] // episodes
         parts.append(_run(cfg, env, step, params, jax.random.fold_in(key, first), rows))
     return Episodes(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+
+
+class Moment(NamedTuple):
+    """One action of an episode; leaves of one scene, NumPy."""
+
+    before: State
+    action: Action
+    drive: Drive  # how the robot moved
+    after: State
+
+
+def episode(cfg: Config, env: Env, name: str, params: Params | None, seed: int) -> Iterator[Moment]:
+    """One episode of a policy in the first scene of the environment's pool, action by action."""
+    act = _policy(cfg, env, name)
+
+    @jax.jit
+    def step(key: jax.Array, params: Params, states: State):
+        action = act(key, params, states)
+        plan = jax.vmap(lambda obs, one: primitives.plan(cfg.sim, cfg.heightmap, obs.height, one))(states.obs, action)
+        drive = jax.vmap(lambda one: robot.drive(cfg.sim.robot, one))(plan)
+        return action, drive, jax.vmap(env.step)(states, action)
+
+    key = jax.random.key(seed)
+    states = jax.jit(lambda key: _begin(env, key, np.zeros(1, int)))(jax.random.fold_in(key, 0))
+    for number in range(1, cfg.task.max_actions + 1):
+        action, drive, after = step(jax.random.fold_in(key, number), params, states)
+        yield jax.tree.map(lambda leaf: np.asarray(leaf)[0], Moment(states, action, drive, after))
+        states = after
+        if bool(after.done[0]):
+            return
 
 
 def _run(cfg: Config, env: Env, step: Callable, params: Params | None, key: jax.Array, rows: np.ndarray) -> Episodes:
@@ -63,7 +95,7 @@ def _run(cfg: Config, env: Env, step: Callable, params: Params | None, key: jax.
 def _begin(env: Env, key: jax.Array, rows: np.ndarray) -> State:
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), env.scenes)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(rows)))
-    return jax.vmap(env.begin)(jax.vmap(env.vary)(keys, scenes))
+    return jax.vmap(env.begin)(jax.vmap(env.vary)(keys, scenes), keys)
 
 
 def _step(env: Env, act: Policy, key: jax.Array, params: Params, states: State):

@@ -146,8 +146,7 @@ def _learn(
         current = replay.replace(priority=priority)
         slots, weights = samplers.sample(key_sample, cfg.replay, current, progress, cfg.learn.batch)
         batch = ring.gather(replay, slots)
-        if cfg.learn.augment:
-            batch = jax.vmap(augment.randomly)(_keys(key_augment, cfg.learn.batch), batch)
+        batch = jax.vmap(augment.vary, (0, None, 0))(_keys(key_augment, cfg.learn.batch), cfg, batch)
         state, info = learning.update_critic(key_target, learner, state, batch, weights)
         current = ring.set_priorities(current, slots, samplers.priority(cfg.replay, info.error))
         return (state, current.priority), (info, batch.obs)
@@ -174,8 +173,11 @@ def _keys(key: jax.Array, num: int) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
 
 
-def init(program: Program) -> TrainState:
-    """The state before the first step: fresh scenes and networks, an empty ring (lines 1-4). A fixed point of types."""
+def init(program: Program, trunk: Any = None) -> TrainState:
+    """The state before the first step: fresh scenes and networks, an empty ring (lines 1-4). A fixed point of types.
+
+    trunk: variables that the networks' trunks begin with, see `weights.read`; None for random ones.
+    """
     cfg = program.cfg
 
     def build() -> TrainState:
@@ -190,7 +192,8 @@ def init(program: Program) -> TrainState:
             replay=ring.init(cfg.replay, example(cfg)),
         )
 
-    return jax.jit(build)()
+    state = jax.jit(build)()
+    return state if trunk is None else state.replace(learner=learning.with_trunk(state.learner, trunk))
 
 
 def example(cfg: Config) -> Transition:

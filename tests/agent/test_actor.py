@@ -44,6 +44,16 @@ def test_two_peaks(frames, pose):
         np.testing.assert_allclose(got[2], frames.yaws[peaks[0][0]], atol=0.01)
 
 
+@pytest.mark.parametrize("step", [(0, 2), (2, 0), (2, 2), (1, 2), (0, -2)])
+def test_two_peaks_side_by_side(frames, pose, step):
+    """Claim: nor is it between two peaks with a dip of one cell between them, were they equally high."""
+    logits = _flat(frames)
+    logits[2, 8, 9] = 20.0
+    logits[2, 8 + step[0], 9 + step[1]] = 20.0 - 1e-4
+    got = pose(jnp.asarray(logits), _everywhere(frames))
+    np.testing.assert_allclose(got[:2], frames.xy[2, 8, 9], atol=0.01 * frames.cell)
+
+
 def test_sharp_peaks_are_reproduced(frames, pose):
     """Claim: a sharp peak in any cell of any yaw, at the edges too, gives that cell's pose within a part of a cell."""
     rng = np.random.default_rng(0)

@@ -1,5 +1,6 @@
 """The eight symmetries of the square."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chisquare
+from scipy.stats import chisquare, kstest
 
 from csac_jax import geometry, presets
 from csac_jax.agent import augment, maps
@@ -182,3 +183,104 @@ def test_randomly_draws_all_eight_alike(transition):
     _, counts = np.unique(np.asarray(drawn).reshape(-1, 4), axis=0, return_counts=True)
     assert counts.size == 8
     assert chisquare(counts).pvalue > 1e-4
+
+
+move = jax.jit(lambda transition, yaw, cells: augment.move(CFG, transition, yaw, cells))
+CELL = CFG.heightmap.cell
+
+
+def _shifted(cells: tuple[int, int]) -> Scene:
+    """The scene moved by rows and columns of cells."""
+    return _scene(ROTATION, POSITION + np.array([cells[1] * CELL, cells[0] * CELL, 0.0]))
+
+
+@pytest.mark.parametrize("cells", [(0, 0), (2, 1), (-1, 3)])
+def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
+    """Claim: a shift by whole cells gives height, colour and target mask of the shifted scene, table that comes in
+    included, and moves the action as far; another shift takes it back, cell by cell."""
+    moved = move(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
+    seen = heightmap.pack(look(_shifted(cells)))
+    for obs in (moved.obs, moved.next_obs):
+        off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
+        assert np.mean(off > 1) < 0.005  # a ray along an edge
+        off = np.abs(np.asarray(seen.colour, int) - np.asarray(obs.colour, int)).max(axis=-1)
+        assert np.mean(off > 1) < 0.005
+        np.testing.assert_array_equal(seen.target, obs.target)
+    np.testing.assert_allclose(moved.action.pose, np.add(POSE, [cells[1] * CELL, cells[0] * CELL, 0.0]), atol=1e-6)
+    back = move(moved, jnp.float32(0.0), -jnp.array(cells, jnp.int32))
+    assert _signature(back) == _signature(transition)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_quarter_turns_are_exact(transition, turns):
+    """Claim: a quarter turn only permutes cells."""
+    moved = move(transition, jnp.float32(turns * np.pi / 2), jnp.zeros(2, jnp.int32))
+    np.testing.assert_array_equal(moved.obs.height, np.rot90(transition.obs.height, -turns))  # rows point up
+    np.testing.assert_array_equal(moved.obs.colour, np.rot90(transition.obs.colour, -turns))
+
+
+@pytest.mark.parametrize("yaw", [0.1, -0.37, 1.3, 3.0])
+def test_a_turn_is_exact_in_the_action_and_nearest_in_the_map(transition, yaw):
+    """Claim: place and yaw of the action turn with the scene; a cell shows what lies at most half a cell a side from
+    its place in the map before."""
+    index = np.arange(32, dtype=np.uint16)
+    place = np.asarray(geometry.cell_centres(CFG.heightmap))
+    source = np.asarray(geometry.rotate2d(jnp.float32(-yaw), jnp.asarray(place)))
+    inside = np.abs(source).max(-1) < 0.5 * CFG.heightmap.extent - 1e-6
+    for axis, ramp in enumerate((np.tile(index, (32, 1)), np.tile(index[:, None], (1, 32)))):  # x, y in low counts
+        flat = transition.obs.replace(height=jnp.asarray(ramp))
+        moved = move(transition.replace(obs=flat, next_obs=flat), jnp.float32(yaw), jnp.zeros(2, jnp.int32))
+        shown = (np.asarray(moved.obs.height) + 0.5) * CELL - 0.5 * CFG.heightmap.extent
+        assert np.abs(shown - source[..., axis])[inside].max() <= 0.5 * CELL + 1e-6
+        assert np.all(np.asarray(moved.obs.height)[np.abs(source).max(-1) > 0.5 * CFG.heightmap.extent + 1e-6] == 0)
+    x, y, turned = np.asarray(moved.action.pose)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    np.testing.assert_allclose([x, y], np.array([[cos, -sin], [sin, cos]]) @ POSE[:2], atol=1e-6)
+    np.testing.assert_allclose(turned, (POSE[2] + yaw) % (2 * np.pi), atol=1e-5)
+
+
+def test_what_would_be_cut_off_stays(transition):
+    """Claim: a shift that would push a block, the place of an action or the end of a push out leaves all as it was."""
+    still = jnp.float32(0.0)
+    bare = transition.replace(
+        obs=transition.obs.replace(height=jnp.zeros((32, 32), jnp.uint16)),
+        next_obs=transition.next_obs.replace(height=jnp.zeros((32, 32), jnp.uint16)),
+    )
+    cases = (
+        (transition, (-6, 0), Primitive.GRASP, POSE, False),  # a block out
+        (bare, (-6, 0), Primitive.GRASP, POSE, True),
+        (bare.replace(next_obs=transition.next_obs), (-6, 0), Primitive.GRASP, POSE, False),
+        (bare, (0, 12), Primitive.GRASP, POSE, False),  # the place out
+        (bare, (0, 6), Primitive.GRASP, POSE, True),
+        (bare, (0, 6), Primitive.PUSH, POSE, False),  # the end of the push out
+        (bare, (0, -6), Primitive.PUSH, np.array([0.2, 0.0, 0.0]), False),  # which was cut off before
+    )
+    for before, cells, primitive, pose, goes in cases:
+        action = Action(primitive=jnp.int32(primitive), pose=jnp.asarray(pose, jnp.float32))
+        after = move(before.replace(action=action), still, jnp.array(cells, jnp.int32))
+        assert (not np.array_equal(after.action.pose, action.pose)) == goes
+        if not goes:
+            assert _signature(after) == _signature(before)
+
+
+def test_vary_is_what_the_config_says(transition):
+    """Claim: by default `vary` draws the same symmetry as `randomly`; shifts and turns stay in their bounds and reach
+    them; with everything off it changes nothing."""
+    same = jax.jit(augment.vary, static_argnums=1)
+    for seed in range(3):
+        default, randomly = (
+            same(jax.random.key(seed), CFG, transition),
+            augment.randomly(jax.random.key(seed), transition),
+        )
+        jax.tree.map(np.testing.assert_array_equal, default, randomly)
+    off = dataclasses.replace(CFG, learn=dataclasses.replace(CFG.learn, augment=False))
+    jax.tree.map(np.testing.assert_array_equal, same(jax.random.key(0), off, transition), transition)
+    wide = dataclasses.replace(off, learn=dataclasses.replace(off.learn, augment_shift=2))
+    keys = jax.random.split(jax.random.key(1), 300)
+    poses = jax.jit(jax.vmap(lambda key: augment.vary(key, wide, transition).action.pose))(keys)
+    shifts = (np.asarray(poses) - POSE)[:, :2] / CELL
+    np.testing.assert_allclose(shifts, shifts.round(), atol=1e-4)
+    assert len(np.unique(shifts.round(), axis=0)) == 25
+    turning = dataclasses.replace(off, learn=dataclasses.replace(off.learn, augment_turn=0.2))
+    poses = jax.jit(jax.vmap(lambda key: augment.vary(key, turning, transition).action.pose))(keys)
+    assert kstest((np.asarray(poses)[:, 2] - POSE[2]) / 0.2, "uniform", args=(-1, 2)).pvalue > 1e-3

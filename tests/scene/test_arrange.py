@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from csac_jax.config import HeightmapConfig, SceneConfig, SimConfig
+from csac_jax.config import MESH_KINDS, HeightmapConfig, SceneConfig, SimConfig
 from csac_jax.scene import arrange, blocks, cases, families, layout, model, overlap
 from csac_jax.scene.layout import Scene
 
@@ -181,7 +181,7 @@ def _sizes(cfg: SceneConfig) -> tuple[float, float]:
 
 def test_mesh_blocks_of_one_kind_are_alike(drawn: Drawn):
     """Claim: prisms share their size in a scene, and so do cylinders, as the physics asks."""
-    for kind in blocks.MESH_KINDS:
+    for kind in MESH_KINDS:
         height = drawn.scenes.half_size[:, np.array(drawn.cfg.slots) == kind, 2]
         assert height.size == 0 or np.ptp(height, axis=1).max() == 0.0
 

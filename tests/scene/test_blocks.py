@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from csac_jax.config import SceneConfig, SimConfig
+from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig
 from csac_jax.scene import blocks, model
 
 CONVEX = [name for name in blocks.SHAPES if name != "arch"]
@@ -60,7 +60,7 @@ def test_half_sizes_are_those_of_the_bounding_box(shape: str):
     np.testing.assert_allclose(corners.min(axis=0), -half, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", blocks.MESH_KINDS)
+@pytest.mark.parametrize("kind", MESH_KINDS)
 def test_compiler_keeps_the_origin_of_a_mesh(kind: str):
     """Claim: a mesh block's pose in physics is that of its bounding box, although MuJoCo moves meshes to their mass."""
     compiled = model.build(SceneConfig(slots=(kind,), min_blocks=1), SimConfig()).model

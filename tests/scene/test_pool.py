@@ -11,6 +11,7 @@ import pytest
 
 from csac_jax.config import SceneConfig, SimConfig
 from csac_jax.scene import blocks, model, pool
+from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene, parking
 
 CONFIG = SceneConfig(slots=("box", "arch", "prism", "half_cylinder"), min_blocks=3)
@@ -169,6 +170,6 @@ def test_unwritable_cache_is_no_error(small: model.World, tmp_path: Path, monkey
 def test_hopeless_configuration_is_one_line(small: model.World):
     """Claim: a configuration whose blocks never come to rest ends with one line that names what to change."""
     falling = dataclasses.replace(ONE, drop_height=1.0, settle_time=0.5)  # lands after 0.45 s
-    with pytest.raises(RuntimeError, match=r"scene\.settle_time") as error:
+    with pytest.raises(SceneError, match=r"scene\.settle_time") as error:
         pool.settled(small, falling, EXTENT, 0, 4)
     assert "\n" not in str(error.value)

@@ -10,7 +10,7 @@ import pytest
 
 from csac_jax.config import Config, SceneConfig
 from csac_jax.env import Env
-from csac_jax.scene import layout, model, pool
+from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, primitives, robot
 from csac_jax.sim.outcome import Trace
@@ -44,6 +44,14 @@ def _kicked(scene: Scene, speed: float) -> Scene:
     return dataclasses.replace(scene, velocity=scene.velocity + np.float32([[speed, 0, 0, 0, 0, 0], [0] * 6, [0] * 6]))
 
 
+def _spinning() -> Scene:
+    """A plank in the air, spinning about all axes as one squeezed from under the hand was seen to."""
+    scene = place(cube=(0.1, 0.1, 0.0))
+    half, position, velocity = scene.half_size.copy(), scene.position.copy(), scene.velocity.copy()
+    half[0], position[0, 2], velocity[0, 3:] = blocks.SHAPES["plank"].half_size, 0.4, [148.0, 137.0, -148.0]
+    return scene.replace(half_size=half, position=position, velocity=velocity)
+
+
 CASES: dict[str, tuple[Scene, Action]] = {
     "nothing": (place(cube=(0.1, 0.1, 0.0)), grasp(-0.1, -0.1)),
     # The window sees the corner of a cube beside the pads: 9 mm left of and above the place, 13 mm off their path.
@@ -53,6 +61,7 @@ CASES: dict[str, tuple[Scene, Action]] = {
     "lifted": (place(cube=(0.0, 0.0, 0.0), other=(0.15, 0.1, 0.5)), grasp(0.0, 0.0)),
     "push": (place(cube=(0.06, 0.0, 0.0), prism=(-0.1, 0.1, 0.0)), push(0.0, 0.0)),
     "miss": (place(cube=(0.06, 0.06, 0.0)), push(0.0, 0.0)),
+    "spinning": (_spinning(), push(-0.1, -0.1)),
     "nan": (_kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), np.nan), grasp(0.15, -0.15)),
     "exploded": (_kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), 1e3), grasp(0.15, -0.15)),
 }

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from csac_jax.config import Config, SceneConfig
-from csac_jax.scene import blocks, layout, model
-from csac_jax.sim import mjx_physics, outcome, physics as simulation
+from csac_jax.config import MESH_KINDS, Config, SceneConfig
+from csac_jax.scene import layout, model
+from csac_jax.sim import c_physics, mjx_physics, outcome, physics as simulation, robot
 from csac_jax.sim.outcome import Outcome
 
 pytestmark = pytest.mark.mjx
@@ -88,6 +88,15 @@ def test_failed_physics_is_flagged_alone(executed):
     assert health.sum() == len(health) - len(names)
 
 
+def test_fast_spin_does_not_blow_up(executed, world):
+    """Claim: a thin block that comes in spinning at 250 rad/s is held to the speed limit, in MJX and in C."""
+    run = executed.case("spinning")
+    end, _ = c_physics.CPhysics(world, CONFIG.sim).run(run.scene, robot.drive("hand", run.plan))
+    for after in (run.after, end):
+        assert simulation.healthy(after)
+        assert (np.abs(after.velocity) <= layout.SPEED_LIMIT).all()
+
+
 @pytest.mark.parametrize(
     ("field", "value", "slot", "good"),
     [
@@ -99,10 +108,18 @@ def test_failed_physics_is_flagged_alone(executed):
         ("velocity", 15.0, 0, True),
         ("velocity", np.inf, 0, False),
         ("quaternion", np.nan, 0, False),
+        ("quaternion", 0.2, 0, False),
+        ("quaternion", 1e-4, 1, True),
+        ("position", 101.0, 1, False),
+        ("half_size", np.nan, 1, False),
+        ("half_size", 0.0, 0, False),
+        ("half_size", 1e6, 0, False),
+        ("half_size", 0.3, 0, True),
     ],
 )
 def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
-    """Claim: healthy = finite, slower than MAX_SPEED and, if in play, within MAX_HEIGHT of the origin."""
+    """Claim: healthy = finite, slower than MAX_SPEED, within MAX_HEIGHT of the origin if in play, of unit quaternion
+    and of a block's size."""
     scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
     scene = scene.replace(position=jnp.zeros((2, 3)), in_play=jnp.array([True, False]))
     assert simulation.healthy(scene)
@@ -110,10 +127,27 @@ def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
     assert simulation.healthy(dataclasses.replace(scene, **{field: changed})) == good
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "good"),
+    [
+        *((field, value, False) for field in ("density", "friction") for value in (np.nan, np.inf, 1e6, 0.0, -1.0)),
+        ("density", 3000.0, True),
+        ("friction", 2.0, True),
+        *(("colour", value, False) for value in (-1, 10, 1_000_000)),
+        ("colour", 9, True),
+    ],
+)
+def test_healthy_materials(field: str, value: float, good: bool):
+    """Claim: a healthy scene has densities and frictions of solid things, and colours that there are."""
+    scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
+    changed = getattr(scene, field).at[1].set(value)
+    assert simulation.healthy(dataclasses.replace(scene, **{field: changed})) == good
+
+
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_meshes_are_as_large_as_the_blocks(scale: float):
     """Claim: corners and faces that MJX collides span the block's bounding box, whatever its size in the scene."""
-    config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=blocks.MESH_KINDS, min_blocks=1))
+    config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=MESH_KINDS, min_blocks=1))
     world = model.build(config.scene, config.sim)
     scene = layout.parked(config.scene.slots)
     scene = scene.replace(half_size=scene.half_size * np.float32(scale))

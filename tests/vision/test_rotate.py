@@ -157,3 +157,40 @@ def test_a_wrong_request_says_so():
         rotate.tables(64, 0.448, 16, 17, 0.25)
     with pytest.raises(ValueError, match="margin"):
         rotate.tables(64, 0.448, 16, 16, -0.25)
+
+
+@pytest.mark.parametrize("k", range(_K))
+def test_there_and_back(k):
+    """Claim: what frame k shows at the place of a workspace cell, read by SciPy, is that cell to half a pixel a side;
+    with a margin of sqrt(2) - 1 this holds for every cell, corners included."""
+    size = 64
+    tables = _ROOMY
+    row, col = np.meshgrid(*[np.arange(size, dtype=np.float32)] * 2, indexing="ij")
+    frame = np.asarray(rotate.rotate_one(tables, jnp.asarray(np.stack([row, col], axis=-1)), jnp.int32(k)))
+    xy = geometry.cell_centres(HeightmapConfig(size))
+    place = rotate.to_cell(tables.canvas, tables.cell, rotate.frame_position(jnp.asarray(_yaw(k), jnp.float32), xy))
+    place = np.asarray(place).round()
+    assert place.min() >= 0
+    assert place.max() < tables.canvas
+    off = (np.asarray(place) - 0.5 * (tables.canvas - 1)) - (
+        np.asarray(rotate.frame_position(jnp.asarray(_yaw(k), jnp.float32), xy))[..., ::-1] / tables.cell
+    )
+    shift = np.asarray(geometry.rotate2d(jnp.asarray(_yaw(k), jnp.float32), jnp.asarray(off[..., ::-1])))[..., ::-1]
+    inner = np.s_[1:-1, 1:-1]  # beside the rim the nearest canvas cell may look past it
+    for channel, exact in enumerate((row, col)):
+        read = scipy.ndimage.map_coordinates(frame[..., channel], np.moveaxis(place, -1, 0), order=1)
+        assert np.abs(read - exact - shift[..., channel])[inner].max() <= 0.5 + 1e-3
+
+
+_ROOMY = rotate.tables(64, 0.448, _K, _K, 2**0.5 - 1)
+
+
+def test_a_small_margin_loses_corners():
+    """Claim: a margin of sqrt(2) - 1 shows the workspace's corners in every frame, one of 1/8 does not in frame 2."""
+    corners = np.zeros((64, 64, 1), np.float32)
+    corners[[0, 0, -1, -1], [0, -1, 0, -1]] = 1.0
+    corners[[1, 1, -2, -2], [1, -2, 1, -2]] = 1.0
+    for tables, kept in ((_ROOMY, True), (rotate.tables(64, 0.448, _K, _K, 0.125), False)):
+        frames = np.asarray(rotate.rotate(tables, jnp.asarray(corners)))
+        quarters = np.stack([np.rot90(frames[2, :, :, 0], turn)[: tables.canvas // 4] for turn in range(4)])
+        assert np.all(quarters.sum((1, 2)) >= 1.0) == kept

@@ -1,0 +1,61 @@
+"""Which network a config asks for, and its variables: what gradients change, and running statistics of batch norm.
+
+Both kinds have a critic, maps [B, C, C, I] -> Q [B, h, w, OUTPUTS] and features, and an actor's head, features -> maps
+of the same shape. Called with `train`, batch norm takes the statistics of the batch, else the running ones.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from csac_jax.config import NetConfig
+from csac_jax.nets import dense, densenet
+
+STATISTICS = "batch_stats"
+
+Critic = dense.Critic | densenet.Critic
+Head = dense.Head | densenet.Head
+
+
+def critic(cfg: NetConfig) -> Critic:
+    """The critic of a config."""
+    return dense.Critic(cfg) if cfg.kind == "small" else densenet.Critic(cfg)
+
+
+def head(cfg: NetConfig) -> Head:
+    """The actor's head of a config."""
+    return dense.Head(cfg) if cfg.kind == "small" else densenet.Head(cfg)
+
+
+def stride(cfg: NetConfig) -> int:
+    """Cells of the net's input per cell of its maps, along each axis."""
+    return dense.STRIDE if cfg.kind == "small" else cfg.output_stride
+
+
+def inputs(cfg: NetConfig, colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:
+    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3], height [..., H, W] m, target [..., H, W]."""
+    prepare = dense.inputs if cfg.kind == "small" else densenet.inputs
+    return prepare(colour if cfg.colour else None, height, target)
+
+
+def learned(variables: Any) -> Any:
+    """The variables that gradients change; the rest are running statistics."""
+    return {"params": variables["params"]}
+
+
+def train(net: Critic | Head, variables: Any, fed: jax.Array) -> tuple[Any, Any]:
+    """Outputs of a net by the statistics of this batch, and the running ones after it, {} without batch norm."""
+    return net.apply(variables, fed, train=True, mutable=[STATISTICS])
+
+
+def with_trunk(variables: Any, trunk: Any) -> Any:
+    """A critic's variables, leaves [M, T, ...], with `trunk`'s, leaves [...], in each of its trunks."""
+
+    def fill(old: jax.Array, new: Any) -> jax.Array:
+        return jnp.broadcast_to(jnp.asarray(new, old.dtype), old.shape)
+
+    return {
+        name: {**modules, "trunk": jax.tree.map(fill, modules["trunk"], trunk[name])}
+        for name, modules in variables.items()
+    }

@@ -1,0 +1,49 @@
+"""Weights of DenseNet-121 in torchvision's names to the variables of a trunk.
+
+`features.denseblock1.denselayer2.conv1.weight` [O, I, k, k] is `params.denseblock1.denselayer2.conv1.kernel`
+[k, k, I, O]; a norm's `weight`, `bias`, `running_mean` and `running_var` are its scale, bias, mean and variance.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax.config import NetConfig
+from csac_jax.nets import densenet
+
+_LEAVES = {"kernel": "weight", "scale": "weight", "bias": "bias", "mean": "running_mean", "var": "running_var"}
+
+
+def _needed(name: str) -> bool:
+    """False for the classifier and for the counters of batch norm."""
+    return not name.startswith("classifier.") and not name.endswith(".num_batches_tracked")
+
+
+def variables(cfg: NetConfig, tensors: Mapping[str, np.ndarray]) -> Any:
+    """Variables of one trunk, float32 leaves [...], from `tensors` by name.
+
+    Raises ValueError naming the first tensor that is missing, misshapen or not known.
+    """
+    trunk, blank = densenet.Trunk(cfg), jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
+    wanted = jax.eval_shape(trunk.init, jax.random.key(0), blank)
+    names = set()
+
+    def take(path: Any, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
+        *modules, kind = (key.key for key in path[1:])
+        name = ".".join(["features", *modules, _LEAVES[kind]])
+        names.add(name)
+        if name not in tensors:
+            raise ValueError(f"tensor {name} is missing")
+        tensor = np.asarray(tensors[name], np.float32)
+        shape = tuple(leaf.shape[axis] for axis in (3, 2, 0, 1)) if kind == "kernel" else leaf.shape
+        if tensor.shape != shape:
+            raise ValueError(f"tensor {name} has the shape {list(tensor.shape)}, not {list(shape)}")
+        return tensor.transpose(2, 3, 1, 0) if kind == "kernel" else tensor
+
+    taken = jax.tree_util.tree_map_with_path(take, wanted)
+    if extra := sorted(name for name in tensors if _needed(name) and name not in names):
+        raise ValueError(f"tensor {extra[0]} is none of DenseNet-121")
+    return taken

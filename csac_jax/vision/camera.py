@@ -1,0 +1,96 @@
+"""A pinhole camera: what it sees of a scene, as depth and colour, and its pixels as points in space.
+
+The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depths are along z, not along
+the ray: the ray of a pixel is not of unit length, but advances by 1 m in depth per unit of the caster's distance.
+
+    eye = camera.make(CameraConfig(scale=0.5))
+    picture = camera.render(eye, solids.read(model, data.geom_xpos, data.geom_xmat))  # .colour [H, W, 3] in 0 .. 1
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from csac_jax.config import CameraConfig
+from csac_jax.scene.solids import Solids
+from csac_jax.vision import raycast, shade
+
+
+@struct.dataclass
+class Camera:
+    """Intrinsics and pose."""
+
+    focal: jax.Array  # [2] px, along the image's width and height
+    centre: jax.Array  # [2] px, column and row of the optical axis; pixel centres are whole numbers
+    position: jax.Array  # [3] m, world frame
+    rotation: jax.Array  # [3, 3] camera to world
+    width: int = struct.field(pytree_node=False)  # W, px
+    height: int = struct.field(pytree_node=False)  # H, px
+
+
+@struct.dataclass
+class Picture:
+    """What a camera sees. H, W = rows and columns of the image."""
+
+    colour: jax.Array  # [H, W, 3] float32, 0 .. 1
+    depth: jax.Array  # [H, W] float32 m, along the optical axis; 0 where not valid
+    geom: jax.Array  # [H, W] int32, `Hit.geom`; meaningless where not valid
+    valid: jax.Array  # [H, W] bool, True if the pixel sees anything
+
+
+def make(cfg: CameraConfig) -> Camera:
+    """The camera of a config."""
+    width, height = cfg.pixels
+    share = np.array([width, height]) / np.array(cfg.size)
+    return Camera(
+        focal=jnp.asarray(np.array(cfg.focal) * share, jnp.float32),
+        centre=jnp.asarray((np.array(cfg.centre) + 0.5) * share - 0.5, jnp.float32),
+        position=jnp.asarray(cfg.position, jnp.float32),
+        rotation=jnp.asarray(level_rotation(np.array(cfg.position), np.array(cfg.look_at)), jnp.float32),
+        width=width,
+        height=height,
+    )
+
+
+def level_rotation(position: np.ndarray, look_at: np.ndarray) -> np.ndarray:
+    """Rotation [3, 3], camera to world, of a camera at `position` [3] that looks at a point, its x horizontal."""
+    forward = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.array([forward[1], -forward[0], 0.0]) / np.hypot(forward[0], forward[1])
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def directions(camera: Camera) -> jax.Array:
+    """Rays [H, W, 3] of all pixels in the world frame, each 1 m long in depth."""
+    x = (jnp.arange(camera.width, dtype=jnp.float32) - camera.centre[0]) / camera.focal[0]
+    y = (jnp.arange(camera.height, dtype=jnp.float32) - camera.centre[1]) / camera.focal[1]
+    right, down, forward = (camera.rotation[:, axis] for axis in range(3))
+    return x[None, :, None] * right[None, None] + y[:, None, None] * down[None, None] + forward[None, None]
+
+
+def points(camera: Camera, depth: jax.Array) -> jax.Array:
+    """Points [H, W, 3] m in the world frame of the depths [H, W] m of all pixels."""
+    return depth[..., None] * directions(camera) + camera.position[None, None]
+
+
+def look(camera: Camera, cast: Callable[[jax.Array, jax.Array], Any]) -> Any:
+    """What `cast`, a function of one ray (origin [3] m, direction [3]), makes of every pixel: leaves [H, W, ...]."""
+    one = jax.vmap(cast, in_axes=(None, 0))
+    seen = one(camera.position, directions(camera).reshape(-1, 3))
+    return jax.tree.map(lambda leaf: leaf.reshape(camera.height, camera.width, *leaf.shape[1:]), seen)
+
+
+def render(camera: Camera, solids: Solids) -> Picture:
+    """The picture of a scene of any geoms, flat shaded."""
+    hit = look(camera, lambda origin, direction: raycast.cast_solids(solids, origin, direction))
+    own = jnp.asarray(solids.colour).at[jnp.maximum(hit.geom, 0)].get(mode="promise_in_bounds")
+    lit = shade.flat(own.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(own.shape)
+    return Picture(
+        colour=jnp.where(hit.valid[..., None], lit, shade.SKY[None, None]),
+        depth=jnp.where(hit.valid, hit.distance, 0.0),
+        geom=hit.geom,
+        valid=hit.valid,
+    )

@@ -1,0 +1,161 @@
+"""Speed of the raycaster, as JSON: `csac-jax bench raycast [--size N] [--scenes N] [--repeats N]`.
+
+Rays straight down through every cell of the map, at random poses of the ten blocks of the preset `fast`, and the
+table: ours gives distance and surface, `mjx.ray` distance and geom, of the same model (without the hand), vmapped over
+rays and scenes, in parts of PEER_ROWS rows a scene, since it keeps every triangle of every ray in memory. It passes
+through cylinders, of which there are none: round blocks are meshes; and it fails on models without a material, so it
+gets one.
+Calls take turns and the median counts.
+
+Arithmetic limit: the rate of a kernel that does nothing but multiply-adds (2 operations each): CHAINS chains per
+element, each DEPTH long, of which only the last sum is written, so that memory does not bound it; compiled by the same
+compiler and timed in the same run. Operations of a ray are counted from the code: every sum, product, comparison,
+selection, minimum, maximum and logical operation is one. Per plane (`enter_half_spaces` for a direction that all rays
+share: what depends on the direction alone has no ray axis): room 6 (3 products, 2 sums, a difference), crossing 1,
+outside 2, inwards 1, outwards 2, face 2, enter 1, leave 1: 16. Per geom: valid 3, closer 2, number and selection of the
+surface 3, distance 1: 9. Planes that a geom lacks are computed as well, and counted.
+"""
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax import geometry, presets
+from csac_jax.cli import BadArgumentsError
+from csac_jax.config import HeightmapConfig
+from csac_jax.scene import blocks, model as models
+from csac_jax.scene.model import World
+from csac_jax.sim import mjx_physics
+from csac_jax.train import provenance
+from csac_jax.vision import heightmap, raycast
+from csac_jax.vision.raycast import Polytopes
+from experiments.bench._options import read
+
+PER_PLANE, PER_GEOM = 16, 9
+PEER_ROWS = 8
+CHAINS, DEPTH, ELEMENTS = 4, 64, 2**20
+DOWN = np.array([0.0, 0.0, -1.0], np.float32)
+
+Call = Callable[[], Any]
+
+
+def _poses(rng: np.random.Generator, scenes: int, num: int) -> tuple[jax.Array, jax.Array]:
+    """Positions [E, N, 3] m and unit quaternions [E, N, 4] of blocks in the workspace."""
+    position = rng.uniform([-0.15, -0.15, 0.02], [0.15, 0.15, 0.1], (scenes, num, 3))
+    quaternion = rng.normal(size=(scenes, num, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return jnp.asarray(position, jnp.float32), jnp.asarray(quaternion, jnp.float32)
+
+
+def _origins(size: int) -> jax.Array:
+    """Where the rays of a map start [R, 3] m."""
+    xy = geometry.cell_centres(HeightmapConfig(size)).reshape(-1, 2)
+    return jnp.concatenate([xy, jnp.full((size * size, 1), heightmap.VIEW_HEIGHT)], axis=1)
+
+
+def _ours(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -> Call:
+    """Distances and surfaces, leaves [E, R]."""
+    half_size = np.stack([models.LARGEST * blocks.half_size_choices(kind).max(axis=0) for kind in world.slots])
+    normal, offset = blocks.half_spaces(world.slots, jnp.asarray(half_size))
+    slot = world.parts.slot
+
+    def look(position: jax.Array, quaternion: jax.Array) -> Any:
+        turn = jax.vmap(geometry.quat_to_matrix)(quaternion)
+        shapes = Polytopes(normal, offset, position[slot], turn[slot], jnp.zeros((len(slot), 3)))
+        return jax.vmap(raycast.meet, (None, 0, None))(shapes, origin, jnp.asarray(DOWN))
+
+    compiled = jax.jit(jax.vmap(look))
+    return lambda: compiled(*poses)
+
+
+def _peer(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -> Call:
+    """Distances and geoms, leaves [E, R]."""
+    from mujoco import mjx  # after csac_jax.sim, which keeps it from complaining of optional parts
+
+    physics = mjx_physics.make(world, presets.get("fast").sim)
+    model = physics.model.replace(mat_rgba=jnp.ones((1, 4)))
+    hand = sorted(set(range(1, world.model.nbody)) - set(world.block_bodies.tolist()))
+    part = PEER_ROWS * round(len(origin) ** 0.5)
+
+    def look(position: jax.Array, quaternion: jax.Array) -> Any:
+        qpos = physics.data.qpos.at[world.block_qpos].set(jnp.concatenate([position, quaternion], axis=1))
+        data = mjx.kinematics(model, physics.data.replace(qpos=qpos))
+        cast = jax.vmap(lambda start: mjx.ray(model, data, start, jnp.asarray(DOWN), bodyexclude=hand))
+        found = jax.lax.map(cast, origin.reshape(-1, part, 3))
+        return jax.tree.map(jnp.ravel, found)
+
+    compiled = jax.jit(jax.vmap(look))
+    return lambda: compiled(*poses)
+
+
+def _limit() -> Call:
+    """CHAINS * DEPTH multiply-adds per element."""
+
+    def kernel(start: jax.Array, factor: jax.Array, summand: jax.Array) -> jax.Array:
+        chains = [start + float(chain) for chain in range(CHAINS)]
+        for _ in range(DEPTH):
+            chains = [chain * factor + summand for chain in chains]
+        return sum(chains[1:], chains[0])
+
+    compiled = jax.jit(kernel)
+    start = jnp.linspace(0.0, 1.0, ELEMENTS)
+    return lambda: compiled(start, jnp.float32(0.999), jnp.float32(0.001))
+
+
+def _median_seconds(calls: dict[str, Call], repeats: int) -> dict[str, float]:
+    """The calls in turn, so that what else the machine does hits all alike."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for call in calls.values():
+        jax.block_until_ready(call())
+    for _ in range(repeats):
+        for name, call in calls.items():
+            begun = time.perf_counter()
+            jax.block_until_ready(call())
+            seconds[name].append(time.perf_counter() - begun)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def measure(size: int, scenes: int, repeats: int) -> dict[str, Any]:
+    """Rays per second of both casters and the arithmetic limit."""
+    cfg = presets.get("fast")
+    world = models.build(cfg.scene, cfg.sim)
+    poses, origin = _poses(np.random.default_rng(0), scenes, len(world.slots)), _origins(size)
+    calls = {"ours": _ours(world, poses, origin), "mjx": _peer(world, poses, origin), "multiply_adds": _limit()}
+    seconds = _median_seconds(calls, repeats)
+    ours, theirs = np.asarray(calls["ours"]()[0]), np.asarray(calls["mjx"]()[0])
+    rays = scenes * size * size
+    geoms = len(world.parts.slot)
+    per_ray = geoms * (blocks.MAX_FACES * PER_PLANE + PER_GEOM)
+    limit = 2.0 * CHAINS * DEPTH * ELEMENTS / seconds["multiply_adds"]
+    rate = rays / seconds["ours"]
+    return {
+        "size": size,
+        "scenes": scenes,
+        "blocks": len(world.slots),
+        "geoms": geoms,
+        "rays": rays,
+        "median_seconds": seconds,
+        "rays_per_second": {"ours": rate, "mjx": rays / seconds["mjx"]},
+        "mjx_seconds_over_ours": seconds["mjx"] / seconds["ours"],
+        "rays_further_apart_than_0.1_mm": float(np.mean(np.abs(ours - theirs) > 1e-4)),
+        "operations_per_ray": per_ray,
+        "operations_per_second": per_ray * rate,
+        "arithmetic_limit": limit,
+        "share_of_limit": per_ray * rate / limit,
+    }
+
+
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    options = read("raycast", arguments, size=224, scenes=256, repeats=11)
+    try:
+        HeightmapConfig(options["size"])
+    except ValueError as error:
+        raise BadArgumentsError(f"bench raycast: --size: {error}") from error
+    print(json.dumps(measure(**options) | provenance.record(), indent=2))

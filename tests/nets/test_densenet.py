@@ -1,0 +1,253 @@
+"""DenseNet-121 against Keras 3 with the same weights, and its parts."""
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+os.environ.setdefault("KERAS_BACKEND", "jax")
+
+from csac_jax.config import NetConfig
+from csac_jax.nets import densenet
+
+TINY = NetConfig(kind="densenet121", block_layers=(1, 1, 1, 1), block_growth=4, head=8)
+PARAMETERS = 7_037_504  # of a trunk without the top, running statistics included
+KERAS = {"norm1": "0_bn", "conv1": "1_conv", "norm2": "1_bn", "conv2": "2_conv"}
+
+
+def random_variables(module: nn.Module, seed: int, *shapes: tuple[int, ...]) -> Any:
+    """Variables that are all random, with activations of about 1; nothing is compiled."""
+    rng = np.random.default_rng(seed)
+    blanks = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+
+    def draw(path: Any, leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        kind = path[-1].key
+        if kind == "kernel":
+            values = rng.normal(scale=np.sqrt(2.0 / np.prod(leaf.shape[:-1])), size=leaf.shape)
+        elif kind in ("scale", "var"):
+            values = rng.uniform(0.5, 1.5, leaf.shape)
+        else:
+            values = rng.normal(scale=0.2, size=leaf.shape)
+        return jnp.asarray(values, leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(draw, jax.eval_shape(module.init, jax.random.key(0), *blanks))
+
+
+def _keras_name(modules: tuple[str, ...]) -> str:
+    """Keras's name of the layer that a module's output is compared with."""
+    if modules[0] in ("conv0", "norm0", "norm5"):
+        return {"conv0": "conv1_conv", "norm0": "conv1_bn", "norm5": "bn"}[modules[0]]
+    stage = int(modules[0][-1]) + 1
+    if modules[0].startswith("transition"):
+        return f"pool{stage}_" + {"norm": "bn", "conv": "conv"}.get(modules[-1], "pool")
+    layer = f"conv{stage}_block{modules[1].removeprefix('denselayer')}_"
+    return layer + (KERAS[modules[2]] if len(modules) == 3 else "concat")
+
+
+def _outputs(tree: Any, modules: tuple[str, ...] = ()) -> Iterator[tuple[str, jax.Array]]:
+    """Keras's name and output of every module in the captured intermediates but whole blocks and the trunk."""
+    for name, entry in tree.items():
+        if name != "__call__":
+            yield from _outputs(entry, (*modules, name))
+        elif modules and not (len(modules) == 1 and modules[0].startswith("denseblock")):
+            yield _keras_name(modules), entry[0]
+
+
+def _weights(variables: Any, modules: tuple[str, ...] = ()) -> Iterator[tuple[str, list[np.ndarray]]]:
+    """Keras's name and weights of every layer that has some."""
+    params, statistics = variables
+    for name, entry in params.items():
+        if "kernel" in entry:
+            yield _keras_name((*modules, name)), [np.asarray(entry["kernel"])]
+        elif "scale" in entry:
+            own = statistics[name]
+            yield _keras_name((*modules, name)), [np.asarray(w) for w in (*_scale(entry), own["mean"], own["var"])]
+        else:
+            yield from _weights((entry, statistics.get(name, {})), (*modules, name))
+
+
+def _scale(entry: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    return entry["scale"], entry["bias"]
+
+
+def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
+    """Compares every module with Keras's in both modes of batch norm; returns how many outputs were compared."""
+    cfg = NetConfig(kind="densenet121", norm="batch", block_layers=block_layers)
+    trunk = densenet.Trunk(cfg)
+    variables = random_variables(trunk, 0, (1, size, size, 3))
+    maps = jnp.asarray(np.random.default_rng(1).normal(size=(4, size, size, 3)), jnp.float32)
+
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.debug_key_reuse(False):
+        call, names = _keras(block_layers, size, variables)
+        theirs = {train: jax.tree.map(np.asarray, call(maps, train)) for train in (False, True)}
+
+    def ours(variables: Any, maps: jax.Array, train: bool) -> Any:
+        kinds = ["intermediates", "batch_stats"]
+        return trunk.apply(variables, maps, train, capture_intermediates=True, mutable=kinds)[1]
+
+    for train, (outputs, statistics) in theirs.items():
+        state = jax.jit(ours, static_argnums=2)(variables, maps, train)
+        got = dict(_outputs(state["intermediates"]))
+        assert got.keys() == set(names)
+        for name, wanted in zip(names, outputs, strict=True):
+            error = np.abs(got[name] - wanted).max() / np.abs(wanted).max()
+            assert error <= 1e-4, (name, train, error)
+        after = dict(_weights((variables["params"], state["batch_stats"])))
+        for name, (_, _, *wanted) in statistics.items():
+            for mine, other in zip(after[name][2:], wanted, strict=True):
+                np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-4, err_msg=name)
+    return len(names)
+
+
+def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Callable, list[str]]:
+    """(maps, train) -> (outputs, statistics by layer) of Keras's net with our weights; names of the outputs."""
+    import keras
+    from keras.src.applications.densenet import DenseNet
+
+    net = DenseNet(list(block_layers), include_top=False, weights=None, input_shape=(size, size, 3))
+    norms = []
+    for name, weights in _weights((variables["params"], variables["batch_stats"])):
+        layer = net.get_layer(name)
+        layer.set_weights(weights)
+        if len(weights) == 4:
+            layer.momentum, layer.epsilon = 0.9, 1e-5  # torchvision's in place of Keras's 0.99 and 1.001e-5
+            norms.append(name)
+    kinds = ("_conv", "_bn", "_concat", "_pool")
+    wanted = [layer.name for layer in net.layers if layer.name.endswith(kinds) or layer.name == "bn"]
+    whole = keras.Model(net.inputs, [net.get_layer(name).output for name in wanted])
+    trained, other = ([v.value for v in group] for group in (whole.trainable_variables, whole.non_trainable_variables))
+
+    def run(trained: Any, other: Any, maps: jax.Array, train: bool) -> Any:
+        return whole.stateless_call(trained, other, maps, training=train)
+
+    compiled = jax.jit(run, static_argnums=3)
+
+    def call(maps: jax.Array, train: bool) -> Any:
+        outputs, after = compiled(trained, other, maps, train)
+        by_path = {variable.path: value for variable, value in zip(whole.non_trainable_variables, after, strict=True)}
+        statistics = {name: [by_path.get(v.path, v.value) for v in net.get_layer(name).variables] for name in norms}
+        return outputs, statistics
+
+    return call, wanted
+
+
+def test_every_stage_is_kerass():
+    """Claim: with weights ported, every convolution, norm, dense layer and transition is Keras's within 1e-4 of the
+    largest value, batch norm both with running statistics and with the batch's, which move the running ones alike."""
+    assert _compare((2, 1, 1, 1), 64) == 2 + 5 * 5 + 3 * 3 + 1
+
+
+@pytest.mark.slow
+def test_every_stage_of_densenet_121_is_kerass():
+    """Claim: the same for all 121 layers."""
+    assert _compare((6, 12, 24, 16), 64) == 2 + 58 * 5 + 3 * 3 + 1
+
+
+def test_number_of_parameters():
+    """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running statistics."""
+    trunk = densenet.Trunk(NetConfig(kind="densenet121", norm="batch"))
+    blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
+    variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
+    sizes = {name: sum(leaf.size for leaf in jax.tree.leaves(entry)) for name, entry in variables.items()}
+    assert sizes == {"params": PARAMETERS - 83_648, "batch_stats": 83_648}
+    assert jax.eval_shape(trunk.apply, variables, blank).shape == (1, 2, 2, 1024)
+    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.float32.dtype}
+
+
+def test_max_pool_is_flaxs():
+    """Claim: the maximum of shifted maps is a max pool with padding, gradient included, without the operation that GPUs
+    lack when results are to repeat."""
+    rng = np.random.default_rng(0)
+    maps = jnp.asarray(np.maximum(rng.normal(size=(2, 8, 12, 3)), 0.0), jnp.float32)
+    pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
+    np.testing.assert_array_equal(densenet.max_pool(maps), pool(maps))
+    weight = jnp.asarray(rng.normal(size=(2, 4, 6, 3)), jnp.float32)
+    losses = [lambda maps, f=f: jnp.sum(weight * f(maps)) for f in (densenet.max_pool, pool)]
+    got, wanted = (jax.jit(jax.grad(loss))(maps) for loss in losses)
+    positive = maps > 0.0  # at 0 several cells are the largest; the ReLU before takes the gradient away there
+    np.testing.assert_allclose(jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6)
+    named = ["select_and_scatter" in str(jax.make_jaxpr(jax.grad(loss))(maps)) for loss in losses]
+    assert named == [False, True]
+
+
+def test_trunks_see_colour_height_and_mask():
+    """Claim: a trunk each for colour, for height and for the mask, the latter two three times over, pixels repeated."""
+    maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
+    zoomed = NetConfig(kind="densenet121", zoom=2)
+    seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
+    assert seen.shape == (3, 2, 8, 8, 3)
+    np.testing.assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
+    for trunk, channel in ((1, 3), (2, 4)):
+        for copy in range(3):
+            np.testing.assert_array_equal(seen[trunk, :, ::2, 1::2, copy], maps[..., channel])
+    blind = NetConfig(kind="densenet121", colour=False)
+    only = densenet._trunk_inputs(blind, maps[..., 3:4])
+    np.testing.assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
+
+
+def test_inputs():
+    """Claim: bare table is 0; on blocks colours are normalised as ImageNet's and 3 cm of height are 1; without colour
+    only the height is left."""
+    height, colour = jnp.array([[0.0, 0.03]]), jnp.full((1, 2, 3), 0.5)
+    fed = np.asarray(densenet.inputs(colour, height, jnp.array([[True, False]])))
+    np.testing.assert_array_equal(fed[0, 0], [0.0, 0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(fed[0, 1], [0.015 / 0.229, 0.044 / 0.224, 0.094 / 0.225, 1.0, 0.0], rtol=1e-4)
+    np.testing.assert_allclose(densenet.inputs(None, height, None), [[[0.0], [1.0]]], rtol=1e-6)
+
+
+def test_trunks_have_weights_of_their_own():
+    """Claim: each trunk has its own weights, and features are joined colour first: changing what one trunk sees, or one
+    trunk's weights, changes its share of the features only."""
+    critic = densenet.Critic(TINY)
+    maps = jnp.asarray(np.random.default_rng(2).normal(size=(1, 64, 64, 4)), jnp.float32)
+    variables = random_variables(critic, 0, maps.shape)
+    features = jax.jit(lambda variables, maps: critic.apply(variables, maps)[1])
+    before, half = features(variables, maps), 8
+    assert before.shape == (1, 2, 2, 2 * half)
+    trunk = jax.tree.map(lambda leaf: leaf.at[0].multiply(1.5), variables["params"]["trunk"])
+    heavier = {"params": {**variables["params"], "trunk": trunk}}
+    for after in (features(heavier, maps), features(variables, maps.at[..., :3].multiply(-1.0))):
+        np.testing.assert_array_equal(after[..., half:], before[..., half:])
+        assert np.any(after[..., :half] != before[..., :half])
+
+
+@pytest.mark.parametrize(("zoom", "output_stride", "factor"), [(1, 4, 8), (2, 1, 16), (2, 16, 1)])
+def test_head_upsamples(zoom: int, output_stride: int, factor: int):
+    """Claim: maps have the resolution that `output_stride` says; they are bilinear between the features' cells, which
+    keep their places, and constant features give a constant map."""
+    cfg = NetConfig(kind="densenet121", zoom=zoom, output_stride=output_stride)
+    plane = jnp.asarray(np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None], jnp.float32)
+    got = np.asarray(densenet._upsample(plane, 32 // (cfg.zoom * cfg.output_stride)))[0, ..., 0]
+    assert got.shape == (4 * factor, 5 * factor)
+    at = [(np.arange(n * factor) + 0.5) / factor - 0.5 for n in (4, 5)]
+    inner = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]
+    np.testing.assert_allclose(got[np.ix_(*inner)], np.add.outer(3.0 * at[0][inner[0]], at[1][inner[1]]), atol=1e-5)
+
+
+def test_group_norm_sees_one_map():
+    """Claim: with group norm the maps of a picture do not depend on what else is in the batch, in the head either."""
+    head = densenet.Head(TINY)
+    features = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, 2, 16)), jnp.float32)
+    variables = random_variables(head, 0, (1, 2, 2, 16))
+    together = head.apply(variables, features)
+    assert together.shape == (2, 3, 16, 16, 3)
+    np.testing.assert_allclose(together[1, 2], head.apply(variables, features[1, 2:])[0], atol=1e-5)
+
+
+def test_bfloat16_has_float32_parameters():
+    """Claim: in bfloat16 parameters and Q stay float32, features are bfloat16, and Q is that of float32 within 5 %."""
+    half = dataclasses.replace(TINY, dtype="bfloat16")
+    maps = jnp.asarray(np.random.default_rng(4).normal(size=(1, 64, 64, 4)), jnp.float32)
+    with jax.numpy_dtype_promotion("standard"):  # Flax's norm promotes in half precision
+        variables = random_variables(densenet.Critic(half), 0, maps.shape)
+        q, features = jax.jit(densenet.Critic(half).apply)(variables, maps)
+    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
+    wanted, _ = jax.jit(densenet.Critic(TINY).apply)(variables, maps)
+    assert (q.dtype, features.dtype) == (jnp.float32, jnp.bfloat16)
+    assert np.abs(q - wanted).max() <= 0.05 * np.abs(wanted).max()

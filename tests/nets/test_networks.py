@@ -1,0 +1,89 @@
+"""Which network a config asks for, and which configs are refused."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from csac_jax import presets
+from csac_jax.agent import maps
+from csac_jax.config import Config, HeightmapConfig, NetConfig
+from csac_jax.nets import dense, densenet, networks
+
+
+def _config(size: int = 224, **net: Any) -> Config:
+    fields = {"kind": "densenet121", "margin": 0.4286, **net}
+    return dataclasses.replace(presets.smoke(), heightmap=HeightmapConfig(size=size), net=NetConfig(**fields))
+
+
+@pytest.mark.parametrize(
+    ("size", "net", "message"),
+    [
+        (
+            224,
+            {"margin": 0.125},
+            r"net.margin: .* of 32 cells, not 252; try 0.0000 \(224 cells\), 0.1429 \(256",
+        ),
+        (
+            64,
+            {"margin": 0.25},
+            r"net.margin: .* of 32 cells, not 80; try 0.0000 \(64 cells\), 0.5000 \(96 cel",
+        ),
+        (40, {"margin": 0.0}, r"net.margin: .* multiple of 32 cells, not 40; no margin .* heightmap.size than 40"),
+        (64, {"margin": 0.125, "zoom": 2}, r"net.margin: .* multiple of 16 cells, not 72; try 0.0000"),
+        (224, {"zoom": 3}, "net.zoom, net.output_stride: their product must divide 32"),
+        (224, {"output_stride": 64}, "net.zoom, net.output_stride: their product must divide 32"),
+        (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: at least one layer"),
+        (224, {"block_growth": 30}, "net.block_growth: must be a multiple of 4"),
+        (224, {"norm": "layer"}, "net.norm: 'layer' is not one of: group, batch"),
+        (224, {"kind": "resnet"}, "net.kind: 'resnet' is not one of: small, densenet121"),
+        (224, {"weights": "x.safetensors"}, "net.weights: need --net.norm batch"),
+        (64, {"kind": "small", "margin": 0.125, "norm": "batch"}, "net.norm batch, net.weights: only of"),
+        (64, {"kind": "small", "margin": 0.125, "weights": "x"}, "net.norm batch, net.weights: only of"),
+        (64, {"kind": "small", "margin": 0.22}, "net.margin: rotated maps of 78 cells are not a multiple of 4"),
+    ],
+)
+def test_config_that_no_net_can_have(size: int, net: dict[str, Any], message: str):
+    """Claim: sizes that the strides do not divide, and settings that do not go together, are refused in one line as the
+    config is built, with margins that would do."""
+    with pytest.raises(ValueError, match=f"^{message}") as raised:
+        _config(size, **net)
+    assert "\n" not in str(raised.value)
+
+
+def test_suggested_margins_do():
+    """Claim: the margins that the complaint names are good ones."""
+    for size in (64, 96, 112, 224, 232):
+        for zoom in (1, 2):
+            with pytest.raises(ValueError, match="try") as raised:
+                _config(size, margin=0.2, zoom=zoom)
+            for word in str(raised.value).split("try ")[1].split(", "):
+                margin, side = word.split(" (")
+                frames = maps.frames(_config(size, margin=float(margin), zoom=zoom))
+                assert frames.tables.canvas == int(side.removesuffix(" cells)"))
+
+
+@pytest.mark.parametrize("colour", [True, False])
+@pytest.mark.parametrize("target", [True, False])
+@pytest.mark.parametrize("kind", ["small", "densenet121"])
+def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: bool):
+    """Claim: either net, with and without colour and mask, gives maps of the size that the frames say, and the actor's
+    head gives maps of the same size from its features."""
+    cfg = _config(64, kind=kind, margin=0.5, colour=colour, rotations=4, block_layers=(1, 1, 1, 1), block_growth=4)
+    cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, kind="target" if target else "clear"))
+    frames = maps.frames(cfg)
+    seen = jax.eval_shape(
+        lambda colour, height, mask: networks.inputs(cfg.net, colour, height, mask if frames.marked else None),
+        jnp.zeros((1, 96, 96, 3)),
+        jnp.zeros((1, 96, 96)),
+        jnp.zeros((1, 96, 96), bool),
+    )
+    assert seen.shape == (1, 96, 96, 3 * colour + 1 + target)
+    critic, head = networks.critic(cfg.net), networks.head(cfg.net)
+    (q, features), _ = jax.eval_shape(critic.init_with_output, jax.random.key(0), seen)
+    actor, _ = jax.eval_shape(head.init_with_output, jax.random.key(0), features)
+    assert q.shape == actor.shape == (1, frames.side, frames.side, dense.OUTPUTS)
+    assert frames.side * networks.stride(cfg.net) == frames.tables.canvas == 96
+    assert isinstance(critic, densenet.Critic if kind == "densenet121" else dense.Critic)

@@ -1,0 +1,79 @@
+"""DenseNet-121 in the training step: the preset `paper` as far as a CPU goes, and a run at the smallest size."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import presets
+from csac_jax.config import NetConfig
+from csac_jax.env import Env
+from csac_jax.train import checkpoint, step
+from tests.train.test_step import assert_same, copy, equal
+
+pytestmark = pytest.mark.mjx
+TRUNK = 7_037_504
+
+
+class Still(Env):
+    """The environment without physics: compiles fast."""
+
+    def step(self, state, action):
+        """The scene as it was."""
+        return state.replace(actions=state.actions + 1)
+
+
+def test_paper_has_densenet_121_twice():
+    """Claim: the state of the preset `paper` can be made: a trunk each for colour and height, online and target, and a
+    ring that holds all 2,500 actions."""
+    cfg = presets.paper()
+    state = step.abstract_state(cfg)
+    for params in (state.learner.online, state.learner.target):
+        trunks = [params.critic[kind]["trunk"] for kind in ("params", "batch_stats")]
+        assert sum(leaf.size for leaf in jax.tree.leaves(trunks)) == 2 * TRUNK
+        assert params.critic["params"]["head"]["conv0"]["kernel"].shape == (1, 2048, 64)
+    assert state.replay.items.obs.height.shape == (2500, 224, 224)
+    assert cfg.train.steps == cfg.train.actions == 2500
+
+
+@pytest.mark.slow
+def test_paper_can_be_traced():
+    """Claim: the whole training step of `paper` can be traced, and gives back a state of the same shapes and types."""
+    cfg = presets.paper()
+    cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, pool=1))
+    program = step.make(cfg)
+    state = step.abstract_state(cfg)
+    after, metrics = jax.eval_shape(step.compile_chunk(program, 1), state)
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype), state
+    )
+    assert metrics.critic_loss.shape == (1,)
+
+
+@pytest.mark.slow
+def test_run_with_batch_norm_resumes(tmp_path):
+    """Claim: a run of DenseNet with batch norm learns, moves its statistics, and goes on after a checkpoint as if
+    nothing had happened, in every bit of every leaf."""
+    smoke = presets.smoke()
+    net = NetConfig(
+        "densenet121", 4, margin=0.0, head=8, norm="batch", block_layers=(1, 1, 1, 1), block_growth=4, zoom=2
+    )
+    cfg = dataclasses.replace(smoke, net=net)
+    program = step.make(cfg)
+    program = dataclasses.replace(program, env=Still(cfg, program.env.physics, program.env.scenes))
+    begun = step.init(program)
+    chunk = step.compile_chunk(program, 4).lower(begun).compile()
+    first, _ = chunk(copy(begun))
+    second, metrics = chunk(copy(first))
+    assert np.all(np.isfinite(metrics.critic_loss))
+    for name in ("critic", "actor"):
+        before, after = (getattr(state.learner.online, name)["batch_stats"] for state in (first, second))
+        assert not equal(before, after), name
+    checkpoint.save(tmp_path, 4, first, cfg, {})
+    restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: begun))
+    again, repeated = chunk(restored)
+    assert_same(again, second)
+    assert_same(repeated, metrics)
+    assert jnp.any(again.learner.updates > 0)

@@ -1,0 +1,96 @@
+"""Models with every kind of geom, and many rays through them by C MuJoCo."""
+
+from typing import NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from csac_jax.config import SceneConfig, SimConfig, SlotKind
+from csac_jax.scene import blocks, layout, model as models, solids
+
+SHAPES = tuple(blocks.SHAPES)
+SLOTS: tuple[SlotKind, ...] = tuple(blocks.SHAPES[name].kind for name in SHAPES)
+
+
+class Placed(NamedTuple):
+    """A model at a pose."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
+
+class Rays(NamedTuple):
+    """What R rays meet."""
+
+    distance: np.ndarray  # [R] in lengths of the direction, -1 for a miss
+    geom: np.ndarray  # [R] -1 for a miss
+    normal: np.ndarray  # [R, 3]
+
+
+def blocks_and_arm(rng: np.random.Generator) -> Placed:
+    """The eight blocks in random poses under and about the UR5 with its hand, on the table."""
+    scene = layout.parked(SLOTS)
+    half_size = np.array([blocks.SHAPES[name].half_size for name in SHAPES], np.float32)
+    with pytest.MonkeyPatch.context() as patch:  # C's search trees follow neither rescaled meshes nor turned inertias
+        patch.setattr(models, "LARGEST", 1.0)
+        patch.setattr(models, "_align_inertia", lambda model: None)
+        world = models.build(SceneConfig(slots=SLOTS, min_blocks=1), SimConfig(robot="ur5"))
+        fields = jax.device_get(models.scene_fields(world, scene.replace(half_size=half_size)))
+    model = models.with_blocks(world, fields)
+    data = mujoco.MjData(model)
+    quaternion = rng.normal(size=(len(SHAPES), 4))
+    data.qpos[world.robot_qpos] = rng.uniform(-1.5, 1.5, len(world.robot_qpos))
+    data.qpos[world.robot_qpos[-2:]] = rng.uniform(0.0, 0.05)
+    data.qpos[world.block_qpos[:, :3]] = rng.uniform([-0.2, -0.2, 0.02], [0.2, 0.2, 0.2], (len(SHAPES), 3))
+    data.qpos[world.block_qpos[:, 3:]] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    mujoco.mj_kinematics(model, data)
+    return Placed(model, data)
+
+
+def every_type(rng: np.random.Generator) -> Placed:
+    """Two of each type that the raycaster knows but meshes, of random sizes and poses; one plane has an end."""
+    geoms = '<geom type="plane" size="0 0 1" pos="0 0 -0.3"/><geom type="plane" size="0.3 0.2 1" euler="10 20 30"/>'
+    for kind in ("box", "sphere", "capsule", "cylinder") * 2:
+        size, place, turn = (
+            " ".join(f"{value:.6f}" for value in rng.uniform(low, high, 3))
+            for low, high in ((0.02, 0.08), (-0.25, 0.25), (-180, 180))
+        )
+        geoms += f'<geom type="{kind}" size="{size}" pos="{place}" euler="{turn}"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return Placed(model, data)
+
+
+def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
+    """The model at the pose of its data."""
+    return solids.read(model, data.geom_xpos, data.geom_xmat)
+
+
+def cast(model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, direction: np.ndarray) -> Rays:
+    """R rays along `direction` [R, 3] from one `origin` [3], by C MuJoCo; `mj_multiRay` loses some at edges."""
+    num = len(direction)
+    found, distance, geom, normal = (
+        np.zeros((1, 1), np.int32),
+        np.zeros(num),
+        np.zeros(num, np.int32),
+        np.zeros((num, 3)),
+    )
+    start, along = origin.astype(np.float64)[:, None], direction.astype(np.float64)[:, :, None]
+    found, surface = np.zeros((1, 1), np.int32), np.zeros((3, 1))
+    for ray in range(num):
+        distance[ray] = mujoco.mj_ray(model, data, start, along[ray], None, 1, -1, found, surface)
+        geom[ray], normal[ray] = found[0, 0], surface[:, 0]
+    return Rays(distance, geom, normal)
+
+
+def bundle(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """An origin [3] on a sphere of 0.7 m about the scene, and unit directions [R, 3] to points in it; float32."""
+    origin = rng.normal(size=3)
+    origin *= 0.7 / np.linalg.norm(origin)
+    origin[2] = abs(origin[2])
+    direction = rng.uniform([-0.25, -0.25, -0.1], [0.25, 0.25, 0.25], (count, 3)) - origin
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return origin.astype(np.float32), direction.astype(np.float32)

@@ -1,0 +1,124 @@
+"""Height maps from points and from a camera's depth image, against NumPy and against the view from above."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings, strategies as st
+
+from csac_jax import geometry
+from csac_jax.config import CameraConfig, HeightmapConfig
+from csac_jax.vision import camera, heightmap, raycast
+
+CFG = HeightmapConfig(64, view="oblique")
+_TABLE = np.array([0.5, 0.4, 0.3], np.float32)
+_EYE, _FINE = camera.make(CameraConfig(scale=0.25)), camera.make(CameraConfig(scale=0.5))
+
+
+def _by_hand(cfg: HeightmapConfig, points: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Height [H, W] and which point [H, W], -1 for none, point by point."""
+    height, source = np.zeros((cfg.size, cfg.size), np.float32), np.full((cfg.size, cfg.size), -1)
+    top = np.full((cfg.size, cfg.size), -np.inf)
+    cells = np.floor((points[:, :2] + np.float32(0.5 * cfg.extent)) / np.float32(cfg.cell))
+    for i in np.flatnonzero(valid):
+        col, row = cells[i]
+        if 0 <= row < cfg.size and 0 <= col < cfg.size:
+            row, col = int(row), int(col)
+            if points[i, 2] > top[row, col]:
+                top[row, col], source[row, col] = points[i, 2], i
+                height[row, col] = max(points[i, 2], 0.0)
+    return height, source
+
+
+_from_points = jax.jit(heightmap.from_points, static_argnums=0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_points_agree_with_numpy(seed):
+    """Claim: height and source of every cell are those of a loop over the points: the highest, of ties the first."""
+    rng = np.random.default_rng(seed)
+    cfg = HeightmapConfig(16, extent=0.5)  # a cell of 2^-5 m: dividing by it is exact
+    points = rng.uniform(-0.3, 0.3, (400, 3)).astype(np.float32)
+    points[:, 2] = rng.integers(-1, 4, 400) * 0.01  # ties, and some below the table
+    valid = rng.uniform(size=400) < 0.8
+    points[~valid & (rng.uniform(size=400) < 0.5)] = np.nan
+    cells = jax.device_get(_from_points(cfg, jnp.asarray(points), jnp.asarray(valid)))
+    height, source = _by_hand(cfg, points, valid)
+    np.testing.assert_array_equal(cells.height, height)
+    np.testing.assert_array_equal(cells.filled, source >= 0)
+    np.testing.assert_array_equal(cells.source[cells.filled], source[cells.filled])
+
+
+def test_the_view_agrees_with_numpy(reference):
+    """Claim: from the same depth image, height, colour and target mask are those of NumPy, bit for bit.
+
+    Not compiled as a whole: a fused multiply-add may move a point across the border of a cell.
+    """
+    seen = heightmap.sight(reference.polytopes, _EYE)
+    wanted = jnp.arange(6) == 4
+    tables = heightmap.surface_tables(reference.polytopes, jnp.asarray(_TABLE), wanted)
+    obs = heightmap.from_depth(CFG, _EYE, seen.distance, seen.valid, seen.surface, tables)
+    depth, valid, surface = (np.asarray(leaf) for leaf in (seen.distance, seen.valid, seen.surface))
+    points = depth[..., None] * np.asarray(camera.directions(_EYE)) + np.asarray(_EYE.position)
+    height, source = _by_hand(CFG, points.reshape(-1, 3), valid.reshape(-1))
+    row = surface.reshape(-1)[source]
+    empty = source < 0
+    assert 0.02 < empty.mean() < 0.5
+    np.testing.assert_array_equal(obs.height, height)
+    np.testing.assert_array_equal(obs.colour, np.where(empty[..., None], 0.0, np.asarray(tables[0])[row]))
+    np.testing.assert_array_equal(obs.target, np.where(empty, False, np.asarray(tables[1])[row]))
+    assert np.asarray(obs.target).any()
+
+
+_views = jax.jit(
+    lambda polytopes: (
+        heightmap.orthographic(CFG, polytopes, jnp.asarray(_TABLE), jnp.ones(6, bool)),
+        heightmap.oblique(CFG, polytopes, jnp.asarray(_TABLE), jnp.ones(6, bool), _EYE),
+    )
+)
+
+
+def test_both_views_agree_where_the_camera_sees(reference):
+    """Claim: away from edges, cells that the camera sees are as high as from above, to the slope within a cell; the
+    rest is empty, and in the clearing task the target mask is all ones."""
+    above, beside = jax.device_get(_views(reference.polytopes))
+    filled = beside.colour.sum(-1) > 0.0
+    flat = np.abs(above.height[1:-1, 1:-1, None, None] - np.lib.stride_tricks.sliding_window_view(above.height, (3, 3)))
+    flat = np.pad(flat.max((2, 3)) < 0.004, 1)
+    assert (filled & flat).mean() > 0.5
+    off = np.abs(beside.height - above.height)[filled & flat]
+    assert off.max() < 0.004
+    assert np.median(off) < 1e-4
+    assert np.all(beside.height[~filled] == 0.0)
+    assert np.all(beside.target)
+
+
+def test_a_block_casts_a_shadow():
+    """Claim: of a cube the camera sees the top where it is, and behind it nothing as far as the sight line says."""
+    cube = raycast.Polytopes(
+        normal=jnp.asarray(np.concatenate([np.eye(3), -np.eye(3)])[None], jnp.float32),
+        offset=jnp.full((1, 6), 0.025),
+        position=jnp.array([[0.0, 0.0, 0.025]]),
+        rotation=jnp.eye(3)[None],
+        colour=jnp.ones((1, 3)),
+    )
+    obs = jax.jit(lambda: heightmap.oblique(CFG, cube, jnp.asarray(_TABLE), jnp.ones(1, bool), _FINE))()
+    height, filled = np.asarray(obs.height), np.asarray(obs.colour).sum(-1) > 0.0
+    x = np.asarray(geometry.cell_centres(CFG))[0, :, 0]
+    middle = slice(30, 34)  # rows at y = 0
+    end = 0.025 + (0.025 + 0.5) * 0.05 / (0.5 - 0.05)  # where the line over the far top edge meets the table
+    np.testing.assert_allclose(height[middle][:, np.abs(x) < 0.02], 0.05, atol=1e-4)
+    assert not filled[middle][:, (x > 0.03) & (x < end - 0.008)].any()
+    assert filled[middle][:, x > end + 0.008].mean() > 0.95
+    assert filled[middle][:, x < -0.03].mean() > 0.95
+
+
+def test_resolution_of_the_camera_is_free(reference):
+    """Claim: four times the pixels fill more cells and change few heights; half of the paper's resolution fills all
+    cells of a 64-cell map that are not hidden."""
+    look = jax.jit(lambda eye: heightmap.oblique(CFG, reference.polytopes, jnp.asarray(_TABLE), jnp.ones(6, bool), eye))
+    few, many = (jax.device_get(look(eye)) for eye in (_EYE, _FINE))
+    filled = [obs.colour.sum(-1) > 0.0 for obs in (few, many)]
+    assert filled[1].mean() >= filled[0].mean()
+    both = filled[0] & filled[1]
+    assert np.mean(np.abs(few.height - many.height)[both] > 0.005) < 0.05

@@ -1,0 +1,172 @@
+"""The sensor's errors follow their laws, and cost nothing when there are none."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+
+from csac_jax import presets
+from csac_jax.config import CameraConfig, Config, HeightmapConfig, SensorConfig
+from csac_jax.env import Env
+from csac_jax.scene import layout
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import outcome
+from csac_jax.sim.primitives import Action
+from csac_jax.vision import camera, heightmap, sensor
+
+ERRORS = SensorConfig(depth_floor=0.001, depth_square=0.0014, dropped=0.1, colour=0.05)
+SMALL = HeightmapConfig(32)
+
+
+@pytest.mark.parametrize("distance", [0.3, 1.0, 2.0])
+def test_depth_errors_grow_with_the_square(distance):
+    """Claim: depths are normal about the true ones with sigma = depth_floor + depth_square d^2, and the stated share
+    is dropped."""
+    true = jnp.full((200, 200), distance)
+    measured, kept = sensor.depth(jax.random.key(0), ERRORS, true)
+    sigma = 0.001 + 0.0014 * distance**2
+    assert kstest((np.asarray(measured).ravel() - distance) / sigma, "norm").pvalue > 1e-3
+    assert abs(float(jnp.mean(kept)) - 0.9) < 0.01
+
+
+def test_the_camera_is_jittered():
+    """Claim: place and orientation scatter about the believed ones with the stated spreads, as rotations."""
+    errors, eye = SensorConfig(position=0.01, rotation=0.02), camera.make(CameraConfig())
+    keys = jax.random.split(jax.random.key(1), 3000)
+    real = jax.jit(jax.vmap(lambda key: sensor.pose(key, errors, eye)))(keys)
+    shift = np.asarray(real.position) - np.asarray(eye.position)
+    np.testing.assert_allclose(shift.std(0), 0.01, rtol=0.06)
+    np.testing.assert_allclose(shift.mean(0), 0.0, atol=0.001)
+    turn = Rotation.from_matrix(np.asarray(real.rotation) @ np.asarray(eye.rotation).T).as_rotvec()
+    np.testing.assert_allclose(turn.std(0), 0.02, rtol=0.06)
+    product = np.einsum("nij,nkj->nik", real.rotation, real.rotation)
+    np.testing.assert_allclose(product, np.tile(np.eye(3), (3000, 1, 1)), atol=1e-5)
+
+
+def test_colours_change_together():
+    """Claim: one gain for each of red, green and blue in a view, and colours stay in 0 .. 1."""
+    true = jnp.asarray(np.random.default_rng(0).uniform(0.2, 0.8, (8, 8, 3)), jnp.float32)
+    gains = np.asarray(sensor.colour(jax.random.key(2), ERRORS, true)) / np.asarray(true)
+    np.testing.assert_allclose(gains, np.broadcast_to(gains[0, 0], gains.shape), rtol=1e-5)
+    assert len(np.unique(gains[0, 0].round(4))) == 3
+    assert np.asarray(sensor.colour(jax.random.key(2), SensorConfig(colour=0.5), 10.0 * true)).max() <= 1.0
+
+
+def test_no_errors_change_nothing():
+    """Claim: with every spread 0 each part gives back what it was given."""
+    none, eye = SensorConfig(), camera.make(CameraConfig())
+    true = jnp.linspace(0.0, 1.0, 12).reshape(2, 2, 3)
+    measured, kept = sensor.depth(jax.random.key(0), none, true)
+    assert measured is true
+    assert np.all(kept)
+    assert sensor.colour(jax.random.key(0), none, true) is true
+    jax.tree.map(np.testing.assert_array_equal, sensor.pose(jax.random.key(0), none, eye), eye)
+
+
+class Still:
+    """Physics in which nothing moves."""
+
+    def run(self, scene, drive):
+        return layout.park(scene, scene.in_play), outcome.blank(len(scene.colour))
+
+
+def _env(**changes) -> Env:
+    cfg = dataclasses.replace(presets.smoke(), heightmap=SMALL, camera=CameraConfig(scale=0.1))
+    return Env(dataclasses.replace(cfg, **changes), Still(), _scenes(cfg))
+
+
+def _scenes(cfg: Config) -> Scene:
+    """A pool of one scene: a cube and a prism."""
+    scene = layout.parked(cfg.scene.slots)
+    position = np.array([[0.05, 0.0, 0.025], scene.position[1], [-0.08, 0.06, 0.0243]], np.float32)
+    scene = scene.replace(position=position, in_play=np.array([True, False, True]))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
+
+
+OBLIQUE = HeightmapConfig(32, view="oblique")
+_PUSH = Action(primitive=jnp.int32(0), pose=jnp.array([0.15, 0.15, 0.0]))
+
+
+@pytest.mark.mjx  # steps, whose health check promotes ranks
+@pytest.mark.parametrize(
+    ("view", "errors"),
+    [(SMALL, ERRORS), (OBLIQUE, dataclasses.replace(ERRORS, position=0.005, rotation=0.01))],
+)
+def test_views_differ_from_step_to_step(view, errors):
+    """Claim: every view of an episode has errors of its own, that of another episode others; the same key, the same."""
+    env = _env(heightmap=view, sensor=errors)
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    first, other, again = (reset(jax.random.key(seed)) for seed in (0, 1, 0))
+    jax.tree.map(np.testing.assert_array_equal, first.obs, again.obs)
+    second = step(first, _PUSH)
+    third = step(second, _PUSH)
+    states = (first, second, third, other)
+    assert len({np.asarray(state.obs.height).tobytes() for state in states}) == 4
+    jax.tree.map(np.testing.assert_array_equal, second.obs, step(again, _PUSH).obs)
+    true = jax.jit(env.look)(first.scene)
+    off = np.abs(np.asarray(first.obs.height) - np.asarray(true.height))
+    assert 0.0 < np.mean(off) < 0.01
+
+
+def test_orthographic_errors():
+    """Claim: from above, heights err as depths do from VIEW_HEIGHT, and a dropped cell is empty."""
+    env = _env(sensor=dataclasses.replace(ERRORS, depth_square=0.01))
+    views = jax.jit(jax.vmap(env.look, (None, 0)))(
+        env._fresh(jax.random.key(0)), jax.random.split(jax.random.key(3), 500)
+    )
+    true = jax.jit(env.look)(env._fresh(jax.random.key(0)))
+    height, empty = np.asarray(views.height), np.asarray(views.colour).sum(-1) == 0.0
+    assert abs(empty.mean() - 0.1) < 0.005
+    assert np.all(height[empty] == 0.0)
+    raised = np.asarray(true.height) > 0.04
+    assert raised.sum() > 10
+    errors = (height - np.asarray(true.height))[:, raised][~empty[:, raised]]
+    depth = heightmap.VIEW_HEIGHT - 0.05
+    np.testing.assert_allclose(errors.std(), 0.001 + 0.01 * depth**2, rtol=0.1)
+
+
+@pytest.mark.mjx
+def test_without_errors_there_is_no_randomness():
+    """Claim: by default a state carries no key and the compiled view draws no random numbers."""
+    env = _env()
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    assert state.noise is None
+    stepped = str(jax.make_jaxpr(env.step)(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state), _PUSH))
+    assert "random" not in stepped
+    noisy = _env(sensor=ERRORS)
+    begin = jax.make_jaxpr(lambda key: noisy.begin(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), noisy.scenes), key))
+    assert "random" in str(begin(jax.random.key(0)))
+
+
+def test_an_episode_with_errors_needs_a_key():
+    """Claim: beginning an episode without a key says so, instead of showing every episode the same errors."""
+    env = _env(sensor=ERRORS)
+    with pytest.raises(ValueError, match=r"sensor.*key"):
+        env.begin(jax.tree.map(lambda leaf: leaf[0], env.scenes))
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: SensorConfig(dropped=1.0), "sensor.dropped"),
+        (lambda: SensorConfig(depth_square=-0.1), "sensor.depth_square"),
+        (lambda: Config(sensor=SensorConfig(rotation=0.01)), "sensor.position, sensor.rotation.*ortho"),
+        (lambda: HeightmapConfig(view="side"), "heightmap.view"),
+        (lambda: HeightmapConfig(size=60), "heightmap.size"),
+        (lambda: dataclasses.replace(Config(), heightmap=HeightmapConfig(size=80)), "net.margin"),
+        (
+            lambda: dataclasses.replace(Config(), net=dataclasses.replace(Config().net, rotations=202)),
+            "net.rotations: at most 200",
+        ),
+        (lambda: dataclasses.replace(Config(), net=dataclasses.replace(Config().net, rotations=15)), "net.rotations"),
+    ],
+)
+def test_bad_settings_are_refused(build, message):
+    """Claim: what the sensor, the view, the strides or the even spacing of yaws cannot do is refused in one line."""
+    with pytest.raises(ValueError, match=message) as error:
+        build()
+    assert "\n" not in str(error.value)

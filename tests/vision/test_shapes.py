@@ -1,0 +1,192 @@
+"""Every kind of geom against C MuJoCo, and laws of each by itself."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
+
+from csac_jax.scene import solids
+from csac_jax.scene.solids import Group, Kind, Solids
+from csac_jax.vision import raycast, shapes
+from tests.vision import mujoco_rays
+
+_cast = jax.jit(jax.vmap(raycast.cast_solids, in_axes=(None, None, 0)))
+_cast_from = jax.jit(jax.vmap(raycast.cast_solids, in_axes=(None, 0, 0)))
+_seeds = st.integers(0, 2**32 - 1)
+_ROUND = (Kind.SPHERE, Kind.CAPSULE, Kind.CYLINDER)
+PIXEL = 1.0 / 618.62  # rad, of the default camera
+
+
+def _silhouette(model, data, origin: np.ndarray, direction: np.ndarray, ours: np.ndarray) -> np.ndarray:
+    """True where a ray one pixel beside this one meets another geom or nothing, or something 5 mm nearer, [R] bool."""
+    side = np.cross(direction, [0.0, 0.0, 1.0])
+    side *= PIXEL / np.linalg.norm(side, axis=1, keepdims=True)
+    up = np.cross(side, direction)
+    edge = np.zeros(len(direction), bool)
+    for step in (side, -side, up, -up):
+        other = mujoco_rays.cast(model, data, origin, direction + step)
+        edge |= (other.distance < 0.0) != np.isinf(ours)
+        edge |= np.abs(np.where(other.distance < 0.0, np.inf, other.distance) - ours) > 5e-3
+    return edge
+
+
+def _compare(make, rng: np.random.Generator, scenes: int, count: int) -> tuple[int, int]:
+    """Rays cast and rays of which one caster alone says that they meet something; distances are checked on the way."""
+    total, differ = 0, 0
+    for _ in range(scenes):
+        model, data = make(rng)
+        origin, direction = mujoco_rays.bundle(rng, count)
+        expected = mujoco_rays.cast(model, data, origin, direction)
+        hit = jax.device_get(_cast(mujoco_rays.read(model, data), origin, direction))
+        assert len(np.unique(expected.geom)) >= 5
+        total, differ = total + count, differ + int(np.sum(hit.valid != (expected.geom >= 0)))
+        both = hit.valid & (expected.geom >= 0)
+        off = np.abs(np.where(both, hit.distance, 0.0) - np.where(both, expected.distance, 0.0))
+        far = np.flatnonzero(off > 1e-4)
+        at_edge = _silhouette(model, data, origin, direction[far], hit.distance[far])
+        assert np.all(at_edge), (off[far][~at_edge], expected.geom[far][~at_edge])
+        close = both & (off < 1e-5)
+        other = close & (hit.geom != expected.geom)  # two geoms share a surface: spheres at the elbow
+        assert other.mean() < 0.02
+        np.testing.assert_allclose(hit.normal[close & ~other], expected.normal[close & ~other], rtol=0, atol=2e-3)
+    return total, differ
+
+
+@pytest.mark.parametrize("make", [mujoco_rays.every_type, mujoco_rays.blocks_and_arm])
+def test_rays_agree_with_mujoco(make):
+    """Claim: distances are those of C MuJoCo to 0.1 mm off silhouettes, normals to 0.002, and hit is hit."""
+    total, differ = _compare(make, np.random.default_rng(0), scenes=3, count=2000)
+    assert differ / total <= 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [mujoco_rays.every_type, mujoco_rays.blocks_and_arm])
+def test_a_million_rays_agree_with_mujoco(make):
+    """Claim: of 500,000 rays each through all types and through blocks and arm, at most 1 in 100,000 meets something
+    for one caster alone."""
+    total, differ = _compare(make, np.random.default_rng(1), scenes=50, count=10_000)
+    assert differ / total <= 1e-5
+
+
+def _solid(kind: Kind, rng: np.random.Generator) -> tuple[Solids, np.ndarray, np.ndarray, np.ndarray]:
+    """One geom of random size and pose: the scene, its size [3], position [3] and rotation [3, 3]."""
+    size, position = rng.uniform(0.01, 0.08, 3), rng.uniform(-0.2, 0.2, 3)
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    group = Group(
+        kind,
+        jnp.asarray(size[None], jnp.float32),
+        jnp.asarray(position[None], jnp.float32),
+        jnp.asarray(rotation[None], jnp.float32),
+        jnp.zeros(1, jnp.int32),
+    )
+    return Solids((group,), jnp.zeros((1, 3))), size, position, rotation
+
+
+def _depth(kind: Kind, size: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Signed distances to the surface (about it: of the right sign and zeros), negative inside, of points [R, 3]."""
+    if kind is Kind.SPHERE:
+        return np.linalg.norm(point, axis=1) - size[0]
+    if kind is Kind.BOX:
+        return (np.abs(point) - size).max(axis=1)
+    beyond = np.abs(point[:, 2]) - size[1]
+    around = np.linalg.norm(point[:, :2], axis=1)
+    if kind is Kind.CYLINDER:
+        return np.maximum(around - size[0], beyond)
+    return np.hypot(around, np.maximum(beyond, 0.0)) - size[0]
+
+
+@pytest.mark.parametrize("kind", [Kind.BOX, *_ROUND])
+@settings(max_examples=25, deadline=None)
+@given(seed=_seeds, scale=st.floats(0.1, 10.0))
+def test_hits_lie_on_the_surface(kind, seed, scale):
+    """Claim: a hit lies on the surface, its normal points outwards and against the ray, and nothing lies before it."""
+    rng = np.random.default_rng(seed)
+    scene, size, position, rotation = _solid(kind, rng)
+    origin, direction = mujoco_rays.bundle(rng, 64)
+    direction = direction + 0.2 * (position - origin - direction)  # towards the geom
+    direction = (scale * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    hit = jax.device_get(_cast(scene, origin, direction))
+    met = hit.valid
+    local = (origin - position) @ rotation + hit.distance[met, None] * (direction[met] @ rotation)
+    np.testing.assert_allclose(_depth(kind, size, local), 0.0, atol=3e-6)
+    assert np.all(np.sum(hit.normal * direction, axis=1)[met] <= 1e-3 * scale)
+    np.testing.assert_allclose(np.linalg.norm(hit.normal[met], axis=1), 1.0, atol=1e-3)
+    outside = local + 1e-3 * (hit.normal[met] @ rotation)
+    assert np.all(_depth(kind, size, outside) > 2e-4)
+    for share in np.linspace(0.0, 0.999, 20):
+        way = share * hit.distance[met, None] * (direction[met] @ rotation)
+        assert np.all(_depth(kind, size, (origin - position) @ rotation + way) > -1e-6)
+    steps = np.linspace(0.0, 2.0 / scale, 400)[:, None, None]
+    along = (origin - position) @ rotation + steps * (direction[~met] @ rotation)[None]
+    assert np.all(_depth(kind, size, along.reshape(-1, 3)) > -1e-5)
+
+
+@pytest.mark.parametrize("kind", [Kind.BOX, *_ROUND])
+def test_rays_along_the_axes_agree_with_mujoco(kind):
+    """Claim: rays parallel to a geom's axis or faces, where a slab gives 0 / 0, are told apart rightly too."""
+    rng = np.random.default_rng(2)
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="{kind.value}" size="0.05 0.03 0.02"/></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    direction = np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 100, axis=0).astype(np.float32)
+    origin = (rng.uniform(-0.1, 0.1, (600, 3)) - 0.5 * direction).astype(np.float32)
+    origin[::10] = np.where(direction[::10] == 0.0, 0.0, origin[::10])  # along the axis itself
+    hit = jax.device_get(_cast_from(mujoco_rays.read(model, data), origin, direction))
+    rays = [mujoco_rays.cast(model, data, o, d[None]) for o, d in zip(origin, direction, strict=True)]
+    distance = np.array([ray.distance[0] for ray in rays])
+    np.testing.assert_array_equal(hit.valid, distance >= 0.0)
+    assert 0.1 < hit.valid.mean() < 0.9
+    np.testing.assert_allclose(hit.distance[hit.valid], distance[hit.valid], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [Kind.BOX, *_ROUND])
+def test_seen_from_outside_only(kind):
+    """Claim: a ray that starts inside a geom, or behind it, does not meet it."""
+    scene, _, position, rotation = _solid(kind, np.random.default_rng(3))
+    origin = np.stack([position, position + 0.3 * rotation[:, 0]]).astype(np.float32)
+    direction = np.stack([rotation[:, 0]] * 2).astype(np.float32)
+    np.testing.assert_array_equal(_cast_from(scene, origin, direction).valid, [False, False])
+
+
+def test_there_is_a_function_for_every_kind():
+    """Claim: the table of ray functions is total."""
+    assert set(shapes.RAY) == set(Kind)
+
+
+def test_unknown_type_is_refused_by_name():
+    """Claim: a geom of a type that rays do not meet is an error when the scene is read, with its name and the type."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom name="egg" type="ellipsoid" size="0.1 0.2 0.3"/></worldbody></mujoco>'
+    )
+    with pytest.raises(ValueError, match=r"geom egg: .*ellipsoid.*cylinder"):
+        solids.read(model)
+
+
+def test_invisible_geoms_are_left_out():
+    """Claim: a geom of opacity 0 is not met, as in C, and colours are the geom's own or its material's."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset><material name="red" rgba="1 0 0 1"/></asset><worldbody>
+        <geom type="sphere" size="0.1" pos="0 0 1" rgba="1 1 1 0"/>
+        <geom type="sphere" size="0.1" pos="0 0 0.5" rgba="0.25 0.5 0.75 1"/>
+        <geom type="sphere" size="0.1" pos="1 0 0.5" material="red"/></worldbody></mujoco>"""
+    )
+    scene = solids.read(model)
+    hit = _cast_from(scene, jnp.array([[0.0, 0, 2], [1, 0, 2]]), jnp.tile(jnp.array([[0.0, 0, -1]]), (2, 1)))
+    np.testing.assert_array_equal(hit.geom, [1, 2])
+    np.testing.assert_allclose(scene.colour[1:], [[0.25, 0.5, 0.75], [1, 0, 0]])
+
+
+def test_solids_follow_their_poses():
+    """Claim: `place` moves what `read` read to other poses, also inside a compiled function."""
+    rng = np.random.default_rng(4)
+    model, data = mujoco_rays.every_type(rng)
+    rest = solids.read(model)
+    data.geom_xpos += [0.01, -0.02, 0.03]
+    moved = jax.jit(solids.place)(rest, jnp.asarray(data.geom_xpos, jnp.float32), jnp.asarray(data.geom_xmat))
+    direct = mujoco_rays.read(model, data)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), moved, direct)
