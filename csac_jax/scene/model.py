@@ -24,7 +24,7 @@ ROBOT_JOINTS: dict[RobotKind, tuple[str, ...]] = {
 }
 LARGEST = 1.25  # size of compiled blocks relative to nominal: C culls pairs by the bounds it was compiled with
 MAX_OPENING = 0.110  # m, RG2 data sheet
-HAND_PARK_HEIGHT = 1.0  # m, where the hand waits while blocks settle
+HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above all drops, or it catches the highest
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

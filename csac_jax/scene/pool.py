@@ -23,7 +23,7 @@ from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import HAND_PARK_HEIGHT, BlockFields, World, assets, scene_fields, with_blocks
 
 TRAIN_STREAM = 0  # stream of random numbers of the training pool; evaluation takes 1 + its seed
-_VERSION = 3  # raise when the meaning of a cached pool changes
+_VERSION = 4  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round

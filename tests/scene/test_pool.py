@@ -85,6 +85,15 @@ def test_settled_blocks_lie_within_the_radius(scenes: Scene):
     np.testing.assert_array_equal(scenes.position[~play], places[~play])
 
 
+def test_no_block_lies_on_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: blocks of ten, dropped from up to 1.3 m, all come down to the table: none rests on the waiting hand."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(pool, "_ROUND", 24)
+    cfg = SceneConfig(slots=("box",) * 10, min_blocks=10)
+    settled = pool.settled(model.build(cfg, SimConfig()), cfg, EXTENT, pool.TRAIN_STREAM, 20)
+    assert settled.position[:, :, 2].max() < 0.3
+
+
 def test_blocks_differ_within_their_ranges(scenes: Scene):
     """Claim: a box slot draws each of its shapes, and sizes, densities and frictions spread over their ranges."""
     nominal = blocks.half_size_choices("box")
