@@ -35,7 +35,7 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
     return MjxPhysics(world, cfg, mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax"))
 
 
-def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
+def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     """The model with this scene's block sizes, masses and frictions."""
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
@@ -90,7 +90,7 @@ def _pad_contacts(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
 def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
     """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the hand is."""
     world, cfg = physics.world, physics.cfg
-    model = _scene_model(physics, scene)
+    model = scene_model(physics, scene)
     initial = _initial_data(physics, scene, drive)
     z_address = world.block_qpos[:, 2]
     finger = world.robot_qpos[-2]
