@@ -58,7 +58,7 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     )
 
 
-def _initial_data(physics: MjxPhysics, scene: Scene, drive: Drive) -> mjx.Data:
+def initial_data(physics: MjxPhysics, scene: Scene, drive: Drive) -> mjx.Data:
     """Data with the scene's blocks and the robot where the drive starts, at rest."""
     world = physics.world
     poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
@@ -91,7 +91,7 @@ def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]
     """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the hand is."""
     world, cfg = physics.world, physics.cfg
     model = scene_model(physics, scene)
-    initial = _initial_data(physics, scene, drive)
+    initial = initial_data(physics, scene, drive)
     z_address = world.block_qpos[:, 2]
     finger = world.robot_qpos[-2]
     close_end = sum(cfg.grasp_phases[:2])
