@@ -236,20 +236,15 @@ def _raft(gap: float) -> Scene:
 
 def test_both_levels_of_a_push_are_reached(lab: Lab):
     """Claim: physics reaches both levels of a push (CSAC eq. 16): what breaks a packing up is worth +1; what misses it,
-    shifts it as a whole, or moves what could be grasped before, -1."""
-    along, across = (-0.12, 0.025, 0.0), (0.0, 0.12, -np.pi / 2)
-    cases = [
-        (_raft(0.0006), along),
-        (_raft(0.0006), across),
-        (_raft(0.0006), BARE),
-        (_cube(0.0, 0.0), (-0.07, 0.0, 0.0)),
-    ]
+    or moves what could be grasped before, -1."""
+    raft, alone = _raft(0.0006), _cube(0.0, 0.0)
+    cases = [(raft, (-0.12, 0.025, 0.0)), (raft, BARE), (alone, (-0.07, 0.0, 0.0)), (alone, BARE)]
     scenes, places = zip(*(cases * 2), strict=True)
     before = lab.begin(_stack(*scenes))
     after = lab.step(before, _actions(*((Primitive.PUSH, place) for place in places)))
     assert not after.info.ill.any()
     phi = [np.array([_graspable(np.asarray(row)) for row in state.obs.height[:4]]) for state in (before, after)]
-    np.testing.assert_array_equal(phi[0], [0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(phi[0], [0.0, 0.0, 1.0, 1.0])
     cfg = CONFIG.reward
     zero, push = jnp.zeros(()), jnp.int32(Primitive.PUSH)
     level, reward = [], []
@@ -259,7 +254,9 @@ def test_both_levels_of_a_push_are_reached(lab: Lab):
         reward.append(float(rewards.reward(cfg, push, jnp.int32(Outcome.NOTHING), zero, *seen)))
     assert level == [1.0, -1.0, -1.0, -1.0]
     assert reward == [0.5, -0.5, -0.5, -0.5]  # Gamma = 0.5, eq. 13
-    np.testing.assert_array_equal(np.asarray(after.info.moved[:4]) > environment.CHANGE_AREA, [True, True, False, True])
+    np.testing.assert_array_equal(
+        np.asarray(after.info.moved[:4]) > environment.CHANGE_AREA, [True, False, True, False]
+    )
 
 
 def _leaves(state: State) -> list[bytes]:
