@@ -377,7 +377,8 @@ class PolicyConfig:
     """Which primitive: that of larger value; a push after an action without visible change, else a grasp (CSAC sec.
     3.4); or always a grasp."""
     mask: bool = True
-    """Leave out cells with nothing to act on (SPOT, arXiv:1909.04730); else every cell above the workspace counts."""
+    """Leave out cells with nothing to act on (SPOT, arXiv:1909.04730); else every cell above the workspace counts, but
+    for grasps beside the target in the target task."""
 
     def __post_init__(self) -> None:
         _require_choices(self, "policy.")

@@ -33,7 +33,7 @@ class Info:
     """What the last action did."""
 
     outcome: jax.Array  # [] int32, Outcome of a grasp by ground truth; NOTHING after a push; of a wrong block TOUCHED
-    outcome_by_gap: jax.Array  # [] int32, the same as finger gap and height map suggest
+    outcome_by_gap: jax.Array  # [] int32, as finger gap and height map suggest; a wrong block is seen to be one
     moved: jax.Array  # [] cm^2 of the height map that moved
     distance: jax.Array  # [] m, between the place aimed at and the nearest block lifted; 0 if none was
     cleared: jax.Array  # [] int32, blocks taken from the table
@@ -173,10 +173,11 @@ class Env:
         off = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
         nothing = jnp.int32(Outcome.NOTHING)
         judged = outcome.grasp_outcome(trace, plan.surface, hand_rise)
-        judged = jnp.where(jnp.any(lifted) & ~jnp.any(got), jnp.int32(Outcome.TOUCHED), judged)
+        by_gap = outcome.grasp_outcome_by_gap(trace, plan.surface, changed)
+        wrong, touched = jnp.any(lifted) & ~jnp.any(got), jnp.int32(Outcome.TOUCHED)
         info = Info(
-            outcome=jnp.where(grasped, judged, nothing),
-            outcome_by_gap=jnp.where(grasped, outcome.grasp_outcome_by_gap(trace, plan.surface, changed), nothing),
+            outcome=jnp.where(grasped, jnp.where(wrong, touched, judged), nothing),
+            outcome_by_gap=jnp.where(grasped, jnp.where(wrong, jnp.minimum(by_gap, touched), by_gap), nothing),
             moved=moved,
             distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, off, jnp.inf)), 0.0),
             cleared=jnp.sum(lifted, dtype=jnp.int32),

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment
+from csac_jax.agent import rewards
 from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.env import Env, State
-from csac_jax.scene import layout
+from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle
 from csac_jax.sim.outcome import Outcome
@@ -135,6 +136,7 @@ def test_wrong_block_is_no_success(lane):
     """Claim: lifting another block than the target takes it away, counts as `touched` and is worth nothing."""
     state = lane("wrong")
     assert (state.done, state.reward, state.info.cleared, state.info.outcome) == (False, 0.0, 1, Outcome.TOUCHED)
+    assert state.info.outcome_by_gap == Outcome.TOUCHED  # no disagreement: the camera sees which block is gone
     assert state.obs.target.any()
     np.testing.assert_array_equal(state.obs.target, state.obs.height > 0.001)  # the target alone is left
 
@@ -205,6 +207,56 @@ def test_oracle_clears_scenes(lab: Lab):
         taken, cleared = taken + np.where(cleared, 0, info.cleared), cleared | np.asarray(state.terminated)
     assert cleared.mean() > 0.7
     np.testing.assert_array_equal(taken[cleared], blocks[cleared])
+
+
+def _graspable(height: np.ndarray) -> float:
+    """phi_g of a fixed critic: 1 if somewhere something stands with room for both fingers beside it, else 0.
+
+    Room: nothing 36 to 64 mm to either side, along x or along y.
+    """
+    cell = CONFIG.heightmap.cell
+    occupied = height > 0.02
+    for axis in (0, 1):
+        room = np.ones_like(occupied)
+        for cells in range(int(np.ceil(0.036 / cell)), int(0.064 / cell) + 1):
+            for sign in (-1, 1):
+                room &= ~np.roll(occupied, sign * cells, axis=axis)
+        if np.any(room & occupied):
+            return 1.0
+    return 0.0
+
+
+def _raft(gap: float) -> Scene:
+    """Two cuboids side by side along x, 100 mm square."""
+    scene = _cube(0.0, 0.0, 1)
+    half = scene.half_size.at[:2].set(jnp.array(blocks.SHAPES["cuboid"].half_size))
+    position = scene.position.at[:2].set(jnp.array([[0.0, 0.5 * gap + 0.025, 0.025], [0.0, -0.5 * gap - 0.025, 0.025]]))
+    return scene.replace(half_size=half, position=position, target=jnp.int32(layout.ANY))
+
+
+def test_both_levels_of_a_push_are_reached(lab: Lab):
+    """Claim: physics reaches both levels of a push (CSAC eq. 16): what breaks a packing up is worth +1; what misses it,
+    or moves what could be grasped before, -1."""
+    raft, alone = _raft(0.0006), _cube(0.0, 0.0)
+    cases = [(raft, (-0.12, 0.025, 0.0)), (raft, BARE), (alone, (-0.07, 0.0, 0.0)), (alone, BARE)]
+    scenes, places = zip(*(cases * 2), strict=True)
+    before = lab.begin(_stack(*scenes))
+    after = lab.step(before, _actions(*((Primitive.PUSH, place) for place in places)))
+    assert not after.info.ill.any()
+    phi = [np.array([_graspable(np.asarray(row)) for row in state.obs.height[:4]]) for state in (before, after)]
+    np.testing.assert_array_equal(phi[0], [0.0, 0.0, 1.0, 1.0])
+    cfg = CONFIG.reward
+    zero, push = jnp.zeros(()), jnp.int32(Primitive.PUSH)
+    level, reward = [], []
+    for low, high, moved in zip(*phi, after.info.moved[:4], strict=True):
+        seen = (jnp.float32(low), jnp.float32(high), moved > environment.CHANGE_AREA)
+        level.append(float(rewards.push_effect(cfg, *seen)))
+        reward.append(float(rewards.reward(cfg, push, jnp.int32(Outcome.NOTHING), zero, *seen)))
+    assert level == [1.0, -1.0, -1.0, -1.0]
+    assert reward == [0.5, -0.5, -0.5, -0.5]  # Gamma = 0.5, eq. 13
+    np.testing.assert_array_equal(
+        np.asarray(after.info.moved[:4]) > environment.CHANGE_AREA, [True, False, True, False]
+    )
 
 
 def _leaves(state: State) -> list[bytes]:

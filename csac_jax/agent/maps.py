@@ -117,8 +117,13 @@ def _under(frames: Frames, height: jax.Array) -> jax.Array:
 
 
 def everywhere(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells above the workspace for each primitive, [P, K, h, w] bool, whatever is seen: no masking."""
-    return jnp.broadcast_to(frames.inside, (NUM_PRIMITIVES, *frames.inside.shape))
+    """Cells above the workspace for each primitive, [P, K, h, w] bool, whatever is seen: no masking.
+
+    In the target task, grasps only where the target lies under the cell: phi_g of eq. 16 is that of the target.
+    """
+    inside = jnp.asarray(frames.inside)
+    grasp = inside & _under(frames, jnp.where(obs.target, obs.height, 0.0)) if frames.marked else inside
+    return jnp.stack([inside, grasp])
 
 
 def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:

@@ -70,32 +70,6 @@ def require_target(case: Case) -> None:
         raise ValueError(f"case '{case.name}' marks no block as the target; give one of them \"target\": true")
 
 
-def fit(case: Case, slots: tuple[SlotKind, ...]) -> Scene:
-    """The case's scene in other slots: each block takes the first free slot of its kind, the rest are parked.
-
-    Raises ValueError, naming the kind, where a kind has too few slots.
-    """
-    places = [slot for block, kind in enumerate(case.slots) for slot in _nth(slots, kind, case.slots[:block])]
-    if len(places) < len(case.slots):
-        short = next(kind for kind in case.slots if slots.count(kind) < case.slots.count(kind))
-        raise ValueError(
-            f"case '{case.name}' has {case.slots.count(short)} blocks of kind {short}, scene.slots only "
-            f"{slots.count(short)}; add some to scene.slots"
-        )
-    fitted = layout.parked(slots)
-    for field in dataclasses.fields(Scene):
-        if field.name != "target":
-            getattr(fitted, field.name)[places] = getattr(case.scene, field.name)
-    target = int(case.scene.target)
-    return fitted.replace(target=np.int32(layout.ANY if target == layout.ANY else places[target]))
-
-
-def _nth(slots: tuple[SlotKind, ...], kind: SlotKind, before: tuple[SlotKind, ...]) -> list[int]:
-    """The first slot of this kind that is not taken by a block before, as a list; empty if there is none."""
-    taken = before.count(kind)
-    return [slot for slot, other in enumerate(slots) if other == kind][taken : taken + 1]
-
-
 # From text to a scene.
 
 

@@ -47,7 +47,8 @@ class Stage:
     def motion(self, moment: Moment) -> Iterator[np.ndarray]:
         """The action as it runs in C MuJoCo; a still picture where the robot cannot follow the plan."""
         yield self.still(moment)
-        for pose in c_physics.film(self._world, self._fields, moment.before.scene, moment.drive)[:: self._every]:
+        film = c_physics.film(self._world, self._fields, moment.before.scene, moment.drive)
+        for pose in film.qpos[:: self._every]:
             self._data.qpos[:] = pose
             yield self._picture()
 

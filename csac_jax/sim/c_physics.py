@@ -8,7 +8,7 @@ import concurrent.futures
 import dataclasses
 import functools
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,12 +95,23 @@ def _substeps(world: World, exact: mujoco.MjModel, scene: Scene, drive: Drive) -
         yield data
 
 
-def film(world: World, fields: BlockFields, scene: Scene, drive: Drive) -> np.ndarray:
-    """Positions of all joints [T, nq] after every substep of a drive of one scene, all NumPy: how `run` goes."""
+class Film(NamedTuple):
+    """What `run` goes through, substep by substep; no substep where the robot cannot follow. T = substeps."""
+
+    qpos: np.ndarray  # [T, nq] m and rad, MuJoCo's order
+    qvel: np.ndarray  # [T, nv] m/s and rad/s
+
+
+def film(world: World, fields: BlockFields, scene: Scene, drive: Drive) -> Film:
+    """Every state of one drive of one scene; NumPy throughout."""
     exact = model.with_blocks(world, fields)
-    if not drive.reachable:
-        return np.zeros((0, exact.nq))
-    return np.stack([data.qpos.copy() for data in _substeps(world, exact, scene, drive)])
+    steps = _substeps(world, exact, scene, drive) if drive.reachable else ()
+    states = [(data.qpos.copy(), data.qvel.copy()) for data in steps]
+    return (
+        Film(*(np.stack(column) for column in zip(*states, strict=True)))
+        if states
+        else Film(np.zeros((0, exact.nq)), np.zeros((0, exact.nv)))
+    )
 
 
 def _touching(world: World, data: mujoco.MjData) -> np.ndarray:

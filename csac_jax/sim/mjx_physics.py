@@ -39,7 +39,7 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
     return MjxPhysics(world, cfg, mjx_model, data, _pad_contacts)
 
 
-def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
+def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     """The model with this scene's block sizes, masses and frictions."""
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
@@ -63,7 +63,7 @@ def _scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     )
 
 
-def _initial_data(physics: MjxPhysics, scene: Scene, drive: Drive) -> mjx.Data:
+def initial_data(physics: MjxPhysics, scene: Scene, drive: Drive) -> mjx.Data:
     """Data with the scene's blocks and the robot where the drive starts, at rest."""
     world = physics.world
     poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
@@ -96,8 +96,8 @@ def _pad_contacts(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
 def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
     """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the hand is."""
     world, cfg = physics.world, physics.cfg
-    model = _scene_model(physics, scene)
-    initial = _initial_data(physics, scene, drive)
+    model = scene_model(physics, scene)
+    initial = initial_data(physics, scene, drive)
     z_address = world.block_qpos[:, 2]
     finger = world.robot_qpos[-2]
     close_end = sum(cfg.grasp_phases[:2])

@@ -1,6 +1,6 @@
 """Speed of this machine, as JSON: `csac-jax bench step [PRESET]`, with PRESET `quick` if none is given.
 
-The training step is timed beside a bare `mjx.step` loop of the same model and number of scenes in the same process, and
+The training step is timed beside a bare `mjx.step` loop of the same scenes and set-points in the same process, and
 each part is the median of several calls; machines are noisy, so trust ratios.
 """
 
@@ -19,6 +19,7 @@ from csac_jax.cli import BadArgumentsError
 from csac_jax.nets.convolution import conv2d
 from csac_jax.sim.primitives import Action
 from csac_jax.train import provenance, step
+from experiments.bench import _bare
 
 REPEATS = 5
 
@@ -31,21 +32,6 @@ def _median_seconds(call: Callable[[], Any]) -> float:
         jax.block_until_ready(call())
         seconds.append(time.perf_counter() - begun)
     return statistics.median(seconds)
-
-
-def _bare_loop(program: step.Program, scenes: int) -> Callable[[], Any]:
-    """As many plain `mjx.step`s as one primitive has, from the model's initial state."""
-    from mujoco import mjx  # after csac_jax.sim, which keeps it from complaining of optional parts
-
-    physics, substeps = program.env.physics, program.cfg.sim.substeps
-    data = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * scenes), physics.data)
-
-    def loop(data: mjx.Data) -> mjx.Data:
-        advance = jax.vmap(lambda one: mjx.step(physics.model, one))
-        return jax.lax.fori_loop(0, substeps, lambda _, data: advance(data), data).qpos
-
-    compiled = jax.jit(loop)
-    return lambda: compiled(data)
 
 
 def _conv_gradient(conv: Callable[[jax.Array, jax.Array], jax.Array]) -> float:
@@ -76,12 +62,13 @@ def measure(preset: str) -> dict[str, Any]:
     state = step.init(program)
 
     actions = Action(primitive=jnp.ones(scenes, jnp.int32), pose=jnp.zeros((scenes, 3)))
+    drives = _bare.drives(cfg, state.scenes.obs.height, actions)
     simulate = jax.jit(jax.vmap(program.env.step))
     look = jax.jit(lambda params, obs: learning.look(learner, params, obs))
     parts = {
         "simulate": _median_seconds(lambda: simulate(state.scenes, actions)),
         "look": _median_seconds(lambda: look(state.learner.online, state.scenes.obs)),
-        "bare_mjx_loop": _median_seconds(_bare_loop(program, scenes)),
+        "bare_mjx_loop": _median_seconds(_bare.loop(program.env.physics, state.scenes.scene, drives)),
     }
 
     def train() -> Any:

@@ -215,6 +215,18 @@ def test_nothing_is_valid_outside_of_the_workspace(cfg, frames):
     assert not np.any(maps.actionable(frames, full.replace(height=jnp.zeros((size, size)))))
 
 
+def test_without_mask_every_cell_counts(cfg, frames):
+    """Claim: with no masking every cell above the workspace counts; in the target task, grasps of the target alone."""
+    obs = _one_block(cfg)
+    obs = obs.replace(target=obs.height > 0.01, height=jnp.maximum(obs.height, 0.02))  # the target amid another block
+    np.testing.assert_array_equal(maps.everywhere(frames, obs), np.stack([frames.inside] * 2))
+    marked = dataclasses.replace(frames, marked=True)
+    valid = np.asarray(maps.everywhere(marked, obs))
+    np.testing.assert_array_equal(valid[PUSH], frames.inside)
+    np.testing.assert_array_equal(valid[GRASP], maps.actionable(marked, obs)[GRASP])
+    assert 0 < valid[GRASP].sum() < frames.inside.sum() / 4
+
+
 def test_best_cells(frames):
     """Claim: the largest valid values in their order; if none is valid, the largest of all."""
     values = _random_maps(frames)[GRASP]

@@ -14,6 +14,7 @@ import pytest
 from csac_jax.config import MESH_KINDS, HeightmapConfig, SceneConfig, SimConfig
 from csac_jax.scene import arrange, blocks, cases, families, layout, model, overlap
 from csac_jax.scene.layout import Scene
+from tests.scene import placed
 
 COUNT = 200  # keys per level
 LEVELS = (0.0, 0.5, 1.0)
@@ -51,13 +52,7 @@ def _many(cfg: SceneConfig, extent: float, keys: jax.Array, levels: jax.Array) -
 
 def _measured(world: model.World, scene: Scene, fields: model.BlockFields) -> tuple:
     """Reach, lowest, overlap, distance and moved of one scene."""
-    exact = model.with_blocks(world, fields)
-    exact.opt.iterations, exact.opt.ls_iterations = 20, 20
-    exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
-    data = mujoco.MjData(exact)
-    data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
-    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    mujoco.mj_forward(exact, data)
+    exact, data = placed.in_c(world, scene, fields, iterations=20)
     geoms = [(g, s) for g, s in zip(world.block_geoms, world.parts.slot, strict=True) if scene.in_play[s]]
     corners = np.concatenate([cases._corners(exact, data, geom) for geom, _ in geoms])
     deepest = max(0.0, -data.contact.dist.min()) if data.ncon else 0.0
@@ -200,9 +195,11 @@ def test_shipped_cases_are_held_out(drawn: Drawn):
     slots = MANY.slots
     if drawn.cfg.slots != slots:
         pytest.skip("five boxes cannot make a shipped case")
-    shipped = [cases.fit(cases.load(cases.shipped(name)), slots) for name in cases.names()]
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *shipped)
-    held_out = [max(_clusters(slots, row), key=Counter.total) for row in _examined(MANY, stacked).distance]
+    held_out = []
+    for case in map(cases.load, map(cases.shipped, cases.names())):
+        alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], case.scene)
+        (row,) = _examined(SceneConfig(slots=case.slots, min_blocks=1), alone).distance
+        held_out.append(max(_clusters(case.slots, row), key=Counter.total))
     assert sorted(cluster.total() for cluster in held_out) == [2, 3, 4, 5]
     found = [cluster for row in drawn.distance for cluster in _clusters(slots, row)]
     assert sum(cluster.total() >= 3 for cluster in found) > COUNT

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from csac_jax.config import HeightmapConfig, SceneConfig, SimConfig
-from csac_jax.scene import blocks, cases, layout, model
+from csac_jax.config import HeightmapConfig
+from csac_jax.scene import blocks, cases, layout
+from tests.scene import placed
 
 SHIPPED = ("hole", "pinwheel", "ridge", "row")
 FLAT = [1, 0, 0, 0]
@@ -41,12 +42,7 @@ def _load(folder: Path, *entries: dict) -> cases.Case:
 
 def _settled(case: cases.Case, seconds: float) -> np.ndarray:
     """Positions [N, 3] m of the case's blocks after this time in C MuJoCo."""
-    world = model.build(SceneConfig(slots=case.slots, min_blocks=1), SimConfig())
-    exact = model.with_blocks(world, jax.tree.map(np.asarray, model.scene_fields(world, case.scene)))
-    exact.opt.iterations, exact.opt.ls_iterations = 50, 50
-    data = mujoco.MjData(exact)
-    data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
-    data.qpos[world.block_qpos] = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
+    world, exact, data = placed.case_in_c(case)
     mujoco.mj_step(exact, data, nstep=round(seconds / exact.opt.timestep))
     return data.qpos[world.block_qpos[:, :3]]
 
@@ -77,11 +73,7 @@ def test_shipped_case_has_a_target_hemmed_in(name: str):
 
 def _gaps(case: cases.Case) -> np.ndarray:
     """Distance [N, N] m between blocks in C MuJoCo, NaN on the diagonal; at most 1 m."""
-    world = model.build(SceneConfig(slots=case.slots, min_blocks=1), SimConfig())
-    exact = model.with_blocks(world, jax.tree.map(np.asarray, model.scene_fields(world, case.scene)))
-    data = mujoco.MjData(exact)
-    data.qpos[world.block_qpos] = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
-    mujoco.mj_forward(exact, data)
+    world, exact, data = placed.case_in_c(case)
     gap = np.full((len(case.slots),) * 2, np.nan)
     for one, slot in zip(world.block_geoms, world.parts.slot, strict=True):
         for two, other in zip(world.block_geoms, world.parts.slot, strict=True):
@@ -248,39 +240,10 @@ def test_the_square_may_be_another(tmp_path: Path):
         cases.load(path, 0.14)
 
 
-def test_fit_takes_the_first_free_slot_of_the_kind(tmp_path: Path):
-    """Claim: each block goes unchanged to the first free slot of its kind, the rest stay parked, the target follows."""
-    case = _load(
-        tmp_path,
-        _block("plank", [0.1, 0.0, 0.0125], "blue"),
-        _block("prism", [-0.1, 0.0, 0.0243], "pink"),
-        _block("cube", [0.0, 0.1, 0.025], "red", [1, 0, 0, 1], target=True),
-    )
-    slots = ("arch", "prism", "box", "prism", "box", "box")
-    scene = cases.fit(case, slots)
-    np.testing.assert_array_equal(scene.in_play, [False, True, True, False, True, False])
-    assert scene.target == 4
-    places, empty = [2, 1, 4], [0, 3, 5]
-    nothing = layout.parked(slots)
-    for leaf in ("position", "quaternion", "velocity", "half_size", "density", "friction", "colour"):
-        np.testing.assert_array_equal(getattr(scene, leaf)[places], getattr(case.scene, leaf))
-        np.testing.assert_array_equal(getattr(scene, leaf)[empty], getattr(nothing, leaf)[empty])
-    assert jax.tree.map(lambda leaf: leaf.dtype, scene) == jax.tree.map(lambda leaf: leaf.dtype, nothing)
-
-
-def test_fit_names_the_kind_that_is_short(tmp_path: Path):
-    """Claim: too few slots of a kind is an error that names the kind and both numbers."""
-    case = cases.load(_written(tmp_path, PAIR | {"blocks": [*PAIR["blocks"], _block("tile", [0.05, 0.1, 0.0125])]}))
-    with pytest.raises(ValueError, match=r"'pair' has 2 blocks of kind box, scene\.slots only 1"):
-        cases.fit(case, ("arch", "box", "arch"))
-    with pytest.raises(ValueError, match="1 blocks of kind arch"):
-        cases.fit(case, ("box", "box", "prism"))
-
-
 def test_target_is_required_where_asked(tmp_path: Path):
     """Claim: without a target a case is for the clearing task only."""
     cases.require_target(_load(tmp_path, *PAIR["blocks"]))
     loose = _load(tmp_path, PAIR["blocks"][1])
-    assert (int(loose.scene.target), int(cases.fit(loose, ("box", "arch")).target)) == (layout.ANY, layout.ANY)
+    assert int(loose.scene.target) == layout.ANY
     with pytest.raises(ValueError, match="case 'test' marks no block as the target"):
         cases.require_target(loose)

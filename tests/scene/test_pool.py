@@ -13,6 +13,7 @@ from csac_jax.config import SceneConfig, SimConfig
 from csac_jax.scene import blocks, model, pool
 from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene, parking
+from tests.scene import placed
 
 CONFIG = SceneConfig(slots=("box", "arch", "prism", "half_cylinder"), min_blocks=3)
 EXTENT = 0.448
@@ -44,16 +45,7 @@ ONE = SceneConfig(slots=("box",), min_blocks=1)
 
 
 def _placed(world: model.World, scenes: Scene, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Scene `index` in C MuJoCo, parked blocks without weight."""
-    scene = jax.tree.map(lambda leaf: leaf[index], scenes)
-    exact = model.with_blocks(world, jax.tree.map(np.asarray, model.scene_fields(world, scene)))
-    exact.opt.iterations, exact.opt.ls_iterations = 50, 50
-    exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
-    data = mujoco.MjData(exact)
-    data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
-    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    mujoco.mj_forward(exact, data)
-    return exact, data
+    return placed.in_c(world, jax.tree.map(lambda leaf: leaf[index], scenes))
 
 
 def test_settled_blocks_are_at_rest(world: model.World, scenes: Scene):

@@ -151,7 +151,7 @@ def test_meshes_are_as_large_as_the_blocks(scale: float):
     world = model.build(config.scene, config.sim)
     scene = layout.parked(config.scene.slots)
     scene = scene.replace(half_size=scene.half_size * np.float32(scale))
-    scaled = mjx_physics._scene_model(mjx_physics.make(world, config.sim), scene)
+    scaled = mjx_physics.scene_model(mjx_physics.make(world, config.sim), scene)
     for slot, geom in enumerate(world.block_geoms):
         mesh = scaled._impl.mesh_convex[world.model.geom_dataid[geom]]
         turn = Rotation.from_quat(world.model.geom_quat[geom], scalar_first=True)

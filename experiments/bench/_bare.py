@@ -1,0 +1,70 @@
+"""What physics costs by itself: plain steps from the states that an action starts from, with its set-points."""
+
+import concurrent.futures
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from csac_jax.config import Config
+from csac_jax.scene import model
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import mjx_physics, primitives, robot
+from csac_jax.sim.c_physics import CPhysics
+from csac_jax.sim.mjx_physics import MjxPhysics
+from csac_jax.sim.primitives import Action
+from csac_jax.sim.robot import Drive
+
+from mujoco import mjx  # isort: skip  (after csac_jax.sim, which imports it quietly)
+
+
+def drives(cfg: Config, height: jax.Array, actions: Action) -> Drive:
+    """How the robot moves in actions chosen from the height maps [E, H, W] m; leaves [E, ...]."""
+
+    def drive(height: jax.Array, action: Action) -> Drive:
+        return robot.drive(cfg.sim.robot, primitives.plan(cfg.sim, cfg.heightmap, height, action))
+
+    return jax.jit(jax.vmap(drive))(height, actions)
+
+
+def loop(physics: MjxPhysics | CPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
+    """As many plain steps as an action has, of scenes and drives with leaves [E, ...]; a call runs them all."""
+    return _mjx(physics, scenes, drives) if isinstance(physics, MjxPhysics) else _c(physics, scenes, drives)
+
+
+def _mjx(physics: MjxPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
+    def one(scene: Scene, drive: Drive) -> jax.Array:
+        its, data = mjx_physics.scene_model(physics, scene), mjx_physics.initial_data(physics, scene, drive)
+
+        def step(data: mjx.Data, control: jax.Array) -> tuple[mjx.Data, None]:
+            return mjx.step(its, data.replace(ctrl=control)), None
+
+        return jax.lax.scan(step, data, drive.control)[0].qpos
+
+    compiled = jax.jit(jax.vmap(one))
+    return lambda: compiled(scenes, drives)
+
+
+def _c(physics: CPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
+    world = physics.world
+    fields = jax.device_get(jax.vmap(lambda scene: model.scene_fields(world, scene))(scenes))
+    rows = jax.device_get((scenes, fields, drives))
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(len(rows[2].reachable))]
+    models = [model.with_blocks(world, field) for _, field, _ in each]
+
+    def one(exact: mujoco.MjModel, row: tuple[Any, Any, Any]) -> None:
+        scene, _, drive = row
+        data = mujoco.MjData(exact)
+        data.qpos[world.robot_qpos] = drive.start
+        data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+        for control in drive.control:
+            data.ctrl[:] = control
+            mujoco.mj_step(exact, data)
+
+    def call() -> int:
+        with concurrent.futures.ThreadPoolExecutor() as threads:
+            return len(list(threads.map(one, models, each)))
+
+    return call

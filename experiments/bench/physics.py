@@ -1,0 +1,70 @@
+"""Speed of every physics installed, as JSON: `csac-jax bench physics [--smallest E0] [--scenes E]`, from a batch of E0
+(1) scenes to one of E (64), each eight times the last.
+
+Each is timed as an action of the environment, heights and outcomes included, beside a bare loop of the engine's own
+steps: same model, same settled scenes with their block sizes, same set-points, same batch, same process, turn by turn.
+`share` is (actions/s x substeps) / (bare steps/s): what is left of the engine's speed. Blocks are those of the preset
+`quick`; every action is a planned grasp.
+"""
+
+import dataclasses
+import functools
+import json
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from csac_jax import env as environment, presets
+from csac_jax.config import Config
+from csac_jax.sim import oracle
+from csac_jax.train import provenance
+from experiments.bench import _bare
+from experiments.bench._options import read
+
+PHYSICS = ("c", "mjx")
+REPEATS = 5
+
+
+def _turns(calls: dict[str, Callable[[], Any]]) -> dict[str, float]:
+    """Median seconds of every call, one after the other in each round, so that what else the machine does hits all."""
+    for call in calls.values():
+        jax.block_until_ready(call())
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(REPEATS):
+        for name, call in calls.items():
+            begun = time.perf_counter()
+            jax.block_until_ready(call())
+            seconds[name].append(time.perf_counter() - begun)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def measure(cfg: Config, name: Any, scenes: int) -> dict[str, Any]:
+    """One physics and one batch."""
+    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=name))
+    env = environment.make(cfg)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
+    plan_grasp = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
+    actions = jax.jit(jax.vmap(plan_grasp))(states.scene, states.obs.height)
+    bare = _bare.loop(env.physics, states.scene, _bare.drives(cfg, states.obs.height, actions))
+    step = jax.jit(jax.vmap(env.step))
+    seconds = _turns({"action": lambda: step(states, actions), "bare": bare})
+    return {
+        "physics": name,
+        "scenes": scenes,
+        "actions_per_second": scenes / seconds["action"],
+        "steps_per_second": scenes * cfg.sim.substeps / seconds["action"],
+        "bare_steps_per_second": scenes * cfg.sim.substeps / seconds["bare"],
+        "share": seconds["bare"] / seconds["action"],
+    }
+
+
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    options = read("physics", arguments, smallest=1, scenes=64)
+    cfg = presets.get("quick")
+    batches = [options["smallest"] * 8**i for i in range(8) if options["smallest"] * 8**i <= options["scenes"]]
+    rows = [measure(cfg, name, batch) for name in PHYSICS for batch in batches]
+    print(json.dumps({"substeps": cfg.sim.substeps, "runs": rows} | provenance.record(), indent=2))

@@ -1,0 +1,81 @@
+"""Does the arm grasp as the floating hand does? As JSON: `csac-jax bench robots [--grasps N]`, in C MuJoCo.
+
+The same grasps in the same settled piles of six, each pile turned by another yaw every time it is used, so that the arm
+stands otherwise. One grasp in four is beside the planned place, and turned, so that outcomes differ.
+"""
+
+import collections
+import dataclasses
+import functools
+import json
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax.config import Config, RobotKind
+from csac_jax.env import Env
+from csac_jax.scene import layout, model, pool
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import oracle, outcome, physics as simulation
+from csac_jax.sim.outcome import Outcome
+from csac_jax.sim.primitives import Action
+from csac_jax.train import provenance
+from experiments.bench._options import read
+from experiments.bench.parity import STREAM, TEN, pile_config
+
+BATCH = 50
+SCENES = 128
+NOISE = (0.03, 0.03, 0.5)  # m, m, rad
+ROBOTS: tuple[RobotKind, ...] = ("hand", "ur5")
+
+
+def _outcomes(cfg: Config, kind: RobotKind, scenes: Scene, height: jax.Array, actions: Action) -> np.ndarray:
+    """Outcome of every grasp with this robot [n]."""
+    sim = dataclasses.replace(cfg.sim, robot=kind, physics="c")
+    engine = simulation.make(model.build(cfg.scene, sim), sim)
+
+    @jax.jit
+    @jax.vmap
+    def grasp(scene: Scene, height: jax.Array, action: Action) -> jax.Array:
+        _, trace, plan = simulation.execute(engine, sim, cfg.heightmap, scene, height, action)
+        return outcome.grasp_outcome(trace, plan.surface, plan.start[2] - jnp.min(plan.control[:, 2]))
+
+    every = (scenes, height, actions)
+    count = len(actions.primitive)
+    rows = [jax.tree.map(lambda leaf, i=i: leaf[i : i + BATCH], every) for i in range(0, count, BATCH)]
+    return np.concatenate([np.asarray(grasp(*row)) for row in rows])
+
+
+def measure(grasps: int) -> dict[str, Any]:
+    """Outcomes of both robots."""
+    cfg = pile_config(TEN.scene.slots[:6], 6)
+    world = model.build(cfg.scene, cfg.sim)
+    settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, STREAM, SCENES)
+    rng = np.random.default_rng(STREAM)
+    scenes = jax.tree.map(lambda leaf: leaf[np.arange(grasps) % SCENES], settled)
+    yaws = rng.uniform(0.0, 2.0 * np.pi, grasps).astype(np.float32)
+    scenes = jax.jit(jax.vmap(layout.turn))(scenes, yaws)
+    height = jax.jit(jax.vmap(lambda scene: Env(cfg, None, None).look(scene).height))(scenes)
+    plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
+    actions = jax.jit(jax.vmap(plan))(scenes, height)
+    noise = rng.normal(size=(grasps, 3)) * NOISE * (np.arange(grasps) % 4 == 0)[:, None]
+    actions = actions.replace(pose=jnp.asarray(actions.pose + noise.astype(np.float32)))
+    found = {kind: _outcomes(cfg, kind, scenes, height, actions) for kind in ROBOTS}
+    equal = found["hand"] == found["ur5"]
+    counts = {
+        kind: {level.name.lower(): collections.Counter(rows.tolist())[level] for level in Outcome}
+        for kind, rows in found.items()
+    }
+    return {"grasps": grasps, "outcome_equal": float(equal.mean()), "equal": int(equal.sum()), "outcomes": counts}
+
+
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    options = read("robots", arguments, grasps=500)
+    begun = time.perf_counter()
+    result = measure(options["grasps"])
+    result["seconds"] = time.perf_counter() - begun
+    print(json.dumps(result | provenance.record(), indent=2))

@@ -1,0 +1,31 @@
+"""Blocks of a scene in C MuJoCo, where they lie, for the tests of this folder."""
+
+import jax
+import mujoco
+import numpy as np
+
+from csac_jax.config import SceneConfig, SimConfig
+from csac_jax.scene import cases, model
+from csac_jax.scene.layout import Scene
+
+
+def in_c(
+    world: model.World, scene: Scene, fields: model.BlockFields | None = None, iterations: int = 50
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """One scene of NumPy arrays in C MuJoCo, contacts found, the hand high above, parked blocks without weight."""
+    if fields is None:
+        fields = jax.tree.map(np.asarray, model.scene_fields(world, scene))
+    exact = model.with_blocks(world, fields)
+    exact.opt.iterations, exact.opt.ls_iterations = iterations, iterations
+    exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
+    data = mujoco.MjData(exact)
+    data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
+    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    mujoco.mj_forward(exact, data)
+    return exact, data
+
+
+def case_in_c(case: cases.Case) -> tuple[model.World, mujoco.MjModel, mujoco.MjData]:
+    """The blocks of a case in C MuJoCo."""
+    world = model.build(SceneConfig(slots=case.slots, min_blocks=1), SimConfig())
+    return world, *in_c(world, case.scene)
