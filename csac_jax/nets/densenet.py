@@ -56,6 +56,7 @@ def _norm(cfg: NetConfig, channels: int, train: bool, name: str) -> nn.Module:
     """Norm of maps [..., channels]; `train`: batch norm takes the batch's statistics and moves the running ones."""
     dtype = compute_dtype(cfg)
     if cfg.norm == "batch":
+        # E x^2 - (E x)^2, Flax's default, would cost a decimal in the last block: 1.5e-4 away from Keras, not 1.3e-5.
         return nn.BatchNorm(
             not train, use_fast_variance=False, momentum=_MOMENTUM, epsilon=_EPSILON, dtype=dtype, name=name
         )

@@ -33,14 +33,14 @@ from experiments.bench._options import read
 def _canvas(pixels: int, multiple: int) -> int:
     """Side of turned maps of `pixels` cells: their diagonal, rounded up; less where the margin may not be so large."""
     sides = range(-(-pixels // multiple) * multiple, int(1.5 * pixels) + 1, multiple)
-    return next((side for side in sides if side >= math.sqrt(2.0) * pixels), max(sides, default=0))
+    return next((side for side in sides if side >= math.sqrt(2.0) * pixels), max(sides, default=pixels))
 
 
 def _densenet(pixels: int, zoom: int) -> Config:
     """The preset `paper` with maps of `pixels` cells, as fine as its height map."""
     paper = presets.paper()
     try:
-        margin = _canvas(pixels, DENSENET_STRIDE // zoom) / pixels - 1.0
+        margin = _canvas(pixels, max(DENSENET_STRIDE // zoom, 1)) / pixels - 1.0
         net = dataclasses.replace(paper.net, margin=margin, zoom=zoom, output_stride=1)
         return dataclasses.replace(paper, heightmap=HeightmapConfig(size=pixels), net=net)
     except ValueError as error:

@@ -97,6 +97,7 @@ def test_acting_uses_running_statistics(learner, state, observations):
         assert np.abs(getattr(after, maps) - getattr(both, maps)).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_learning_uses_the_batchs_statistics(state, batch, update, updated):
     """Claim: while learning, Q(s, a) of a transition depends on the batch, and not on the running statistics."""
     flat = jax.tree.map(lambda leaf: leaf.at[1:].set(jnp.zeros((), leaf.dtype)), batch.obs)
@@ -107,6 +108,7 @@ def test_learning_uses_the_batchs_statistics(state, batch, update, updated):
     np.testing.assert_allclose(other[1].error, updated[1].error, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_change_parameters_only(learner, state, batch, update, updated):
     """Claim: an update moves every kernel, and the running statistics to 0.9 of what they were and 0.1 of the batch's,
     whatever the gradient; the optimisers know of no statistics."""
@@ -129,6 +131,7 @@ def test_gradients_change_parameters_only(learner, state, batch, update, updated
     assert "kernel" in names
 
 
+@pytest.mark.slow
 def test_targets_follow_statistics_too(learner, state, updated):
     """Claim: target networks follow running statistics as they follow parameters."""
     tau = learner.cfg.learn.tau
@@ -138,6 +141,7 @@ def test_targets_follow_statistics_too(learner, state, updated):
     assert _differ(updated[0].target.critic["batch_stats"], target["batch_stats"])
 
 
+@pytest.mark.slow
 def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
     """Claim: an update of the actor moves its parameters and statistics, and none of the critic's."""
     obs = heightmap.unpack(batch.obs)

@@ -235,19 +235,30 @@ def test_group_norm_sees_one_map():
     head = densenet.Head(TINY)
     features = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, 2, 16)), jnp.float32)
     variables = random_variables(head, 0, (1, 2, 2, 16))
-    together = head.apply(variables, features)
+    apply = jax.jit(head.apply)
+    together = apply(variables, features)
     assert together.shape == (2, 3, 16, 16, 3)
-    np.testing.assert_allclose(together[1, 2], head.apply(variables, features[1, 2:])[0], atol=1e-5)
+    np.testing.assert_allclose(together[1, 2], apply(variables, features[1, 2:])[0], atol=1e-5)
+
+
+HALF = dataclasses.replace(TINY, dtype="bfloat16")
 
 
 def test_bfloat16_has_float32_parameters():
-    """Claim: in bfloat16 parameters and Q stay float32, features are bfloat16, and Q is that of float32 within 5 %."""
-    half = dataclasses.replace(TINY, dtype="bfloat16")
-    maps = jnp.asarray(np.random.default_rng(4).normal(size=(1, 64, 64, 4)), jnp.float32)
+    """Claim: in bfloat16 parameters and Q stay float32, features are bfloat16."""
+    critic, maps = densenet.Critic(HALF), jax.ShapeDtypeStruct((1, 64, 64, 4), jnp.float32)
     with jax.numpy_dtype_promotion("standard"):  # Flax's norm promotes in half precision
-        variables = random_variables(densenet.Critic(half), 0, maps.shape)
-        q, features = jax.jit(densenet.Critic(half).apply)(variables, maps)
+        (q, features), variables = jax.eval_shape(critic.init_with_output, jax.random.key(0), maps)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
-    wanted, _ = jax.jit(densenet.Critic(TINY).apply)(variables, maps)
     assert (q.dtype, features.dtype) == (jnp.float32, jnp.bfloat16)
-    assert np.abs(q - wanted).max() <= 0.05 * np.abs(wanted).max()
+
+
+@pytest.mark.slow
+def test_bfloat16_is_near_float32():
+    """Claim: Q in bfloat16 is that in float32 within 5 % of the largest."""
+    maps = jnp.asarray(np.random.default_rng(4).normal(size=(1, 64, 64, 4)), jnp.float32)
+    variables = random_variables(densenet.Critic(TINY), 0, maps.shape)
+    with jax.numpy_dtype_promotion("standard"):
+        q, _ = jax.jit(densenet.Critic(HALF).apply)(variables, maps)
+    wanted, _ = jax.jit(densenet.Critic(TINY).apply)(variables, maps)
+    assert 0.0 < np.abs(q - wanted).max() <= 0.05 * np.abs(wanted).max()
