@@ -174,10 +174,14 @@ def surface_tables(
     polytopes: raycast.Polytopes, table_colour: jax.Array, wanted: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Of every surface (see `raycast.Meeting`): its colour as lit, [S, 3], and whether it is wanted, [S] bool."""
-    normal, geom = raycast.surfaces(polytopes)
-    own = jnp.concatenate([table_colour[None], polytopes.colour])  # row 0 is geom TABLE = -1
-    asked = jnp.concatenate([jnp.all(wanted, keepdims=True), wanted])
-    return shade.flat(own[geom - raycast.TABLE], normal), asked[geom - raycast.TABLE]
+    normal, _ = raycast.surfaces(polytopes)
+    geoms, faces = polytopes.offset.shape
+
+    def spread(of_table: jax.Array, of_geom: jax.Array) -> jax.Array:  # not a gather, which XLA would do for every ray
+        each = jnp.broadcast_to(of_geom[:, None], (geoms, faces, *of_geom.shape[1:]))
+        return jnp.concatenate([of_table[None], each.reshape(-1, *of_geom.shape[1:])])
+
+    return shade.flat(spread(table_colour, polytopes.colour), normal), spread(jnp.all(wanted), wanted)
 
 
 def pack(obs: Observation) -> PackedObservation:

@@ -11,8 +11,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from csac_jax.scene.solids import Kind
+
+_ALONG = np.float32(1e-30)  # taken for the speed towards a plane that the ray runs along
+_ON_PLANE = np.float32(1e-12)  # m, room of an origin that lies on a plane
 
 Vector = jax.Array | Sequence[jax.Array]
 """[3], or its three scalars []."""
@@ -43,21 +47,22 @@ def enter_half_spaces(normal: jax.Array, offset: jax.Array, origin: Vector, dire
     """One ray against one intersection of half-spaces (slab method, Kay and Kajiya 1986).
 
     t = (offset - n . o) / (n . d) at each plane; the ray enters at the largest t with n . d < 0 and leaves at the
-    smallest with n . d > 0. A plane parallel to the ray is never left if the origin lies inside of it, else at once.
-    Times the reciprocal of n . d: where all rays share a direction, the division is done once per plane.
+    smallest with n . d > 0. A plane along the ray is left at t = +-1e30 (offset - n . o): never if the origin lies
+    inside of it or on it, at once if outside. Times the reciprocal of n . d: where all rays share a direction, the
+    division is done once per plane.
 
     Args: normal [F, 3] and offset [F] m; origin [3] m, direction [3].
     """
     enter, leave, face = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32), jnp.array(0, jnp.int32)
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
-        room = offset[f] - dot(normal[f], origin)  # m, not negative inside
-        parallel = ~(jnp.abs(speed) > 0.0)
-        crossing = room * (1.0 / jnp.where(parallel, 1.0, speed))
+        inverse = 1.0 / jnp.where(speed == 0.0, _ALONG, speed)
+        room = (offset[f] - dot(normal[f], origin)) + _ON_PLANE  # m, not negative inside
+        crossing = room * inverse
         inwards = jnp.where(speed < 0.0, crossing, -jnp.inf)
-        outwards = jnp.where(speed > 0.0, crossing, jnp.where(parallel & (room < 0.0), -jnp.inf, jnp.inf))
         face = jnp.where(inwards > enter, f, face)
-        enter, leave = jnp.maximum(enter, inwards), jnp.minimum(leave, outwards)
+        enter = jnp.maximum(enter, inwards)
+        leave = jnp.minimum(leave, jnp.where(speed < 0.0, jnp.inf, crossing))
     return Crossing(enter, face, (enter >= 0.0) & (enter <= leave))
 
 
@@ -132,12 +137,10 @@ def ray_capsule(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     """The capsule about z of radius size[0], half length size[1] without its caps.
 
     A line that enters the endless tube between the caps enters the capsule there; one that enters it beyond an end can
-    meet only the sphere at that end, and one that runs along the tube only the sphere at the end it comes from.
+    meet only the sphere at that end, and a ray along the tube only the sphere at the end beyond which it starts.
     """
     enter, _, hits = _tube(size[0], origin, direction)
-    along = jnp.isinf(enter)
-    z = origin[2] + jnp.where(along, 0.0, enter) * direction[2]
-    z = jnp.where(along, -jnp.inf * jnp.sign(direction[2]), z)
+    z = origin[2] + jnp.where(jnp.isinf(enter), 0.0, enter) * direction[2]
     middle = jnp.abs(z) <= size[1]
     cap = ray_sphere(size, (origin[0], origin[1], origin[2] - jnp.sign(z) * size[1]), direction)
     x, y = ((origin[axis] + enter * direction[axis]) / size[0] for axis in range(2))

@@ -50,15 +50,20 @@ def blocks_and_arm(rng: np.random.Generator) -> Placed:
 
 
 def every_type(rng: np.random.Generator) -> Placed:
-    """Two of each type that the raycaster knows but meshes, of random sizes and poses; one plane has an end."""
+    """Two of each type that the raycaster knows, of random sizes and poses; one plane has an end."""
     geoms = '<geom type="plane" size="0 0 1" pos="0 0 -0.3"/><geom type="plane" size="0.3 0.2 1" euler="10 20 30"/>'
-    for kind in ("box", "sphere", "capsule", "cylinder") * 2:
+    meshes = ""
+    for number, kind in enumerate(("box", "sphere", "capsule", "cylinder", "mesh") * 2):
         size, place, turn = (
             " ".join(f"{value:.6f}" for value in rng.uniform(low, high, 3))
             for low, high in ((0.02, 0.08), (-0.25, 0.25), (-180, 180))
         )
-        geoms += f'<geom type="{kind}" size="{size}" pos="{place}" euler="{turn}"/>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
+        if kind == "mesh":  # the convex hull of 12 points
+            corners = " ".join(f"{value:.6f}" for value in rng.normal(scale=0.04, size=36))
+            meshes += f'<mesh name="{number}" vertex="{corners}"/>'
+        shape = f'mesh="{number}"' if kind == "mesh" else f'size="{size}"'
+        geoms += f'<geom type="{kind}" {shape} pos="{place}" euler="{turn}"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><asset>{meshes}</asset><worldbody>{geoms}</worldbody></mujoco>")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return Placed(model, data)

@@ -34,7 +34,9 @@ def _opengl_depth(folder: Path, model: mujoco.MjModel, data: mujoco.MjData, eye:
     pytest.skip("OpenGL works neither by EGL nor by OSMesa: " + done.stderr.decode().strip().splitlines()[-1])
 
 
-@pytest.mark.parametrize("make", [mujoco_rays.every_type, mujoco_rays.blocks_and_arm])
+@pytest.mark.parametrize(
+    "make", [mujoco_rays.every_type, pytest.param(mujoco_rays.blocks_and_arm, marks=pytest.mark.slow)]
+)
 def test_depth_agrees_with_opengl(tmp_path, make):
     """Claim: depths are those of MuJoCo's own renderer to 2 mm in every pixel two pixels off an edge or more."""
     model, data = make(np.random.default_rng(5))

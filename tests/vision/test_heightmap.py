@@ -69,6 +69,7 @@ def _settled_pile(rng: np.random.Generator) -> tuple[Env, Scene, Placed]:
     return Env(cfg, None, None), scene, Placed(exact, data)
 
 
+@pytest.mark.slow
 @pytest.mark.mjx
 def test_a_settled_pile_agrees_with_mujoco():
     """Claim: every cell of the 224-cell map of a settled pile of ten, edges apart, is as high as C MuJoCo's to 0.1 mm.

@@ -32,7 +32,7 @@ def _by_hand(cfg: HeightmapConfig, points: np.ndarray, valid: np.ndarray) -> tup
 _from_points = jax.jit(heightmap.from_points, static_argnums=0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_points_agree_with_numpy(seed):
     """Claim: height and source of every cell are those of a loop over the points: the highest, of ties the first."""
@@ -111,14 +111,3 @@ def test_a_block_casts_a_shadow():
     assert not filled[middle][:, (x > 0.03) & (x < end - 0.008)].any()
     assert filled[middle][:, x > end + 0.008].mean() > 0.95
     assert filled[middle][:, x < -0.03].mean() > 0.95
-
-
-def test_resolution_of_the_camera_is_free(reference):
-    """Claim: four times the pixels fill more cells and change few heights; half of the paper's resolution fills all
-    cells of a 64-cell map that are not hidden."""
-    look = jax.jit(lambda eye: heightmap.oblique(CFG, reference.polytopes, jnp.asarray(_TABLE), jnp.ones(6, bool), eye))
-    few, many = (jax.device_get(look(eye)) for eye in (_EYE, _FINE))
-    filled = [obs.colour.sum(-1) > 0.0 for obs in (few, many)]
-    assert filled[1].mean() >= filled[0].mean()
-    both = filled[0] & filled[1]
-    assert np.mean(np.abs(few.height - many.height)[both] > 0.005) < 0.05

@@ -94,7 +94,10 @@ _PUSH = Action(primitive=jnp.int32(0), pose=jnp.array([0.15, 0.15, 0.0]))
 @pytest.mark.mjx  # steps, whose health check promotes ranks
 @pytest.mark.parametrize(
     ("view", "errors"),
-    [(SMALL, ERRORS), (OBLIQUE, dataclasses.replace(ERRORS, position=0.005, rotation=0.01))],
+    [
+        (SMALL, ERRORS),
+        pytest.param(OBLIQUE, dataclasses.replace(ERRORS, position=0.005, rotation=0.01), marks=pytest.mark.slow),
+    ],
 )
 def test_views_differ_from_step_to_step(view, errors):
     """Claim: every view of an episode has errors of its own, that of another episode others; the same key, the same."""

