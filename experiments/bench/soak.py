@@ -1,7 +1,8 @@
 """Random actions without end: is every block accounted for, how often does physics fail? JSON.
 
 `csac-jax bench soak [--actions N] [--scenes E]`. Half of the actions are pushes; scenes hold ten blocks of
-all shapes and are replaced as in training. Then the same actions run once more with twice as many contacts.
+all shapes and are replaced as in training. Then random grasps run once more with twice as many contacts, and once from
+scenes a micrometre away: what that alone changes is chaos.
 """
 
 import dataclasses
@@ -24,6 +25,7 @@ from csac_jax.train import provenance
 from experiments.bench._options import read
 from experiments.bench.parity import TEN, pile_config
 
+NUDGE = 1e-6  # m
 CHUNK = 10  # actions per scene in one call of the compiled program
 
 
@@ -108,20 +110,24 @@ def soak(actions: int, scenes: int) -> dict[str, Any]:
         "quarantine_rate": counts["ill"] / counts["actions"],
         "saturated_substeps_share": counts["saturated"] / counts["actions"] / cfg.sim.substeps,
         "actions_per_second": number * CHUNK * scenes / seconds if number else None,
-        "outcomes_equal_with_doubled_caps": _caps(cfg, env, frames, state),
+        "outcomes_equal": _caps(cfg, env, frames, state),
     }
 
 
 def _caps(cfg: Config, env: Env, frames: maps.Frames, state: State) -> dict[str, Any]:
-    """The same actions from the same states with the caps of the config and with twice as many."""
-    other = environment.make(_doubled(cfg))
+    """Share of random grasps that end alike with the caps of the config and with twice as many; and, as the floor that
+    chaos sets, with the caps of the config and every block NUDGE away."""
     count = state.actions.shape[0]
     keys = jax.random.split(jax.random.key(1), count)
     action = jax.jit(jax.vmap(_random, (0, None, 0)), static_argnums=1)(keys, frames, state)
-    ends = [jax.device_get(jax.jit(jax.vmap(each.step))(state, action)) for each in (env, other)]
-    equal = np.stack([ends[0].info.outcome == ends[1].info.outcome, ends[0].info.cleared == ends[1].info.cleared])
-    grasps = np.asarray(action.primitive) == Primitive.GRASP
-    return {"share": float(equal.all(axis=0).mean()), "n": count, "grasps": int(grasps.sum())}
+    action = action.replace(primitive=jnp.full_like(action.primitive, Primitive.GRASP))
+    step = jax.jit(jax.vmap(env.step))
+    moved = state.replace(scene=state.scene.replace(position=state.scene.position + NUDGE))
+    doubled = jax.jit(jax.vmap(environment.make(_doubled(cfg)).step))
+    ends = {"as_it_is": step(state, action), "nudged": step(moved, action), "doubled_caps": doubled(state, action)}
+    judged = {name: np.asarray(end.info.outcome) for name, end in ends.items()}
+    equal = {name: float(np.mean(judged[name] == judged["as_it_is"])) for name in ("doubled_caps", "nudged")}
+    return {**equal, "nudge_m": NUDGE, "grasps": count}
 
 
 def main(arguments: list[str]) -> None:
