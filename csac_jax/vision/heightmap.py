@@ -135,7 +135,7 @@ def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Ce
     """
     xy = jnp.where(valid[:, None], points[:, :2], cfg.extent)  # outside
     col, row = jnp.floor((xy + 0.5 * cfg.extent) / cfg.cell).astype(jnp.int32).T
-    inside = valid & (row >= 0) & (row < cfg.size) & (col >= 0) & (col < cfg.size)
+    inside = (row >= 0) & (row < cfg.size) & (col >= 0) & (col < cfg.size)
     cell = jnp.where(inside, row * cfg.size + col, cfg.size**2)  # outside: dropped
     top = jnp.full(cfg.size**2, -jnp.inf).at[cell].max(points[:, 2], mode="drop")
     is_top = points[:, 2] == top.at[cell].get(mode="fill", fill_value=jnp.inf)

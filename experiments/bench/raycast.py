@@ -39,7 +39,7 @@ from experiments.bench._options import read
 
 PER_PLANE, PER_GEOM = 14, 9
 PEER_ROWS = 8
-CHAINS, DEPTH, ELEMENTS = 4, 64, 2**20
+CHAINS, DEPTH, ELEMENTS = 8, 64, 2**20
 DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 
 Call = Callable[[], Any]

@@ -145,6 +145,16 @@ def test_without_errors_there_is_no_randomness():
     assert "random" in str(begin(jax.random.key(0)))
 
 
+def test_the_config_chooses_the_view():
+    """Claim: the environment looks from above by default, and through the config's camera if the view is oblique."""
+    env = _env(heightmap=OBLIQUE)
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
+    above, beside = (jax.jit(each.look)(scene) for each in (_env(), env))
+    hidden = np.asarray(beside.colour).sum(-1) == 0.0
+    assert 0.01 < hidden.mean() < 0.9
+    assert np.asarray(above.colour).sum(-1).min() > 0.0
+
+
 def test_an_episode_with_errors_needs_a_key():
     """Claim: beginning an episode without a key says so, instead of showing every episode the same errors."""
     env = _env(sensor=ERRORS)
