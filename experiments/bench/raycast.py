@@ -7,13 +7,12 @@ through cylinders, of which there are none: round blocks are meshes; and it fail
 gets one.
 Calls take turns and the median counts.
 
-Arithmetic limit: the rate of a kernel that does nothing but multiply-adds (2 operations each): CHAINS chains per
-element, each DEPTH long, of which only the last sum is written, so that memory does not bound it; compiled by the same
-compiler and timed in the same run. Operations of a ray are counted from the code: every sum, product, comparison,
-selection, minimum, maximum and logical operation is one. Per plane (`enter_half_spaces` for a direction that all rays
-share: what depends on the direction alone has no ray axis): room 7 (3 products, 3 sums, a difference), crossing 1,
-inwards 1, face 2, enter 1, leave 2: 14. Per geom: valid 3, closer 2, number and selection of the surface 3, distance 1:
-9. Planes that a geom lacks are computed as well, and counted.
+Arithmetic limit: the rate of a float32 matrix product at full precision, 2 SIDE^3 operations, timed in the same run.
+Operations of a ray are counted from the code: every sum, product, comparison, selection, minimum, maximum and logical
+operation is one. Per plane (`enter_half_spaces` for a direction that all rays share: what depends on the direction alone
+has no ray axis): room 7 (3 products, 3 sums, a difference), crossing 1, inwards 1, face 2, enter 1, leave 2: 14. Per
+geom: valid 3, closer 2, number and selection of the surface 3, distance 1: 9. Planes that a geom lacks are computed as
+well, and counted.
 """
 
 import json
@@ -39,7 +38,7 @@ from experiments.bench._options import read
 
 PER_PLANE, PER_GEOM = 14, 9
 PEER_ROWS = 8
-CHAINS, DEPTH, ELEMENTS = 8, 64, 2**20
+SIDE = 1024 if jax.default_backend() == "cpu" else 4096
 DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 
 Call = Callable[[], Any]
@@ -95,17 +94,10 @@ def _peer(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -
 
 
 def _limit() -> Call:
-    """CHAINS * DEPTH multiply-adds per element."""
-
-    def kernel(start: jax.Array, factor: jax.Array, summand: jax.Array) -> jax.Array:
-        chains = [start + float(chain) for chain in range(CHAINS)]
-        for _ in range(DEPTH):
-            chains = [chain * factor + summand for chain in chains]
-        return sum(chains[1:], chains[0])
-
-    compiled = jax.jit(kernel)
-    start = jnp.linspace(0.0, 1.0, ELEMENTS)
-    return lambda: compiled(start, jnp.float32(0.999), jnp.float32(0.001))
+    """A square matrix product."""
+    compiled = jax.jit(lambda a, b: jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST))
+    left, right = jax.random.normal(jax.random.key(0), (2, SIDE, SIDE))
+    return lambda: compiled(left, right)
 
 
 def _median_seconds(calls: dict[str, Call], repeats: int) -> dict[str, float]:
@@ -126,13 +118,13 @@ def measure(size: int, scenes: int, repeats: int) -> dict[str, Any]:
     cfg = presets.get("fast")
     world = models.build(cfg.scene, cfg.sim)
     poses, origin = _poses(np.random.default_rng(0), scenes, len(world.slots)), _origins(size)
-    calls = {"ours": _ours(world, poses, origin), "mjx": _peer(world, poses, origin), "multiply_adds": _limit()}
+    calls = {"ours": _ours(world, poses, origin), "mjx": _peer(world, poses, origin), "matrix_product": _limit()}
     seconds = _median_seconds(calls, repeats)
     ours, theirs = np.asarray(calls["ours"]()[0]), np.asarray(calls["mjx"]()[0])
     rays = scenes * size * size
     geoms = len(world.parts.slot)
     per_ray = geoms * (blocks.MAX_FACES * PER_PLANE + PER_GEOM)
-    limit = 2.0 * CHAINS * DEPTH * ELEMENTS / seconds["multiply_adds"]
+    limit = 2.0 * SIDE**3 / seconds["matrix_product"]
     rate = rays / seconds["ours"]
     return {
         "size": size,
