@@ -13,6 +13,7 @@ from csac_jax.sim.primitives import Action, Primitive, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric
 FINGER_HALF = (0.008, 0.012)  # m, half footprint of a finger tip across and along its pad, with a little room
+EXACT = jax.lax.Precision.HIGHEST  # a GPU would cut products of matrices to 10 bits
 ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
 
@@ -21,7 +22,7 @@ def _support(normals: jax.Array, offsets: jax.Array, axis: jax.Array) -> tuple[j
 
     Args: normals [F, 3] world frame, offsets [F] m from the block's centre.
     """
-    cosine = normals @ axis
+    cosine = jnp.matmul(normals, axis, precision=EXACT)
     low, high = jnp.argmin(cosine), jnp.argmax(cosine)
     return jnp.minimum(cosine[high], -cosine[low]), offsets[high] + offsets[low]
 
@@ -35,7 +36,8 @@ def grasp(
     """
     hulls: tuple[SlotKind, ...] = tuple("box" if kind == "arch" else kind for kind in slots)
     normals, offsets = blocks.half_spaces(hulls, scene.half_size)
-    world_normals = jnp.einsum("nij,nfj->nfi", jax.vmap(quat_to_matrix)(scene.quaternion), normals)
+    turn = jax.vmap(quat_to_matrix)(scene.quaternion)
+    world_normals = jnp.einsum("nij,nfj->nfi", turn, normals, precision=EXACT)
     yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
     cells = cell_centres(heightmap)
 

@@ -9,10 +9,10 @@ Calls take turns and the median counts.
 
 Arithmetic limit: the rate of a float32 matrix product at full precision, 2 SIDE^3 operations, timed in the same run.
 Operations of a ray are counted from the code: every sum, product, comparison, selection, minimum, maximum and logical
-operation is one. Per plane (`enter_half_spaces` for a direction that all rays share: what depends on the direction alone
-has no ray axis): room 7 (3 products, 3 sums, a difference), crossing 1, inwards 1, face 2, enter 1, leave 2: 14. Per
-geom: valid 3, closer 2, number and selection of the surface 3, distance 1: 9. Planes that a geom lacks are computed as
-well, and counted.
+operation is one. Per plane (`enter_half_spaces` for a direction that all rays share: what depends on the direction
+alone has no ray axis): room 7 (3 products, 3 sums, a difference), crossing 1, inwards 1, face 2, enter 1, leave 2: 14.
+Per geom: valid 3, closer 2, number and selection of the surface 3, distance 1: 9. Planes that a geom lacks are computed
+as well, and counted.
 """
 
 import json

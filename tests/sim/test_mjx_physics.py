@@ -1,6 +1,7 @@
 """Primitives in MJX: scripted scenes, health, and agreement with C MuJoCo."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax.config import MESH_KINDS, Config, SceneConfig
 from csac_jax.scene import layout, model
-from csac_jax.sim import c_physics, mjx_physics, outcome, physics as simulation, robot
+from csac_jax.sim import c_physics, mjx_physics, oracle, outcome, physics as simulation, robot
 from csac_jax.sim.outcome import Outcome
 
 pytestmark = pytest.mark.mjx
@@ -86,6 +87,22 @@ def test_failed_physics_is_flagged_alone(executed):
     for name in names:
         assert not simulation.healthy(executed.case(name).after)
     assert health.sum() == len(health) - len(names)
+
+
+def test_products_keep_their_precision(config, world):
+    """Claim: no product of matrices of the physics or the planner runs at less than float32's precision on a GPU."""
+    scene = jax.tree.map(jnp.asarray, layout.parked(config.scene.slots))
+    height = jnp.zeros((config.heightmap.size,) * 2)
+    engine = simulation.make(world, config.sim)
+
+    def act(scene, height):
+        action = oracle.grasp(config.sim, config.heightmap, config.scene.slots, scene, height)
+        return simulation.execute(engine, config.sim, config.heightmap, scene, height, action)
+
+    text = str(jax.make_jaxpr(act)(scene, height))
+    products = re.findall(r"dot_general\[(.*?)\n *\] ", text, re.DOTALL)
+    assert len(products) > 10
+    assert all("precision=(Precision.HIGHEST, Precision.HIGHEST)" in product for product in products)
 
 
 def test_fast_spin_does_not_blow_up(executed, world):
