@@ -1,9 +1,10 @@
-# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, NAME may be set.
+# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, NAME, JOBS may be set.
 PYTHON ?= python3
 PRESET ?= quick
 POLICY ?= learned
 EPISODES ?= 50
 NAME ?= step
+JOBS ?= 2
 RUN ?= $(firstword $(shell ls -1dt runs/*/ 2>/dev/null))
 ARGS ?=
 
@@ -11,7 +12,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup train eval test test-slow lint format bench pictures doctor clean
+.PHONY: help setup train eval test test-slow lint format bench pictures figures doctor clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -30,11 +31,11 @@ eval: $(STAMP)  ## evaluate RUN (the newest) with POLICY (learned) over EPISODES
 	@test -n "$(RUN)" || { echo "eval: there is no run under runs/; run 'make train' first or set RUN=DIR" >&2; exit 1; }
 	$(BIN)/csac-jax eval $(RUN) --policy $(POLICY) --episodes $(EPISODES) --json $(RUN:/=)/eval-$(POLICY).json $(ARGS)
 
-test: $(STAMP)  ## fast tests
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+test: $(STAMP)  ## fast tests, in JOBS (2) processes
+	$(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile $(ARGS)
 
 test-slow: $(STAMP)  ## slow tests
-	$(BIN)/python -m pytest -m slow $(ARGS)
+	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .
@@ -52,6 +53,9 @@ pictures: $(STAMP)  ## the pictures of README.md, anew
 	for shown in row:hand ridge:hand pinwheel:ur5 hole:ur5; do \
 	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --png docs/pictures/$${shown%:*}.png; \
 	done
+
+figures: $(STAMP)  ## the figures of recorded results, anew
+	$(BIN)/python -m experiments.figures
 
 doctor: $(STAMP)  ## versions, devices, numerics self-test
 	$(BIN)/csac-jax doctor $(ARGS)

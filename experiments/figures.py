@@ -1,0 +1,43 @@
+"""Figures of recorded results, drawn anew by `make figures` into docs/figures."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display
+import matplotlib.pyplot as plt
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS, FIGURES = ROOT / "experiments" / "results", ROOT / "docs" / "figures"
+SAMPLERS = {"uniform": "uniform", "prioritised": "prioritised", "beta": "beta", "flashbax": "prioritised, flashbax"}
+
+
+def _read(*names: str) -> list[dict[str, Any]]:
+    return [json.loads((RESULTS / name).read_text()) for name in names]
+
+
+def replay() -> None:
+    """Time to draw 64 transitions and replace their priorities against the ring's capacity, on a CPU and a GPU."""
+    records = {
+        "2-core CPU, busy": _read("bench-replay-cpu.json"),
+        "H200": _read("bench-replay-h200-12.json", "bench-replay-h200-18.json"),
+    }
+    figure, panels = plt.subplots(1, len(records), figsize=(9, 3.4), sharey=True, layout="constrained")
+    for panel, (device, parts) in zip(panels, records.items(), strict=True):
+        rows = [row for part in parts for row in part["capacities"]]
+        for name, label in SAMPLERS.items():
+            microseconds = [1e6 * row["median_seconds"][name] for row in rows]
+            panel.plot([row["capacity"] for row in rows], microseconds, "o-", label=label)
+        panel.set(title=device, xlabel="capacity, transitions", xscale="log", yscale="log")
+        panel.set_xscale("log", base=2)
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("median per step, \N{MICRO SIGN}s")
+    panels[1].legend()
+    figure.savefig(FIGURES / "replay.png", dpi=110, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    FIGURES.mkdir(exist_ok=True)
+    replay()
