@@ -32,10 +32,10 @@ eval: $(STAMP)  ## evaluate RUN (the newest) with POLICY (learned) over EPISODES
 	$(BIN)/csac-jax eval $(RUN) --policy $(POLICY) --episodes $(EPISODES) --json $(RUN:/=)/eval-$(POLICY).json $(ARGS)
 
 test: $(STAMP)  ## fast tests, in JOBS (2) processes
-	$(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadgroup $(ARGS)
 
 test-slow: $(STAMP)  ## slow tests
-	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadgroup $(ARGS)
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .

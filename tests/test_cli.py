@@ -346,7 +346,7 @@ def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     """Claim: a stopped run exits with 128 + the signal; --json has the result, the config and where it comes from."""
     from csac_jax.train import loop
 
-    def train(options, cfg, run_dir, stop):
+    def train(options, cfg, run_dir, stop, trunk):
         stop.signal = code - 128 if code else None
         return loop.Summary(4, 8, 1.5, 0.5, None, 0, stop.signal)
 

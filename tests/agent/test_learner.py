@@ -339,6 +339,7 @@ def _one(params: Params, m: int) -> Params:
     return params.replace(critic=jax.tree.map(lambda leaf: leaf[m : m + 1], params.critic))
 
 
+@pytest.mark.slow
 def test_twin_critics(learner, batch, randomised):
     """Claim: of two critics the maps are the lower value in each cell; each is trained on its own loss, towards one
     target from the lower maps, and they differ from the start."""

@@ -106,6 +106,7 @@ def test_two_steps_are_learned(algo, low, high):
     assert low <= learned.value <= high
 
 
+@pytest.mark.slow
 def test_grasping_alone_fails():
     """Claim: where only a push makes a grasp possible, grasp_only never pushes, lifts nothing and expects nothing."""
     learned = learn(toys.two_step, "grasp_only", actions=800, cap=CAP)

@@ -165,7 +165,14 @@ def _peaked(key: jax.Array, frames) -> DenseMaps:
     return DenseMaps(q, 5.0 * jax.random.normal(key_logits, q.shape), jnp.broadcast_to(frames.inside, q.shape))
 
 
-@pytest.mark.parametrize(("start", "least", "most"), [("both", 0.98, 1.0), ("cells", 0.98, 1.0), ("actor", 0.0, 0.1)])
+@pytest.mark.parametrize(
+    ("start", "least", "most"),
+    [
+        ("both", 0.98, 1.0),
+        pytest.param("cells", 0.98, 1.0, marks=pytest.mark.slow),
+        pytest.param("actor", 0.0, 0.1, marks=pytest.mark.slow),
+    ],
+)
 def test_search_finds_the_highest_of_several_peaks(cfg, frames, start, least, most):
     """Claim: with the default settings, of 1,000 searches on maps of one to five peaks at least 98 % reach the highest
     value within 1 %, whatever the actor proposes; from an actor alone that knows nothing of it, hardly one does."""

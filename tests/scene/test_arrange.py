@@ -237,6 +237,7 @@ def test_too_small_a_square_is_an_error():
         arrange.arrange(jax.random.key(0), MANY, 0.4, jnp.float32(0.5))
 
 
+@pytest.mark.slow
 def test_key_decides():
     """Claim: the same key gives the same scene, alone or in a batch; another key, another scene."""
     cfg = SceneConfig(slots=("box", "arch", "cylinder"), min_blocks=3)

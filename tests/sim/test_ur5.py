@@ -149,6 +149,7 @@ def test_gripper_ends_at_the_flange():
 
 
 @pytest.mark.mjx
+@pytest.mark.slow
 def test_arm_follows_the_plan_in_mjx():
     """Claim: in MJX, too, the tips are within 3 mm of the set-point as each phase of a push ends. Only there: while an
     actuator is at its limit, MJX's implicit integrator still counts its damping, and C MuJoCo does not."""

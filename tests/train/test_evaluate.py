@@ -107,6 +107,7 @@ def test_same_seed_same_episodes(magnet, random):
     assert any(not np.array_equal(a, b) for a, b in zip(random, other, strict=True))
 
 
+@pytest.mark.slow
 def test_more_episodes_than_run_at_once(magnet, monkeypatch):
     """Claim: episodes beyond those that run side by side follow in order, each from its own scene."""
     monkeypatch.setattr(evaluate, "SIDE_BY_SIDE", 3)
@@ -115,6 +116,7 @@ def test_more_episodes_than_run_at_once(magnet, monkeypatch):
     assert np.all(episodes.completed)
 
 
+@pytest.mark.slow
 def test_learned_needs_its_networks_only(magnet):
     """Claim: the learned policy runs from parameters alone and gives consistent records."""
     learner = learning.make(CFG)

@@ -59,6 +59,7 @@ def test_target_is_the_cases_own():
     assert (_varied(CFG, "hole")[1].target == layout.ANY).all()
 
 
+@pytest.mark.slow
 def test_generated_scenes_follow_the_seed():
     """Claim: the suite `generated` is the same for the same seed, another for another, and harder towards its end."""
     first, again, other = (suites.environments(CFG, "generated", 30, seed)["generated"].scenes for seed in (0, 0, 1))
