@@ -129,6 +129,7 @@ def test_damaged_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path, comman
     assert (code, "half-written" in line) == (1, True)
 
 
+@pytest.mark.slow
 def test_scenes_that_never_settle(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, run_dir: Path
 ):

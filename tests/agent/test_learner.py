@@ -230,6 +230,7 @@ def _with_target(learner: Learner, **settings) -> Learner:
     return dataclasses.replace(learner, cfg=cfg)
 
 
+@pytest.mark.slow
 def test_next_value_lies_within_the_map(learner):
     """Claim: the softmax value is never outside of the map's values, grows with the inverse temperature, and comes near
     the largest value."""
@@ -319,12 +320,14 @@ def test_max_target_reaches_the_update(learner, state, batch, update):
     np.testing.assert_allclose(going - ended, 0.5 * np.clip(best, *learner.bounds), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_squared_loss_reaches_the_update(learner, state, batch):
     """Claim: with `squared` the loss is the mean of the squared errors, line 21."""
     info = _run(_changed(learner, "learn", loss="squared"))(state, batch)[1]
     np.testing.assert_allclose(info.critic_loss, np.mean(np.asarray(info.error) ** 2), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_hard_targets_reach_the_update(learner, state, batch):
     """Claim: with hard updates and C = 2, the targets stay after one update and are the networks after two."""
     run = _run(_changed(learner, "learn", target_update="hard", copy_every=2))

@@ -91,7 +91,7 @@ def test_bandit_is_solved(algo, value):
         pytest.param("csac", 1.2, 1.6, marks=SLOW),
         pytest.param("csac_per", 1.2, 1.6, marks=SLOW),
         pytest.param("csac_beta", 1.2, 1.6, marks=SLOW),
-        ("vpg", 0.9, 1.1),
+        pytest.param("vpg", 0.9, 1.1, marks=SLOW),
     ],
 )
 def test_two_steps_are_learned(algo, low, high):

@@ -246,6 +246,7 @@ def test_normalise_is_inverse(frames):
 
 
 @pytest.mark.optax
+@pytest.mark.slow
 def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
     """Claim: a scene turned by one frame step gives the same maps one frame on, with a random net, the actor's too; so
     the best action turns with the scene.

@@ -77,6 +77,7 @@ def test_random_grasps_land_on_blocks(cfg, frames, observations):
     assert np.mean(height > BARE) < 0.3  # it would be easy otherwise
 
 
+@pytest.mark.slow
 def test_without_exploration_it_acts_greedily(cfg, frames):
     """Claim: with no noise, random primitive nor random place, what is tried is valid and worth the best value."""
     state = _state(frames, 7)
@@ -128,6 +129,7 @@ def test_choice_of_primitive(rule, values, idle, expected):
 
 
 @pytest.mark.parametrize("idle", [0, 1])
+@pytest.mark.slow
 def test_rule_reaches_the_action(cfg, frames, idle):
     """Claim: what is done follows the rule with and without exploration, where values say the opposite."""
     own = _with(cfg, "policy", primitive="rule")

@@ -137,6 +137,7 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
     return call, wanted
 
 
+@pytest.mark.slow
 def test_every_stage_is_kerass():
     """Claim: with weights ported, every convolution, norm, dense layer and transition is Keras's within 1e-4 of the
     largest value, batch norm both with running statistics and with the batch's, which move the running ones alike."""

@@ -102,6 +102,7 @@ def test_blocks_differ_within_their_ranges(scenes: Scene):
         assert high - 0.1 * (high - low) < drawn.max() <= high
 
 
+@pytest.mark.slow
 def test_same_arguments_same_scenes(world: model.World, scenes: Scene, monkeypatch, tmp_path: Path):
     """Claim: the same arguments give the same scenes, bit for bit, settled anew or read from the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -25,6 +25,7 @@ class Still(Env):
         return state.replace(actions=state.actions + 1)
 
 
+@pytest.mark.slow
 def test_paper_has_densenet_121_twice():
     """Claim: the state of the preset `paper` can be made: a trunk each for colour and height, online and target, and a
     ring that holds all 2,500 actions."""

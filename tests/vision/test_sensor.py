@@ -115,6 +115,7 @@ def test_views_differ_from_step_to_step(view, errors):
     assert 0.0 < np.mean(off) < 0.01
 
 
+@pytest.mark.slow
 def test_orthographic_errors():
     """Claim: from above, heights err as depths do from VIEW_HEIGHT, and a dropped cell is empty."""
     env = _env(sensor=dataclasses.replace(ERRORS, depth_square=0.01))
