@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 RobotKind = Literal["hand", "ur5"]
+PhysicsKind = Literal["mjx", "warp", "c"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
@@ -94,7 +95,7 @@ class TaskConfig:
 class SimConfig:
     """Physics and the two motion primitives; one primitive is `substeps` physics steps, whatever it does."""
 
-    physics: Literal["mjx", "warp", "c"] = "mjx"
+    physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not repeatable bit for bit.
     `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
     robot: RobotKind = "hand"

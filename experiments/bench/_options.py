@@ -1,4 +1,4 @@
-"""Arguments of benchmarks: whole numbers by name."""
+"""Arguments of benchmarks: whole numbers by name, and switches."""
 
 import argparse
 from typing import NoReturn
@@ -14,12 +14,15 @@ class _Parser(argparse.ArgumentParser):
 
 
 def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
-    """The numbers given for the benchmark `name`, each at least 1; what is not given has its default."""
+    """The numbers given for the benchmark `name`, each at least 1, and its switches, whose default is False."""
     parser = _Parser(prog=f"bench {name}", allow_abbrev=False)
     for option, default in defaults.items():
-        parser.add_argument(f"--{option}", type=int, default=default)
+        if default is False:
+            parser.add_argument(f"--{option}", action="store_true")
+        else:
+            parser.add_argument(f"--{option}", type=int, default=default)
     options = vars(parser.parse_args(arguments))
     for option, value in options.items():
-        if value < 1:
+        if value < 1 and value is not False:
             parser.error(f"--{option}: must be at least 1")
     return options

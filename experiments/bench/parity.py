@@ -1,5 +1,6 @@
-"""Does MJX move blocks as C MuJoCo does? As JSON: `csac-jax bench parity [--primitives N] [--poses N]`,
-N grasps and N pushes in piles of 6 and of 10, and N poses of each shape alone.
+"""Does MJX move blocks as C MuJoCo does? As JSON: `csac-jax bench parity [--primitives N] [--poses N] [--warp]`,
+N grasps and N pushes in piles of 6 and of 10, and N poses of each shape alone. With --warp MJX on Warp, on CUDA, is
+measured in place of MJX on JAX, and meshes have their nominal size.
 
 The same settled scenes and the same actions go through both. Grasps are the planner's, which reads poses: its share of
 lifts is the ceiling that physics allows. Pushes start before a random block and go through it.
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.config import Config, SceneConfig, SlotKind
+from csac_jax.config import Config, PhysicsKind, SceneConfig, SlotKind
 from csac_jax.env import Env
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
@@ -29,14 +30,16 @@ from experiments.bench._options import read
 BATCH = 64
 STREAM = 9001  # of drops: neither training's nor an evaluation's
 PUSH_RUN_UP = 0.07  # m from the place of a push to the block's centre
-ENGINES = ("mjx", "c")
+REFERENCE = "c"
 TEN = presets.get("fast")
 
 
-def pile_config(slots: tuple[SlotKind, ...], in_play: int) -> Config:
+def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind = "mjx") -> Config:
     """Scenes of `in_play` blocks in these slots, with contacts enough for ten."""
-    scene = SceneConfig(slots=slots, min_blocks=in_play)
-    return dataclasses.replace(presets.get("quick"), scene=scene, sim=TEN.sim)
+    spread = 0.0 if physics == "warp" else SceneConfig().mesh_spread
+    scene = SceneConfig(slots=slots, min_blocks=in_play, mesh_spread=spread)
+    sim = dataclasses.replace(TEN.sim, physics=physics)
+    return dataclasses.replace(presets.get("quick"), scene=scene, sim=sim)
 
 
 def _batches(tree: Any, size: int) -> list[Any]:
@@ -45,7 +48,7 @@ def _batches(tree: Any, size: int) -> list[Any]:
 
 
 class Bench:
-    """Both engines over one world, compiled once each."""
+    """The config's engine and the reference over one world, compiled once each."""
 
     def __init__(self, cfg: Config) -> None:
         self.cfg = cfg
@@ -54,15 +57,15 @@ class Bench:
         plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
         self.oracle = jax.jit(jax.vmap(plan))
         self.push = jax.jit(jax.vmap(_push))
-        self.engines = {name: self._engine(name) for name in ENGINES}
+        self.engines = {name: self._engine(name) for name in (cfg.sim.physics, REFERENCE)}
 
-    def _engine(self, name: str):
+    def _engine(self, name: Any):
         sim = dataclasses.replace(self.cfg.sim, physics=name)
         engine = simulation.make(self.world, sim)
         return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, sim, self.cfg.heightmap)))
 
     def run(self, scenes: Scene, actions: Action) -> dict[str, Any]:
-        """What both engines make of the actions, leaves [E, ...]: ends [E, N, 3], outcomes [E], saturated [E]."""
+        """What both engines make of the actions: ends [E, N, 3], outcomes [E], saturated [E], ill [E]."""
         height = self.look(scenes)
         result = {}
         for name, engine in self.engines.items():
@@ -83,9 +86,9 @@ def _push(key: jax.Array, scene: Scene) -> Action:
     return Action(primitive=jnp.int32(Primitive.PUSH), pose=jnp.append(place, yaw))
 
 
-def piles(in_play: int, slots: tuple[SlotKind, ...], count: int) -> dict[str, Any]:
+def piles(in_play: int, slots: tuple[SlotKind, ...], count: int, physics: PhysicsKind) -> dict[str, Any]:
     """Grasps and pushes in settled piles."""
-    cfg = pile_config(slots, in_play)
+    cfg = pile_config(slots, in_play, physics)
     bench = Bench(cfg)
     settled = pool.settled(bench.world, cfg.scene, cfg.heightmap.extent, STREAM, count)
     rows = []
@@ -95,27 +98,30 @@ def piles(in_play: int, slots: tuple[SlotKind, ...], count: int) -> dict[str, An
         rows.append((scenes, bench.run(scenes, grasps), bench.run(scenes, bench.push(keys, scenes))))
     starts = np.concatenate([row[0].position for row in rows])
     grasped, pushed = (
-        {name: [np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)] for name in ENGINES}
+        {
+            name: [np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)]
+            for name in bench.engines
+        }
         for i in (1, 2)
     )
-    lifted = {name: float(np.mean(grasped[name][1] == Outcome.LIFTED)) for name in ENGINES}
+    lifted = {name: float(np.mean(grasped[name][1] == Outcome.LIFTED)) for name in bench.engines}
     return {
         "blocks": in_play,
         "grasps": len(starts),
         "oracle_lifts": lifted,
-        "grasp_outcome_equal": float(np.mean(grasped["mjx"][1] == grasped["c"][1])),
-        "pushed_block_apart_mm": _apart(starts, pushed),
-        "saturated_substeps_share": _saturated(cfg, grasped, pushed),
-        "ill": int(grasped["mjx"][3].sum() + pushed["mjx"][3].sum()),
+        "grasp_outcome_equal": float(np.mean(grasped[physics][1] == grasped[REFERENCE][1])),
+        "pushed_block_apart_mm": _apart(starts, pushed[physics], pushed[REFERENCE]),
+        "saturated_substeps_share": _saturated(cfg, grasped[physics], pushed[physics]),
+        "ill": int(grasped[physics][3].sum() + pushed[physics][3].sum()),
     }
 
 
-def _apart(starts: np.ndarray, pushed: dict[str, Any]) -> dict[str, float]:
-    """How far apart the two engines leave the block that C moved most, mm."""
-    moved = np.linalg.norm(pushed["c"][0] - starts, axis=2)
+def _apart(starts: np.ndarray, pushed: list[np.ndarray], reference: list[np.ndarray]) -> dict[str, float]:
+    """How far apart the two engines leave the block that the reference moved most, mm."""
+    moved = np.linalg.norm(reference[0] - starts, axis=2)
     slot = moved.argmax(axis=1)
     rows = np.arange(len(slot))
-    apart = 1e3 * np.linalg.norm(pushed["mjx"][0][rows, slot] - pushed["c"][0][rows, slot], axis=1)
+    apart = 1e3 * np.linalg.norm(pushed[0][rows, slot] - reference[0][rows, slot], axis=1)
     return {
         "median": float(np.median(apart)),
         "p95": float(np.percentile(apart, 95)),
@@ -124,14 +130,14 @@ def _apart(starts: np.ndarray, pushed: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _saturated(cfg: Config, *runs: dict[str, Any]) -> float:
-    return float(np.mean([run["mjx"][2].mean() for run in runs]) / cfg.sim.substeps)
+def _saturated(cfg: Config, *runs: list[np.ndarray]) -> float:
+    return float(np.mean([run[2].mean() for run in runs]) / cfg.sim.substeps)
 
 
-def shapes(poses: int) -> dict[str, Any]:
+def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
     """Grasps of a single block of every shape, as it came to rest after a fall in any orientation."""
     slots: tuple[SlotKind, ...] = ("box", "arch", "prism", "half_cylinder", "cylinder")
-    cfg = pile_config(slots, 1)
+    cfg = pile_config(slots, 1, physics)
     bench = Bench(cfg)
     each = {name: _resting(bench, cfg, name, poses) for name in blocks.SHAPES}
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each.values())
@@ -140,7 +146,7 @@ def shapes(poses: int) -> dict[str, Any]:
     runs = [bench.run(batch, bench.oracle(batch, bench.look(batch))) for batch in _batches(padded, size)]
     lifted = {
         name: np.concatenate([run[name][1] for run in runs])[:total].reshape(-1, poses) == Outcome.LIFTED
-        for name in ENGINES
+        for name in bench.engines
     }
     return {
         "poses_per_shape": poses,
@@ -178,10 +184,11 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = read("parity", arguments, primitives=512, poses=125)
+    options = read("parity", arguments, primitives=512, poses=125, warp=False)
+    physics: PhysicsKind = "warp" if options["warp"] else "mjx"
     begun = time.perf_counter()
-    result: dict[str, Any] = {"shapes": shapes(options["poses"])}
-    result["piles_of_6"] = piles(6, TEN.scene.slots[:6], options["primitives"])
-    result["piles_of_10"] = piles(10, TEN.scene.slots, options["primitives"])
+    result: dict[str, Any] = {"physics": physics, "shapes": shapes(options["poses"], physics)}
+    result["piles_of_6"] = piles(6, TEN.scene.slots[:6], options["primitives"], physics)
+    result["piles_of_10"] = piles(10, TEN.scene.slots, options["primitives"], physics)
     result["seconds"] = time.perf_counter() - begun
     print(json.dumps(result | provenance.record(), indent=2))

@@ -1,5 +1,5 @@
-"""Speed of every physics installed, as JSON: `csac-jax bench physics [--smallest E0] [--scenes E]`, from a batch of E0
-(1) scenes to one of E (64), each eight times the last.
+"""Speed of every physics, as JSON: `csac-jax bench physics [--smallest E0] [--scenes E] [--warp]`, from a batch of E0
+(1) scenes to one of E (64), each eight times the last; with --warp MJX on Warp too, on CUDA.
 
 Each is timed as an action of the environment, heights and outcomes included, beside a bare loop of the engine's own
 steps: same model, same settled scenes with their block sizes, same set-points, same batch, same process, turn by turn.
@@ -18,13 +18,12 @@ from typing import Any
 import jax
 
 from csac_jax import env as environment, presets
-from csac_jax.config import Config
+from csac_jax.config import Config, PhysicsKind
 from csac_jax.sim import oracle
 from csac_jax.train import provenance
 from experiments.bench import _bare
 from experiments.bench._options import read
 
-PHYSICS = ("c", "mjx")
 REPEATS = 5
 
 
@@ -41,7 +40,7 @@ def _turns(calls: dict[str, Callable[[], Any]]) -> dict[str, float]:
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 
-def measure(cfg: Config, name: Any, scenes: int) -> dict[str, Any]:
+def measure(cfg: Config, name: PhysicsKind, scenes: int) -> dict[str, Any]:
     """One physics and one batch."""
     cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=name))
     env = environment.make(cfg)
@@ -63,8 +62,9 @@ def measure(cfg: Config, name: Any, scenes: int) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = read("physics", arguments, smallest=1, scenes=64)
+    options = read("physics", arguments, smallest=1, scenes=64, warp=False)
+    physics: tuple[PhysicsKind, ...] = ("c", "mjx", "warp") if options["warp"] else ("c", "mjx")
     cfg = presets.get("quick")
     batches = [options["smallest"] * 8**i for i in range(8) if options["smallest"] * 8**i <= options["scenes"]]
-    rows = [measure(cfg, name, batch) for name in PHYSICS for batch in batches]
+    rows = [measure(cfg, name, batch) for name in physics for batch in batches]
     print(json.dumps({"substeps": cfg.sim.substeps, "runs": rows} | provenance.record(), indent=2))
