@@ -520,7 +520,7 @@ def _print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table("metric", "value", "95 % interval", "n", title=title)
-    for name, entry in summary.items():
+    for name, entry in {**summary, **summary.get("failures", {})}.items():
         if "value" in entry:
             shown = ("-", "-") if entry["n"] == 0 else (_percent(entry["value"]), _interval(entry))
             table.add_row(name, *shown, str(entry["n"]))
