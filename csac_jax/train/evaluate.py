@@ -34,7 +34,7 @@ def rollout(cfg: Config, env: Env, name: str, params: Params | None, episodes: i
     Args: name, one of POLICIES; params, the networks that `learned` needs; seed of the policy's and the scenes' turns.
     Episodes end as in training: table cleared, action cap, no-change cap.
     """
-    program = _cached(type(env), cfg, env.physics, env.any_yaw, name)
+    program = _program(env, name)
     size = -(-episodes // -(-episodes // SIDE_BY_SIDE))  # batches of one size: one compilation
     parts = []
     for first in range(0, episodes, size):
@@ -53,9 +53,15 @@ class _Program(NamedTuple):
     step: Callable[..., Any]  # key, numbers [E], params, states -> states, record
 
 
+def _program(env: Env, name: str) -> _Program:
+    """The program of an environment; parts of a suite that share config and physics compile once."""
+    kind: Any = type(env)
+    physics: Any = env.physics
+    return _cached(kind, env.cfg, physics, env.any_yaw, name)
+
+
 @functools.lru_cache(maxsize=2)
 def _cached(kind: Any, cfg: Config, physics: Any, any_yaw: bool, name: str) -> _Program:
-    """Of an environment of this kind, config and physics: parts of a suite that share them compile once."""
     env = kind(cfg, physics, NO_SCENES, any_yaw)
     act = _policy(cfg, env, name)
     return _Program(
