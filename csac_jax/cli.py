@@ -81,7 +81,8 @@ class EvalOptions:
     policy: Literal["learned", "random", "oracle"] = "learned"
     """What acts: the run's networks; a random place with a block under it; or one that reads the blocks' poses."""
     suite: str = "own"
-    """Scenes: own (dropped like the training's), random10, cases, generated, or a case file."""
+    """Scenes: own (dropped like the training's), random10, random30 (with --physics c on a CPU), cases, target (needs a
+    policy of that task), generated, or a case file."""
     physics: Literal["mjx", "c"] = "mjx"
     """What moves the blocks: MJX as in training, or C MuJoCo, the reference."""
     robot: Literal["hand", "ur5"] = "hand"
@@ -412,7 +413,7 @@ def _evaluate(options: EvalOptions, cfg: Config) -> dict[str, dict[str, Any]]:
     from csac_jax.train import checkpoint, evaluate, metrics, step, suites
 
     try:
-        parts = suites.environments(cfg, options.suite, options.episodes, options.seed)
+        parts = suites.environments(cfg, options.suite, options.episodes, options.seed, options.policy)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
     params = None
