@@ -11,13 +11,12 @@ import dataclasses
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import env as environment, presets
 from csac_jax.config import Config, SceneConfig, SlotKind
 from csac_jax.env import Env
-from csac_jax.scene import arrange, cases, layout, model
+from csac_jax.scene import cases, model
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation
 
@@ -72,11 +71,6 @@ def _case(cfg: Config, path: Path) -> Env:
 
 
 def _generated(cfg: Config, episodes: int, stream: int) -> Env:
-    scene = dataclasses.replace(cfg.scene, slots=PACKED, min_blocks=4)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(stream), jnp.arange(episodes))
-    levels = jnp.linspace(0.0, 1.0, episodes)
-    draw = jax.vmap(lambda key, level: arrange.arrange(key, scene, cfg.heightmap.extent, level))
-    scenes = jax.device_get(jax.jit(draw)(keys, levels))
-    if cfg.task.kind == "clear":
-        scenes = scenes.replace(target=np.full_like(scenes.target, layout.ANY))
+    scene = dataclasses.replace(cfg.scene, slots=PACKED, min_blocks=environment.LEAST_ARRANGED)
+    scenes = environment.arrangements(scene, cfg.heightmap.extent, stream, episodes)
     return _placed(cfg, scene, scenes)
