@@ -37,9 +37,10 @@ A robot learns to push and grasp in clutter.
   train PRESET       train with a preset: {", ".join(presets.PRESETS)}
                      --algo NAME: {", ".join(algorithms.ALGORITHMS)}
   train --resume DIR go on with a run that was stopped
-  eval DIR           measure what a run has learned
+  eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
   report RUN...      tables and figures of recorded runs and evaluations
+  export DIR FILE    write the policy of a run into one small file
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 
@@ -77,10 +78,10 @@ class TrainOptions:
 class EvalOptions:
     """Measures a policy in scenes that training never saw."""
 
-    run_dir: tyro.conf.Positional[Path]
-    """Folder of the run."""
+    source: tyro.conf.Positional[str]
+    """Folder of the run, a policy file, or shipped for the policy that comes with the package."""
     policy: Literal["learned", "random", "oracle"] = "learned"
-    """What acts: the run's networks; a random place with a block under it; or one that reads the blocks' poses."""
+    """What acts: the networks; a random place with a block under it; or one that reads the blocks' poses."""
     suite: str = "own"
     """Scenes: own (dropped like the training's), random10, random30 (with --physics c on a CPU), cases, target (needs a
     policy of that task), generated, or a case file."""
@@ -105,7 +106,8 @@ class PlayOptions:
     robot: Literal["hand", "ur5"] = "hand"
     """What moves the gripper: nothing, it floats; or the arm."""
     policy: str = "oracle"
-    """What acts: oracle (reads the blocks' poses), random (a random place above a block), or the folder of a run."""
+    """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped (learned, comes with
+    the package), the folder of a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
     """What moves the blocks; with mjx, the motion between two states that a video shows is still C MuJoCo's."""
     video: Path | None = None
@@ -130,6 +132,16 @@ class ReportOptions:
     """Folder to write a page with figures to, index.html; needs the extra `bench`."""
     json: Path | None = None
     """File to write the numbers to, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportOptions:
+    """Writes the policy that a run has learned, networks and config, into one file for `eval` and `play`."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    file: tyro.conf.Positional[Path]
+    """File to write, which must not exist, such as policy.safetensors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -409,10 +421,10 @@ def evaluate(arguments: list[str]) -> int:
         raise BadArgumentsError("--episodes: at least 1")
     if not 0 <= options.seed < 2**31 - 1:
         raise BadArgumentsError("--seed: must lie in 0 .. 2147483646")
-    cfg = _stored_config(options.run_dir)
-    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
+    stored, networks = _learned(options.source)
+    cfg = dataclasses.replace(stored, sim=dataclasses.replace(stored.sim, physics=options.physics, robot=options.robot))
     begun = time.time()
-    parts = _evaluate(options, cfg)
+    parts = _evaluate(options, cfg, networks)
     seconds = round(time.time() - begun, 1)
     for part, summary in parts.items():
         _print_summary(f"{options.policy} in {options.episodes} episodes of {part}, seed {options.seed}", summary)
@@ -422,21 +434,37 @@ def evaluate(arguments: list[str]) -> int:
     return 0
 
 
-def _evaluate(options: EvalOptions, cfg: Config) -> dict[str, dict[str, Any]]:
+def _learned(source: str) -> tuple[Config, Callable[[], Any]]:
+    """Config of the policy in a run's folder, in a policy file or `shipped`, and what reads its networks."""
+    from csac_jax.train import checkpoint, policy_file, step
+
+    path = policy_file.SHIPPED if source == "shipped" else Path(source)
+    try:
+        if path.is_file():
+            cfg, params = policy_file.load(path)
+            return cfg, lambda: params
+    except policy_file.PolicyFileError as error:
+        raise FailedError(str(error)) from None
+    cfg = _stored_config(path)
+
+    def read() -> Any:
+        try:
+            return checkpoint.restore(path, step.abstract_state(cfg))[0].learner.online
+        except checkpoint.CheckpointError as error:
+            raise FailedError(str(error)) from None
+
+    return cfg, read
+
+
+def _evaluate(options: EvalOptions, cfg: Config, networks: Callable[[], Any]) -> dict[str, dict[str, Any]]:
     """Metrics of every part of the suite."""
-    from csac_jax.train import checkpoint, evaluate, metrics, step, suites
+    from csac_jax.train import evaluate, metrics, suites
 
     try:
         parts = suites.environments(cfg, options.suite, options.episodes, options.seed, options.policy)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
-    params = None
-    if options.policy == "learned":
-        try:
-            state, _ = checkpoint.restore(options.run_dir, step.abstract_state(cfg))
-        except checkpoint.CheckpointError as error:
-            raise FailedError(str(error)) from None
-        params = state.learner.online
+    params = networks() if options.policy == "learned" else None
     return {
         name: metrics.summarise(evaluate.rollout(env.cfg, env, options.policy, params, options.episodes, options.seed))
         for name, env in parts.items()
@@ -455,11 +483,11 @@ def play(arguments: list[str]) -> int:
         from csac_jax.show import gl
 
         opengl = gl.choose()  # before MuJoCo is imported
-    run_dir = None if options.policy in ("oracle", "random") else Path(options.policy)
-    cfg = presets.quick() if run_dir is None else _stored_config(run_dir)
+    learned = options.policy not in ("oracle", "random")
+    cfg, networks = _learned(options.policy) if learned else (presets.quick(), None)
     cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
     begun = time.time()
-    cfg, moments = _play(options, cfg, run_dir)
+    cfg, moments = _play(options, cfg, networks)
     from csac_jax.show import play as playing
 
     print(playing.summary(moments))
@@ -492,24 +520,19 @@ def _check_play(options: PlayOptions) -> None:
             raise BadArgumentsError("--video needs an extra; run: pip install 'csac-jax[video]'")
 
 
-def _play(options: PlayOptions, cfg: Config, run_dir: Path | None) -> tuple[Config, list[Any]]:
+def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None) -> tuple[Config, list[Any]]:
     """The scene's config and the moments of the episode, each printed as it happens."""
     from csac_jax.show import play as playing
-    from csac_jax.train import checkpoint, evaluate, step, suites
+    from csac_jax.train import evaluate, suites
 
     try:
         suite = "own" if options.scene == "random" else str(_case_file(options.scene))
         (env,) = suites.environments(cfg, suite, 1, options.seed).values()
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
-    params = None
-    if run_dir is not None:
-        try:
-            params = checkpoint.restore(run_dir, step.abstract_state(cfg))[0].learner.online
-        except checkpoint.CheckpointError as error:
-            raise FailedError(str(error)) from None
+    params = None if networks is None else networks()
     moments: list[Any] = []
-    name = "learned" if run_dir is not None else options.policy
+    name = options.policy if networks is None else "learned"
     for moment in evaluate.episode(env.cfg, env, name, params, options.seed):
         moments.append(moment)
         print(playing.line(len(moments), moment), flush=True)
@@ -581,6 +604,26 @@ def report(arguments: list[str]) -> int:
         print(path)
     if options.json is not None:
         _replace_text(options.json, reporting.as_json(found))
+    return 0
+
+
+# export.
+
+
+def export(arguments: list[str]) -> int:
+    """`csac-jax export`."""
+    options = _parse(ExportOptions, arguments, f"{PROGRAM} export")
+    if options.file.suffix != ".safetensors":
+        raise BadArgumentsError(f"{options.file}: the name of a policy file ends in .safetensors")
+    if options.file.exists():
+        raise BadArgumentsError(f"{options.file} exists; give another name")
+    if not options.run_dir.is_dir():
+        raise FailedError(f"there is no folder {options.run_dir}; give the folder of a run")
+    from csac_jax.train import policy_file
+
+    cfg, networks = _learned(str(options.run_dir))
+    policy_file.save(options.file, networks(), cfg)
+    print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
     return 0
 
 
@@ -681,6 +724,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "eval": evaluate,
     "play": play,
     "report": report,
+    "export": export,
     "doctor": doctor,
     "bench": bench,
 }

@@ -43,7 +43,9 @@ class SceneConfig:
     min_blocks: int = 5
     """Fewest blocks in play in a scene; the most is the number of slots."""
     pool: int = 1024
-    """Distinct settled scenes per number of blocks that resets draw from; each is turned by a random yaw then."""
+    """Distinct scenes at rest per number of blocks that resets draw from; each is turned by a random yaw then."""
+    arranged: float = 0.0
+    """Share of those scenes that are packed arrangements of all levels (`scene.arrange`); the others are dropped."""
     size_spread: float = 0.1
     """Sizes of boxes and arches differ from nominal by up to this share, from scene to scene."""
     mesh_spread: float = 0.1
@@ -63,6 +65,7 @@ class SceneConfig:
         _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
         _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
         _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")
+        _require(0.0 <= self.arranged <= 1.0, "scene.arranged: must lie in 0 .. 1")
         for name in ("size_spread", "mesh_spread"):
             _require(0.0 <= getattr(self, name) <= 0.25, f"scene.{name}: must lie in 0 .. 0.25")
         _require(

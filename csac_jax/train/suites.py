@@ -18,13 +18,12 @@ import typing
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import env as environment, presets
 from csac_jax.config import Config, SceneConfig, SimConfig, SlotKind
 from csac_jax.env import Env
-from csac_jax.scene import arrange, cases, layout, model, pool
+from csac_jax.scene import cases, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation
 
@@ -84,7 +83,7 @@ def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN.sim) -> Config:
 
 def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config:
     """The config with these blocks in play, and actions enough to take them."""
-    scene = dataclasses.replace(cfg.scene, slots=slots, min_blocks=len(slots))
+    scene = dataclasses.replace(cfg.scene, slots=slots, min_blocks=len(slots), arranged=0.0)
     task = dataclasses.replace(cfg.task, max_actions=max(cfg.task.max_actions, len(slots) * 5 // 2))
     return dataclasses.replace(_wide(cfg, scene, sim), task=task)
 
@@ -130,11 +129,6 @@ def _cases(cfg: Config) -> dict[str, Env]:
 
 
 def _generated(cfg: Config, episodes: int, stream: int) -> Env:
-    scene = dataclasses.replace(cfg.scene, slots=PACKED, min_blocks=4)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(stream), jnp.arange(episodes))
-    levels = jnp.linspace(0.0, 1.0, episodes)
-    draw = jax.vmap(lambda key, level: arrange.arrange(key, scene, cfg.heightmap.extent, level))
-    scenes = jax.device_get(jax.jit(draw)(keys, levels))
-    if cfg.task.kind == "clear":
-        scenes = scenes.replace(target=np.full_like(scenes.target, layout.ANY))
+    scene = dataclasses.replace(cfg.scene, slots=PACKED, min_blocks=environment.LEAST_ARRANGED)
+    scenes = environment.arrangements(scene, cfg.heightmap.extent, stream, episodes)
     return _placed(cfg, scene, scenes)

@@ -99,7 +99,7 @@ def test_users_case_file(tmp_path: Path):
 @pytest.mark.parametrize(("suite", "blocks", "most"), [("random10", 10, 25), ("random30", 30, 75)])
 def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int, most: int):
     """Claim: random10 and random30 hold ten and thirty blocks of all kinds, contacts and actions enough for them, and
-    scenes of a stream that is not the training's."""
+    scenes of a stream that is not the training's; none is arranged, whatever the training's are."""
     asked = []
 
     def settled(world, cfg, extent, stream, count, poured=False):
@@ -107,7 +107,8 @@ def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int
         return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.slots))
 
     monkeypatch.setattr(pool, "settled", settled)
-    (env,) = suites.environments(CFG, suite, EPISODES, 0).values()
+    packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))
+    (env,) = suites.environments(packed, suite, EPISODES, 0).values()
     ((slots, least, stream, count, poured),) = asked
     assert (len(slots), least, count, poured) == (blocks, blocks, EPISODES, suite == "random30")
     assert set(slots) == {"box", "arch", "prism", "half_cylinder", "cylinder"}
