@@ -51,8 +51,9 @@ bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke 
 
 pictures: $(STAMP)  ## the pictures of README.md, anew
 	for shown in row:hand ridge:hand pinwheel:ur5 hole:ur5; do \
-	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --png docs/pictures/$${shown%:*}.png; \
+	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --no-views --png docs/pictures/$${shown%:*}.png; \
 	done
+	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
 
 figures: $(STAMP)  ## the figures of recorded results, anew
 	$(BIN)/python -m experiments.figures

@@ -116,6 +116,9 @@ class PlayOptions:
     """File to write a picture of the first moment to."""
     size: tuple[int, int] = (640, 480)
     """Width and height of picture and video, px, even numbers."""
+    views: bool = True
+    """Show height map and action beside the scene; of a learned policy also Q of both primitives, best over yaws, and
+    the candidates of its search."""
     seed: int = 0
     """Number that the scene and the policy's noise follow from."""
     json: Path | None = None
@@ -492,7 +495,7 @@ def play(arguments: list[str]) -> int:
 
     print(playing.summary(moments))
     if drawn:
-        stage = playing.Stage(cfg, moments[0].before, options.size, opengl)
+        stage = playing.Stage(cfg, moments[0].before, options.size, opengl, options.views)
         playing.record(stage, moments, options.png, options.video)
     last = moments[-1].after
     result = {

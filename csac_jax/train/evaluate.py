@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.agent import learner as learning, maps, policy
-from csac_jax.agent.learner import Params
+from csac_jax import geometry
+from csac_jax.agent import learner as learning, maps, policy, rewards
+from csac_jax.agent.learner import Learner, Params
 from csac_jax.config import Config
 from csac_jax.env import CHANGE_AREA, Env, State
 from csac_jax.scene.layout import Scene
@@ -70,6 +71,14 @@ def _cached(kind: Any, cfg: Config, physics: Any, any_yaw: bool, name: str) -> _
     )
 
 
+class Thought(NamedTuple):
+    """What a learned policy saw in a state. P = primitives, H W as the height map."""
+
+    q: jax.Array  # [P, H, W] largest value over the yaws; -inf where there is nothing to act on
+    candidates: jax.Array  # [P, J, 3] m, m, rad: the last poses that the cross-entropy method tried
+    best_grasp: jax.Array  # [] phi_g of CSAC eq. 16, by the critic that acts
+
+
 class Moment(NamedTuple):
     """One action of an episode; leaves of one scene, NumPy."""
 
@@ -77,28 +86,55 @@ class Moment(NamedTuple):
     action: Action
     drive: Drive  # how the robot moved
     after: State
+    reward: np.ndarray  # [] R of CSAC eq. 12 for a learned policy; else 1 where a block that was asked for was taken
+    thought: Thought | None  # of a learned policy
 
 
 def episode(cfg: Config, env: Env, name: str, params: Params | None, seed: int) -> Iterator[Moment]:
     """One episode of a policy in the first scene of the environment's pool, action by action."""
     act, numbers = _policy(cfg, env, name), jnp.zeros(1, jnp.int32)
+    learner = learning.make(cfg) if name == "learned" else None
 
     @jax.jit
     def step(key: jax.Array, params: Params, states: State):
-        action = act(_keys(key, numbers), params, states)
+        keys = _keys(key, numbers)
+        action = act(keys, params, states)
         plan = jax.vmap(lambda obs, one: primitives.plan(cfg.sim, cfg.heightmap, obs.height, one))(states.obs, action)
         drive = jax.vmap(lambda one: robot.drive(cfg.sim.robot, one))(plan)
-        return action, drive, jax.vmap(env.step)(states, action)
+        after = jax.vmap(env.step)(states, action)
+        if learner is None:
+            return action, drive, after, after.reward, None
+        thought = _think(learner, keys, params, states)
+        return action, drive, after, _rewards(learner, params, thought, action, after), thought
 
     key = jax.random.key(seed)
     first = jax.tree.map(lambda leaf: leaf[:1], env.scenes)
     states = jax.jit(lambda key: _begin(env, _keys(key, numbers), first))(jax.random.fold_in(key, 0))
     for number in range(1, cfg.task.max_actions + 1):
-        action, drive, after = step(jax.random.fold_in(key, number), params, states)
-        yield jax.tree.map(lambda leaf: np.asarray(leaf)[0], Moment(states, action, drive, after))
+        action, drive, after, reward, thought = step(jax.random.fold_in(key, number), params, states)
+        yield jax.tree.map(lambda leaf: np.asarray(leaf)[0], Moment(states, action, drive, after, reward, thought))
         states = after
         if bool(after.done[0]):
             return
+
+
+def _think(learner: Learner, keys: jax.Array, params: Params, states: State) -> Thought:
+    """What the policy `learned`, given the same keys, looks at; leaves [E, ...]."""
+    cfg, frames = learner.cfg, learner.frames
+    seen, span = learning.look(learner, params, states.obs), learner.bounds[1] - learner.bounds[0]
+    places = geometry.cell_centres(cfg.heightmap)
+    q, _ = jax.vmap(maps.best_over_yaws, (None, 0, None))(frames, seen, places)
+    candidates = jax.vmap(policy.candidates, (0, None, None, 0, None))(keys, cfg, frames, seen, span)
+    return Thought(q, candidates, jax.vmap(learning.best_grasp)(seen))
+
+
+def _rewards(learner: Learner, params: Params, thought: Thought, action: Action, after: State) -> jax.Array:
+    """What training would have paid [E]; phi by the critic that acts, where training takes the target critic."""
+    info, cfg = after.info, learner.cfg.reward
+    phi = jax.vmap(learning.best_grasp)(learning.look(learner, params, after.obs))
+    pay = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))
+    changed = info.moved > CHANGE_AREA
+    return pay(cfg, action.primitive, info.outcome, info.distance, thought.best_grasp, phi, changed)
 
 
 def _run(
