@@ -1,6 +1,6 @@
 """What a policy is measured on: environments whose scenes training never saw.
 
-`own`        scenes dropped like the training's, from another stream of random numbers.
+`own`        scenes dropped or arranged like the training's, from another stream of random numbers.
 `random10`   ten blocks of all shapes, dropped.
 `cases`      the shipped hard arrangements, one environment each, quarter turns of the case as it is.
 `generated`  ordered arrangements of all levels of difficulty, drawn anew.
@@ -35,7 +35,8 @@ def environments(cfg: Config, suite: str, episodes: int, seed: int) -> dict[str,
     if suite == "own":
         return {suite: environment.make(cfg, stream, episodes)}
     if suite == "random10":
-        scene = dataclasses.replace(cfg.scene, slots=TEN.scene.slots, min_blocks=len(TEN.scene.slots))
+        slots = TEN.scene.slots
+        scene = dataclasses.replace(cfg.scene, slots=slots, min_blocks=len(slots), arranged=0.0)
         return {suite: environment.make(_wide(cfg, scene), stream, episodes)}
     if suite == "generated":
         return {suite: _generated(cfg, episodes, stream)}
