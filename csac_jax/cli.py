@@ -39,6 +39,7 @@ A robot learns to push and grasp in clutter.
   train --resume DIR go on with a run that was stopped
   eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
+  report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
@@ -82,7 +83,8 @@ class EvalOptions:
     policy: Literal["learned", "random", "oracle"] = "learned"
     """What acts: the networks; a random place with a block under it; or one that reads the blocks' poses."""
     suite: str = "own"
-    """Scenes: own (dropped like the training's), random10, cases, generated, or a case file."""
+    """Scenes: own (dropped like the training's), random10, random30 (with --physics c on a CPU), cases, target (needs a
+    policy of that task), generated, or a case file."""
     physics: Literal["mjx", "c"] = "mjx"
     """What moves the blocks: MJX as in training, or C MuJoCo, the reference."""
     robot: Literal["hand", "ur5"] = "hand"
@@ -118,6 +120,18 @@ class PlayOptions:
     """Number that the scene and the policy's noise follow from."""
     json: Path | None = None
     """File to write the result to, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportOptions:
+    """Brings recorded runs and evaluations together, over their seeds; reads only, needs no JAX."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of runs, or of folders of runs, and files that `eval --json` wrote."""
+    out: Path | None = None
+    """Folder to write a page with figures to, index.html; needs the extra `bench`."""
+    json: Path | None = None
+    """File to write the numbers to, as JSON."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,6 +258,7 @@ def train(arguments: list[str]) -> int:
     summary = _train(options, cfg, run_dir, stop, trunk)
     result = {"run_dir": str(run_dir), **summary._asdict(), "wall_seconds": round(time.time() - begun, 1)}
     _write_json(options.json, result, cfg)
+    _write_json(run_dir / "train.json", result, cfg)  # `report` reads it
     return stop.exit_code
 
 
@@ -446,7 +461,7 @@ def _evaluate(options: EvalOptions, cfg: Config, networks: Callable[[], Any]) ->
     from csac_jax.train import evaluate, metrics, suites
 
     try:
-        parts = suites.environments(cfg, options.suite, options.episodes, options.seed)
+        parts = suites.environments(cfg, options.suite, options.episodes, options.seed, options.policy)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
     params = networks() if options.policy == "learned" else None
@@ -543,7 +558,7 @@ def _print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table("metric", "value", "95 % interval", "n", title=title)
-    for name, entry in summary.items():
+    for name, entry in {**summary, **summary.get("failures", {})}.items():
         if "value" in entry:
             shown = ("-", "-") if entry["n"] == 0 else (_percent(entry["value"]), _interval(entry))
             table.add_row(name, *shown, str(entry["n"]))
@@ -561,6 +576,35 @@ def _percent(value: float) -> str:
 
 def _interval(entry: dict[str, Any]) -> str:
     return f"{100 * entry['low']:.1f} .. {100 * entry['high']:.1f} %"
+
+
+# report.
+
+
+def report(arguments: list[str]) -> int:
+    """`csac-jax report`."""
+    options = _parse(ReportOptions, arguments, f"{PROGRAM} report")
+    if not options.runs:
+        raise BadArgumentsError("report: give at least one folder of a run, or a file of `eval --json`")
+    if options.out is not None:
+        import importlib.util
+
+        if importlib.util.find_spec("matplotlib") is None:
+            raise BadArgumentsError("--out needs an extra; run: pip install 'csac-jax[bench]'")
+    from csac_jax.show import report as reporting, results
+
+    try:
+        found = reporting.build(results.read(options.runs))
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    if not (found.curves or found.scores):
+        raise FailedError("; ".join(found.notes))
+    print(reporting.markdown(found), end="")
+    for path in reporting.write(found, options.out) if options.out is not None else ():
+        print(path)
+    if options.json is not None:
+        _replace_text(options.json, reporting.as_json(found))
+    return 0
 
 
 # export.
@@ -664,7 +708,11 @@ def _write_json(path: Path | None, result: dict[str, Any], cfg: Config | None) -
     from csac_jax.train import config_json, provenance
 
     config = {} if cfg is None else {"config": config_json.to_dict(cfg)}
-    text = json.dumps({**result, **config, **provenance.record()}, indent=2) + "\n"
+    _replace_text(path, {**result, **config, **provenance.record()})
+
+
+def _replace_text(path: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=2) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(text)
@@ -675,6 +723,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
     "eval": evaluate,
     "play": play,
+    "report": report,
     "export": export,
     "doctor": doctor,
     "bench": bench,

@@ -45,3 +45,35 @@ def test_film_of_what_the_robot_cannot_follow_is_empty(world: model.World, pushe
     still: Drive = dataclasses.replace(drive, reachable=np.array(False))
     film = c_physics.film(world, fields, scene, still)
     assert (film.qpos.shape, film.qvel.shape) == ((0, world.model.nq), (0, world.model.nv))
+
+
+def test_touches_are_those_of_every_contact(world: model.World, pushed: tuple):
+    """Claim: a hand geom touches a block where any contact of the two is deeper than 0, in either order."""
+    scene, fields, drive = pushed
+    exact = model.with_blocks(world, fields)
+    row_of_geom = np.full(world.model.ngeom, -1)
+    row_of_geom[world.hand_geoms] = np.arange(3)
+    seen = 0
+    for data in c_physics._substeps(world, exact, scene, drive):
+        wanted = np.zeros((3, len(world.slots)), bool)
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            for hand, other in (contact.geom, contact.geom[::-1]):
+                if hand in world.hand_geoms and world.slot_of_geom[other] >= 0 and contact.dist < 0.0:
+                    wanted[list(world.hand_geoms).index(hand), world.slot_of_geom[other]] = True
+        np.testing.assert_array_equal(c_physics._touching(world, row_of_geom, data), wanted)
+        seen += wanted.any()
+    assert seen > 20
+
+
+def test_nothing_to_move(world: model.World, pushed: tuple):
+    """Claim: an empty table and a drive that the robot cannot follow leave the scene as it is, with a blank trace."""
+    scene, fields, drive = pushed
+    cleared = dataclasses.replace(scene, in_play=np.zeros(len(world.slots), bool))
+    still = dataclasses.replace(drive, reachable=np.array(False))
+    for its, his in ((cleared, drive), (scene, still)):
+        pose, velocity, trace = c_physics._run(world, 109, its, fields, his)
+        np.testing.assert_array_equal(pose, np.concatenate([scene.position, scene.quaternion], axis=1))
+        np.testing.assert_array_equal(velocity, scene.velocity)
+        assert not trace.touched
+        assert trace.gap_end == 0.0
