@@ -370,8 +370,9 @@ def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Sto
     from rich.console import Console
 
     from csac_jax.show.progress import Group, Terminal
-    from csac_jax.train import checkpoint, loop, step
+    from csac_jax.train import cache, checkpoint, loop, step
 
+    cache.enable()
     with Terminal(Console()) as terminal:
         terminal.say(f"run {run_dir}")
         program = step.make(cfg)
@@ -443,8 +444,9 @@ def _learned(source: str) -> tuple[Config, Callable[[], Any]]:
 
 def _evaluate(options: EvalOptions, cfg: Config, networks: Callable[[], Any]) -> dict[str, dict[str, Any]]:
     """Metrics of every part of the suite."""
-    from csac_jax.train import evaluate, metrics, suites
+    from csac_jax.train import cache, evaluate, metrics, suites
 
+    cache.enable()
     try:
         parts = suites.environments(cfg, options.suite, options.episodes, options.seed)
     except ValueError as error:
@@ -508,8 +510,9 @@ def _check_play(options: PlayOptions) -> None:
 def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None) -> tuple[Config, list[Any]]:
     """The scene's config and the moments of the episode, each printed as it happens."""
     from csac_jax.show import play as playing
-    from csac_jax.train import evaluate, suites
+    from csac_jax.train import cache, evaluate, suites
 
+    cache.enable()
     try:
         suite = "own" if options.scene == "random" else str(_case_file(options.scene))
         (env,) = suites.environments(cfg, suite, 1, options.seed).values()
