@@ -259,7 +259,7 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
     sections = {field.name: getattr(base, field.name) for field in _sections()}
     defaults = _Train(seed=base.seed, algo=base.algo, **sections)
     options: Any = _parse(_Train, flags, f"{prog} {preset or 'PRESET'}", defaults)
-    asked = _build_config(preset or base.preset, options)
+    asked = _resolve(_build_config(preset or base.preset, options))
     if stored is not None:
         _check_resume(options, stored, asked)
     elif preset is None:
@@ -321,6 +321,15 @@ def _check_resume(options: TrainOptions, stored: Config, asked: Config) -> None:
         )
 
 
+def _resolve(cfg: Config) -> Config:
+    """The config with what `auto` stands for here."""
+    if cfg.sim.physics != "auto":
+        return cfg  # no need of JAX
+    from csac_jax.train import auto
+
+    return auto.resolve(cfg)
+
+
 def _check_physics(cfg: Config) -> None:
     if cfg.sim.physics == "c":
         raise BadArgumentsError("--sim.physics: training is one compiled program, which c is no part of; eval takes it")
@@ -366,6 +375,14 @@ def _new_run_dir(cfg: Config) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
+def _first_line(run_dir: Path, cfg: Config) -> str:
+    from csac_jax.train import provenance
+
+    scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
+    what = f"preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, physics {cfg.sim.physics}"
+    return f"run {run_dir}: {what}, on {provenance.device()}"
+
+
 def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop, trunk: Any) -> Any:
     from rich.console import Console
 
@@ -374,7 +391,7 @@ def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Sto
 
     cache.enable()
     with Terminal(Console()) as terminal:
-        terminal.say(f"run {run_dir}")
+        terminal.say(_first_line(run_dir, cfg))
         program = step.make(cfg)
         reporters: list[loop.Reporter] = [terminal]
         if options.tensorboard:
