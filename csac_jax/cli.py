@@ -277,7 +277,7 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
     sections = {field.name: getattr(base, field.name) for field in _sections()}
     defaults = _Train(seed=base.seed, algo=base.algo, **sections)
     options: Any = _parse(_Train, flags, f"{prog} {preset or 'PRESET'}", defaults)
-    asked = _build_config(preset or base.preset, options)
+    asked = _resolve(_build_config(preset or base.preset, options))
     if stored is not None:
         _check_resume(options, stored, asked)
     elif preset is None:
@@ -339,6 +339,15 @@ def _check_resume(options: TrainOptions, stored: Config, asked: Config) -> None:
         )
 
 
+def _resolve(cfg: Config) -> Config:
+    """The config with what `auto` stands for here."""
+    if cfg.sim.physics != "auto":
+        return cfg  # no need of JAX
+    from csac_jax.train import auto
+
+    return auto.resolve(cfg)
+
+
 def _check_physics(cfg: Config) -> None:
     if cfg.sim.physics == "c":
         raise BadArgumentsError("--sim.physics: training is one compiled program, which c is no part of; eval takes it")
@@ -384,14 +393,23 @@ def _new_run_dir(cfg: Config) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
+def _first_line(run_dir: Path, cfg: Config) -> str:
+    from csac_jax.train import provenance
+
+    scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
+    what = f"preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, physics {cfg.sim.physics}"
+    return f"run {run_dir}: {what}, on {provenance.device()}"
+
+
 def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop, trunk: Any) -> Any:
     from rich.console import Console
 
     from csac_jax.show.progress import Group, Terminal
-    from csac_jax.train import checkpoint, loop, step
+    from csac_jax.train import cache, checkpoint, loop, step
 
+    cache.enable()
     with Terminal(Console()) as terminal:
-        terminal.say(f"run {run_dir}")
+        terminal.say(_first_line(run_dir, cfg))
         program = step.make(cfg)
         reporters: list[loop.Reporter] = [terminal]
         if options.tensorboard:
@@ -461,8 +479,9 @@ def _learned(source: str) -> tuple[Config, Callable[[], Any]]:
 
 def _evaluate(options: EvalOptions, cfg: Config, networks: Callable[[], Any]) -> dict[str, dict[str, Any]]:
     """Metrics of every part of the suite."""
-    from csac_jax.train import evaluate, metrics, suites
+    from csac_jax.train import cache, evaluate, metrics, suites
 
+    cache.enable()
     try:
         parts = suites.environments(cfg, options.suite, options.episodes, options.seed, options.policy)
     except ValueError as error:
@@ -526,8 +545,9 @@ def _check_play(options: PlayOptions) -> None:
 def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None) -> tuple[Config, list[Any]]:
     """The scene's config and the moments of the episode, each printed as it happens."""
     from csac_jax.show import play as playing
-    from csac_jax.train import evaluate, suites
+    from csac_jax.train import cache, evaluate, suites
 
+    cache.enable()
     try:
         suite = "own" if options.scene == "random" else str(_case_file(options.scene))
         (env,) = suites.environments(cfg, suite, 1, options.seed).values()

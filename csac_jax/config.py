@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 RobotKind = Literal["hand", "ur5"]
-PhysicsKind = Literal["mjx", "warp", "c"]
+PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
@@ -100,7 +100,8 @@ class SimConfig:
 
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not repeatable bit for bit.
-    `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
+    `c`: C MuJoCo on the host's cores, the reference, for evaluation. `auto`: `warp` where it is known to be the faster
+    one and can do the scene, else `mjx`; a run's config names what was chosen."""
     robot: RobotKind = "hand"
     """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
     timestep: float = 0.004

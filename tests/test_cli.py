@@ -311,6 +311,19 @@ def test_replay_benchmark(capsys: pytest.CaptureFixture):
     assert {"device", "versions", "commit", "item", "batch", "repeats"} <= result.keys()
 
 
+def test_automatic_physics_is_resolved(tmp_path: Path):
+    """Claim: `--sim.physics auto` reaches a run as what it stands for here, and may be asked for again when the run is
+    resumed; the first line of a run says what it runs on."""
+    _, cfg = cli._read_train(["smoke", "--sim.physics", "auto", "--seed", "3"])
+    assert cfg == dataclasses.replace(SMOKE, seed=3)
+    folder = tmp_path / "runs" / "three"
+    checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []})
+    assert cli._read_train(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
+    line = cli._first_line(folder, cfg)
+    wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics mjx, on 1 x cpu (cpu)"
+    assert line == f"run {folder}: {wanted}"
+
+
 def test_default_run_dirs_do_not_collide(tmp_path: Path):
     """Claim: two runs begun in the same second get folders of their own."""
     first = cli._new_run_dir(SMOKE)

@@ -1,6 +1,6 @@
 """What a policy is measured on: environments whose scenes training never saw.
 
-`own`        scenes dropped like the training's, from another stream of random numbers.
+`own`        scenes dropped or arranged like the training's, from another stream of random numbers.
 `random10`   ten blocks of all shapes, dropped.
 `random30`   thirty, poured into a pile; on a CPU of use in C MuJoCo (`--physics c`) only, MJX takes minutes to compile.
 `cases`      the shipped hard arrangements, one environment each, quarter turns of the case as it is.
