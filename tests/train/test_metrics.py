@@ -56,7 +56,7 @@ def _episodes() -> Episodes:
         blocks=np.array([2, 2, 2], np.int32),
         completed=np.array([True, True, False]),
         left=np.array([0, 1, 0], np.int32),
-        changed=np.array([[0, 1, 1, 1], [0, 1, 0, 0], [0, 0, 0, 1]], bool),
+        changed=np.array([[0, 1, 1, 1], [0, 1, 0, 0], [0, 0, 0, 0]], bool),
         wrong=np.array([[1, 0, 0, 1], [0, 0, 1, 1], [0, 0, 1, 0]], bool),
         ending=np.array([0, 0, 1], np.int32),
     )
@@ -86,7 +86,7 @@ def test_failures_by_hand():
         "grasp_touched": (0, 7),  # the only one brought a wrong block
         "grasp_dropped": (1, 7),
         "grasp_wrong_block": (1, 7),
-        "push_no_change": (1, 2),  # that of episode 0
+        "push_no_change": (2, 2),
         "block_left": (1, 6),
         "episode_action_cap": (1, 3),
         "episode_no_change_cap": (0, 3),
