@@ -79,7 +79,7 @@ def _lines(curves: Sequence[Curve]) -> Figure:
             axes.fill_between([x for x, _ in banded], low, high, color=colour, alpha=0.2, linewidth=0)
         if curve.variant.method and algo in PAPER_TRAINING:
             axes.plot(PAPER_ACTIONS, 100 * PAPER_TRAINING[algo], "D", color=colour, markeredgecolor="black")
-    axes.plot([], [], "D", color="white", markeredgecolor="black", label="paper, after 2,500 actions")
+    axes.plot([], [], "D", color="white", markeredgecolor="black", label="paper: ten blocks, 2,500 actions")
     axes.set(xlabel="actions", ylabel="success over the last 200 grasps, %", ylim=(0, 101))
     axes.set_xlim(left=0)
     axes.grid(alpha=0.3)
