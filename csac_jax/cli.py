@@ -23,7 +23,7 @@ import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.config import Algo, Config
 from csac_jax.scene.errors import SceneError
-from csac_jax.train import stop as stopping
+from csac_jax.train import grid, stop as stopping
 
 Arguments = TypeVar("Arguments")
 
@@ -37,6 +37,8 @@ A robot learns to push and grasp in clutter.
   train PRESET       train with a preset: {", ".join(presets.PRESETS)}
                      --algo NAME: {", ".join(algorithms.ALGORITHMS)}
   train --resume DIR go on with a run that was stopped
+  sweep PRESET       train several seeds and settings side by side, in one program
+                     --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
   report RUN...      tables and figures of recorded runs and evaluations
@@ -70,6 +72,32 @@ class TrainOptions:
     """File to write the result to, as JSON."""
     seed: int = 0
     """Number that all randomness of the run follows from."""
+    algo: Algo = "csac_beta"
+    """The algorithm: it changes settings of the preset, and settings given as options win over it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepOptions:
+    """Trains several seeds, with several settings, side by side in one program; or goes on with a sweep that was
+    stopped. Every setting of a preset is an option."""
+
+    seeds: int = 4
+    """Seeds of every setting: --seed, --seed + 1, ..."""
+    vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=A,B,...: a setting, or algo, and the values it takes; once per setting, every combination is run. Items of a
+    tuple are parted by colons: replay.beta_end=1:4,1:12."""
+    run_dir: Path | None = None
+    """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
+    resume: Path | None = None
+    """Folder of a sweep to go on with, by itself: its settings are the sweep's."""
+    shard: Literal["seeds", "scenes"] = "seeds"
+    """What several devices share out: whole seeds, or the scenes and batches of each."""
+    devices: int = 1
+    """Devices to use."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+    seed: int = 0
+    """The first seed."""
     algo: Algo = "csac_beta"
     """The algorithm: it changes settings of the preset, and settings given as options win over it."""
 
@@ -196,14 +224,17 @@ def _sections() -> list[dataclasses.Field[Any]]:
     return [field for field in dataclasses.fields(Config) if dataclasses.is_dataclass(field.type)]
 
 
-# All settings and options of `train`: TrainOptions and, as groups of flags, every section of Config.
-_Train = dataclasses.make_dataclass(
-    "_Train",
-    [(field.name, field.type, field) for field in _sections()],
-    bases=(TrainOptions,),
-    frozen=True,
-    namespace={"__doc__": TrainOptions.__doc__},
-)
+def _with_settings(options: type) -> Any:
+    """A dataclass of these options and, as groups of flags, of every section of Config."""
+    fields = [(field.name, field.type, field) for field in _sections()]
+    namespace = {"__doc__": options.__doc__}
+    return dataclasses.make_dataclass(
+        f"_{options.__name__}", fields, bases=(options,), frozen=True, namespace=namespace
+    )
+
+
+_Train = _with_settings(TrainOptions)
+_Sweep = _with_settings(SweepOptions)
 
 
 def _parse(kind: type[Arguments], arguments: list[str], prog: str, default: Any = tyro.MISSING_NONPROP) -> Arguments:
@@ -388,7 +419,12 @@ def _require_tensorboard() -> None:
 
 def _new_run_dir(cfg: Config) -> Path:
     """A folder that does not exist yet."""
-    stem = RUNS / f"{cfg.preset}-{cfg.seed}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    return _new_folder(f"{cfg.preset}-{cfg.seed}")
+
+
+def _new_folder(name: str) -> Path:
+    """A folder under RUNS, with the time in its name, that does not exist yet."""
+    stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
     return next(path for path in candidates if not path.exists())
 
@@ -430,6 +466,110 @@ def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Sto
             raise BadArgumentsError(f"{run_dir} exists; give another --run-dir, or go on with it by --resume") from None
         except (loop.TrainingError, checkpoint.CheckpointError) as error:
             raise FailedError(str(error)) from None
+
+
+# sweep.
+
+
+def sweep(arguments: list[str]) -> int:
+    """`csac-jax sweep`."""
+    stop = stopping.install()
+    options, plan = _read_sweep(arguments)
+    folder = options.resume or options.run_dir or _new_folder(f"sweep-{plan.settings[0].cfg.preset}")
+    begun = time.time()
+    result = _sweep(options, plan, folder, stop)
+    times = {"compile_seconds": result.compile_seconds, "wall_seconds": round(time.time() - begun, 1)}
+    _write_json(
+        options.json, {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}, None
+    )
+    return stop.exit_code
+
+
+def _read_sweep(arguments: list[str]) -> tuple[SweepOptions, Any]:
+    """Options and plan of a sweep, from the command line or, if it is resumed, from its folder."""
+    named = bool(arguments) and not arguments[0].startswith("-")
+    preset, flags = (arguments[0], arguments[1:]) if named else ("quick", arguments)
+    options, cfg = _parse_setting(preset, flags)
+    if options.seeds < 1 or options.seed + options.seeds > 2**31:
+        raise BadArgumentsError("--seeds: at least 1, and no seed may exceed 2147483647")
+    if options.resume is not None:
+        return options, _stored_plan(options.resume, preset if named else None, options, cfg)
+    if not named:
+        raise BadArgumentsError(f"sweep: give a preset first, one of: {', '.join(presets.PRESETS)}")
+    if options.run_dir is not None and options.run_dir.exists():
+        raise BadArgumentsError(f"{options.run_dir} exists; give another --run-dir, or go on with it by --resume")
+    try:
+        combinations = grid.settings(options.vary)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    found = [(one, _parse_setting(preset, [*flags, *one.flags])[1]) for one in combinations]
+    for _, each in found:
+        _check_physics(each)
+    from csac_jax.train import sweep as sweeping
+
+    plan = sweeping.Plan(options.seeds, [sweeping.Setting(one.name, one.values, each) for one, each in found])
+    try:
+        sweeping.check(plan)
+    except (ValueError, sweeping.SweepError) as error:
+        raise BadArgumentsError(str(error)) from None
+    return options, plan
+
+
+def _parse_setting(preset: str, flags: list[str]) -> tuple[SweepOptions, Config]:
+    """Options of a sweep and the config of a setting, whose flags are the last ones."""
+    base = _preset(preset, _value_of(flags, "--algo"))
+    sections = {field.name: getattr(base, field.name) for field in _sections()}
+    options = _parse(_Sweep, flags, f"{PROGRAM} sweep {preset}", _Sweep(algo=base.algo, **sections))
+    return options, _build_config(preset, options)
+
+
+def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:
+    from csac_jax.train import sweep as sweeping
+
+    if preset or options.vary or options.run_dir or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
+        raise BadArgumentsError("sweep --resume: a sweep goes on with its own settings; leave all others out")
+    try:
+        return sweeping.read_plan(folder)
+    except sweeping.SweepError as error:
+        raise FailedError(str(error)) from None
+
+
+def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) -> Any:
+    from rich.console import Console
+
+    from csac_jax.show.progress import Terminal
+    from csac_jax.train import checkpoint, loop, members, mesh, sweep as sweeping
+
+    try:
+        line = mesh.make(options.devices)
+        for one in plan.settings:
+            mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
+            sweeping.check_memory(plan, one.cfg, 1 if line is None or options.shard == "scenes" else line.size)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    trunks = {one.cfg.net: _read_weights(one.cfg) for one in plan.settings}
+
+    def engine(group: members.Group) -> sweeping.Engine:
+        return members.engine(group, line, options.shard, trunks[group.configs[0].net])
+
+    with Terminal(Console()) as terminal:
+        terminal.say(f"sweep {folder}")
+        try:
+            result = sweeping.run(plan, folder, engine, terminal, stop, resume=options.resume is not None)
+        except FileExistsError:
+            raise BadArgumentsError(f"{folder} exists; give another --run-dir, or go on with it by --resume") from None
+        except (sweeping.SweepError, loop.TrainingError, checkpoint.CheckpointError) as error:
+            raise FailedError(str(error)) from None
+        for one in result.summary["settings"]:
+            terminal.say(f"{one['name']}: {_seeds_line(one['grasp_success'])}")
+    return result
+
+
+def _seeds_line(success: dict[str, Any]) -> str:
+    if not success["n"]:
+        return "no seed is done"
+    interval = f" (95 % interval {_interval(success)})" if success["low"] is not None else ""
+    return f"grasp success {_percent(success['value'])}{interval}, interquartile mean of {success['n']} seeds"
 
 
 # eval.
@@ -744,6 +884,7 @@ def _replace_text(path: Path, content: dict[str, Any]) -> None:
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
+    "sweep": sweep,
     "eval": evaluate,
     "play": play,
     "report": report,

@@ -75,7 +75,8 @@ def load_config(run_dir: Path) -> Config:
 def restore(run_dir: Path, abstract_state: Any, step: int | None = None) -> tuple[Any, dict[str, Any]]:
     """State and `extra` of `step` (the newest if None), as they were given to `save`.
 
-    `abstract_state` has the state's structure, shapes and dtypes, as `jax.eval_shape` gives them.
+    `abstract_state` has the state's structure, shapes and dtypes, as `jax.eval_shape` gives them. A leaf that has a
+    sharding is laid out by it, however it was when it was saved; the others go to the first device.
     """
     folder = _verified(run_dir, step)
     number = int(folder.name)
@@ -123,9 +124,10 @@ def _raw_leaves(state: Any) -> dict[str, Any]:
 
 
 def _raw_abstract(abstract_state: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    sharding = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    places = {name: leaf.sharding or one for name, leaf in _named(abstract_state)}
     raw = jax.eval_shape(_raw_leaves, abstract_state)
-    return {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding) for name, leaf in raw.items()}
+    return {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=places[name]) for name, leaf in raw.items()}
 
 
 def _with_leaves(abstract_state: Any, raw: dict[str, Any]) -> Any:

@@ -86,3 +86,11 @@ def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: 
     monkeypatch.setattr(policy_file, "SHIPPED", path)
     with pytest.raises(policy_file.PolicyFileError, match="is not the file that this version ships"):
         policy_file.load(path)
+
+
+def test_shipped_policy():
+    """Claim: the policy that comes with the package is at most 5 MB, what its digest says, and of this version."""
+    assert policy_file.SHIPPED.stat().st_size <= 5e6
+    cfg, params = policy_file.load(policy_file.SHIPPED)
+    assert (cfg.preset, cfg.task.kind, cfg.net.kind) == ("fast", "clear", "small")
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
