@@ -6,7 +6,7 @@ EPISODES ?= 50
 NAME ?= step
 JOBS ?= 2
 RUN ?= $(firstword $(shell ls -1dt runs/*/ 2>/dev/null))
-VIEWED ?= $(RUN)
+VIEWED ?= shipped
 ARGS ?=
 
 VENV := .venv
@@ -54,7 +54,7 @@ pictures: $(STAMP)  ## the pictures of README.md, anew
 	for shown in row:hand ridge:hand pinwheel:ur5 hole:ur5; do \
 	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --no-views --png docs/pictures/$${shown%:*}.png; \
 	done
-	test -z "$(VIEWED)" || $(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
+	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
 
 figures: $(STAMP)  ## the figures of recorded results, anew
 	$(BIN)/python -m experiments.figures

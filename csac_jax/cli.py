@@ -479,9 +479,9 @@ def sweep(arguments: list[str]) -> int:
     begun = time.time()
     result = _sweep(options, plan, folder, stop)
     times = {"compile_seconds": result.compile_seconds, "wall_seconds": round(time.time() - begun, 1)}
-    _write_json(
-        options.json, {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}, None
-    )
+    summary = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
+    _write_json(options.json, summary, None)
+    _write_json(folder / "train.json", summary, None)  # `report` reads it
     return stop.exit_code
 
 

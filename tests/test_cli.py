@@ -369,6 +369,7 @@ def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     result = json.loads((tmp_path / "out/result.json").read_text())
     assert (result["actions"], result["config"]["seed"], result["config"]["preset"]) == (8, 3, "smoke")
     assert {"device", "versions", "commit", "run_dir", "wall_seconds"} <= result.keys()
+    assert json.loads((tmp_path / result["run_dir"] / "train.json").read_text()) == result
 
 
 @pytest.mark.mjx

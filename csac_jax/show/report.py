@@ -252,7 +252,7 @@ def provenance(report: Report) -> Table:
                 one.record.get("device") or "-",
                 ", ".join(names) or "-",
                 str(one.record.get("commit") or "-")[:10],
-                "-" if seconds is None else f"{seconds:.0f} s",
+                "-" if seconds is None else f"{seconds:.0f} s" + (", whole sweep" if "settings" in one.record else ""),
             ]
         )
     return rows

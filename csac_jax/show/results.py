@@ -16,6 +16,7 @@ from csac_jax import algorithms, presets
 from csac_jax.train import config_json
 
 METRICS, CONFIG = "metrics.jsonl", "config.json"  # as in train/loop.py, which imports JAX
+RECORD = "train.json"  # with device, versions and commit, in the folder of a run or of a sweep
 SKIPPED = ("checkpoints", "tensorboard")
 METRIC_NAMES = (
     "grasp_success",
@@ -156,9 +157,18 @@ def _config_of(path: Path) -> tuple[Json, Json]:
     record = trained[0] if trained else {}
     if not stem:
         own = _json(path.parent / CONFIG)
-        return own, {key: value for key, value in record.items() if record["config"] == own}
+        return own, _record_of(path.parent, own)
     configs = [content["config"] for content in trained + beside if "config" in content]
     return (configs[0] if configs else {}), record
+
+
+def _record_of(folder: Path, config: Json) -> Json:
+    """What `train` or, two folders up, `sweep` wrote about the run of this folder; empty where neither did."""
+    for place in (folder, *folder.resolve().parents[1:2]):
+        record = _json(place / RECORD)
+        if record and record.get("config", config) == config:
+            return record
+    return {}
 
 
 def _evaluations(path: Path) -> list[Evaluation]:

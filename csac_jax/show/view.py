@@ -63,8 +63,8 @@ def _q_map(moment: Moment, primitive: Primitive, side: int) -> np.ndarray:
     low, high = (there.min(), there.max()) if there.size else (0.0, 1.0)
     own = every[primitive][np.isfinite(every[primitive])]
     image = canvas.enlarge(canvas.colours(_upright(every[primitive]), low, high), side, side)
-    best = f" BEST {own.max():+.2f}" if own.size else " NOWHERE"
-    canvas.write(image, (2, 2), f"Q {primitive.name}{best}", _scale(2 * side), TITLE)
+    best = f"BEST {own.max():+.2f}" if own.size else "NOWHERE"
+    canvas.write(image, (2, 2), f"{primitive.name} VALUES, {best}", _scale(2 * side), TITLE)
     return image
 
 

@@ -182,7 +182,7 @@ def test_wrap():
 def test_last_rounds_are_what_the_search_tries():
     """Claim: `last_round` gives the samples of the last round: the best of all rounds' is the result of the search."""
     score = functools.partial(peaks, jnp.array([[0.3, -0.2, 0.9]]), jnp.array([1.0]), jnp.array([0.3]))
-    mean, start = jnp.array([-0.4, 0.5, -0.7]), jnp.array([[0.2, -0.1, -0.95], [-0.5, 0.5, 0.5]])
+    mean, start = jnp.array([-0.4, 0.5, -0.7]), jnp.array([[-0.6, 0.7, -0.4], [-0.5, 0.5, -0.5]])
     key = jax.random.key(5)
     cfgs = [CEMConfig(rounds=rounds, candidates=16) for rounds in (1, 2, 3)]
     last = [lambda key, cfg=cfg: cem.last_round(key, cfg, score, mean, start, box.POSE_WRAPS) for cfg in cfgs]

@@ -201,7 +201,7 @@ def test_random_places_without_the_mask(cfg, frames):
 
 def test_candidates_are_those_of_the_search(cfg, frames):
     """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same key."""
-    one = dataclasses.replace(cfg, cem=dataclasses.replace(cfg.cem, rounds=1))
+    one = dataclasses.replace(cfg, cem=dataclasses.replace(cfg.cem, rounds=1, start="actor"))
     state, key = _state(frames, 0), jax.random.key(3)
     tried = jax.jit(lambda key: policy.candidates(key, one, frames, state, PENALTY))(key)
     assert tried.shape == (2, cfg.cem.candidates, 3)

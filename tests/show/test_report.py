@@ -55,6 +55,7 @@ def recorded(tmp_path: Path) -> Path:
     root = tmp_path / "sweep"
     _run(root / "beta" / "seed-0", _config("csac_beta", 0), [0.5, 0.8, 0.95], {"device": "a card", "commit": "abc"})
     _run(root / "beta" / "seed-1", _config("csac_beta", 1), [0.7, 0.9])
+    (root / "train.json").write_text(json.dumps({"settings": [], "wall_seconds": 99.0, "device": "two cards"}))
     _run(root / "vpg", _config("vpg", 0), [0.2, 0.3, 0.4])
     _run(root / "max", _config("csac_beta", 0, target__value="max"), [0.1, 0.2, 0.3])
     for name, algo, seed, lifted in (("beta/seed-0", "csac_beta", 0, 10), ("beta/seed-1", "csac_beta", 1, 8)):
@@ -130,7 +131,9 @@ def test_numbers_as_json(recorded: Path):
     rows = {row["file"]: row for row in content["provenance"]}
     trained = rows["seed-0/metrics.jsonl"]
     assert (trained["device"], trained["commit"], trained["wall time"]) == ("a card", "abc", "77 s")
-    assert rows["seed-1/metrics.jsonl"]["wall time"] == "30 s"
+    swept = rows["seed-1/metrics.jsonl"]
+    assert (swept["device"], swept["wall time"]) == ("two cards", "99 s, whole sweep")
+    assert rows["vpg/metrics.jsonl"]["wall time"] == "40 s"  # no record: the log's last time
     assert trained["settings as a command"] == "csac-jax train paper --algo csac_beta --seed 0"
     assert rows["max/metrics.jsonl"]["settings as a command"].endswith("--seed 0 --target.value max")
 
