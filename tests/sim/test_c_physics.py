@@ -1,6 +1,8 @@
 """C MuJoCo as the reference: what is filmed of it is what it does."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +66,19 @@ def test_touches_are_those_of_every_contact(world: model.World, pushed: tuple):
         np.testing.assert_array_equal(c_physics._touching(world, row_of_geom, data), wanted)
         seen += wanted.any()
     assert seen > 20
+
+
+def test_touches_by_hand(world: model.World):
+    """Claim: contacts count in either order, not those that are only near, nor those of hand and table or of blocks."""
+    row_of_geom = np.full(world.model.ngeom, -1)
+    row_of_geom[world.hand_geoms] = np.arange(3)
+    (palm, low, high), block, table = world.hand_geoms, world.block_geoms, world.model.geom("table").id
+    pairs = [[palm, block[0]], [block[1], low], [high, block[2]], [low, table], [block[0], block[1]]]
+    contact = SimpleNamespace(geom=np.array(pairs), dist=np.array([-1e-3, -1e-4, 1e-4, -1e-3, -1e-3]))
+    wanted = np.zeros((3, len(world.slots)), bool)
+    wanted[0, world.slot_of_geom[block[0]]] = wanted[1, world.slot_of_geom[block[1]]] = True
+    data: Any = SimpleNamespace(contact=contact)
+    np.testing.assert_array_equal(c_physics._touching(world, row_of_geom, data), wanted)
 
 
 def test_nothing_to_move(world: model.World, pushed: tuple):
