@@ -92,8 +92,17 @@ class SweepOptions:
     """Folder of a sweep to go on with, by itself: its settings are the sweep's."""
     shard: Literal["seeds", "scenes"] = "seeds"
     """What several devices share out: whole seeds, or the scenes and batches of each."""
-    devices: int = 1
-    """Devices to use."""
+    devices: int | None = None
+    """Devices to use; one if not given, and with several processes all that they have."""
+    coordinator: str | None = None
+    """ADDRESS:PORT of the first of several processes, on one host or many; all run the same command. See
+    docs/cluster.md."""
+    processes: int | None = None
+    """How many processes there are."""
+    process_id: int | None = None
+    """Number of this process, from 0."""
+    cluster: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Join the processes of a job of SLURM, Open MPI or Kubernetes: JAX finds out where they are."""
     json: Path | None = None
     """File to write the result to, as JSON."""
     seed: int = 0
@@ -492,6 +501,7 @@ def _read_sweep(arguments: list[str]) -> tuple[SweepOptions, Any]:
     options, cfg = _parse_setting(preset, flags)
     if options.seeds < 1 or options.seed + options.seeds > 2**31:
         raise BadArgumentsError("--seeds: at least 1, and no seed may exceed 2147483647")
+    _join(options)
     if options.resume is not None:
         return options, _stored_plan(options.resume, preset if named else None, options, cfg)
     if not named:
@@ -513,6 +523,21 @@ def _read_sweep(arguments: list[str]) -> tuple[SweepOptions, Any]:
     except (ValueError, sweeping.SweepError) as error:
         raise BadArgumentsError(str(error)) from None
     return options, plan
+
+
+def _join(options: SweepOptions) -> None:
+    """Joins the other processes, if there are to be several."""
+    place = (options.coordinator, options.processes, options.process_id)
+    if not options.cluster and place == (None, None, None):
+        return
+    if options.run_dir is None and options.resume is None:
+        raise BadArgumentsError("sweep: several processes need --run-dir, one folder that all of them see")
+    from csac_jax.train import cluster
+
+    try:
+        cluster.join(cluster.Place(*place))
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
 
 
 def _parse_setting(preset: str, flags: list[str]) -> tuple[SweepOptions, Config]:
@@ -538,7 +563,7 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
     from rich.console import Console
 
     from csac_jax.show.progress import Terminal
-    from csac_jax.train import checkpoint, loop, members, mesh, sweep as sweeping
+    from csac_jax.train import checkpoint, cluster, loop, members, mesh, sweep as sweeping
 
     try:
         line = mesh.make(options.devices)
@@ -552,7 +577,7 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
     def engine(group: members.Group) -> sweeping.Engine:
         return members.engine(group, line, options.shard, trunks[group.configs[0].net])
 
-    with Terminal(Console()) as terminal:
+    with Terminal(Console(quiet=not cluster.is_first())) as terminal:
         terminal.say(f"sweep {folder}")
         try:
             result = sweeping.run(plan, folder, engine, terminal, stop, resume=options.resume is not None)

@@ -54,7 +54,7 @@ def run_dir(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("trian quick", "unknown command 'trian'; choose one of: train, eval, play, export, doctor"),
+        ("trian quick", "unknown command 'trian'; choose one of: train, sweep, eval, play, report, export, doctor"),
         ("train", "give a preset first, one of: smoke, quick"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
         ("train quik", "unknown preset 'quik'; choose one of: smoke, quick"),

@@ -21,7 +21,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import LatestN
 
 from csac_jax.config import Config
-from csac_jax.train import config_json
+from csac_jax.train import cluster, config_json
 
 FOLDER = "checkpoints"
 MANIFEST = "manifest.sha256"
@@ -35,7 +35,8 @@ class CheckpointError(Exception):
 def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any]) -> Path:
     """Writes `state` (a pytree of arrays and typed keys) as `step`; returns once it is complete. The last two are kept.
 
-    Temporary folders that a killed process left are removed. `extra` is anything that JSON can hold.
+    Temporary folders that a killed process left are removed. `extra` is anything that JSON can hold. With several
+    processes all must call it.
     """
     leaves = _raw_leaves(state)
     record = {"layout": _layout(state), "extra": extra}
@@ -50,7 +51,10 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
             ),
         )
         manager.wait_until_finished()  # a failed save raises here
-    _write_manifest(folder)
+    cluster.wait(f"saved {folder}")
+    if cluster.is_first():
+        _write_manifest(folder)
+    cluster.wait(f"manifest of {folder}")
     return folder
 
 

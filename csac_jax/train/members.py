@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -19,6 +18,8 @@ from csac_jax.config import Config
 from csac_jax.train import step
 from csac_jax.train.mesh import AXIS, Shard, Spread
 from csac_jax.train.step import Program, StepMetrics, TrainState
+
+Array = np.ndarray | jax.Array
 
 NUMBERS = (
     *("cem.std", "cem.std_min", "target.gamma", "target.inverse_temperature"),
@@ -45,9 +46,9 @@ AXES = _prefix(0, None, 0)  # of a state of members
 class Members(NamedTuple):
     """What tells members apart."""
 
-    seed: jax.Array  # [S] uint32
-    numbers: dict[str, jax.Array]  # those of NUMBERS that differ, [S, ...] float32
-    bounds: tuple[jax.Array, jax.Array] | None  # smallest and largest possible return, [S]; None if no number differs
+    seed: Array  # [S] uint32
+    numbers: dict[str, Array]  # those of NUMBERS that differ, [S, ...] float32
+    bounds: tuple[Array, Array] | None  # smallest and largest possible return, [S]; None if no number differs
 
 
 class Engine(NamedTuple):
@@ -98,13 +99,17 @@ def with_numbers(cfg: Config, values: dict[str, Any]) -> Config:
 
 
 def members(given: Group) -> Members:
-    """What tells the members of a group apart, as arrays. Bounds of returns are found here, from plain numbers."""
-    seed = jnp.asarray([cfg.seed for cfg in given.configs], jnp.uint32)
-    numbers = {name: jnp.asarray([number(cfg, name) for cfg in given.configs], jnp.float32) for name in given.numbers}
+    """What tells the members of a group apart. Arrays of NumPy: every process of a cluster brings its own along.
+
+    Bounds of returns are found here, from plain numbers.
+    """
+    seed = np.array([cfg.seed for cfg in given.configs], np.uint32)
+    numbers: dict[str, Array] = {}
+    numbers |= {name: np.array([number(cfg, name) for cfg in given.configs], np.float32) for name in given.numbers}
     if not numbers:
         return Members(seed, {}, None)
     low, high = np.array([rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in given.configs], np.float32).T
-    return Members(seed, numbers, (jnp.asarray(low), jnp.asarray(high)))
+    return Members(seed, numbers, (low, high))
 
 
 def _lifted(program: Program, member: Members) -> Program:
@@ -200,5 +205,5 @@ def engine(given: Group, mesh: Mesh | None = None, shard: Shard = "seeds", trunk
         init=begin,
         abstract=lambda: abstract(program, each, mesh, shard),
         chunk=lambda num_steps: compile_chunk(program, each, num_steps, mesh, shard),
-        member=member,
+        member=member if mesh is None else jax.jit(member, out_shardings=NamedSharding(mesh, PartitionSpec())),
     )

@@ -42,12 +42,17 @@ ALONE = Spread()
 
 
 def make(devices: int | None) -> Mesh | None:
-    """A line of the first `devices` devices; all that there are if None; no mesh for one alone.
+    """A line of the first `devices` devices of all processes; no mesh for one alone.
 
-    Raises ValueError if there are fewer.
+    If None, one, or with several processes all that there are. Raises ValueError if there are fewer, or if a process
+    were left without one.
     """
-    found = jax.devices()
-    wanted = len(found) if devices is None else devices
+    found, alone = jax.devices(), jax.process_count() == 1
+    wanted = devices
+    if wanted is None:
+        wanted = 1 if alone else len(found)
+    if not alone and wanted != len(found):
+        raise ValueError(f"--devices: {wanted} asked for; leave it out: several processes use all {len(found)}")
     if not 1 <= wanted <= len(found):
         raise ValueError(
             f"--devices: {wanted} asked for, there are {len(found)} ({found[0].platform}); give 1 .. {len(found)}"

@@ -14,6 +14,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +26,7 @@ import numpy as np
 
 from csac_jax.config import Config
 from csac_jax.replay import ring
-from csac_jax.train import checkpoint, config_json, loop, memory, step as training
+from csac_jax.train import checkpoint, cluster, config_json, loop, memory, step as training
 from csac_jax.train.members import Engine, Group, group
 from csac_jax.train.stop import Stop
 from csac_jax.train.summary import interquartile_mean
@@ -89,18 +90,20 @@ def run(
     Args: folder, made unless `resume`; engine, gives the program of a group, once per group that is not done.
     Raises SweepError if a chunk is left that no member can go on with, CheckpointError if a checkpoint is damaged.
     """
-    if not resume:
+    cluster.wait("sweep")  # all have looked whether there is such a folder
+    if not resume and cluster.is_first():
         folder.mkdir(parents=True)
-        loop.replace_file(folder / PLAN, json.dumps(_plan_to_dict(plan), indent=2) + "\n")
+        loop.replace_file(folder / PLAN, plan_text(plan))
     sweep = _Sweep(plan, folder, reporter, stop)
     compiled = []
     for index, (given, each) in enumerate(sweep.groups):
-        if stop.signal is None and not (sweep.group_folder(index) / DONE).exists():
+        if not sweep.stopping() and not (sweep.group_folder(index) / DONE).exists():
             compiled += sweep.run_group(index, given, each, engine(given))
     summary = summarise(plan, folder)
-    loop.replace_file(folder / SUMMARY, json.dumps(summary, indent=2) + "\n")
-    reporter.say(_ending(folder, stop))
-    return Result(summary, compiled, stop.signal)
+    if cluster.is_first():
+        loop.replace_file(folder / SUMMARY, json.dumps(summary, indent=2) + "\n")
+    reporter.say(_ending(folder, sweep.stopped))
+    return Result(summary, compiled, sweep.stopped)
 
 
 def read_plan(folder: Path) -> Plan:
@@ -117,11 +120,12 @@ def read_plan(folder: Path) -> Plan:
         raise SweepError(f"{folder / PLAN} cannot be read ({error}); begin a new sweep") from None
 
 
-def _plan_to_dict(plan: Plan) -> dict[str, Any]:
+def plan_text(plan: Plan) -> str:
+    """What `read_plan` reads, as JSON."""
     settings = [
         {"name": one.name, "values": one.values, "config": config_json.to_dict(one.cfg)} for one in plan.settings
     ]
-    return {"seeds": plan.seeds, "settings": settings}
+    return json.dumps({"seeds": plan.seeds, "settings": settings}, indent=2) + "\n"
 
 
 def members_of(plan: Plan) -> list[Member]:
@@ -168,7 +172,13 @@ class _Sweep:
     def __init__(self, plan: Plan, folder: Path, reporter: loop.Reporter, stop: Stop) -> None:
         self.folder, self.reporter, self.stop = folder, reporter, stop
         self.groups = groups_of(plan)
+        self.stopped: int | None = None  # number of the signal that all processes know of
         self._total = sum(_actions(given.configs) for given, _ in self.groups)
+
+    def stopping(self) -> bool:
+        """Whether a signal has come to any process. All must ask at once."""
+        self.stopped = cluster.agree(self.stop.signal)
+        return self.stopped is not None
 
     def group_folder(self, index: int) -> Path:
         return self.folder / "groups" / str(index)
@@ -181,7 +191,7 @@ class _Sweep:
         compiled: list[float] = []
         chunk = None
         with self._logs(each) as logs:
-            while step < loop.total_steps(cfg) and self.stop.signal is None:
+            while step < loop.total_steps(cfg) and not self.stopping():
                 if all(one.failed is not None for one in progress):
                     break
                 if chunk is None:
@@ -197,7 +207,7 @@ class _Sweep:
                     _save(folder, step, state, cfg, progress)
         if checkpoint.latest_step(folder) != step:
             _save(folder, step, state, cfg, progress)
-        if self.stop.signal is None:
+        if self.stopped is None:
             self._finish(folder, step, each, engine, state, progress)
         return compiled
 
@@ -209,11 +219,12 @@ class _Sweep:
             state, extra = checkpoint.restore(folder, engine.abstract())
             progress = [Progress(loop.Progress(*run), failed) for run, failed in extra["members"]]
             step = int(state.step)
-        for one in each:
-            path = member_folder(self.folder, one)
-            path.mkdir(parents=True, exist_ok=True)
-            loop.replace_file(path / loop.CONFIG, json.dumps(config_json.to_dict(one.cfg), indent=2) + "\n")
-            loop.truncate_log(path / loop.METRICS, step)
+        if cluster.is_first():
+            for one in each:
+                path = member_folder(self.folder, one)
+                path.mkdir(parents=True, exist_ok=True)
+                loop.replace_file(path / loop.CONFIG, json.dumps(config_json.to_dict(one.cfg), indent=2) + "\n")
+                loop.truncate_log(path / loop.METRICS, step)
         return state, progress, step
 
     def _title(self, index: int, each: list[Member], step: int) -> str:
@@ -225,7 +236,8 @@ class _Sweep:
     @contextlib.contextmanager
     def _logs(self, each: list[Member]) -> Iterator[list[TextIO]]:
         with contextlib.ExitStack() as stack:
-            yield [stack.enter_context((member_folder(self.folder, one) / loop.METRICS).open("a")) for one in each]
+            paths = [member_folder(self.folder, one) / loop.METRICS for one in each]
+            yield [stack.enter_context(open(path if cluster.is_first() else os.devnull, "a")) for path in paths]
 
     def _log(
         self,
@@ -277,10 +289,18 @@ class _Sweep:
         for i, (one, given) in enumerate(zip(each, progress, strict=True)):
             if given.failed is None:
                 path = member_folder(self.folder, one)
-                shutil.rmtree(path / checkpoint.FOLDER, ignore_errors=True)
+                _remove(path / checkpoint.FOLDER)
                 checkpoint.save(path, step, engine.member(state, i), one.cfg, given.run._asdict())
-        loop.replace_file(folder / DONE, "")
-        shutil.rmtree(folder / checkpoint.FOLDER)
+        if cluster.is_first():
+            loop.replace_file(folder / DONE, "")
+        _remove(folder / checkpoint.FOLDER)
+
+
+def _remove(folder: Path) -> None:
+    """Removes a folder, once, and returns when it is gone for all processes."""
+    if cluster.is_first():
+        shutil.rmtree(folder, ignore_errors=True)
+    cluster.wait(f"removed {folder}")
 
 
 def _actions(configs: Sequence[Config]) -> int:
@@ -296,8 +316,8 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return math.fsum(known) / len(known) if known else None
 
 
-def _ending(folder: Path, stop: Stop) -> str:
-    if stop.signal is None:
+def _ending(folder: Path, stopped: int | None) -> str:
+    if stopped is None:
         return f"done; saved in {folder}, results in {folder / SUMMARY}"
     return f"stopped and saved; go on with: csac-jax sweep --resume {folder}"
 

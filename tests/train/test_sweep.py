@@ -166,7 +166,7 @@ def test_stopped_sweep_ends_like_the_uninterrupted(moment: int, uninterrupted, t
     again = sweep.run(sweep.read_plan(folder), folder, engines, Listener(), Stop(), resume=True)
     assert again.stopped_by is None
     assert again.summary == uninterrupted[3].summary
-    assert len(engines.groups) == (1 if moment > CHUNKS else 2)
+    assert len(engines.groups) == (1 if moment >= CHUNKS else 2)
     assert _final(folder) == _final(uninterrupted[0])
     engines = Engines()
     sweep.run(PLAN, folder, engines, Listener(), Stop(), resume=True)

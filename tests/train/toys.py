@@ -1,5 +1,6 @@
 """A training step that is small, compiles fast and yet calls what every number of a config enters."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,12 +12,13 @@ from csac_jax.agent import cem, explore, learner as learning, losses, rewards, s
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
 from csac_jax.replay import samplers
-from csac_jax.train.members import with_numbers
 from csac_jax.train.step import Program, StepMetrics, TrainState
 
 SMOKE = presets.smoke()
 SCENES = 8
-CFG = with_numbers(SMOKE, {"train.scenes": SCENES, "train.actions": 12 * SCENES, "learn.batch": 8, "train.warmup": 8})
+CFG = dataclasses.replace(
+    SMOKE, train=dataclasses.replace(SMOKE.train, scenes=SCENES, actions=12 * SCENES)
+)  # 12 steps, 3 chunks
 
 
 def program(cfg: Config = CFG) -> Program:
