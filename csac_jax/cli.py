@@ -186,7 +186,9 @@ class ExportOptions:
 
 @dataclasses.dataclass(frozen=True)
 class DoctorOptions:
-    """Prints versions, devices and the protections in force, and checks that this machine computes right."""
+    """Prints versions, devices and the protections in force, and checks that this machine computes right.
+
+    With --preset PRESET, and settings of it as for `train`, also the memory that such a run will take."""
 
     json: Path | None = None
     """File to write the result to, as JSON."""
@@ -402,7 +404,7 @@ def _check_memory(cfg: Config) -> None:
     from csac_jax.train import memory
 
     try:
-        memory.check_replay(cfg)
+        memory.check(cfg)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
 
@@ -820,7 +822,9 @@ def export(arguments: list[str]) -> int:
 
 def doctor(arguments: list[str]) -> int:
     """`csac-jax doctor`."""
-    options = _parse(DoctorOptions, arguments, f"{PROGRAM} doctor")
+    own, cfg = _split_doctor(arguments)
+    options = _parse(DoctorOptions, own, f"{PROGRAM} doctor")
+    needs = {} if cfg is None else _print_memory(cfg)
     with _watchdog(90.0, "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8 and try again"):
         from csac_jax import _guard
         from csac_jax.train import provenance, selftest
@@ -845,11 +849,44 @@ def doctor(arguments: list[str]) -> int:
     pool = {"variable": variable, "threads": threads, "guarded": guarded}
     tests = [{**check._asdict(), "passed": check.passed} for check in checks]
     guard = {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", "")}
-    _write_json(options.json, {**guard, "self_test": tests}, None)
+    _write_json(options.json, {**guard, "self_test": tests, **needs}, cfg)
     failed = [check.name for check in checks if not check.passed]
     if failed:
         raise FailedError(f"self-test failed: {'; '.join(failed)}; do not trust results of these versions here")
     return 0
+
+
+def _split_doctor(arguments: list[str]) -> tuple[list[str], Config | None]:
+    """The arguments of `doctor` itself, and the config that the others ask for, if a preset is among them."""
+    preset = _value_of(arguments, "--preset")
+    if {"-h", "--help"} & set(arguments):
+        return ["--help"], None
+    if preset is None:
+        if "--preset" in arguments:
+            raise BadArgumentsError(f"doctor: give a preset after --preset, one of: {', '.join(presets.PRESETS)}")
+        return arguments, None
+    own: list[str] = []
+    others: list[str] = []
+    group: list[str] = []  # where an option and its values go
+    for word in arguments:
+        if word.startswith("--"):
+            name = word.split("=")[0]
+            group = {"--json": own, "--preset": []}.get(name, others)
+        group.append(word)
+    return own, _read_train([preset, *others])[1]
+
+
+def _print_memory(cfg: Config) -> dict[str, Any]:
+    """Prints what a run will hold in memory; returns it for the JSON."""
+    from csac_jax.train import memory
+
+    parts, available = memory.predict(cfg), memory.limit()
+    total = sum(parts.values())
+    listed = ", ".join(f"{name} {size / memory.GIB:.2f}" for name, size in parts.items())
+    print(f"memory     {total / memory.GIB:.2f} GiB of {available / memory.GIB:.1f} for {cfg.preset}: {listed}")
+    stages = memory.stages(cfg)
+    print(f"           step: {', '.join(f'{name} {size / memory.GIB:.2f}' for name, size in stages.items())}")
+    return {"memory": {"bytes": parts, "step_bytes": stages, "limit_bytes": available}}
 
 
 # bench.
