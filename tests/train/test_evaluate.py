@@ -115,6 +115,10 @@ def test_same_seed_same_episodes(magnet, random):
 
 def test_batches_do_not_matter(magnet, random, monkeypatch):
     """Claim: what an episode draws does not depend on how many run side by side, nor on one left over."""
+    begin, key = evaluate._program(magnet, "random").begin, jax.random.key(0)
+    rows = [jax.tree.map(lambda leaf, some=some: leaf[some], magnet.scenes) for some in (slice(0, 5), slice(3, 5))]
+    whole, part = begin(key, jnp.arange(5), rows[0]), begin(key, jnp.arange(3, 5), rows[1])
+    np.testing.assert_allclose(whole.scene.position[3:], part.scene.position, atol=1e-6)
     monkeypatch.setattr(evaluate, "SIDE_BY_SIDE", 3)
     for together, apart in zip(random, evaluate.rollout(CFG, magnet, "random", None, EPISODES, 0), strict=True):
         np.testing.assert_array_equal(together, apart)
