@@ -1,14 +1,17 @@
 """`csac-jax sweep`: bad input is one line, exit code 2 and nothing started; settings reach their configs."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
 
 from csac_jax import algorithms, cli, presets
-from csac_jax.train import sweep
+from csac_jax.train import step, stop, sweep
+from tests.train import toys
 
 SMOKE = presets.smoke()
+RUN = sweep.run
 
 
 @pytest.fixture(autouse=True)
@@ -86,3 +89,27 @@ def test_plan_survives_its_file(tmp_path: Path):
     _, plan = cli._read_sweep(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
     (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
     assert cli._read_sweep(["--resume", str(tmp_path)])[1] == plan
+
+
+@pytest.mark.optax
+def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a sweep that is stopped by a signal exits with 130 or 143 and says how to go on; resumed, it ends with 0
+    and its results. A small step stands in for the learner's."""
+    monkeypatch.setattr(sweep, "run", RUN)
+    for name, toy in (("make", toys.program), ("begin", toys.begin), ("train_step", toys.train_step)):
+        monkeypatch.setattr(step, name, toy)
+    for number in (2, 15):
+        stopped = stop.Stop()
+        stopped.signal = number
+        monkeypatch.setattr(cli.stopping, "install", lambda stopped=stopped: stopped)
+        first = ["smoke", "--seeds", "2", "--run-dir", "run"] if number == 2 else ["--resume", "run"]
+        assert cli.main(["sweep", *first]) == 128 + number
+        assert "go on with: csac-jax sweep --resume run" in capsys.readouterr().out
+    monkeypatch.setattr(cli.stopping, "install", stop.Stop)
+    assert cli.main(["sweep", "--resume", "run", "--json", "out.json"]) == 0
+    assert "interquartile mean of 2 seeds" in capsys.readouterr().out
+    result = json.loads(Path("out.json").read_text())
+    assert result["complete"]
+    assert len(result["compile_seconds"]) == 1
+    assert [row["run_dir"] for row in result["settings"][0]["members"]] == ["base/seed-0", "base/seed-1"]
+    assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2

@@ -276,7 +276,7 @@ class _Sweep:
             actions=done,
             actions_per_second=speed,
             grasp_success=_mean([record.grasp_success for record in records]),
-            grasps_counted=min(record.grasps_counted for record in records),
+            grasps_counted=sum(record.grasps_counted for record in records),
             critic_loss=_mean([record.critic_loss for record in records]),
             actor_loss=_mean([record.actor_loss for record in records]),
         )
