@@ -39,8 +39,10 @@ A robot learns to push and grasp in clutter.
   train --resume DIR go on with a run that was stopped
   sweep PRESET       train several seeds and settings side by side, in one program
                      --seeds N, --vary NAME=A,B
-  eval DIR           measure what a run has learned
+  eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
+  report RUN...      tables and figures of recorded runs and evaluations
+  export DIR FILE    write the policy of a run into one small file
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 
@@ -113,12 +115,13 @@ class SweepOptions:
 class EvalOptions:
     """Measures a policy in scenes that training never saw."""
 
-    run_dir: tyro.conf.Positional[Path]
-    """Folder of the run."""
+    source: tyro.conf.Positional[str]
+    """Folder of the run, a policy file, or shipped for the policy that comes with the package."""
     policy: Literal["learned", "random", "oracle"] = "learned"
-    """What acts: the run's networks; a random place with a block under it; or one that reads the blocks' poses."""
+    """What acts: the networks; a random place with a block under it; or one that reads the blocks' poses."""
     suite: str = "own"
-    """Scenes: own (dropped like the training's), random10, cases, generated, or a case file."""
+    """Scenes: own (dropped like the training's), random10, random30 (with --physics c on a CPU), cases, target (needs a
+    policy of that task), generated, or a case file."""
     physics: Literal["mjx", "c"] = "mjx"
     """What moves the blocks: MJX as in training, or C MuJoCo, the reference."""
     robot: Literal["hand", "ur5"] = "hand"
@@ -140,7 +143,8 @@ class PlayOptions:
     robot: Literal["hand", "ur5"] = "hand"
     """What moves the gripper: nothing, it floats; or the arm."""
     policy: str = "oracle"
-    """What acts: oracle (reads the blocks' poses), random (a random place above a block), or the folder of a run."""
+    """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped (learned, comes with
+    the package), the folder of a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
     """What moves the blocks; with mjx, the motion between two states that a video shows is still C MuJoCo's."""
     video: Path | None = None
@@ -149,6 +153,9 @@ class PlayOptions:
     """File to write a picture of the first moment to."""
     size: tuple[int, int] = (640, 480)
     """Width and height of picture and video, px, even numbers."""
+    views: bool = True
+    """Show height map and action beside the scene; of a learned policy also Q of both primitives, best over yaws, and
+    the candidates of its search."""
     seed: int = 0
     """Number that the scene and the policy's noise follow from."""
     json: Path | None = None
@@ -156,8 +163,32 @@ class PlayOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class ReportOptions:
+    """Brings recorded runs and evaluations together, over their seeds; reads only, needs no JAX."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of runs, or of folders of runs, and files that `eval --json` wrote."""
+    out: Path | None = None
+    """Folder to write a page with figures to, index.html; needs the extra `bench`."""
+    json: Path | None = None
+    """File to write the numbers to, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportOptions:
+    """Writes the policy that a run has learned, networks and config, into one file for `eval` and `play`."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    file: tyro.conf.Positional[Path]
+    """File to write, which must not exist, such as policy.safetensors."""
+
+
+@dataclasses.dataclass(frozen=True)
 class DoctorOptions:
-    """Prints versions, devices and the protections in force, and checks that this machine computes right."""
+    """Prints versions, devices and the protections in force, and checks that this machine computes right.
+
+    With --preset PRESET, and settings of it as for `train`, also the memory that such a run will take."""
 
     json: Path | None = None
     """File to write the result to, as JSON."""
@@ -272,6 +303,7 @@ def train(arguments: list[str]) -> int:
     summary = _train(options, cfg, run_dir, stop, trunk)
     result = {"run_dir": str(run_dir), **summary._asdict(), "wall_seconds": round(time.time() - begun, 1)}
     _write_json(options.json, result, cfg)
+    _write_json(run_dir / "train.json", result, cfg)  # `report` reads it
     return stop.exit_code
 
 
@@ -287,7 +319,7 @@ def _read_train(arguments: list[str]) -> tuple[TrainOptions, Config]:
     sections = {field.name: getattr(base, field.name) for field in _sections()}
     defaults = _Train(seed=base.seed, algo=base.algo, **sections)
     options: Any = _parse(_Train, flags, f"{prog} {preset or 'PRESET'}", defaults)
-    asked = _build_config(preset or base.preset, options)
+    asked = _resolve(_build_config(preset or base.preset, options))
     if stored is not None:
         _check_resume(options, stored, asked)
     elif preset is None:
@@ -349,6 +381,15 @@ def _check_resume(options: TrainOptions, stored: Config, asked: Config) -> None:
         )
 
 
+def _resolve(cfg: Config) -> Config:
+    """The config with what `auto` stands for here."""
+    if cfg.sim.physics != "auto":
+        return cfg  # no need of JAX
+    from csac_jax.train import auto
+
+    return auto.resolve(cfg)
+
+
 def _check_physics(cfg: Config) -> None:
     if cfg.sim.physics == "c":
         raise BadArgumentsError("--sim.physics: training is one compiled program, which c is no part of; eval takes it")
@@ -363,7 +404,7 @@ def _check_memory(cfg: Config) -> None:
     from csac_jax.train import memory
 
     try:
-        memory.check_replay(cfg)
+        memory.check(cfg)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
 
@@ -399,14 +440,23 @@ def _new_folder(name: str) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
+def _first_line(run_dir: Path, cfg: Config) -> str:
+    from csac_jax.train import provenance
+
+    scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
+    what = f"preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, physics {cfg.sim.physics}"
+    return f"run {run_dir}: {what}, on {provenance.device()}"
+
+
 def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Stop, trunk: Any) -> Any:
     from rich.console import Console
 
     from csac_jax.show.progress import Group, Terminal
-    from csac_jax.train import checkpoint, loop, step
+    from csac_jax.train import cache, checkpoint, loop, step
 
+    cache.enable()
     with Terminal(Console()) as terminal:
-        terminal.say(f"run {run_dir}")
+        terminal.say(_first_line(run_dir, cfg))
         program = step.make(cfg)
         reporters: list[loop.Reporter] = [terminal]
         if options.tensorboard:
@@ -440,9 +490,9 @@ def sweep(arguments: list[str]) -> int:
     begun = time.time()
     result = _sweep(options, plan, folder, stop)
     times = {"compile_seconds": result.compile_seconds, "wall_seconds": round(time.time() - begun, 1)}
-    _write_json(
-        options.json, {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}, None
-    )
+    summary = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
+    _write_json(options.json, summary, None)
+    _write_json(folder / "train.json", summary, None)  # `report` reads it
     return stop.exit_code
 
 
@@ -559,10 +609,10 @@ def evaluate(arguments: list[str]) -> int:
         raise BadArgumentsError("--episodes: at least 1")
     if not 0 <= options.seed < 2**31 - 1:
         raise BadArgumentsError("--seed: must lie in 0 .. 2147483646")
-    cfg = _stored_config(options.run_dir)
-    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
+    stored, networks = _learned(options.source)
+    cfg = dataclasses.replace(stored, sim=dataclasses.replace(stored.sim, physics=options.physics, robot=options.robot))
     begun = time.time()
-    parts = _evaluate(options, cfg)
+    parts = _evaluate(options, cfg, networks)
     seconds = round(time.time() - begun, 1)
     for part, summary in parts.items():
         _print_summary(f"{options.policy} in {options.episodes} episodes of {part}, seed {options.seed}", summary)
@@ -572,21 +622,38 @@ def evaluate(arguments: list[str]) -> int:
     return 0
 
 
-def _evaluate(options: EvalOptions, cfg: Config) -> dict[str, dict[str, Any]]:
-    """Metrics of every part of the suite."""
-    from csac_jax.train import checkpoint, evaluate, metrics, step, suites
+def _learned(source: str) -> tuple[Config, Callable[[], Any]]:
+    """Config of the policy in a run's folder, in a policy file or `shipped`, and what reads its networks."""
+    from csac_jax.train import checkpoint, policy_file, step
 
+    path = policy_file.SHIPPED if source == "shipped" else Path(source)
     try:
-        parts = suites.environments(cfg, options.suite, options.episodes, options.seed)
-    except ValueError as error:
-        raise BadArgumentsError(str(error)) from None
-    params = None
-    if options.policy == "learned":
+        if path.is_file():
+            cfg, params = policy_file.load(path)
+            return cfg, lambda: params
+    except policy_file.PolicyFileError as error:
+        raise FailedError(str(error)) from None
+    cfg = _stored_config(path)
+
+    def read() -> Any:
         try:
-            state, _ = checkpoint.restore(options.run_dir, step.abstract_state(cfg))
+            return checkpoint.restore(path, step.abstract_state(cfg))[0].learner.online
         except checkpoint.CheckpointError as error:
             raise FailedError(str(error)) from None
-        params = state.learner.online
+
+    return cfg, read
+
+
+def _evaluate(options: EvalOptions, cfg: Config, networks: Callable[[], Any]) -> dict[str, dict[str, Any]]:
+    """Metrics of every part of the suite."""
+    from csac_jax.train import cache, evaluate, metrics, suites
+
+    cache.enable()
+    try:
+        parts = suites.environments(cfg, options.suite, options.episodes, options.seed, options.policy)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    params = networks() if options.policy == "learned" else None
     return {
         name: metrics.summarise(evaluate.rollout(env.cfg, env, options.policy, params, options.episodes, options.seed))
         for name, env in parts.items()
@@ -605,16 +672,16 @@ def play(arguments: list[str]) -> int:
         from csac_jax.show import gl
 
         opengl = gl.choose()  # before MuJoCo is imported
-    run_dir = None if options.policy in ("oracle", "random") else Path(options.policy)
-    cfg = presets.quick() if run_dir is None else _stored_config(run_dir)
+    learned = options.policy not in ("oracle", "random")
+    cfg, networks = _learned(options.policy) if learned else (presets.quick(), None)
     cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
     begun = time.time()
-    cfg, moments = _play(options, cfg, run_dir)
+    cfg, moments = _play(options, cfg, networks)
     from csac_jax.show import play as playing
 
     print(playing.summary(moments))
     if drawn:
-        stage = playing.Stage(cfg, moments[0].before, options.size, opengl)
+        stage = playing.Stage(cfg, moments[0].before, options.size, opengl, options.views)
         playing.record(stage, moments, options.png, options.video)
     last = moments[-1].after
     result = {
@@ -642,24 +709,20 @@ def _check_play(options: PlayOptions) -> None:
             raise BadArgumentsError("--video needs an extra; run: pip install 'csac-jax[video]'")
 
 
-def _play(options: PlayOptions, cfg: Config, run_dir: Path | None) -> tuple[Config, list[Any]]:
+def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None) -> tuple[Config, list[Any]]:
     """The scene's config and the moments of the episode, each printed as it happens."""
     from csac_jax.show import play as playing
-    from csac_jax.train import checkpoint, evaluate, step, suites
+    from csac_jax.train import cache, evaluate, suites
 
+    cache.enable()
     try:
         suite = "own" if options.scene == "random" else str(_case_file(options.scene))
         (env,) = suites.environments(cfg, suite, 1, options.seed).values()
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
-    params = None
-    if run_dir is not None:
-        try:
-            params = checkpoint.restore(run_dir, step.abstract_state(cfg))[0].learner.online
-        except checkpoint.CheckpointError as error:
-            raise FailedError(str(error)) from None
+    params = None if networks is None else networks()
     moments: list[Any] = []
-    name = "learned" if run_dir is not None else options.policy
+    name = options.policy if networks is None else "learned"
     for moment in evaluate.episode(env.cfg, env, name, params, options.seed):
         moments.append(moment)
         print(playing.line(len(moments), moment), flush=True)
@@ -685,7 +748,7 @@ def _print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table("metric", "value", "95 % interval", "n", title=title)
-    for name, entry in summary.items():
+    for name, entry in {**summary, **summary.get("failures", {})}.items():
         if "value" in entry:
             shown = ("-", "-") if entry["n"] == 0 else (_percent(entry["value"]), _interval(entry))
             table.add_row(name, *shown, str(entry["n"]))
@@ -705,12 +768,63 @@ def _interval(entry: dict[str, Any]) -> str:
     return f"{100 * entry['low']:.1f} .. {100 * entry['high']:.1f} %"
 
 
+# report.
+
+
+def report(arguments: list[str]) -> int:
+    """`csac-jax report`."""
+    options = _parse(ReportOptions, arguments, f"{PROGRAM} report")
+    if not options.runs:
+        raise BadArgumentsError("report: give at least one folder of a run, or a file of `eval --json`")
+    if options.out is not None:
+        import importlib.util
+
+        if importlib.util.find_spec("matplotlib") is None:
+            raise BadArgumentsError("--out needs an extra; run: pip install 'csac-jax[bench]'")
+    from csac_jax.show import report as reporting, results
+
+    try:
+        found = reporting.build(results.read(options.runs))
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    if not (found.curves or found.scores):
+        raise FailedError("; ".join(found.notes))
+    print(reporting.markdown(found), end="")
+    for path in reporting.write(found, options.out) if options.out is not None else ():
+        print(path)
+    if options.json is not None:
+        _replace_text(options.json, reporting.as_json(found))
+    return 0
+
+
+# export.
+
+
+def export(arguments: list[str]) -> int:
+    """`csac-jax export`."""
+    options = _parse(ExportOptions, arguments, f"{PROGRAM} export")
+    if options.file.suffix != ".safetensors":
+        raise BadArgumentsError(f"{options.file}: the name of a policy file ends in .safetensors")
+    if options.file.exists():
+        raise BadArgumentsError(f"{options.file} exists; give another name")
+    if not options.run_dir.is_dir():
+        raise FailedError(f"there is no folder {options.run_dir}; give the folder of a run")
+    from csac_jax.train import policy_file
+
+    cfg, networks = _learned(str(options.run_dir))
+    policy_file.save(options.file, networks(), cfg)
+    print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
+    return 0
+
+
 # doctor.
 
 
 def doctor(arguments: list[str]) -> int:
     """`csac-jax doctor`."""
-    options = _parse(DoctorOptions, arguments, f"{PROGRAM} doctor")
+    own, cfg = _split_doctor(arguments)
+    options = _parse(DoctorOptions, own, f"{PROGRAM} doctor")
+    needs = {} if cfg is None else _print_memory(cfg)
     with _watchdog(90.0, "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8 and try again"):
         from csac_jax import _guard
         from csac_jax.train import provenance, selftest
@@ -735,11 +849,44 @@ def doctor(arguments: list[str]) -> int:
     pool = {"variable": variable, "threads": threads, "guarded": guarded}
     tests = [{**check._asdict(), "passed": check.passed} for check in checks]
     guard = {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", "")}
-    _write_json(options.json, {**guard, "self_test": tests}, None)
+    _write_json(options.json, {**guard, "self_test": tests, **needs}, cfg)
     failed = [check.name for check in checks if not check.passed]
     if failed:
         raise FailedError(f"self-test failed: {'; '.join(failed)}; do not trust results of these versions here")
     return 0
+
+
+def _split_doctor(arguments: list[str]) -> tuple[list[str], Config | None]:
+    """The arguments of `doctor` itself, and the config that the others ask for, if a preset is among them."""
+    preset = _value_of(arguments, "--preset")
+    if {"-h", "--help"} & set(arguments):
+        return ["--help"], None
+    if preset is None:
+        if "--preset" in arguments:
+            raise BadArgumentsError(f"doctor: give a preset after --preset, one of: {', '.join(presets.PRESETS)}")
+        return arguments, None
+    own: list[str] = []
+    others: list[str] = []
+    group: list[str] = []  # where an option and its values go
+    for word in arguments:
+        if word.startswith("--"):
+            name = word.split("=")[0]
+            group = {"--json": own, "--preset": []}.get(name, others)
+        group.append(word)
+    return own, _read_train([preset, *others])[1]
+
+
+def _print_memory(cfg: Config) -> dict[str, Any]:
+    """Prints what a run will hold in memory; returns it for the JSON."""
+    from csac_jax.train import memory
+
+    parts, available = memory.predict(cfg), memory.limit()
+    total = sum(parts.values())
+    listed = ", ".join(f"{name} {size / memory.GIB:.2f}" for name, size in parts.items())
+    print(f"memory     {total / memory.GIB:.2f} GiB of {available / memory.GIB:.1f} for {cfg.preset}: {listed}")
+    stages = memory.stages(cfg)
+    print(f"           step: {', '.join(f'{name} {size / memory.GIB:.2f}' for name, size in stages.items())}")
+    return {"memory": {"bytes": parts, "step_bytes": stages, "limit_bytes": available}}
 
 
 # bench.
@@ -786,7 +933,11 @@ def _write_json(path: Path | None, result: dict[str, Any], cfg: Config | None) -
     from csac_jax.train import config_json, provenance
 
     config = {} if cfg is None else {"config": config_json.to_dict(cfg)}
-    text = json.dumps({**result, **config, **provenance.record()}, indent=2) + "\n"
+    _replace_text(path, {**result, **config, **provenance.record()})
+
+
+def _replace_text(path: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=2) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(text)
@@ -798,6 +949,8 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "sweep": sweep,
     "eval": evaluate,
     "play": play,
+    "report": report,
+    "export": export,
     "doctor": doctor,
     "bench": bench,
 }

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 RobotKind = Literal["hand", "ur5"]
-PhysicsKind = Literal["mjx", "warp", "c"]
+PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 Algo = Literal["csac", "csac_per", "csac_beta", "vpg", "grasp_only", "reactive"]
@@ -43,7 +43,9 @@ class SceneConfig:
     min_blocks: int = 5
     """Fewest blocks in play in a scene; the most is the number of slots."""
     pool: int = 1024
-    """Distinct settled scenes per number of blocks that resets draw from; each is turned by a random yaw then."""
+    """Distinct scenes at rest per number of blocks that resets draw from; each is turned by a random yaw then."""
+    arranged: float = 0.0
+    """Share of those scenes that are packed arrangements of all levels (`scene.arrange`); the others are dropped."""
     size_spread: float = 0.1
     """Sizes of boxes and arches differ from nominal by up to this share, from scene to scene."""
     mesh_spread: float = 0.1
@@ -63,6 +65,7 @@ class SceneConfig:
         _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
         _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
         _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")
+        _require(0.0 <= self.arranged <= 1.0, "scene.arranged: must lie in 0 .. 1")
         for name in ("size_spread", "mesh_spread"):
             _require(0.0 <= getattr(self, name) <= 0.25, f"scene.{name}: must lie in 0 .. 0.25")
         _require(
@@ -97,7 +100,8 @@ class SimConfig:
 
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not repeatable bit for bit.
-    `c`: C MuJoCo on the host's cores, the reference, for evaluation."""
+    `c`: C MuJoCo on the host's cores, the reference, for evaluation. `auto`: `warp` where it is known to be the faster
+    one and can do the scene, else `mjx`; a run's config names what was chosen."""
     robot: RobotKind = "hand"
     """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
     timestep: float = 0.004

@@ -13,8 +13,9 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.config import Config
-from csac_jax.scene import blocks, layout, model, pool
+from csac_jax.config import Config, SceneConfig
+from csac_jax.scene import arrange, blocks, families, layout, model, pool
+from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
@@ -25,6 +26,7 @@ from csac_jax.vision.heightmap import Observation
 from csac_jax.vision.raycast import Polytopes
 
 _NOISE = np.uint32(2**31)  # folded into an episode's key: beside its children from `split`
+LEAST_ARRANGED = 4  # blocks in an arrangement
 CHANGE_AREA = 12.0  # cm^2 that must move for an action to count as a change (VPG)
 
 
@@ -69,7 +71,7 @@ class Env:
     cfg: Config
     physics: Physics
     scenes: Scene  # NumPy leaves [P, N, ...], at rest
-    any_yaw: bool = True  # scenes stay in the workspace however they are turned; else only by quarter turns
+    any_yaw: bool = True  # scenes are turned by any yaw that keeps them in the workspace; else only by quarter turns
 
     def reset(self, key: jax.Array) -> State:
         """A fresh settled scene of the pool, turned by a random yaw."""
@@ -94,7 +96,9 @@ class Env:
         """A scene as an episode meets it: turned at random; with a target, its own or any, if the task has one."""
         key_yaw, key_target = jax.random.split(key)
         yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
-        turned = layout.turn(scene, yaw if self.any_yaw else jnp.round(yaw / (0.5 * np.pi)) * (0.5 * np.pi))
+        near = jnp.linalg.norm(scene.position[:, :2], axis=1) <= 0.5 * self.cfg.heightmap.extent
+        anyhow = self.any_yaw & jnp.all(near | ~scene.in_play)
+        turned = layout.turn(scene, jnp.where(anyhow, yaw, jnp.round(yaw / (0.5 * np.pi)) * (0.5 * np.pi)))
         if self.cfg.task.kind != "target":
             return turned.replace(target=jnp.full_like(scene.target, layout.ANY))
         own = scene.target != layout.ANY
@@ -212,11 +216,35 @@ def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None
     """The environment of a config; settles (or reads from the cache) the scenes that resets draw from.
 
     Args: stream, the stream of random numbers that drops follow: training takes 0, evaluation others;
-    scenes, size of the pool at least, as many with each number of blocks; `cfg.scene.pool` of each if None.
+    scenes, size of the pool at least, as many with each number of blocks; `cfg.scene.pool` of each if None. Of these
+    `cfg.scene.arranged` are arrangements, behind the others.
     """
     world = model.build(cfg.scene, cfg.sim)
     floating = model.build(cfg.scene, dataclasses.replace(cfg.sim, robot="hand"))
     numbers = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     count = cfg.scene.pool if scenes is None else -(-scenes // numbers)
-    settled = pool.settled(floating, cfg.scene, cfg.heightmap.extent, stream, count)
-    return Env(cfg, simulation.make(world, cfg.sim), settled)
+    packed, extent = round(cfg.scene.arranged * count), cfg.heightmap.extent
+    parts = []
+    if packed < count:
+        dropped = dataclasses.replace(cfg.scene, arranged=0.0)
+        parts.append(pool.settled(floating, dropped, extent, stream, count - packed))
+    if packed:
+        parts.append(arrangements(cfg.scene, extent, stream, packed * numbers))
+    scenes_at_rest = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return Env(cfg, simulation.make(world, cfg.sim), scenes_at_rest)
+
+
+def arrangements(cfg: SceneConfig, extent: float, stream: int, count: int) -> Scene:
+    """`count` packed arrangements, NumPy leaves [P, N, ...], easy ones first; streams as in `make`.
+
+    Each has at least LEAST_ARRANGED blocks or `cfg.min_blocks`, whichever is less, as far as there is room. Raises
+    SceneError where the slots allow no arrangement.
+    """
+    try:
+        families.available(cfg.slots)
+    except ValueError as error:
+        raise SceneError(f"scene.arranged: {error}") from None
+    few = dataclasses.replace(cfg, min_blocks=min(cfg.min_blocks, LEAST_ARRANGED))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(stream), jnp.arange(count))
+    draw = jax.vmap(lambda key, level: arrange.arrange(key, few, extent, level))
+    return jax.device_get(jax.jit(draw)(keys, jnp.linspace(0.0, 1.0, count)))

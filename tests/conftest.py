@@ -1,9 +1,12 @@
 """Strict JAX in every test."""
 
 import contextlib
+import os
 from collections.abc import Iterator
 
 import pytest
+
+os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "0")  # tests compile what they test, their own processes too
 
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 

@@ -54,7 +54,7 @@ def run_dir(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("trian quick", "unknown command 'trian'; choose one of: train, sweep, eval, play, doctor"),
+        ("trian quick", "unknown command 'trian'; choose one of: train, sweep, eval, play, report, export, doctor"),
         ("train", "give a preset first, one of: smoke, quick"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
         ("train quik", "unknown preset 'quik'; choose one of: smoke, quick"),
@@ -95,6 +95,16 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench", "bench: unknown benchmark ''; choose one of: "),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),
         ("bench step slow", "bench step: give one preset of: smoke, quick, fast"),
+        ("bench step --curve length", "bench step: argument --curve: invalid choice: 'length'"),
+        ("bench step --smallest 2", "bench step: --smallest and --largest belong to --curve"),
+        ("bench step --curve map --smallest 36 --largest 40", "bench step: heightmap.size: must be a multiple of 8"),
+        ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
+        ("bench step fast --physics warp --curve scenes --smallest 8192 --largest 8192", "train.scenes: at most 4096"),
+        ("bench memory huge", "bench memory: give names of: smoke, 64 scenes, "),
+        ("doctor --preset", "doctor: give a preset after --preset, one of: smoke, quick"),
+        ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
+        ("doctor --preset quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
         ("bench soak --actions 0", "bench soak: --actions: must be at least 1"),
         ("bench act --pixels 40", "bench act: net.margin: DenseNet-121 needs maps of a multiple of 32 cells, not 40"),
         ("bench act --zoom 64", "bench act: net.zoom, net.output_stride: their product must divide 32"),
@@ -255,7 +265,7 @@ def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
 
     code, line = _fails(capsys, "train", "quick", "--replay.capacity", str(2**30))
     assert code == 2
-    match = re.fullmatch(r"csac-jax: replay.capacity: .* GiB, .*; lower --replay.capacity to (\d+) .*\n", line)
+    match = re.fullmatch(r"csac-jax: replay.capacity: .* GiB, .*; lower --replay.capacity from \d+ to (\d+) .*\n", line)
     assert match
     assert list(tmp_path.iterdir()) == []
     quick = presets.quick()
@@ -263,7 +273,7 @@ def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
         capacity = int(match[1]) + extra
         cfg = dataclasses.replace(quick, replay=dataclasses.replace(quick.replay, capacity=capacity))
         with pytest.raises(ValueError, match=r"replay\.capacity") if extra else contextlib.nullcontext():
-            memory.check_replay(cfg)
+            memory.check(cfg)
 
 
 def test_limit_of_the_device_goes_first(monkeypatch: pytest.MonkeyPatch):
@@ -297,6 +307,44 @@ def test_benchmark_is_run_with_its_arguments(
 
 
 @pytest.mark.slow
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_step_benchmark(capsys: pytest.CaptureFixture):
+    """Claim: `bench step` times every stage beside the whole step, and compiles again from a cache of its own."""
+    assert cli.main(["bench", "step", "smoke", "--steps", "1", "--repeats", "1"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    shares = result["stage_shares"]
+    assert list(shares) == ["look", "act", "simulate", "reward", "remember", "learn", "replace"]
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert result["actions_per_second"] == pytest.approx(2 / result["step_seconds"])
+    assert result["physics_steps_per_second"] == pytest.approx(55 * 2 / result["step_seconds"])
+    assert result["compile_seconds"]["found_in_cache"]
+    assert result["compile_seconds"]["cached"]["compile"] < result["compile_seconds"]["cold"]["compile"]
+    assert {"device", "versions", "commit", "temporary_bytes", "bare_loop_over_step"} <= result.keys()
+
+
+def test_points_of_a_curve():
+    """Claim: a curve's points are its first value and doublings of it; only what it is named after changes, and
+    contact caps with the blocks."""
+    from experiments.bench import step as bench
+
+    assert bench._values(3, 13) == [3, 6, 12]
+    quick = presets.quick()
+    assert bench._at(quick, "scenes", 32).train.scenes == 32
+    assert bench._at(quick, "scenes", 2**13).replay.capacity == 2**13
+    assert bench._at(quick, "map", 128).heightmap.size == 128
+    assert bench._at(quick, "capacity", 64).replay.capacity == 64
+    twice = bench._at(quick, "blocks", 10)
+    assert (len(twice.scene.slots), twice.scene.min_blocks) == (10, 10)
+    assert (twice.sim.geom_pairs, twice.sim.contacts) == (2 * quick.sim.geom_pairs, 2 * quick.sim.contacts)
+    for curve in bench.CURVES:
+        other = bench._at(quick, curve, 8 if curve == "blocks" else 64)
+        touched = {"scenes": {"train", "replay"}, "blocks": {"scene", "sim"}, "map": set(), "capacity": {"replay"}}
+        names = [field.name for field in dataclasses.fields(Config)]
+        assert {name for name in names if getattr(other, name) != getattr(quick, name)} <= touched[curve]
+
+
+@pytest.mark.slow
 def test_replay_benchmark(capsys: pytest.CaptureFixture):
     """Claim: `bench replay` prints JSON with the times of every sampler and where they come from."""
     pytest.importorskip("flashbax")
@@ -309,6 +357,19 @@ def test_replay_benchmark(capsys: pytest.CaptureFixture):
         assert row["median_seconds"].keys() == {"uniform", "prioritised", "beta", "flashbax"}
         assert min(row["median_seconds"].values()) > 0.0
     assert {"device", "versions", "commit", "item", "batch", "repeats"} <= result.keys()
+
+
+def test_automatic_physics_is_resolved(tmp_path: Path):
+    """Claim: `--sim.physics auto` reaches a run as what it stands for here, and may be asked for again when the run is
+    resumed; the first line of a run says what it runs on."""
+    _, cfg = cli._read_train(["smoke", "--sim.physics", "auto", "--seed", "3"])
+    assert cfg == dataclasses.replace(SMOKE, seed=3)
+    folder = tmp_path / "runs" / "three"
+    checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []})
+    assert cli._read_train(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
+    line = cli._first_line(folder, cfg)
+    wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics mjx, on 1 x cpu (cpu)"
+    assert line == f"run {folder}: {wanted}"
 
 
 def test_default_run_dirs_do_not_collide(tmp_path: Path):
@@ -356,6 +417,7 @@ def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     result = json.loads((tmp_path / "out/result.json").read_text())
     assert (result["actions"], result["config"]["seed"], result["config"]["preset"]) == (8, 3, "smoke")
     assert {"device", "versions", "commit", "run_dir", "wall_seconds"} <= result.keys()
+    assert json.loads((tmp_path / result["run_dir"] / "train.json").read_text()) == result
 
 
 @pytest.mark.mjx
@@ -368,6 +430,21 @@ def test_doctor_passes(capsys: pytest.CaptureFixture, tmp_path: Path):
     result = json.loads((tmp_path / "doctor.json").read_text())
     assert result["thread_pool"]["guarded"]
     assert all(check["passed"] for check in result["self_test"])
+
+
+def test_doctor_shows_memory(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: `doctor --preset X`, with any settings, says what such a run will hold in memory, part by part."""
+    from csac_jax.train import selftest
+
+    monkeypatch.setattr(selftest, "CHECKS", ())
+    flags = "--preset smoke --scene.slots box box --scene.min-blocks 1 --json doctor.json --replay.capacity 128"
+    assert cli.main(["doctor", *flags.split()]) == 0
+    assert re.search(r"memory +0\.00 GiB of [\d.]+ for smoke: replay 0\.00, scenes", capsys.readouterr().out)
+    result = json.loads((tmp_path / "doctor.json").read_text())
+    assert result["config"]["scene"]["slots"] == ["box", "box"]
+    cells, obs = 32 * 32, 2
+    transition = cells * obs * (3 + 2 + 1) + 4 + 12 + 4 + 1 + 4  # packed maps, action, reward, end, priority
+    assert result["memory"]["bytes"]["replay"] == 128 * transition + 8  # head and size
 
 
 @pytest.mark.parametrize("error", [1.0, float("nan")])

@@ -42,7 +42,7 @@ ONLY_IN = {
     "orbax": ("train/checkpoint.py",),
     "tyro": ("cli.py",),
     "rich": ("show", "cli.py"),
-    "safetensors": ("train/weights.py",),
+    "safetensors": ("train/weights.py", "train/policy_file.py"),
 }
 JIT_IN = ("train", "env.py", "show/picture.py")  # the last draws on machines without OpenGL
 PURE = ("vision", "nets", "agent", "replay", "sim")  # no printing, no files

@@ -45,7 +45,7 @@ def make(world: World, cfg: SimConfig) -> Physics:
         return warp_physics.make(world, cfg)
     if cfg.physics == "c":
         return c_physics.CPhysics(world, cfg)
-    raise ValueError(f"sim.physics: {cfg.physics!r} is none of mjx, warp, c")
+    raise ValueError(f"sim.physics: {cfg.physics!r} names no engine; choose mjx, warp or c")
 
 
 def execute(

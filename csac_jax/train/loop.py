@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from csac_jax.config import Config
-from csac_jax.train import checkpoint, config_json
+from csac_jax.train import cache, checkpoint, config_json
 from csac_jax.train.metrics import GRASP, LIFTED, OUTCOMES
 from csac_jax.train.stop import Stop
 
@@ -164,10 +164,10 @@ def compile_program(
     cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter
 ) -> tuple[Any, float]:
     reporter.say("compiling the training program; this takes a while, once")
-    begun = time.perf_counter()
+    begun, hits = time.perf_counter(), cache.hits()
     program = compile_chunk(cfg.train.chunk).lower(state).compile()
     seconds = time.perf_counter() - begun
-    reporter.say(f"compiled in {seconds:.1f} s")
+    reporter.say(f"compiled in {seconds:.1f} s{' (from the cache)' if cache.hits() > hits else ''}")
     return program, seconds
 
 

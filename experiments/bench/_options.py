@@ -6,7 +6,7 @@ from typing import NoReturn
 from csac_jax.cli import BadArgumentsError
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
     """Complains in one line, as the rest of the command line does."""
 
     def error(self, message: str) -> NoReturn:
@@ -15,7 +15,7 @@ class _Parser(argparse.ArgumentParser):
 
 def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
     """The numbers given for the benchmark `name`, each at least 1, and its switches, whose default is False."""
-    parser = _Parser(prog=f"bench {name}", allow_abbrev=False)
+    parser = Parser(prog=f"bench {name}", allow_abbrev=False)
     for option, default in defaults.items():
         if default is False:
             parser.add_argument(f"--{option}", action="store_true")

@@ -1,41 +1,186 @@
-"""Speed of this machine, as JSON: `csac-jax bench step [PRESET]`, with PRESET `quick` if none is given.
+"""Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics mjx|warp|auto] [--steps N]
+[--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B]`, PRESET `quick` if none is given.
 
-The training step is timed beside a bare `mjx.step` loop of the same scenes and set-points in the same process, and
-each part is the median of several calls; machines are noisy, so trust ratios.
+Each stage of `train_step` is compiled by itself and timed beside the whole step, a compiled loop of STEPS (2) steps as
+in training, and beside a bare loop of the engine's own steps of the same scenes and set-points: in one process, turn by
+turn, the median of REPEATS (5) rounds, so that what else the machine does hits all alike. Trust ratios.
+
+With --curve the whole step alone is timed at A, 2 A, 4 A .. B scenes, blocks, cells along a side of the map, or
+transitions in the ring; contact caps grow with the blocks. On an accelerator, `peak_bytes` is of all measured so far.
 """
 
+import argparse
+import contextlib
+import dataclasses
 import json
+import resource
 import statistics
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.compilation_cache import compilation_cache
 
-from csac_jax import presets
-from csac_jax.agent import learner as learning
+from csac_jax import env as environment, presets
+from csac_jax.agent import learner as learning, policy, rewards
+from csac_jax.agent.learner import Transition
 from csac_jax.cli import BadArgumentsError
+from csac_jax.config import Config
 from csac_jax.nets.convolution import conv2d
-from csac_jax.sim.primitives import Action
-from csac_jax.train import provenance, step
+from csac_jax.replay import ring
+from csac_jax.sim.mjx_physics import MjxPhysics
+from csac_jax.train import auto, cache, provenance, step
+from csac_jax.vision import heightmap
 from experiments.bench import _bare
+from experiments.bench._options import Parser
 
-REPEATS = 5
+CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
+_SEPARATE = ("look", "act", "simulate", "reward", "remember", "learn", "replace")
 
 
-def _median_seconds(call: Callable[[], Any]) -> float:
-    jax.block_until_ready(call())
-    seconds = []
-    for _ in range(REPEATS):
-        begun = time.perf_counter()
+def _turns(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median seconds of every call, one after the other in each round."""
+    for call in calls.values():
         jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - begun)
-    return statistics.median(seconds)
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            begun = time.perf_counter()
+            jax.block_until_ready(call())
+            seconds[name].append(time.perf_counter() - begun)
+    return {name: statistics.median(values) for name, values in seconds.items()}
 
 
-def _conv_gradient(conv: Callable[[jax.Array, jax.Array], jax.Array]) -> float:
-    """Seconds per kernel gradient of a 3 x 3 convolution, 64 maps of 36 x 36, 16 to 16 channels, in `lax.scan`."""
+def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, float]]:
+    """The compiled chunk, seconds to trace it and to compile it."""
+    begun = time.perf_counter()
+    lowered = step.compile_chunk(program, steps).lower(state)
+    traced = time.perf_counter()
+    compiled = lowered.compile()
+    return compiled, {"trace": traced - begun, "compile": time.perf_counter() - traced}
+
+
+@contextlib.contextmanager
+def _fresh_cache() -> Iterator[None]:
+    """An empty cache of compiled programs, in place of the user's."""
+    names = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, value in zip(names, (folder, True, 0.0), strict=True):
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+        cache.enable()  # counts hits
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                jax.config.update(name, value)
+            compilation_cache.reset_cache()
+
+
+def _compile_twice(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, Any]]:
+    """The compiled chunk, and what it took with an empty cache and with a filled one, tracing anew both times."""
+    with _fresh_cache():
+        _, cold = _compile(program, state, steps)
+        jax.clear_caches()
+        hits = cache.hits()
+        chunk, cached = _compile(program, state, steps)
+        return chunk, {"cold": cold, "cached": cached, "found_in_cache": cache.hits() > hits}
+
+
+def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable[[], Any]]:
+    """The stages of `train_step`, each a call of a program of its own."""
+    cfg, env, learner = program.cfg, program.env, program.learner
+    scenes, num = state.scenes, cfg.train.scenes
+    keys = step._keys(jax.random.key(1), num)
+    span = learner.bounds[1] - learner.bounds[0]
+
+    look = jax.jit(lambda params, obs: learning.look(learner, params, obs))
+    maps = look(state.learner.online, scenes.obs)
+    choose = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
+    act = jax.jit(lambda keys, maps: choose(keys, cfg, learner.frames, maps, span, scenes.idle, jnp.int32(0)))
+    action = act(keys, maps)
+    simulate = jax.jit(jax.vmap(env.step))
+    after = simulate(scenes, action)
+
+    @jax.jit
+    def reward(nets: Any, before: Any, after: Any) -> jax.Array:
+        phi = [step._best_grasps(learner, nets, obs) for obs in (before.obs, after.obs)]
+        changed = after.info.moved > environment.CHANGE_AREA
+        of_one = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))
+        return of_one(cfg.reward, action.primitive, after.info.outcome, after.info.distance, *phi, changed)
+
+    def store(replay: Any, before: Any, after: Any) -> Any:
+        packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
+        seen = Transition(packed[0], action, jnp.zeros(num), packed[1], after.terminated)
+        return ring.add(replay, seen, ~after.info.ill)
+
+    write = jax.jit(store, donate_argnums=0)
+    replay = write(jax.tree.map(jnp.copy, state.replay), scenes, after)
+
+    def remember() -> Any:
+        nonlocal replay
+        replay = write(replay, scenes, after)
+        return replay.head
+
+    learn = jax.jit(lambda key, nets, replay: step._learn(program, key, nets, replay))
+
+    @jax.jit
+    def replace(keys: jax.Array, after: Any) -> Any:
+        fresh = jax.vmap(env.restart)(keys, after)
+        return jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
+
+    filled = jax.tree.map(jnp.copy, replay)
+    calls = {
+        "look": lambda: look(state.learner.online, scenes.obs),
+        "act": lambda: act(keys, maps),
+        "simulate": lambda: simulate(scenes, action),
+        "reward": lambda: reward(state.learner, scenes, after),
+        "remember": remember,
+        "learn": lambda: learn(jax.random.key(2), state.learner, filled),
+        "replace": lambda: replace(keys, after),
+    }
+    if isinstance(env.physics, MjxPhysics):
+        drives = _bare.drives(cfg, scenes.obs.height, action)
+        calls["bare_loop"] = _bare.loop(env.physics, scenes.scene, drives)
+    return calls
+
+
+def _whole(chunk: Any, state: step.TrainState) -> Callable[[], Any]:
+    """A call of the compiled chunk, going on from where the last one ended."""
+
+    def call() -> Any:
+        nonlocal state
+        state, metrics = chunk(state)
+        return metrics
+
+    return call
+
+
+def _rates(cfg: Config, seconds: float) -> dict[str, float]:
+    """What a training step of so many seconds comes to."""
+    return {
+        "actions_per_second": cfg.train.scenes / seconds,
+        "physics_steps_per_second": cfg.train.scenes * cfg.sim.substeps / seconds,
+        "updates_per_second": cfg.learn.updates / seconds,
+    }
+
+
+def _memory(chunk: Any) -> dict[str, int | None]:
+    stats, device = chunk.memory_analysis(), jax.devices()[0].memory_stats() or {}
+    return {
+        "state_bytes": stats.argument_size_in_bytes,
+        "temporary_bytes": stats.temp_size_in_bytes,
+        "peak_bytes": device.get("peak_bytes_in_use"),
+        "process_peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+def _conv_gradient(conv: Callable[[jax.Array, jax.Array], jax.Array]) -> Callable[[], Any]:
+    """Two kernel gradients of a 3 x 3 convolution, 64 maps of 36 x 36, 16 to 16 channels, in `lax.scan`."""
     maps = jax.random.normal(jax.random.key(0), (64, 36, 36, 16))
     kernel = jax.random.normal(jax.random.key(1), (3, 3, 16, 16))
     gradient = jax.grad(lambda kernel, shift: jnp.sum(conv(maps + shift, kernel) ** 2))
@@ -44,57 +189,131 @@ def _conv_gradient(conv: Callable[[jax.Array, jax.Array], jax.Array]) -> float:
         return jax.lax.scan(lambda total, i: (total + gradient(kernel, i), None), kernel, jnp.arange(2.0))[0]
 
     compiled = jax.jit(loop)
-    return _median_seconds(lambda: compiled(kernel)) / 2
+    return lambda: compiled(kernel)
 
 
 def _autodiff_conv(maps: jax.Array, kernel: jax.Array) -> jax.Array:
     return jax.lax.conv_general_dilated(maps, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
 
-def measure(preset: str) -> dict[str, Any]:
-    """Timings of one preset, s and actions/s."""
-    cfg = presets.get(preset)
+def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
+    """Times of one config's step and of its stages."""
     program = step.make(cfg)
-    scenes, learner = cfg.train.scenes, program.learner
-    begun = time.perf_counter()
-    chunk = step.compile_chunk(program, 1).lower(step.init(program)).compile()
-    compile_seconds = time.perf_counter() - begun
     state = step.init(program)
-
-    actions = Action(primitive=jnp.ones(scenes, jnp.int32), pose=jnp.zeros((scenes, 3)))
-    drives = _bare.drives(cfg, state.scenes.obs.height, actions)
-    simulate = jax.jit(jax.vmap(program.env.step))
-    look = jax.jit(lambda params, obs: learning.look(learner, params, obs))
-    parts = {
-        "simulate": _median_seconds(lambda: simulate(state.scenes, actions)),
-        "look": _median_seconds(lambda: look(state.learner.online, state.scenes.obs)),
-        "bare_mjx_loop": _median_seconds(_bare.loop(program.env.physics, state.scenes.scene, drives)),
-    }
-
-    def train() -> Any:
-        nonlocal state
-        state, metrics = chunk(state)
-        return metrics
-
-    parts["train_step"] = _median_seconds(train)
+    chunk, compiling = _compile_twice(program, state, steps)
+    calls = _stages(program, state)
+    seconds = _turns({**calls, "whole": _whole(chunk, state)}, repeats)
+    whole = seconds["whole"] / steps
+    stages = {name: seconds[name] for name in _SEPARATE}
+    total = sum(stages.values())
+    bare = seconds.get("bare_loop")
+    gradients = {"ours": lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1), "autodiff": _autodiff_conv}
     return {
-        "preset": preset,
-        "scenes": scenes,
-        "substeps": cfg.sim.substeps,
-        "compile_seconds": compile_seconds,
-        "median_seconds": parts,
-        "actions_per_second": scenes / parts["train_step"],
-        "physics_share": parts["simulate"] / parts["train_step"],
-        "conv_gradient_in_scan": {
-            "ours": _conv_gradient(lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1)),
-            "autodiff": _conv_gradient(_autodiff_conv),
-        },
-        "bare_loop_over_simulate": parts["bare_mjx_loop"] / parts["simulate"],
+        "stage_seconds": stages,
+        "stage_shares": {name: value / total for name, value in stages.items()},
+        "step_seconds": whole,
+        "sum_of_stages_over_step": total / whole,
+        **_rates(cfg, whole),
+        "bare_loop_seconds": bare,
+        "bare_loop_over_simulate": bare and bare / stages["simulate"],
+        "bare_loop_over_step": bare and bare / whole,
+        "compile_seconds": compiling,
+        "conv_gradients_in_scan": _turns({name: _conv_gradient(conv) for name, conv in gradients.items()}, repeats),
+        **_memory(chunk),
     }
+
+
+def _at(cfg: Config, curve: str, value: int) -> Config:
+    """The config with `value` scenes, blocks, cells along a side or transitions."""
+    scene, sim, train, replay = cfg.scene, cfg.sim, cfg.train, cfg.replay
+    if curve == "scenes":
+        return dataclasses.replace(
+            cfg,
+            train=dataclasses.replace(train, scenes=value),
+            replay=dataclasses.replace(replay, capacity=max(replay.capacity, value)),
+        )
+    if curve == "map":
+        return dataclasses.replace(cfg, heightmap=dataclasses.replace(cfg.heightmap, size=value))
+    if curve == "capacity":
+        return dataclasses.replace(cfg, replay=dataclasses.replace(replay, capacity=value))
+    share = value / len(scene.slots)
+    slots = tuple(scene.slots[i % len(scene.slots)] for i in range(value))
+    return dataclasses.replace(
+        cfg,
+        scene=dataclasses.replace(scene, slots=slots, min_blocks=value, pool=min(scene.pool, 64)),
+        sim=dataclasses.replace(
+            sim,
+            geom_pairs=max(round(share * sim.geom_pairs), 4),
+            contacts=max(round(share * sim.contacts), 16),
+        ),
+    )
+
+
+def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dict[str, Any]:
+    """One point of a curve: the whole step alone."""
+    program = step.make(cfg)
+    state = step.init(program)
+    chunk, compiling = _compile(program, state, steps)
+    seconds = _turns({"whole": _whole(chunk, state)}, repeats)["whole"] / steps
+    return {curve: value, "step_seconds": seconds, **_rates(cfg, seconds), "compile_seconds": compiling} | _memory(
+        chunk
+    )
+
+
+def _options(arguments: list[str]) -> argparse.Namespace:
+    parser = Parser(prog="bench step", allow_abbrev=False)
+    parser.add_argument("preset", nargs="?", default="quick")
+    parser.add_argument("--physics", choices=("mjx", "warp", "auto"), default="mjx")
+    parser.add_argument("--curve", choices=tuple(CURVES))
+    for name, default in {"steps": 2, "repeats": 5, "smallest": 0, "largest": 0}.items():
+        parser.add_argument(f"--{name}", type=int, default=default)
+    options = parser.parse_args(arguments)
+    if options.preset not in presets.PRESETS:
+        raise BadArgumentsError(f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick")
+    if min(options.steps, options.repeats) < 1:
+        raise BadArgumentsError("bench step: --steps, --repeats: at least 1")
+    if options.curve is None:
+        if options.smallest or options.largest:
+            raise BadArgumentsError("bench step: --smallest and --largest belong to --curve")
+        return options
+    smallest, largest = CURVES[options.curve]
+    options.smallest, options.largest = options.smallest or smallest, options.largest or largest
+    if not 1 <= options.smallest <= options.largest:
+        raise BadArgumentsError("bench step: --smallest, --largest: 1 <= smallest <= largest is needed")
+    return options
+
+
+def _config(options: argparse.Namespace) -> Config:
+    cfg = presets.get(options.preset)
+    if options.physics == "warp":
+        cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, mesh_spread=0.0))
+    return auto.resolve(dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics)))
+
+
+def _values(smallest: int, largest: int) -> list[int]:
+    return [smallest << i for i in range(32) if smallest << i <= largest]
 
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    if len(arguments) > 1 or not presets.PRESETS.keys() >= set(arguments):
-        raise BadArgumentsError(f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick")
-    print(json.dumps(measure(*arguments or ["quick"]) | provenance.record(), indent=2))
+    options = _options(arguments)
+    try:
+        cfg = _config(options)
+        points = (
+            [_at(cfg, options.curve, v) for v in _values(options.smallest, options.largest)] if options.curve else []
+        )
+    except ValueError as error:
+        raise BadArgumentsError(f"bench step: {error}") from None
+    result = {"preset": options.preset, "physics": cfg.sim.physics, "scenes": cfg.train.scenes} | {
+        name: getattr(options, name) for name in ("steps", "repeats")
+    }
+    if options.curve:
+        values = _values(options.smallest, options.largest)
+        rows = [
+            _point(p, options.curve, v, options.steps, options.repeats) for p, v in zip(points, values, strict=True)
+        ]
+        result |= {"curve": options.curve, "points": rows}
+    else:
+        result |= {"substeps": cfg.sim.substeps, "updates": cfg.learn.updates}
+        result |= measure(cfg, options.steps, options.repeats)
+    print(json.dumps(result | provenance.record(), indent=2))

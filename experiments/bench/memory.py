@@ -1,0 +1,116 @@
+"""Memory that a run is predicted to take beside what its program takes, as JSON: `csac-jax bench memory [NAME ...]`.
+
+A name is a preset's or one of `CONFIGS`; without any, all of these, ten small ones that differ in scenes, map, yaws,
+batch, blocks, net and ring. Each training step is compiled, not run, and XLA says what it holds: the state that goes
+in, results, temporaries. On an accelerator the program is run as well, on zeros, and the device's own peak stands
+beside it (`peak_bytes_in_use`, of all configs so far: give one preset at a time there).
+"""
+
+import dataclasses
+import json
+import sys
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax import presets
+from csac_jax.agent import learner as learning
+from csac_jax.cli import BadArgumentsError
+from csac_jax.config import Config
+from csac_jax.env import Env
+from csac_jax.scene import layout, model
+from csac_jax.sim import physics
+from csac_jax.train import memory, provenance, step
+
+
+def _smoke(**sections: dict[str, Any]) -> Config:
+    """The preset `smoke` with other values in some sections."""
+    cfg = presets.smoke()
+    parts: dict[str, Any] = {name: dataclasses.replace(getattr(cfg, name), **new) for name, new in sections.items()}
+    return dataclasses.replace(cfg, **parts)
+
+
+_NET = {"rotations": 16, "growth": 24, "stem": 16, "head": 32, "dilations": (1, 2, 4, 1)}
+_BOXES: dict[str, Any] = {"slots": ("box",) * 6, "min_blocks": 6}
+CONFIGS: dict[str, Config] = {
+    "smoke": _smoke(),
+    "64 scenes": _smoke(train={"scenes": 64, "warmup": 64}),
+    "map of 64 cells": _smoke(heightmap={"size": 64}),
+    "16 yaws": _smoke(net={"rotations": 16}),
+    "batch of 64": _smoke(learn={"batch": 64}, train={"warmup": 64}),
+    "6 boxes, 48 contacts, 32 scenes": _smoke(
+        scene=_BOXES, sim={"contacts": 48, "geom_pairs": 12}, train={"scenes": 32, "warmup": 32}
+    ),
+    "net of quick": _smoke(net=_NET),
+    "learner of quick": _smoke(
+        heightmap={"size": 64}, net=_NET, learn={"batch": 32, "updates": 2}, train={"scenes": 8, "warmup": 64}
+    ),
+    "ring of 4096, 64 cells": _smoke(heightmap={"size": 64}, replay={"capacity": 4096}),
+    "two critics, no actor, 56 cells": _smoke(heightmap={"size": 56}, learn={"critics": 2, "actor": False}),
+}
+
+
+def _program(cfg: Config) -> step.Program:
+    """The program of a config with a single scene in its pool: nothing needs to settle."""
+    world = model.build(cfg.scene, cfg.sim)
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+    return step.Program(cfg, Env(cfg, physics.make(world, cfg.sim), blank), learning.make(cfg))
+
+
+def measure(cfg: Config) -> dict[str, Any]:
+    """Bytes of one config, predicted and measured."""
+    begun = time.perf_counter()
+    predicted = memory.predict(cfg)
+    predicting = time.perf_counter() - begun
+    program = _program(cfg)
+    state = jax.eval_shape(lambda: step.init(program))
+    begun = time.perf_counter()
+    compiled = step.compile_chunk(program, 1).lower(state).compile()
+    stats = compiled.memory_analysis()
+    new = stats.output_size_in_bytes - stats.alias_size_in_bytes
+    measured = stats.argument_size_in_bytes + new + stats.temp_size_in_bytes
+    total = sum(predicted.values())
+    return {
+        "predicted_bytes": total,
+        "measured_bytes": measured,
+        "predicted_over_measured": total / measured,
+        "predicted_parts": predicted,
+        "measured_parts": {
+            "state": stats.argument_size_in_bytes,
+            "results": new,
+            "temporaries": stats.temp_size_in_bytes,
+        },
+        "device_peak_bytes": _device_peak(compiled, state),
+        "predict_seconds": predicting,
+        "compile_seconds": time.perf_counter() - begun,
+    }
+
+
+def _device_peak(compiled: Any, state: Any) -> int | None:
+    """Most bytes that the device held in this process after one step from a state of zeros; None on a CPU."""
+    if jax.default_backend() == "cpu":
+        return None
+
+    def zeros(leaf: Any) -> jax.Array:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.key(0) if leaf.shape == () else jax.random.split(jax.random.key(0), leaf.shape)
+        return jnp.zeros(leaf.shape, leaf.dtype)
+
+    jax.block_until_ready(compiled(jax.tree.map(zeros, state)))
+    return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+
+
+def main(arguments: list[str]) -> None:
+    """Prints the result, and on stderr how far it is."""
+    known = CONFIGS | {name: presets.get(name) for name in presets.PRESETS}
+    if not known.keys() >= set(arguments):
+        raise BadArgumentsError(f"bench memory: give names of: {', '.join(known)}; or none, for ten small configs")
+    rows = {}
+    for name in arguments or CONFIGS:
+        rows[name] = measure(known[name])
+        print(f"{name}: predicted / measured {rows[name]['predicted_over_measured']:.3f}", file=sys.stderr, flush=True)
+    worst = max(abs(row["predicted_over_measured"] - 1.0) for row in rows.values())
+    print(json.dumps({"configs": rows, "worst_error": worst} | provenance.record(), indent=2))

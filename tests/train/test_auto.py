@@ -1,0 +1,53 @@
+"""`sim.physics auto`: what it stands for, whatever this machine has."""
+
+import dataclasses
+
+import pytest
+
+from csac_jax import presets
+from csac_jax.config import Config, PhysicsKind
+from csac_jax.sim import physics
+from csac_jax.train import auto
+
+
+def _config(kind: PhysicsKind, mesh_spread: float = 0.0, scenes: int = 256) -> Config:
+    fast = presets.fast()
+    return dataclasses.replace(
+        fast,
+        scene=dataclasses.replace(fast.scene, mesh_spread=mesh_spread),
+        sim=dataclasses.replace(fast.sim, physics=kind),
+        train=dataclasses.replace(fast.train, scenes=scenes),
+    )
+
+
+@pytest.mark.parametrize(
+    ("backend", "installed", "measured", "mesh_spread", "scenes", "chosen"),
+    [
+        ("gpu", True, range(64, 5001), 0.0, 256, "warp"),
+        ("cpu", True, range(64, 5001), 0.0, 256, "mjx"),
+        ("gpu", False, range(64, 5001), 0.0, 256, "mjx"),
+        ("gpu", True, range(64, 5001), 0.1, 256, "mjx"),
+        ("gpu", True, range(64, 5001), 0.0, 32, "mjx"),
+        ("gpu", True, range(64, 5001), 0.0, 5000, "mjx"),
+        ("gpu", True, range(0), 0.0, 256, "mjx"),
+    ],
+)
+def test_choice(monkeypatch: pytest.MonkeyPatch, backend, installed, measured, mesh_spread, scenes, chosen):
+    """Claim: `auto` is `warp` where measured to be faster, on CUDA, installed, able to do the scene; else `mjx`."""
+    monkeypatch.setattr(auto.jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(auto.importlib.util, "find_spec", lambda name: object() if installed else None)
+    monkeypatch.setattr(auto, "WARP_SCENES", measured)
+    cfg = _config("auto", mesh_spread, scenes)
+    assert auto.resolve(cfg) == dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=chosen))
+
+
+def test_other_choices_stay():
+    """Claim: what the user has chosen stays."""
+    for kind in ("mjx", "warp", "c"):
+        assert auto.resolve(_config(kind)) == _config(kind)
+
+
+def test_auto_is_no_engine():
+    """Claim: `auto` that nobody resolved is an error that says what to do, not the physics of some engine."""
+    with pytest.raises(ValueError, match=r"sim\.physics: 'auto' .* mjx, warp or c"):
+        physics.make(None, _config("auto").sim)

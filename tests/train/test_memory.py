@@ -1,0 +1,110 @@
+"""Memory of a run: what is exact, what is a model of XLA's temporaries, and what is refused."""
+
+import dataclasses
+import re
+import time
+from typing import Any
+
+import jax
+import pytest
+
+from csac_jax import presets
+from csac_jax.agent import learner as learning
+from csac_jax.config import Config
+from csac_jax.replay import ring
+from csac_jax.train import memory, step
+
+SMOKE = presets.smoke()
+
+
+def _smoke(**sections: dict[str, Any]) -> Config:
+    parts: dict[str, Any] = {name: dataclasses.replace(getattr(SMOKE, name), **new) for name, new in sections.items()}
+    return dataclasses.replace(SMOKE, **parts)
+
+
+def test_state_is_exact():
+    """Claim: ring and networks are predicted to the byte."""
+    quick = presets.quick()
+    predicted = memory.predict(quick)
+    small = dataclasses.replace(quick.replay, capacity=64)
+    stored = sum(leaf.nbytes for leaf in jax.tree.leaves(ring.init(small, step.example(quick))))
+    assert predicted["replay"] == (stored - 8) * quick.replay.capacity // 64 + 8  # head and size are no slots
+    parameters, counters = 49_891 + 3_715, 5  # of critic and actor; two in each optimiser, one of updates
+    assert predicted["networks"] == 4 * (4 * parameters + counters)  # online, target and Adam's two moments
+
+
+@pytest.mark.parametrize(
+    "cfg",
+    [
+        _smoke(train={"scenes": 8}),
+        _smoke(train={"scenes": 16}, heightmap={"size": 64}, net={"growth": 12, "rotations": 8}),
+    ],
+)
+def test_looking_takes_what_is_predicted(cfg: Config):
+    """Claim: what looking at all scenes needs is predicted within 15 % of what XLA reserves."""
+    learner = learning.make(cfg)
+    state = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+    obs = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((cfg.train.scenes, *leaf.shape[1:]), leaf.dtype),
+        step.abstract_state(cfg).scenes.obs,
+    )
+    look = jax.jit(lambda state, obs: step._best_grasps(learner, state, obs))
+    measured = look.lower(state, obs).compile().memory_analysis().temp_size_in_bytes
+    assert memory.stages(cfg)["look"] == pytest.approx(measured, rel=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_whole_program_takes_what_is_predicted():
+    """Claim: a whole training program takes within 15 % of what is predicted."""
+    from experiments.bench import memory as bench
+
+    assert bench.measure(bench.CONFIGS["map of 64 cells"])["predicted_over_measured"] == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("sections", "name"),
+    [
+        ({"replay": {"capacity": 100_000}}, "replay.capacity"),
+        ({"learn": {"batch": 1000}, "train": {"warmup": 1000}, "replay": {"capacity": 2000}}, "learn.batch"),
+        ({"train": {"scenes": 2000}, "replay": {"capacity": 2000}}, "train.scenes"),
+    ],
+)
+def test_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, sections: dict[str, Any], name: str):
+    """Claim: a run larger than memory is refused in under 5 s; the value named fits, the next one does not."""
+    monkeypatch.setattr(memory, "limit", lambda: 100 * 2**20)
+    cfg = _smoke(**sections)
+    begun = time.perf_counter()
+    with pytest.raises(ValueError, match=rf"^{name}: .* lower --{name} from \d+ to \d+ ") as caught:
+        memory.check(cfg)
+    assert time.perf_counter() - begun < 5.0
+    found = re.search(r"to (\d+) at the very most", str(caught.value))
+    assert found
+    section, field = name.split(".")
+
+    def with_value(value: int) -> Config:
+        return _smoke(**{**sections, section: {**sections[section], field: value}})
+
+    memory.check(with_value(int(found[1])))
+    with pytest.raises(ValueError, match=name):
+        memory.check(with_value(int(found[1]) + 1))
+
+
+def test_nothing_fits(monkeypatch: pytest.MonkeyPatch):
+    """Claim: where no single setting makes a run fit, the message says so."""
+    monkeypatch.setattr(memory, "limit", lambda: 2**16)
+    with pytest.raises(ValueError, match=r"heightmap\.size: .* or several of: replay\.capacity, learn\.batch"):
+        memory.check(SMOKE)
+
+
+def test_presets_fit():
+    """Claim: no preset is refused on a machine with 16 GB."""
+    for name in presets.PRESETS:
+        assert memory._sure(presets.get(name)) < 16e9
+
+
+def test_gradient_of_densenet_is_shown_and_refuses_nothing():
+    """Claim: what nothing was fitted to is shown, but is no reason to refuse a run."""
+    paper = presets.paper()
+    assert memory.stages(paper)["learn"] > 2 * memory.stages(paper, fitted_only=True)["learn"]
