@@ -47,7 +47,7 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
         ("smoke --vary learn.tau=0.1,0.10", "--vary: two settings have the same values"),
         ("smoke --devices 4096", "--devices: 4096 asked for, there are "),
-        ("smoke --seeds 100000", "lower --replay.capacity or --seeds, or raise --devices"),
+        ("smoke --seeds 100000", "lower --seeds or --replay.capacity, vary fewer numbers"),
         ("smoke --cluster", "several processes need --run-dir"),
         ("smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2", "--process-id: must lie in 0 .. 1"),
         ("smoke --run-dir .", ". exists; give another --run-dir"),
@@ -113,3 +113,33 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     assert len(result["compile_seconds"]) == 1
     assert [row["run_dir"] for row in result["settings"][0]["members"]] == ["base/seed-0", "base/seed-1"]
     assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--seeds 0", "bench sweep: --seeds, --steps, --repeats: at least 1"),
+        ("--devices 4096", "bench sweep: --devices: 4096 asked for"),
+        ("fats", "bench sweep: argument preset: invalid choice: 'fats'"),
+        ("--batch 8000", "bench sweep: replay.capacity: must hold"),
+    ],
+)
+def test_bad_arguments_of_the_benchmark(capsys: pytest.CaptureFixture, arguments: str, message: str):
+    """Claim: what `bench sweep` cannot measure is one line and exit code 2."""
+    assert cli.main(["bench", "sweep", *arguments.split()]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.optax
+def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `bench sweep` prints a row for each number of seeds, and the run of one seed by itself, with where they
+    come from. A small step stands in for the learner's."""
+    for name, toy in (("make", toys.program), ("begin", toys.begin), ("train_step", toys.train_step)):
+        monkeypatch.setattr(step, name, toy)
+    assert cli.main(["bench", "sweep", "smoke", "--seeds", "1", "3", "--repeats", "1"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(row["seeds"], row["devices"]) for row in found["rows"]] == [(1, 1), (3, 1)]
+    for row in found["rows"]:
+        assert row["actions_per_second"] == pytest.approx(row["seeds"] * 2 * 2 / row["seconds"])
+    assert found["train"]["compile_seconds"] > 0.0
+    assert {"preset", "device", "versions", "commit"} <= found.keys()

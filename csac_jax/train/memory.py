@@ -118,13 +118,11 @@ def check(cfg: Config) -> None:
 
     In seconds: networks, which take long to trace and little room, are left out, and so is what was not fitted.
     """
-    available, total = limit(), _sure(cfg)
+    available, total = limit(), sure(cfg)
     if total <= available:
         return
     too_large = f"a run takes {total / GIB:.1f} GiB, there are {available / GIB:.1f}"
-    for name in sorted(
-        KNOBS, key=lambda name: _sure(_with(cfg, name, KNOBS[name]))
-    ):  # what most depends on comes first
+    for name in sorted(KNOBS, key=lambda name: sure(_with(cfg, name, KNOBS[name]))):  # what most depends on comes first
         value = _largest(cfg, name, available)
         if value:
             raise ValueError(
@@ -137,7 +135,7 @@ KNOBS = {"replay.capacity": 2, "learn.batch": 1, "train.scenes": 1}
 """Settings that memory falls with, and their least values."""
 
 
-def _sure(cfg: Any) -> int:
+def sure(cfg: Any) -> int:
     """Bytes that a run takes for sure."""
     slot = ring.bytes_needed(1, step.example(cfg))
     return cfg.replay.capacity * slot + max(stages(cfg, fitted_only=True).values())
@@ -161,5 +159,5 @@ def _largest(cfg: Config, name: str, available: int) -> int:
     low, high = KNOBS[name] - 1, _value(cfg, name)  # high does not fit
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if _sure(_with(cfg, name, middle)) <= available else (low, middle)
+        low, high = (middle, high) if sure(_with(cfg, name, middle)) <= available else (low, middle)
     return low if low >= needed else 0
