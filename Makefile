@@ -1,4 +1,4 @@
-# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, NAME, JOBS may be set.
+# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, NAME, JOBS, VIEWED may be set.
 PYTHON ?= python3
 PRESET ?= quick
 POLICY ?= learned
@@ -6,6 +6,7 @@ EPISODES ?= 50
 NAME ?= step
 JOBS ?= 2
 RUN ?= $(firstword $(shell ls -1dt runs/*/ 2>/dev/null))
+VIEWED ?= shipped
 ARGS ?=
 
 VENV := .venv
@@ -51,8 +52,9 @@ bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke 
 
 pictures: $(STAMP)  ## the pictures of README.md, anew
 	for shown in row:hand ridge:hand pinwheel:ur5 hole:ur5; do \
-	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --png docs/pictures/$${shown%:*}.png; \
+	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --no-views --png docs/pictures/$${shown%:*}.png; \
 	done
+	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
 
 figures: $(STAMP)  ## the figures of recorded results, anew
 	$(BIN)/python -m experiments.figures

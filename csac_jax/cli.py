@@ -23,7 +23,7 @@ import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.config import Algo, Config
 from csac_jax.scene.errors import SceneError
-from csac_jax.train import stop as stopping
+from csac_jax.train import grid, stop as stopping
 
 Arguments = TypeVar("Arguments")
 
@@ -37,8 +37,11 @@ A robot learns to push and grasp in clutter.
   train PRESET       train with a preset: {", ".join(presets.PRESETS)}
                      --algo NAME: {", ".join(algorithms.ALGORITHMS)}
   train --resume DIR go on with a run that was stopped
+  sweep PRESET       train several seeds and settings side by side, in one program
+                     --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
+  report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
@@ -74,6 +77,41 @@ class TrainOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class SweepOptions:
+    """Trains several seeds, with several settings, side by side in one program; or goes on with a sweep that was
+    stopped. Every setting of a preset is an option."""
+
+    seeds: int = 4
+    """Seeds of every setting: --seed, --seed + 1, ..."""
+    vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=A,B,...: a setting, or algo, and the values it takes; once per setting, every combination is run. Items of a
+    tuple are parted by colons: replay.beta_end=1:4,1:12."""
+    run_dir: Path | None = None
+    """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
+    resume: Path | None = None
+    """Folder of a sweep to go on with, by itself: its settings are the sweep's."""
+    shard: Literal["seeds", "scenes"] = "seeds"
+    """What several devices share out: whole seeds, or the scenes and batches of each."""
+    devices: int | None = None
+    """Devices to use; one if not given, and with several processes all that they have."""
+    coordinator: str | None = None
+    """ADDRESS:PORT of the first of several processes, on one host or many; all run the same command. See
+    docs/cluster.md."""
+    processes: int | None = None
+    """How many processes there are."""
+    process_id: int | None = None
+    """Number of this process, from 0."""
+    cluster: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Join the processes of a job of SLURM, Open MPI or Kubernetes: JAX finds out where they are."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+    seed: int = 0
+    """The first seed."""
+    algo: Algo = "csac_beta"
+    """The algorithm: it changes settings of the preset, and settings given as options win over it."""
+
+
+@dataclasses.dataclass(frozen=True)
 class EvalOptions:
     """Measures a policy in scenes that training never saw."""
 
@@ -82,7 +120,8 @@ class EvalOptions:
     policy: Literal["learned", "random", "oracle"] = "learned"
     """What acts: the networks; a random place with a block under it; or one that reads the blocks' poses."""
     suite: str = "own"
-    """Scenes: own (dropped like the training's), random10, cases, generated, or a case file."""
+    """Scenes: own (dropped like the training's), random10, random30 (with --physics c on a CPU), cases, target (needs a
+    policy of that task), generated, or a case file."""
     physics: Literal["mjx", "c"] = "mjx"
     """What moves the blocks: MJX as in training, or C MuJoCo, the reference."""
     robot: Literal["hand", "ur5"] = "hand"
@@ -114,10 +153,25 @@ class PlayOptions:
     """File to write a picture of the first moment to."""
     size: tuple[int, int] = (640, 480)
     """Width and height of picture and video, px, even numbers."""
+    views: bool = True
+    """Show height map and action beside the scene; of a learned policy also Q of both primitives, best over yaws, and
+    the candidates of its search."""
     seed: int = 0
     """Number that the scene and the policy's noise follow from."""
     json: Path | None = None
     """File to write the result to, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportOptions:
+    """Brings recorded runs and evaluations together, over their seeds; reads only, needs no JAX."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of runs, or of folders of runs, and files that `eval --json` wrote."""
+    out: Path | None = None
+    """Folder to write a page with figures to, index.html; needs the extra `bench`."""
+    json: Path | None = None
+    """File to write the numbers to, as JSON."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,14 +235,17 @@ def _sections() -> list[dataclasses.Field[Any]]:
     return [field for field in dataclasses.fields(Config) if dataclasses.is_dataclass(field.type)]
 
 
-# All settings and options of `train`: TrainOptions and, as groups of flags, every section of Config.
-_Train = dataclasses.make_dataclass(
-    "_Train",
-    [(field.name, field.type, field) for field in _sections()],
-    bases=(TrainOptions,),
-    frozen=True,
-    namespace={"__doc__": TrainOptions.__doc__},
-)
+def _with_settings(options: type) -> Any:
+    """A dataclass of these options and, as groups of flags, of every section of Config."""
+    fields = [(field.name, field.type, field) for field in _sections()]
+    namespace = {"__doc__": options.__doc__}
+    return dataclasses.make_dataclass(
+        f"_{options.__name__}", fields, bases=(options,), frozen=True, namespace=namespace
+    )
+
+
+_Train = _with_settings(TrainOptions)
+_Sweep = _with_settings(SweepOptions)
 
 
 def _parse(kind: type[Arguments], arguments: list[str], prog: str, default: Any = tyro.MISSING_NONPROP) -> Arguments:
@@ -246,6 +303,7 @@ def train(arguments: list[str]) -> int:
     summary = _train(options, cfg, run_dir, stop, trunk)
     result = {"run_dir": str(run_dir), **summary._asdict(), "wall_seconds": round(time.time() - begun, 1)}
     _write_json(options.json, result, cfg)
+    _write_json(run_dir / "train.json", result, cfg)  # `report` reads it
     return stop.exit_code
 
 
@@ -372,7 +430,12 @@ def _require_tensorboard() -> None:
 
 def _new_run_dir(cfg: Config) -> Path:
     """A folder that does not exist yet."""
-    stem = RUNS / f"{cfg.preset}-{cfg.seed}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    return _new_folder(f"{cfg.preset}-{cfg.seed}")
+
+
+def _new_folder(name: str) -> Path:
+    """A folder under RUNS, with the time in its name, that does not exist yet."""
+    stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
     return next(path for path in candidates if not path.exists())
 
@@ -414,6 +477,126 @@ def _train(options: TrainOptions, cfg: Config, run_dir: Path, stop: stopping.Sto
             raise BadArgumentsError(f"{run_dir} exists; give another --run-dir, or go on with it by --resume") from None
         except (loop.TrainingError, checkpoint.CheckpointError) as error:
             raise FailedError(str(error)) from None
+
+
+# sweep.
+
+
+def sweep(arguments: list[str]) -> int:
+    """`csac-jax sweep`."""
+    stop = stopping.install()
+    options, plan = _read_sweep(arguments)
+    folder = options.resume or options.run_dir or _new_folder(f"sweep-{plan.settings[0].cfg.preset}")
+    begun = time.time()
+    result = _sweep(options, plan, folder, stop)
+    times = {"compile_seconds": result.compile_seconds, "wall_seconds": round(time.time() - begun, 1)}
+    summary = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
+    _write_json(options.json, summary, None)
+    _write_json(folder / "train.json", summary, None)  # `report` reads it
+    return stop.exit_code
+
+
+def _read_sweep(arguments: list[str]) -> tuple[SweepOptions, Any]:
+    """Options and plan of a sweep, from the command line or, if it is resumed, from its folder."""
+    named = bool(arguments) and not arguments[0].startswith("-")
+    preset, flags = (arguments[0], arguments[1:]) if named else ("quick", arguments)
+    options, cfg = _parse_setting(preset, flags)
+    if options.seeds < 1 or options.seed + options.seeds > 2**31:
+        raise BadArgumentsError("--seeds: at least 1, and no seed may exceed 2147483647")
+    _join(options)
+    if options.resume is not None:
+        return options, _stored_plan(options.resume, preset if named else None, options, cfg)
+    if not named:
+        raise BadArgumentsError(f"sweep: give a preset first, one of: {', '.join(presets.PRESETS)}")
+    if options.run_dir is not None and options.run_dir.exists():
+        raise BadArgumentsError(f"{options.run_dir} exists; give another --run-dir, or go on with it by --resume")
+    try:
+        combinations = grid.settings(options.vary)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    found = [(one, _parse_setting(preset, [*flags, *one.flags])[1]) for one in combinations]
+    for _, each in found:
+        _check_physics(each)
+    from csac_jax.train import sweep as sweeping
+
+    plan = sweeping.Plan(options.seeds, [sweeping.Setting(one.name, one.values, each) for one, each in found])
+    try:
+        sweeping.check(plan)
+    except (ValueError, sweeping.SweepError) as error:
+        raise BadArgumentsError(str(error)) from None
+    return options, plan
+
+
+def _join(options: SweepOptions) -> None:
+    """Joins the other processes, if there are to be several."""
+    place = (options.coordinator, options.processes, options.process_id)
+    if not options.cluster and place == (None, None, None):
+        return
+    if options.run_dir is None and options.resume is None:
+        raise BadArgumentsError("sweep: several processes need --run-dir, one folder that all of them see")
+    from csac_jax.train import cluster
+
+    try:
+        cluster.join(cluster.Place(*place))
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+
+
+def _parse_setting(preset: str, flags: list[str]) -> tuple[SweepOptions, Config]:
+    """Options of a sweep and the config of a setting, whose flags are the last ones."""
+    base = _preset(preset, _value_of(flags, "--algo"))
+    sections = {field.name: getattr(base, field.name) for field in _sections()}
+    options = _parse(_Sweep, flags, f"{PROGRAM} sweep {preset}", _Sweep(algo=base.algo, **sections))
+    return options, _build_config(preset, options)
+
+
+def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:
+    from csac_jax.train import sweep as sweeping
+
+    if preset or options.vary or options.run_dir or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
+        raise BadArgumentsError("sweep --resume: a sweep goes on with its own settings; leave all others out")
+    try:
+        return sweeping.read_plan(folder)
+    except sweeping.SweepError as error:
+        raise FailedError(str(error)) from None
+
+
+def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) -> Any:
+    from rich.console import Console
+
+    from csac_jax.show.progress import Terminal
+    from csac_jax.train import checkpoint, cluster, loop, members, mesh, sweep as sweeping
+
+    try:
+        line = mesh.make(options.devices)
+        for one in plan.settings:
+            mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
+            sweeping.check_memory(plan, one.cfg, 1 if line is None or options.shard == "scenes" else line.size)
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    trunks = {one.cfg.net: _read_weights(one.cfg) for one in plan.settings}
+
+    def engine(group: members.Group) -> sweeping.Engine:
+        return members.engine(group, line, options.shard, trunks[group.configs[0].net])
+
+    with Terminal(Console(quiet=not cluster.is_first())) as terminal:
+        terminal.say(f"sweep {folder}")
+        try:
+            result = sweeping.run(plan, folder, engine, terminal, stop, resume=options.resume is not None)
+        except FileExistsError:
+            raise BadArgumentsError(f"{folder} exists; give another --run-dir, or go on with it by --resume") from None
+        except (sweeping.SweepError, loop.TrainingError, checkpoint.CheckpointError) as error:
+            raise FailedError(str(error)) from None
+        for one in result.summary["settings"]:
+            terminal.say(f"{one['name']}: {_seeds_line(one['grasp_success'])}")
+    return result
+
+
+def _seeds_line(success: dict[str, Any]) -> str:
+    if not success["n"]:
+        return "no seed is done"
+    interval = f" (95 % interval {_interval(success)})" if success["low"] is not None else ""
+    return f"grasp success {_percent(success['value'])}{interval}, interquartile mean of {success['n']} seeds"
 
 
 # eval.
@@ -467,7 +650,7 @@ def _evaluate(options: EvalOptions, cfg: Config, networks: Callable[[], Any]) ->
 
     cache.enable()
     try:
-        parts = suites.environments(cfg, options.suite, options.episodes, options.seed)
+        parts = suites.environments(cfg, options.suite, options.episodes, options.seed, options.policy)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
     params = networks() if options.policy == "learned" else None
@@ -498,7 +681,7 @@ def play(arguments: list[str]) -> int:
 
     print(playing.summary(moments))
     if drawn:
-        stage = playing.Stage(cfg, moments[0].before, options.size, opengl)
+        stage = playing.Stage(cfg, moments[0].before, options.size, opengl, options.views)
         playing.record(stage, moments, options.png, options.video)
     last = moments[-1].after
     result = {
@@ -565,7 +748,7 @@ def _print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table("metric", "value", "95 % interval", "n", title=title)
-    for name, entry in summary.items():
+    for name, entry in {**summary, **summary.get("failures", {})}.items():
         if "value" in entry:
             shown = ("-", "-") if entry["n"] == 0 else (_percent(entry["value"]), _interval(entry))
             table.add_row(name, *shown, str(entry["n"]))
@@ -583,6 +766,35 @@ def _percent(value: float) -> str:
 
 def _interval(entry: dict[str, Any]) -> str:
     return f"{100 * entry['low']:.1f} .. {100 * entry['high']:.1f} %"
+
+
+# report.
+
+
+def report(arguments: list[str]) -> int:
+    """`csac-jax report`."""
+    options = _parse(ReportOptions, arguments, f"{PROGRAM} report")
+    if not options.runs:
+        raise BadArgumentsError("report: give at least one folder of a run, or a file of `eval --json`")
+    if options.out is not None:
+        import importlib.util
+
+        if importlib.util.find_spec("matplotlib") is None:
+            raise BadArgumentsError("--out needs an extra; run: pip install 'csac-jax[bench]'")
+    from csac_jax.show import report as reporting, results
+
+    try:
+        found = reporting.build(results.read(options.runs))
+    except ValueError as error:
+        raise BadArgumentsError(str(error)) from None
+    if not (found.curves or found.scores):
+        raise FailedError("; ".join(found.notes))
+    print(reporting.markdown(found), end="")
+    for path in reporting.write(found, options.out) if options.out is not None else ():
+        print(path)
+    if options.json is not None:
+        _replace_text(options.json, reporting.as_json(found))
+    return 0
 
 
 # export.
@@ -721,7 +933,11 @@ def _write_json(path: Path | None, result: dict[str, Any], cfg: Config | None) -
     from csac_jax.train import config_json, provenance
 
     config = {} if cfg is None else {"config": config_json.to_dict(cfg)}
-    text = json.dumps({**result, **config, **provenance.record()}, indent=2) + "\n"
+    _replace_text(path, {**result, **config, **provenance.record()})
+
+
+def _replace_text(path: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=2) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(text)
@@ -730,8 +946,10 @@ def _write_json(path: Path | None, result: dict[str, Any], cfg: Config | None) -
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
+    "sweep": sweep,
     "eval": evaluate,
     "play": play,
+    "report": report,
     "export": export,
     "doctor": doctor,
     "bench": bench,

@@ -1,4 +1,5 @@
-"""Figures of recorded results, drawn anew by `make figures` into docs/figures."""
+"""Figures of recorded results, drawn anew by `make figures` into docs/figures: the samplers' speed, and whatever
+`csac-jax report experiments/results` draws."""
 
 import json
 from pathlib import Path
@@ -8,6 +9,8 @@ import matplotlib
 
 matplotlib.use("Agg")  # no display
 import matplotlib.pyplot as plt
+
+from csac_jax.show import charts, report, results
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, FIGURES = ROOT / "experiments" / "results", ROOT / "docs" / "figures"
@@ -69,3 +72,4 @@ if __name__ == "__main__":
     FIGURES.mkdir(exist_ok=True)
     replay()
     steps()
+    charts.save(report.build(results.read([RESULTS])), FIGURES)

@@ -54,7 +54,7 @@ def run_dir(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("trian quick", "unknown command 'trian'; choose one of: train, eval, play, export, doctor"),
+        ("trian quick", "unknown command 'trian'; choose one of: train, sweep, eval, play, report, export, doctor"),
         ("train", "give a preset first, one of: smoke, quick"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
         ("train quik", "unknown preset 'quik'; choose one of: smoke, quick"),
@@ -417,6 +417,7 @@ def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     result = json.loads((tmp_path / "out/result.json").read_text())
     assert (result["actions"], result["config"]["seed"], result["config"]["preset"]) == (8, 3, "smoke")
     assert {"device", "versions", "commit", "run_dir", "wall_seconds"} <= result.keys()
+    assert json.loads((tmp_path / result["run_dir"] / "train.json").read_text()) == result
 
 
 @pytest.mark.mjx

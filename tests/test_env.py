@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from csac_jax.agent import rewards
 from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.env import Env, State
 from csac_jax.scene import blocks, layout
+from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle
 from csac_jax.sim.outcome import Outcome
@@ -73,6 +75,40 @@ def _cube(x: float, y: float, target: int = layout.ANY) -> Scene:
     in_play = jnp.array([True, target != layout.ANY, False])
     position = jnp.where(in_play[:, None], scene.position.at[:2].set(places), scene.position)
     return scene.replace(position=position, in_play=in_play, target=jnp.int32(target))
+
+
+@pytest.mark.slow
+def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `scene.arranged` of the scenes that resets draw from are packed arrangements, the others are dropped."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    scene = dataclasses.replace(CONFIG.scene, slots=("box",) * 3, min_blocks=3, pool=8)
+    dropped, mixed = (
+        environment.make(
+            dataclasses.replace(CONFIG, scene=dataclasses.replace(scene, arranged=share, pool=pool))
+        ).scenes
+        for share, pool in ((0.0, 6), (0.25, 8))
+    )
+    np.testing.assert_array_equal(mixed.position[:6], dropped.position)
+    packed = environment.arrangements(scene, CONFIG.heightmap.extent, 0, 2)
+    np.testing.assert_array_equal(mixed.position[6:], packed.position)
+    assert mixed.in_play.all()
+
+
+def test_arrangement_without_blocks_for_it():
+    """Claim: `scene.arranged` with blocks that allow no arrangement is one line that names the slots."""
+    two = SceneConfig(slots=("box", "prism"), min_blocks=2)
+    with pytest.raises(SceneError, match=r"scene\.arranged: scene\.slots: too few for an arrangement"):
+        environment.arrangements(two, CONFIG.heightmap.extent, 0, 2)
+
+
+def test_scenes_stay_inside_however_turned(lab: Lab):
+    """Claim: a scene that a turn would take out of the square is turned by quarters, any other by any yaw."""
+    for seed, (x, quarters) in enumerate(((0.21, True), (0.15, False))):
+        scene, keys = _cube(x, x), jax.random.split(jax.random.key(seed), 64)
+        places = jax.vmap(lab.env.vary, (0, None))(keys, scene).position[:, 0, :2]
+        assert np.abs(places).max() <= 0.5 * CONFIG.heightmap.extent
+        whole = np.isclose(np.abs(places), x, atol=1e-5).all(axis=1)
+        assert whole.all() if quarters else whole.mean() < 0.2
 
 
 def _stack(*trees):

@@ -39,23 +39,49 @@ def maximise(
     Args: mean [A] the actor's proposal; start [P0, A] further starting points, P0 <= J, may be 0; wraps [A] bool, True
     for the dimensions in which -1 and 1 are the same point.
     """
+    search = _refit(cfg, score, _begin(cfg, mean, wraps), _first(key, cfg, mean, start, wraps), wraps)
+
+    def iterate(search: _Search, i: jax.Array) -> tuple[_Search, None]:
+        return _refit(cfg, score, search, _gaussian(key, search, i, cfg.candidates, wraps), wraps), None
+
+    search, _ = jax.lax.scan(iterate, search, jnp.arange(1, cfg.rounds))
+    return search.best
+
+
+def last_round(
+    key: jax.Array, cfg: CEMConfig, score: Score, mean: jax.Array, start: jax.Array, wraps: jax.Array | np.ndarray
+) -> jax.Array:
+    """The samples [J, A] that the last round of `maximise` tries when called with the same: to be looked at."""
+    actions, search = _first(key, cfg, mean, start, wraps), _begin(cfg, mean, wraps)
+    for i in range(1, cfg.rounds):
+        search = _refit(cfg, score, search, actions, wraps)
+        actions = _gaussian(key, search, i, cfg.candidates, wraps)
+    return actions
+
+
+def _begin(cfg: CEMConfig, mean: jax.Array, wraps: jax.Array | np.ndarray) -> _Search:
+    """The search before its first round."""
+    centre = box.project(mean, wraps)
+    return _Search(centre, jnp.full_like(mean, cfg.std), CEMResult(centre, jnp.full((), -jnp.inf, mean.dtype)))
+
+
+def _first(
+    key: jax.Array, cfg: CEMConfig, mean: jax.Array, start: jax.Array, wraps: jax.Array | np.ndarray
+) -> jax.Array:
+    """The samples [J, A] of the first round: `start`, filled up with Gaussian ones."""
     num_start = start.shape[0]
     if num_start > cfg.candidates:
         raise ValueError(f"cem.candidates: {cfg.candidates} samples cannot hold {num_start} starting points; raise it")
+    drawn = _gaussian(key, _begin(cfg, mean, wraps), 0, cfg.candidates - num_start, wraps)
+    return jnp.concatenate([box.project(start, wraps), drawn])
 
-    def gaussian(search: _Search, i: jax.Array | int, num: int) -> jax.Array:
-        noise = jax.random.normal(jax.random.fold_in(key, i), (num, *mean.shape), mean.dtype)
-        return box.project(search.mean[None] + search.std[None] * noise, wraps)
 
-    def iterate(search: _Search, i: jax.Array) -> tuple[_Search, None]:
-        return _refit(cfg, score, search, gaussian(search, i, cfg.candidates), wraps), None
-
-    centre = box.project(mean, wraps)
-    search = _Search(centre, jnp.full_like(mean, cfg.std), CEMResult(centre, jnp.full((), -jnp.inf, mean.dtype)))
-    first = gaussian(search, 0, cfg.candidates - num_start)
-    search = _refit(cfg, score, search, jnp.concatenate([box.project(start, wraps), first]), wraps)
-    search, _ = jax.lax.scan(iterate, search, jnp.arange(1, cfg.rounds))
-    return search.best
+def _gaussian(
+    key: jax.Array, search: _Search, i: jax.Array | int, num: int, wraps: jax.Array | np.ndarray
+) -> jax.Array:
+    """Samples [num, A] of round i about the search's mean."""
+    noise = jax.random.normal(jax.random.fold_in(key, i), (num, *search.mean.shape), search.mean.dtype)
+    return box.project(search.mean[None] + search.std[None] * noise, wraps)
 
 
 def _refit(cfg: CEMConfig, score: Score, search: _Search, actions: jax.Array, wraps: jax.Array | np.ndarray) -> _Search:

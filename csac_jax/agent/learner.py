@@ -75,14 +75,23 @@ class Learner:
 
 def make(cfg: Config) -> Learner:
     """The learner of a config."""
-    return Learner(
-        cfg,
-        maps.frames(cfg),
-        networks.critic(cfg.net),
-        networks.head(cfg.net),
+    bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
+    return Learner(cfg, maps.frames(cfg), networks.critic(cfg.net), networks.head(cfg.net), *_optimisers(cfg), bounds)
+
+
+def with_numbers(learner: Learner, cfg: Config, bounds: tuple[Any, Any]) -> Learner:
+    """The learner of a config that differs in numbers only, which may be traced, and with them the `bounds`."""
+    critic_optimiser, actor_optimiser = _optimisers(cfg)
+    return dataclasses.replace(
+        learner, cfg=cfg, critic_optimiser=critic_optimiser, actor_optimiser=actor_optimiser, bounds=bounds
+    )
+
+
+def _optimisers(cfg: Config) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+    """Of the critic and of the actor."""
+    return (
         _optimiser(cfg, cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates),
         _optimiser(cfg, cfg.learn.actor_learning_rate, cfg.train.steps),
-        rewards.bounds(cfg.reward, cfg.target.gamma),
     )
 
 

@@ -147,6 +147,24 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
     return (1.0 - share) * at(k) + share * at(k + 1)
 
 
+def best_over_yaws(frames: Frames, state: DenseMaps, places: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The largest valid value over the yaws at `places` [..., 2] m, and whether any is valid, both [P, ...].
+
+    To be looked at: a picture of what the maps say, without their turned frames.
+    """
+    flat = places.reshape(-1, 2)
+
+    def at(primitive: jax.Array, place: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pose = jnp.append(place, yaw)
+        return read(frames, state.q, primitive, pose), is_valid(frames, state.valid, primitive, pose)
+
+    every = jax.vmap(jax.vmap(jax.vmap(at, (None, None, 0)), (None, 0, None)), (0, None, None))
+    values, valid = every(jnp.arange(NUM_PRIMITIVES), flat, jnp.asarray(frames.yaws))  # [P, places, K]
+    best = jnp.max(jnp.where(valid, values, -jnp.inf), axis=-1)
+    shape = (NUM_PRIMITIVES, *places.shape[:-1])
+    return best.reshape(shape), jnp.any(valid, axis=-1).reshape(shape)
+
+
 def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
     """Whether the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
     num, side = frames.yaws.shape[0], frames.side

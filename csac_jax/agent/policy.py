@@ -41,7 +41,30 @@ def greedy(key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalt
 def _search(
     key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, primitive: Primitive
 ) -> cem.CEMResult:
-    """Maximises Q over the pose of a primitive by the cross-entropy method, Algorithm 1 lines 8-13.
+    """Maximises Q over the pose of a primitive by the cross-entropy method, Algorithm 1 lines 8-13."""
+    score, mean, start = _problem(cfg, frames, state, penalty, primitive)
+    return cem.maximise(key, cfg.cem, score, mean, start, box.POSE_WRAPS)
+
+
+def candidates(key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float) -> jax.Array:
+    """Poses [P, J, 3] that the last round of `greedy`'s searches tries; the best pixel if it has none."""
+
+    def cloud(primitive: Primitive) -> jax.Array:
+        if cfg.policy.place != "cem":
+            return _best_pixel(frames, state, primitive).action[None]
+        its_key = jax.random.fold_in(key, primitive)
+        score, mean, start = _problem(cfg, frames, state, penalty, primitive)
+        return cem.last_round(its_key, cfg.cem, score, mean, start, box.POSE_WRAPS)
+
+    points = jnp.stack([cloud(primitive) for primitive in Primitive])
+    each = jax.vmap(jax.vmap(maps.denormalise, (None, 0)), (None, 0))
+    return each(frames, points)
+
+
+def _problem(
+    cfg: Config, frames: Frames, state: DenseMaps, penalty: float, primitive: Primitive
+) -> tuple[cem.Score, jax.Array, jax.Array]:
+    """What a search maximises, its mean [A] and its starting points [P0, A].
 
     It starts, by `cem.start`, at the actor's mean, at the map's best cells, as many as there are elites, or at both;
     `penalty` keeps it off cells with nothing to act on.
@@ -61,7 +84,7 @@ def _search(
         mean = start[0]
     elif cfg.cem.start != "both":
         raise ValueError(f"cem.start: {cfg.cem.start!r} is none of 'both', 'actor', 'cells'")
-    return cem.maximise(key, cfg.cem, score, mean, start, box.POSE_WRAPS)
+    return score, mean, start
 
 
 def _best_pixel(frames: Frames, state: DenseMaps, primitive: Primitive) -> cem.CEMResult:

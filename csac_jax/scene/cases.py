@@ -70,6 +70,26 @@ def require_target(case: Case) -> None:
         raise ValueError(f"case '{case.name}' marks no block as the target; give one of them \"target\": true")
 
 
+def seat(case: Case, slots: tuple[SlotKind, ...]) -> Scene:
+    """The case's scene in other slots, each block in the first free one of its kind; slots left over are parked."""
+    free = list(range(len(slots)))
+    place = []
+    for kind in case.slots:
+        place.append(next(slot for slot in free if slots[slot] == kind))
+        free.remove(place[-1])
+    given, scene = case.scene, layout.parked(slots)
+    leaves: dict[str, Any] = {}
+    for field in dataclasses.fields(scene):
+        if field.name == "target":
+            continue
+        leaf = getattr(scene, field.name).copy()
+        leaf[place] = getattr(given, field.name)
+        leaves[field.name] = leaf
+    target = int(given.target)
+    leaves["target"] = np.int32(target if target == layout.ANY else place[target])
+    return dataclasses.replace(scene, **leaves)
+
+
 # From text to a scene.
 
 

@@ -27,9 +27,12 @@ _VERSION = 4  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round
+_PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
+_PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
+_MOST_DROPS = 3  # times the number of blocks: pauses that pouring a scene may take
 
 
-def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: int) -> Scene:
+def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool = False) -> Scene:
     """`count` distinct settled scenes per number of blocks, leaves [P, N, ...], from the cache or settled now.
 
     P = count for each number from `min_blocks` to N, fewest first.
@@ -37,32 +40,46 @@ def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: i
     Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
     by any yaw. `world` is one with the floating hand, which waits high above. The same arguments give the same scenes
     on every machine of one kind. Raises SceneError where hardly any scene comes to rest.
+
+    Blocks are dropped all at once, stacked up in the air; `poured` drops one after another from `drop_height` above
+    what lies there already, and those that roll off anew, for piles of more blocks than fit beside one another.
     """
-    path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count)}.npz"
+    path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count, poured)}.npz"
     cached = _read(path)
     if cached is not None:
         return cached
     rng = np.random.default_rng([stream, 20221])
     numbers = range(cfg.min_blocks, len(cfg.slots) + 1)
-    each = [_settle(world, cfg, extent, rng, in_play, count) for in_play in numbers]
+    each = [_settle(world, cfg, extent, rng, in_play, count, poured) for in_play in numbers]
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each)
     _write(path, scenes)
     return scenes
 
 
-def _settle(world: World, cfg: SceneConfig, extent: float, rng: np.random.Generator, in_play: int, count: int) -> Scene:
+def _settle(
+    world: World,
+    cfg: SceneConfig,
+    extent: float,
+    rng: np.random.Generator,
+    in_play: int,
+    count: int,
+    poured: bool,
+) -> Scene:
     """`count` settled scenes of `in_play` blocks."""
+    fall = pour if poured else rest
     fields_of = jax.vmap(functools.partial(scene_fields, world))
     found: list[Scene] = []
     kept = dropped = 0
     with concurrent.futures.ThreadPoolExecutor() as threads:
         while kept < count:
-            drops = [_drop(cfg, rng, in_play) for _ in range(_ROUND)]
+            # a round of piles takes minutes: no more of them than are wanted
+            num = min(_ROUND, count - kept) if poured else _ROUND
+            drops = [_drop(cfg, rng, in_play) for _ in range(num)]
             fields = jax.device_get(fields_of(jax.tree.map(lambda *leaves: np.stack(leaves), *drops)))
-            rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(_ROUND)]
-            ended = threads.map(lambda scene, row: rest(world, cfg, extent, scene, row), drops, rows)
+            rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
+            ended = threads.map(lambda scene, row: fall(world, cfg, extent, scene, row), drops, rows)
             good = [scene for scene in ended if scene is not None]
-            found, kept, dropped = found + good, kept + len(good), dropped + _ROUND
+            found, kept, dropped = found + good, kept + len(good), dropped + num
             if dropped >= 20 * _ROUND and kept < dropped / 50:
                 raise SceneError(
                     f"only {kept} of {dropped} dropped scenes came to rest inside the workspace; "
@@ -105,18 +122,60 @@ def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
     return (sizes * scales[blocks.size_leader(cfg.slots)][:, None]).astype(np.float32)
 
 
-def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
-    """The scene after its blocks fell, None where a block is not at rest or left the workspace."""
+def _falling(world: World, scene: Scene, fields: BlockFields) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The scene's blocks where they are, the hand high above."""
     model = with_blocks(world, fields)
     model.opt.iterations, model.opt.ls_iterations = 20, 20  # quality over speed: this runs once
+    model.opt.timestep = 0.5 * world.model.opt.timestep
     data = mujoco.MjData(model)
     data.qpos[world.robot_qpos] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0, 0.0]
     data.ctrl[:] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0]
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    parked = ~scene.in_play
-    model.body_gravcomp[world.block_bodies[parked]] = 1.0
-    model.opt.timestep = 0.5 * world.model.opt.timestep
+    return model, data
+
+
+def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
+    """The scene after its blocks fell, None where a block is not at rest or left the workspace."""
+    model, data = _falling(world, scene, fields)
+    model.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
     mujoco.mj_step(model, data, nstep=round(cfg.settle_time / model.opt.timestep))
+    return _at_rest(world, extent, scene, data)
+
+
+def pour(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
+    """As `rest`, the blocks dropped one after another, lowest first; one that leaves the workspace is dropped anew."""
+    model, data = _falling(world, scene, fields)
+    num, still = len(scene.in_play), round(_PAUSE / model.opt.timestep)
+    waiting = [int(slot) for slot in np.argsort(scene.position[:, 2]) if scene.in_play[slot]]
+    rng = np.random.default_rng(np.abs(scene.position * 1e6).astype(np.uint64).ravel())
+    aloft = np.ones(num, bool)
+    pinned, quiet = layout.parking(num), 0.0
+
+    def run() -> None:
+        for _ in range(0, still, _PIN_EVERY):
+            data.qpos[world.block_qpos[aloft, :3]], data.qvel[world.block_dofs[aloft]] = pinned[aloft], 0.0
+            mujoco.mj_step(model, data, nstep=_PIN_EVERY)
+
+    for _ in range(_MOST_DROPS * len(waiting)):
+        if waiting:
+            slot, half = waiting.pop(0), 0.5 * cfg.drop_extent
+            high = data.qpos[world.block_qpos[~aloft, 2]].max(initial=0.0)
+            aloft[slot], quiet = False, 0.0
+            data.qpos[world.block_qpos[slot, :3]] = [*rng.uniform(-half, half, 2), high + cfg.drop_height]
+            data.qvel[world.block_dofs[slot]] = 0.0
+        run()
+        quiet += _PAUSE
+        off = ~aloft & (np.linalg.norm(data.qpos[world.block_qpos[:, :2]], axis=1) > 0.5 * extent)
+        waiting += [int(slot) for slot in np.flatnonzero(off)]
+        aloft |= off
+        if not waiting and quiet >= cfg.settle_time:
+            return _at_rest(world, extent, scene, data)
+    return None
+
+
+def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> Scene | None:
+    """The scene as its blocks lie now, None where a block is not at rest or left the workspace."""
+    parked = ~scene.in_play
     pose = data.qpos[world.block_qpos].astype(np.float32)
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
@@ -136,10 +195,10 @@ def _cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "csac_jax" / "pools"
 
 
-def _digest(world: World, cfg: SceneConfig, extent: float, stream: int, count: int) -> str:
+def _digest(world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool) -> str:
     """Name of a pool: hash of everything that decides its content."""
     relevant = (_VERSION, mujoco.__version__, repr(cfg), float(extent), stream, count, world.model.opt.timestep)
-    content = hashlib.sha256(repr(relevant).encode())
+    content = hashlib.sha256(repr((*relevant, "poured") if poured else relevant).encode())
     for name in ("table.xml", "hand.xml", "blocks.xml"):
         content.update((assets() / name).read_bytes())
     return content.hexdigest()[:32]

@@ -44,7 +44,17 @@ class CPhysics:
 
 def _blank(num: int) -> Trace:
     """`outcome.blank` in NumPy."""
-    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: outcome.blank(num)))
+    no, zero, zeros = np.zeros((), bool), np.zeros((), np.float32), np.zeros(num, np.float32)
+    leaves: dict[str, Any] = {
+        "touched": no,
+        "held_rise": zeros,
+        "held": np.zeros(num, bool),
+        "rise": zeros,
+        "gap_closed": zero,
+        "gap_end": zero,
+        "saturated": np.zeros((), np.int32),
+    }
+    return Trace(**leaves)
 
 
 def _run_batch(world: World, closed_at: int, scene: Scene, fields: BlockFields, drive: Drive) -> Any:
@@ -62,36 +72,51 @@ def _run(world: World, closed_at: int, scene: Scene, fields: BlockFields, drive:
     pose = np.concatenate([scene.position, scene.quaternion], axis=1)
     if not (np.isfinite(pose).all() and np.isfinite(scene.velocity).all()):  # MuJoCo would start anew from scratch
         return pose, scene.velocity, _blank(len(pose))
-    trace = _blank(len(pose))
+    if not (drive.reachable and scene.in_play.any()):  # nothing moves, and nobody looks at the gap
+        return pose, scene.velocity, _blank(len(pose))
+    row_of_geom, touched = np.full(world.model.ngeom, -1), False
+    row_of_geom[world.hand_geoms] = np.arange(len(world.hand_geoms))
+    held, held_rise, gap_closed = np.zeros(len(pose), bool), np.zeros(len(pose), np.float32), np.float32(0.0)
+    heights, finger = world.block_qpos[:, 2], world.robot_qpos[-2]
     for index, data in enumerate(_substeps(world, model.with_blocks(world, fields), scene, drive)):
-        touching = _touching(world, data)
+        touching = _touching(world, row_of_geom, data)
         held = touching[1] & touching[2]
-        rise = (data.qpos[world.block_qpos[:, 2]] - pose[:, 2]).astype(np.float32)
-        gap = np.float32(2.0 * data.qpos[world.robot_qpos[-2]])
-        seen: dict[str, Any] = {
-            "touched": trace.touched | touching.any(),
-            "held_rise": np.where(held, np.maximum(trace.held_rise, rise), trace.held_rise),
-            "held": held,
-            "rise": rise,
-            "gap_closed": gap if index == closed_at else trace.gap_closed,
-            "gap_end": gap,
-        }
-        trace = dataclasses.replace(trace, **seen)
-    return data.qpos[world.block_qpos].astype(np.float32), data.qvel[world.block_dofs].astype(np.float32), trace
+        rise = (data.qpos[heights] - pose[:, 2]).astype(np.float32)
+        touched = touched or bool(touching.any())
+        if held.any():
+            held_rise = np.where(held, np.maximum(held_rise, rise), held_rise)
+        if index == closed_at:
+            gap_closed = np.float32(2.0 * data.qpos[finger])
+    leaves: dict[str, Any] = {
+        "touched": np.asarray(touched),
+        "held_rise": held_rise,
+        "held": held,
+        "rise": rise,
+        "gap_closed": gap_closed,
+        "gap_end": np.float32(2.0 * data.qpos[finger]),
+        "saturated": np.zeros((), np.int32),
+    }
+    end = data.qpos[world.block_qpos].astype(np.float32), data.qvel[world.block_dofs].astype(np.float32)
+    return *end, Trace(**leaves)
 
 
 def _substeps(world: World, exact: mujoco.MjModel, scene: Scene, drive: Drive) -> Iterator[mujoco.MjData]:
     """The state after every substep, one and the same object; NumPy throughout."""
     exact.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    data, parked = mujoco.MjData(exact), ~scene.in_play
+    data, parked = mujoco.MjData(exact), np.flatnonzero(~scene.in_play)
     pose = np.concatenate([scene.position, scene.quaternion], axis=1)
     data.qpos[world.robot_qpos] = drive.start
     data.qpos[world.block_qpos], data.qvel[world.block_dofs] = pose, scene.velocity
+    places, still, waiting = world.block_qpos[parked], world.block_dofs[parked], pose[parked]
+    fastest = np.full(exact.nv, np.inf)
+    fastest[world.block_dofs] = layout.SPEED_LIMIT
     for control in drive.control:
         data.ctrl[:] = control
         mujoco.mj_step(exact, data)
-        data.qvel[world.block_dofs] = np.clip(data.qvel[world.block_dofs], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
-        data.qpos[world.block_qpos[parked]], data.qvel[world.block_dofs[parked]] = pose[parked], 0.0
+        np.minimum(data.qvel, fastest, out=data.qvel)
+        np.maximum(data.qvel, -fastest, out=data.qvel)
+        if len(parked):
+            data.qpos[places], data.qvel[still] = waiting, 0.0
         yield data
 
 
@@ -114,12 +139,16 @@ def film(world: World, fields: BlockFields, scene: Scene, drive: Drive) -> Film:
     )
 
 
-def _touching(world: World, data: mujoco.MjData) -> np.ndarray:
-    """Which hand geom touches which block, [3, N] bool."""
-    pairs = data.contact.geom[data.contact.dist < 0.0]  # [C, 2]
+def _touching(world: World, row_of_geom: np.ndarray, data: mujoco.MjData) -> np.ndarray:
+    """Which hand geom touches which block, [3, N] bool; `row_of_geom` [geoms], -1 where it is none of the hand's."""
     touching = np.zeros((len(world.hand_geoms), len(world.slots)), bool)
-    for hand, other in (pairs.T, pairs.T[::-1]):
-        slot = world.slot_of_geom[other]
-        for row, geom in enumerate(world.hand_geoms):
-            touching[row, slot[(hand == geom) & (slot >= 0)]] = True
+    pairs = data.contact.geom  # [C, 2]
+    row = row_of_geom[pairs]
+    near = np.flatnonzero((row >= 0).any(axis=1))
+    if near.size:
+        near = near[data.contact.dist[near] < 0.0]
+        row, slot = row[near], world.slot_of_geom[pairs[near]]
+        for hand, other in ((0, 1), (1, 0)):
+            met = (row[:, hand] >= 0) & (slot[:, other] >= 0)
+            touching[row[met, hand], slot[met, other]] = True
     return touching

@@ -7,7 +7,7 @@ import numpy as np
 from csac_jax.config import HeightmapConfig, SimConfig, SlotKind
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
 from csac_jax.scene import blocks
-from csac_jax.scene.layout import Scene
+from csac_jax.scene.layout import ANY, Scene
 from csac_jax.scene.model import MAX_OPENING
 from csac_jax.sim.primitives import Action, Primitive, local_top
 
@@ -32,6 +32,8 @@ def grasp(
 ) -> Action:
     """The grasp of the block and yaw with room for both fingers, faces square to the pads, high and narrow.
 
+    With a target, of the target if it can be had so, else of the block nearest to it that can.
+
     Args: slots, kinds of the block slots; height [H, W] m.
     """
     hulls: tuple[SlotKind, ...] = tuple("box" if kind == "arch" else kind for kind in slots)
@@ -54,7 +56,10 @@ def grasp(
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
         fits = width < MAX_OPENING - 0.02
         cost = 4.0 * blocked + 4.0 * ~fits + 20.0 * jnp.maximum(1.0 - square - ALIGNED, 0.0) + 10.0 * width
-        return jnp.where(scene.in_play[slot], 5.0 * scene.position[slot, 2] - cost, -jnp.inf)
+        away = jnp.linalg.norm(centre - scene.position[scene.target, :2])  # of the last slot where there is no target
+        asked = jnp.where(scene.target == slot, 3.0, -4.0 * away)
+        wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[slot, 2], asked)
+        return jnp.where(scene.in_play[slot], wanted - cost, -jnp.inf)
 
     every = jax.vmap(jax.vmap(score, (None, 0)), (0, None))
     scores = every(jnp.arange(len(slots)), yaws)  # [N, YAWS]

@@ -21,7 +21,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import LatestN
 
 from csac_jax.config import Config
-from csac_jax.train import config_json
+from csac_jax.train import cluster, config_json
 
 FOLDER = "checkpoints"
 MANIFEST = "manifest.sha256"
@@ -35,7 +35,8 @@ class CheckpointError(Exception):
 def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any]) -> Path:
     """Writes `state` (a pytree of arrays and typed keys) as `step`; returns once it is complete. The last two are kept.
 
-    Temporary folders that a killed process left are removed. `extra` is anything that JSON can hold.
+    Temporary folders that a killed process left are removed. `extra` is anything that JSON can hold. With several
+    processes all must call it.
     """
     leaves = _raw_leaves(state)
     record = {"layout": _layout(state), "extra": extra}
@@ -50,7 +51,10 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
             ),
         )
         manager.wait_until_finished()  # a failed save raises here
-    _write_manifest(folder)
+    cluster.wait(f"saved {folder}")
+    if cluster.is_first():
+        _write_manifest(folder)
+    cluster.wait(f"manifest of {folder}")
     return folder
 
 
@@ -75,7 +79,8 @@ def load_config(run_dir: Path) -> Config:
 def restore(run_dir: Path, abstract_state: Any, step: int | None = None) -> tuple[Any, dict[str, Any]]:
     """State and `extra` of `step` (the newest if None), as they were given to `save`.
 
-    `abstract_state` has the state's structure, shapes and dtypes, as `jax.eval_shape` gives them.
+    `abstract_state` has the state's structure, shapes and dtypes, as `jax.eval_shape` gives them. A leaf that has a
+    sharding is laid out by it, however it was when it was saved; the others go to the first device.
     """
     folder = _verified(run_dir, step)
     number = int(folder.name)
@@ -123,9 +128,10 @@ def _raw_leaves(state: Any) -> dict[str, Any]:
 
 
 def _raw_abstract(abstract_state: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    sharding = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    one = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    places = {name: leaf.sharding or one for name, leaf in _named(abstract_state)}
     raw = jax.eval_shape(_raw_leaves, abstract_state)
-    return {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding) for name, leaf in raw.items()}
+    return {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=places[name]) for name, leaf in raw.items()}
 
 
 def _with_leaves(abstract_state: Any, raw: dict[str, Any]) -> Any:

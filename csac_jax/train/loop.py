@@ -12,7 +12,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -27,6 +27,7 @@ from csac_jax.train.stop import Stop
 WINDOW = 200  # grasps that the running success is taken over (CSAC sec. 4.2)
 METRICS = "metrics.jsonl"
 CONFIG = "config.json"
+LOSSES = ("critic_loss", "actor_loss")
 
 
 class TrainingError(Exception):
@@ -121,14 +122,14 @@ def run(
     with (run_dir / METRICS).open("a") as log:
         while step < total_steps(cfg) and stop.signal is None:
             if chunk is None:
-                chunk, compile_seconds = _compile(cfg, compile_chunk, state, reporter)
+                chunk, compile_seconds = compile_program(cfg, compile_chunk, state, reporter)
                 continue  # a signal may have come meanwhile
             begun = time.perf_counter()
             state, metrics = chunk(state)
             metrics = jax.device_get(metrics)
             step += cfg.train.chunk
             _check_finite(run_dir, metrics, step)
-            progress, record = _record(cfg, step, metrics, progress, time.perf_counter() - begun)
+            progress, record = record_chunk(cfg, step, metrics, progress, time.perf_counter() - begun)
             log.write(json.dumps(dataclasses.asdict(record)) + "\n")
             log.flush()
             reporter.progress(record, total_steps(cfg) * cfg.train.scenes, _eta(cfg, record))
@@ -144,7 +145,7 @@ def run(
 
 def _begin(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
     run_dir.mkdir(parents=True)
-    _replace(run_dir / CONFIG, json.dumps(config_json.to_dict(cfg), indent=2) + "\n")
+    replace_file(run_dir / CONFIG, json.dumps(config_json.to_dict(cfg), indent=2) + "\n")
     return init(), Progress(0.0, []), 0
 
 
@@ -155,11 +156,13 @@ def _resume(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, P
         raise TrainingError(f"{run_dir} was trained with other values of {', '.join(names)}; resume it with its own")
     state, extra = checkpoint.restore(run_dir, jax.eval_shape(init))
     step = int(state.step)
-    _truncate_log(run_dir / METRICS, step)
+    truncate_log(run_dir / METRICS, step)
     return state, Progress(extra["seconds"], extra["grasps"]), step
 
 
-def _compile(cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter) -> tuple[Any, float]:
+def compile_program(
+    cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter
+) -> tuple[Any, float]:
     reporter.say("compiling the training program; this takes a while, once")
     begun, hits = time.perf_counter(), cache.hits()
     program = compile_chunk(cfg.train.chunk).lower(state).compile()
@@ -174,9 +177,8 @@ def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress)
 
 def _check_finite(run_dir: Path, metrics: Any, step: int) -> None:
     """Raises TrainingError if a loss of the chunk that ended at `step` is not finite. Nothing is saved then."""
-    learned = np.asarray(metrics.learned)
-    for name in ("critic_loss", "actor_loss"):
-        if not np.all(np.isfinite(np.asarray(getattr(metrics, name))[learned])):
+    for name in LOSSES:
+        if not is_finite(metrics, (name,)):
             last = checkpoint.latest_step(run_dir)
             kept = "no checkpoint was saved before" if last is None else f"the checkpoint of step {last} is kept"
             raise TrainingError(
@@ -185,7 +187,13 @@ def _check_finite(run_dir: Path, metrics: Any, step: int) -> None:
             )
 
 
-def _record(cfg: Config, step: int, metrics: Any, before: Progress, seconds: float) -> tuple[Progress, Record]:
+def is_finite(metrics: Any, names: Sequence[str] = LOSSES) -> bool:
+    """Whether the losses `names` of a run's chunk are all finite; those of the warm-up do not count."""
+    learned = np.asarray(metrics.learned)
+    return all(bool(np.all(np.isfinite(np.asarray(getattr(metrics, name))[learned]))) for name in names)
+
+
+def record_chunk(cfg: Config, step: int, metrics: Any, before: Progress, seconds: float) -> tuple[Progress, Record]:
     """The log's line for a chunk with `metrics` [T, E] that took `seconds`."""
     grasped = metrics.primitive == GRASP
     outcomes = metrics.outcome[grasped]  # in order of time, then of scene
@@ -245,13 +253,13 @@ def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
 
 
-def _truncate_log(path: Path, step: int) -> None:
+def truncate_log(path: Path, step: int) -> None:
     """Keeps the lines of steps up to `step`."""
     kept = [json.dumps(line) + "\n" for line in _complete_lines(path) if line["step"] <= step] if path.exists() else []
-    _replace(path, "".join(kept))
+    replace_file(path, "".join(kept))
 
 
-def _replace(path: Path, text: str) -> None:
+def replace_file(path: Path, text: str) -> None:
     """Writes a file such that it is never seen half-written."""
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.write_text(text)

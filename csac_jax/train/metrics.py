@@ -17,6 +17,18 @@ block, and a grasp that brings another one counts as `touched`.
 
 Beside them `outcomes` counts grasps by what came of them (nothing, empty, touched, dropped, lifted), and `counts` holds
 episodes, blocks, pushes, grasps, and blocks that were taken and that left the square.
+
+`failures` are metrics too, one for each cause; no action has two of them. Wilson intervals over the cases named.
+`grasp_nothing`           grasps at bare table / grasps.
+`grasp_empty`             grasps that met no block although there was something at the place / grasps.
+`grasp_touched`           grasps that met a block and did not lift it by 1 cm between the pads / grasps.
+`grasp_dropped`           grasps that lifted a block by 1 cm or more and lost it / grasps.
+`grasp_wrong_block`       grasps that brought another block than the target / grasps; they do not count as touched here.
+`push_no_change`          pushes that moved no more than 12 cm^2 of the height map / pushes.
+`block_left`              blocks that left the square / blocks in play at the start.
+`episode_action_cap`      episodes cut off at `task.max_actions` / episodes.
+`episode_no_change_cap`   episodes cut off after `task.max_idle` actions in a row without change / episodes.
+`episode_ill`             episodes in which physics failed / episodes.
 """
 
 import math
@@ -26,6 +38,7 @@ import numpy as np
 
 OUTCOMES = ("nothing", "empty", "touched", "dropped", "lifted")  # numbers 0 to 4
 LIFTED = OUTCOMES.index("lifted")
+ENDINGS = ("terminated", "action_cap", "no_change_cap", "ill")  # numbers 0 to 3: why an episode was over
 GRASP = 1  # number of the primitive
 Z_95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
 RESAMPLES = 2000
@@ -41,6 +54,9 @@ class Episodes(NamedTuple):
     blocks: np.ndarray  # [M] int32, in play at the start
     completed: np.ndarray  # [M] bool, no block was in the square at the end
     left: np.ndarray  # [M] int32, blocks that left the square
+    changed: np.ndarray  # [M, T] bool, the height map moved by more than 12 cm^2
+    wrong: np.ndarray  # [M, T] bool, the grasp brought a block, but not the target
+    ending: np.ndarray  # [M] int32, number in ENDINGS
 
 
 def wilson(successes: int, n: int) -> dict[str, Any]:
@@ -53,7 +69,8 @@ def wilson(successes: int, n: int) -> dict[str, Any]:
     share, z2 = successes / n, Z_95**2
     centre = (share + z2 / (2 * n)) / (1 + z2 / n)
     half = Z_95 * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
-    return {"value": share, "low": max(0.0, centre - half), "high": min(1.0, centre + half), "n": n}
+    low, high = max(0.0, centre - half), min(1.0, centre + half)
+    return {"value": share, "low": low if successes else 0.0, "high": high if successes < n else 1.0, "n": n}
 
 
 def bootstrap_ratio(above: np.ndarray, below: np.ndarray, n: int, seed: int = 0) -> dict[str, Any]:
@@ -76,9 +93,8 @@ def _empty() -> dict[str, Any]:
 
 def summarise(episodes: Any) -> dict[str, Any]:
     """Every metric of the module's docstring, ready for JSON. `episodes` has the fields of `Episodes`."""
-    valid, primitive, outcome, cleared, blocks, completed, left = (
-        np.asarray(value) for value in Episodes(*(getattr(episodes, name) for name in Episodes._fields))
-    )
+    episodes = Episodes(*(np.asarray(getattr(episodes, name)) for name in Episodes._fields))
+    valid, primitive, outcome, cleared, blocks, completed, left = episodes[:7]
     grasps = valid & (primitive == GRASP)
     actions = valid.sum(axis=1)
     taken = np.where(valid, cleared, 0).sum(axis=1)
@@ -91,6 +107,7 @@ def summarise(episodes: Any) -> dict[str, Any]:
         "completion_reachable": wilson(int(completed.sum()), completed.size),
         "action_efficiency": bootstrap_ratio(taken, actions, int(actions.sum())),
         "action_efficiency_completed": bootstrap_ratio(per_episode, np.ones(per_episode.size), per_episode.size),
+        "failures": _failures(episodes),
         "outcomes": {name: int(count) for name, count in zip(OUTCOMES, counts, strict=True)},
         "counts": {
             "episodes": int(completed.size),
@@ -101,3 +118,20 @@ def summarise(episodes: Any) -> dict[str, Any]:
             "left": int(left.sum()),
         },
     }
+
+
+def _failures(episodes: Episodes) -> dict[str, dict[str, Any]]:
+    """What went wrong, by cause."""
+    grasps = episodes.valid & (episodes.primitive == GRASP)
+    pushes, wrong = episodes.valid & ~grasps, episodes.wrong & grasps
+    found = {
+        f"grasp_{name}": wilson(int((grasps & ~wrong & (episodes.outcome == number)).sum()), int(grasps.sum()))
+        for number, name in enumerate(OUTCOMES)
+        if number != LIFTED
+    }
+    found["grasp_wrong_block"] = wilson(int(wrong.sum()), int(grasps.sum()))
+    found["push_no_change"] = wilson(int((pushes & ~episodes.changed).sum()), int(pushes.sum()))
+    found["block_left"] = wilson(int(episodes.left.sum()), int(episodes.blocks.sum()))
+    for number, name in enumerate(ENDINGS[1:], 1):
+        found[f"episode_{name}"] = wilson(int((episodes.ending == number).sum()), episodes.ending.size)
+    return found

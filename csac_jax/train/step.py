@@ -20,6 +20,7 @@ from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.train.mesh import ALONE, Spread
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 
@@ -63,6 +64,7 @@ class Program:
     cfg: Config
     env: Env
     learner: Learner
+    spread: Spread = ALONE  # of scenes and batches over devices
 
 
 def make(cfg: Config) -> Program:
@@ -84,7 +86,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     action = act(_keys(key_act, cfg.train.scenes), cfg, learner.frames, maps, span, scenes.idle, taken)
 
     # Simulate.
-    after = jax.vmap(env.step)(scenes, action)
+    after = program.spread.scenes(jax.vmap(env.step))(scenes, action)
 
     # Reward and remember (lines 14-15).
     phi_before, phi_after = (_best_grasps(learner, state.learner, obs) for obs in (scenes.obs, after.obs))
@@ -146,6 +148,7 @@ def _learn(
         current = replay.replace(priority=priority)
         slots, weights = samplers.sample(key_sample, cfg.replay, current, progress, cfg.learn.batch)
         batch = ring.gather(replay, slots)
+        batch = program.spread.batch(batch)
         batch = jax.vmap(augment.vary, (0, None, 0))(_keys(key_augment, cfg.learn.batch), cfg, batch)
         state, info = learning.update_critic(key_target, learner, state, batch, weights)
         current = ring.set_priorities(current, slots, samplers.priority(cfg.replay, info.error))
@@ -178,22 +181,21 @@ def init(program: Program, trunk: Any = None) -> TrainState:
 
     trunk: variables that the networks' trunks begin with, see `weights.read`; None for random ones.
     """
-    cfg = program.cfg
-
-    def build() -> TrainState:
-        key = jax.random.key(cfg.seed)
-        key_scenes, key_nets = jax.random.split(jax.random.fold_in(key, np.uint32(2**32 - 1)))
-        scenes = jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes))
-        return TrainState(
-            key=key,
-            step=jnp.int32(0),
-            scenes=scenes,
-            learner=learning.init(key_nets, program.learner),
-            replay=ring.init(cfg.replay, example(cfg)),
-        )
-
-    state = jax.jit(build)()
+    state = jax.jit(lambda: begin(program, jax.random.key(program.cfg.seed)))()
     return state if trunk is None else state.replace(learner=learning.with_trunk(state.learner, trunk))
+
+
+def begin(program: Program, key: jax.Array) -> TrainState:
+    """The state before the first step of the run whose root key is `key`; pure."""
+    cfg = program.cfg
+    key_scenes, key_nets = jax.random.split(jax.random.fold_in(key, np.uint32(2**32 - 1)))
+    return TrainState(
+        key=key,
+        step=jnp.int32(0),
+        scenes=jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes)),
+        learner=learning.init(key_nets, program.learner),
+        replay=ring.init(cfg.replay, example(cfg)),
+    )
 
 
 def example(cfg: Config) -> Transition:

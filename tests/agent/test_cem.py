@@ -177,3 +177,21 @@ def test_wrap():
     u = jnp.array([-3.2, -1.0, -0.5, 0.0, 0.99, 1.0, 1.5, 7.25, np.nextafter(np.float32(-1.0), np.float32(-2.0))])
     np.testing.assert_allclose(box.wrap(u), [0.8, -1.0, -0.5, 0.0, 0.99, -1.0, -0.5, -0.75, 1.0], atol=1e-6)
     assert np.all(box.wrap(u) < 1.0)
+
+
+def test_last_rounds_are_what_the_search_tries():
+    """Claim: `last_round` gives the samples of the last round: the best of all rounds' is the result of the search."""
+    score = functools.partial(peaks, jnp.array([[0.3, -0.2, 0.9]]), jnp.array([1.0]), jnp.array([0.3]))
+    mean, start = jnp.array([-0.4, 0.5, -0.7]), jnp.array([[-0.6, 0.7, -0.4], [-0.5, 0.5, -0.5]])
+    key = jax.random.key(5)
+    cfgs = [CEMConfig(rounds=rounds, candidates=16) for rounds in (1, 2, 3)]
+    last = [lambda key, cfg=cfg: cem.last_round(key, cfg, score, mean, start, box.POSE_WRAPS) for cfg in cfgs]
+    tried = [jax.jit(one)(key) for one in last]
+    assert all(actions.shape == (16, 3) for actions in tried)
+    every = jnp.concatenate(tried)
+    found = jax.jit(lambda key: cem.maximise(key, cfgs[-1], score, mean, start, box.POSE_WRAPS))(key)
+    values = jax.vmap(score)(every)
+    np.testing.assert_allclose(found.value, values.max(), atol=1e-6)
+    np.testing.assert_allclose(found.action, every[values.argmax()], atol=1e-6)
+    away = [float(jnp.mean(jnp.linalg.norm(actions[:, :2] - jnp.array([[0.3, -0.2]]), axis=1))) for actions in tried]
+    assert away[2] < away[1] < away[0]

@@ -197,3 +197,25 @@ def test_random_places_without_the_mask(cfg, frames):
         jax.random.split(jax.random.key(0), 400)
     )
     assert np.all(np.abs(u[..., :2]).max(axis=0) > 0.9)
+
+
+def test_candidates_are_those_of_the_search(cfg, frames):
+    """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same key."""
+    one = dataclasses.replace(cfg, cem=dataclasses.replace(cfg.cem, rounds=1, start="actor"))
+    state, key = _state(frames, 0), jax.random.key(3)
+    tried = jax.jit(lambda key: policy.candidates(key, one, frames, state, PENALTY))(key)
+    assert tried.shape == (2, cfg.cem.candidates, 3)
+    greedy = jax.jit(lambda key: policy.greedy(key, one, frames, state, PENALTY, jnp.int32(0)).greedy.poses)
+    for primitive, u in zip(Primitive, greedy(key), strict=True):
+        pose = maps.denormalise(frames, u)
+        assert np.min(np.abs(np.asarray(tried[primitive]) - np.asarray(pose)[None]).max(axis=1)) < 1e-5
+
+
+def test_without_a_search_there_is_one_candidate(cfg, frames):
+    """Claim: VPG's only candidate is the best pixel."""
+    vpg = algorithms.configure(cfg, "vpg")
+    state, key = _state(frames, 0), jax.random.key(3)
+    tried = policy.candidates(key, vpg, frames, state, PENALTY)
+    action = policy.best_action(key, vpg, frames, state, PENALTY, jnp.int32(0))
+    assert tried.shape == (2, 1, 3)
+    np.testing.assert_allclose(tried[action.primitive, 0], action.pose, atol=1e-5)

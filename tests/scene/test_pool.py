@@ -175,3 +175,28 @@ def test_hopeless_configuration_is_one_line(small: model.World):
     with pytest.raises(SceneError, match=r"scene\.settle_time") as error:
         pool.settled(small, falling, EXTENT, 0, 4)
     assert "\n" not in str(error.value)
+
+
+PILE = SceneConfig(slots=("box", "arch", "prism") * 4, min_blocks=12, drop_extent=0.1, settle_time=1.0)
+
+
+@pytest.mark.slow
+def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: poured blocks are all in play, inside the workspace, at rest, higher than one layer; scenes differ, and
+    the same stream gives the same ones."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    world = model.build(PILE, SimConfig())
+    scenes = pool.settled(world, PILE, EXTENT, 1, 3, poured=True)
+    assert scenes.in_play.shape == (3, 12)
+    assert scenes.in_play.all()
+    assert (np.linalg.norm(scenes.position[..., :2], axis=-1) <= 0.5 * EXTENT).all()
+    assert (scenes.position[..., 2].max(axis=1) > 0.06).all()
+    assert len({scene.tobytes() for scene in scenes.position}) == 3
+    for index in range(3):
+        exact, data = _placed(world, scenes, index)
+        mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
+        moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
+        assert moved.max() < 0.5 * pool._STILL, f"scene {index}: {moved}"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+    again = pool.settled(world, PILE, EXTENT, 1, 3, poured=True)
+    np.testing.assert_array_equal(again.position, scenes.position)

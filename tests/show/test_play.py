@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax import cli
-from csac_jax.show import gl
+from csac_jax.show import gl, play
 
 pytestmark = pytest.mark.mjx
 
@@ -31,16 +31,20 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2
     assert "grasp at x " in lines[0]
-    assert "lifted (red); 0 blocks left" in lines[0]
+    assert "lifted (red); reward +1.00; 0 blocks left" in lines[0]
     assert lines[1] == "the table is clear after 1 actions, 1 blocks taken"
     result = json.loads((here / "a" / "b.json").read_text())
     assert (result["actions"], result["cleared"], result["completed"], result["renderer"]) == (1, 1, True, "rays")
-    assert imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10  # 4 ms a substep, 25 pictures a second
+    assert (
+        imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + play.HOLD
+    )  # 4 ms a substep, 25 a second
     frames = imageio_ffmpeg.read_frames("a/b.mp4")
-    next(frames)
-    red = [np.argwhere(_is_red(np.frombuffer(frame, np.uint8).reshape(64, 96, 3))) for frame in frames]
-    height = [places[:, 0].mean() for places in red]
-    assert height[-1] < height[0] - 5  # the cube is seen to rise
+    width, height = next(frames)["size"]
+    assert (width, height) == (96 + 64, 64 + 16)  # the height map to the right, two lines of text below
+    pictures = [np.frombuffer(frame, np.uint8).reshape(height, width, 3)[:64, :96] for frame in frames]
+    red = [np.argwhere(_is_red(image)) for image in pictures]
+    row = [places[:, 0].mean() for places in red]
+    assert row[-1] < row[0] - 5  # the cube is seen to rise
 
 
 def _is_red(image: np.ndarray) -> np.ndarray:

@@ -42,7 +42,10 @@ class Magnet(Env):
             truncated=capped & ~terminated,
             actions=actions,
             idle=idle,
-            info=state.info.replace(outcome=outcome, cleared=jnp.sum(taken, dtype=jnp.int32)),
+            reward=jnp.any(taken).astype(jnp.float32),
+            info=state.info.replace(
+                outcome=outcome, cleared=jnp.sum(taken, dtype=jnp.int32), moved=jnp.where(jnp.any(taken), 25.0, 0.0)
+            ),
         )
 
 
@@ -93,10 +96,13 @@ def test_random_episodes_end_at_the_caps(magnet, random):
     assert_consistent(random, CFG.task.max_actions)
     assert random.valid.shape == (EPISODES, CFG.task.max_actions)
     assert not np.all(random.completed)
-    for cleared, valid, completed in zip(random.cleared, random.valid, random.completed, strict=True):
+    for i, (cleared, valid) in enumerate(zip(random.cleared, random.valid, strict=True)):
         num = valid.sum()
         idle = num >= CFG.task.max_idle and not np.any(cleared[num - CFG.task.max_idle : num])
-        assert completed or idle or num == CFG.task.max_actions
+        capped = 1 if num == CFG.task.max_actions else 2 if idle else None
+        assert random.ending[i] == (0 if random.completed[i] else capped)
+    np.testing.assert_array_equal(random.changed & random.valid, random.cleared > 0)
+    assert not random.wrong.any()
 
 
 def test_same_seed_same_episodes(magnet, random):
@@ -105,6 +111,22 @@ def test_same_seed_same_episodes(magnet, random):
     for a, b in zip(random, again, strict=True):
         np.testing.assert_array_equal(a, b)
     assert any(not np.array_equal(a, b) for a, b in zip(random, other, strict=True))
+
+
+def test_batches_do_not_matter(magnet, random, monkeypatch):
+    """Claim: what an episode draws does not depend on how many run side by side, nor on one left over."""
+    monkeypatch.setattr(evaluate, "SIDE_BY_SIDE", 3)
+    for together, apart in zip(random, evaluate.rollout(CFG, magnet, "random", None, EPISODES, 0), strict=True):
+        np.testing.assert_array_equal(together, apart)
+
+
+@pytest.mark.slow
+def test_endings_by_hand(magnet):
+    """Claim: with two actions at most, scenes of two blocks are cleared and those of three are cut off by that cap."""
+    cfg = dataclasses.replace(CFG, task=TaskConfig(max_actions=2, max_idle=2))
+    short = Magnet(cfg, magnet.physics, magnet.scenes)
+    episodes = evaluate.rollout(cfg, short, "oracle", None, EPISODES, 0)
+    np.testing.assert_array_equal(episodes.ending, np.where(_blocks(magnet) == 2, 0, 1))
 
 
 @pytest.mark.slow

@@ -269,7 +269,7 @@ def test_success_is_over_the_last_200_grasps():
     """Claim: grasp success is over the last 200 grasps, pushes not counted, oldest dropped first."""
     before = loop.Progress(0.0, [1] * 150 + [0] * 49)  # 199 grasps
     metrics = _metrics(primitive=[1, 0, 1, 1], outcome=[4, 4, 3, 4])
-    after, record = loop._record(CFG, 4, metrics, before, 0.5)
+    after, record = loop.record_chunk(CFG, 4, metrics, before, 0.5)
     assert after.grasps == [1] * 148 + [0] * 49 + [1, 0, 1]
     assert (record.grasp_success, record.grasps_counted) == (150 / 200, 200)
     assert (record.pushes, record.grasps) == (1, 3)

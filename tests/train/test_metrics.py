@@ -46,7 +46,7 @@ def _episodes() -> Episodes:
     """Three episodes, with rubbish beyond their ends.
 
     0: push, lift, lift: both blocks taken in 3 actions.  1: dropped, lift: one taken, the other left the square.
-    2: nothing, empty, touched, push: nothing taken of 2 blocks.
+    2: nothing, empty, touched as the block was a wrong one, push: nothing taken of 2 blocks, ended by the action cap.
     """
     return Episodes(
         valid=np.array([[1, 1, 1, 0], [1, 1, 0, 0], [1, 1, 1, 1]], bool),
@@ -56,6 +56,9 @@ def _episodes() -> Episodes:
         blocks=np.array([2, 2, 2], np.int32),
         completed=np.array([True, True, False]),
         left=np.array([0, 1, 0], np.int32),
+        changed=np.array([[0, 1, 1, 1], [0, 1, 0, 0], [0, 0, 0, 0]], bool),
+        wrong=np.array([[1, 0, 0, 1], [0, 0, 1, 1], [0, 0, 1, 0]], bool),
+        ending=np.array([0, 0, 1], np.int32),
     )
 
 
@@ -72,6 +75,33 @@ def test_summary_by_hand():
     }
     assert got["outcomes"] == {"nothing": 1, "empty": 1, "touched": 1, "dropped": 1, "lifted": 3}
     assert got["counts"] == {"episodes": 3, "blocks": 6, "pushes": 2, "grasps": 7, "taken": 3, "left": 1}
+
+
+def test_failures_by_hand():
+    """Claim: every cause of failure is what its definition says, worked out by hand; no action has two."""
+    got = metrics.summarise(_episodes())["failures"]
+    assert {name: (entry["value"] * entry["n"], entry["n"]) for name, entry in got.items()} == {
+        "grasp_nothing": (1, 7),
+        "grasp_empty": (1, 7),
+        "grasp_touched": (0, 7),  # the only one brought a wrong block
+        "grasp_dropped": (1, 7),
+        "grasp_wrong_block": (1, 7),
+        "push_no_change": (2, 2),
+        "block_left": (1, 6),
+        "episode_action_cap": (1, 3),
+        "episode_no_change_cap": (0, 3),
+        "episode_ill": (0, 3),
+    }
+    for entry in got.values():
+        assert entry["low"] <= entry["value"] <= entry["high"]
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_every_ending_is_counted(number: int):
+    """Claim: of the endings, each that is a failure has its own share of the episodes."""
+    got = metrics.summarise(_episodes()._replace(ending=np.full(3, number, np.int32)))["failures"]
+    ends = {name: entry["value"] for name, entry in got.items() if name.startswith("episode_")}
+    assert ends == {f"episode_{name}": float(i == number) for i, name in enumerate(metrics.ENDINGS) if i > 0}
 
 
 def test_intervals_hold_their_values():

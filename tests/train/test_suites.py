@@ -11,8 +11,8 @@ import pytest
 
 from csac_jax import presets
 from csac_jax.config import Config, TaskConfig
-from csac_jax.scene import cases, layout
-from csac_jax.train import suites
+from csac_jax.scene import cases, layout, pool
+from csac_jax.train import evaluate, suites
 
 pytestmark = pytest.mark.mjx
 
@@ -33,18 +33,34 @@ def test_cases_are_the_shipped_files():
     parts = suites.environments(CFG, "cases", EPISODES, 0)
     assert tuple(parts) == cases.names()
     for name, env in parts.items():
-        content = json.loads(cases.shipped(name).read_text())
-        places = [block["position"] for block in content["blocks"]]
-        np.testing.assert_allclose(env.scenes.position[0], places, atol=1e-6)
-        assert env.scenes.in_play.all()
+        wanted = cases.load(cases.shipped(name), CFG.heightmap.extent)
+        scene = jax.tree.map(lambda leaf: leaf[0], env.scenes)
+        places = [block["position"] for block in json.loads(cases.shipped(name).read_text())["blocks"]]
+        order = [int(np.argmin(np.linalg.norm(scene.position - place, axis=1))) for place in places]
+        assert sorted(order) == np.flatnonzero(scene.in_play).tolist()
+        assert [env.cfg.scene.slots[slot] for slot in order] == list(wanted.slots)
+        for field in ("position", "quaternion", "half_size", "colour"):
+            np.testing.assert_array_equal(getattr(scene, field)[order], getattr(wanted.scene, field))
+        assert order[int(wanted.scene.target)] == scene.target
         assert env.cfg.sim.contacts >= 64
+
+
+def test_cases_share_their_compilation():
+    """Claim: all four cases have one config and one physics, so that what is compiled for one serves all."""
+    first, *others = suites.environments(CFG, "cases", EPISODES, 0).values()
+    assert all(env.cfg == first.cfg and env.physics is first.physics for env in others)
+    begun = evaluate._cached.cache_info().misses
+    for env in (first, *others):
+        evaluate._program(env, "oracle")
+    assert evaluate._cached.cache_info().misses == begun + 1
 
 
 def test_cases_are_turned_by_quarters():
     """Claim: an episode begins with the case turned by 0, 90, 180 or 270 degrees, so that it stays inside."""
     scene, turned = _varied(CFG, "row")
-    before = np.asarray(scene.position)
-    angle = np.arctan2(turned.position[..., 1], turned.position[..., 0]) - np.arctan2(before[:, 1], before[:, 0])
+    lies = np.asarray(scene.in_play)
+    before, after = np.asarray(scene.position)[lies], turned.position[:, lies]
+    angle = np.arctan2(after[..., 1], after[..., 0]) - np.arctan2(before[:, 1], before[:, 0])
     quarters = np.mod(angle / (0.5 * np.pi) + 0.5, 4.0) - 0.5
     np.testing.assert_allclose(quarters, quarters.round(), atol=1e-3)
     np.testing.assert_allclose(quarters.T, np.broadcast_to(quarters[:, 0], quarters.T.shape), atol=1e-3)
@@ -80,7 +96,48 @@ def test_users_case_file(tmp_path: Path):
         suites.environments(TARGET, str(path), EPISODES, 0)
 
 
+@pytest.mark.parametrize(("suite", "blocks", "most"), [("random10", 10, 25), ("random30", 30, 75)])
+def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int, most: int):
+    """Claim: random10 and random30 hold ten and thirty blocks of all kinds, contacts and actions enough for them, and
+    scenes of a stream that is not the training's; none is arranged, whatever the training's are."""
+    asked = []
+
+    def settled(world, cfg, extent, stream, count, poured=False):
+        asked.append((cfg.slots, cfg.min_blocks, stream, count, poured))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.slots))
+
+    monkeypatch.setattr(pool, "settled", settled)
+    packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))
+    (env,) = suites.environments(packed, suite, EPISODES, 0).values()
+    ((slots, least, stream, count, poured),) = asked
+    assert (len(slots), least, count, poured) == (blocks, blocks, EPISODES, suite == "random30")
+    assert set(slots) == {"box", "arch", "prism", "half_cylinder", "cylinder"}
+    assert stream != pool.TRAIN_STREAM
+    assert env.cfg.task.max_actions == most
+    assert env.cfg.sim.contacts >= 8 * blocks
+    long = dataclasses.replace(CFG, task=TaskConfig(max_actions=90))
+    assert suites.environments(long, suite, EPISODES, 0)[suite].cfg.task.max_actions == 90
+
+
+def test_target_suite(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the suite `target` is the cases and random10, one marked block each, within 5 actions; a policy that was
+    trained to clear the table is refused, one that reads the blocks' poses is not."""
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN.scene.slots))
+    everyone = blank.replace(in_play=np.ones_like(blank.in_play))
+    monkeypatch.setattr(pool, "settled", lambda *_, **__: everyone)
+    for cfg, policy in ((TARGET, "learned"), (CFG, "oracle"), (CFG, "random")):
+        parts = suites.environments(cfg, "target", EPISODES, 0, policy)
+        assert tuple(parts) == (*cases.names(), "random10")
+        for env in parts.values():
+            assert (env.cfg.task.kind, env.cfg.task.max_actions) == ("target", 5)
+            scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
+            varied = env.vary(jax.random.key(0), scene)
+            assert scene.in_play[varied.target]
+    with pytest.raises(ValueError, match=r"^--suite: target needs a policy trained with --task.kind target"):
+        suites.environments(CFG, "target", EPISODES, 0)
+
+
 def test_unknown_suite():
     """Claim: a suite that is none is refused with the names of those that there are."""
-    with pytest.raises(ValueError, match=r"'hard'.*random10, cases, generated"):
+    with pytest.raises(ValueError, match=r"'hard'.*random10, random30, cases, target, generated"):
         suites.environments(CFG, "hard", EPISODES, 0)

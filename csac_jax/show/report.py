@@ -1,0 +1,327 @@
+"""Recorded results as numbers, tables and one page; every number comes from a file that names its provenance."""
+
+import html
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from csac_jax.show import results as recorded, statistics
+from csac_jax.show.results import METRIC_NAMES, WINDOW, Evaluation, Results, Run, Variant
+from csac_jax.show.statistics import Band
+
+NAMES = {
+    "grasp_only": "Grasping-only",
+    "reactive": "P+G reactive",
+    "vpg": "VPG",
+    "csac": "CSAC",
+    "csac_per": "CSAC-PER",
+    "csac_beta": "CSAC-beta",
+}
+PAPER_TRAINING = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
+"""Grasp success over the last 200 grasps of 2,500 actions, read off the text to figures 6 and 7 (CSAC sec. 4.3)."""
+PAPER_ACTIONS = 2500
+PAPER_CASES = {"completion": {"vpg": 0.60, "csac_beta": 0.90}, "action_efficiency": {"vpg": 0.70, "csac_beta": 0.80}}
+"""Means of the four cases, figure 9 (sec. 4.4 and 5); the text gives no numbers for the others."""
+GOOD = 0.9  # grasp success whose time is reported
+
+Table = list[list[str]]  # rows, the header first
+
+
+class Curve(NamedTuple):
+    """The runs of a variant together."""
+
+    variant: Variant
+    runs: list[Run]
+    actions: np.ndarray  # [m] up to where the shortest run ends
+    success: list[Band]  # [m]
+    final: Band  # over the last grasps of each run, wherever it ends
+
+
+class Score(NamedTuple):
+    """The evaluations of a variant in one part of a suite together."""
+
+    evaluations: list[Evaluation]
+    variant: Variant
+    policy: str
+    suite: str
+    part: str
+    physics: str
+    robot: str
+    seed: int  # of the evaluation
+
+    def band(self, metric: str) -> Band | None:
+        """IQM of the runs' values with its band; of a single run, the interval of its own episodes. None: no cases."""
+        entries = [one.metrics[metric] for one in self.evaluations if one.metrics.get(metric, {}).get("n")]
+        if not entries:
+            return None
+        if len(entries) == 1:
+            return Band(entries[0]["value"], entries[0]["low"], entries[0]["high"], 1)
+        return statistics.band([np.array([entry["value"] for entry in entries])])
+
+
+class Report(NamedTuple):
+    """Everything that tables and figures are made of."""
+
+    curves: list[Curve]
+    scores: list[Score]
+    results: Results
+    notes: list[str]
+
+
+def build(results: Results) -> Report:
+    """Runs and evaluations brought together over their seeds."""
+    notes = list(results.notes)
+    grouped = _grouped(results.runs, lambda run: recorded.variant(run.config))
+    made = [_curve(variant, runs, notes) for variant, runs in grouped.items()]
+    parts = _grouped(results.evaluations, _place)
+    scores = [Score(evaluations, *place) for place, evaluations in parts.items()]
+    return Report(made, scores, results, notes)
+
+
+def _grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
+    found: dict[Any, list[Any]] = {}
+    for item in items:
+        found.setdefault(key(item), []).append(item)
+    return found
+
+
+def _place(one: Evaluation) -> tuple[Variant, str, str, str, str, str, int]:
+    sim = one.config["sim"]
+    variant = recorded.variant(one.config)
+    if one.policy != "learned":  # what its run was trained with does not matter
+        variant = Variant(variant.preset, one.policy, ())
+    return (variant, one.policy, one.suite, one.part, sim.get("physics", "mjx"), sim.get("robot", "hand"), one.seed)
+
+
+def _curve(variant: Variant, runs: list[Run], notes: list[str]) -> Curve:
+    ends = sorted({int(run.actions[-1]) for run in runs})
+    if len(ends) > 1:
+        several = ", ".join(f"{end:,}" for end in ends)
+        notes.append(f"{label(variant)}: runs end at {several} actions; their curve is drawn up to {ends[0]:,}")
+    if len(runs) < 2:
+        notes.append(f"{label(variant)}: one run only, so its curve has no band")
+    actions, success = statistics.curves([(run.actions, run.success) for run in runs])
+    return Curve(variant, runs, actions, success, statistics.band([np.array([run.success[-1] for run in runs])]))
+
+
+def label(variant: Variant, preset: bool = True) -> str:
+    """Name of a variant in figures and tables."""
+    name = NAMES.get(variant.algo, variant.algo)
+    changed = [f"{setting} {value}" for setting, value in variant.changed]
+    return ", ".join([f"{name} ({variant.preset})" if preset else name, *changed])
+
+
+# Numbers.
+
+
+def _seeds(runs: Sequence[Run | Evaluation]) -> str:
+    return ", ".join(str(seed) for seed in sorted(one.config.get("seed", 0) for one in runs))
+
+
+def _time_to(run: Run) -> float | None:
+    """Training seconds after which the success of a full window first reached GOOD."""
+    there = np.flatnonzero((run.success >= GOOD) & (run.grasps >= WINDOW))
+    return float(run.seconds[there[0]]) if there.size else None
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The report's numbers, plain values only."""
+    return {
+        "curves": [
+            {
+                "preset": curve.variant.preset,
+                "algo": curve.variant.algo,
+                "changed": dict(curve.variant.changed),
+                "seeds": [run.config.get("seed", 0) for run in curve.runs],
+                "final": curve.final._asdict(),
+                "seconds_to_90": [_time_to(run) for run in curve.runs],
+                "seconds": [float(run.seconds[-1]) for run in curve.runs],
+                "actions": curve.actions.tolist(),
+                "success": [band._asdict() for band in curve.success],
+            }
+            for curve in report.curves
+        ],
+        "scores": [
+            {
+                **{name: getattr(score, name) for name in Score._fields if name not in ("variant", "evaluations")},
+                "preset": score.variant.preset,
+                "algo": score.variant.algo,
+                "changed": dict(score.variant.changed),
+                "seeds": [one.config.get("seed", 0) for one in score.evaluations],
+                "metrics": {name: found._asdict() for name in METRIC_NAMES if (found := score.band(name)) is not None},
+            }
+            for score in report.scores
+        ],
+        "provenance": [dict(zip(provenance(report)[0], row, strict=True)) for row in provenance(report)[1:]],
+        "notes": report.notes,
+    }
+
+
+# Tables.
+
+
+def shown(band: Band | None) -> str:
+    """A share in per cent with its band."""
+    if band is None:
+        return "-"
+    if band.low is None or band.high is None:
+        return f"{100 * band.value:.1f} %"
+    return f"{100 * band.value:.1f} % ({100 * band.low:.1f} to {100 * band.high:.1f})"
+
+
+def _range(values: Sequence[float | None]) -> str:
+    """Least and most of some times."""
+    there = [value for value in values if value is not None]
+    if not there:
+        return "-"
+    text = f"{min(there):.0f} s" if len(there) == 1 else f"{min(there):.0f} to {max(there):.0f} s"
+    return text if len(there) == len(values) else f"{text} ({len(there)} of {len(values)} runs)"
+
+
+def training(report: Report) -> Table:
+    """How training went, a row per variant."""
+    rows = [["method", "seeds", "actions", f"success, last {WINDOW} grasps", "paper", "time to 90 %", "training time"]]
+    for curve in report.curves:
+        mark = PAPER_TRAINING.get(curve.variant.algo) if curve.variant.method else None
+        ends = sorted({int(run.actions[-1]) for run in curve.runs})
+        rows.append(
+            [
+                label(curve.variant),
+                _seeds(curve.runs),
+                " to ".join(f"{end:,}" for end in ([ends[0], ends[-1]] if len(ends) > 1 else ends)),
+                shown(curve.final),
+                "-" if mark is None else f"{100 * mark:.0f} %",
+                _range([_time_to(run) for run in curve.runs]),
+                _range([float(run.seconds[-1]) for run in curve.runs]),
+            ]
+        )
+    return rows
+
+
+def evaluation(report: Report) -> Table:
+    """What policies reached, a row per part of a suite."""
+    titles = ["grasp success", "completion", "over reachable", "blocks / actions", "the same, completed episodes"]
+    rows = [["policy", "part", "physics, robot, seed", "runs", "episodes", *titles]]
+    for score in report.scores:
+        episodes = sum(one.metrics.get("counts", {}).get("episodes", 0) for one in score.evaluations)
+        bands = [shown(score.band(metric)) for metric in METRIC_NAMES]
+        rows.append([*_named(score), str(len(score.evaluations)), str(episodes), *bands])
+    return rows
+
+
+def failures(report: Report) -> Table:
+    """What went wrong in evaluations that tell causes apart, as counts and what they are counts of, all runs summed."""
+    scores = [score for score in report.scores if all("failures" in one.metrics for one in score.evaluations)]
+    if not scores:
+        return [[]]
+    causes = list(scores[0].evaluations[0].metrics["failures"])
+    rows = [["policy", "part", "physics, robot, seed", *(cause.replace("_", " ") for cause in causes)]]
+    for score in scores:
+        found = [[one.metrics["failures"][cause] for one in score.evaluations] for cause in causes]
+        sums = [(sum(round(e["n"] * (e["value"] or 0.0)) for e in each), sum(e["n"] for e in each)) for each in found]
+        rows.append([*_named(score), *(f"{count} / {n}" if n else "-" for count, n in sums)])
+    return rows
+
+
+def _named(score: Score) -> list[str]:
+    """The first cells of a row about a score."""
+    name = score.policy if score.policy != "learned" else label(score.variant)
+    part = score.part if score.part == score.suite else f"{score.suite}: {score.part}"
+    return [name, part, f"{score.physics}, {score.robot}, {score.seed}"]
+
+
+def provenance(report: Report) -> Table:
+    """Where every number comes from, a row per file."""
+    rows = [["file", "settings as a command", "preset", "seed", "device", "versions", "commit", "wall time"]]
+    every: list[Run | Evaluation] = [*report.results.runs, *report.results.evaluations]
+    files = {one.path: one for one in every}
+    for path, one in files.items():
+        versions = one.record.get("versions") or {}
+        names = [f"{name} {versions[name]}" for name in ("python", "jax", "mujoco") if name in versions]
+        seconds = one.record.get("wall_seconds" if isinstance(one, Run) else "seconds")
+        if seconds is None and isinstance(one, Run):
+            seconds = float(one.seconds[-1])
+        rows.append(
+            [
+                path.name if path.name != recorded.METRICS else f"{path.parent.name}/{path.name}",
+                recorded.command(one),
+                one.config.get("preset", "-"),
+                str(one.config.get("seed", "-")),
+                one.record.get("device") or "-",
+                ", ".join(names) or "-",
+                str(one.record.get("commit") or "-")[:10],
+                "-" if seconds is None else f"{seconds:.0f} s" + (", whole sweep" if "settings" in one.record else ""),
+            ]
+        )
+    return rows
+
+
+def _tables(report: Report) -> dict[str, Table]:
+    """By title; those without a row are left out."""
+    every = {
+        "Training": training(report),
+        "Evaluation": evaluation(report),
+        "Failures": failures(report),
+        "Provenance": provenance(report),
+    }
+    return {title: table for title, table in every.items() if len(table) > 1}
+
+
+EXPLAINED = (
+    "Several runs: interquartile mean and, in brackets, its 95 % band (bootstrap over seeds). One run: its value, and "
+    "the 95 % interval of its episodes where it was evaluated. Metrics are defined in csac_jax/train/metrics.py. "
+    "Paper: numbers of CSAC's text, sec. 4.3, 4.4 and 5, of one scene and 2,500 actions; of the presets only `paper` "
+    "keeps to that."
+)
+
+
+def markdown(report: Report) -> str:
+    """All tables and notes."""
+    parts = []
+    for title, table in _tables(report).items():
+        head, *rows = ["| " + " | ".join(cell.replace("|", "/") for cell in row) + " |" for row in table]
+        parts.append("\n".join([f"## {title}", "", head, "|" + "---|" * len(table[0]), *rows]))
+    notes = "\n".join(f"- {note}" for note in report.notes)
+    return "\n\n".join([*parts, EXPLAINED, *([notes] if notes else [])]) + "\n"
+
+
+STYLE = """body { font: 15px/1.45 sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+table { border-collapse: collapse; font-size: 13px; margin: 0.5rem 0 1.5rem }
+th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: left; vertical-align: top }
+svg { max-width: 100%; height: auto }"""
+
+
+def page(report: Report, figures: dict[str, str]) -> str:
+    """One HTML page that needs no other file; figures by title, each an SVG."""
+    body = ["<h1>csac_jax: results</h1>", f"<p>{html.escape(EXPLAINED)}</p>"]
+    body += [f"<h2>{html.escape(title)}</h2>\n{svg}" for title, svg in figures.items()]
+    for title, table in _tables(report).items():
+        body.append(
+            f"<h2>{html.escape(title)}</h2>\n<table>{''.join(_row(row, i == 0) for i, row in enumerate(table))}</table>"
+        )
+    if report.notes:
+        body.append(
+            "<h2>Notes</h2>\n<ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in report.notes) + "</ul>"
+        )
+    head = f'<meta charset="utf-8"><title>csac_jax: results</title><style>{STYLE}</style>'
+    return f"<!doctype html>\n<html lang='en'><head>{head}</head>\n<body>\n" + "\n".join(body) + "\n</body></html>\n"
+
+
+def _row(cells: list[str], head: bool) -> str:
+    tag = "th" if head else "td"
+    return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>\n"
+
+
+def write(report: Report, folder: Path) -> list[Path]:
+    """Writes the page, its figures and its tables; returns the files. Needs matplotlib."""
+    from csac_jax.show import charts
+
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = charts.draw(report)
+    files = {"index.html": page(report, {chart.title: chart.svg for chart in drawn}), "results.md": markdown(report)}
+    files |= {f"{chart.name}.svg": chart.svg for chart in drawn}
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return [folder / name for name in files]

@@ -1,0 +1,90 @@
+"""Run with eight virtual devices: prints, as JSON, how members on eight of them differ from those on one.
+
+python -m tests.train.eight_devices toy|real FOLDER
+"""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import csac_jax  # noqa: F401  (before JAX)
+
+import jax  # isort: skip
+import numpy as np
+
+from csac_jax import presets
+from csac_jax.train import checkpoint, members, mesh, step
+from tests.train import toys
+
+SEEDS = {"seeds": 8, "scenes": 2}
+STEPS = 4
+
+
+def _config(kind: str) -> Any:
+    if kind == "toy":
+        return toys.CFG
+    smoke = presets.smoke()
+    return dataclasses.replace(smoke, train=dataclasses.replace(smoke.train, scenes=8, actions=64))
+
+
+def _program(kind: str, cfg: Any) -> step.Program:
+    if kind == "real":
+        return step.make(cfg)
+    step.begin, step.train_step = toys.begin, toys.train_step
+    return toys.program(cfg)
+
+
+def run(kind: str, shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
+    """State after two chunks, their metrics, and the second chunk's state from a checkpoint of the first."""
+    cfg = _config(kind)
+    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])])
+    program, each, line = _program(kind, cfg), members.members(group), mesh.make(devices)
+    state = members.init(program, each, line, shard)
+    places = jax.tree.map(lambda leaf: leaf.sharding, state)
+    chunk = members.compile_chunk(program, each, STEPS, line, shard).lower(state).compile()
+    state, first = chunk(state)
+    assert jax.tree.map(lambda leaf: leaf.sharding, state) == places
+    checkpoint.save(folder, STEPS, state, cfg, {})
+    state, second = chunk(state)
+    restored, _ = checkpoint.restore(folder, members.abstract(program, each, line, shard))
+    assert jax.tree.map(lambda leaf: leaf.sharding, restored) == places
+    again, _ = chunk(restored)
+    return state, jax.device_get([first, second]), again
+
+
+def _leaves(tree: Any) -> list[np.ndarray]:
+    is_key = [jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in jax.tree.leaves(tree)]
+    leaves = zip(jax.tree.leaves(tree), is_key, strict=True)
+    return [np.asarray(jax.random.key_data(leaf) if key else leaf) for leaf, key in leaves]
+
+
+def _difference(a: Any, b: Any) -> float:
+    """Largest difference of two trees, relative to the larger of 1 and the value."""
+    pairs = zip(_leaves(a), _leaves(b), strict=True)
+    return max(float(np.max(np.abs(x.astype(float) - y) / np.maximum(np.abs(y), 1.0))) for x, y in pairs)
+
+
+def compare(kind: str, shard: str, folder: Path) -> dict[str, Any]:
+    """What differs between one device and eight."""
+    (one, seen, _), (eight, others, again) = (run(kind, shard, n, folder / f"{shard}-{n}") for n in (1, 8))
+    abstract = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), one)
+    elsewhere, _ = checkpoint.restore(folder / f"{shard}-8", abstract)  # saved on eight, read on one
+    parts = (
+        [leaf.addressable_shards[0].data.shape for leaf in (eight.scenes, eight.learner["online"])]
+        if kind == "toy"
+        else []
+    )
+    return {
+        "metrics": max(_difference(a._asdict(), b._asdict()) for a, b in zip(seen, others, strict=True)),
+        "state": _difference(one, eight),
+        "resumed": _difference(eight, again),
+        "moved": _difference(elsewhere, checkpoint.restore(folder / f"{shard}-1", abstract)[0]),
+        "parts": parts,
+    }
+
+
+if __name__ == "__main__":
+    found = {shard: compare(sys.argv[1], shard, Path(sys.argv[2])) for shard in sys.argv[3:] or SEEDS}
+    print(json.dumps({"devices": len(jax.devices()), **found}))

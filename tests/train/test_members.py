@@ -1,0 +1,162 @@
+"""Members of a sweep in one program, with a small step in place of the learner's."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from csac_jax import algorithms, presets
+from csac_jax.train import members, step
+from csac_jax.train.members import Members
+from tests.train import toys
+
+pytestmark = pytest.mark.optax
+
+OTHER = {
+    "cem.std": 0.35,
+    "cem.std_min": 0.2,
+    "target.gamma": 0.4,
+    "target.inverse_temperature": 5.0,
+    "reward.reach": 0.5,
+    "reward.distance": 0.2,
+    "reward.farthest": 0.3,
+    "reward.eta0": 0.1,
+    "reward.eta1": 0.7,
+    "reward.push_level": 0.5,
+    "reward.grasp_level": 2.0,
+    "reward.nothing": -2.0,
+    "reward.empty": -0.9,
+    "reward.touched": -0.3,
+    "reward.dropped": 0.2,
+    "reward.lifted": 3.0,
+    "reward.push_better": 0.6,
+    "reward.push_worse": -0.4,
+    "reward.dead_band": 0.02,
+    "explore.noise_std": 0.2,
+    "explore.noise_clip": 0.1,
+    "explore.primitive_start": 0.9,
+    "explore.primitive_end": 0.2,
+    "explore.place_start": 0.8,
+    "explore.place_end": 0.1,
+    "explore.decay": 0.99,
+    "explore.push_fraction": 0.6,
+    "learn.learning_rate": 3e-3,
+    "learn.actor_learning_rate": 2e-3,
+    "learn.rate_end": 0.5,
+    "learn.tau": 0.3,
+    "learn.gradient_clip": 0.5,
+    "learn.huber": 0.05,
+    "replay.alpha": 0.9,
+    "replay.floor": 0.3,
+    "replay.weight_start": 0.2,
+    "replay.weight_end": 0.7,
+    "replay.beta_start": (2.0, 3.0),
+    "replay.beta_middle": (3.0, 1.0),
+    "replay.beta_middle_at": 0.6,
+    "replay.beta_end": (4.0, 2.0),
+}
+"""Another value of every number."""
+
+PER = dataclasses.replace(toys.CFG, replay=dataclasses.replace(toys.CFG.replay, sampler="prioritised"))
+
+
+@pytest.fixture(autouse=True)
+def toy_step(monkeypatch: pytest.MonkeyPatch):
+    """The small step in place of the real one."""
+    monkeypatch.setattr(step, "begin", toys.begin)
+    monkeypatch.setattr(step, "train_step", toys.train_step)
+
+
+def _seeds(num: int, cfg=toys.CFG) -> members.Group:
+    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(num)])
+    return group
+
+
+def _run(group: members.Group, chunks: int = 2) -> tuple[Any, list[Any]]:
+    program, each = toys.program(group.configs[0]), members.members(group)
+    chunk = members.compile_chunk(program, each, 4)
+    state, seen = members.init(program, each), []
+    for _ in range(chunks):
+        state, metrics = chunk(state)
+        seen.append(jax.device_get(metrics))
+    return state, seen
+
+
+def _alone(cfg, chunks: int = 2) -> tuple[Any, list[Any]]:
+    """As `train` runs it: its numbers are constants, its state has no axis of members."""
+    program = toys.program(cfg)
+    chunk, state, seen = step.compile_chunk(program, 4), step.init(program), []
+    for _ in range(chunks):
+        state, metrics = chunk(state)
+        seen.append(jax.device_get(metrics))
+    return state, seen
+
+
+def _assert_close(a: Any, b: Any, rtol: float) -> None:
+    for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(a), jax.tree.leaves(b), strict=True):
+        if jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):
+            one, other = jax.random.key_data(one), jax.random.key_data(other)
+        np.testing.assert_allclose(one, other, rtol, 1e-6, err_msg=jax.tree_util.keystr(path))
+
+
+def test_members_are_the_runs_of_train():
+    """Claim: each member of a sweep is the run that `train` makes of its seed and settings, to rounding, also where
+    numbers are lifted out of the config, every one of them."""
+    assert OTHER.keys() == set(members.NUMBERS)
+    configs = (PER, dataclasses.replace(members.with_numbers(PER, OTHER), seed=1))
+    (group,) = members.group(configs)
+    assert group == (configs, members.NUMBERS)
+    state, seen = _run(group)
+    for k, cfg in enumerate(configs):
+        alone, metrics = _alone(cfg)
+        _assert_close(members.member(state, k), alone, 1e-4)
+        for one, other in zip(seen, metrics, strict=True):
+            _assert_close(jax.tree.map(lambda leaf, k=k: leaf[:, k], one), other, 1e-4)
+
+
+def test_seeds_differ_and_share_the_counter():
+    """Claim: members of two seeds differ in every scene and network; they share the step counter, so that a schedule
+    by it stays a branch, a `cond`; a chunk gives their state back in its own memory."""
+    group = _seeds(2)
+    program, each = toys.program(), members.members(group)
+    state = members.init(program, each)
+    assert state.scenes.shape == (2, toys.SCENES)
+    traced = members.compile_chunk(program, each, 4).trace(state)
+    assert "cond[" in str(traced.jaxpr)
+    chunk = traced.lower().compile()
+    assert chunk.memory_analysis().alias_size_in_bytes >= sum(leaf.nbytes for leaf in jax.tree.leaves(state.replay))
+    after, _ = chunk(state)
+    assert (after.step.shape, int(after.step)) == ((), 4)
+    for leaf in (after.scenes, after.learner["online"]):
+        assert len(np.unique(np.asarray(leaf))) == leaf.size
+
+
+def test_settings_that_are_numbers_share_a_program():
+    """Claim: numbers, names and seeds do not part groups; a sampler, a size or a branch does. Order is kept."""
+    smoke = presets.smoke()
+    learn = dataclasses.replace(smoke.learn, tau=0.5)
+    uniform = algorithms.configure(smoke, "csac")
+    configs = [smoke, uniform, dataclasses.replace(smoke, learn=learn), dataclasses.replace(uniform, seed=3)]
+    first, second = members.group(configs)
+    assert first == ((configs[0], configs[2]), ("learn.tau",))
+    assert second == ((configs[1], configs[3]), ())
+    vpg, reactive = (algorithms.configure(smoke, name) for name in ("vpg", "reactive"))
+    assert members.group([vpg, reactive])[0].numbers == ("target.gamma",)
+
+
+def test_seeds_alone_keep_their_constants():
+    """Claim: where only seeds differ, nothing is lifted: numbers stay constants of the program."""
+    each = members.members(_seeds(2))
+    assert each == Members(each.seed, {}, None)
+    assert each.seed.tolist() == [0, 1]
+
+
+def test_bounds_are_those_of_the_settings():
+    """Claim: bounds of returns that are lifted are those that each setting has by itself."""
+    other = dataclasses.replace(toys.CFG, target=dataclasses.replace(toys.CFG.target, gamma=0.25))
+    (group,) = members.group([toys.CFG, other])
+    each = members.members(group)
+    wanted = np.array([toys.program(cfg).learner.bounds for cfg in (toys.CFG, other)])
+    np.testing.assert_allclose(np.stack(each.bounds, axis=1), wanted, 1e-6)

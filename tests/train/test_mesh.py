@@ -1,0 +1,74 @@
+"""Several devices: eight virtual ones of the CPU, in a process of their own."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+
+import csac_jax
+from csac_jax.train import mesh
+
+ROOT = Path(csac_jax.__file__).parents[1]
+
+
+def _eight(kind: str, folder: Path, timeout: int) -> dict[str, Any]:
+    """What `eight_devices` prints."""
+    variables = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "tests.train.eight_devices", kind, str(folder)]
+    done = subprocess.run(command, env=variables, cwd=ROOT, capture_output=True, text=True, timeout=timeout)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _check(found: dict[str, Any], tolerance: float) -> None:
+    assert found["devices"] == 8
+    for shard in ("seeds", "scenes"):
+        assert found[shard]["metrics"] < tolerance, shard
+        assert found[shard]["state"] < tolerance, shard
+        assert found[shard]["moved"] < tolerance, shard
+        assert found[shard]["resumed"] == 0.0, shard
+
+
+def test_eight_devices_are_one(tmp_path: Path):
+    """Claim: seeds or scenes over eight devices give the metrics and the state of one, to the rounding of sums in
+    another order; each device holds its share; a checkpoint of eight goes on bit for bit, and can be read on one. A
+    small step stands in for the learner's."""
+    found = _eight("toy", tmp_path, 300)
+    _check(found, 1e-5)
+    assert found["seeds"]["parts"] == [[1, 8], [1, 3]]
+    assert found["scenes"]["parts"] == [[2, 1], [2, 3]]
+
+
+@pytest.mark.slow
+def test_eight_devices_are_one_in_earnest(tmp_path: Path):
+    """Claim: the same of the whole training step, physics and networks included, over eight training steps; beyond,
+    rounding ends in other contacts and other actions."""
+    _check(_eight("real", tmp_path, 3000), 1e-2)
+
+
+@pytest.mark.parametrize("devices", [0, -1, 10_000])
+def test_devices_that_are_not_there(devices: int):
+    """Claim: a mesh larger than the devices there are is refused, with their number."""
+    with pytest.raises(ValueError, match=f"--devices: {devices} asked for, there are {len(jax.devices())}"):
+        mesh.make(devices)
+
+
+def test_what_cannot_be_divided():
+    """Claim: seeds, scenes or a batch that the devices cannot share evenly are refused by name."""
+
+    class Three:
+        size = 3
+
+    mesh.check(Three(), "seeds", 6, 8, 8)
+    mesh.check(Three(), "scenes", 1, 6, 9)
+    mesh.check(None, "scenes", 1, 7, 5)
+    for arguments, name in ((("seeds", 8, 6, 9), "--seeds: 8"), (("scenes", 6, 8, 9), "train.scenes: 8")):
+        with pytest.raises(ValueError, match=name):
+            mesh.check(Three(), *arguments)
+    with pytest.raises(ValueError, match=r"learn\.batch: 8"):
+        mesh.check(Three(), "scenes", 6, 6, 8)
