@@ -514,7 +514,7 @@ def _read_sweep(arguments: list[str]) -> tuple[SweepOptions, Any]:
         combinations = grid.settings(options.vary)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
-    found = [(one, _parse_setting(preset, [*flags, *one.flags])[1]) for one in combinations]
+    found = [(one, _resolve(_parse_setting(preset, [*flags, *one.flags])[1])) for one in combinations]
     for _, each in found:
         _check_physics(each)
     from csac_jax.train import sweep as sweeping
@@ -565,8 +565,9 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
     from rich.console import Console
 
     from csac_jax.show.progress import Terminal
-    from csac_jax.train import checkpoint, cluster, loop, members, mesh, sweep as sweeping
+    from csac_jax.train import cache, checkpoint, cluster, loop, members, mesh, sweep as sweeping
 
+    cache.enable()
     try:
         line = mesh.make(options.devices)
         for one in plan.settings:
