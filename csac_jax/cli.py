@@ -515,11 +515,12 @@ def _read_sweep(arguments: list[str]) -> tuple[SweepOptions, Any]:
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
     found = [(one, _parse_setting(preset, [*flags, *one.flags])[1]) for one in combinations]
-    for _, each in found:
-        _check_physics(each)
     from csac_jax.train import sweep as sweeping
 
-    plan = sweeping.Plan(options.seeds, [sweeping.Setting(one.name, one.values, each) for one, each in found])
+    settings = [sweeping.Setting(one.name, one.values, _resolve(each)) for one, each in found]
+    for each in settings:
+        _check_physics(each.cfg)
+    plan = sweeping.Plan(options.seeds, settings)
     try:
         sweeping.check(plan)
     except (ValueError, sweeping.SweepError) as error:
@@ -565,13 +566,14 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
     from rich.console import Console
 
     from csac_jax.show.progress import Terminal
-    from csac_jax.train import checkpoint, cluster, loop, members, mesh, sweep as sweeping
+    from csac_jax.train import cache, checkpoint, cluster, loop, members, mesh, sweep as sweeping
 
+    cache.enable()
     try:
         line = mesh.make(options.devices)
         for one in plan.settings:
             mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
-            sweeping.check_memory(plan, one.cfg, 1 if line is None or options.shard == "scenes" else line.size)
+        sweeping.check_memory(plan, 1 if line is None or options.shard == "scenes" else line.size)
     except ValueError as error:
         raise BadArgumentsError(str(error)) from None
     trunks = {one.cfg.net: _read_weights(one.cfg) for one in plan.settings}

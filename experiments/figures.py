@@ -41,7 +41,35 @@ def replay() -> None:
     figure.savefig(FIGURES / "replay.png", dpi=110, metadata={"Software": None})
 
 
+CURVES = {
+    "scenes": "scenes side by side",
+    "blocks": "blocks on the table",
+    "map": "cells along a side of the map",
+    "capacity": "capacity of the replay, transitions",
+}
+
+
+def steps() -> None:
+    """Time of a training step against what grows, one figure for each curve that `bench step --curve` recorded."""
+    for curve, label in CURVES.items():
+        records = [json.loads(path.read_text()) for path in sorted(RESULTS.glob(f"bench-step-*-{curve}.json"))]
+        if not records:
+            continue
+        figure, panel = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
+        for record in records:
+            points = record["points"]
+            what = f"{record['preset']}, {record['physics']}, {record['device']}"
+            panel.plot([p[curve] for p in points], [p["step_seconds"] for p in points], "o-", label=what)
+        panel.set(xlabel=label, ylabel="time of a training step, s", yscale="log")
+        panel.set_xscale("log", base=2)
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize="small")
+        figure.savefig(FIGURES / f"step-{curve}.png", dpi=110, metadata={"Software": None})
+        plt.close(figure)
+
+
 if __name__ == "__main__":
     FIGURES.mkdir(exist_ok=True)
     replay()
+    steps()
     charts.save(report.build(results.read([RESULTS])), FIGURES)

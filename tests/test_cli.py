@@ -367,6 +367,7 @@ def test_automatic_physics_is_resolved(tmp_path: Path):
     folder = tmp_path / "runs" / "three"
     checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []})
     assert cli._read_train(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
+    assert cli._read_sweep(["smoke", "--sim.physics", "auto"])[1].settings[0].cfg.sim == SMOKE.sim
     line = cli._first_line(folder, cfg)
     wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics mjx, on 1 x cpu (cpu)"
     assert line == f"run {folder}: {wanted}"

@@ -1,14 +1,17 @@
 """`csac-jax sweep`: bad input is one line, exit code 2 and nothing started; settings reach their configs."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
 
 from csac_jax import algorithms, cli, presets
-from csac_jax.train import sweep
+from csac_jax.train import step, stop, sweep
+from tests.train import toys
 
 SMOKE = presets.smoke()
+RUN = sweep.run
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +47,7 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
         ("smoke --vary learn.tau=0.1,0.10", "--vary: two settings have the same values"),
         ("smoke --devices 4096", "--devices: 4096 asked for, there are "),
-        ("smoke --seeds 100000", "lower --replay.capacity or --seeds, or raise --devices"),
+        ("smoke --seeds 100000", "lower --seeds or --replay.capacity, vary fewer numbers"),
         ("smoke --cluster", "several processes need --run-dir"),
         ("smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2", "--process-id: must lie in 0 .. 1"),
         ("smoke --run-dir .", ". exists; give another --run-dir"),
@@ -86,3 +89,57 @@ def test_plan_survives_its_file(tmp_path: Path):
     _, plan = cli._read_sweep(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
     (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
     assert cli._read_sweep(["--resume", str(tmp_path)])[1] == plan
+
+
+@pytest.mark.optax
+def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a sweep that is stopped by a signal exits with 130 or 143 and says how to go on; resumed, it ends with 0
+    and its results. A small step stands in for the learner's."""
+    monkeypatch.setattr(sweep, "run", RUN)
+    for name, toy in (("make", toys.program), ("begin", toys.begin), ("train_step", toys.train_step)):
+        monkeypatch.setattr(step, name, toy)
+    for number in (2, 15):
+        stopped = stop.Stop()
+        stopped.signal = number
+        monkeypatch.setattr(cli.stopping, "install", lambda stopped=stopped: stopped)
+        first = ["smoke", "--seeds", "2", "--run-dir", "run"] if number == 2 else ["--resume", "run"]
+        assert cli.main(["sweep", *first]) == 128 + number
+        assert "go on with: csac-jax sweep --resume run" in capsys.readouterr().out
+    monkeypatch.setattr(cli.stopping, "install", stop.Stop)
+    assert cli.main(["sweep", "--resume", "run", "--json", "out.json"]) == 0
+    assert "interquartile mean of 2 seeds" in capsys.readouterr().out
+    result = json.loads(Path("out.json").read_text())
+    assert result["complete"]
+    assert len(result["compile_seconds"]) == 1
+    assert [row["run_dir"] for row in result["settings"][0]["members"]] == ["base/seed-0", "base/seed-1"]
+    assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--seeds 0", "bench sweep: --seeds, --steps, --repeats: at least 1"),
+        ("--devices 4096", "bench sweep: --devices: 4096 asked for"),
+        ("fats", "bench sweep: argument preset: invalid choice: 'fats'"),
+        ("--batch 8000", "bench sweep: replay.capacity: must hold"),
+    ],
+)
+def test_bad_arguments_of_the_benchmark(capsys: pytest.CaptureFixture, arguments: str, message: str):
+    """Claim: what `bench sweep` cannot measure is one line and exit code 2."""
+    assert cli.main(["bench", "sweep", *arguments.split()]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.optax
+def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `bench sweep` prints a row for each number of seeds, and the run of one seed by itself, with where they
+    come from. A small step stands in for the learner's."""
+    for name, toy in (("make", toys.program), ("begin", toys.begin), ("train_step", toys.train_step)):
+        monkeypatch.setattr(step, name, toy)
+    assert cli.main(["bench", "sweep", "smoke", "--seeds", "1", "3", "--repeats", "1"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(row["seeds"], row["devices"]) for row in found["rows"]] == [(1, 1), (3, 1)]
+    for row in found["rows"]:
+        assert row["actions_per_second"] == pytest.approx(row["seeds"] * 2 * 2 / row["seconds"])
+    assert found["train"]["compile_seconds"] > 0.0
+    assert {"preset", "device", "versions", "commit"} <= found.keys()

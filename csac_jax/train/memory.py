@@ -1,9 +1,9 @@
 """What a run will hold in memory, part by part, known before anything is compiled; a run that cannot fit is refused.
 
 State, ring and networks are exact: their shapes are traced. What a training step needs beside them is a model: counts
-of the maps that are alive at once, times their sizes, with coefficients fitted to what XLA reports for compiled steps
-on a CPU (jaxlib 0.10.1, small nets; `csac-jax bench memory` stands both side by side). XLA shares memory between
-stages, so the largest of them counts. Where nothing was fitted, DenseNet-121's gradients and GPUs, expect less.
+of the maps that are alive at once, times their sizes, with coefficients fitted to what XLA reports for compiled stages
+on a CPU (jaxlib 0.10.1, small nets; `csac-jax bench memory` puts both side by side). XLA shares memory between stages,
+so the largest need counts. Where nothing was fitted, DenseNet-121's gradients and GPUs, expect less.
 """
 
 import dataclasses
@@ -45,7 +45,12 @@ def predict(cfg: Config) -> dict[str, int]:
     """Bytes by part: `replay`, `scenes` and `networks` are the run's state, `step` the largest need of a stage."""
     state = step.abstract_state(cfg)
     exact = {"replay": _bytes(state.replay), "scenes": _bytes(state.scenes), "networks": _bytes(state.learner)}
-    return {**exact, "step": max(stages(cfg).values())}
+    return {**exact, "step": _largest_need(stages(cfg))}
+
+
+def _largest_need(needs: dict[str, int]) -> int:
+    """Of a step's stages. The scenes are looked at while they move, as XLA orders it; learning is apart from both."""
+    return max(needs["learn"], needs["look"] + needs["simulate"])
 
 
 def _bytes(tree: Any) -> int:
@@ -118,13 +123,11 @@ def check(cfg: Config) -> None:
 
     In seconds: networks, which take long to trace and little room, are left out, and so is what was not fitted.
     """
-    available, total = limit(), _sure(cfg)
+    available, total = limit(), sure(cfg)
     if total <= available:
         return
     too_large = f"a run takes {total / GIB:.1f} GiB, there are {available / GIB:.1f}"
-    for name in sorted(
-        KNOBS, key=lambda name: _sure(_with(cfg, name, KNOBS[name]))
-    ):  # what most depends on comes first
+    for name in sorted(KNOBS, key=lambda name: sure(_with(cfg, name, KNOBS[name]))):  # what most depends on comes first
         value = _largest(cfg, name, available)
         if value:
             raise ValueError(
@@ -137,10 +140,10 @@ KNOBS = {"replay.capacity": 2, "learn.batch": 1, "train.scenes": 1}
 """Settings that memory falls with, and their least values."""
 
 
-def _sure(cfg: Any) -> int:
+def sure(cfg: Any) -> int:
     """Bytes that a run takes for sure."""
     slot = ring.bytes_needed(1, step.example(cfg))
-    return cfg.replay.capacity * slot + max(stages(cfg, fitted_only=True).values())
+    return cfg.replay.capacity * slot + _largest_need(stages(cfg, fitted_only=True))
 
 
 def _value(cfg: Config, name: str) -> int:
@@ -161,5 +164,5 @@ def _largest(cfg: Config, name: str, available: int) -> int:
     low, high = KNOBS[name] - 1, _value(cfg, name)  # high does not fit
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if _sure(_with(cfg, name, middle)) <= available else (low, middle)
+        low, high = (middle, high) if sure(_with(cfg, name, middle)) <= available else (low, middle)
     return low if low >= needed else 0

@@ -25,8 +25,7 @@ import jax
 import numpy as np
 
 from csac_jax.config import Config
-from csac_jax.replay import ring
-from csac_jax.train import checkpoint, cluster, config_json, loop, memory, step as training
+from csac_jax.train import checkpoint, cluster, config_json, loop, memory
 from csac_jax.train.members import Engine, Group, group
 from csac_jax.train.stop import Stop
 from csac_jax.train.summary import interquartile_mean
@@ -155,15 +154,17 @@ def check(plan: Plan) -> None:
     groups_of(plan)
 
 
-def check_memory(plan: Plan, cfg: Config, devices: int) -> None:
-    """Raises ValueError where the rings of a setting's seeds, spread over `devices`, exceed a device's memory."""
-    slot, seeds = ring.bytes_needed(1, training.example(cfg)), -(-plan.seeds // devices)
-    wanted, available = seeds * cfg.replay.capacity * slot, memory.limit()
-    if wanted > available:
-        raise ValueError(
-            f"--seeds: the replays of {seeds} seeds on one device take {wanted / memory.GIB:.1f} GiB, there are "
-            f"{available / memory.GIB:.1f}; lower --replay.capacity or --seeds, or raise --devices"
-        )
+def check_memory(plan: Plan, devices: int) -> None:
+    """Raises ValueError where the members of a group, spread over `devices`, are known to exceed a device's memory."""
+    for given, _ in groups_of(plan):
+        one, available = memory.sure(given.configs[0]), memory.limit()
+        members = -(-len(given.configs) // devices)
+        if members * one > available:
+            total, there = members * one / memory.GIB, available / memory.GIB
+            raise ValueError(
+                f"--seeds: {members} members side by side take {total:.1f} GiB, there are {there:.1f}, enough for "
+                f"{available // one}; lower --seeds or --replay.capacity, vary fewer numbers or raise --devices"
+            )
 
 
 class _Sweep:
@@ -276,7 +277,7 @@ class _Sweep:
             actions=done,
             actions_per_second=speed,
             grasp_success=_mean([record.grasp_success for record in records]),
-            grasps_counted=min(record.grasps_counted for record in records),
+            grasps_counted=sum(record.grasps_counted for record in records),
             critic_loss=_mean([record.critic_loss for record in records]),
             actor_loss=_mean([record.actor_loss for record in records]),
         )

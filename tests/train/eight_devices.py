@@ -18,7 +18,7 @@ from csac_jax import presets
 from csac_jax.train import checkpoint, members, mesh, step
 from tests.train import toys
 
-SEEDS = {"seeds": 8, "scenes": 2}
+SEEDS = {"toy": {"seeds": 8, "scenes": 2}, "real": {"scenes": 1}}
 STEPS = 4
 
 
@@ -39,7 +39,7 @@ def _program(kind: str, cfg: Any) -> step.Program:
 def run(kind: str, shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
     """State after two chunks, their metrics, and the second chunk's state from a checkpoint of the first."""
     cfg = _config(kind)
-    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])])
+    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(SEEDS[kind][shard])])
     program, each, line = _program(kind, cfg), members.members(group), mesh.make(devices)
     state = members.init(program, each, line, shard)
     places = jax.tree.map(lambda leaf: leaf.sharding, state)
@@ -86,5 +86,5 @@ def compare(kind: str, shard: str, folder: Path) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    found = {shard: compare(sys.argv[1], shard, Path(sys.argv[2])) for shard in sys.argv[3:] or SEEDS}
+    found = {shard: compare(sys.argv[1], shard, Path(sys.argv[2])) for shard in SEEDS[sys.argv[1]]}
     print(json.dumps({"devices": len(jax.devices()), **found}))

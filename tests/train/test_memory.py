@@ -101,7 +101,7 @@ def test_nothing_fits(monkeypatch: pytest.MonkeyPatch):
 def test_presets_fit():
     """Claim: no preset is refused on a machine with 16 GB."""
     for name in presets.PRESETS:
-        assert memory._sure(presets.get(name)) < 16e9
+        assert memory.sure(presets.get(name)) < 16e9
 
 
 def test_gradient_of_densenet_is_shown_and_refuses_nothing():

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.config import TrainConfig
 from csac_jax.train import checkpoint, sweep
 from csac_jax.train.members import Engine, Group
 from csac_jax.train.stop import Stop
@@ -226,14 +225,14 @@ def test_equal_settings_are_refused():
         sweep.check(Plan(1, [_setting("a"), _setting("b")]))
 
 
-def test_rings_of_all_seeds_must_fit(monkeypatch: pytest.MonkeyPatch):
-    """Claim: the replays of all seeds of a setting must fit into the devices together."""
-    monkeypatch.setattr(sweep.memory, "limit", lambda: 2 * CFG.replay.capacity * 20_000)
-    cfg = dataclasses.replace(CFG, train=TrainConfig(scenes=2, warmup=8))
-    for seeds, devices, fits in ((1, 1, True), (8, 1, False), (8, 4, True)):
-        plan = Plan(seeds, [Setting("a", {}, cfg)])
+def test_members_must_fit_together(monkeypatch: pytest.MonkeyPatch):
+    """Claim: what the members of a group need together, those of settings that are numbers included, must fit into
+    the devices; else it is said how many would."""
+    monkeypatch.setattr(sweep.memory, "limit", lambda: 4 * sweep.memory.sure(CFG))
+    for seeds, devices, fits in ((2, 1, True), (3, 1, False), (3, 2, True)):  # of two settings
+        plan = Plan(seeds, [_setting("a"), _setting("c", learn={"tau": 0.5})])
         if fits:
-            sweep.check_memory(plan, cfg, devices)
+            sweep.check_memory(plan, devices)
         else:
-            with pytest.raises(ValueError, match="--seeds: the replays of 8 seeds"):
-                sweep.check_memory(plan, cfg, devices)
+            with pytest.raises(ValueError, match=r"--seeds: 6 members .* enough for 4"):
+                sweep.check_memory(plan, devices)

@@ -1,0 +1,86 @@
+"""What seeds side by side cost, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices 1 ...] [--shard
+seeds|scenes] [--steps N] [--repeats N] [--scenes E --batch B]`, PRESET `quick` if none is given.
+
+For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
+and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds that the devices
+do not divide are left out. `train` is the program of one seed as `csac-jax train` has it, on one device. Configurations
+follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
+"""
+
+import dataclasses
+import json
+import statistics
+import time
+from typing import Any
+
+import jax
+
+from csac_jax import presets
+from csac_jax.cli import BadArgumentsError
+from csac_jax.config import Config
+from csac_jax.train import auto, members, mesh, provenance, step
+from experiments.bench._options import Parser
+
+
+def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
+    """Seconds of the compilation and, the median, of a call that goes on where the last one ended."""
+    begun = time.perf_counter()
+    chunk = jitted.lower(state).compile()
+    compiled = time.perf_counter() - begun
+    seconds = []
+    for _ in range(1 + repeats):
+        begun = time.perf_counter()
+        state, metrics = chunk(state)
+        jax.block_until_ready((state, metrics))
+        seconds.append(time.perf_counter() - begun)
+    temporary = chunk.memory_analysis().temp_size_in_bytes
+    return {"compile_seconds": compiled, "seconds": statistics.median(seconds[1:]), "temporary_bytes": temporary}
+
+
+def measure(program: step.Program, seeds: int, devices: int, shard: mesh.Shard, steps: int, repeats: int) -> Any:
+    """A row: `seeds` members on `devices` devices."""
+    cfg, line = program.cfg, mesh.make(devices)
+    mesh.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
+    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
+    each = members.members(group)
+    jitted = members.compile_chunk(program, each, steps, line, shard)
+    row = _timed(jitted, members.init(program, each, line, shard), repeats)
+    rate = seeds * cfg.train.scenes * steps / row["seconds"]
+    return {"seeds": seeds, "devices": devices, **row, "actions_per_second": rate}
+
+
+def _config(options: Any) -> Config:
+    cfg = auto.resolve(presets.get(options.preset))
+    scenes, batch = options.scenes or cfg.train.scenes, options.batch or cfg.learn.batch
+    train = dataclasses.replace(cfg.train, scenes=scenes, warmup=max(cfg.train.warmup, batch))
+    return dataclasses.replace(cfg, train=train, learn=dataclasses.replace(cfg.learn, batch=batch))
+
+
+def main(arguments: list[str]) -> None:
+    """Prints the result. Raises BadArgumentsError for what cannot be measured."""
+    parser = Parser(prog="bench sweep", description=__doc__)
+    parser.add_argument("preset", nargs="?", default="quick", choices=presets.PRESETS)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--devices", type=int, nargs="+", default=[1])
+    parser.add_argument("--shard", choices=["seeds", "scenes"], default="seeds")
+    for name, default in (("steps", 2), ("repeats", 3), ("scenes", 0), ("batch", 0)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    options = parser.parse_args(arguments)
+    if min(*options.seeds, options.steps, options.repeats) < 1:
+        raise BadArgumentsError("bench sweep: --seeds, --steps, --repeats: at least 1")
+    try:
+        cfg = _config(options)
+        for devices in options.devices:
+            mesh.check(mesh.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch)
+    except ValueError as error:
+        raise BadArgumentsError(f"bench sweep: {error}") from None
+    program = step.make(cfg)
+    alone = _timed(step.compile_chunk(program, options.steps), step.init(program), options.repeats)
+    rows = [
+        measure(program, seeds, devices, options.shard, options.steps, options.repeats)
+        for devices in options.devices
+        for seeds in options.seeds
+        if options.shard == "scenes" or seeds % devices == 0
+    ]
+    sizes = {"scenes": cfg.train.scenes, "batch": cfg.learn.batch, "steps": options.steps, "shard": options.shard}
+    print(json.dumps({"preset": cfg.preset, **sizes, "train": alone, "rows": rows, **provenance.record()}, indent=2))
