@@ -200,3 +200,14 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
     again = pool.settled(world, PILE, EXTENT, 1, 3, poured=True)
     np.testing.assert_array_equal(again.position, scenes.position)
+
+
+def test_poured_blocks_that_leave_are_dropped_anew():
+    """Claim: where a block of nearly every scene falls outside the workspace, pouring still gives the scene."""
+    cfg = SceneConfig(slots=("box",) * 4, min_blocks=4, drop_extent=0.448, settle_time=1.0)
+    world, rng = model.build(cfg, SimConfig()), np.random.default_rng(0)
+    for _ in range(6):
+        scene = pool._drop(cfg, rng, 4)
+        poured = pool.pour(world, cfg, EXTENT, scene, jax.device_get(model.scene_fields(world, scene)))
+        assert poured is not None
+        assert (np.linalg.norm(poured.position[:, :2], axis=1) <= 0.5 * EXTENT).all()
