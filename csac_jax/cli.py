@@ -491,9 +491,12 @@ def sweep(arguments: list[str]) -> int:
     result = _sweep(options, plan, folder, stop)
     times = {"compile_seconds": result.compile_seconds, "wall_seconds": round(time.time() - begun, 1)}
     summary = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
-    _write_json(options.json, summary, None)
-    _write_json(folder / "train.json", summary, None)  # `report` reads it
-    return stop.exit_code
+    from csac_jax.train import cluster
+
+    if cluster.is_first():
+        _write_json(options.json, summary, None)
+        _write_json(folder / "train.json", summary, None)  # `report` reads it
+    return 0 if result.stopped_by is None else 128 + result.stopped_by
 
 
 def _read_sweep(arguments: list[str]) -> tuple[SweepOptions, Any]:

@@ -1,6 +1,7 @@
-"""Run with eight virtual devices: prints, as JSON, how members on eight of them differ from those on one.
+"""Run with eight virtual devices and a small step in place of the learner's: prints, as JSON, how members on eight of
+them differ from those on one.
 
-python -m tests.train.eight_devices toy|real FOLDER
+python -m tests.train.eight_devices FOLDER
 """
 
 import dataclasses
@@ -14,33 +15,18 @@ import csac_jax  # noqa: F401  (before JAX)
 import jax  # isort: skip
 import numpy as np
 
-from csac_jax import presets
 from csac_jax.train import checkpoint, members, mesh, step
 from tests.train import toys
 
-SEEDS = {"toy": {"seeds": 8, "scenes": 2}, "real": {"scenes": 1}}
+SEEDS = {"seeds": 8, "scenes": 2}
 STEPS = 4
 
 
-def _config(kind: str) -> Any:
-    if kind == "toy":
-        return toys.CFG
-    smoke = presets.smoke()
-    return dataclasses.replace(smoke, train=dataclasses.replace(smoke.train, scenes=8, actions=64))
-
-
-def _program(kind: str, cfg: Any) -> step.Program:
-    if kind == "real":
-        return step.make(cfg)
-    step.begin, step.train_step = toys.begin, toys.train_step
-    return toys.program(cfg)
-
-
-def run(kind: str, shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
+def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
     """State after two chunks, their metrics, and the second chunk's state from a checkpoint of the first."""
-    cfg = _config(kind)
-    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(SEEDS[kind][shard])])
-    program, each, line = _program(kind, cfg), members.members(group), mesh.make(devices)
+    cfg = toys.CFG
+    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])])
+    program, each, line = toys.program(cfg), members.members(group), mesh.make(devices)
     state = members.init(program, each, line, shard)
     places = jax.tree.map(lambda leaf: leaf.sharding, state)
     chunk = members.compile_chunk(program, each, STEPS, line, shard).lower(state).compile()
@@ -66,16 +52,12 @@ def _difference(a: Any, b: Any) -> float:
     return max(float(np.max(np.abs(x.astype(float) - y) / np.maximum(np.abs(y), 1.0))) for x, y in pairs)
 
 
-def compare(kind: str, shard: str, folder: Path) -> dict[str, Any]:
+def compare(shard: str, folder: Path) -> dict[str, Any]:
     """What differs between one device and eight."""
-    (one, seen, _), (eight, others, again) = (run(kind, shard, n, folder / f"{shard}-{n}") for n in (1, 8))
+    (one, seen, _), (eight, others, again) = (run(shard, n, folder / f"{shard}-{n}") for n in (1, 8))
     abstract = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), one)
     elsewhere, _ = checkpoint.restore(folder / f"{shard}-8", abstract)  # saved on eight, read on one
-    parts = (
-        [leaf.addressable_shards[0].data.shape for leaf in (eight.scenes, eight.learner["online"])]
-        if kind == "toy"
-        else []
-    )
+    parts = [leaf.addressable_shards[0].data.shape for leaf in (eight.scenes, eight.learner["online"])]
     return {
         "metrics": max(_difference(a._asdict(), b._asdict()) for a, b in zip(seen, others, strict=True)),
         "state": _difference(one, eight),
@@ -86,5 +68,6 @@ def compare(kind: str, shard: str, folder: Path) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    found = {shard: compare(sys.argv[1], shard, Path(sys.argv[2])) for shard in SEEDS[sys.argv[1]]}
+    step.begin, step.train_step = toys.begin, toys.train_step
+    found = {shard: compare(shard, Path(sys.argv[1])) for shard in SEEDS}
     print(json.dumps({"devices": len(jax.devices()), **found}))

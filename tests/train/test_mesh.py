@@ -14,15 +14,13 @@ import csac_jax
 from csac_jax.train import mesh
 
 ROOT = Path(csac_jax.__file__).parents[1]
-FAST_COMPILER = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
-def _eight(kind: str, folder: Path, timeout: int) -> dict[str, Any]:
+def _eight(folder: Path) -> dict[str, Any]:
     """What `eight_devices` prints."""
-    flags = f"--xla_force_host_platform_device_count=8 {FAST_COMPILER if kind == 'real' else ''}"
-    variables = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-    command = [sys.executable, "-m", "tests.train.eight_devices", kind, str(folder)]
-    done = subprocess.run(command, env=variables, cwd=ROOT, capture_output=True, text=True, timeout=timeout)
+    variables = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "tests.train.eight_devices", str(folder)]
+    done = subprocess.run(command, env=variables, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -40,17 +38,10 @@ def test_eight_devices_are_one(tmp_path: Path):
     """Claim: seeds or scenes over eight devices give the metrics and the state of one, to the rounding of sums in
     another order; each device holds its share; a checkpoint of eight goes on bit for bit, and can be read on one. A
     small step stands in for the learner's."""
-    found = _eight("toy", tmp_path, 300)
+    found = _eight(tmp_path)
     _check(found, 1e-5)
     assert found["seeds"]["parts"] == [[1, 8], [1, 3]]
     assert found["scenes"]["parts"] == [[2, 1], [2, 3]]
-
-
-@pytest.mark.slow
-def test_eight_devices_are_one_in_earnest(tmp_path: Path):
-    """Claim: the same of scenes in the whole training step, physics and networks included, over eight training steps;
-    beyond, rounding ends in other contacts and other actions."""
-    _check(_eight("real", tmp_path, 3000), 1e-2)
 
 
 @pytest.mark.parametrize("devices", [0, -1, 10_000])
