@@ -14,11 +14,8 @@ import pytest
 import csac_jax
 from csac_jax import algorithms, cli, presets
 from csac_jax.config import Config, SceneConfig
-from csac_jax.scene import layout, pool
-from csac_jax.sim import outcome, physics as simulation
+from csac_jax.scene import pool
 from csac_jax.train import checkpoint
-
-import jax  # isort: skip  (after csac_jax)
 
 ROOT = Path(csac_jax.__file__).parents[1]
 SMOKE = presets.smoke()
@@ -307,36 +304,6 @@ def test_benchmark_is_run_with_its_arguments(
     assert json.loads(capsys.readouterr().out) == ["a", "--b"]
     assert cli.main(["bench", "--help"]) == 0
     assert capsys.readouterr().out == "usage: csac-jax bench NAME ..., with NAME one of: one\n"
-
-
-class _Still:
-    """Physics in which nothing moves, to compile in seconds."""
-
-    def run(self, scene, drive):
-        return layout.park(scene, scene.in_play), outcome.blank(len(scene.colour))
-
-
-@pytest.mark.slow
-@pytest.mark.mjx
-@pytest.mark.optax
-def test_step_benchmark(monkeypatch: pytest.MonkeyPatch):
-    """Claim: `bench step` times every stage beside the whole step, and compiles again from a cache of its own."""
-    from experiments.bench import step as bench
-
-    monkeypatch.setattr(simulation, "make", lambda world, cfg: _Still())
-    folder = jax.config.jax_compilation_cache_dir
-    result = bench.measure(SMOKE, steps=2, repeats=1)
-    shares = result["stage_shares"]
-    assert list(shares) == ["look", "act", "simulate", "reward", "remember", "learn", "replace"]
-    assert sum(shares.values()) == pytest.approx(1.0)
-    assert result["actions_per_second"] == pytest.approx(2 / result["step_seconds"])
-    assert result["physics_steps_per_second"] == pytest.approx(55 * 2 / result["step_seconds"])
-    assert result["compile_seconds"]["found_in_cache"]
-    assert result["bare_loop_seconds"] is None  # there is no engine here
-    assert (jax.config.jax_compilation_cache_dir, jax.config.jax_enable_compilation_cache) == (folder, False)
-    point = bench._point(SMOKE, "capacity", 64, steps=1, repeats=1)
-    assert point["capacity"] == 64
-    assert point["step_seconds"] > 0.0
 
 
 def test_points_of_a_curve():
