@@ -13,9 +13,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from csac_jax.show import report as reporting, statistics
+from csac_jax.show import report as reporting
 from csac_jax.show.report import NAMES, PAPER_ACTIONS, PAPER_CASES, PAPER_TRAINING, Curve, Report, Score
 from csac_jax.show.results import Variant
+from csac_jax.train import statistics
 
 SAMPLERS = ("csac", "csac_per", "csac_beta")
 COLOURS = dict(zip(NAMES, ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759"), strict=True))

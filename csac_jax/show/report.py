@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from csac_jax.show import results as recorded, statistics
+from csac_jax.show import results as recorded
 from csac_jax.show.results import METRIC_NAMES, WINDOW, Evaluation, Results, Run, Variant
-from csac_jax.show.statistics import Band
+from csac_jax.train import statistics
+from csac_jax.train.statistics import Band
 
 NAMES = {
     "grasp_only": "Grasping-only",

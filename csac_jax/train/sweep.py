@@ -25,10 +25,9 @@ import jax
 import numpy as np
 
 from csac_jax.config import Config
-from csac_jax.train import checkpoint, cluster, config_json, loop, memory
+from csac_jax.train import checkpoint, cluster, config_json, loop, memory, statistics
 from csac_jax.train.members import Engine, Group, group
 from csac_jax.train.stop import Stop
-from csac_jax.train.summary import interquartile_mean
 
 PLAN = "sweep.json"
 SUMMARY = "summary.json"
@@ -336,12 +335,19 @@ def summarise(plan: Plan, folder: Path) -> dict[str, Any]:
             {
                 "name": one.name,
                 "values": one.values,
-                "grasp_success": interquartile_mean(np.array(done)),
+                "grasp_success": _over_seeds(done),
                 "members": rows,
             }
         )
     complete = all(row["complete"] for one in settings for row in one["members"])
     return {"seeds": plan.seeds, "complete": complete, "settings": settings}
+
+
+def _over_seeds(values: Sequence[float]) -> dict[str, Any]:
+    """Interquartile mean and its band; no value of no seed."""
+    if not values:
+        return {"value": None, "low": None, "high": None, "n": 0}
+    return statistics.band([np.array(values)])._asdict()
 
 
 def _row(folder: Path, one: Member) -> dict[str, Any]:

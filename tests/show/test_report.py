@@ -12,8 +12,8 @@ import scipy.stats
 
 from csac_jax import algorithms, cli, presets
 from csac_jax.config import Algo
-from csac_jax.show import charts, report, results, statistics
-from csac_jax.train import config_json, loop, metrics
+from csac_jax.show import charts, report, results
+from csac_jax.train import config_json, loop, metrics, statistics
 
 CASES = ("hole", "row")
 
@@ -125,9 +125,9 @@ def test_numbers_as_json(recorded: Path):
     assert set(scores) == {(algo, case) for algo in ("csac_beta", "vpg") for case in CASES}
     hole = scores["csac_beta", "hole"]
     assert (hole["physics"], hole["seed"], hole["seeds"]) == ("c", 5, [0, 1])
-    assert hole["metrics"]["completion"] == pytest.approx({"value": 0.9, "low": 0.8, "high": 1.0, "seeds": 2})
+    assert hole["metrics"]["completion"] == pytest.approx({"value": 0.9, "low": 0.8, "high": 1.0, "n": 2})
     alone, wilson = scores["vpg", "row"]["metrics"]["completion"], metrics.wilson(5, 10)
-    assert alone == pytest.approx({"value": 0.5, "low": wilson["low"], "high": wilson["high"], "seeds": 1})
+    assert alone == pytest.approx({"value": 0.5, "low": wilson["low"], "high": wilson["high"], "n": 1})
     rows = {row["file"]: row for row in content["provenance"]}
     trained = rows["seed-0/metrics.jsonl"]
     assert (trained["device"], trained["commit"], trained["wall time"]) == ("a card", "abc", "77 s")

@@ -1,11 +1,14 @@
-"""What several seeds say together: interquartile mean and stratified bootstrap (Agarwal et al., arXiv:2108.13264)."""
+"""What several seeds say together: interquartile mean and stratified bootstrap (Agarwal et al., arXiv:2108.13264).
+
+NumPy only.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-RESAMPLES = 2000
+RESAMPLES = 10_000
 CUT = 0.25  # share of the values left out at either end
 
 
@@ -15,7 +18,7 @@ class Band(NamedTuple):
     value: float
     low: float | None
     high: float | None
-    seeds: int  # fewest of any stratum
+    n: int  # seeds, the fewest of any stratum
 
 
 def iqm(values: np.ndarray) -> np.ndarray:

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from csac_jax.train.summary import interquartile_mean
+from csac_jax.train import statistics
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8, 16, 17])
 def test_value_is_scipys(n: int):
     """Claim: the value is SciPy's mean with a quarter cut off at either end."""
     values = np.random.default_rng(n).normal(size=n)
-    result = interquartile_mean(values)
-    assert result["n"] == n
-    np.testing.assert_allclose(result["value"], scipy.stats.trim_mean(values, 0.25), rtol=1e-12)
+    result = statistics.band([values])
+    assert result.n == n
+    np.testing.assert_allclose(result.value, scipy.stats.trim_mean(values, 0.25), rtol=1e-12)
 
 
 def test_interval_is_scipys():
     """Claim: the interval is the 95 % percentile bootstrap's over seeds, as SciPy has it, to its own scatter."""
     values = np.random.default_rng(3).normal(size=16)
-    result = interquartile_mean(values)
+    result = statistics.band([values])
 
     def middle(x, axis):
         return scipy.stats.trim_mean(x, 0.25, axis=axis)
@@ -27,11 +27,5 @@ def test_interval_is_scipys():
     wanted = scipy.stats.bootstrap(
         (values,), middle, method="percentile", rng=np.random.default_rng(1)
     ).confidence_interval
-    np.testing.assert_allclose((result["low"], result["high"]), wanted, atol=0.03)
-    assert result["low"] < result["value"] < result["high"]
-
-
-def test_few_seeds():
-    """Claim: no seed has no value, one seed no interval."""
-    assert interquartile_mean(np.array([])) == {"value": None, "low": None, "high": None, "n": 0}
-    assert interquartile_mean(np.array([0.5])) == {"value": 0.5, "low": None, "high": None, "n": 1}
+    np.testing.assert_allclose((result.low, result.high), wanted, atol=0.03)
+    assert result.low < result.value < result.high
