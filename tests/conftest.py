@@ -13,13 +13,6 @@ import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 import jax  # isort: skip
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Groups for several processes: a file's tests stay together, and those of `sim`, which share a compilation."""
-    for item in items:
-        folder = item.path.parent
-        item.add_marker(pytest.mark.xdist_group(str(folder if folder.name == "sim" else item.path)))
-
-
 @pytest.fixture(autouse=True)
 def strict_jax(request: pytest.FixtureRequest) -> Iterator[None]:
     """Silent broadcasting, promotion and key reuse are errors, except through the code of MJX and optax."""
