@@ -812,8 +812,6 @@ def export(arguments: list[str]) -> int:
         raise BadArgumentsError(f"{options.file}: the name of a policy file ends in .safetensors")
     if options.file.exists():
         raise BadArgumentsError(f"{options.file} exists; give another name")
-    if not options.run_dir.is_dir():
-        raise FailedError(f"there is no folder {options.run_dir}; give the folder of a run")
     from csac_jax.train import policy_file
 
     cfg, networks = _learned(str(options.run_dir))

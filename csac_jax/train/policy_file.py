@@ -29,10 +29,12 @@ class PolicyFileError(Exception):
 
 
 def save(path: Path, params: Params, cfg: Config) -> None:
-    """Writes a policy; the file appears all at once."""
+    """Writes a policy; the file appears all at once, its folder is made. Raises OSError where it cannot be written."""
     remarks = {_CONFIG: json.dumps(config_json.to_dict(cfg))}
+    content = safetensors.numpy.save({name: np.asarray(leaf) for name, leaf in _named(params)}, remarks)
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
-    safetensors.numpy.save_file({name: np.asarray(leaf) for name, leaf in _named(params)}, temporary, remarks)
+    temporary.write_bytes(content)
     os.replace(temporary, path)
 
 

@@ -11,9 +11,7 @@ import dataclasses
 import importlib.util
 import json
 import math
-import statistics
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -28,6 +26,7 @@ from csac_jax.config import DENSENET_STRIDE, Config, HeightmapConfig, NetConfig
 from csac_jax.train import provenance, step
 from csac_jax.vision.heightmap import Observation
 from experiments.bench._options import read
+from experiments.bench._timing import medians
 
 
 def _canvas(pixels: int, multiple: int) -> int:
@@ -68,16 +67,6 @@ def _observations(size: int, num: int) -> Observation:
     )
 
 
-def _median_seconds(call: Callable[[], Any], repeats: int) -> float:
-    call()
-    seconds = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - begun)
-    return statistics.median(seconds)
-
-
 def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     """Time of the Q maps of `states` states at once."""
     learner = learning.make(cfg)
@@ -86,7 +75,7 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     begun = time.perf_counter()
     look = jax.jit(lambda params, obs: learning.look(learner, params, obs).q).lower(params, obs).compile()
     compiled = time.perf_counter() - begun
-    seconds = _median_seconds(lambda: jax.block_until_ready(look(params, obs)), repeats)
+    seconds = medians({"look": lambda: look(params, obs)}, repeats)["look"]
     return {
         "states": states,
         "pixels_of_a_pass": learner.frames.tables.canvas * (cfg.net.zoom if cfg.net.kind == "densenet121" else 1),
@@ -204,7 +193,7 @@ def _vpg(net: NetConfig, pixels: int, repeats: int) -> dict[str, Any]:
         "tf32_convolutions": torch.backends.cudnn.allow_tf32,
         "passes": net.rotations * 4,
         "pixels_of_a_pass": side,
-        "seconds_per_state": _median_seconds(call, repeats),
+        "seconds_per_state": medians({"passes": call}, repeats)["passes"],
     }
 
 

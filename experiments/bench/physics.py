@@ -10,9 +10,6 @@ steps: same model, same settled scenes with their block sizes, same set-points, 
 import dataclasses
 import functools
 import json
-import statistics
-import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,21 +20,9 @@ from csac_jax.sim import oracle
 from csac_jax.train import provenance
 from experiments.bench import _bare
 from experiments.bench._options import read
+from experiments.bench._timing import medians
 
 REPEATS = 5
-
-
-def _turns(calls: dict[str, Callable[[], Any]]) -> dict[str, float]:
-    """Median seconds of every call, one after the other in each round, so that what else the machine does hits all."""
-    for call in calls.values():
-        jax.block_until_ready(call())
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(REPEATS):
-        for name, call in calls.items():
-            begun = time.perf_counter()
-            jax.block_until_ready(call())
-            seconds[name].append(time.perf_counter() - begun)
-    return {name: statistics.median(values) for name, values in seconds.items()}
 
 
 def measure(cfg: Config, name: PhysicsKind, scenes: int) -> dict[str, Any]:
@@ -49,7 +34,7 @@ def measure(cfg: Config, name: PhysicsKind, scenes: int) -> dict[str, Any]:
     actions = jax.jit(jax.vmap(plan_grasp))(states.scene, states.obs.height)
     bare = _bare.loop(env.physics, states.scene, _bare.drives(cfg, states.obs.height, actions))
     step = jax.jit(jax.vmap(env.step))
-    seconds = _turns({"action": lambda: step(states, actions), "bare": bare})
+    seconds = medians({"action": lambda: step(states, actions), "bare": bare}, REPEATS)
     return {
         "physics": name,
         "scenes": scenes,

@@ -16,8 +16,6 @@ as well, and counted.
 """
 
 import json
-import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -35,6 +33,7 @@ from csac_jax.train import provenance
 from csac_jax.vision import heightmap, raycast
 from csac_jax.vision.raycast import Polytopes
 from experiments.bench._options import read
+from experiments.bench._timing import medians
 
 PER_PLANE, PER_GEOM = 14, 9
 PEER_ROWS = 8
@@ -100,26 +99,13 @@ def _limit() -> Call:
     return lambda: compiled(left, right)
 
 
-def _median_seconds(calls: dict[str, Call], repeats: int) -> dict[str, float]:
-    """The calls in turn, so that what else the machine does hits all alike."""
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for call in calls.values():
-        jax.block_until_ready(call())
-    for _ in range(repeats):
-        for name, call in calls.items():
-            begun = time.perf_counter()
-            jax.block_until_ready(call())
-            seconds[name].append(time.perf_counter() - begun)
-    return {name: statistics.median(values) for name, values in seconds.items()}
-
-
 def measure(size: int, scenes: int, repeats: int) -> dict[str, Any]:
     """Rays per second of both casters and the arithmetic limit."""
     cfg = presets.get("fast")
     world = models.build(cfg.scene, cfg.sim)
     poses, origin = _poses(np.random.default_rng(0), scenes, len(world.slots)), _origins(size)
     calls = {"ours": _ours(world, poses, origin), "mjx": _peer(world, poses, origin), "matrix_product": _limit()}
-    seconds = _median_seconds(calls, repeats)
+    seconds = medians(calls, repeats)
     ours, theirs = np.asarray(calls["ours"]()[0]), np.asarray(calls["mjx"]()[0])
     rays = scenes * size * size
     geoms = len(world.parts.slot)

@@ -14,7 +14,6 @@ import contextlib
 import dataclasses
 import json
 import resource
-import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -36,22 +35,10 @@ from csac_jax.train import auto, cache, provenance, step
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
 from experiments.bench._options import Parser
+from experiments.bench._timing import medians
 
 CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
 _SEPARATE = ("look", "act", "simulate", "reward", "remember", "learn", "replace")
-
-
-def _turns(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Median seconds of every call, one after the other in each round."""
-    for call in calls.values():
-        jax.block_until_ready(call())
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(repeats):
-        for name, call in calls.items():
-            begun = time.perf_counter()
-            jax.block_until_ready(call())
-            seconds[name].append(time.perf_counter() - begun)
-    return {name: statistics.median(values) for name, values in seconds.items()}
 
 
 def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, float]]:
@@ -202,7 +189,7 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     state = step.init(program)
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
-    seconds = _turns({**calls, "whole": _whole(chunk, step.init(program))}, repeats)  # it uses its state up
+    seconds = medians({**calls, "whole": _whole(chunk, step.init(program))}, repeats)  # it uses its state up
     whole = seconds["whole"] / steps
     stages = {name: seconds[name] for name in _SEPARATE}
     total = sum(stages.values())
@@ -218,7 +205,7 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
         "bare_loop_over_simulate": bare and bare / stages["simulate"],
         "bare_loop_over_step": bare and bare / whole,
         "compile_seconds": compiling,
-        "conv_gradients_in_scan": _turns({name: _conv_gradient(conv) for name, conv in gradients.items()}, repeats),
+        "conv_gradients_in_scan": medians({name: _conv_gradient(conv) for name, conv in gradients.items()}, repeats),
         **_memory(chunk),
     }
 
@@ -254,7 +241,7 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
     program = step.make(cfg)
     state = step.init(program)
     chunk, compiling = _compile(program, state, steps)
-    seconds = _turns({"whole": _whole(chunk, state)}, repeats)["whole"] / steps
+    seconds = medians({"whole": _whole(chunk, state)}, repeats)["whole"] / steps
     return {curve: value, "step_seconds": seconds, **_rates(cfg, seconds), "compile_seconds": compiling} | _memory(
         chunk
     )

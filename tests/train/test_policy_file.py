@@ -36,13 +36,13 @@ def _rewrite(path: Path, change: Callable[[dict[str, Any], dict[str, str]], None
 
 def test_what_is_read_is_what_was_written(tmp_path: Path, params: Params):
     """Claim: a policy file gives back the config and every variable, bit for bit."""
-    path = tmp_path / "policy.safetensors"
+    path = tmp_path / "new" / "policy.safetensors"
     policy_file.save(path, params, CFG)
     cfg, again = policy_file.load(path)
     assert cfg == CFG
     assert jax.tree.structure(again) == jax.tree.structure(params)
     jax.tree.map(np.testing.assert_array_equal, again, params)
-    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 @pytest.mark.parametrize(
