@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from csac_jax import algorithms, cli, presets
+from csac_jax.cli import sweep as command
 from csac_jax.train import step, stop, sweep
 from tests.train import toys
 
@@ -23,7 +24,7 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sweep, "run", forbidden)
-    monkeypatch.setattr(cli.stopping, "install", cli.stopping.Stop)
+    monkeypatch.setattr(stop, "install", stop.Stop)
 
 
 def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
@@ -70,7 +71,7 @@ def test_no_sweep_to_resume(capsys: pytest.CaptureFixture):
 def test_settings_reach_their_configs():
     """Claim: each setting is the preset with its algorithm, the flags for all, and its own values, which win."""
     flags = "--seeds 3 --seed 7 --learn.batch 4 --vary algo=csac,vpg --vary target.gamma=0.1,0.3"
-    options, plan = cli._read_sweep(["smoke", *flags.split()])
+    options, plan = command.read(["smoke", *flags.split()])
     assert (options.seeds, plan.seeds, options.devices, options.shard) == (3, 3, None, "seeds")
     wanted = []
     for algo in ("csac", "vpg"):
@@ -86,9 +87,9 @@ def test_settings_reach_their_configs():
 
 def test_plan_survives_its_file(tmp_path: Path):
     """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
-    _, plan = cli._read_sweep(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
+    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
     (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
-    assert cli._read_sweep(["--resume", str(tmp_path)])[1] == plan
+    assert command.read(["--resume", str(tmp_path)])[1] == plan
 
 
 @pytest.mark.optax
@@ -101,11 +102,11 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     for number in (2, 15):
         stopped = stop.Stop()
         stopped.signal = number
-        monkeypatch.setattr(cli.stopping, "install", lambda stopped=stopped: stopped)
+        monkeypatch.setattr(stop, "install", lambda stopped=stopped: stopped)
         first = ["smoke", "--seeds", "2", "--run-dir", "run"] if number == 2 else ["--resume", "run"]
         assert cli.main(["sweep", *first]) == 128 + number
         assert "go on with: csac-jax sweep --resume run" in capsys.readouterr().out
-    monkeypatch.setattr(cli.stopping, "install", stop.Stop)
+    monkeypatch.setattr(stop, "install", stop.Stop)
     assert cli.main(["sweep", "--resume", "run", "--json", "out.json"]) == 0
     assert "interquartile mean of 2 seeds" in capsys.readouterr().out
     result = json.loads(Path("out.json").read_text())
