@@ -89,6 +89,9 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
+        ("eval . --seed 2147483647", "--seed: must lie in"),
+        ("eval shipped --suite nowhere", "--suite: 'nowhere' is neither a case file nor one of: own, random10"),
+        ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
         ("doctor --fix", "Unrecognized options: --fix"),
         ("train smoke --sim.physics c", "--sim.physics: training is one compiled program, which c is no part of"),
         ("train smoke --sim.physics warp", "scene.mesh_spread: must be 0 where sim.physics is warp"),
@@ -122,21 +125,24 @@ def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: s
     assert message in line
 
 
-@pytest.mark.parametrize("command", ["train --resume", "eval"])
+READERS = ["train --resume {}", "eval {}", "export {} p.safetensors", "play --policy {}"]
+
+
+@pytest.mark.parametrize("command", READERS)
 def test_missing_run(capsys: pytest.CaptureFixture, tmp_path: Path, command: str):
     """Claim: a run that is not there, or has no checkpoint, is one line and exit code 1."""
-    code, line = _fails(capsys, *command.split(), "nowhere")
+    code, line = _fails(capsys, *command.format("nowhere").split())
     assert (code, "there is no folder nowhere" in line) == (1, True)
     (tmp_path / "empty").mkdir()
-    code, line = _fails(capsys, *command.split(), "empty")
+    code, line = _fails(capsys, *command.format("empty").split())
     assert (code, "there is no checkpoint" in line) == (1, True)
 
 
-@pytest.mark.parametrize("command", ["train --resume", "eval"])
+@pytest.mark.parametrize("command", READERS)
 def test_damaged_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path, command: str):
     """Claim: a damaged checkpoint is one line and exit code 1."""
     (run_dir / "checkpoints/4" / checkpoint.MANIFEST).unlink()
-    code, line = _fails(capsys, *command.split(), str(run_dir))
+    code, line = _fails(capsys, *command.format(run_dir).split())
     assert (code, "half-written" in line) == (1, True)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import sweep as command
-from csac_jax.train import step, stop, sweep
+from csac_jax.train import checkpoint, loop, step, stop, sweep
 from tests.train import toys
 
 SMOKE = presets.smoke()
@@ -41,6 +41,12 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
     [
         ("", "sweep: give a preset first, one of: smoke, quick"),
         ("smoke --seeds 0", "--seeds: at least 1"),
+        ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
+        ("smoke --sim.physics c", "--sim.physics: training is one compiled program, which c is no part of"),
+        (
+            "smoke --net.kind densenet121 --net.norm batch --net.margin 0 --net.weights none.safetensors",
+            "net.weights: none.safetensors cannot be read as .safetensors",
+        ),
         ("smoke --vary learn.tua=0.1", "--vary: 'learn.tua' is no setting; perhaps you meant learn.tau"),
         ("smoke --vary learn.tau=", "--vary learn.tau=: give a setting and its values"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
@@ -53,6 +59,10 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2", "--process-id: must lie in 0 .. 1"),
         ("smoke --run-dir .", ". exists; give another --run-dir"),
         ("--resume x --learn.tau 0.1", "leave all others out"),
+        ("--resume x --seeds 5", "leave all others out"),
+        ("--resume x --run-dir y", "leave all others out"),
+        ("--resume x --vary learn.tau=0.1", "leave all others out"),
+        ("quick --resume x", "leave all others out"),
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
@@ -66,6 +76,28 @@ def test_no_sweep_to_resume(capsys: pytest.CaptureFixture):
     """Claim: a folder without a sweep is one line and exit code 1."""
     code, line = _fails(capsys, "--resume nowhere")
     assert (code, "there is no sweep.json in nowhere" in line) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (FileExistsError(), 2, "there exists; give another --run-dir"),
+        (sweep.SweepError("all are lost"), 1, "all are lost"),
+        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
+        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
+    ],
+)
+def test_failures(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int, message: str
+):
+    """Claim: a sweep that fails is one line and an exit code; a folder that someone else has made meanwhile as well."""
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(sweep, "run", fail)
+    assert cli.main(["sweep", "smoke", "--run-dir", "there"]) == code
+    assert capsys.readouterr().err.startswith(f"csac-jax: {message}")
 
 
 def test_settings_reach_their_configs():

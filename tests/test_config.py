@@ -27,6 +27,7 @@ def _config(settings: dict) -> Config:
 @pytest.mark.parametrize(
     ("name", "values"),
     [
+        ("scene.slots", [("box", "ball", "box", "box", "box")]),
         ("scene.min_blocks", [0, 6]),
         ("scene.pool", [0]),
         ("scene.arranged", [-0.1, 1.1]),
