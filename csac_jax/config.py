@@ -289,6 +289,8 @@ class NetConfig:
     """small: dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
     stem: int = 16
     """small: channels of the first convolution."""
+    subcells: int = 1
+    """small: cells of the maps per cell of its features, along each axis: 1 or 2 (the height map's resolution)."""
     norm: Literal["group", "batch"] = "group"
     """densenet121: `batch`, as in the paper, or `group`, which is the same while acting and while learning."""
     block_layers: tuple[int, int, int, int] = (6, 12, 24, 16)
@@ -301,7 +303,7 @@ class NetConfig:
     """densenet121: cells of the map per cell that its outputs are upsampled to (ours; the paper 1, at 16 times the
     memory: what is upsampled is bilinear, and so is reading it)."""
     dtype: Literal["auto", "float32", "bfloat16"] = "auto"
-    """densenet121: what it computes in, parameters being float32; auto: bfloat16 on accelerators, float32 on a CPU."""
+    """What the net computes in, parameters being float32; auto: bfloat16 on accelerators, float32 on a CPU."""
     weights: str = ""
     """densenet121: .safetensors file with ImageNet weights in torchvision's names that its trunks begin with; none if
     empty."""
@@ -312,6 +314,7 @@ class NetConfig:
         _require(min(self.growth, self.stem, self.head) >= 4, "net.growth, stem, head: at least 4 channels")
         _require(len(self.dilations) >= 1 and min(self.dilations) >= 1, "net.dilations: at least one layer, each >= 1")
         _require(0.0 <= self.margin <= 0.5, "net.margin: must lie in 0 .. 0.5")
+        _require(self.subcells in (1, 2), "net.subcells: must be 1 or 2")
         _require(min(self.block_layers) >= 1, "net.block_layers: at least one layer in each block")
         _require(
             self.block_growth >= 4 and self.block_growth % 4 == 0, "net.block_growth: must be a multiple of 4 channels"

@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "ef1640f6aa56bc9d84237e026e4b3d3fa025337227896ec4f9ceb100ab3c13f3"
+SHIPPED_SHA256 = "9cc82dd05d219f32eba4fd63e521348c66828712482700861e3b80361f8710f6"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 
