@@ -54,8 +54,8 @@ class SceneConfig:
     """Range of block densities, kg/m^3 (ours: woods; about 0.1 kg a block)."""
     friction: tuple[float, float] = (0.5, 1.0)
     """Range of the sliding friction between blocks and table."""
-    drop_extent: float = 0.248
-    """Side of the square in which blocks are dropped, m (VPG)."""
+    drop_extent: tuple[float, float] = (0.248, 0.248)
+    """Range of the side of the square in which the blocks of a scene are dropped, m (VPG: 0.248)."""
     drop_height: float = 0.15
     """Height of the first drop, m (VPG); later blocks of a scene start higher, so that none overlap."""
     settle_time: float = 2.5
@@ -72,7 +72,8 @@ class SceneConfig:
             100.0 <= self.density[0] <= self.density[1] <= 3000.0, "scene.density: 100 <= low <= high <= 3000 kg/m^3"
         )
         _require(0.1 <= self.friction[0] <= self.friction[1] <= 2.0, "scene.friction: 0.1 <= low <= high <= 2")
-        _require(0.05 <= self.drop_extent <= 0.448, "scene.drop_extent: must lie in 0.05 .. 0.448 m")
+        least, most = self.drop_extent
+        _require(0.05 <= least <= most <= 0.448, "scene.drop_extent: 0.05 <= least <= most <= 0.448 m is needed")
         _require(0.05 <= self.drop_height <= 1.0, "scene.drop_height: must lie in 0.05 .. 1 m")
         _require(0.5 <= self.settle_time <= 20.0, "scene.settle_time: must lie in 0.5 .. 20 s")
 

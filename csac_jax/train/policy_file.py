@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "9cc82dd05d219f32eba4fd63e521348c66828712482700861e3b80361f8710f6"
+SHIPPED_SHA256 = "8fd0cb75ddfdae61fe103b4640f9400867649c6c07dcc43e472b264b95715406"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 
