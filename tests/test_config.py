@@ -35,7 +35,7 @@ def _config(settings: dict) -> Config:
         ("scene.mesh_spread", [-0.1, 0.3]),
         ("scene.density", [(50.0, 900.0), (900.0, 450.0), (450.0, 4000.0)]),
         ("scene.friction", [(0.05, 1.0), (1.0, 0.5), (0.5, 2.5)]),
-        ("scene.drop_extent", [0.04, 0.5]),
+        ("scene.drop_extent", [(0.04, 0.2), (0.2, 0.1), (0.2, 0.5)]),
         ("scene.drop_height", [0.04, 1.1]),
         ("scene.settle_time", [0.4, 21.0]),
         ("task.kind", ["stack"]),
