@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-SAME_PLACE = 1e-5  # m; contact points of a pair that are nearer to each other are one
+SAME_PLACE = 1e-5  # m; copies lie within 1e-7 m of each other, other points of a pair seldom under 1e-4
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
