@@ -12,7 +12,7 @@ from csac_jax.config import SimConfig
 from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World, scene_fields
-from csac_jax.sim import outcome
+from csac_jax.sim import mjx_step, outcome
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.robot import Drive
 
@@ -27,6 +27,7 @@ class MjxPhysics:
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
     touch: Callable[[World, mjx.Data], tuple[jax.Array, jax.Array]]
     """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing, [] bool."""
+    step: Callable[[mjx.Model, mjx.Data], mjx.Data] = mjx.step
 
     def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
         """See `physics.Physics`. Products of matrices keep float32's precision: a GPU would cut them to 10 bits."""
@@ -37,7 +38,7 @@ class MjxPhysics:
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
     """Physics of a world, MJX with its JAX implementation."""
     mjx_model, data = mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax")
-    return MjxPhysics(world, cfg, mjx_model, data, _pad_contacts)
+    return MjxPhysics(world, cfg, mjx_model, data, _pad_contacts, mjx_step.step)
 
 
 def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
@@ -106,7 +107,7 @@ def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]
     def substep(carry, x):
         data, trace = carry
         index, control = x
-        data = _restrain(world, ~scene.in_play, initial, mjx.step(model, data.replace(ctrl=control)))
+        data = _restrain(world, ~scene.in_play, initial, physics.step(model, data.replace(ctrl=control)))
         touching, full = physics.touch(world, data)
         held = touching[1] & touching[2]
         rise = data.qpos[z_address] - scene.position[:, 2]

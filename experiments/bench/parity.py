@@ -4,16 +4,21 @@ measured in place of MJX on JAX, and meshes have their nominal size.
 
 The same settled scenes and the same actions go through both. Grasps are the planner's, which reads poses: its share of
 lifts is the ceiling that physics allows. Pushes start before a random block and go through it.
+
+How near two engines can come is measured beside it: C MuJoCo against itself, with every block a micrometre aside, and
+with the solver of MJX, which takes a scene as one problem where C takes each heap of touching blocks by itself.
 """
 
 import dataclasses
 import functools
 import json
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from csac_jax import presets
@@ -21,6 +26,7 @@ from csac_jax.config import Config, PhysicsKind, SceneConfig, SlotKind
 from csac_jax.env import Env
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import World
 from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
 from csac_jax.sim.primitives import Action, Primitive
@@ -31,7 +37,9 @@ BATCH = 64
 STREAM = 9001  # of drops: neither training's nor an evaluation's
 PUSH_RUN_UP = 0.07  # m from the place of a push to the block's centre
 REFERENCE = "c"
+ASIDE = 1e-6  # m
 TEN = presets.get("fast")
+Engine = Callable[[Scene, jax.Array, Action], Any]  # scenes, heights [E, H, W] m, actions
 
 
 def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind = "mjx") -> Config:
@@ -57,24 +65,38 @@ class Bench:
         plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
         self.oracle = jax.jit(jax.vmap(plan))
         self.push = jax.jit(jax.vmap(_push))
-        self.engines = {name: self._engine(name) for name in (cfg.sim.physics, REFERENCE)}
+        self.engines = {name: self._engine(name, self.world) for name in (cfg.sim.physics, REFERENCE)}
+        whole = model.build(cfg.scene, cfg.sim)
+        whole.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+        solved_whole = self._engine(REFERENCE, whole)
+        self.references = {
+            "c_against_itself_1um": lambda scenes, *rest: self.engines[REFERENCE](_aside(scenes), *rest),
+            "c_against_itself_solved_whole": solved_whole,
+        }
 
-    def _engine(self, name: Any):
+    def _engine(self, name: Any, world: World) -> Engine:
         sim = dataclasses.replace(self.cfg.sim, physics=name)
-        engine = simulation.make(self.world, sim)
+        engine = simulation.make(world, sim)
         return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, sim, self.cfg.heightmap)))
 
-    def run(self, scenes: Scene, actions: Action) -> dict[str, Any]:
-        """What both engines make of the actions: ends [E, N, 3], outcomes [E], saturated [E], ill [E]."""
+    def run(self, engines: dict[str, Engine], scenes: Scene, actions: Action) -> dict[str, Any]:
+        """What engines make of the actions: ends [E, N, 3], outcomes [E], saturated [E], ill [E]."""
         height = self.look(scenes)
         result = {}
-        for name, engine in self.engines.items():
+        for name, engine in engines.items():
             after, trace, plan = jax.block_until_ready(engine(scenes, height, actions))
             rise = plan.start[:, 2] - jnp.min(plan.control[:, :, 2], axis=1)
             judged = jax.vmap(outcome.grasp_outcome)(trace, plan.surface, rise)
             ill = ~jax.vmap(simulation.healthy)(after)
             result[name] = jax.device_get((after.position, judged, trace.saturated, ill))
         return result
+
+
+def _aside(scenes: Scene) -> Scene:
+    """The same with each block in play a micrometre aside, each another way."""
+    way = np.random.default_rng(STREAM).uniform(0.0, 2.0 * np.pi, scenes.position.shape[:2])
+    step = ASIDE * np.stack([np.cos(way), np.sin(way), np.zeros_like(way)], axis=-1) * scenes.in_play[..., None]
+    return scenes.replace(position=scenes.position + step.astype(np.float32))
 
 
 def _push(key: jax.Array, scene: Scene) -> Action:
@@ -91,17 +113,14 @@ def piles(in_play: int, slots: tuple[SlotKind, ...], count: int, physics: Physic
     cfg = pile_config(slots, in_play, physics)
     bench = Bench(cfg)
     settled = pool.settled(bench.world, cfg.scene, cfg.heightmap.extent, STREAM, count)
-    rows = []
+    rows, engines = [], bench.engines | bench.references
     for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))
         grasps = bench.oracle(scenes, bench.look(scenes))
-        rows.append((scenes, bench.run(scenes, grasps), bench.run(scenes, bench.push(keys, scenes))))
+        rows.append((scenes, *(bench.run(engines, scenes, act) for act in (grasps, bench.push(keys, scenes)))))
     starts = np.concatenate([row[0].position for row in rows])
     grasped, pushed = (
-        {
-            name: [np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)]
-            for name in bench.engines
-        }
+        {name: [np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)] for name in engines}
         for i in (1, 2)
     )
     lifted = {name: float(np.mean(grasped[name][1] == Outcome.LIFTED)) for name in bench.engines}
@@ -109,10 +128,21 @@ def piles(in_play: int, slots: tuple[SlotKind, ...], count: int, physics: Physic
         "blocks": in_play,
         "grasps": len(starts),
         "oracle_lifts": lifted,
-        "grasp_outcome_equal": float(np.mean(grasped[physics][1] == grasped[REFERENCE][1])),
-        "pushed_block_apart_mm": _apart(starts, pushed[physics], pushed[REFERENCE]),
+        **_agreement(starts, *((runs[physics], runs[REFERENCE]) for runs in (grasped, pushed))),
+        **{
+            name: _agreement(starts, *((runs[name], runs[REFERENCE]) for runs in (grasped, pushed)))
+            for name in bench.references
+        },
         "saturated_substeps_share": _saturated(cfg, grasped[physics], pushed[physics]),
         "ill": int(grasped[physics][3].sum() + pushed[physics][3].sum()),
+    }
+
+
+def _agreement(starts: np.ndarray, grasped: tuple[list, list], pushed: tuple[list, list]) -> dict[str, Any]:
+    """How well an engine agrees with the reference in grasps and in pushes, each (the engine's runs, the other's)."""
+    return {
+        "grasp_outcome_equal": float(np.mean(grasped[0][1] == grasped[1][1])),
+        "pushed_block_apart_mm": _apart(starts, *pushed),
     }
 
 
@@ -143,7 +173,7 @@ def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each.values())
     total, size = len(blocks.SHAPES) * poses, min(BATCH, poses)
     padded = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[: -total % size]]), scenes)
-    runs = [bench.run(batch, bench.oracle(batch, bench.look(batch))) for batch in _batches(padded, size)]
+    runs = [bench.run(bench.engines, batch, bench.oracle(batch, bench.look(batch))) for batch in _batches(padded, size)]
     lifted = {
         name: np.concatenate([run[name][1] for run in runs])[:total].reshape(-1, poses) == Outcome.LIFTED
         for name in bench.engines

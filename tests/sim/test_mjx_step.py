@@ -1,0 +1,133 @@
+"""One step of our MJX beside one of C MuJoCo, from states that show what `mjx.step` does otherwise."""
+
+from typing import NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from csac_jax.config import Config, SceneConfig, SimConfig
+from csac_jax.scene import layout, model
+from csac_jax.sim import mjx_physics
+
+from mujoco import mjx  # isort: skip  (after csac_jax.sim, which imports it quietly)
+
+pytestmark = pytest.mark.mjx
+
+CONFIG = Config(
+    scene=SceneConfig(slots=("box", "box"), min_blocks=1),
+    sim=SimConfig(iterations=50, line_search=50),  # both solvers converge: what differs is not theirs
+)
+PAD = 0.012  # m, front of the closed fingers from the hand's axis; the axis stands at the origin, tips 12 mm high
+HALF, DEEP = 0.025, 3e-4  # m, half a cube and how deep it is in what it touches
+DIAGONAL = np.sqrt(2.0) * HALF
+TILT = 0.2  # rad
+FAR = 0.3  # m, out of everything's way
+
+
+class Case(NamedTuple):
+    """Two cubes in the air, by place (m) and Euler angles (deg), a set-point of the fingers, and C's contacts."""
+
+    cube: tuple[float, float, float]
+    turn: tuple[float, float, float]
+    other: tuple[float, float, float] = (FAR, 0.0, FAR)
+    other_turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    fingers: float = 0.0
+    contacts: int = 0
+
+
+CASES = {
+    "face on pad": Case((PAD + HALF - DEEP, 0.004, 0.035), (0, 0, 0), contacts=4),
+    "edge on pad": Case((PAD + DIAGONAL - DEEP, 0.001, 0.035), (45, 0, 0), contacts=2),
+    "corner on pad": Case(
+        (PAD + DIAGONAL * np.cos(TILT) + HALF * np.sin(TILT) - DEEP, 0.0, 0.045), (45, np.degrees(TILT), 0), contacts=1
+    ),
+    "edge on cube": Case(
+        (FAR, 0.0, 0.1), (0, 0, 0), (FAR + 0.005, 0.003, 0.1 + HALF + DIAGONAL - DEEP), (0, 45, 0), contacts=2
+    ),
+    "pressing": Case((FAR, 0.1, FAR), (0, 0, 0), fingers=0.055),
+}
+TOUCHING = [name for name, case in CASES.items() if case.contacts]
+
+
+class Ends(NamedTuple):
+    """What a step came to. Velocities [cases, nv] m/s and rad/s, depths of contacts that push, deepest first, m."""
+
+    qvel: np.ndarray
+    depths: list[np.ndarray]
+    deep: list[int]  # points deeper than 0, whether they push or not
+
+
+def _state(world: model.World, case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """qpos [nq] and ctrl [nu]."""
+    qpos, ctrl = world.model.qpos0.copy(), np.zeros(world.model.nu)
+    qpos[world.robot_qpos] = ctrl_hand = np.array([0.0, 0.0, 0.012, 0.0, 0.0, 0.0])
+    for address, place, turn in zip(
+        world.block_qpos, (case.cube, case.other), (case.turn, case.other_turn), strict=True
+    ):
+        qpos[address[:3]] = place
+        qpos[address[3:]] = Rotation.from_euler("zyx", turn, degrees=True).as_quat(scalar_first=True)
+    ctrl[:4], ctrl[4] = ctrl_hand[:4], case.fingers
+    return qpos, ctrl
+
+
+@pytest.fixture(scope="module")
+def world() -> model.World:
+    return model.build(CONFIG.scene, CONFIG.sim)
+
+
+@pytest.fixture(scope="module")
+def scene() -> layout.Scene:
+    return layout.parked(CONFIG.scene.slots)
+
+
+@pytest.fixture(scope="module")
+def ours(world: model.World, scene: layout.Scene) -> Ends:
+    physics = mjx_physics.make(world, CONFIG.sim)
+
+    def one(qpos: jax.Array, ctrl: jax.Array) -> mjx.Data:
+        its = mjx_physics.scene_model(physics, scene)
+        return physics.step(its, physics.data.replace(qpos=qpos, ctrl=ctrl))
+
+    states = [np.float32(column) for column in zip(*(_state(world, case) for case in CASES.values()), strict=True)]
+    data = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*states))
+    contact = data._impl.contact
+    active = contact.dist < contact.includemargin
+    deep = np.sum(contact.dist < 0.0, axis=1).tolist()
+    return Ends(data.qvel, [np.sort(dist[row]) for dist, row in zip(contact.dist, active, strict=True)], deep)
+
+
+@pytest.fixture(scope="module")
+def theirs(world: model.World, scene: layout.Scene) -> Ends:
+    exact = model.with_blocks(world, jax.device_get(model.scene_fields(world, scene)))
+    rows, depths = [], []
+    for case in CASES.values():
+        data = mujoco.MjData(exact)
+        data.qpos, data.ctrl = _state(world, case)
+        mujoco.mj_step(exact, data)
+        rows.append(data.qvel.copy())
+        depths.append(np.sort(data.contact.dist[data.contact.dist < 0.0]))
+    return Ends(np.stack(rows), depths, [len(row) for row in depths])
+
+
+@pytest.mark.parametrize("name", TOUCHING)
+def test_contacts_are_those_of_c(name: str, ours: Ends, theirs: Ends):
+    """Claim: each point of a touch pushes once: as many contacts as in C MuJoCo, as deep to a micrometre."""
+    index = list(CASES).index(name)
+    assert len(theirs.depths[index]) == CASES[name].contacts
+    np.testing.assert_allclose(ours.depths[index], theirs.depths[index], atol=1e-6)
+
+
+def test_repeated_points_keep_their_depth(ours: Ends):
+    """Claim: a point that MJX repeats pushes once, but keeps its depth: full slots of contacts are told by it."""
+    assert [ours.deep[list(CASES).index(name)] for name in TOUCHING] == [4] * len(TOUCHING)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_speeds_after_a_step_are_those_of_c(name: str, ours: Ends, theirs: Ends):
+    """Claim: a step leaves the speeds that C MuJoCo leaves, at touches and with a finger at its limit of force."""
+    index = list(CASES).index(name)
+    assert np.abs(theirs.qvel[index]).max() > 0.01
+    np.testing.assert_allclose(ours.qvel[index], theirs.qvel[index], atol=0.01)
