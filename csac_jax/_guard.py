@@ -6,11 +6,12 @@
 3. Batched Cholesky factorisations, which batched MJX runs many of, wait for one another in the thread pool of
    jaxlib 0.10 and hang for ever if the pool is small: on 2 cores, two at once are enough. A pool with more threads
    than factorisations at once cures it and costs no speed. Its size is read from the environment, once, when the CPU
-   client starts.
+   client starts. Virtual devices (`DEVICES_FLAG`) share one pool and wait for one another in it.
 """
 
 import importlib.metadata
 import os
+import re
 
 BROKEN_JAX = ("0.10.2",)
 FUSION_FLAG = "--xla_cpu_experimental_ynn_fusion_type"  # given no types, it switches that kind of fusion off
@@ -18,6 +19,8 @@ FUSION_SERIES = "0.10."  # versions of jaxlib that are known to have the flag: X
 POOL_VARIABLE = "PJRT_NPROC"  # goes before NPROC
 USER_VARIABLES = (POOL_VARIABLE, "NPROC")  # what a user may have set
 MIN_THREADS = 8  # ours: 2 hangs and 8 does not, on 2 cores with batches of 4 and 8 scenes
+DEVICES_FLAG = "--xla_force_host_platform_device_count"
+DEVICE_THREADS = 4  # ours, per virtual device: of eight that train together, 8 threads in all hung and 32 did not
 
 
 def refuse_broken_jax() -> None:
@@ -39,7 +42,8 @@ def switch_off_broken_fusion() -> None:
 def widen_thread_pool() -> None:
     """Sets the pool's size to at least `MIN_THREADS`, unless the user has chosen one."""
     if not any(name in os.environ for name in USER_VARIABLES):
-        os.environ[POOL_VARIABLE] = str(max(MIN_THREADS, os.cpu_count() or 1))
+        counts = re.findall(rf"{DEVICES_FLAG}=(\d+)", os.environ.get("XLA_FLAGS", "")) or ["1"]
+        os.environ[POOL_VARIABLE] = str(max(MIN_THREADS, os.cpu_count() or 1, DEVICE_THREADS * int(counts[-1])))
 
 
 def pool_setting() -> tuple[str, int]:

@@ -70,6 +70,12 @@ def test_import_widens_the_pool_and_leaves_jax_alone():
     assert jax_imported == "False"
 
 
+def test_virtual_devices_widen_the_pool():
+    """Claim: with virtual devices of the CPU the pool has four threads for each."""
+    done = _python("import csac_jax, os; print(os.environ['PJRT_NPROC'])", XLA_FLAGS=f"{_guard.DEVICES_FLAG}=100")
+    assert done.stdout.split() == ["400"], done.stderr
+
+
 @pytest.mark.parametrize("name", ["PJRT_NPROC", "NPROC"])
 def test_user_setting_is_kept(name: str):
     """Claim: what the user has set decides."""

@@ -2,8 +2,9 @@
 
 State, ring and networks are exact: their shapes are traced. What a training step needs beside them is a model: counts
 of the maps that are alive at once, times their sizes, with coefficients fitted to what XLA reports for compiled stages
-on a CPU (jaxlib 0.10.1, small nets; `csac-jax bench memory` puts both side by side). XLA shares memory between stages,
-so the largest need counts. Where nothing was fitted, DenseNet-121's gradients and GPUs, expect less.
+on a CPU (jaxlib 0.10.1, small nets). Whole programs, to which nothing was fitted, stand beside their predictions in
+`experiments/results/bench-memory-cpu.json`. XLA shares memory between stages, so the largest need counts. Where nothing
+was fitted, DenseNet-121's gradients and GPUs, expect less.
 """
 
 import dataclasses
@@ -27,9 +28,7 @@ FLOAT = 4  # bytes
 _LOOK = (2.0, 1.0)  # per pass: 2 F + 1, both the maps before and after a layer
 _VALUE = (0.914, 45.5)  # per pass whose gradient is taken: 0.914 S + 45.5
 _ACTOR = (1.5, 3.28, 18.9)  # per pass of the actor's update: 1.5 F + 3.28 h + 18.9
-# Fitted, per scene while it moves and is looked at.
-_VIEW = 22  # maps of the size of the height map
-_ENGINE = 0.64  # share of an engine's data that is alive besides
+_VIEW = 22  # fitted, per scene while it is cast into a view: maps of the size of the height map
 
 
 def limit() -> int:
@@ -49,7 +48,7 @@ def predict(cfg: Config) -> dict[str, int]:
 
 
 def _largest_need(needs: dict[str, int]) -> int:
-    """Of a step's stages. The scenes are looked at while they move, as XLA orders it; learning is apart from both."""
+    """Of a step's stages. As XLA orders it, features of a look are held while the scenes move; learning is apart."""
     return max(needs["learn"], needs["look"] + needs["simulate"])
 
 
@@ -112,10 +111,13 @@ def _densenet_saved(layers: tuple[int, ...], growth: int) -> float:
 
 
 def _scene(cfg: Config) -> int:
-    """Bytes that one scene needs while it moves: maps of its view, constraint rows, matrices of the solver."""
+    """Bytes that one scene needs while it moves, or after that while it is seen, whichever is more.
+
+    Moving, it holds an engine's data: constraint rows, matrices of the solver. Seen, maps of its view.
+    """
     freedoms, contacts = 6 * len(cfg.scene.slots) + 6, cfg.sim.contacts
     data = 4 * FLOAT * contacts * freedoms + 2 * FLOAT * freedoms**2 + 350 * contacts + 4500  # fitted to mjx.Data
-    return round(_ENGINE * data) + _VIEW * FLOAT * cfg.heightmap.size**2
+    return max(data, _VIEW * FLOAT * cfg.heightmap.size**2)
 
 
 def check(cfg: Config) -> None:
