@@ -830,7 +830,7 @@ def doctor(arguments: list[str]) -> int:
     needs = {} if cfg is None else _print_memory(cfg)
     with _watchdog(90.0, "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8 and try again"):
         from csac_jax import _guard
-        from csac_jax.train import provenance, selftest
+        from csac_jax.train import compiler, provenance, selftest
 
         record = provenance.record()
         print(f"device     {record['device']}")
@@ -842,6 +842,8 @@ def doctor(arguments: list[str]) -> int:
         verdict = "enough for batched MJX" if guarded else remedy
         print(f"XLA flags  {os.environ.get('XLA_FLAGS') or 'none'}")
         print(f"threads    {threads} in JAX's pool on the CPU, by {variable}: {verdict}")
+        fast = compiler.has_library()
+        print(f"training   convolutions by XLA's {'second library' if fast else 'default library'}")
         begun = time.perf_counter()
         checks = selftest.run()
     for check in checks:
@@ -851,7 +853,7 @@ def doctor(arguments: list[str]) -> int:
     print(f"self-test  {time.perf_counter() - begun:.1f} s")
     pool = {"variable": variable, "threads": threads, "guarded": guarded}
     tests = [{**check._asdict(), "passed": check.passed} for check in checks]
-    guard = {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", "")}
+    guard = {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", ""), "second_library": fast}
     _write_json(options.json, {**guard, "self_test": tests, **needs}, cfg)
     failed = [check.name for check in checks if not check.passed]
     if failed:

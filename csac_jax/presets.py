@@ -27,7 +27,13 @@ def quick() -> Config:
     needed.
     """
     alike = SceneConfig(size_spread=0.0, mesh_spread=0.0, density=(600.0, 600.0), friction=(0.8, 0.8))
-    return Config(preset="quick", scene=alike, target=TargetConfig(gamma=0.2), replay=ReplayConfig(beta_end=(1.0, 4.0)))
+    return Config(
+        preset="quick",
+        scene=alike,
+        target=TargetConfig(gamma=0.2),
+        learn=LearnConfig(actor_batch=8),
+        replay=ReplayConfig(beta_end=(1.0, 4.0)),
+    )
 
 
 def fast() -> Config:

@@ -80,6 +80,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --algo=", "unknown algorithm ''"),
         ("train quick --algo", "Missing value for argument '--algo'"),
         ("train quick --algo grasp_only --explore.push-fraction 0.2", "explore.push_fraction: must be 0 where"),
+        ("train quick --learn.actor-batch 33", "learn.actor_batch: must lie in 0 .. learn.batch"),
         ("train quick --learn.critics 3", "learn.critics: must be 1 or 2"),
         ("train quick --learn.loss mse", "invalid choice 'mse' for argument '--learn.loss'"),
         ("train quick --cem.elites 65", "cem.elites: must lie in 2 .. cem.candidates"),
@@ -411,8 +412,10 @@ def test_doctor_passes(capsys: pytest.CaptureFixture, tmp_path: Path):
     shown = capsys.readouterr().out
     assert "jax 0." in shown
     assert shown.count("ok  ") == 3
+    assert "training   convolutions by XLA's second library" in shown
     result = json.loads((tmp_path / "doctor.json").read_text())
     assert result["thread_pool"]["guarded"]
+    assert result["second_library"]
     assert all(check["passed"] for check in result["self_test"])
 
 
