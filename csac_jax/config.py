@@ -54,8 +54,8 @@ class SceneConfig:
     """Range of block densities, kg/m^3 (ours: woods; about 0.1 kg a block)."""
     friction: tuple[float, float] = (0.5, 1.0)
     """Range of the sliding friction between blocks and table."""
-    drop_extent: float = 0.248
-    """Side of the square in which blocks are dropped, m (VPG)."""
+    drop_extent: tuple[float, float] = (0.248, 0.248)
+    """Range of the side of the square in which the blocks of a scene are dropped, m (VPG: 0.248)."""
     drop_height: float = 0.15
     """Height of the first drop, m (VPG); later blocks of a scene start higher, so that none overlap."""
     settle_time: float = 2.5
@@ -72,7 +72,8 @@ class SceneConfig:
             100.0 <= self.density[0] <= self.density[1] <= 3000.0, "scene.density: 100 <= low <= high <= 3000 kg/m^3"
         )
         _require(0.1 <= self.friction[0] <= self.friction[1] <= 2.0, "scene.friction: 0.1 <= low <= high <= 2")
-        _require(0.05 <= self.drop_extent <= 0.448, "scene.drop_extent: must lie in 0.05 .. 0.448 m")
+        least, most = self.drop_extent
+        _require(0.05 <= least <= most <= 0.448, "scene.drop_extent: 0.05 <= least <= most <= 0.448 m is needed")
         _require(0.05 <= self.drop_height <= 1.0, "scene.drop_height: must lie in 0.05 .. 1 m")
         _require(0.5 <= self.settle_time <= 20.0, "scene.settle_time: must lie in 0.5 .. 20 s")
 
@@ -289,6 +290,8 @@ class NetConfig:
     """small: dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
     stem: int = 16
     """small: channels of the first convolution."""
+    subcells: int = 1
+    """small: cells of the maps per cell of its features, along each axis: 1 or 2 (the height map's resolution)."""
     norm: Literal["group", "batch"] = "group"
     """densenet121: `batch`, as in the paper, or `group`, which is the same while acting and while learning."""
     block_layers: tuple[int, int, int, int] = (6, 12, 24, 16)
@@ -301,7 +304,7 @@ class NetConfig:
     """densenet121: cells of the map per cell that its outputs are upsampled to (ours; the paper 1, at 16 times the
     memory: what is upsampled is bilinear, and so is reading it)."""
     dtype: Literal["auto", "float32", "bfloat16"] = "auto"
-    """densenet121: what it computes in, parameters being float32; auto: bfloat16 on accelerators, float32 on a CPU."""
+    """What the net computes in, parameters being float32; auto: bfloat16 on accelerators, float32 on a CPU."""
     weights: str = ""
     """densenet121: .safetensors file with ImageNet weights in torchvision's names that its trunks begin with; none if
     empty."""
@@ -312,6 +315,7 @@ class NetConfig:
         _require(min(self.growth, self.stem, self.head) >= 4, "net.growth, stem, head: at least 4 channels")
         _require(len(self.dilations) >= 1 and min(self.dilations) >= 1, "net.dilations: at least one layer, each >= 1")
         _require(0.0 <= self.margin <= 0.5, "net.margin: must lie in 0 .. 0.5")
+        _require(self.subcells in (1, 2), "net.subcells: must be 1 or 2")
         _require(min(self.block_layers) >= 1, "net.block_layers: at least one layer in each block")
         _require(
             self.block_growth >= 4 and self.block_growth % 4 == 0, "net.block_growth: must be a multiple of 4 channels"

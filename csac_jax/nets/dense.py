@@ -1,9 +1,14 @@
 """The small dense net: densely connected convolutions with group norm, at half the resolution of its input.
 
+Its maps may be finer: the last 1 x 1 convolution then gives `net.subcells`^2 values per cell of the features, laid out
+beside each other (Shi et al., arXiv:1609.05158), at next to no cost.
+
 It sees maps already turned to a frame, so that what it must know of a push is "ahead" and of a grasp "across". The
 frame of yaw + pi shows the same picture upside down: each pass gives three maps, push ahead, push back and grasp (a
 parallel gripper is symmetric), and K / 2 passes give all K yaws of both primitives.
 """
+
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -12,11 +17,18 @@ import jax.numpy as jnp
 from csac_jax.config import NetConfig
 from csac_jax.nets.convolution import conv2d
 
-STRIDE = 2  # cells of the input per cell of the output, along each axis
+STRIDE = 2  # cells of the input per cell of the features, along each axis
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 TABLE_HEIGHT = 0.002  # m: what is lower is bare table
 _HEIGHT_SCALE = 0.05  # m, a block's height: brings heights near 1
 _GROUP = 8  # channels per group of the norm
+
+
+def compute_dtype(cfg: NetConfig) -> Any:
+    """What a net computes in on this machine; its parameters and its maps are float32."""
+    if cfg.dtype == "auto":
+        return jnp.float32 if jax.default_backend() == "cpu" else jnp.bfloat16
+    return jnp.dtype(cfg.dtype)
 
 
 def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
@@ -41,11 +53,13 @@ class Convolution(nn.Module):
     padding: int  # cells of zeros around the maps
     stride: int = 1
     dilation: int = 1
+    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
         shape = (self.size, self.size, maps.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.he_normal(), shape)
+        maps, kernel = maps.astype(self.dtype), kernel.astype(self.dtype)
         return conv2d(maps, kernel, self.stride, self.dilation, self.padding)
 
 
@@ -56,28 +70,37 @@ class Trunk(nn.Module):
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
-        features = Convolution(self.cfg.stem, size=4, stride=STRIDE, padding=1)(maps)
-        features = nn.relu(_norm(self.cfg.stem)(features))
-        for dilation in self.cfg.dilations:
-            new = Convolution(self.cfg.growth, size=3, dilation=dilation, padding=dilation)(features)
-            features = jnp.concatenate([features, nn.relu(_norm(self.cfg.growth)(new))], axis=-1)
+        cfg, dtype = self.cfg, compute_dtype(self.cfg)
+        features = Convolution(cfg.stem, size=4, stride=STRIDE, padding=1, dtype=dtype)(maps)
+        features = nn.relu(_norm(cfg.stem, dtype)(features))
+        for dilation in cfg.dilations:
+            new = Convolution(cfg.growth, size=3, dilation=dilation, padding=dilation, dtype=dtype)(features)
+            features = jnp.concatenate([features, nn.relu(_norm(cfg.growth, dtype)(new))], axis=-1)
         return features
 
 
 class Head(nn.Module):
-    """Dense maps from features: [..., F] -> [..., OUTPUTS], two 1 x 1 convolutions."""
+    """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS], s = subcells; two 1 x 1 convolutions."""
 
     cfg: NetConfig
 
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
         del train  # group norm is the same in both
-        hidden = nn.relu(nn.Dense(self.cfg.head)(features))
-        return nn.Dense(OUTPUTS, kernel_init=nn.initializers.variance_scaling(0.01, "fan_in", "normal"))(hidden)
+        hidden = nn.relu(nn.Dense(self.cfg.head, dtype=compute_dtype(self.cfg))(features)).astype(jnp.float32)
+        small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
+        return _spread(nn.Dense(OUTPUTS * self.cfg.subcells**2, kernel_init=small)(hidden), self.cfg.subcells)
 
 
-def _norm(channels: int) -> nn.GroupNorm:
-    return nn.GroupNorm(num_groups=max(channels // _GROUP, 1))
+def _spread(maps: jax.Array, factor: int) -> jax.Array:
+    """Channels laid out as cells: [..., h, w, s s O] -> [..., s h, s w, O], s = factor; row, column, output."""
+    *batch, rows, cols, channels = maps.shape
+    parts = maps.reshape(*batch, rows, cols, factor, factor, channels // factor**2)
+    return jnp.swapaxes(parts, -4, -3).reshape(*batch, factor * rows, factor * cols, -1)
+
+
+def _norm(channels: int, dtype: Any) -> nn.GroupNorm:
+    return nn.GroupNorm(num_groups=max(channels // _GROUP, 1), dtype=dtype)
 
 
 class Critic(nn.Module):
@@ -90,7 +113,7 @@ class Critic(nn.Module):
         self.head = Head(self.cfg)
 
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, C / 2, C / 2, OUTPUTS], features [B, C / 2, C / 2, F]."""
+        """[B, C, C, I] -> Q [B, s C / 2, s C / 2, OUTPUTS], features [B, C / 2, C / 2, F]."""
         del train  # group norm is the same in both
         features = self.trunk(maps)
         return self.head(features), features

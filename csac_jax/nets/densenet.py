@@ -9,7 +9,6 @@ The trunks are the same program with other weights: they are stacked along an ax
 
 import functools
 import math
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import DENSENET_STRIDE, NetConfig
-from csac_jax.nets.dense import OUTPUTS, TABLE_HEIGHT
+from csac_jax.nets.dense import OUTPUTS, TABLE_HEIGHT, compute_dtype
 
 _COLOUR_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of ImageNet, as torchvision's weights want it
 _COLOUR_STD = np.array([0.229, 0.224, 0.225], np.float32)
@@ -43,13 +42,6 @@ def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None
     if target is not None:
         maps.append(target[..., None].astype(height.dtype))
     return jnp.concatenate(maps, axis=-1)
-
-
-def compute_dtype(cfg: NetConfig) -> Any:
-    """What the net computes in on this machine."""
-    if cfg.dtype == "auto":
-        return jnp.float32 if jax.default_backend() == "cpu" else jnp.bfloat16
-    return jnp.dtype(cfg.dtype)
 
 
 def _norm(cfg: NetConfig, channels: int, train: bool, name: str) -> nn.Module:

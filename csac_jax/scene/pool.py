@@ -23,7 +23,7 @@ from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import HAND_PARK_HEIGHT, BlockFields, World, assets, scene_fields, with_blocks
 
 TRAIN_STREAM = 0  # stream of random numbers of the training pool; evaluation takes 1 + its seed
-_VERSION = 4  # raise when the meaning of a cached pool changes
+_VERSION = 5  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round
@@ -93,9 +93,10 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
     num = len(cfg.slots)
     in_play = rng.permutation(num) < count
     quaternion = rng.normal(size=(num, 4))
+    half = 0.5 * rng.uniform(*cfg.drop_extent)
     position = np.concatenate(
         [
-            rng.uniform(-0.5 * cfg.drop_extent, 0.5 * cfg.drop_extent, (num, 2)),
+            rng.uniform(-half, half, (num, 2)),
             cfg.drop_height + _SPACING * rng.permutation(num)[:, None],
         ],
         axis=1,
@@ -148,6 +149,7 @@ def pour(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: Bl
     num, still = len(scene.in_play), round(_PAUSE / model.opt.timestep)
     waiting = [int(slot) for slot in np.argsort(scene.position[:, 2]) if scene.in_play[slot]]
     rng = np.random.default_rng(np.abs(scene.position * 1e6).astype(np.uint64).ravel())
+    half = 0.5 * rng.uniform(*cfg.drop_extent)
     aloft = np.ones(num, bool)
     pinned, quiet = layout.parking(num), 0.0
 
@@ -158,7 +160,7 @@ def pour(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: Bl
 
     for _ in range(_MOST_DROPS * len(waiting)):
         if waiting:
-            slot, half = waiting.pop(0), 0.5 * cfg.drop_extent
+            slot = waiting.pop(0)
             high = data.qpos[world.block_qpos[~aloft, 2]].max(initial=0.0)
             aloft[slot], quiet = False, 0.0
             data.qpos[world.block_qpos[slot, :3]] = [*rng.uniform(-half, half, 2), high + cfg.drop_height]

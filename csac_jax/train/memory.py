@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import Config
-from csac_jax.nets import dense, densenet
+from csac_jax.nets import dense
 from csac_jax.replay import ring
 from csac_jax.train import step
 
@@ -84,8 +84,8 @@ def _pass_unit(cfg: Config) -> float:
     """Bytes of one channel of a pass: the small net's maps; DenseNet-121's input in the type that it computes in."""
     side = round(cfg.heightmap.size * (1.0 + cfg.net.margin) / 2.0) * 2
     if cfg.net.kind == "small":
-        return FLOAT * (side // dense.STRIDE) ** 2
-    return jnp.dtype(densenet.compute_dtype(cfg.net)).itemsize * (side * cfg.net.zoom) ** 2
+        return jnp.dtype(dense.compute_dtype(cfg.net)).itemsize * (side // dense.STRIDE) ** 2
+    return jnp.dtype(dense.compute_dtype(cfg.net)).itemsize * (side * cfg.net.zoom) ** 2
 
 
 def _pass_channels(cfg: Config) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "ef1640f6aa56bc9d84237e026e4b3d3fa025337227896ec4f9ceb100ab3c13f3"
+SHIPPED_SHA256 = "8fd0cb75ddfdae61fe103b4640f9400867649c6c07dcc43e472b264b95715406"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 

@@ -83,7 +83,8 @@ def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN.sim) -> Config:
 
 def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config:
     """The config with these blocks in play, and actions enough to take them."""
-    scene = dataclasses.replace(cfg.scene, slots=slots, min_blocks=len(slots), arranged=0.0)
+    extent = SceneConfig.drop_extent
+    scene = dataclasses.replace(cfg.scene, slots=slots, min_blocks=len(slots), arranged=0.0, drop_extent=extent)
     task = dataclasses.replace(cfg.task, max_actions=max(cfg.task.max_actions, len(slots) * 5 // 2))
     return dataclasses.replace(_wide(cfg, scene, sim), task=task)
 

@@ -42,6 +42,7 @@ def _config(size: int = 224, **net: Any) -> Config:
         (224, {"weights": "x.safetensors"}, "net.weights: need --net.norm batch"),
         (64, {"kind": "small", "margin": 0.125, "norm": "batch"}, "net.norm batch, net.weights: only of"),
         (64, {"kind": "small", "margin": 0.125, "weights": "x"}, "net.norm batch, net.weights: only of"),
+        (64, {"kind": "small", "subcells": 3}, "net.subcells: must be 1 or 2"),
         (64, {"kind": "small", "margin": 0.22}, "net.margin: rotated maps of 78 cells are not a multiple of 4"),
     ],
 )

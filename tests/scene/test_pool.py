@@ -8,6 +8,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from scipy import stats
 
 from csac_jax.config import SceneConfig, SimConfig
 from csac_jax.scene import blocks, model, pool
@@ -177,7 +178,17 @@ def test_hopeless_configuration_is_one_line(small: model.World):
     assert "\n" not in str(error.value)
 
 
-PILE = SceneConfig(slots=("box", "arch", "prism") * 4, min_blocks=12, drop_extent=0.1, settle_time=1.0)
+def test_blocks_are_dropped_close_together_or_far_apart():
+    """Claim: each scene has a square of its own in which its blocks are dropped, its side uniform in the range."""
+    cfg = SceneConfig(slots=("box",) * 8, min_blocks=8, drop_extent=(0.1, 0.4))
+    rng = np.random.default_rng(0)
+    reach = np.array([np.abs(pool._drop(cfg, rng, 8).position[:, :2]).max() for _ in range(400)])
+    # The largest of 16 uniform numbers in 0 .. half is 16/17 of half in the mean.
+    assert stats.kstest(reach * 17 / 16, stats.uniform(0.05, 0.15).cdf).statistic < 0.12
+    assert reach.max() <= 0.2
+
+
+PILE = SceneConfig(slots=("box", "arch", "prism") * 4, min_blocks=12, drop_extent=(0.1, 0.1), settle_time=1.0)
 
 
 @pytest.mark.slow
@@ -204,7 +215,7 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 def test_poured_blocks_that_leave_are_dropped_anew():
     """Claim: where a block of nearly every scene falls outside the workspace, pouring still gives the scene."""
-    cfg = SceneConfig(slots=("box",) * 4, min_blocks=4, drop_extent=0.448, settle_time=1.0)
+    cfg = SceneConfig(slots=("box",) * 4, min_blocks=4, drop_extent=(0.448, 0.448), settle_time=1.0)
     world, rng = model.build(cfg, SimConfig()), np.random.default_rng(0)
     for _ in range(6):
         scene = pool._drop(cfg, rng, 4)
