@@ -14,7 +14,7 @@ Map, in the direction of data; imports point only backwards along it:
     env         reset and step of one scene
     train       the training step, host loop, checkpoints, evaluation
     show        progress and pictures
-    cli         the command `csac-jax`
+    cli         the command `csac-jax`, a file per subcommand
 
 Axis letters: E scenes in the batch, B learner batch, N block slots, G geoms, R rays, K rotations, H W heightmap rows
 and columns, J CEM candidates, A action dimensions, C replay capacity, S seeds, T scan time.

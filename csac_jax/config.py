@@ -26,12 +26,16 @@ def _require(condition: bool, message: str) -> None:
 
 
 def _require_choices(cfg: Any, section: str) -> None:
-    """Every field of a Literal type has one of its values: a typing mistake must not pass for the other branch."""
+    """Every field of a Literal type, or of a tuple of them, has its values: a typing mistake must not pass for the
+    other branch."""
     for field in dataclasses.fields(cfg):
-        if typing.get_origin(field.type) is Literal:
-            choices, value = typing.get_args(field.type), getattr(cfg, field.name)
+        value, kind = getattr(cfg, field.name), field.type
+        items, kind = (value, typing.get_args(kind)[0]) if typing.get_origin(kind) is tuple else ((value,), kind)
+        if typing.get_origin(kind) is Literal:
+            choices = typing.get_args(kind)
             names = ", ".join(map(str, choices))
-            _require(value in choices, f"{section}{field.name}: {value!r} is not one of: {names}")
+            for item in items:
+                _require(item in choices, f"{section}{field.name}: {item!r} is not one of: {names}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +66,7 @@ class SceneConfig:
     """Time the blocks are given to come to rest, s (ours)."""
 
     def __post_init__(self) -> None:
+        _require_choices(self, "scene.")
         _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
         _require(1 <= self.min_blocks <= len(self.slots), "scene.min_blocks: must lie in 1 .. number of scene.slots")
         _require(self.pool >= 1, "scene.pool: at least one settled scene is needed")

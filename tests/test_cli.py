@@ -13,9 +13,10 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, cli, presets
+from csac_jax.cli import bench, evaluation, stored, sweep, train
 from csac_jax.config import Config, SceneConfig
 from csac_jax.scene import pool
-from csac_jax.train import checkpoint
+from csac_jax.train import checkpoint, stop
 
 ROOT = Path(csac_jax.__file__).parents[1]
 SMOKE = presets.smoke()
@@ -29,8 +30,8 @@ def no_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         raise AssertionError("training began")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "_train", forbidden)
-    monkeypatch.setattr(cli.stopping, "install", cli.stopping.Stop)
+    monkeypatch.setattr(train, "_train", forbidden)
+    monkeypatch.setattr(stop, "install", stop.Stop)
 
 
 def _fails(capsys: pytest.CaptureFixture, *arguments: str) -> tuple[int, str]:
@@ -89,6 +90,9 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
+        ("eval . --seed 2147483647", "--seed: must lie in"),
+        ("eval shipped --suite nowhere", "--suite: 'nowhere' is neither a case file nor one of: own, random10"),
+        ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
         ("doctor --fix", "Unrecognized options: --fix"),
         ("train smoke --sim.physics c", "--sim.physics: training is one compiled program, which c is no part of"),
         ("train smoke --sim.physics warp", "scene.mesh_spread: must be 0 where sim.physics is warp"),
@@ -122,21 +126,24 @@ def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: s
     assert message in line
 
 
-@pytest.mark.parametrize("command", ["train --resume", "eval"])
+READERS = ["train --resume {}", "eval {}", "export {} p.safetensors", "play --policy {}"]
+
+
+@pytest.mark.parametrize("command", READERS)
 def test_missing_run(capsys: pytest.CaptureFixture, tmp_path: Path, command: str):
     """Claim: a run that is not there, or has no checkpoint, is one line and exit code 1."""
-    code, line = _fails(capsys, *command.split(), "nowhere")
+    code, line = _fails(capsys, *command.format("nowhere").split())
     assert (code, "there is no folder nowhere" in line) == (1, True)
     (tmp_path / "empty").mkdir()
-    code, line = _fails(capsys, *command.split(), "empty")
+    code, line = _fails(capsys, *command.format("empty").split())
     assert (code, "there is no checkpoint" in line) == (1, True)
 
 
-@pytest.mark.parametrize("command", ["train --resume", "eval"])
+@pytest.mark.parametrize("command", READERS)
 def test_damaged_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path, command: str):
     """Claim: a damaged checkpoint is one line and exit code 1."""
     (run_dir / "checkpoints/4" / checkpoint.MANIFEST).unlink()
-    code, line = _fails(capsys, *command.split(), str(run_dir))
+    code, line = _fails(capsys, *command.format(run_dir).split())
     assert (code, "half-written" in line) == (1, True)
 
 
@@ -148,7 +155,7 @@ def test_scenes_that_never_settle(
     falling = SceneConfig(slots=("box",), min_blocks=1, drop_height=1.0, settle_time=0.5)  # lands after 0.45 s
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(pool, "_ROUND", 8)
-    monkeypatch.setattr(cli, "_stored_config", lambda _: dataclasses.replace(SMOKE, scene=falling))
+    monkeypatch.setattr(stored, "config", lambda _: dataclasses.replace(SMOKE, scene=falling))
     code, line = _fails(capsys, "eval", str(run_dir), "--policy", "random")
     assert code == 1
     assert "scene.settle_time" in line
@@ -193,7 +200,7 @@ def test_resume_takes_the_config_of_the_run(run_dir: Path, flag: str, preset: st
     """Claim: a resumed run needs no settings, and may be given its own."""
     own = "--learn.batch 8 --seed 0"
     for arguments in (preset + flag.format(run_dir), f"{preset}{flag.format(run_dir)} {own}"):
-        options, cfg = cli._read_train(arguments.split())
+        options, cfg = train.read(arguments.split())
         assert cfg == SMOKE
         assert options.resume == run_dir
 
@@ -201,7 +208,7 @@ def test_resume_takes_the_config_of_the_run(run_dir: Path, flag: str, preset: st
 def test_flags_reach_the_config():
     """Claim: settings on the command line reach the config, the rest is the preset's."""
     flags = "--seed 3 --learn.batch 4 --scene.slots box prism --replay.beta-end 2 3"
-    _, cfg = cli._read_train(["smoke", *flags.split()])
+    _, cfg = train.read(["smoke", *flags.split()])
     assert cfg == dataclasses.replace(
         SMOKE,
         seed=3,
@@ -215,11 +222,11 @@ def test_flags_reach_the_config():
 def test_algorithm_reaches_the_config(flag: str):
     """Claim: --algo makes the preset one of that algorithm, and settings given as well win over it, before or after."""
     wanted = algorithms.configure(SMOKE, "vpg")
-    assert cli._read_train(["smoke", *flag.split()])[1] == wanted
+    assert train.read(["smoke", *flag.split()])[1] == wanted
     own = dataclasses.replace(wanted, target=dataclasses.replace(wanted.target, gamma=0.3))
     for arguments in (f"smoke {flag} --target.gamma 0.3", f"smoke --target.gamma 0.3 {flag}"):
-        assert cli._read_train(arguments.split())[1] == own
-    assert cli._read_train(["smoke"])[1] == SMOKE
+        assert train.read(arguments.split())[1] == own
+    assert train.read(["smoke"])[1] == SMOKE
 
 
 def test_resumed_run_keeps_its_algorithm(capsys: pytest.CaptureFixture, tmp_path: Path):
@@ -227,7 +234,7 @@ def test_resumed_run_keeps_its_algorithm(capsys: pytest.CaptureFixture, tmp_path
     cfg, folder = algorithms.configure(SMOKE, "vpg"), tmp_path / "runs" / "two"
     checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []})
     for flags in ([], ["--algo", "vpg"]):
-        assert cli._read_train(["--resume", str(folder), *flags])[1] == cfg
+        assert train.read(["--resume", str(folder), *flags])[1] == cfg
     code, line = _fails(capsys, "train", "--resume", str(folder), "--algo", "csac")
     assert (code, "other values of algo;" in line) == (2, True)
 
@@ -295,7 +302,7 @@ def test_benchmark_is_run_with_its_arguments(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     """Claim: `bench NAME ...` calls `main` of that file of the checkout; without a checkout it is one line."""
-    monkeypatch.setattr(cli, "BENCHMARKS", tmp_path / "bench")
+    monkeypatch.setattr(bench, "BENCHMARKS", tmp_path / "bench")
     code, line = _fails(capsys, "bench", "one")
     assert (code, "come with a checkout" in line) == (2, True)
     (tmp_path / "bench").mkdir()
@@ -346,23 +353,23 @@ def test_replay_benchmark(capsys: pytest.CaptureFixture):
 def test_automatic_physics_is_resolved(tmp_path: Path):
     """Claim: `--sim.physics auto` reaches a run as what it stands for here, and may be asked for again when the run is
     resumed; the first line of a run says what it runs on."""
-    _, cfg = cli._read_train(["smoke", "--sim.physics", "auto", "--seed", "3"])
+    _, cfg = train.read(["smoke", "--sim.physics", "auto", "--seed", "3"])
     assert cfg == dataclasses.replace(SMOKE, seed=3)
     folder = tmp_path / "runs" / "three"
     checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []})
-    assert cli._read_train(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
-    assert cli._read_sweep(["smoke", "--sim.physics", "auto"])[1].settings[0].cfg.sim == SMOKE.sim
-    line = cli._first_line(folder, cfg)
+    assert train.read(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
+    assert sweep.read(["smoke", "--sim.physics", "auto"])[1].settings[0].cfg.sim == SMOKE.sim
+    line = train.first_line(folder, cfg)
     wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics mjx, on 1 x cpu (cpu)"
     assert line == f"run {folder}: {wanted}"
 
 
 def test_default_run_dirs_do_not_collide(tmp_path: Path):
     """Claim: two runs begun in the same second get folders of their own."""
-    first = cli._new_run_dir(SMOKE)
+    first = train.new_run_dir(SMOKE)
     assert first.name.startswith("smoke-0-20")
     first.mkdir(parents=True)
-    assert cli._new_run_dir(SMOKE) != first
+    assert train.new_run_dir(SMOKE) != first
 
 
 def test_help_comes_without_jax():
@@ -393,11 +400,11 @@ def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     """Claim: a stopped run exits with 128 + the signal; --json has the result, the config and where it comes from."""
     from csac_jax.train import loop
 
-    def train(options, cfg, run_dir, stop, trunk):
+    def trained(options, cfg, run_dir, stop, trunk):
         stop.signal = code - 128 if code else None
         return loop.Summary(4, 8, 1.5, 0.5, None, 0, stop.signal)
 
-    monkeypatch.setattr(cli, "_train", train)
+    monkeypatch.setattr(train, "_train", trained)
     assert cli.main(["train", "smoke", "--seed", "3", "--json", "out/result.json"]) == code
     result = json.loads((tmp_path / "out/result.json").read_text())
     assert (result["actions"], result["config"]["seed"], result["config"]["preset"]) == (8, 3, "smoke")
@@ -468,7 +475,7 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
         "outcomes": {"lifted": 9},
         "counts": {"grasps": 10},
     }
-    cli._print_summary("random in 1 episode", summary)
+    evaluation.print_summary("random in 1 episode", summary)
     shown = capsys.readouterr().out
     assert "90.0 %" in shown
     assert "lifted 9" in shown

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from csac_jax import algorithms, cli, presets
-from csac_jax.train import step, stop, sweep
+from csac_jax.cli import sweep as command
+from csac_jax.train import checkpoint, loop, step, stop, sweep
 from tests.train import toys
 
 SMOKE = presets.smoke()
@@ -23,7 +24,7 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sweep, "run", forbidden)
-    monkeypatch.setattr(cli.stopping, "install", cli.stopping.Stop)
+    monkeypatch.setattr(stop, "install", stop.Stop)
 
 
 def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
@@ -40,6 +41,12 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
     [
         ("", "sweep: give a preset first, one of: smoke, quick"),
         ("smoke --seeds 0", "--seeds: at least 1"),
+        ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
+        ("smoke --sim.physics c", "--sim.physics: training is one compiled program, which c is no part of"),
+        (
+            "smoke --net.kind densenet121 --net.norm batch --net.margin 0 --net.weights none.safetensors",
+            "net.weights: none.safetensors cannot be read as .safetensors",
+        ),
         ("smoke --vary learn.tua=0.1", "--vary: 'learn.tua' is no setting; perhaps you meant learn.tau"),
         ("smoke --vary learn.tau=", "--vary learn.tau=: give a setting and its values"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
@@ -52,6 +59,10 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2", "--process-id: must lie in 0 .. 1"),
         ("smoke --run-dir .", ". exists; give another --run-dir"),
         ("--resume x --learn.tau 0.1", "leave all others out"),
+        ("--resume x --seeds 5", "leave all others out"),
+        ("--resume x --run-dir y", "leave all others out"),
+        ("--resume x --vary learn.tau=0.1", "leave all others out"),
+        ("quick --resume x", "leave all others out"),
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
@@ -67,10 +78,32 @@ def test_no_sweep_to_resume(capsys: pytest.CaptureFixture):
     assert (code, "there is no sweep.json in nowhere" in line) == (1, True)
 
 
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (FileExistsError(), 2, "there exists; give another --run-dir"),
+        (sweep.SweepError("all are lost"), 1, "all are lost"),
+        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
+        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
+    ],
+)
+def test_failures(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int, message: str
+):
+    """Claim: a sweep that fails is one line and an exit code; a folder that someone else has made meanwhile as well."""
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(sweep, "run", fail)
+    assert cli.main(["sweep", "smoke", "--run-dir", "there"]) == code
+    assert capsys.readouterr().err.startswith(f"csac-jax: {message}")
+
+
 def test_settings_reach_their_configs():
     """Claim: each setting is the preset with its algorithm, the flags for all, and its own values, which win."""
     flags = "--seeds 3 --seed 7 --learn.batch 4 --vary algo=csac,vpg --vary target.gamma=0.1,0.3"
-    options, plan = cli._read_sweep(["smoke", *flags.split()])
+    options, plan = command.read(["smoke", *flags.split()])
     assert (options.seeds, plan.seeds, options.devices, options.shard) == (3, 3, None, "seeds")
     wanted = []
     for algo in ("csac", "vpg"):
@@ -86,9 +119,9 @@ def test_settings_reach_their_configs():
 
 def test_plan_survives_its_file(tmp_path: Path):
     """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
-    _, plan = cli._read_sweep(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
+    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
     (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
-    assert cli._read_sweep(["--resume", str(tmp_path)])[1] == plan
+    assert command.read(["--resume", str(tmp_path)])[1] == plan
 
 
 @pytest.mark.optax
@@ -101,11 +134,11 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     for number in (2, 15):
         stopped = stop.Stop()
         stopped.signal = number
-        monkeypatch.setattr(cli.stopping, "install", lambda stopped=stopped: stopped)
+        monkeypatch.setattr(stop, "install", lambda stopped=stopped: stopped)
         first = ["smoke", "--seeds", "2", "--run-dir", "run"] if number == 2 else ["--resume", "run"]
         assert cli.main(["sweep", *first]) == 128 + number
         assert "go on with: csac-jax sweep --resume run" in capsys.readouterr().out
-    monkeypatch.setattr(cli.stopping, "install", stop.Stop)
+    monkeypatch.setattr(stop, "install", stop.Stop)
     assert cli.main(["sweep", "--resume", "run", "--json", "out.json"]) == 0
     assert "interquartile mean of 2 seeds" in capsys.readouterr().out
     result = json.loads(Path("out.json").read_text())

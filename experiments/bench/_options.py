@@ -3,7 +3,7 @@
 import argparse
 from typing import NoReturn
 
-from csac_jax.cli import BadArgumentsError
+from csac_jax.cli.errors import BadArgumentsError
 
 
 class Parser(argparse.ArgumentParser):

@@ -21,7 +21,7 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.agent import learner as learning
 from csac_jax.agent.learner import Learner
-from csac_jax.cli import BadArgumentsError
+from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import DENSENET_STRIDE, Config, HeightmapConfig, NetConfig
 from csac_jax.train import provenance, step
 from csac_jax.vision.heightmap import Observation

@@ -18,7 +18,7 @@ import numpy as np
 
 from csac_jax import presets
 from csac_jax.agent import learner as learning
-from csac_jax.cli import BadArgumentsError
+from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.env import Env
 from csac_jax.scene import layout, model

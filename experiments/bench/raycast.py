@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry, presets
-from csac_jax.cli import BadArgumentsError
+from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import HeightmapConfig
 from csac_jax.scene import blocks, model as models
 from csac_jax.scene.model import World

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from csac_jax.cli import BadArgumentsError
+from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import ReplayConfig
 from csac_jax.replay import ring, samplers
 from csac_jax.train import provenance

@@ -27,7 +27,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from csac_jax import env as environment, presets
 from csac_jax.agent import learner as learning, policy, rewards
 from csac_jax.agent.learner import Transition
-from csac_jax.cli import BadArgumentsError
+from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring

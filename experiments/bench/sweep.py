@@ -16,7 +16,7 @@ from typing import Any
 import jax
 
 from csac_jax import presets
-from csac_jax.cli import BadArgumentsError
+from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.train import auto, members, mesh, provenance, step
 from experiments.bench._options import Parser

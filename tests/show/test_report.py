@@ -11,6 +11,7 @@ import pytest
 import scipy.stats
 
 from csac_jax import algorithms, cli, presets
+from csac_jax.cli import train
 from csac_jax.config import Algo
 from csac_jax.show import charts, report, results
 from csac_jax.train import config_json, loop, metrics, statistics
@@ -145,7 +146,7 @@ def test_command_gives_the_config_back():
     run = results.Run(Path("x"), config, *[np.zeros(1)] * 4, record={})
     program, command, *flags = results.command(run).split()
     assert (program, command) == ("csac-jax", "train")
-    assert config_json.to_dict(cli._read_train(flags)[1]) == config
+    assert config_json.to_dict(train.read(flags)[1]) == config
 
 
 def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):

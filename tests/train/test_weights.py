@@ -14,7 +14,7 @@ from csac_jax import cli, presets
 from csac_jax.agent import learner as learning
 from csac_jax.config import NetConfig
 from csac_jax.nets import torchvision
-from csac_jax.train import weights
+from csac_jax.train import stop, weights
 
 LAYERS, GROWTH = (1, 2, 1, 1), 4
 NET = NetConfig(
@@ -131,7 +131,7 @@ def test_command_line_complains_before_training(tmp_path, capsys):
     run = tmp_path / "run"
     flags = ["--net.weights", str(tmp_path / "none.safetensors"), "--run-dir", str(run)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli.stopping, "install", cli.stopping.Stop)
+        patch.setattr(stop, "install", stop.Stop)
         assert cli.main(["train", "paper", *flags]) == 2
     line = capsys.readouterr().err
     assert line.startswith("csac-jax: net.weights: ")

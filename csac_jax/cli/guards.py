@@ -1,0 +1,41 @@
+"""What more than one command refuses, before anything is started."""
+
+import importlib.util
+from pathlib import Path
+
+from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.config import Config
+
+
+def check_seed(seed: int) -> None:
+    """Seeds of scenes that training never saw; JAX takes keys from 32 bits."""
+    if not 0 <= seed < 2**31 - 1:
+        raise BadArgumentsError("--seed: must lie in 0 .. 2147483646")
+
+
+def check_extra(option: str, module: str, extra: str) -> None:
+    """The option needs a module that comes with an extra of the package."""
+    if importlib.util.find_spec(module) is None:
+        raise BadArgumentsError(f"{option} needs an extra; run: pip install 'csac-jax[{extra}]'")
+
+
+def check_new(folder: Path | None) -> None:
+    """A new run needs a folder that does not exist."""
+    if folder is not None and folder.exists():
+        raise exists(folder)
+
+
+def exists(folder: Path) -> BadArgumentsError:
+    """The complaint about a run's folder that is there already."""
+    return BadArgumentsError(f"{folder} exists; give another --run-dir, or go on with it by --resume")
+
+
+def check_physics(cfg: Config) -> None:
+    """Physics that training cannot do, here or at all."""
+    if cfg.sim.physics == "c":
+        raise BadArgumentsError("--sim.physics: training is one compiled program, which c is no part of; eval takes it")
+    if cfg.sim.physics == "warp":
+        import jax
+
+        if jax.default_backend() != "gpu":
+            raise BadArgumentsError("--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx")

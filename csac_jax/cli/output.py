@@ -1,0 +1,46 @@
+"""What commands write: folders with the time in their name, JSON with its provenance, shares as text."""
+
+import datetime
+import json
+from pathlib import Path
+from typing import Any
+
+from csac_jax.config import Config
+
+RUNS = Path("runs")
+
+
+def new_folder(name: str) -> Path:
+    """A folder under RUNS, with the time in its name, that does not exist yet."""
+    stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
+    return next(path for path in candidates if not path.exists())
+
+
+def write_result(path: Path | None, result: dict[str, Any], cfg: Config | None) -> None:
+    """Writes a result with its config and provenance, if there is a path."""
+    if path is None:
+        return
+    from csac_jax.train import config_json, provenance
+
+    config = {} if cfg is None else {"config": config_json.to_dict(cfg)}
+    write_json(path, {**result, **config, **provenance.record()})
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Writes a file that appears all at once, and its folder."""
+    text = json.dumps(content, indent=2) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text)
+    temporary.replace(path)
+
+
+def percent(value: float) -> str:
+    """A share, such as 0.931, as `93.1 %`."""
+    return f"{100 * value:.1f} %"
+
+
+def interval(entry: dict[str, Any]) -> str:
+    """The interval of a metric, as `91.2 .. 94.6 %`."""
+    return f"{100 * entry['low']:.1f} .. {100 * entry['high']:.1f} %"

@@ -1,0 +1,110 @@
+"""`csac-jax play`: one episode, shown."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from csac_jax import presets
+from csac_jax.cli import guards, output, parsing, stored
+from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments
+from csac_jax.config import Config
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayOptions:
+    """Runs one episode and says what every action did; draws it, if asked to, with no display."""
+
+    scene: str = "random"
+    """What lies on the table: random (blocks dropped anew), the name of a shipped case, or a case file."""
+    robot: Literal["hand", "ur5"] = "hand"
+    """What moves the gripper: nothing, it floats; or the arm."""
+    policy: str = "oracle"
+    """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped (learned, comes with
+    the package), the folder of a run or a policy file."""
+    physics: Literal["c", "mjx"] = "c"
+    """What moves the blocks; with mjx, the motion between two states that a video shows is still C MuJoCo's."""
+    video: Path | None = None
+    """File to write a video to, such as out.mp4."""
+    png: Path | None = None
+    """File to write a picture of the first moment to."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height of picture and video, px, even numbers."""
+    views: bool = True
+    """Show height map and action beside the scene; of a learned policy also Q of both primitives, best over yaws, and
+    the candidates of its search."""
+    seed: int = 0
+    """Number that the scene and the policy's noise follow from."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+
+
+def run(arguments: list[str]) -> int:
+    """Runs the episode; returns the exit code."""
+    options = parsing.parse(PlayOptions, arguments, "play")
+    _check(options)
+    drawn, opengl = options.png is not None or options.video is not None, None
+    if drawn:
+        from csac_jax.show import gl
+
+        opengl = gl.choose()  # before MuJoCo is imported
+    learned = options.policy not in ("oracle", "random")
+    cfg, networks = stored.policy(options.policy) if learned else (presets.quick(), None)
+    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
+    begun = time.time()
+    cfg, moments = _play(options, cfg, networks)
+    from csac_jax.show import play as playing
+
+    print(playing.summary(moments))
+    if drawn:
+        stage = playing.Stage(cfg, moments[0].before, options.size, opengl, options.views)
+        playing.record(stage, moments, options.png, options.video)
+    result = {
+        "scene": options.scene,
+        "policy": options.policy,
+        "renderer": (opengl or "rays") if drawn else None,
+        "actions": len(moments),
+        "cleared": sum(int(moment.after.info.cleared) for moment in moments),
+        "completed": bool(moments[-1].after.terminated),
+        "seconds": round(time.time() - begun, 1),
+    }
+    output.write_result(options.json, result, cfg)
+    return 0
+
+
+def _check(options: PlayOptions) -> None:
+    guards.check_seed(options.seed)
+    if not all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size):
+        raise BadArgumentsError("--size: both numbers must be even and lie in 16 .. 4096 px")
+    if options.video is not None:
+        guards.check_extra("--video", "imageio_ffmpeg", "video")
+
+
+def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None) -> tuple[Config, list[Any]]:
+    """The scene's config and the moments of the episode, each printed as it happens."""
+    from csac_jax.show import play as playing
+    from csac_jax.train import cache, evaluate, suites
+
+    cache.enable()
+    with as_bad_arguments(ValueError):
+        suite = "own" if options.scene == "random" else str(_case_file(options.scene))
+        (env,) = suites.environments(cfg, suite, 1, options.seed).values()
+    params = None if networks is None else networks()
+    moments: list[Any] = []
+    name = options.policy if networks is None else "learned"
+    for moment in evaluate.episode(env.cfg, env, name, params, options.seed):
+        moments.append(moment)
+        print(playing.line(len(moments), moment), flush=True)
+    return env.cfg, moments
+
+
+def _case_file(scene: str) -> Path:
+    """File of a shipped case by name, or the user's own. Raises ValueError if there is neither."""
+    from csac_jax.scene import cases
+
+    if scene in cases.names():
+        return cases.shipped(scene)
+    if Path(scene).is_file():
+        return Path(scene)
+    raise ValueError(f"--scene: '{scene}' is neither a case file nor one of: random, {', '.join(cases.names())}")

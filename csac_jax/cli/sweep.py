@@ -1,0 +1,164 @@
+"""`csac-jax sweep`: several seeds and settings side by side."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from csac_jax import presets
+from csac_jax.cli import guards, output, settings, stored
+from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments, as_failure
+from csac_jax.config import Algo, Config
+from csac_jax.train import grid, stop as stopping
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepOptions:
+    """Trains several seeds, with several settings, side by side in one program; or goes on with a sweep that was
+    stopped. Every setting of a preset is an option."""
+
+    seeds: int = 4
+    """Seeds of every setting: --seed, --seed + 1, ..."""
+    vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=A,B,...: a setting, or algo, and the values it takes; once per setting, every combination is run. Items of a
+    tuple are parted by colons: replay.beta_end=1:4,1:12."""
+    run_dir: Path | None = None
+    """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
+    resume: Path | None = None
+    """Folder of a sweep to go on with, by itself: its settings are the sweep's."""
+    shard: Literal["seeds", "scenes"] = "seeds"
+    """What several devices share out: whole seeds, or the scenes and batches of each."""
+    devices: int | None = None
+    """Devices to use; one if not given, and with several processes all that they have."""
+    coordinator: str | None = None
+    """ADDRESS:PORT of the first of several processes, on one host or many; all run the same command. See
+    docs/cluster.md."""
+    processes: int | None = None
+    """How many processes there are."""
+    process_id: int | None = None
+    """Number of this process, from 0."""
+    cluster: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Join the processes of a job of SLURM, Open MPI or Kubernetes: JAX finds out where they are."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+    seed: int = 0
+    """The first seed."""
+    algo: Algo = "csac_beta"
+    """The algorithm: it changes settings of the preset, and settings given as options win over it."""
+
+
+_Options = settings.with_sections(SweepOptions)
+
+
+def run(arguments: list[str]) -> int:
+    """Trains all; returns the exit code."""
+    stop = stopping.install()
+    options, plan = read(arguments)
+    folder = options.resume or options.run_dir or output.new_folder(f"sweep-{plan.settings[0].cfg.preset}")
+    begun = time.time()
+    result = _sweep(options, plan, folder, stop)
+    times = {"compile_seconds": result.compile_seconds, "wall_seconds": round(time.time() - begun, 1)}
+    summary = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
+    from csac_jax.train import cluster
+
+    if cluster.is_first():
+        output.write_result(options.json, summary, None)
+        output.write_result(folder / "train.json", summary, None)  # `report` reads it
+    return 0 if result.stopped_by is None else 128 + result.stopped_by
+
+
+def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
+    """Options and plan of a sweep, from the command line or, if it is resumed, from its folder."""
+    preset, flags = settings.split(arguments)
+    options, cfg = _parse(preset or "quick", flags)
+    if options.seeds < 1 or options.seed + options.seeds > 2**31:
+        raise BadArgumentsError("--seeds: at least 1, and no seed may exceed 2147483647")
+    _join(options)
+    if options.resume is not None:
+        return options, _stored_plan(options.resume, preset, options, cfg)
+    if preset is None:
+        raise BadArgumentsError(f"sweep: give a preset first, one of: {settings.PRESETS}")
+    guards.check_new(options.run_dir)
+    return options, _new_plan(preset, flags, options)
+
+
+def _parse(preset: str, flags: list[str]) -> tuple[SweepOptions, Config]:
+    """Options of a sweep and the config of a setting, whose flags are the last ones."""
+    return settings.parse(_Options, f"sweep {preset}", settings.preset(preset, flags), flags)
+
+
+def _join(options: SweepOptions) -> None:
+    """Joins the other processes, if there are to be several."""
+    place = (options.coordinator, options.processes, options.process_id)
+    if not options.cluster and place == (None, None, None):
+        return
+    if options.run_dir is None and options.resume is None:
+        raise BadArgumentsError("sweep: several processes need --run-dir, one folder that all of them see")
+    from csac_jax.train import cluster
+
+    with as_bad_arguments(ValueError):
+        cluster.join(cluster.Place(*place))
+
+
+def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
+    with as_bad_arguments(ValueError):
+        combinations = grid.settings(options.vary)
+    found = [(one, _parse(preset, [*flags, *one.flags])[1]) for one in combinations]
+    from csac_jax.train import sweep as sweeping
+
+    each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg)) for one, cfg in found]
+    for setting in each:
+        guards.check_physics(setting.cfg)
+    plan = sweeping.Plan(options.seeds, each)
+    with as_bad_arguments(ValueError, sweeping.SweepError):
+        sweeping.check(plan)
+    return plan
+
+
+def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:
+    from csac_jax.train import sweep as sweeping
+
+    if preset or options.vary or options.run_dir or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
+        raise BadArgumentsError("sweep --resume: a sweep goes on with its own settings; leave all others out")
+    with as_failure(sweeping.SweepError):
+        return sweeping.read_plan(folder)
+
+
+def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) -> Any:
+    from rich.console import Console
+
+    from csac_jax.show.progress import Terminal
+    from csac_jax.train import cache, checkpoint, cluster, loop, members, mesh, sweep as sweeping
+
+    cache.enable()
+    with as_bad_arguments(ValueError):
+        line = mesh.make(options.devices)
+        for one in plan.settings:
+            mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
+        sweeping.check_memory(plan, 1 if line is None or options.shard == "scenes" else line.size)
+    trunks = {one.cfg.net: stored.weights(one.cfg) for one in plan.settings}
+
+    def engine(group: members.Group) -> sweeping.Engine:
+        return members.engine(group, line, options.shard, trunks[group.configs[0].net])
+
+    with (
+        Terminal(Console(quiet=not cluster.is_first())) as terminal,
+        as_failure(sweeping.SweepError, loop.TrainingError, checkpoint.CheckpointError),
+    ):
+        terminal.say(f"sweep {folder}")
+        try:
+            result = sweeping.run(plan, folder, engine, terminal, stop, resume=options.resume is not None)
+        except FileExistsError:
+            raise guards.exists(folder) from None
+        for one in result.summary["settings"]:
+            terminal.say(f"{one['name']}: {_seeds_line(one['grasp_success'])}")
+    return result
+
+
+def _seeds_line(success: dict[str, Any]) -> str:
+    if not success["n"]:
+        return "no seed is done"
+    interval = f" (95 % interval {output.interval(success)})" if success["low"] is not None else ""
+    return f"grasp success {output.percent(success['value'])}{interval}, interquartile mean of {success['n']} seeds"
