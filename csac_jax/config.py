@@ -514,6 +514,8 @@ class LearnConfig:
     """B, transitions per update (N of Algorithm 1)."""
     updates: int = 2
     """Updates of the critic per training step, that is, per `train.scenes` actions; the actor has one per step."""
+    actor_batch: int = 0
+    """Transitions of the last of them that the actor's update is made on; 0: all."""
     augment: bool = True
     """Show each drawn transition under a random symmetry of the square."""
     augment_shift: int = 0
@@ -545,6 +547,7 @@ class LearnConfig:
         _require(self.actor_learning_rate > 0.0, "learn.actor_learning_rate: must be positive")
         _require(0.0 < self.rate_end <= 1.0, "learn.rate_end: must lie in 0 < rate_end <= 1")
         _require(self.batch >= 1 and self.updates >= 1, "learn.batch and learn.updates: at least 1")
+        _require(0 <= self.actor_batch <= self.batch, "learn.actor_batch: must lie in 0 .. learn.batch")
         _require(self.critics in (1, 2), "learn.critics: must be 1 or 2")
         _require(0.0 < self.tau <= 1.0, "learn.tau: must lie in 0 < tau <= 1")
         _require(self.copy_every >= 1, "learn.copy_every: at least 1 update")

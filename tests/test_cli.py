@@ -81,6 +81,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --algo=", "unknown algorithm ''"),
         ("train quick --algo", "Missing value for argument '--algo'"),
         ("train quick --algo grasp_only --explore.push-fraction 0.2", "explore.push_fraction: must be 0 where"),
+        ("train quick --learn.actor-batch 33", "learn.actor_batch: must lie in 0 .. learn.batch"),
         ("train quick --learn.critics 3", "learn.critics: must be 1 or 2"),
         ("train quick --learn.loss mse", "invalid choice 'mse' for argument '--learn.loss'"),
         ("train quick --cem.elites 65", "cem.elites: must lie in 2 .. cem.candidates"),
@@ -436,6 +437,20 @@ def test_doctor_shows_memory(capsys: pytest.CaptureFixture, monkeypatch: pytest.
     cells, obs = 32 * 32, 2
     transition = cells * obs * (3 + 2 + 1) + 4 + 12 + 4 + 1 + 4  # packed maps, action, reward, end, priority
     assert result["memory"]["bytes"]["replay"] == 128 * transition + 8  # head and size
+
+
+@pytest.mark.parametrize(("found", "said"), [(True, "second library"), (False, "default library")])
+def test_doctor_names_the_library(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, found: bool, said: str
+):
+    """Claim: `doctor` says by which of XLA's libraries training computes convolutions."""
+    from csac_jax.train import compiler, selftest
+
+    monkeypatch.setattr(selftest, "CHECKS", ())
+    monkeypatch.setattr(compiler, "has_library", lambda: found)
+    assert cli.main(["doctor", "--json", "doctor.json"]) == 0
+    assert f"training   convolutions by XLA's {said}" in capsys.readouterr().out
+    assert json.loads((tmp_path / "doctor.json").read_text())["second_library"] is found
 
 
 @pytest.mark.parametrize("error", [1.0, float("nan")])

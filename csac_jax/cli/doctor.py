@@ -84,7 +84,7 @@ def _print_memory(cfg: Config) -> dict[str, Any]:
 def _print_machine() -> dict[str, Any]:
     """Prints versions, devices and the protections in force; returns these for the JSON."""
     from csac_jax import _guard
-    from csac_jax.train import provenance
+    from csac_jax.train import compiler, provenance
 
     record = provenance.record()
     print(f"device     {record['device']}")
@@ -96,8 +96,10 @@ def _print_machine() -> dict[str, Any]:
     verdict = "enough for batched MJX" if guarded else remedy
     print(f"XLA flags  {os.environ.get('XLA_FLAGS') or 'none'}")
     print(f"threads    {threads} in JAX's pool on the CPU, by {variable}: {verdict}")
+    fast = compiler.has_library()
+    print(f"training   convolutions by XLA's {'second library' if fast else 'default library'}")
     pool = {"variable": variable, "threads": threads, "guarded": guarded}
-    return {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", "")}
+    return {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", ""), "second_library": fast}
 
 
 @contextlib.contextmanager

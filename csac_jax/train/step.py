@@ -20,6 +20,7 @@ from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.train import compiler
 from csac_jax.train.mesh import ALONE, Spread
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
@@ -89,7 +90,8 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     after = program.spread.scenes(jax.vmap(env.step))(scenes, action)
 
     # Reward and remember (lines 14-15).
-    phi_before, phi_after = (_best_grasps(learner, state.learner, obs) for obs in (scenes.obs, after.obs))
+    pushed = action.primitive == Primitive.PUSH
+    phi_before, phi_after = _around(learner, state.learner, scenes.obs, after.obs, pushed)
     info = after.info
     changed = info.moved > environment.CHANGE_AREA
     reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))(
@@ -114,7 +116,6 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     fresh = jax.vmap(env.restart)(_keys(key_reset, cfg.train.scenes), after)
     scenes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
-    pushed = action.primitive == Primitive.PUSH
     metrics = StepMetrics(
         primitive=action.primitive,
         outcome=info.outcome,
@@ -137,7 +138,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 def _learn(
     program: Program, key: jax.Array, state: LearnerState, replay: ReplayState
 ) -> tuple[LearnerState, jax.Array, dict[str, jax.Array]]:
-    """The critic's updates, each on a batch drawn anew, then one of the actor on the last batch."""
+    """The critic's updates, each on a batch drawn anew, then one of the actor on the last batch, or a part of it."""
     cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
 
@@ -156,7 +157,7 @@ def _learn(
 
     numbers = jnp.arange(cfg.learn.updates)
     (state, priority), (info, observations) = jax.lax.scan(update, (state, replay.priority), numbers)
-    last = heightmap.unpack(jax.tree.map(lambda leaf: leaf[-1], observations))
+    last = heightmap.unpack(jax.tree.map(lambda leaf: leaf[-1, : cfg.learn.actor_batch or None], observations))
     state, actor_loss = learning.update_actor(learner, state, last)
     losses = {
         "critic_loss": jnp.mean(info.critic_loss),
@@ -170,6 +171,21 @@ def _learn(
 def _best_grasps(learner: Learner, state: LearnerState, obs: Observation) -> jax.Array:
     """phi_g of E states [E] by the target critic, eq. 16."""
     return jax.vmap(learning.best_grasp)(learning.look(learner, state.target, obs))
+
+
+def _around(
+    learner: Learner, state: LearnerState, before: Observation, after: Observation, pushed: jax.Array
+) -> jax.Array:
+    """phi_g before and after the action [2, E]; zeros if no scene was `pushed` [E] bool, since grasps need none.
+
+    With seeds side by side the branch turns into a selection: both sides run.
+    """
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, after)
+
+    def look() -> jax.Array:
+        return jax.lax.map(lambda obs: _best_grasps(learner, state, obs), views)
+
+    return jax.lax.cond(jnp.any(pushed), look, lambda: jnp.zeros((2, *pushed.shape)))
 
 
 def _keys(key: jax.Array, num: int) -> jax.Array:
@@ -228,4 +244,4 @@ def compile_chunk(program: Program, num_steps: int):
     def chunk(state: TrainState) -> tuple[TrainState, StepMetrics]:
         return jax.lax.scan(lambda carry, _: train_step(program, carry), state, length=num_steps)
 
-    return jax.jit(chunk, donate_argnums=0)
+    return jax.jit(chunk, donate_argnums=0, compiler_options=compiler.options(program.cfg))

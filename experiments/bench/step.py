@@ -12,6 +12,7 @@ transitions in the ring; contact caps grow with the blocks. On an accelerator, `
 import argparse
 import contextlib
 import dataclasses
+import functools
 import json
 import resource
 import tempfile
@@ -31,7 +32,8 @@ from csac_jax.config import Config
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
 from csac_jax.sim.mjx_physics import MjxPhysics
-from csac_jax.train import auto, cache, provenance, step
+from csac_jax.sim.primitives import Primitive
+from csac_jax.train import auto, cache, compiler, provenance, step
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
 from experiments.bench._options import Parser
@@ -85,7 +87,8 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     keys = step._keys(jax.random.key(1), num)
     span = learner.bounds[1] - learner.bounds[0]
 
-    look = jax.jit(lambda params, obs: learning.look(learner, params, obs))
+    jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
+    look = jit(lambda params, obs: learning.look(learner, params, obs))
     maps = look(state.learner.online, scenes.obs)
     choose = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
     act = jax.jit(lambda keys, maps: choose(keys, cfg, learner.frames, maps, span, scenes.idle, jnp.int32(0)))
@@ -93,9 +96,10 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     simulate = jax.jit(jax.vmap(env.step))
     after = simulate(scenes, action)
 
-    @jax.jit
+    @jit
     def reward(nets: Any, before: Any, after: Any) -> jax.Array:
-        phi = [step._best_grasps(learner, nets, obs) for obs in (before.obs, after.obs)]
+        pushed = action.primitive == Primitive.PUSH
+        phi = step._around(learner, nets, before.obs, after.obs, pushed)
         changed = after.info.moved > environment.CHANGE_AREA
         of_one = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))
         return of_one(cfg.reward, action.primitive, after.info.outcome, after.info.distance, *phi, changed)
@@ -113,7 +117,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         replay = write(replay, scenes, after)
         return replay.head
 
-    learn = jax.jit(lambda key, nets, replay: step._learn(program, key, nets, replay))
+    learn = jit(lambda key, nets, replay: step._learn(program, key, nets, replay))
 
     @jax.jit
     def replace(keys: jax.Array, after: Any) -> Any:

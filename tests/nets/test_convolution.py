@@ -17,9 +17,9 @@ SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first four
 ]
 
 
-def _drawn(rows: int, cols: int, size: int) -> tuple[jax.Array, jax.Array]:
-    rng = np.random.default_rng(0)
-    return (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((2, rows, cols, 3), (size, size, 3, 5)))
+def _drawn(rows: int, cols: int, size: int, inputs: int = 3, outputs: int = 5) -> tuple[jax.Array, jax.Array]:
+    rng, shapes = np.random.default_rng(0), ((2, rows, cols, inputs), (size, size, inputs, outputs))
+    return (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
 
 
 def _numpy(maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int) -> np.ndarray:
@@ -54,10 +54,11 @@ def test_forward_is_numpys(setting):
     np.testing.assert_allclose(conv2d(maps, kernel, *setting[3:]), _numpy(maps, kernel, *setting[3:]), atol=2e-5)
 
 
+@pytest.mark.parametrize("channels", [(3, 5), (5, 3)])
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_gradients_are_jaxs(setting):
+def test_gradients_are_jaxs(setting, channels):
     """Claim: the gradients in maps and kernel are those that JAX derives from its own convolution, also inside scan."""
-    maps, kernel = _drawn(*setting[:3])
+    maps, kernel = _drawn(*setting[:3], *channels)
 
     def loss(conv):
         return lambda maps, kernel: jnp.sum(jnp.sin(conv(maps, kernel, *setting[3:])))

@@ -1,6 +1,7 @@
 """The compiled training step, with the smallest preset."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
 from csac_jax.train import checkpoint, step
 from csac_jax.train.step import Program, StepMetrics, TrainState
+from csac_jax.vision.heightmap import Observation
 
 pytestmark = pytest.mark.mjx
 
@@ -303,3 +305,51 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     expected = np.full(64, 7.0)
     expected[: 2 * num : 2] = np.sqrt(np.abs(error) + 0.25) if sampler == "prioritised" else np.abs(error)
     np.testing.assert_allclose(priority, expected, rtol=1e-6)
+
+
+def _opinions() -> tuple[learning.Learner, learning.LearnerState]:
+    """A learner and networks whose critic values every cell differently."""
+    learner = learning.make(CFG)
+    rng = np.random.default_rng(0)
+    blank = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+    state = jax.jit(lambda: learning.init(jax.random.key(0), learner))()
+    noise = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), blank.online)
+    return learner, state.replace(online=noise, target=noise)
+
+
+def _pictures(count: int, seed: int) -> Observation:
+    rng, size = np.random.default_rng(seed), CFG.heightmap.size
+    height = np.where(rng.random((count, size, size)) < 0.2, 0.05, 0.0).astype(np.float32)
+    colour = rng.random((count, size, size, 3)).astype(np.float32)
+    return Observation(colour=jnp.asarray(colour), height=jnp.asarray(height), target=jnp.asarray(height > 0.0))
+
+
+def test_only_pushes_ask_for_the_best_grasps():
+    """Claim: phi_g before and after an action is the target critic's as soon as one scene was pushed, else 0."""
+    learner, state = _opinions()
+    before, after = _pictures(2, seed=1), _pictures(2, seed=2)
+    around = jax.jit(lambda pushed: step._around(learner, state, before, after, pushed))
+    one = jax.jit(lambda obs: step._best_grasps(learner, state, obs))
+    wanted = np.stack([one(before), one(after)])
+    assert np.all(np.abs(wanted) > 1e-3)
+    np.testing.assert_allclose(around(jnp.array([False, True])), wanted, rtol=1e-4, atol=1e-5)
+    assert not np.any(around(jnp.array([False, False])))
+
+
+def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the actor's update takes `learn.actor_batch` of the batch's transitions, all if that is 0."""
+    nothing: Any = None
+    taken = []
+
+    def update(learner, state, obs):
+        taken.append(obs.height.shape[0])
+        return state, jnp.zeros(())
+
+    monkeypatch.setattr(learning, "update_actor", update)
+    for actor_batch in (0, 3):
+        cfg = dataclasses.replace(CFG, learn=dataclasses.replace(CFG.learn, actor_batch=actor_batch))
+        program = Program(cfg, nothing, learning.make(cfg))
+        state = jax.eval_shape(lambda program=program: learning.init(jax.random.key(0), program.learner))
+        replay = jax.eval_shape(lambda: ring.init(CFG.replay, step.example(CFG)))
+        jax.eval_shape(functools.partial(step._learn, program), jax.random.key(0), state, replay)
+    assert taken == [CFG.learn.batch, 3]

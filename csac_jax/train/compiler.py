@@ -1,0 +1,43 @@
+"""What XLA is asked for when a training program is compiled for a CPU.
+
+XLA has a second library for convolutions there, which is about twice as fast as Eigen at those of the small net. It is
+no default, and versions of jaxlib differ in it, so it is asked for only where it is seen to compute right.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax import _guard
+from csac_jax.config import Config
+from csac_jax.nets.convolution import conv2d
+
+LIBRARY = {_guard.FUSION_FLAG.lstrip("-"): "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"}
+_BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float32 gives some 1e-5
+
+
+def options(cfg: Config) -> dict[str, str] | None:
+    """Options of `jax.jit` for the config's training program; None if there is nothing to ask for.
+
+    Only with the small net: the library is slow at kernel gradients, which `conv2d` keeps away from it.
+    """
+    return dict(LIBRARY) if cfg.net.kind == "small" and has_library() else None
+
+
+@functools.cache
+def has_library() -> bool:
+    """Whether the back end is a CPU, its XLA knows the library, and a small convolution by it is right."""
+    if jax.default_backend() != "cpu":
+        return False
+    rng = np.random.default_rng(0)
+    maps, kernel = (rng.normal(size=shape).astype(np.float32) for shape in ((1, 8, 8, 40), (3, 3, 40, 24)))
+    try:
+        program = jax.jit(lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1), compiler_options=LIBRARY)
+        got = np.asarray(program(jnp.asarray(maps), jnp.asarray(kernel)))
+    except jax.errors.JaxRuntimeError:
+        return False
+    padded = np.pad(maps.astype(np.float64), ((0, 0), (1, 1), (1, 1), (0, 0)))
+    wanted = sum(padded[:, i : i + 8, j : j + 8] @ kernel[i, j] for i in range(3) for j in range(3))
+    return bool(np.max(np.abs(got - wanted)) < _BOUND)
