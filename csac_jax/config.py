@@ -547,7 +547,7 @@ class LearnConfig:
         _require(self.actor_learning_rate > 0.0, "learn.actor_learning_rate: must be positive")
         _require(0.0 < self.rate_end <= 1.0, "learn.rate_end: must lie in 0 < rate_end <= 1")
         _require(self.batch >= 1 and self.updates >= 1, "learn.batch and learn.updates: at least 1")
-        _require(0 <= self.actor_batch <= self.batch, "learn.actor_batch: must lie in 0 .. learn.batch")
+        _require(self.actor_batch >= 0, "learn.actor_batch: must not be negative")
         _require(self.critics in (1, 2), "learn.critics: must be 1 or 2")
         _require(0.0 < self.tau <= 1.0, "learn.tau: must lie in 0 < tau <= 1")
         _require(self.copy_every >= 1, "learn.copy_every: at least 1 update")
@@ -652,6 +652,7 @@ class Config:
             self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0,
             "explore.push_fraction: must be 0 where policy.primitive is grasp, which never pushes",
         )
+        _require(self.learn.actor_batch <= self.learn.batch, "learn.actor_batch: must not exceed learn.batch")
         _require(
             self.learn.batch <= self.train.warmup,
             f"learn.batch: {self.learn.batch} transitions cannot be drawn after train.warmup = {self.train.warmup}; "

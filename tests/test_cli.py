@@ -81,7 +81,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --algo=", "unknown algorithm ''"),
         ("train quick --algo", "Missing value for argument '--algo'"),
         ("train quick --algo grasp_only --explore.push-fraction 0.2", "explore.push_fraction: must be 0 where"),
-        ("train quick --learn.actor-batch 33", "learn.actor_batch: must lie in 0 .. learn.batch"),
+        ("train quick --learn.actor-batch 33", "learn.actor_batch: must not exceed learn.batch"),
         ("train quick --learn.critics 3", "learn.critics: must be 1 or 2"),
         ("train quick --learn.loss mse", "invalid choice 'mse' for argument '--learn.loss'"),
         ("train quick --cem.elites 65", "cem.elites: must lie in 2 .. cem.candidates"),

@@ -98,6 +98,7 @@ def _config(settings: dict) -> Config:
         ("explore.noise_clip", [0.0]),
         ("learn.learning_rate", [0.0]),
         ("learn.actor_learning_rate", [0.0]),
+        ("learn.actor_batch", [-1]),
         ("learn.rate_end", [0.0, 1.1]),
         ("learn.augment_shift", [-1, 65]),
         ("learn.augment_turn", [-0.1, 3.2]),

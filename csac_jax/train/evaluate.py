@@ -177,7 +177,7 @@ def _endings(cfg: Config, states: State) -> np.ndarray:
 
 
 class _Record(NamedTuple):
-    """What one action did in every scene, each [E]; see `Episodes`."""
+    """What one action did in every scene, each [E], 0 where the episode was over; see `Episodes`."""
 
     valid: jax.Array
     primitive: jax.Array
@@ -204,11 +204,12 @@ def _step(env: Env, act: Policy, keys: jax.Array, params: Params, states: State)
         valid=going,
         primitive=action.primitive,
         outcome=info.outcome,
-        cleared=jnp.where(going, after.reward.astype(jnp.int32) if one else info.cleared, 0),
+        cleared=after.reward.astype(jnp.int32) if one else info.cleared,
         changed=info.moved > CHANGE_AREA,
-        wrong=going & (info.cleared > 0) & (after.reward == 0.0) if one else jnp.zeros_like(going),
-        left=jnp.where(going, lost if one else info.left, 0),
+        wrong=(info.cleared > 0) & (after.reward == 0.0) if one else jnp.zeros_like(going),
+        left=lost if one else info.left,
     )
+    record = jax.tree.map(lambda leaf: jnp.where(going, leaf, jnp.zeros_like(leaf)), record)
     keep = jax.vmap(jnp.where)
     return jax.tree.map(lambda new, old: keep(going, new, old), after, states), record
 

