@@ -40,10 +40,15 @@ def switch_off_broken_fusion() -> None:
 
 
 def widen_thread_pool() -> None:
-    """Sets the pool's size to at least `MIN_THREADS`, unless the user has chosen one."""
+    """Sets the pool's size to at least `needed_threads`, unless the user has chosen one."""
     if not any(name in os.environ for name in USER_VARIABLES):
-        counts = re.findall(rf"{DEVICES_FLAG}=(\d+)", os.environ.get("XLA_FLAGS", "")) or ["1"]
-        os.environ[POOL_VARIABLE] = str(max(MIN_THREADS, os.cpu_count() or 1, DEVICE_THREADS * int(counts[-1])))
+        os.environ[POOL_VARIABLE] = str(max(needed_threads(), os.cpu_count() or 1))
+
+
+def needed_threads() -> int:
+    """Threads in the pool without which batched MJX may hang, by the virtual devices that XLA is told to make."""
+    counts = re.findall(rf"{DEVICES_FLAG}=(\d+)", os.environ.get("XLA_FLAGS", "")) or ["1"]
+    return max(MIN_THREADS, DEVICE_THREADS * int(counts[-1]))
 
 
 def pool_setting() -> tuple[str, int]:

@@ -106,6 +106,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
         ("bench step fast --physics warp --curve scenes --smallest 8192 --largest 8192", "train.scenes: at most 4096"),
         ("bench memory huge", "bench memory: give names of: smoke, 64 scenes, "),
+        (f"bench memory --record {__file__}", f"bench memory: {__file__} is no record of it"),
         ("doctor --preset", "doctor: give a preset after --preset, one of: smoke, quick"),
         ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
         ("doctor --preset quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),

@@ -91,8 +91,8 @@ def _print_machine() -> dict[str, Any]:
     print("versions   " + ", ".join(f"{name} {version}" for name, version in provenance.versions().items()))
     print(f"commit     {record['commit'] or 'none'}")
     variable, threads = _guard.pool_setting()
-    guarded = threads >= _guard.MIN_THREADS
-    remedy = f"batched MJX may hang; set {_guard.POOL_VARIABLE}={_guard.MIN_THREADS}"
+    guarded = threads >= _guard.needed_threads()
+    remedy = f"batched MJX may hang; set {_guard.POOL_VARIABLE}={_guard.needed_threads()}"
     verdict = "enough for batched MJX" if guarded else remedy
     print(f"XLA flags  {os.environ.get('XLA_FLAGS') or 'none'}")
     print(f"threads    {threads} in JAX's pool on the CPU, by {variable}: {verdict}")

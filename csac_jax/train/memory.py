@@ -70,6 +70,7 @@ def stages(cfg: Config, fitted_only: bool = False) -> dict[str, int]:
     actor = passes * (_ACTOR[0] * critics * features + _ACTOR[1] * cfg.net.head + _ACTOR[2])
     if not cfg.learn.actor or cfg.net.kind != "small":  # DenseNet-121's features are 1/32 as wide: next to nothing
         actor = 0.0
+    actor *= (cfg.learn.actor_batch or cfg.learn.batch) / cfg.learn.batch
     if cfg.learn.updates == 1:  # no loop in between: the actor's update shares time with the critic's
         actor += value
     return {
@@ -80,11 +81,10 @@ def stages(cfg: Config, fitted_only: bool = False) -> dict[str, int]:
 
 
 def _pass_unit(cfg: Config) -> float:
-    """Bytes of one channel of a pass: the small net's maps; DenseNet-121's input in the type that it computes in."""
+    """Bytes of one channel of a pass, in the type that it computes in: the small net's maps, DenseNet-121's input."""
     side = round(cfg.heightmap.size * (1.0 + cfg.net.margin) / 2.0) * 2
-    if cfg.net.kind == "small":
-        return jnp.dtype(dense.compute_dtype(cfg.net)).itemsize * (side // dense.STRIDE) ** 2
-    return jnp.dtype(dense.compute_dtype(cfg.net)).itemsize * (side * cfg.net.zoom) ** 2
+    cells = side // dense.STRIDE if cfg.net.kind == "small" else side * cfg.net.zoom
+    return jnp.dtype(dense.compute_dtype(cfg.net)).itemsize * cells**2
 
 
 def _pass_channels(cfg: Config) -> tuple[float, float]:

@@ -141,13 +141,21 @@ def main(arguments: list[str]) -> None:
     if not known.keys() >= set(options.names):
         raise BadArgumentsError(f"bench memory: give names of: {', '.join(known)}; or none, for ten small configs")
     path = options.record
-    rows = json.loads(path.read_text())["configs"] if path and path.exists() else {}
+    rows = _recorded(path) if path and path.exists() else {}
     for name in options.names or CONFIGS:
         rows[name] = judged(known[name], rows[name] if name in rows else _measured(known[name]))
         print(f"{name}: predicted / measured {rows[name]['predicted_over_measured']:.3f}", file=sys.stderr, flush=True)
         if path:
             path.write_text(_text(rows))
     print(_text(rows), end="")
+
+
+def _recorded(path: Path) -> dict[str, Any]:
+    """The rows that a file written with --record holds."""
+    try:
+        return json.loads(path.read_text())["configs"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise BadArgumentsError(f"bench memory: {path} is no record of it; give another --record") from None
 
 
 def _text(rows: dict[str, Any]) -> str:

@@ -185,11 +185,18 @@ def test_seeds_differ(run):
 
 
 def test_scenes_and_steps_differ(run):
-    """Claim: every scene and every step has randomness of its own: hardly two actions of a run are alike, and those are
-    random cells, of which there are some hundred in a scene."""
-    poses = np.asarray(run.states[-1].replay.items.action.pose)[: int(run.states[-1].replay.size)]
-    assert len(poses) > NUM_SEEN
-    assert len(np.unique(poses, axis=0)) >= len(poses) - 2
+    """Claim: every scene and every step has randomness of its own: alike scenes, looked at by one and the same network,
+    are acted on in different ways, and at each step in others."""
+    state = run.states[1]
+    alike = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), state.scenes)
+    first = int(state.replay.size)  # where the next actions are stored
+
+    def poses(number: int) -> np.ndarray:
+        after, _ = run.chunk(copy(state.replace(scenes=alike, step=jnp.int32(number))))
+        return np.asarray(after.replay.items.action.pose)[first : first + CFG.train.scenes]
+
+    acted = np.concatenate([poses(number) for number in range(T, T + 4)])
+    assert len(np.unique(acted, axis=0)) == len(acted) == 4 * CFG.train.scenes
 
 
 def test_nothing_is_learned_before_the_warm_up(run):
