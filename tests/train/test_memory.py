@@ -41,6 +41,9 @@ def test_state_is_exact():
     [
         _smoke(train={"scenes": 8}),
         _smoke(train={"scenes": 16}, heightmap={"size": 64}, net={"growth": 12, "rotations": 8}),
+        _smoke(
+            train={"scenes": 16}, heightmap={"size": 64}, net={"growth": 12, "stem": 16, "stride": 4, "subcells": 2}
+        ),
     ],
 )
 def test_looking_takes_what_is_predicted(cfg: Config):
