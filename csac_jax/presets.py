@@ -37,7 +37,7 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, 256 scenes side by side, for one GPU."""
+    """Ten blocks of all eight shapes, 1,024 scenes side by side, for one GPU."""
     return Config(
         preset="fast",
         scene=SceneConfig(
@@ -48,10 +48,10 @@ def fast() -> Config:
         task=TaskConfig(max_actions=25),
         sim=SimConfig(geom_pairs=24, contacts=80),
         target=TargetConfig(gamma=0.2),
-        explore=ExploreConfig(decay=0.9998),
-        learn=LearnConfig(batch=256, updates=16),
-        replay=ReplayConfig(capacity=16384, beta_end=(1.0, 4.0)),
-        train=TrainConfig(scenes=256, actions=30720, warmup=1024, chunk=4, save_every=10),
+        explore=ExploreConfig(decay=0.9999),
+        learn=LearnConfig(batch=256, updates=32),
+        replay=ReplayConfig(capacity=65536, beta_end=(1.0, 4.0)),
+        train=TrainConfig(scenes=1024, actions=122880, warmup=4096, chunk=2, save_every=20),
     )
 
 

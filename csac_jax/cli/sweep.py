@@ -136,6 +136,7 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
     with as_bad_arguments(ValueError):
         line = mesh.make(options.devices)
         for one in plan.settings:
+            guards.check_host_physics(one.cfg, line)
             mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
         sweeping.check_memory(plan, 1 if line is None or options.shard == "scenes" else line.size)
     trunks = {one.cfg.net: stored.weights(one.cfg) for one in plan.settings}

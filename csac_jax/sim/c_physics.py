@@ -26,6 +26,7 @@ from csac_jax.sim.robot import Drive
 
 _AT_ONCE = 256  # scenes whose films are kept at a time, some 70 MB with ten blocks
 
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class CPhysics:
     """A world in C MuJoCo, built for it, with the solver's effort of the config."""
@@ -62,7 +63,7 @@ def _blank(num: int) -> Trace:
 def _run_batch(world: World, closed_at: int, scene: Scene, fields: BlockFields, drive: Drive) -> Any:
     """Every scene of a batch, leaves [..., N, ...]; same axes come back. NumPy throughout: JAX must not run here."""
     axes = np.shape(drive.reachable)
-    rows = jax.tree.map(lambda leaf: np.reshape(leaf, (-1, *np.shape(leaf)[len(axes) :])), (scene, fields, drive))
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[len(axes) :]), (scene, fields, drive))
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(len(rows[2].reachable))]
     done = [_unmoved(one) for one, _, _ in each]
     moving = [i for i, (one, _, its) in enumerate(each) if _moves(one, its)]
