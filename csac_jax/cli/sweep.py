@@ -111,6 +111,7 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg)) for one, cfg in found]
     for setting in each:
         guards.check_physics(setting.cfg)
+        guards.check_host_physics(setting.cfg, options.devices)
     plan = sweeping.Plan(options.seeds, each)
     with as_bad_arguments(ValueError, sweeping.SweepError):
         sweeping.check(plan)
@@ -136,7 +137,6 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
     with as_bad_arguments(ValueError):
         line = mesh.make(options.devices)
         for one in plan.settings:
-            guards.check_host_physics(one.cfg, line)
             mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
         sweeping.check_memory(plan, 1 if line is None or options.shard == "scenes" else line.size)
     trunks = {one.cfg.net: stored.weights(one.cfg) for one in plan.settings}
