@@ -279,8 +279,8 @@ class NetConfig:
     """The network over turned maps: a small dense net, or DenseNet-121 (CSAC sec. 3.4), both fully convolutional."""
 
     kind: Literal["small", "densenet121"] = "small"
-    """`small`: densely connected, group norm, at half the map's resolution. `densenet121`: a trunk each for colour,
-    height and target mask, at 1/32 of the resolution of its input."""
+    """`small`: densely connected, group norm, at 1/`stride` of the map's resolution. `densenet121`: a trunk each
+    for colour, height and target mask, at 1/32 of the resolution of its input."""
     rotations: int = 16
     """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
     colour: bool = True
@@ -295,8 +295,11 @@ class NetConfig:
     """small: dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
     stem: int = 16
     """small: channels of the first convolution."""
+    stride: int = 2
+    """small: cells of its input per cell of its features, along each axis: 2, or 4 with a quarter of the work."""
     subcells: int = 1
-    """small: cells of the maps per cell of its features, along each axis: 1 or 2 (the height map's resolution)."""
+    """small: cells of the maps per cell of its features, along each axis: 1, 2 or 4, up to `stride`, which gives the
+    height map's resolution."""
     norm: Literal["group", "batch"] = "group"
     """densenet121: `batch`, as in the paper, or `group`, which is the same while acting and while learning."""
     block_layers: tuple[int, int, int, int] = (6, 12, 24, 16)
@@ -320,7 +323,8 @@ class NetConfig:
         _require(min(self.growth, self.stem, self.head) >= 4, "net.growth, stem, head: at least 4 channels")
         _require(len(self.dilations) >= 1 and min(self.dilations) >= 1, "net.dilations: at least one layer, each >= 1")
         _require(0.0 <= self.margin <= 0.5, "net.margin: must lie in 0 .. 0.5")
-        _require(self.subcells in (1, 2), "net.subcells: must be 1 or 2")
+        _require(self.stride in (2, 4), "net.stride: must be 2 or 4")
+        _require(self.subcells in (1, 2, self.stride), f"net.subcells: must divide net.stride, {self.stride}")
         _require(min(self.block_layers) >= 1, "net.block_layers: at least one layer in each block")
         _require(
             self.block_growth >= 4 and self.block_growth % 4 == 0, "net.block_growth: must be a multiple of 4 channels"

@@ -1,4 +1,4 @@
-"""The small dense net: densely connected convolutions with group norm, at half the resolution of its input.
+"""The small dense net: densely connected convolutions with group norm, at 1/`net.stride` of its input's resolution.
 
 Its maps may be finer: the last 1 x 1 convolution then gives `net.subcells`^2 values per cell of the features, laid out
 beside each other (Shi et al., arXiv:1609.05158), at next to no cost.
@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from csac_jax.config import NetConfig
 from csac_jax.nets.convolution import conv2d
 
-STRIDE = 2  # cells of the input per cell of the features, along each axis
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 TABLE_HEIGHT = 0.002  # m: what is lower is bare table
 _HEIGHT_SCALE = 0.05  # m, a block's height: brings heights near 1
@@ -65,14 +64,14 @@ class Convolution(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Dense features of turned maps: [B, C, C, I] -> [B, C / 2, C / 2, stem + layers * growth]."""
+    """Dense features of turned maps: [B, C, C, I] -> [B, C / stride, C / stride, stem + layers * growth]."""
 
     cfg: NetConfig
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
-        cfg, dtype = self.cfg, compute_dtype(self.cfg)
-        features = Convolution(cfg.stem, size=4, stride=STRIDE, padding=1, dtype=dtype)(maps)
+        cfg, stride, dtype = self.cfg, self.cfg.stride, compute_dtype(self.cfg)
+        features = Convolution(cfg.stem, 2 * stride, stride=stride, padding=stride // 2, dtype=dtype)(maps)
         features = nn.relu(GroupNorm(dtype)(features))
         for dilation in cfg.dilations:
             new = Convolution(cfg.growth, size=3, dilation=dilation, padding=dilation, dtype=dtype)(features)
@@ -136,7 +135,7 @@ class Critic(nn.Module):
         self.head = Head(self.cfg)
 
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, s C / 2, s C / 2, OUTPUTS], features [B, C / 2, C / 2, F]."""
+        """[B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s = subcells."""
         del train  # group norm is the same in both
         features = self.trunk(maps)
         return self.head(features), features

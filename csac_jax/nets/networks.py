@@ -30,7 +30,7 @@ def head(cfg: NetConfig) -> Head:
 
 def stride(cfg: NetConfig) -> int:
     """Cells of the net's input per cell of its maps, along each axis."""
-    return dense.STRIDE // cfg.subcells if cfg.kind == "small" else cfg.output_stride
+    return cfg.stride // cfg.subcells if cfg.kind == "small" else cfg.output_stride
 
 
 def inputs(cfg: NetConfig, colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:

@@ -83,7 +83,7 @@ def stages(cfg: Config, fitted_only: bool = False) -> dict[str, int]:
 def _pass_unit(cfg: Config) -> float:
     """Bytes of one channel of a pass, in the type that it computes in: the small net's maps, DenseNet-121's input."""
     side = round(cfg.heightmap.size * (1.0 + cfg.net.margin) / 2.0) * 2
-    cells = side // dense.STRIDE if cfg.net.kind == "small" else side * cfg.net.zoom
+    cells = side // cfg.net.stride if cfg.net.kind == "small" else side * cfg.net.zoom
     return jnp.dtype(dense.compute_dtype(cfg.net)).itemsize * cells**2
 
 

@@ -7,8 +7,9 @@ import pytest
 
 from csac_jax.nets.convolution import conv2d
 
-SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first four are the net's
+SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first five are the net's
     (12, 16, 4, 2, 1, 1),
+    (12, 16, 8, 4, 1, 2),
     (9, 8, 3, 1, 1, 1),
     (9, 8, 3, 1, 2, 2),
     (9, 12, 3, 1, 4, 4),

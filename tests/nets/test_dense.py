@@ -16,7 +16,7 @@ CHANNELS = 4
 GROUP = 8  # channels per group
 
 
-FINE = dataclasses.replace(CFG, subcells=2)
+COARSE = dataclasses.replace(CFG, stride=4, growth=4)
 
 
 @pytest.fixture(scope="module")
@@ -56,24 +56,28 @@ def _norm(maps: np.ndarray, weights: dict) -> np.ndarray:
     return np.maximum(normal * weights["scale"] + weights["bias"], 0.0)
 
 
-def _numpy_net(params: dict, maps: np.ndarray) -> np.ndarray:
-    """The critic's maps, in float64."""
+def _numpy_net(params: dict, maps: np.ndarray, cfg: NetConfig = CFG) -> np.ndarray:
+    """The critic's values of each cell of the features, in float64: kernels twice the stride wide lie half of it over
+    the edge."""
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params["params"])
     trunk, head = weights["trunk"], weights["head"]
-    features = _norm(_convolve(maps, trunk["Convolution_0"]["kernel"], 2, 1, 1), trunk["GroupNorm_0"])
-    for layer, dilation in enumerate(CFG.dilations, start=1):
+    stem = trunk["Convolution_0"]["kernel"]
+    assert stem.shape[0] == 2 * cfg.stride
+    features = _norm(_convolve(maps, stem, cfg.stride, 1, cfg.stride // 2), trunk["GroupNorm_0"])
+    for layer, dilation in enumerate(cfg.dilations, start=1):
         new = _convolve(features, trunk[f"Convolution_{layer}"]["kernel"], 1, dilation, dilation)
         features = np.concatenate([features, _norm(new, trunk[f"GroupNorm_{layer}"])], axis=-1)
     hidden = np.maximum(features @ head["Dense_0"]["kernel"] + head["Dense_0"]["bias"], 0.0)
     return hidden @ head["Dense_1"]["kernel"] + head["Dense_1"]["bias"]
 
 
-def test_net_is_numpys(params):
-    """Claim: densely connected, group norm over the whole map, half the resolution, three maps."""
-    maps = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS))
-    got = _apply(params, maps)
-    assert got.shape == (2, 8, 12, dense.OUTPUTS)
-    np.testing.assert_allclose(got, _numpy_net(params, maps), rtol=1e-3, atol=1e-4)
+@pytest.mark.parametrize("cfg", [CFG, COARSE])
+def test_net_is_numpys(cfg: NetConfig):
+    """Claim: densely connected, group norm over the whole map, 1/stride of the resolution, three maps."""
+    maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
+    got = _apply(params, maps, cfg)
+    assert got.shape == (2, 16 // cfg.stride, 24 // cfg.stride, dense.OUTPUTS)
+    np.testing.assert_allclose(got, _numpy_net(params, maps, cfg), rtol=1e-3, atol=1e-4)
 
 
 def test_half_precision_is_near(params):
@@ -109,16 +113,18 @@ def test_maps_follow_the_picture(params):
     assert np.abs(before - after)[inner, inner].max() > 0.1  # it is not the same everywhere
 
 
-def test_finer_maps_lie_where_their_cells_do():
-    """Claim: with two maps' cells per cell of the features, cell (2 r + i, 2 c + j) of output o is value (i, j, o) of
-    the features' cell (r, c), and the maps have the resolution of what the net sees."""
-    maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(FINE)
-    got, values = _apply(params, maps, FINE), _numpy_net(params, maps)  # values [2, 8, 12, 4 OUTPUTS]
-    assert got.shape == (2, 16, 24, dense.OUTPUTS)
-    for i in range(2):
-        for j in range(2):
+@pytest.mark.parametrize(("stride", "finer"), [(2, 2), (4, 2), (4, 4)])
+def test_finer_maps_lie_where_their_cells_do(stride: int, finer: int):
+    """Claim: with s maps' cells per cell of the features, cell (s r + i, s c + j) of output o is value (i, j, o) of the
+    features' cell (r, c); with s = stride the maps have the resolution of what the net sees."""
+    cfg = dataclasses.replace(COARSE, stride=stride, subcells=finer)
+    maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
+    got, values = _apply(params, maps, cfg), _numpy_net(params, maps, cfg)  # values [2, h, w, s s OUTPUTS]
+    assert got.shape == (2, 16 * finer // stride, 24 * finer // stride, dense.OUTPUTS)
+    for i in range(finer):
+        for j in range(finer):
             for output in range(dense.OUTPUTS):
-                cells, channel = got[:, i::2, j::2, output], (2 * i + j) * dense.OUTPUTS + output
+                cells, channel = got[:, i::finer, j::finer, output], (finer * i + j) * dense.OUTPUTS + output
                 np.testing.assert_allclose(cells, values[..., channel], rtol=1e-3, atol=1e-4)
 
 

@@ -42,8 +42,12 @@ def _config(size: int = 224, **net: Any) -> Config:
         (224, {"weights": "x.safetensors"}, "net.weights: need --net.norm batch"),
         (64, {"kind": "small", "margin": 0.125, "norm": "batch"}, "net.norm batch, net.weights: only of"),
         (64, {"kind": "small", "margin": 0.125, "weights": "x"}, "net.norm batch, net.weights: only of"),
-        (64, {"kind": "small", "subcells": 3}, "net.subcells: must be 1 or 2"),
+        (64, {"kind": "small", "stride": 3}, "net.stride: must be 2 or 4"),
+        (64, {"kind": "small", "subcells": 3}, "net.subcells: must divide net.stride, 2"),
+        (64, {"kind": "small", "subcells": 4}, "net.subcells: must divide net.stride, 2"),
+        (64, {"kind": "small", "stride": 4, "subcells": 3}, "net.subcells: must divide net.stride, 4"),
         (64, {"kind": "small", "margin": 0.22}, "net.margin: rotated maps of 78 cells are not a multiple of 4"),
+        (64, {"kind": "small", "margin": 0.22, "stride": 4}, "net.margin: rotated maps of 78 cells are not a multiple"),
     ],
 )
 def test_config_that_no_net_can_have(size: int, net: dict[str, Any], message: str):
@@ -64,6 +68,16 @@ def test_suggested_margins_do():
                 margin, side = word.split(" (")
                 frames = maps.frames(_config(size, margin=float(margin), zoom=zoom))
                 assert frames.tables.canvas == int(side.removesuffix(" cells)"))
+
+
+@pytest.mark.parametrize(("stride", "finer", "cells"), [(2, 1, 2), (2, 2, 1), (4, 1, 4), (4, 2, 2), (4, 4, 1)])
+def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
+    """Claim: a cell of the small net's maps is stride / subcells cells of its input, in frames as in what it gives."""
+    cfg = _config(64, kind="small", margin=0.125, stride=stride, subcells=finer, dilations=(1,), growth=4)
+    frames, net = maps.frames(cfg), networks.critic(cfg.net)
+    (q, _), _ = jax.eval_shape(net.init_with_output, jax.random.key(0), jnp.zeros((1, 72, 72, 4)))
+    assert (frames.stride, frames.side, frames.cell) == (cells, 72 // cells, pytest.approx(0.007 * cells))
+    assert q.shape == (1, frames.side, frames.side, dense.OUTPUTS)
 
 
 @pytest.mark.parametrize("colour", [True, False])

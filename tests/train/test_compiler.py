@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.nets import dense
 from csac_jax.nets.convolution import conv2d
 from csac_jax.train import compiler
 
@@ -24,9 +23,9 @@ def forgotten():
 def _convolutions(cfg) -> list[tuple[int, ...]]:
     """Side of the maps, channels in and out, kernel, stride, dilation, padding of each in the small net."""
     side = round(cfg.heightmap.size * (1.0 + cfg.net.margin))
-    layers = enumerate(cfg.net.dilations)
-    stem = (side, 4, cfg.net.stem, 4, dense.STRIDE, 1, 1)
-    return [stem, *((side // 2, cfg.net.stem + i * cfg.net.growth, cfg.net.growth, 3, 1, d, d) for i, d in layers)]
+    net, layers = cfg.net, enumerate(cfg.net.dilations)
+    stem = (side, 4, net.stem, 2 * net.stride, net.stride, 1, net.stride // 2)
+    return [stem, *((side // net.stride, net.stem + i * net.growth, net.growth, 3, 1, d, d) for i, d in layers)]
 
 
 @pytest.mark.parametrize("setting", _convolutions(presets.quick()))

@@ -32,7 +32,7 @@ def test_state_is_exact():
     small = dataclasses.replace(quick.replay, capacity=64)
     stored = sum(leaf.nbytes for leaf in jax.tree.leaves(ring.init(small, step.example(quick))))
     assert predicted["replay"] == (stored - 8) * quick.replay.capacity // 64 + 8  # head and size are no slots
-    parameters, counters = 49_891 + 3_715, 5  # of critic and actor; two in each optimiser, one of updates
+    parameters, counters = 70_524 + 6_780, 5  # of critic and actor; two in each optimiser, one of updates
     assert predicted["networks"] == 4 * (4 * parameters + counters)  # online, target and Adam's two moments
 
 
@@ -41,6 +41,9 @@ def test_state_is_exact():
     [
         _smoke(train={"scenes": 8}),
         _smoke(train={"scenes": 16}, heightmap={"size": 64}, net={"growth": 12, "rotations": 8}),
+        _smoke(
+            train={"scenes": 16}, heightmap={"size": 64}, net={"growth": 12, "stem": 16, "stride": 4, "subcells": 2}
+        ),
     ],
 )
 def test_looking_takes_what_is_predicted(cfg: Config):
