@@ -39,21 +39,24 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, 256 scenes side by side, for one GPU."""
+    """Ten blocks of all eight shapes, half of the scenes packed arrangements, 1,024 scenes side by side, for one GPU."""
     return Config(
         preset="fast",
         scene=SceneConfig(
             slots=("box", "box", "arch", "prism", "box", "cylinder", "half_cylinder", "box", "box", "box"),
             min_blocks=10,
             pool=4096,
+            arranged=0.5,
+            drop_extent=(0.1, 0.25),
         ),
         task=TaskConfig(max_actions=25),
         sim=SimConfig(geom_pairs=24, contacts=80),
+        net=NetConfig(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         target=TargetConfig(gamma=0.2),
-        explore=ExploreConfig(decay=0.9998),
-        learn=LearnConfig(batch=256, updates=16),
-        replay=ReplayConfig(capacity=16384, beta_end=(1.0, 4.0)),
-        train=TrainConfig(scenes=256, actions=30720, warmup=1024, chunk=4, save_every=10),
+        explore=ExploreConfig(decay=0.9999),
+        learn=LearnConfig(batch=256, updates=32),
+        replay=ReplayConfig(capacity=65536, beta_end=(1.0, 4.0)),
+        train=TrainConfig(scenes=1024, actions=122880, warmup=4096, chunk=2, save_every=20),
     )
 
 
@@ -98,7 +101,7 @@ def paper_small() -> Config:
         preset="paper_small",
         scene=dataclasses.replace(whole.scene, mesh_spread=0.0),
         heightmap=HeightmapConfig(),
-        net=NetConfig(),
+        net=NetConfig(stride=4, subcells=2, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         explore=ExploreConfig(),
         learn=LearnConfig(batch=32, updates=4),
         train=dataclasses.replace(whole.train, warmup=32),

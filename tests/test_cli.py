@@ -94,7 +94,6 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval shipped --suite nowhere", "--suite: 'nowhere' is neither a case file nor one of: own, random10"),
         ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
         ("doctor --fix", "Unrecognized options: --fix"),
-        ("train smoke --sim.physics c", "--sim.physics: training is one compiled program, which c is no part of"),
         ("train smoke --sim.physics warp", "scene.mesh_spread: must be 0 where sim.physics is warp"),
         ("train smoke --sim.physics warp --scene.mesh-spread 0", "--sim.physics: warp computes on CUDA"),
         ("bench", "bench: unknown benchmark ''; choose one of: "),

@@ -42,7 +42,6 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("", "sweep: give a preset first, one of: smoke, quick"),
         ("smoke --seeds 0", "--seeds: at least 1"),
         ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
-        ("smoke --sim.physics c", "--sim.physics: training is one compiled program, which c is no part of"),
         (
             "smoke --net.kind densenet121 --net.norm batch --net.margin 0 --net.weights none.safetensors",
             "net.weights: none.safetensors cannot be read as .safetensors",
@@ -54,6 +53,7 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
         ("smoke --vary learn.tau=0.1,0.10", "--vary: two settings have the same values"),
         ("smoke --devices 4096", "--devices: 4096 asked for, there are "),
+        ("smoke --sim.physics c --devices 2", "--sim.physics: c computes on the host's cores, for one device"),
         ("smoke --seeds 100000", "lower --seeds or --replay.capacity, vary fewer numbers"),
         ("smoke --cluster", "several processes need --run-dir"),
         ("smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2", "--process-id: must lie in 0 .. 1"),

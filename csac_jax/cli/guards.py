@@ -31,11 +31,15 @@ def exists(folder: Path) -> BadArgumentsError:
 
 
 def check_physics(cfg: Config) -> None:
-    """Physics that training cannot do, here or at all."""
-    if cfg.sim.physics == "c":
-        raise BadArgumentsError("--sim.physics: training is one compiled program, which c is no part of; eval takes it")
+    """Physics that training cannot do here."""
     if cfg.sim.physics == "warp":
         import jax
 
         if jax.default_backend() != "gpu":
             raise BadArgumentsError("--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx")
+
+
+def check_host_physics(cfg: Config, devices: int | None) -> None:
+    """C physics serves one device, the default of `devices`."""
+    if cfg.sim.physics == "c" and devices not in (None, 1):
+        raise BadArgumentsError("--sim.physics: c computes on the host's cores, for one device; leave out --devices")

@@ -111,6 +111,7 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg)) for one, cfg in found]
     for setting in each:
         guards.check_physics(setting.cfg)
+        guards.check_host_physics(setting.cfg, options.devices)
     plan = sweeping.Plan(options.seeds, each)
     with as_bad_arguments(ValueError, sweeping.SweepError):
         sweeping.check(plan)

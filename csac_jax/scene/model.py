@@ -68,7 +68,7 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
         _add_parts(spec, body, kind)
-    if sim.physics == "warp":
+    if sim.physics != "mjx":  # which looks its contacts up
         _add_touch_sensors(spec, len(scene.slots))
     spec.option.timestep = sim.timestep
     spec.option.iterations = sim.iterations
@@ -269,10 +269,11 @@ def _scale_of_meshes(world: World, scale: jax.Array) -> jax.Array:
     return jnp.stack([scale[world.parts.slot[user[0]]] if user.size else one for user in users] or [one])
 
 
-def with_blocks(world: World, fields: BlockFields) -> mujoco.MjModel:
+def with_blocks(world: World, fields: BlockFields, scratch: mujoco.MjData | None = None) -> mujoco.MjModel:
     """A copy of the world's model whose blocks have these fields (NumPy arrays).
 
-    MuJoCo derives the rest: C takes the mass matrix of a free body from `dof_M0`, not from its mass.
+    MuJoCo derives the rest: C takes the mass matrix of a free body from `dof_M0`, not from its mass. What it needs room
+    for is written into `scratch`, if there is any: making room takes longer than the rest.
     """
     model = copy.copy(world.model)
     model.geom_size[world.block_geoms], model.geom_rbound[world.block_geoms] = fields.size, fields.rbound
@@ -283,7 +284,7 @@ def with_blocks(world: World, fields: BlockFields) -> mujoco.MjModel:
     for mesh, scale in zip(range(model.nmesh), fields.mesh_scale, strict=False):
         start = model.mesh_vertadr[mesh]
         model.mesh_vert[start : start + model.mesh_vertnum[mesh]] *= scale
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    mujoco.mj_setConst(model, scratch or mujoco.MjData(model))
     return model
 
 

@@ -1,12 +1,12 @@
-"""Primitives in C MuJoCo: the reference, scene by scene in threads on the host.
+"""Primitives in C MuJoCo: the reference, a scene per core of the host at a time.
 
 It runs behind a callback, so that the same environment, compiled, can be asked to use it. Contacts are all examined
 here: MJX keeps a fixed number of them.
 """
 
-import concurrent.futures
 import dataclasses
 import functools
+import os
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -14,19 +14,22 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco import rollout
 
 from csac_jax.config import SimConfig
 from csac_jax.scene import layout, model
 from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import BlockFields, World
+from csac_jax.scene.model import HAND_GEOMS, BlockFields, World
 from csac_jax.sim import outcome
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.robot import Drive
 
+_AT_ONCE = 256  # scenes whose films are kept at a time, some 70 MB with ten blocks
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CPhysics:
-    """A world in C MuJoCo, with the solver's effort of the config."""
+    """A world in C MuJoCo, built for it, with the solver's effort of the config."""
 
     world: World
     cfg: SimConfig
@@ -58,56 +61,104 @@ def _blank(num: int) -> Trace:
 
 
 def _run_batch(world: World, closed_at: int, scene: Scene, fields: BlockFields, drive: Drive) -> Any:
-    """Every scene of a batch, leaves [..., N, ...], in a thread of its own; same axes come back."""
+    """Every scene of a batch, leaves [..., N, ...]; same axes come back. NumPy throughout: JAX must not run here."""
     axes = np.shape(drive.reachable)
-    rows = jax.tree.map(lambda leaf: np.reshape(leaf, (-1, *np.shape(leaf)[len(axes) :])), (scene, fields, drive))
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[len(axes) :]), (scene, fields, drive))
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(len(rows[2].reachable))]
-    with concurrent.futures.ThreadPoolExecutor() as threads:
-        done = list(threads.map(lambda row: _run(world, closed_at, *row), each))
+    done = [_unmoved(one) for one, _, _ in each]
+    moving = [i for i, (one, _, its) in enumerate(each) if _moves(one, its)]
+    for first in range(0, len(moving), _AT_ONCE):
+        chosen = moving[first : first + _AT_ONCE]
+        for i, seen in zip(chosen, _films(world, [each[i] for i in chosen]), strict=True):
+            done[i] = _judge(world, closed_at, each[i][0], seen)
     return jax.tree.map(lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *done)
 
 
-def _run(world: World, closed_at: int, scene: Scene, fields: BlockFields, drive: Drive) -> tuple[Any, Any, Trace]:
-    """Poses [N, 7], velocities [N, 6] and trace of one scene; NumPy throughout, as JAX must not run in a callback."""
-    pose = np.concatenate([scene.position, scene.quaternion], axis=1)
-    if not (np.isfinite(pose).all() and np.isfinite(scene.velocity).all()):  # MuJoCo would start anew from scratch
-        return pose, scene.velocity, _blank(len(pose))
-    if not (drive.reachable and scene.in_play.any()):  # nothing moves, and nobody looks at the gap
-        return pose, scene.velocity, _blank(len(pose))
-    row_of_geom, touched = np.full(world.model.ngeom, -1), False
-    row_of_geom[world.hand_geoms] = np.arange(len(world.hand_geoms))
-    held, held_rise, gap_closed = np.zeros(len(pose), bool), np.zeros(len(pose), np.float32), np.float32(0.0)
-    heights, finger = world.block_qpos[:, 2], world.robot_qpos[-2]
-    for index, data in enumerate(_substeps(world, model.with_blocks(world, fields), scene, drive)):
-        touching = _touching(world, row_of_geom, data)
-        held = touching[1] & touching[2]
-        rise = (data.qpos[heights] - pose[:, 2]).astype(np.float32)
-        touched = touched or bool(touching.any())
-        if held.any():
-            held_rise = np.where(held, np.maximum(held_rise, rise), held_rise)
-        if index == closed_at:
-            gap_closed = np.float32(2.0 * data.qpos[finger])
+def _moves(scene: Scene, drive: Drive) -> bool:
+    """Whether there is anything to simulate: a block, a way to go, and no NaN, at which MuJoCo would start anew."""
+    state = (scene.position, scene.quaternion, scene.velocity)
+    return bool(drive.reachable and scene.in_play.any() and all(np.isfinite(leaf).all() for leaf in state))
+
+
+def _unmoved(scene: Scene) -> tuple[Any, Any, Trace]:
+    """Poses [N, 7], velocities [N, 6] and trace of a scene in which nothing moves; nobody looks at the gap."""
+    return np.concatenate([scene.position, scene.quaternion], axis=1), scene.velocity, _blank(len(scene.in_play))
+
+
+class Film(NamedTuple):
+    """What a drive goes through, substep by substep; no substep where the robot cannot follow. T = substeps."""
+
+    qpos: np.ndarray  # [T, nq] m and rad, MuJoCo's order
+    qvel: np.ndarray  # [T, nv] m/s and rad/s
+    sensed: np.ndarray  # [T, sensors], at the beginning of the substep
+
+
+def _judge(world: World, closed_at: int, scene: Scene, film: Film) -> tuple[Any, Any, Trace]:
+    """Poses [N, 7], velocities [N, 6] and trace of what a film shows."""
+    touching = film.sensed.reshape(len(film.sensed), len(HAND_GEOMS), len(world.slots)) > 0.0
+    held = touching[:, 1] & touching[:, 2]  # [T, N]
+    rise = (film.qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2]).astype(np.float32)  # [T, N]
+    gap = (2.0 * film.qpos[:, world.robot_qpos[-2]]).astype(np.float32)
     leaves: dict[str, Any] = {
-        "touched": np.asarray(touched),
-        "held_rise": held_rise,
-        "held": held,
-        "rise": rise,
-        "gap_closed": gap_closed,
-        "gap_end": np.float32(2.0 * data.qpos[finger]),
+        "touched": touching.any(),
+        "held_rise": np.where(held, rise, np.float32(0.0)).max(axis=0, initial=0.0),
+        "held": held[-1],
+        "rise": np.where(scene.in_play, rise[-1], np.float32(0.0)),
+        "gap_closed": gap[closed_at],
+        "gap_end": gap[-1],
         "saturated": np.zeros((), np.int32),
     }
-    end = data.qpos[world.block_qpos].astype(np.float32), data.qvel[world.block_dofs].astype(np.float32)
-    return *end, Trace(**leaves)
+    pose, velocity = film.qpos[-1][world.block_qpos], film.qvel[-1][world.block_dofs]
+    return pose.astype(np.float32), velocity.astype(np.float32), Trace(**leaves)
+
+
+def _films(world: World, rows: list[tuple[Scene, BlockFields, Drive]]) -> list[Film]:
+    """The films of scenes that move, on all cores.
+
+    MuJoCo's own loop cannot slow blocks down: a scene in which one is faster than the limit is done once more, by ours.
+    """
+    scratch, models, starts = mujoco.MjData(world.model), [], []
+    for scene, fields, drive in rows:
+        exact = model.with_blocks(world, fields, scratch)
+        parked = np.isin(world.slot_of_geom, np.flatnonzero(~scene.in_play))
+        exact.geom_contype[parked] = exact.geom_conaffinity[parked] = 0  # they fall and meet nothing
+        models.append(_lasting(exact))
+        starts.append(np.concatenate([[0.0], *_start(world, scene, drive)]))  # time, positions, velocities
+    threads = min(len(os.sched_getaffinity(0)), len(rows))
+    spaces = [scratch, *(mujoco.MjData(world.model) for _ in range(threads - 1))]
+    with rollout.Rollout(nthread=threads) as pool:
+        states, sensed = pool.rollout(models, spaces, np.stack(starts), np.stack([drive.control for *_, drive in rows]))
+    films = []
+    for (scene, fields, drive), state, sensors in zip(rows, states, sensed, strict=True):
+        qpos, qvel = np.split(state[:, 1:], [world.model.nq], axis=1)
+        fastest = np.abs(qvel[:, world.block_dofs[scene.in_play]]).max(axis=(0, 1))
+        within = (fastest <= layout.SPEED_LIMIT).all()
+        films.append(Film(qpos, qvel, sensors) if within else film(world, fields, scene, drive))
+    return films
+
+
+def _lasting(exact: mujoco.MjModel) -> mujoco.MjModel:
+    """The model, its state never begun anew after a warning."""
+    exact.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return exact
+
+
+def _start(world: World, scene: Scene, drive: Drive) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities, MuJoCo's order, of the scene's blocks and the robot at the drive's start."""
+    data = np.array(world.model.qpos0), np.zeros(world.model.nv)
+    qpos, qvel = data
+    qpos[world.robot_qpos] = drive.start
+    qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    qvel[world.block_dofs] = scene.velocity
+    return qpos, qvel
 
 
 def _substeps(world: World, exact: mujoco.MjModel, scene: Scene, drive: Drive) -> Iterator[mujoco.MjData]:
     """The state after every substep, one and the same object; NumPy throughout."""
-    exact.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    data, parked = mujoco.MjData(exact), np.flatnonzero(~scene.in_play)
-    pose = np.concatenate([scene.position, scene.quaternion], axis=1)
-    data.qpos[world.robot_qpos] = drive.start
-    data.qpos[world.block_qpos], data.qvel[world.block_dofs] = pose, scene.velocity
-    places, still, waiting = world.block_qpos[parked], world.block_dofs[parked], pose[parked]
+    data, parked = mujoco.MjData(_lasting(exact)), np.flatnonzero(~scene.in_play)
+    data.qpos[:], data.qvel[:] = _start(world, scene, drive)
+    places, still = world.block_qpos[parked], world.block_dofs[parked]
+    waiting = data.qpos[places]
     fastest = np.full(exact.nv, np.inf)
     fastest[world.block_dofs] = layout.SPEED_LIMIT
     for control in drive.control:
@@ -120,35 +171,10 @@ def _substeps(world: World, exact: mujoco.MjModel, scene: Scene, drive: Drive) -
         yield data
 
 
-class Film(NamedTuple):
-    """What `run` goes through, substep by substep; no substep where the robot cannot follow. T = substeps."""
-
-    qpos: np.ndarray  # [T, nq] m and rad, MuJoCo's order
-    qvel: np.ndarray  # [T, nv] m/s and rad/s
-
-
 def film(world: World, fields: BlockFields, scene: Scene, drive: Drive) -> Film:
     """Every state of one drive of one scene; NumPy throughout."""
     exact = model.with_blocks(world, fields)
     steps = _substeps(world, exact, scene, drive) if drive.reachable else ()
-    states = [(data.qpos.copy(), data.qvel.copy()) for data in steps]
-    return (
-        Film(*(np.stack(column) for column in zip(*states, strict=True)))
-        if states
-        else Film(np.zeros((0, exact.nq)), np.zeros((0, exact.nv)))
-    )
-
-
-def _touching(world: World, row_of_geom: np.ndarray, data: mujoco.MjData) -> np.ndarray:
-    """Which hand geom touches which block, [3, N] bool; `row_of_geom` [geoms], -1 where it is none of the hand's."""
-    touching = np.zeros((len(world.hand_geoms), len(world.slots)), bool)
-    pairs = data.contact.geom  # [C, 2]
-    row = row_of_geom[pairs]
-    near = np.flatnonzero((row >= 0).any(axis=1))
-    if near.size:
-        near = near[data.contact.dist[near] < 0.0]
-        row, slot = row[near], world.slot_of_geom[pairs[near]]
-        for hand, other in ((0, 1), (1, 0)):
-            met = (row[:, hand] >= 0) & (slot[:, other] >= 0)
-            touching[row[met, hand], slot[met, other]] = True
-    return touching
+    states = [(data.qpos.copy(), data.qvel.copy(), data.sensordata.copy()) for data in steps]
+    sizes = exact.nq, exact.nv, exact.nsensordata
+    return Film(*(map(np.stack, zip(*states, strict=True)) if states else (np.zeros((0, size)) for size in sizes)))

@@ -58,7 +58,7 @@ def record(bench: Bench, count: int) -> list[State]:
     for i in range(count):
         scene, field, drive = jax.tree.map(lambda leaf, i=i: leaf[i], (scenes, fields, drives))
         film, at = c_physics.film(world, field, scene, drive), int(rng.integers(cfg.sim.substeps - 1))
-        qpos, qvel = (leaf[at].astype(np.float32) for leaf in film)
+        qpos, qvel = (leaf[at].astype(np.float32) for leaf in (film.qpos, film.qvel))
         states.append(State(scene, qpos, qvel, drive.control[at + 1]))
     return states
 

@@ -55,10 +55,15 @@ def test_forward_is_numpys(setting):
     np.testing.assert_allclose(conv2d(maps, kernel, *setting[3:]), _numpy(maps, kernel, *setting[3:]), atol=2e-5)
 
 
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
 @pytest.mark.parametrize("channels", [(3, 5), (5, 3)])
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_gradients_are_jaxs(setting, channels):
-    """Claim: the gradients in maps and kernel are those that JAX derives from its own convolution, also inside scan."""
+def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the gradients in maps and kernel are those that JAX derives from its own convolution, also inside scan.
+
+    In the form for a CPU and in that for a GPU, both computed here.
+    """
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     maps, kernel = _drawn(*setting[:3], *channels)
 
     def loss(conv):

@@ -127,6 +127,11 @@ def world() -> model.World:
 
 
 @pytest.fixture(scope="session")
+def c_world() -> model.World:
+    return model.build(CONFIG.scene, dataclasses.replace(CONFIG.sim, physics="c"))
+
+
+@pytest.fixture(scope="session")
 def executed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """CASES and SETTLED grasps in MJX: the one compilation that the tests of this folder share."""
     with pytest.MonkeyPatch.context() as patch:
@@ -141,9 +146,9 @@ def grasped(executed: Run) -> Run:
 
 
 @pytest.fixture(scope="session")
-def grasped_in_c(world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]:
+def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]:
     """The settled scenes' grasps in C MuJoCo, by the same plans: ends [E, N, 3] m and traces."""
-    engine = c_physics.CPhysics(world, CONFIG.sim)
+    engine = c_physics.CPhysics(c_world, CONFIG.sim)
     run = jax.jit(jax.vmap(lambda scene, plan: engine.run(scene, robot.drive("hand", plan))))
     after, trace = jax.tree.map(np.asarray, run(grasped.scene, grasped.plan))
     return after.position, trace

@@ -1,8 +1,6 @@
 """C MuJoCo as the reference: what is filmed of it is what it does."""
 
 import dataclasses
-from types import SimpleNamespace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,76 +16,103 @@ pytestmark = pytest.mark.mjx
 
 
 @pytest.fixture(scope="module")
-def pushed(world: model.World) -> tuple:
+def pushed(c_world: model.World) -> tuple:
     """A scene of a cube in the way of a push, and the drive of that push."""
     cfg = conftest.CONFIG
     scene = conftest.place(cube=(0.06, 0.0, 0.0))
     action = jax.tree.map(jnp.asarray, conftest.push(0.0, 0.0))
     plan = primitives.plan(cfg.sim, cfg.heightmap, jnp.zeros((cfg.heightmap.size,) * 2), action)
-    fields = jax.device_get(model.scene_fields(world, scene))
+    fields = jax.device_get(model.scene_fields(c_world, scene))
     return scene, fields, jax.device_get(robot.drive("hand", plan))
 
 
-def test_film_goes_the_way_of_the_run(world: model.World, pushed: tuple):
+def test_film_goes_the_way_of_the_run(c_world: model.World, pushed: tuple):
     """Claim: a film has every substep, and its last is where a run leaves the blocks, bit for bit."""
     scene, fields, drive = pushed
-    film = c_physics.film(world, fields, scene, drive)
-    after, trace = jax.jit(c_physics.CPhysics(world, conftest.CONFIG.sim).run)(scene, drive)
-    assert film.qpos.shape == (len(drive.control), world.model.nq)
-    np.testing.assert_array_equal(film.qpos[-1][world.block_qpos[:, :3]].astype(np.float32)[0], after.position[0])
-    moved = film.qpos[:, world.block_qpos[0, 0]]
+    film = c_physics.film(c_world, fields, scene, drive)
+    after, trace = jax.jit(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run)(scene, drive)
+    assert film.qpos.shape == (len(drive.control), c_world.model.nq)
+    np.testing.assert_array_equal(film.qpos[-1][c_world.block_qpos[:, :3]].astype(np.float32)[0], after.position[0])
+    moved = film.qpos[:, c_world.block_qpos[0, 0]]
     assert trace.touched
     assert moved[0] < 0.061 < moved[-1] - 0.04
     assert (np.diff(moved) > -1e-4).all()  # never back
 
 
-def test_film_of_what_the_robot_cannot_follow_is_empty(world: model.World, pushed: tuple):
+def test_film_of_what_the_robot_cannot_follow_is_empty(c_world: model.World, pushed: tuple):
     """Claim: where the robot cannot follow, nothing moves: the film has no substep."""
     scene, fields, drive = pushed
     still: Drive = dataclasses.replace(drive, reachable=np.array(False))
-    film = c_physics.film(world, fields, scene, still)
-    assert (film.qpos.shape, film.qvel.shape) == ((0, world.model.nq), (0, world.model.nv))
+    film = c_physics.film(c_world, fields, scene, still)
+    assert (film.qpos.shape, film.qvel.shape) == ((0, c_world.model.nq), (0, c_world.model.nv))
 
 
-def test_touches_are_those_of_every_contact(world: model.World, pushed: tuple):
+def test_touches_are_those_of_every_contact(c_world: model.World, pushed: tuple):
     """Claim: a hand geom touches a block where any contact of the two is deeper than 0, in either order."""
     scene, fields, drive = pushed
-    exact = model.with_blocks(world, fields)
-    row_of_geom = np.full(world.model.ngeom, -1)
-    row_of_geom[world.hand_geoms] = np.arange(3)
-    seen = 0
-    for data in c_physics._substeps(world, exact, scene, drive):
-        wanted = np.zeros((3, len(world.slots)), bool)
+    exact, seen = model.with_blocks(c_world, fields), 0
+    for data in c_physics._substeps(c_world, exact, scene, drive):
+        wanted = np.zeros((3, len(c_world.slots)), bool)
         for i in range(data.ncon):
             contact = data.contact[i]
             for hand, other in (contact.geom, contact.geom[::-1]):
-                if hand in world.hand_geoms and world.slot_of_geom[other] >= 0 and contact.dist < 0.0:
-                    wanted[list(world.hand_geoms).index(hand), world.slot_of_geom[other]] = True
-        np.testing.assert_array_equal(c_physics._touching(world, row_of_geom, data), wanted)
+                if hand in c_world.hand_geoms and c_world.slot_of_geom[other] >= 0 and contact.dist < 0.0:
+                    wanted[list(c_world.hand_geoms).index(hand), c_world.slot_of_geom[other]] = True
+        np.testing.assert_array_equal(data.sensordata.reshape(wanted.shape) > 0.0, wanted)
         seen += wanted.any()
     assert seen > 20
 
 
-def test_touches_by_hand(world: model.World):
-    """Claim: contacts count in either order, not those that are only near, nor those of hand and table or of blocks."""
-    row_of_geom = np.full(world.model.ngeom, -1)
-    row_of_geom[world.hand_geoms] = np.arange(3)
-    (palm, low, high), block, table = world.hand_geoms, world.block_geoms, world.model.geom("table").id
-    pairs = [[palm, block[0]], [block[1], low], [high, block[2]], [low, table], [block[0], block[1]]]
-    contact = SimpleNamespace(geom=np.array(pairs), dist=np.array([-1e-3, -1e-4, 1e-4, -1e-3, -1e-3]))
-    wanted = np.zeros((3, len(world.slots)), bool)
-    wanted[0, world.slot_of_geom[block[0]]] = wanted[1, world.slot_of_geom[block[1]]] = True
-    data: Any = SimpleNamespace(contact=contact)
-    np.testing.assert_array_equal(c_physics._touching(world, row_of_geom, data), wanted)
+def test_trace_by_hand(c_world: model.World, pushed: tuple):
+    """Claim: held is what both pads touch, its rise the highest while they do; parked blocks, which fall, rise by 0."""
+    scene, _, _ = pushed
+    steps, num = 4, len(c_world.slots)
+    qpos = np.zeros((steps, c_world.model.nq))
+    qpos[:, c_world.block_qpos[:, 2]] = scene.position[:, 2] - 1.0
+    qpos[:, c_world.block_qpos[0, 2]] = scene.position[0, 2] + [0.0, 0.02, 0.03, 0.01]
+    qpos[:, c_world.robot_qpos[-2]] = [0.05, 0.04, 0.03, 0.02]
+    sensed = np.zeros((steps, 3, num))
+    sensed[1:3, 1, 0], sensed[0:2, 2, 0] = 2.0, 1.0  # both pads in step 1 alone
+    film = c_physics.Film(qpos, np.zeros((steps, c_world.model.nv)), sensed.reshape(steps, -1))
+    _, _, trace = c_physics._judge(c_world, 1, scene, film)
+    assert trace.touched
+    assert not trace.held.any()
+    np.testing.assert_allclose(trace.held_rise[0], 0.02, atol=1e-6)
+    np.testing.assert_allclose(trace.rise[0], 0.01, atol=1e-6)
+    np.testing.assert_array_equal(trace.held_rise[1:], 0.0)
+    np.testing.assert_array_equal(trace.rise[1:], 0.0)
+    np.testing.assert_allclose([trace.gap_closed, trace.gap_end], [0.08, 0.04], atol=1e-6)
 
 
-def test_nothing_to_move(world: model.World, pushed: tuple):
+def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
+    """Claim: in a batch each scene ends as its own film does, one that spins too fast too; the ill stay as they are."""
+    scene, _, drive = pushed
+    large = dataclasses.replace(scene, half_size=1.1 * np.asarray(scene.half_size))
+    spun = dataclasses.replace(scene, velocity=np.array(scene.velocity))
+    spun.velocity[0, 3:] = [0.0, 0.0, 250.0]
+    ill = dataclasses.replace(scene, position=np.where(np.arange(3) == 2, np.nan, scene.position).astype(np.float32))
+    scenes = jax.tree.map(lambda *leaves: np.stack(leaves), scene, large, spun, ill, scene)
+    drives = jax.tree.map(lambda leaf: np.stack([leaf] * 5), drive)
+    after, _ = jax.jit(jax.vmap(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run))(scenes, drives)
+    ends = []
+    for i, one in enumerate((scene, large, spun, ill, scene)):
+        film = c_physics.film(c_world, jax.device_get(model.scene_fields(c_world, one)), one, drive)
+        end = film.qpos[-1][c_world.block_qpos[0]].astype(np.float32)
+        ends.append(np.concatenate([after.position[i, 0], after.quaternion[i, 0]]))
+        if one is not ill:
+            np.testing.assert_array_equal(ends[i], end)
+    assert len({tuple(end) for end in ends}) == 4
+    np.testing.assert_array_equal(after.position[3, 0], ill.position[0])
+
+
+def test_nothing_to_move(c_world: model.World, pushed: tuple):
     """Claim: an empty table and a drive that the robot cannot follow leave the scene as it is, with a blank trace."""
     scene, fields, drive = pushed
-    cleared = dataclasses.replace(scene, in_play=np.zeros(len(world.slots), bool))
+    cleared = dataclasses.replace(scene, in_play=np.zeros(len(c_world.slots), bool))
     still = dataclasses.replace(drive, reachable=np.array(False))
     for its, his in ((cleared, drive), (scene, still)):
-        pose, velocity, trace = c_physics._run(world, 109, its, fields, his)
+        one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (its, fields, his))
+        pose, velocity, trace = jax.tree.map(lambda leaf: leaf[0], c_physics._run_batch(c_world, 109, *one))
         np.testing.assert_array_equal(pose, np.concatenate([scene.position, scene.quaternion], axis=1))
         np.testing.assert_array_equal(velocity, scene.velocity)
         assert not trace.touched
