@@ -26,7 +26,7 @@ FLOAT = 4  # bytes
 
 # Fitted, in channels of the size of the net's maps: F of its features, S the sum of F over its layers, h of its head.
 _LOOK = (2.0, 1.0)  # per pass: 2 F + 1, both the maps before and after a layer
-_VALUE = (0.914, 45.5)  # per pass whose gradient is taken: 0.914 S + 45.5
+_VALUE = (0.914, 45.5)  # per pass whose gradient is taken: 0.914 S + 45.5 (stride / 2)^2, maps of its input's size
 _ACTOR = (1.5, 3.28, 18.9)  # per pass of the actor's update: 1.5 F + 3.28 h + 18.9
 _VIEW = 22  # fitted, per scene while it is cast into a view: maps of the size of the height map
 
@@ -66,7 +66,8 @@ def stages(cfg: Config, fitted_only: bool = False) -> dict[str, int]:
     if fitted_only and cfg.net.kind != "small":
         saved = 0.0
     look = passes * (_LOOK[0] * critics * features + _LOOK[1])
-    value = 2 * (_VALUE[0] * critics * saved + _VALUE[1] * 0.5 * (1 + critics))
+    seen = (cfg.net.stride / 2) ** 2 if cfg.net.kind == "small" else 1.0
+    value = 2 * (_VALUE[0] * critics * saved + _VALUE[1] * seen * 0.5 * (1 + critics))
     actor = passes * (_ACTOR[0] * critics * features + _ACTOR[1] * cfg.net.head + _ACTOR[2])
     if not cfg.learn.actor or cfg.net.kind != "small":  # DenseNet-121's features are 1/32 as wide: next to nothing
         actor = 0.0

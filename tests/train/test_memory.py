@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 
 from csac_jax import presets
 from csac_jax.agent import learner as learning
 from csac_jax.config import Config
+from csac_jax.env import Env
 from csac_jax.replay import ring
+from csac_jax.scene import layout
 from csac_jax.train import memory, step
 from experiments.bench import memory as bench
 
@@ -57,6 +60,20 @@ def test_looking_takes_what_is_predicted(cfg: Config):
     look = jax.jit(lambda state, obs: step._best_grasps(learner, state, obs))
     measured = look.lower(state, obs).compile().memory_analysis().temp_size_in_bytes
     assert memory.stages(cfg)["look"] == pytest.approx(measured, rel=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.optax
+def test_learning_at_stride_4_takes_what_is_predicted():
+    """Claim: so is what learning needs with the net of `quick`, whose input has 16 cells per cell of its features."""
+    net = dataclasses.replace(presets.quick().net, rotations=8)
+    cfg = dataclasses.replace(_smoke(heightmap={"size": 64}, learn={"updates": 2}), net=net)
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+    nothing: Any = None
+    program, state = step.Program(cfg, Env(cfg, nothing, blank), learning.make(cfg)), step.abstract_state(cfg)
+    learn = jax.jit(lambda learner, replay: step._learn(program, jax.random.key(0), learner, replay))
+    measured = learn.lower(state.learner, state.replay).compile().memory_analysis().temp_size_in_bytes
+    assert memory.stages(cfg)["learn"] == pytest.approx(measured, rel=0.15)
 
 
 @pytest.mark.slow
