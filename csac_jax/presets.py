@@ -39,7 +39,7 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, half of the scenes packed arrangements, 1,024 scenes side by side, for one GPU."""
+    """Ten blocks of all eight shapes, half of the scenes packed arrangements, 1,024 side by side, for one GPU."""
     return Config(
         preset="fast",
         scene=SceneConfig(
