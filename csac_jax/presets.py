@@ -84,7 +84,7 @@ def paper() -> Config:
             learning_rate=1e-4, actor_learning_rate=1e-4, rate_end=1.0, batch=8, updates=1, augment=False, tau=0.005
         ),
         replay=ReplayConfig(capacity=2500),
-        train=TrainConfig(scenes=1, actions=2500, warmup=8, chunk=10, save_every=10),
+        train=TrainConfig(scenes=1, actions=2500, warmup=8, chunk=50, save_every=10),
     )
 
 

@@ -10,6 +10,7 @@ transitions in the ring; contact caps grow with the blocks. On an accelerator, `
 """
 
 import argparse
+import concurrent.futures
 import contextlib
 import dataclasses
 import functools
@@ -32,7 +33,7 @@ from csac_jax.config import Config
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
 from csac_jax.sim.mjx_physics import MjxPhysics
-from csac_jax.sim.primitives import Primitive
+from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.train import auto, cache, compiler, provenance, step
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
@@ -80,59 +81,83 @@ def _compile_twice(program: step.Program, state: Any, steps: int) -> tuple[Any, 
         return chunk, {"cold": cold, "cached": cached, "found_in_cache": cache.hits() > hits}
 
 
+def _compile_together(programs: dict[str, tuple[Any, tuple[Any, ...]]]) -> dict[str, Any]:
+    """Compiled programs from jitted functions and the arguments, or their shapes, that each is for; all at a time."""
+    with concurrent.futures.ThreadPoolExecutor() as threads:
+        compiled = threads.map(lambda pair: pair[0].lower(*pair[1]).compile(), programs.values())
+        return dict(zip(programs, compiled, strict=True))
+
+
 def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable[[], Any]]:
     """The stages of `train_step`, each a call of a program of its own."""
     cfg, env, learner = program.cfg, program.env, program.learner
-    scenes, num = state.scenes, cfg.train.scenes
-    keys = step._keys(jax.random.key(1), num)
+    scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
+    keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
     span = learner.bounds[1] - learner.bounds[0]
-
-    jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
-    look = jit(lambda params, obs: learning.look(learner, params, obs))
-    maps = look(state.learner.online, scenes.obs)
     choose = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
-    act = jax.jit(lambda keys, maps: choose(keys, cfg, learner.frames, maps, span, scenes.idle, jnp.int32(0)))
-    action = act(keys, maps)
-    simulate = jax.jit(jax.vmap(env.step))
-    after = simulate(scenes, action)
 
-    @jit
-    def reward(nets: Any, before: Any, after: Any) -> jax.Array:
+    def act(keys: jax.Array, maps: Any, idle: jax.Array) -> Action:
+        return choose(keys, cfg, learner.frames, maps, span, idle, jnp.int32(0))
+
+    def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         pushed = action.primitive == Primitive.PUSH
         phi = step._around(learner, nets, before.obs, after.obs, pushed)
         changed = after.info.moved > environment.CHANGE_AREA
         of_one = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))
         return of_one(cfg.reward, action.primitive, after.info.outcome, after.info.distance, *phi, changed)
 
-    def store(replay: Any, before: Any, after: Any) -> Any:
+    def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
         seen = Transition(packed[0], action, jnp.zeros(num), packed[1], after.terminated)
         return ring.add(replay, seen, ~after.info.ill)
 
-    write = jax.jit(store, donate_argnums=0)
-    replay = write(jax.tree.map(jnp.copy, state.replay), scenes, after)
-
-    def remember() -> Any:
-        nonlocal replay
-        replay = write(replay, scenes, after)
-        return replay.head
-
-    learn = jit(lambda key, nets, replay: step._learn(program, key, nets, replay))
-
-    @jax.jit
     def replace(keys: jax.Array, after: Any) -> Any:
         fresh = jax.vmap(env.restart)(keys, after)
         return jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
+    jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
+    stages = {
+        "look": jit(lambda params, obs: learning.look(learner, params, obs)),
+        "act": jax.jit(act),
+        "simulate": jax.jit(jax.vmap(env.step)),
+        "reward": jit(reward),
+        "remember": jax.jit(remember, donate_argnums=0),
+        "learn": jit(lambda key, nets, replay: step._learn(program, key, nets, replay)),
+        "replace": jax.jit(replace),
+    }
+    maps = jax.eval_shape(stages["look"], nets.online, scenes.obs)
+    action = jax.eval_shape(stages["act"], keys, maps, scenes.idle)
+    after = jax.eval_shape(stages["simulate"], scenes, action)
+    shapes = {
+        "look": (nets.online, scenes.obs),
+        "act": (keys, maps, scenes.idle),
+        "simulate": (scenes, action),
+        "reward": (nets, scenes, action, after),
+        "remember": (state.replay, scenes, action, after),
+        "learn": (key, nets, state.replay),
+        "replace": (keys, after),
+    }
+    run = _compile_together({name: (stages[name], arguments) for name, arguments in shapes.items()})
+
+    maps = run["look"](nets.online, scenes.obs)
+    action = run["act"](keys, maps, scenes.idle)
+    after = run["simulate"](scenes, action)
+    replay = run["remember"](jax.tree.map(jnp.copy, state.replay), scenes, action, after)
     filled = jax.tree.map(jnp.copy, replay)
-    calls = {
-        "look": lambda: look(state.learner.online, scenes.obs),
-        "act": lambda: act(keys, maps),
-        "simulate": lambda: simulate(scenes, action),
-        "reward": lambda: reward(state.learner, scenes, after),
-        "remember": remember,
-        "learn": lambda: learn(jax.random.key(2), state.learner, filled),
-        "replace": lambda: replace(keys, after),
+
+    def remember_again() -> Any:
+        nonlocal replay
+        replay = run["remember"](replay, scenes, action, after)
+        return replay.head
+
+    calls: dict[str, Callable[[], Any]] = {
+        "look": lambda: run["look"](nets.online, scenes.obs),
+        "act": lambda: run["act"](keys, maps, scenes.idle),
+        "simulate": lambda: run["simulate"](scenes, action),
+        "reward": lambda: run["reward"](nets, scenes, action, after),
+        "remember": remember_again,
+        "learn": lambda: run["learn"](key, nets, filled),
+        "replace": lambda: run["replace"](keys, after),
     }
     if isinstance(env.physics, MjxPhysics):
         drives = _bare.drives(cfg, scenes.obs.height, action)
@@ -193,7 +218,7 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     state = step.init(program)
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
-    seconds = medians({**calls, "whole": _whole(chunk, step.init(program))}, repeats)  # it uses its state up
+    seconds = medians({**calls, "whole": _whole(chunk, jax.tree.map(jnp.copy, state))}, repeats)  # it uses it up
     whole = seconds["whole"] / steps
     stages = {name: seconds[name] for name in _SEPARATE}
     total = sum(stages.values())
