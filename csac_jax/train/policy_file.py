@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "f4cde2060ed8b620a44e14c642c29dfd2f94726a7257489bad90883a996773a4"
+SHIPPED_SHA256 = "ee0b08035861fba19586186d727801813279361a3bf97f606936d1ff51573673"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 

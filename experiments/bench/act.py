@@ -97,8 +97,8 @@ def _update_memory(learner: Learner) -> int:
 
 
 def _small(states: int, repeats: int) -> dict[str, Any]:
-    """The small net of the preset `quick`."""
-    cfg = presets.quick()
+    """The small net as it is by default, with the map and the batch of `quick`."""
+    cfg = dataclasses.replace(presets.quick(), net=NetConfig())
     learner = learning.make(cfg)
     abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner)).online
     return {
