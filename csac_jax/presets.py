@@ -31,6 +31,7 @@ def quick() -> Config:
     return Config(
         preset="quick",
         scene=alike,
+        sim=SimConfig(physics="auto"),
         net=NetConfig(stride=4, subcells=2, dilations=(1, 2, 1), stem=32, growth=32, head=48),
         target=TargetConfig(gamma=0.2),
         learn=LearnConfig(actor_batch=8),

@@ -1,5 +1,6 @@
-"""Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics mjx|warp|auto] [--steps N]
-[--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B]`, PRESET `quick` if none is given.
+"""Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics mjx|warp|c|auto]
+[--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B]`, PRESET `quick` if none is
+given, physics `auto`.
 
 Each stage of `train_step` is compiled by itself and timed beside the whole step, a compiled loop of STEPS (2) steps as
 in training, and beside a bare loop of the engine's own steps of the same scenes and set-points: in one process, turn by
@@ -32,7 +33,6 @@ from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
-from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.train import auto, cache, compiler, provenance, step
 from csac_jax.vision import heightmap
@@ -159,9 +159,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "learn": lambda: run["learn"](key, nets, filled),
         "replace": lambda: run["replace"](keys, after),
     }
-    if isinstance(env.physics, MjxPhysics):
-        drives = _bare.drives(cfg, scenes.obs.height, action)
-        calls["bare_loop"] = _bare.loop(env.physics, scenes.scene, drives)
+    calls["bare_loop"] = _bare.loop(env.physics, scenes.scene, _bare.drives(cfg, scenes.obs.height, action))
     return calls
 
 
@@ -222,7 +220,7 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     whole = seconds["whole"] / steps
     stages = {name: seconds[name] for name in _SEPARATE}
     total = sum(stages.values())
-    bare = seconds.get("bare_loop")
+    bare = seconds["bare_loop"]
     gradients = {"ours": lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1), "autodiff": _autodiff_conv}
     return {
         "stage_seconds": stages,
@@ -231,8 +229,8 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
         "sum_of_stages_over_step": total / whole,
         **_rates(cfg, whole),
         "bare_loop_seconds": bare,
-        "bare_loop_over_simulate": bare and bare / stages["simulate"],
-        "bare_loop_over_step": bare and bare / whole,
+        "bare_loop_over_simulate": bare / stages["simulate"],
+        "bare_loop_over_step": bare / whole,
         "compile_seconds": compiling,
         "conv_gradients_in_scan": medians({name: _conv_gradient(conv) for name, conv in gradients.items()}, repeats),
         **_memory(chunk),
@@ -279,7 +277,7 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
 def _options(arguments: list[str]) -> argparse.Namespace:
     parser = Parser(prog="bench step", allow_abbrev=False)
     parser.add_argument("preset", nargs="?", default="quick")
-    parser.add_argument("--physics", choices=("mjx", "warp", "auto"), default="mjx")
+    parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"), default="auto")
     parser.add_argument("--curve", choices=tuple(CURVES))
     for name, default in {"steps": 2, "repeats": 5, "smallest": 0, "largest": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
