@@ -31,6 +31,7 @@ def quick() -> Config:
     return Config(
         preset="quick",
         scene=alike,
+        sim=SimConfig(physics="auto"),
         net=NetConfig(stride=4, subcells=2, dilations=(1, 2, 1), stem=32, growth=32, head=48),
         target=TargetConfig(gamma=0.2),
         learn=LearnConfig(actor_batch=8),
@@ -39,7 +40,7 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, half of the scenes packed arrangements, 1,024 scenes at once, for one GPU."""
+    """Ten blocks of all eight shapes, half of the scenes packed arrangements, 1,024 side by side, for one GPU."""
     return Config(
         preset="fast",
         scene=SceneConfig(
@@ -84,7 +85,7 @@ def paper() -> Config:
             learning_rate=1e-4, actor_learning_rate=1e-4, rate_end=1.0, batch=8, updates=1, augment=False, tau=0.005
         ),
         replay=ReplayConfig(capacity=2500),
-        train=TrainConfig(scenes=1, actions=2500, warmup=8, chunk=10, save_every=10),
+        train=TrainConfig(scenes=1, actions=2500, warmup=8, chunk=50, save_every=10),
     )
 
 

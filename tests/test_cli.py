@@ -354,13 +354,14 @@ def test_automatic_physics_is_resolved(tmp_path: Path):
     """Claim: `--sim.physics auto` reaches a run as what it stands for here, and may be asked for again when the run is
     resumed; the first line of a run says what it runs on."""
     _, cfg = train.read(["smoke", "--sim.physics", "auto", "--seed", "3"])
-    assert cfg == dataclasses.replace(SMOKE, seed=3)
+    in_c = dataclasses.replace(SMOKE.sim, physics="c")
+    assert cfg == dataclasses.replace(SMOKE, seed=3, sim=in_c)
     folder = tmp_path / "runs" / "three"
     checkpoint.save(folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []})
     assert train.read(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
-    assert sweep.read(["smoke", "--sim.physics", "auto"])[1].settings[0].cfg.sim == SMOKE.sim
+    assert sweep.read(["smoke", "--sim.physics", "auto"])[1].settings[0].cfg.sim == in_c
     line = train.first_line(folder, cfg)
-    wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics mjx, on 1 x cpu (cpu)"
+    wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics c, on 1 x cpu (cpu)"
     assert line == f"run {folder}: {wanted}"
 
 

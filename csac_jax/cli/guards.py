@@ -39,7 +39,7 @@ def check_physics(cfg: Config) -> None:
             raise BadArgumentsError("--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx")
 
 
-def check_host_physics(cfg: Config, devices: int | None) -> None:
-    """C physics serves one device, the default of `devices`."""
-    if cfg.sim.physics == "c" and devices not in (None, 1):
+def check_host_physics(cfg: Config, devices: int) -> None:
+    """C physics serves one device."""
+    if cfg.sim.physics == "c" and devices > 1:
         raise BadArgumentsError("--sim.physics: c computes on the host's cores, for one device; leave out --devices")

@@ -108,14 +108,21 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     found = [(one, _parse(preset, [*flags, *one.flags])[1]) for one in combinations]
     from csac_jax.train import sweep as sweeping
 
-    each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg)) for one, cfg in found]
+    devices = _devices(options)
+    each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg, devices)) for one, cfg in found]
     for setting in each:
         guards.check_physics(setting.cfg)
-        guards.check_host_physics(setting.cfg, options.devices)
+        guards.check_host_physics(setting.cfg, devices)
     plan = sweeping.Plan(options.seeds, each)
     with as_bad_arguments(ValueError, sweeping.SweepError):
         sweeping.check(plan)
     return plan
+
+
+def _devices(options: SweepOptions) -> int:
+    """Devices of a sweep, those of other processes too; 2 stands for several."""
+    alone = options.processes in (None, 1) and not options.cluster
+    return options.devices or 1 if alone else 2
 
 
 def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:

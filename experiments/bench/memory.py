@@ -40,6 +40,11 @@ def _smoke(**sections: dict[str, Any]) -> Config:
     return dataclasses.replace(cfg, **parts)
 
 
+def _on_mjx(cfg: Config) -> Config:
+    """The config on MJX, whatever would be chosen here: what is predicted is its memory."""
+    return dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics="mjx"))
+
+
 _NET = {"rotations": 16, "growth": 24, "stem": 16, "head": 32, "dilations": (1, 2, 4, 1)}
 
 
@@ -137,7 +142,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--record", type=Path)
     parser.add_argument("names", nargs="*")
     options = parser.parse_args(arguments)
-    known = CONFIGS | {name: presets.get(name) for name in presets.PRESETS}
+    known = CONFIGS | {name: _on_mjx(presets.get(name)) for name in presets.PRESETS}
     if not known.keys() >= set(options.names):
         raise BadArgumentsError(f"bench memory: give names of: {', '.join(known)}; or none, for ten small configs")
     path = options.record

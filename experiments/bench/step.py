@@ -1,5 +1,6 @@
-"""Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics mjx|warp|auto] [--steps N]
-[--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B]`, PRESET `quick` if none is given.
+"""Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics mjx|warp|c|auto]
+[--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B]`, PRESET `quick` if none is
+given, physics `auto`.
 
 Each stage of `train_step` is compiled by itself and timed beside the whole step, a compiled loop of STEPS (2) steps as
 in training, and beside a bare loop of the engine's own steps of the same scenes and set-points: in one process, turn by
@@ -10,6 +11,7 @@ transitions in the ring; contact caps grow with the blocks. On an accelerator, `
 """
 
 import argparse
+import concurrent.futures
 import contextlib
 import dataclasses
 import functools
@@ -31,8 +33,7 @@ from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
-from csac_jax.sim.mjx_physics import MjxPhysics
-from csac_jax.sim.primitives import Primitive
+from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.train import auto, cache, compiler, provenance, step
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
@@ -80,63 +81,85 @@ def _compile_twice(program: step.Program, state: Any, steps: int) -> tuple[Any, 
         return chunk, {"cold": cold, "cached": cached, "found_in_cache": cache.hits() > hits}
 
 
+def _compile_together(programs: dict[str, tuple[Any, tuple[Any, ...]]]) -> dict[str, Any]:
+    """Compiled programs from jitted functions and the arguments, or their shapes, that each is for; all at a time."""
+    with concurrent.futures.ThreadPoolExecutor() as threads:
+        compiled = threads.map(lambda pair: pair[0].lower(*pair[1]).compile(), programs.values())
+        return dict(zip(programs, compiled, strict=True))
+
+
 def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable[[], Any]]:
     """The stages of `train_step`, each a call of a program of its own."""
     cfg, env, learner = program.cfg, program.env, program.learner
-    scenes, num = state.scenes, cfg.train.scenes
-    keys = step._keys(jax.random.key(1), num)
+    scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
+    keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
     span = learner.bounds[1] - learner.bounds[0]
-
-    jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
-    look = jit(lambda params, obs: learning.look(learner, params, obs))
-    maps = look(state.learner.online, scenes.obs)
     choose = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
-    act = jax.jit(lambda keys, maps: choose(keys, cfg, learner.frames, maps, span, scenes.idle, jnp.int32(0)))
-    action = act(keys, maps)
-    simulate = jax.jit(jax.vmap(env.step))
-    after = simulate(scenes, action)
 
-    @jit
-    def reward(nets: Any, before: Any, after: Any) -> jax.Array:
+    def act(keys: jax.Array, maps: Any, idle: jax.Array) -> Action:
+        return choose(keys, cfg, learner.frames, maps, span, idle, jnp.int32(0))
+
+    def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         pushed = action.primitive == Primitive.PUSH
         phi = step._around(learner, nets, before.obs, after.obs, pushed)
         changed = after.info.moved > environment.CHANGE_AREA
         of_one = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))
         return of_one(cfg.reward, action.primitive, after.info.outcome, after.info.distance, *phi, changed)
 
-    def store(replay: Any, before: Any, after: Any) -> Any:
+    def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
         seen = Transition(packed[0], action, jnp.zeros(num), packed[1], after.terminated)
         return ring.add(replay, seen, ~after.info.ill)
 
-    write = jax.jit(store, donate_argnums=0)
-    replay = write(jax.tree.map(jnp.copy, state.replay), scenes, after)
-
-    def remember() -> Any:
-        nonlocal replay
-        replay = write(replay, scenes, after)
-        return replay.head
-
-    learn = jit(lambda key, nets, replay: step._learn(program, key, nets, replay))
-
-    @jax.jit
     def replace(keys: jax.Array, after: Any) -> Any:
         fresh = jax.vmap(env.restart)(keys, after)
         return jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
-    filled = jax.tree.map(jnp.copy, replay)
-    calls = {
-        "look": lambda: look(state.learner.online, scenes.obs),
-        "act": lambda: act(keys, maps),
-        "simulate": lambda: simulate(scenes, action),
-        "reward": lambda: reward(state.learner, scenes, after),
-        "remember": remember,
-        "learn": lambda: learn(jax.random.key(2), state.learner, filled),
-        "replace": lambda: replace(keys, after),
+    jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
+    stages = {
+        "look": jit(lambda params, obs: learning.look(learner, params, obs)),
+        "act": jax.jit(act),
+        "simulate": jax.jit(jax.vmap(env.step)),
+        "reward": jit(reward),
+        "remember": jax.jit(remember, donate_argnums=0),
+        "learn": jit(lambda key, nets, replay: step._learn(program, key, nets, replay)),
+        "replace": jax.jit(replace),
     }
-    if isinstance(env.physics, MjxPhysics):
-        drives = _bare.drives(cfg, scenes.obs.height, action)
-        calls["bare_loop"] = _bare.loop(env.physics, scenes.scene, drives)
+    maps = jax.eval_shape(stages["look"], nets.online, scenes.obs)
+    action = jax.eval_shape(stages["act"], keys, maps, scenes.idle)
+    after = jax.eval_shape(stages["simulate"], scenes, action)
+    shapes = {
+        "look": (nets.online, scenes.obs),
+        "act": (keys, maps, scenes.idle),
+        "simulate": (scenes, action),
+        "reward": (nets, scenes, action, after),
+        "remember": (state.replay, scenes, action, after),
+        "learn": (key, nets, state.replay),
+        "replace": (keys, after),
+    }
+    run = _compile_together({name: (stages[name], arguments) for name, arguments in shapes.items()})
+
+    maps = run["look"](nets.online, scenes.obs)
+    action = run["act"](keys, maps, scenes.idle)
+    after = run["simulate"](scenes, action)
+    replay = run["remember"](jax.tree.map(jnp.copy, state.replay), scenes, action, after)
+    filled = jax.tree.map(jnp.copy, replay)
+
+    def remember_again() -> Any:
+        nonlocal replay
+        replay = run["remember"](replay, scenes, action, after)
+        return replay.head
+
+    calls: dict[str, Callable[[], Any]] = {
+        "look": lambda: run["look"](nets.online, scenes.obs),
+        "act": lambda: run["act"](keys, maps, scenes.idle),
+        "simulate": lambda: run["simulate"](scenes, action),
+        "reward": lambda: run["reward"](nets, scenes, action, after),
+        "remember": remember_again,
+        "learn": lambda: run["learn"](key, nets, filled),
+        "replace": lambda: run["replace"](keys, after),
+    }
+    calls["bare_loop"] = _bare.loop(env.physics, scenes.scene, _bare.drives(cfg, scenes.obs.height, action))
     return calls
 
 
@@ -193,11 +216,11 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     state = step.init(program)
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
-    seconds = medians({**calls, "whole": _whole(chunk, step.init(program))}, repeats)  # it uses its state up
+    seconds = medians({**calls, "whole": _whole(chunk, jax.tree.map(jnp.copy, state))}, repeats)  # it uses it up
     whole = seconds["whole"] / steps
     stages = {name: seconds[name] for name in _SEPARATE}
     total = sum(stages.values())
-    bare = seconds.get("bare_loop")
+    bare = seconds["bare_loop"]
     gradients = {"ours": lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1), "autodiff": _autodiff_conv}
     return {
         "stage_seconds": stages,
@@ -206,8 +229,8 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
         "sum_of_stages_over_step": total / whole,
         **_rates(cfg, whole),
         "bare_loop_seconds": bare,
-        "bare_loop_over_simulate": bare and bare / stages["simulate"],
-        "bare_loop_over_step": bare and bare / whole,
+        "bare_loop_over_simulate": bare / stages["simulate"],
+        "bare_loop_over_step": bare / whole,
         "compile_seconds": compiling,
         "conv_gradients_in_scan": medians({name: _conv_gradient(conv) for name, conv in gradients.items()}, repeats),
         **_memory(chunk),
@@ -254,7 +277,7 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
 def _options(arguments: list[str]) -> argparse.Namespace:
     parser = Parser(prog="bench step", allow_abbrev=False)
     parser.add_argument("preset", nargs="?", default="quick")
-    parser.add_argument("--physics", choices=("mjx", "warp", "auto"), default="mjx")
+    parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"), default="auto")
     parser.add_argument("--curve", choices=tuple(CURVES))
     for name, default in {"steps": 2, "repeats": 5, "smallest": 0, "largest": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)

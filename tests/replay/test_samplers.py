@@ -69,6 +69,25 @@ def test_ranks_follow_the_beta_law(a, b, size):
     assert_fits(ranks(values[:size], slots), probability)
 
 
+@pytest.mark.parametrize(("a", "b"), [(0.2, 1.0), (0.5, 0.5), (0.3, 4.0), (1.0, 12.0), (1.0, 1.0), (40.0, 3.0)])
+def test_beta_draws_follow_scipys_law(a, b):
+    """Claim: draws with traced a and b have the distribution that SciPy knows, by Kolmogorov's test of 400,000."""
+    draws = jax.jit(samplers._beta, static_argnums=3)(jax.random.key(3), a, b, 400_000)
+    assert stats.kstest(np.asarray(draws, np.float64), stats.beta(a, b).cdf).pvalue > P
+
+
+def test_drawing_has_no_open_loop():
+    """Claim: no sampler has a loop of unknown length, whose condition a GPU hands to the host at every turn."""
+    for sampler in ("uniform", "prioritised", "beta"):
+        cfg = ReplayConfig(sampler=sampler, capacity=CAPACITY)
+        text = str(jax.make_jaxpr(lambda key, c=cfg: samplers.sample(key, c, stored(c, np.zeros(9)), 0.5, 64))(
+            jax.random.key(0)
+        ))  # fmt: skip
+        assert "random_bits" in text
+        assert "while" not in text
+        assert "random_gamma" not in text  # of a loop inside
+
+
 LAWS = {
     "normal": lambda rng: rng.normal(size=CAPACITY),
     "twelve decades": lambda rng: 10.0 ** rng.uniform(-6.0, 6.0, CAPACITY),

@@ -24,7 +24,7 @@ def _config(kind: PhysicsKind, mesh_spread: float = 0.0, scenes: int = 256) -> C
     ("backend", "installed", "measured", "mesh_spread", "scenes", "chosen"),
     [
         ("gpu", True, range(64, 5001), 0.0, 256, "warp"),
-        ("cpu", True, range(64, 5001), 0.0, 256, "mjx"),
+        ("cpu", True, range(64, 5001), 0.0, 256, "c"),
         ("gpu", False, range(64, 5001), 0.0, 256, "mjx"),
         ("gpu", True, range(64, 5001), 0.1, 256, "mjx"),
         ("gpu", True, range(64, 5001), 0.0, 32, "mjx"),
@@ -33,12 +33,15 @@ def _config(kind: PhysicsKind, mesh_spread: float = 0.0, scenes: int = 256) -> C
     ],
 )
 def test_choice(monkeypatch: pytest.MonkeyPatch, backend, installed, measured, mesh_spread, scenes, chosen):
-    """Claim: `auto` is `warp` where measured to be faster, on CUDA, installed, able to do the scene; else `mjx`."""
+    """Claim: `auto` is `c` on a CPU, `warp` where measured to be faster, on CUDA, installed, able to do the scene; else
+    `mjx`, also on several CPU devices."""
     monkeypatch.setattr(auto.jax, "default_backend", lambda: backend)
     monkeypatch.setattr(auto.importlib.util, "find_spec", lambda name: object() if installed else None)
     monkeypatch.setattr(auto, "WARP_SCENES", measured)
     cfg = _config("auto", mesh_spread, scenes)
     assert auto.resolve(cfg) == dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=chosen))
+    several = "mjx" if chosen == "c" else chosen
+    assert auto.resolve(cfg, 2).sim.physics == several
 
 
 def test_other_choices_stay():
