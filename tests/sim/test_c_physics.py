@@ -95,13 +95,11 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     drives = jax.tree.map(lambda leaf: np.stack([leaf] * 5), drive)
     after, _ = jax.jit(jax.vmap(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run))(scenes, drives)
     ends = []
-    for i, one in enumerate((scene, large, spun, ill, scene)):
+    for i, one in {0: scene, 1: large, 2: spun, 4: scene}.items():
         film = c_physics.film(c_world, jax.device_get(model.scene_fields(c_world, one)), one, drive)
-        end = film.qpos[-1][c_world.block_qpos[0]].astype(np.float32)
-        ends.append(np.concatenate([after.position[i, 0], after.quaternion[i, 0]]))
-        if one is not ill:
-            np.testing.assert_array_equal(ends[i], end)
-    assert len({tuple(end) for end in ends}) == 4
+        ends.append(film.qpos[-1][c_world.block_qpos[0]].astype(np.float32))
+        np.testing.assert_array_equal(np.concatenate([after.position[i, 0], after.quaternion[i, 0]]), ends[-1])
+    assert len({tuple(end) for end in ends}) == 3
     np.testing.assert_array_equal(after.position[3, 0], ill.position[0])
 
 
