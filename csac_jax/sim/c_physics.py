@@ -145,8 +145,7 @@ def _lasting(exact: mujoco.MjModel) -> mujoco.MjModel:
 
 def _start(world: World, scene: Scene, drive: Drive) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities, MuJoCo's order, of the scene's blocks and the robot at the drive's start."""
-    data = np.array(world.model.qpos0), np.zeros(world.model.nv)
-    qpos, qvel = data
+    qpos, qvel = world.model.qpos0.copy(), np.zeros(world.model.nv)
     qpos[world.robot_qpos] = drive.start
     qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
     qvel[world.block_dofs] = scene.velocity
