@@ -21,6 +21,7 @@ from csac_jax.train import statistics
 SAMPLERS = ("csac", "csac_per", "csac_beta")
 COLOURS = dict(zip(NAMES, ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759"), strict=True))
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
+NAMED = 3  # settings that a legend names
 FOUR = ("cases", "target")  # suites whose parts are the four cases
 
 
@@ -72,7 +73,7 @@ def _lines(curves: Sequence[Curve]) -> Figure:
         colour = next(spare) if algo in drawn or algo not in COLOURS else COLOURS[algo]
         drawn.add(algo)
         value = [100 * band.value for band in curve.success]
-        name = f"{reporting.label(curve.variant, preset=False)} ({len(curve.runs)})"
+        name = f"{reporting.label(curve.variant, preset=False, most=NAMED)} ({len(curve.runs)})"
         axes.plot(curve.actions, value, color=colour, label=name)
         banded = [(x, b) for x, b in zip(curve.actions, curve.success, strict=True) if b.low is not None]
         if banded:
@@ -127,7 +128,7 @@ def _marks(panel: Axes, own: Sequence[Score], parts: Sequence[str], metric: str,
     if len(own) == len(parts) and all(len(stratum) for stratum in strata):
         bands[len(parts)] = statistics.band(strata)
     first = own[0]
-    name = reporting.label(first.variant, preset=False) if first.policy == "learned" else first.policy
+    name = reporting.label(first.variant, preset=False, most=NAMED) if first.policy == "learned" else first.policy
     name += f", {first.physics}, {first.robot} ({len(first.evaluations)})"
     known = COLOURS.get(first.variant.algo)
     colour = known if known and first.variant.method else plt.get_cmap("tab20")(index)

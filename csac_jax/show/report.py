@@ -107,10 +107,12 @@ def _curve(variant: Variant, runs: list[Run], notes: list[str]) -> Curve:
     return Curve(variant, runs, actions, success, statistics.band([np.array([run.success[-1] for run in runs])]))
 
 
-def label(variant: Variant, preset: bool = True) -> str:
-    """Name of a variant in figures and tables."""
+def label(variant: Variant, preset: bool = True, most: int | None = None) -> str:
+    """Name of a variant in figures and tables, with at most so many of the settings that it changes."""
     name = NAMES.get(variant.algo, variant.algo)
     changed = [f"{setting} {value}" for setting, value in variant.changed]
+    if most is not None and len(changed) > most:
+        changed[most:] = [f"others ({len(changed) - most})"]
     return ", ".join([f"{name} ({variant.preset})" if preset else name, *changed])
 
 

@@ -26,6 +26,7 @@ METRIC_NAMES = (
     "action_efficiency_completed",
 )
 APART = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # settings that are shown by themselves
+HOST = ("train.chunk", "train.save_every")  # settings that no result depends on
 SHAPE = "train."  # settings of a run's length and shape do not make it another method
 WINDOW = 200  # grasps that a run's success is taken over (CSAC sec. 4.2)
 
@@ -213,7 +214,7 @@ def variant(config: Json) -> Variant:
     except ValueError:  # a name that is no more
         base = {}
     own = flat(config)
-    changed = [name for name in own if name in base and own[name] != base[name] and name not in APART]
+    changed = [name for name in own if name in base and own[name] != base[name] and name not in (*APART, *HOST)]
     return Variant(preset, algo, tuple((name, _text(own[name])) for name in changed))
 
 
@@ -231,7 +232,8 @@ def command(one: Run | Evaluation) -> str:
         return f"csac-jax {run} --seed {one.seed} --physics {sim.get('physics', 'mjx')} --robot {robot}"
     its = variant(one.config)
     flags = "".join(f" {_flag(name, value)}" for name, value in its.changed)
-    return f"csac-jax train {its.preset} --algo {its.algo} --seed {one.config['seed']}{flags}"
+    physics = one.config.get("sim", {}).get("physics", "mjx")
+    return f"csac-jax train {its.preset} --algo {its.algo} --seed {one.config['seed']} --sim.physics {physics}{flags}"
 
 
 def _flag(name: str, value: str) -> str:

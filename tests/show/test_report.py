@@ -135,8 +135,24 @@ def test_numbers_as_json(recorded: Path):
     swept = rows["seed-1/metrics.jsonl"]
     assert (swept["device"], swept["wall time"]) == ("two cards", "99 s, whole sweep")
     assert rows["vpg/metrics.jsonl"]["wall time"] == "40 s"  # no record: the log's last time
-    assert trained["settings as a command"] == "csac-jax train paper --algo csac_beta --seed 0"
-    assert rows["max/metrics.jsonl"]["settings as a command"].endswith("--seed 0 --target.value max")
+    assert trained["settings as a command"] == "csac-jax train paper --algo csac_beta --seed 0 --sim.physics mjx"
+    assert rows["max/metrics.jsonl"]["settings as a command"].endswith("--sim.physics mjx --target.value max")
+
+
+def test_labels():
+    """Claim: settings that no result depends on name no variant; a label in a figure names as many as it is told to."""
+    assert results.variant(_config("vpg", 0, train__chunk=7, train__save_every=3)).changed == ()
+    changed = {"net__head": 16, "net__growth": 8, "learn__batch": 4, "learn__tau": 0.5}
+    variant = results.variant(_config("vpg", 0, **changed))
+    assert set(report.label(variant).split(", ")[1:]) == {
+        "net.head 16",
+        "net.growth 8",
+        "learn.batch 4",
+        "learn.tau 0.5",
+    }
+    short = report.label(variant, preset=False, most=3)
+    assert (short.count(", "), short[-12:]) == (4, ", others (1)")
+    assert report.label(variant, preset=False, most=4) == report.label(variant, preset=False)
 
 
 def test_command_gives_the_config_back():
