@@ -29,10 +29,17 @@ _AT_ONCE = 256  # scenes whose films are kept at a time, some 70 MB with ten blo
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CPhysics:
-    """A world in C MuJoCo, built for it, with the solver's effort of the config."""
+    """A world in C MuJoCo, with the solver's effort of the config.
+
+    Raises ValueError for a world that was built for MJX, which has no touch sensors.
+    """
 
     world: World
     cfg: SimConfig
+
+    def __post_init__(self) -> None:
+        if self.world.model.nsensordata != len(HAND_GEOMS) * len(self.world.slots):
+            raise ValueError("world: it has no touch sensors; build it with sim.physics c")
 
     def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
         """See `physics.Physics`."""

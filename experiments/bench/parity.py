@@ -26,7 +26,6 @@ from csac_jax.config import Config, PhysicsKind, SceneConfig, SlotKind
 from csac_jax.env import Env
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import World
 from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.outcome import Outcome
 from csac_jax.sim.primitives import Action, Primitive
@@ -65,17 +64,18 @@ class Bench:
         plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
         self.oracle = jax.jit(jax.vmap(plan))
         self.push = jax.jit(jax.vmap(_push))
-        self.engines = {name: self._engine(name, self.world) for name in (cfg.sim.physics, REFERENCE)}
-        whole = model.build(cfg.scene, cfg.sim)
-        whole.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
-        solved_whole = self._engine(REFERENCE, whole)
+        self.engines = {name: self._engine(name) for name in (cfg.sim.physics, REFERENCE)}
+        solved_whole = self._engine(REFERENCE, mujoco.mjtDisableBit.mjDSBL_ISLAND)
         self.references = {
             "c_against_itself_1um": lambda scenes, *rest: self.engines[REFERENCE](_aside(scenes), *rest),
             "c_against_itself_solved_whole": solved_whole,
         }
 
-    def _engine(self, name: Any, world: World) -> Engine:
+    def _engine(self, name: Any, disabled: int = 0) -> Engine:
+        """A physics, with MuJoCo's `disabled` flags set beside its own, in a world of its own."""
         sim = dataclasses.replace(self.cfg.sim, physics=name)
+        world = model.build(self.cfg.scene, sim)
+        world.model.opt.disableflags |= disabled
         engine = simulation.make(world, sim)
         return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, sim, self.cfg.heightmap)))
 

@@ -103,6 +103,12 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     np.testing.assert_array_equal(after.position[3, 0], ill.position[0])
 
 
+def test_world_of_mjx_is_refused(world: model.World):
+    """Claim: a world without touch sensors is one line that says how to build another."""
+    with pytest.raises(ValueError, match=r"no touch sensors; build it with sim\.physics c"):
+        c_physics.CPhysics(world, conftest.CONFIG.sim)
+
+
 def test_nothing_to_move(c_world: model.World, pushed: tuple):
     """Claim: an empty table and a drive that the robot cannot follow leave the scene as it is, with a blank trace."""
     scene, fields, drive = pushed
