@@ -92,9 +92,9 @@ def paper() -> Config:
 def paper_small() -> Config:
     """The protocol of `paper` with the small net on maps of 64 cells: one scene of ten blocks, 2,500 actions.
 
-    Ours, beside the net: four updates of 32 transitions per action, Adam 1e-3, random places at first, exploration
-    that ends after some 1,000 actions, all as in `quick`, and meshes of one size, which `sim.physics warp` needs. Its
-    result is not recorded yet.
+    Ours, beside the net: four updates of 32 transitions per action; Adam 1e-3, random places at first and exploration
+    that ends after some 1,000 actions, as in `quick`; and meshes of one size, which `sim.physics warp` needs. Results:
+    experiments/results/paper-small-h200.
     """
     whole = paper()
     return dataclasses.replace(

@@ -176,3 +176,10 @@ def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatc
         assert row["actions_per_second"] == pytest.approx(row["seeds"] * 2 * 2 / row["seconds"])
     assert found["train"]["compile_seconds"] > 0.0
     assert {"preset", "device", "versions", "commit"} <= found.keys()
+
+
+def test_devices_of_other_processes_count():
+    """Claim: C's physics, for one device, is neither chosen nor allowed where processes or devices are several."""
+    several = ({"devices": 2}, {"processes": 2}, {"cluster": True}, {"devices": 1, "processes": 2})
+    assert all(command._devices(command.SweepOptions(**options)) > 1 for options in several)
+    assert {command._devices(command.SweepOptions(**one)) for one in ({}, {"devices": 1}, {"processes": 1})} == {1}

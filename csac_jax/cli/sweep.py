@@ -122,7 +122,7 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
 def _devices(options: SweepOptions) -> int:
     """Devices of a sweep, those of other processes too; 2 stands for several."""
     alone = options.processes in (None, 1) and not options.cluster
-    return options.devices or 1 if alone else 2
+    return (options.devices or 1) if alone else 2
 
 
 def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:

@@ -3,7 +3,7 @@
 XLA's CPU back end runs the convolutions that autodiff makes, whose batch and channels are swapped, many times slower
 inside a while loop than outside (jaxlib 0.10.1; `experiments/bench` times both ways). Here the swap is a transpose, and
 every convolution plain. On a GPU the gradient for a dilated kernel is its taps one by one: as one convolution it takes
-five to ten times as long (jaxlib 0.11, H200).
+several times as long (jaxlib 0.11, H200).
 """
 
 import functools
