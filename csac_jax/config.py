@@ -463,6 +463,8 @@ class RewardConfig:
     """Any other push (eq. 16)."""
     dead_band: float = 0.1
     """Gain in the best grasp's value that a push must exceed (ours)."""
+    left: float = 0.0
+    """Loss by an action after which a block has left the workspace, out of reach for good (ours)."""
 
     def __post_init__(self) -> None:
         _require_choices(self, "reward.")
@@ -470,6 +472,7 @@ class RewardConfig:
         _require(self.farthest > 0.0, "reward.farthest: must be positive")
         _require(self.push_level <= self.grasp_level, "reward.push_level: must not exceed reward.grasp_level, s_max")
         _require(self.dead_band >= 0.0, "reward.dead_band: must not be negative")
+        _require(self.left >= 0.0, "reward.left: a block out of reach must not be a gain, so it must not be negative")
         levels = (self.nothing, self.empty, self.touched, self.dropped, self.lifted)
         _require(list(levels) == sorted(levels), "reward: nothing <= empty <= touched <= dropped <= lifted is needed")
 

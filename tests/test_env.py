@@ -287,7 +287,7 @@ def test_both_levels_of_a_push_are_reached(lab: Lab):
     for low, high, moved in zip(*phi, after.info.moved[:4], strict=True):
         seen = (jnp.float32(low), jnp.float32(high), moved > environment.CHANGE_AREA)
         level.append(float(rewards.push_effect(cfg, *seen)))
-        reward.append(float(rewards.reward(cfg, push, jnp.int32(Outcome.NOTHING), zero, *seen)))
+        reward.append(float(rewards.reward(cfg, push, jnp.int32(Outcome.NOTHING), zero, *seen, jnp.int32(0))))
     assert level == [1.0, -1.0, -1.0, -1.0]
     assert reward == [0.5, -0.5, -0.5, -0.5]  # Gamma = 0.5, eq. 13
     np.testing.assert_array_equal(

@@ -58,12 +58,14 @@ def reward(
     phi_before: jax.Array,
     phi_after: jax.Array,
     changed: jax.Array,
+    left: jax.Array,
 ) -> jax.Array:
-    """R = r + Gamma(phi) I [], eqs. 12 and 14; a push earns no r2.
+    """R = r + Gamma(phi) I [], eqs. 12 and 14; a push earns no r2. Ours: blocks that left cost `cfg.left`, once.
 
     The text below eq. 12 swaps the names of its two factors; the product is the same.
 
-    Args: primitive [] int32; outcome [] int32, read for grasps only; the others as in `base` and `push_effect`.
+    Args: primitive [] int32; outcome [] int32, read for grasps only; left [] int32, blocks that left the workspace; the
+    others as in `base` and `push_effect`.
     """
     grasped = primitive == GRASP
     effect = jnp.where(
@@ -71,7 +73,7 @@ def reward(
         scale(cfg, cfg.grasp_level) * grasp_effect(cfg, outcome),
         scale(cfg, cfg.push_level) * push_effect(cfg, phi_before, phi_after, changed),
     )
-    return base(cfg, grasped & (outcome == LIFTED), distance) + effect
+    return base(cfg, grasped & (outcome == LIFTED), distance) + effect - jnp.where(left > 0, cfg.left, 0.0)
 
 
 def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:
@@ -83,7 +85,7 @@ def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:
     grasp = [scale(cfg, cfg.grasp_level) * level for level in _grasp_levels(cfg)]
     grasp[LIFTED] += cfg.reach
     push = [scale(cfg, cfg.push_level) * effect for effect in (cfg.push_better, cfg.push_worse)]
-    lowest, highest = min(grasp + push) - cfg.distance * cfg.farthest, max(grasp + push)
+    lowest, highest = min(grasp + push) - cfg.distance * cfg.farthest - cfg.left, max(grasp + push)
     return min(lowest, lowest / (1.0 - gamma)), max(highest, highest / (1.0 - gamma))
 
 

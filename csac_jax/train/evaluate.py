@@ -132,9 +132,9 @@ def _rewards(learner: Learner, params: Params, thought: Thought, action: Action,
     """What training would have paid [E]; phi by the critic that acts, where training takes the target critic."""
     info, cfg = after.info, learner.cfg.reward
     phi = jax.vmap(learning.best_grasp)(learning.look(learner, params, after.obs))
-    pay = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))
+    pay = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
     changed = info.moved > CHANGE_AREA
-    return pay(cfg, action.primitive, info.outcome, info.distance, thought.best_grasp, phi, changed)
+    return pay(cfg, action.primitive, info.outcome, info.distance, thought.best_grasp, phi, changed, info.left)
 
 
 def _run(

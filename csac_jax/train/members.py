@@ -25,7 +25,7 @@ NUMBERS = (
     *("cem.std", "cem.std_min", "target.gamma", "target.inverse_temperature"),
     *("reward.reach", "reward.distance", "reward.farthest", "reward.eta0", "reward.eta1", "reward.push_level"),
     *("reward.grasp_level", "reward.nothing", "reward.empty", "reward.touched", "reward.dropped", "reward.lifted"),
-    *("reward.push_better", "reward.push_worse", "reward.dead_band"),
+    *("reward.push_better", "reward.push_worse", "reward.dead_band", "reward.left"),
     *("explore.noise_std", "explore.noise_clip", "explore.primitive_start", "explore.primitive_end"),
     *("explore.place_start", "explore.place_end", "explore.decay", "explore.push_fraction"),
     *("learn.learning_rate", "learn.actor_learning_rate", "learn.rate_end", "learn.tau", "learn.gradient_clip"),

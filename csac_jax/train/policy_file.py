@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "ee0b08035861fba19586186d727801813279361a3bf97f606936d1ff51573673"
+SHIPPED_SHA256 = "b3ac71fe64328dcf4248694407c90baaabb8f85f35ff417d66ef52cba2cbd208"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 

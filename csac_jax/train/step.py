@@ -94,8 +94,8 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     phi_before, phi_after = _around(learner, state.learner, scenes.obs, after.obs, pushed)
     info = after.info
     changed = info.moved > environment.CHANGE_AREA
-    reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))(
-        cfg.reward, action.primitive, info.outcome, info.distance, phi_before, phi_after, changed
+    reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))(
+        cfg.reward, action.primitive, info.outcome, info.distance, phi_before, phi_after, changed, info.left
     )
     seen = Transition(
         obs=heightmap.pack(scenes.obs),

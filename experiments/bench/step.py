@@ -103,8 +103,8 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         pushed = action.primitive == Primitive.PUSH
         phi = step._around(learner, nets, before.obs, after.obs, pushed)
         changed = after.info.moved > environment.CHANGE_AREA
-        of_one = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0))
-        return of_one(cfg.reward, action.primitive, after.info.outcome, after.info.distance, *phi, changed)
+        info, of_one = after.info, jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
+        return of_one(cfg.reward, action.primitive, info.outcome, info.distance, *phi, changed, info.left)
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)

@@ -15,9 +15,10 @@ from csac_jax.sim.outcome import Outcome
 CFG = RewardConfig()
 
 
-def reward(cfg, primitive, outcome=0, distance=0.0, before=0.0, after=0.0, changed=False):
+def reward(cfg, primitive, outcome=0, distance=0.0, before=0.0, after=0.0, changed=False, left=0):
     values = (jnp.float32(v) for v in (distance, before, after))
-    return float(rewards.reward(cfg, jnp.int32(primitive), jnp.int32(outcome), *values, jnp.asarray(changed)))
+    seen = jnp.asarray(changed), jnp.int32(left)
+    return float(rewards.reward(cfg, jnp.int32(primitive), jnp.int32(outcome), *values, *seen))
 
 
 @pytest.mark.parametrize(("outcome", "expected"), list(zip(Outcome, (-1.0, -0.5, -0.25, 0.0, 2.0), strict=True)))
@@ -56,6 +57,19 @@ def test_distance_is_a_loss():
     np.testing.assert_allclose(rewards.base(near, jnp.array(False), jnp.float32(7.0)), -0.2, rtol=1e-6)
 
 
+@pytest.mark.parametrize("primitive", [rewards.PUSH, rewards.GRASP])
+def test_blocks_that_left_cost_once(primitive):
+    """Claim: with `left` 0.75 an action pays 0.75 less when one block has left, or three, and nothing by default."""
+    strict = RewardConfig(left=0.75)
+    whole = reward(CFG, primitive, Outcome.LIFTED, after=1.0)
+    assert [reward(strict, primitive, Outcome.LIFTED, after=1.0, left=n) for n in (0, 1, 3)] == [
+        whole,
+        whole - 0.75,
+        whole - 0.75,
+    ]
+    assert reward(CFG, primitive, Outcome.LIFTED, after=1.0, left=2) == whole
+
+
 def test_scale():
     """Claim: eq. 13 by hand: eta0 + eta1 2^(s - s_max)."""
     assert rewards.scale(CFG, CFG.push_level) == 0.5
@@ -71,6 +85,7 @@ def test_scale():
         RewardConfig(push_better=9.0, push_worse=2.0, nothing=1.0, empty=1.0, touched=1.0, dropped=1.0, reach=0.0),
         RewardConfig(lifted=0.0, reach=-3.0, push_better=-0.5),
         RewardConfig(eta1=-2.0),
+        RewardConfig(left=1.5),
         RewardConfig(distance=3.0, farthest=0.5, push_level=-2.0, grasp_level=0.5, eta0=0.1),
         algorithms.VPG_REWARD,
         dataclasses.replace(algorithms.VPG_REWARD, push_worse=-3.0, push_better=5.0),
@@ -80,9 +95,9 @@ def test_scale():
 def test_bounds_hold_and_are_reached(cfg, gamma):
     """Claim: every discounted return of one action done 1 to 200 times lies within, and some reach both ends."""
     single = [
-        reward(cfg, primitive, outcome, distance, 0.0, after, changed)
-        for primitive, outcome, distance, after, changed in itertools.product(
-            (0, 1), Outcome, (0.0, 1.0, 3.0), (0.0, 1.0), (False, True)
+        reward(cfg, primitive, outcome, distance, 0.0, after, changed, left)
+        for primitive, outcome, distance, after, changed, left in itertools.product(
+            (0, 1), Outcome, (0.0, 1.0, 3.0), (0.0, 1.0), (False, True), (0, 1)
         )
     ]
     lengths = np.cumsum(gamma ** np.arange(200))  # 1, 1 + gamma, ...

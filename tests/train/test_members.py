@@ -34,6 +34,7 @@ OTHER = {
     "reward.push_better": 0.6,
     "reward.push_worse": -0.4,
     "reward.dead_band": 0.02,
+    "reward.left": 0.7,
     "explore.noise_std": 0.2,
     "explore.noise_clip": 0.1,
     "explore.primitive_start": 0.9,

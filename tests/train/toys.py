@@ -98,11 +98,11 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     )
     outcomes = jnp.arange(5, dtype=jnp.int32)
     far, zero, changed = jnp.float32(0.4), jnp.float32(0.0), jnp.array(True)
-    each = jax.vmap(rewards.reward, (None, None, 0, None, None, None, None))
-    grasps = each(cfg.reward, jnp.int32(1), outcomes, far, zero, zero, changed)
+    each = jax.vmap(rewards.reward, (None, None, 0, None, None, None, None, None))
+    grasps = each(cfg.reward, jnp.int32(1), outcomes, far, zero, zero, changed, jnp.int32(1))
     none_lifted, push = jnp.int32(0), jnp.int32(0)
     gains = (jnp.float32(0.05), jnp.float32(0.5))
-    pushes = [rewards.reward(cfg.reward, push, none_lifted, zero, zero, gain, changed) for gain in gains]
+    pushes = [rewards.reward(cfg.reward, push, none_lifted, zero, zero, gain, changed, jnp.int32(0)) for gain in gains]
     ex = cfg.explore
     chances = [
         explore.probability(start, end, ex.decay, 100 * step)
