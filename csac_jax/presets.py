@@ -92,11 +92,11 @@ def paper() -> Config:
 def paper_small() -> Config:
     """The protocol of `paper` with the small net on maps of 64 cells: one scene of ten blocks, 2,500 actions.
 
-    Ours, beside the net: batches of 32, and with them Adam 1e-3; the squared error of Algorithm 1 line 21; discount
-    0.2; SD3's twin critics; shifts of what is drawn from the replay, without which 2,500 actions are learned by heart;
-    random places at first and exploration that ends after some 1,000 actions, as in `quick`. Physics is C's, the
-    fastest for one scene; meshes are of one size, which `sim.physics warp` needs. What each is worth:
-    experiments/bench/NOTES.md; results: experiments/results/paper-small-h200.
+    Ours, beside the net: batches of 32, and with them Adam 1e-3; no more than one update an action, and shifts of what
+    is drawn from the replay, lest 2,500 actions be learned by heart; the squared error of Algorithm 1 line 21; discount
+    0.2; SD3's twin critics; random places at first and exploration that ends after some 1,000 actions, as in `quick`.
+    Physics is C's, the fastest for one scene; meshes are of one size, which `sim.physics warp` needs. What each is
+    worth: experiments/bench/NOTES.md; results: experiments/results/paper-small-h200.
     """
     whole = paper()
     return dataclasses.replace(
