@@ -51,6 +51,7 @@ class Score(NamedTuple):
     physics: str
     robot: str
     seed: int  # of the evaluation
+    episodes: int  # of each evaluation, which decide what scenes it begins with; 0 where it does not tell
 
     def band(self, metric: str) -> Band | None:
         """IQM of the runs' values with its band; of a single run, the interval of its own episodes. None: no cases."""
@@ -88,12 +89,13 @@ def _grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[
     return found
 
 
-def _place(one: Evaluation) -> tuple[Variant, str, str, str, str, str, int]:
-    sim = one.config["sim"]
+def _place(one: Evaluation) -> tuple[Variant, str, str, str, str, str, int, int]:
+    sim, episodes = one.config["sim"], one.metrics.get("counts", {}).get("episodes", 0)
     variant = recorded.variant(one.config)
     if one.policy != "learned":  # what its run was trained with does not matter
         variant = Variant(variant.preset, one.policy, ())
-    return (variant, one.policy, one.suite, one.part, sim.get("physics", "mjx"), sim.get("robot", "hand"), one.seed)
+    world = sim.get("physics", "mjx"), sim.get("robot", "hand")
+    return (variant, one.policy, one.suite, one.part, *world, one.seed, episodes)
 
 
 def _curve(variant: Variant, runs: list[Run], notes: list[str]) -> Curve:
@@ -208,7 +210,7 @@ def evaluation(report: Report) -> Table:
     titles = ["grasp success", "completion", "over reachable", "blocks / actions", "the same, completed episodes"]
     rows = [["policy", "part", "physics, robot, seed", "runs", "episodes", *titles]]
     for score in report.scores:
-        episodes = sum(one.metrics.get("counts", {}).get("episodes", 0) for one in score.evaluations)
+        episodes = score.episodes * len(score.evaluations)
         bands = [shown(score.band(metric)) for metric in METRIC_NAMES]
         rows.append([*_named(score), str(len(score.evaluations)), str(episodes), *bands])
     return rows

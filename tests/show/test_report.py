@@ -41,10 +41,12 @@ def _run(folder: Path, config: dict[str, Any], success: list[float], record: dic
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"actions": 9')
 
 
-def _evaluation(path: Path, config: dict[str, Any], lifted: int, suite: str = "cases", policy: str = "learned") -> None:
+def _evaluation(
+    path: Path, config: dict[str, Any], lifted: int, suite: str = "cases", policy: str = "learned", episodes: int = 10
+) -> None:
     """What `eval --json` writes: 10 grasps in each case, so many of them lifts."""
     share = metrics.wilson(lifted, 10)
-    part = dict.fromkeys(results.METRIC_NAMES, share) | {"counts": {"episodes": 10}}
+    part = dict.fromkeys(results.METRIC_NAMES, share) | {"counts": {"episodes": episodes}}
     part["failures"] = {"grasp_dropped": metrics.wilson(10 - lifted, 10)}
     asked = {"policy": policy, "suite": suite, "seed": 5, "seconds": 3.0, "device": "a card", "commit": "0123456789abc"}
     path.write_text(json.dumps({**asked, "parts": dict.fromkeys(CASES, part), "config": config}))
@@ -115,6 +117,17 @@ def test_runs_are_grouped_by_what_they_are(recorded: Path):
     assert (both.success[0].low, both.success[0].high) == pytest.approx((0.5, 0.7))
     assert both.final.value == pytest.approx(0.925)
     assert [run.seconds[-1] for run in both.runs] == [40.0, 30.0]
+
+
+def test_one_policy_measured_twice_is_not_two_runs(recorded: Path):
+    """Claim: evaluations of other lengths, and so of other scenes, stand beside each other and are not averaged."""
+    _evaluation(recorded / "vpg" / "longer.json", _config("vpg", 0, sim__physics="c"), 9, episodes=40)
+    scores = [one for one in report.build(results.read([recorded])).scores if one.variant.algo == "vpg"]
+    assert sorted((one.part, one.episodes) for one in scores) == sorted((case, n) for case in CASES for n in (10, 40))
+    assert {(one.episodes, len(one.evaluations), one.band("completion").value) for one in scores} == {
+        (10, 1, 0.5),
+        (40, 1, 0.9),
+    }
 
 
 def test_numbers_as_json(recorded: Path):
