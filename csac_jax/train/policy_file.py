@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "b3ac71fe64328dcf4248694407c90baaabb8f85f35ff417d66ef52cba2cbd208"
+SHIPPED_SHA256 = "df26cb381cefd4c54b7bd72c4e24a99859f6e7daa9fb98d52fdf980b6489b177"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 

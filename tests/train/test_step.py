@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import learner as learning
+from csac_jax.agent import learner as learning, rewards
 from csac_jax.config import ReplayConfig
 from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
@@ -150,6 +150,24 @@ class Still(Env):
 
     def step(self, state, action):
         return state.replace(actions=state.actions + 1)
+
+
+class Losing(Env):
+    """The environment without physics, in which every action drives a block out."""
+
+    def step(self, state, action):
+        return state.replace(info=state.info.replace(left=jnp.int32(1)))
+
+
+def test_blocks_that_left_reach_the_reward(run):
+    """Claim: a step takes `reward.left` where a block has left, from grasps of nothing and worthless pushes alike."""
+    reward = dataclasses.replace(CFG.reward, left=0.75)
+    cfg = dataclasses.replace(CFG, reward=reward)
+    env = Losing(cfg, run.program.env.physics, run.program.env.scenes)
+    program = Program(cfg, env, learning.make(cfg))
+    _, metrics = jax.jit(functools.partial(step.train_step, program))(copy(run.states[0]))
+    grasp, push = reward.nothing - 0.75, rewards.scale(reward, reward.push_level) * reward.push_worse - 0.75
+    np.testing.assert_allclose(metrics.reward, np.where(metrics.primitive == rewards.GRASP, grasp, push), rtol=1e-6)
 
 
 @pytest.mark.slow
