@@ -13,10 +13,10 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, cli, presets
-from csac_jax.cli import bench, evaluation, stored, sweep, train
+from csac_jax.cli import bench, evaluation, play, stored, sweep, train
 from csac_jax.config import Config, SceneConfig
 from csac_jax.scene import pool
-from csac_jax.train import checkpoint, stop
+from csac_jax.train import checkpoint, evaluate, stop
 
 ROOT = Path(csac_jax.__file__).parents[1]
 SMOKE = presets.smoke()
@@ -481,3 +481,18 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
     assert "90.0 %" in shown
     assert "lifted 9" in shown
     assert "-" in next(line for line in shown.splitlines() if "completion" in line)
+
+
+@pytest.mark.parametrize(("scene", "any_yaw"), [("row", False), ("random", True)])
+def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str, any_yaw: bool):
+    """Claim: `play` turns a case by quarters at most, so that it can be known again, and a random scene by any yaw."""
+    turned = []
+
+    def episode(_, env, *__):
+        turned.append(env.any_yaw)
+        yield from ()
+
+    monkeypatch.setattr(evaluate, "episode", episode)
+    physics = dataclasses.replace(SMOKE.sim, physics="c")
+    play._play(play.PlayOptions(scene=scene), dataclasses.replace(SMOKE, sim=physics), None)
+    assert turned == [any_yaw]

@@ -90,6 +90,7 @@ def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None)
     with as_bad_arguments(ValueError):
         suite = "own" if options.scene == "random" else str(_case_file(options.scene))
         (env,) = suites.environments(cfg, suite, 1, options.seed).values()
+    env = dataclasses.replace(env, any_yaw=options.scene == "random")  # a case is to be known again
     params = None if networks is None else networks()
     moments: list[Any] = []
     name = options.policy if networks is None else "learned"

@@ -27,7 +27,7 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
         raise SceneError("sim.physics: warp is an extra; run: pip install 'csac-jax[warp]'") from None
     from mujoco.mjx.third_party.mujoco_warp import OverflowType
 
-    warp.config.quiet = True
+    warp.config.log_level = warp.LOG_WARNING  # not a line for each of its kernels
     model = mjx.put_model(world.model, impl="warp").tree_replace({"opt._impl.warn_overflow": 0})
     data = mjx.make_data(
         world.model, impl="warp", naconmax=WARP_WORLDS * cfg.contacts, njmax=_ROWS * cfg.contacts + _OTHER_ROWS

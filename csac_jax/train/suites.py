@@ -3,13 +3,14 @@
 `own`        scenes dropped or arranged like the training's, from another stream of random numbers.
 `random10`   ten blocks of all shapes, dropped.
 `random30`   thirty, poured into a pile; on a CPU of use in C MuJoCo (`--physics c`) only, MJX takes minutes to compile.
-`cases`      the shipped hard arrangements, one environment each, quarter turns of the case as it is.
+`cases`      the shipped hard arrangements, one environment each, turned as a whole from episode to episode.
 `target`     the cases and random10 with one marked block to get within 5 actions (CSAC sec. 4.4); for policies of the
              target task.
 `generated`  ordered arrangements of all levels of difficulty, drawn anew.
 a path       the user's case file.
 
 Dropped and drawn scenes follow streams of random numbers from 1 on; training's is stream 0. Cases are in no training.
+Every scene is turned by a random yaw, or by quarters where another turn would take a block out of the square.
 An episode may take 2.5 actions for every dropped block, or as many as in training if that is more.
 """
 
@@ -103,7 +104,7 @@ def _thirty(cfg: Config, episodes: int, stream: int) -> Env:
 def _placed(cfg: Config, scene: SceneConfig, scenes: Scene) -> Env:
     """The environment of scenes [P, N, ...] that nobody dropped."""
     cfg = _wide(cfg, scene)
-    return Env(cfg, simulation.make(model.build(scene, cfg.sim), cfg.sim), scenes, any_yaw=False)
+    return Env(cfg, simulation.make(model.build(scene, cfg.sim), cfg.sim), scenes)
 
 
 def _case(cfg: Config, path: Path) -> Env:
@@ -124,7 +125,7 @@ def _cases(cfg: Config) -> dict[str, Env]:
     physics = simulation.make(model.build(scene, cfg.sim), cfg.sim)
     seated = {name: cases.seat(case, slots) for name, case in every.items()}
     return {
-        name: Env(cfg, physics, jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene), any_yaw=False)
+        name: Env(cfg, physics, jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene))
         for name, scene in seated.items()
     }
 

@@ -55,16 +55,17 @@ def test_cases_share_their_compilation():
     assert evaluate._cached.cache_info().misses == begun + 1
 
 
-def test_cases_are_turned_by_quarters():
-    """Claim: an episode begins with the case turned by 0, 90, 180 or 270 degrees, so that it stays inside."""
+def test_cases_are_turned_as_a_whole():
+    """Claim: an episode begins with the case turned by any yaw, all blocks alike, so that no two episodes are the same
+    and all stay inside."""
     scene, turned = _varied(CFG, "row")
     lies = np.asarray(scene.in_play)
     before, after = np.asarray(scene.position)[lies], turned.position[:, lies]
-    angle = np.arctan2(after[..., 1], after[..., 0]) - np.arctan2(before[:, 1], before[:, 0])
-    quarters = np.mod(angle / (0.5 * np.pi) + 0.5, 4.0) - 0.5
-    np.testing.assert_allclose(quarters, quarters.round(), atol=1e-3)
-    np.testing.assert_allclose(quarters.T, np.broadcast_to(quarters[:, 0], quarters.T.shape), atol=1e-3)
-    assert set(quarters[:, 0].round()) == {0.0, 1.0, 2.0, 3.0}
+    yaws = np.arctan2(after[..., 1], after[..., 0]) - np.arctan2(before[:, 1], before[:, 0])  # [episodes, blocks]
+    np.testing.assert_allclose(np.exp(1j * yaws), np.broadcast_to(np.exp(1j * yaws[:, :1]), yaws.shape), atol=1e-3)
+    assert len(np.unique(np.mod(yaws[:, 0], 2.0 * np.pi).round(3))) > 35
+    assert np.histogram(np.mod(yaws[:, 0], 2.0 * np.pi), bins=4, range=(0, 2.0 * np.pi))[0].min() >= 3  # 10 expected
+    assert np.abs(after[..., :2]).max() <= 0.5 * CFG.heightmap.extent
 
 
 def test_target_is_the_cases_own():
