@@ -1,6 +1,7 @@
 """The figures of a report, with matplotlib: figures 6, 7 and 9 of the paper, and whatever else was varied."""
 
 import io
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +23,7 @@ SAMPLERS = ("csac", "csac_per", "csac_beta")
 COLOURS = dict(zip(NAMES, ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759"), strict=True))
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
 NAMED = 3  # settings that a legend names
+WIDE = 56  # characters of a line of a legend
 FOUR = ("cases", "target")  # suites whose parts are the four cases
 
 
@@ -74,7 +76,7 @@ def _lines(curves: Sequence[Curve]) -> Figure:
         drawn.add(algo)
         value = [100 * band.value for band in curve.success]
         name = f"{reporting.label(curve.variant, preset=False, most=NAMED)} ({len(curve.runs)})"
-        axes.plot(curve.actions, value, color=colour, label=name)
+        axes.plot(curve.actions, value, color=colour, label=textwrap.fill(name, WIDE))
         banded = [(x, b) for x, b in zip(curve.actions, curve.success, strict=True) if b.low is not None]
         if banded:
             low, high = ([100 * getattr(b, side) for _, b in banded] for side in ("low", "high"))
@@ -130,6 +132,7 @@ def _marks(panel: Axes, own: Sequence[Score], parts: Sequence[str], metric: str,
     first = own[0]
     name = reporting.label(first.variant, preset=False, most=NAMED) if first.policy == "learned" else first.policy
     name += f", {first.physics}, {first.robot} ({len(first.evaluations)})"
+    name = textwrap.fill(name, WIDE)
     known = COLOURS.get(first.variant.algo)
     colour = known if known and first.variant.method else plt.get_cmap("tab20")(index)
     for i, (place, band) in enumerate(bands.items()):
