@@ -295,6 +295,10 @@ class NetConfig:
     """small: dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
     stem: int = 16
     """small: channels of the first convolution."""
+    border: bool = False
+    """small: one more map, of what is workspace, so that the net sees how near to the border a block lies; shifts and
+    turns of drawn transitions (`learn.augment_shift`) then leave out those that would show another border than there
+    is."""
     stride: int = 2
     """small: cells of its input per cell of its features, along each axis: 2, or 4 with a quarter of the work."""
     subcells: int = 1
@@ -337,6 +341,7 @@ class NetConfig:
             self.kind == "densenet121" or (self.norm == "group" and not self.weights),
             "net.norm batch, net.weights: only of --net.kind densenet121; the small net has group norm",
         )
+        _require(self.kind == "small" or not self.border, "net.border: only of --net.kind small")
         _require(
             not self.weights or self.norm == "batch", "net.weights: need --net.norm batch, whose statistics they bring"
         )

@@ -17,6 +17,8 @@ from csac_jax.sim.primitives import Primitive
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import PackedObservation
 
+CLEAR = 0.05  # m from a side that what stands must keep where the border is shown and that side is none
+
 
 def turn_over(transition: Transition, mirror_x: jax.Array, mirror_y: jax.Array, swap: jax.Array) -> Transition:
     """The transition seen with x mirrored, then y mirrored, then x and y swapped, where the flags [] bool say so."""
@@ -48,7 +50,8 @@ def move(cfg: Config, transition: Transition, yaw: jax.Array, cells: jax.Array) 
 
     As it was where that would cut something off: something higher than BARE in either map, the place of the action, or
     the end of a push, which the workspace must not have cut off before either. What comes in from beside the workspace
-    is bare table.
+    is bare table; or, where the net is shown the border, beyond it: the border moves along. Sides that the move pushes
+    out of sight are where it is not: what stands keeps CLEAR of them.
     """
     pose = transition.action.pose
     step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
@@ -58,8 +61,8 @@ def move(cfg: Config, transition: Transition, yaw: jax.Array, cells: jax.Array) 
     for obs in (transition.obs, transition.next_obs):
         whole &= _stays(cfg, heightmap.unpack(obs).height, yaw, step)
     moved = transition.replace(
-        obs=_moved_map(transition.obs, yaw, cells),
-        next_obs=_moved_map(transition.next_obs, yaw, cells),
+        obs=_moved_map(cfg, transition.obs, yaw, cells),
+        next_obs=_moved_map(cfg, transition.next_obs, yaw, cells),
         action=transition.action.replace(pose=turned),
     )
     return jax.tree.map(lambda new, old: jnp.where(whole, new, old), moved, transition)
@@ -75,10 +78,17 @@ def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
 def _stays(cfg: Config, height: jax.Array, yaw: jax.Array, step: jax.Array) -> jax.Array:
     """Whether all that stands on the map [H, W] m stays above the workspace, turned and shifted by `step` [2] m."""
     place = geometry.rotate2d(yaw, geometry.cell_centres(cfg.heightmap)) + step[None, None]
-    return jnp.all((height <= BARE) | (jnp.max(jnp.abs(place), axis=-1) <= 0.5 * cfg.heightmap.extent))
+    half = 0.5 * cfg.heightmap.extent
+    low, high = jnp.full(2, half), jnp.full(2, half)  # room towards -x, -y and +x, +y
+    if cfg.net.border:
+        turned = jnp.broadcast_to(yaw != 0.0, (2,))
+        low = jnp.where((step < 0.0) | turned, half - CLEAR, half)
+        high = jnp.where((step > 0.0) | turned, half - CLEAR, half)
+    stays = jnp.all((-place <= low[None, None]) & (place <= high[None, None]), axis=-1)
+    return jnp.all((height <= BARE) | stays)
 
 
-def _moved_map(obs: PackedObservation, yaw: jax.Array, cells: jax.Array) -> PackedObservation:
+def _moved_map(cfg: Config, obs: PackedObservation, yaw: jax.Array, cells: jax.Array) -> PackedObservation:
     """Maps turned and then shifted, from the nearest cell; what comes in from beside looks like the lowest cell."""
     size = obs.height.shape[0]
     along = jnp.arange(size, dtype=jnp.float32) + 0.5 - 0.5 * size  # cells from the centre
@@ -94,7 +104,7 @@ def _moved_map(obs: PackedObservation, yaw: jax.Array, cells: jax.Array) -> Pack
 
     return PackedObservation(
         colour=take(obs.colour),
-        height=jnp.where(inside, take(obs.height), jnp.uint16(0)),
+        height=jnp.where(inside, take(obs.height), jnp.uint16(heightmap.BEYOND_COUNT if cfg.net.border else 0)),
         target=jnp.where(inside, take(obs.target), jnp.all(obs.target)),
     )
 

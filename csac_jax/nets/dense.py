@@ -31,17 +31,19 @@ def compute_dtype(cfg: NetConfig) -> Any:
     return jnp.dtype(cfg.dtype)
 
 
-def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
+def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None, border: bool) -> jax.Array:
     """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [..., H, W] m.
 
-    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool. Bare table is 0, like what lies outside of a turned
-    map.
+    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool, + 1 with the border: 1 on the workspace. Bare table
+    is 0 in the others, like what lies outside of a turned map, where all are 0; heights below 0 are outside too.
     """
-    maps = [height[..., None] / _HEIGHT_SCALE]
+    maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
     if colour is not None:
         maps.insert(0, jnp.where(height[..., None] > TABLE_HEIGHT, colour - 0.5, 0.0))
     if target is not None:
         maps.append(target[..., None].astype(height.dtype))
+    if border:
+        maps.append((height >= 0.0)[..., None].astype(height.dtype))
     return jnp.concatenate(maps, axis=-1)
 
 

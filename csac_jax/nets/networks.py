@@ -35,8 +35,10 @@ def stride(cfg: NetConfig) -> int:
 
 def inputs(cfg: NetConfig, colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:
     """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3], height [..., H, W] m, target [..., H, W]."""
-    prepare = dense.inputs if cfg.kind == "small" else densenet.inputs
-    return prepare(colour if cfg.colour else None, height, target)
+    shown = colour if cfg.colour else None
+    if cfg.kind == "small":
+        return dense.inputs(shown, height, target, cfg.border)
+    return densenet.inputs(shown, height, target)
 
 
 def learned(variables: Any) -> Any:

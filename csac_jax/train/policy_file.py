@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "df26cb381cefd4c54b7bd72c4e24a99859f6e7daa9fb98d52fdf980b6489b177"
+SHIPPED_SHA256 = "ebfb732dbb0d5ba3e891232ba5577fb1f7aaf803709a88cf2aca9a872636f5ad"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 

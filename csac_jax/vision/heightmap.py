@@ -18,6 +18,8 @@ from csac_jax.vision.camera import Camera
 VIEW_HEIGHT = 0.5
 """Height from which the map looks down, m: all that is in play lies below, parked blocks must lie wholly above."""
 
+BEYOND = -1.0  # m, the height of what lies beside the workspace, in maps that were shifted or turned
+BEYOND_COUNT = 65535  # packed
 _HEIGHT_UNIT = 1e-4  # m per count of the packed height
 _CM2 = 1e4  # cm^2 in a m^2
 
@@ -185,17 +187,18 @@ def surface_tables(
 
 
 def pack(obs: Observation) -> PackedObservation:
-    """Rounds to a colour level and to a tenth of a millimetre; heights are cut off at 0 and 6.5535 m."""
-    counts = jnp.clip(jnp.round(obs.height / _HEIGHT_UNIT), 0.0, 65535.0)
+    """Rounds to a colour level and to a tenth of a millimetre; heights are cut off at 0 and 6.5534 m."""
+    counts = jnp.clip(jnp.round(obs.height / _HEIGHT_UNIT), 0.0, BEYOND_COUNT - 1.0)
     levels = jnp.clip(jnp.round(obs.colour * 255.0), 0.0, 255.0)
     return PackedObservation(levels.astype(jnp.uint8), counts.astype(jnp.uint16), obs.target)
 
 
 def unpack(packed: PackedObservation) -> Observation:
     """The observation that was packed, up to half a colour level and half a tenth of a millimetre."""
+    height = packed.height.astype(jnp.float32) * _HEIGHT_UNIT
     return Observation(
         colour=packed.colour.astype(jnp.float32) / 255.0,
-        height=packed.height.astype(jnp.float32) * _HEIGHT_UNIT,
+        height=jnp.where(packed.height == BEYOND_COUNT, BEYOND, height),
         target=packed.target,
     )
 

@@ -263,6 +263,41 @@ def test_what_would_be_cut_off_stays(transition):
             assert _signature(after) == _signature(before)
 
 
+BORDERED = dataclasses.replace(CFG, net=dataclasses.replace(CFG.net, border=True))
+move_border = jax.jit(lambda transition, cells: augment.move(BORDERED, transition, jnp.float32(0.0), cells))
+
+
+def test_the_border_moves_along(transition):
+    """Claim: with `net.border` what comes in beside the workspace is marked, all else as without; the net is fed the
+    border where it would be, had the workspace moved with its blocks."""
+    cells = jnp.array([2, 1], jnp.int32)
+    moved, plain = move_border(transition, cells), move(transition, jnp.float32(0.0), cells)
+    beyond = np.zeros((32, 32), bool)
+    beyond[:2] = beyond[:, :1] = True
+    for obs, wanted in zip((moved.obs, moved.next_obs), (plain.obs, plain.next_obs), strict=True):
+        seen = heightmap.unpack(obs)
+        np.testing.assert_array_equal(seen.height, np.where(beyond, heightmap.BEYOND, heightmap.unpack(wanted).height))
+        fed = np.asarray(maps.net_inputs(maps.frames(BORDERED), seen))[0]  # the frame that is not turned
+        np.testing.assert_array_equal(fed[..., -1], np.pad(~beyond, 2))
+        np.testing.assert_array_equal(fed[..., :-1], maps.net_inputs(FRAMES, heightmap.unpack(wanted))[0])
+    assert not np.array_equal(moved.obs.height, transition.obs.height)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(
+    ("cell", "step", "goes"), [(26, 1, True), (27, 1, False), (27, -1, True), (1, 1, True), (4, -1, False)]
+)
+def test_nothing_comes_near_a_border_that_is_none(transition, axis: int, cell: int, step: int, goes: bool):
+    """Claim: with `net.border` a shift that brings what stands within 5 cm of the side it goes to is left out, as the
+    net would see a border there; at the other side, whose border moves along, it is not."""
+    height = np.zeros((32, 32), np.uint16)
+    height[(cell, 16) if axis == 0 else (16, cell)] = 500  # 14 mm cells: the centre of cell 27 is 161 mm off, of 28 175
+    lone = transition.obs.replace(height=jnp.asarray(height))
+    cells = jnp.array([step, 0] if axis == 0 else [0, step], jnp.int32)
+    lone = transition.replace(obs=lone, next_obs=lone, action=transition.action.replace(primitive=jnp.int32(1)))
+    assert (not np.array_equal(move_border(lone, cells).obs.height, height)) == goes
+
+
 def test_vary_is_what_the_config_says(transition):
     """Claim: by default `vary` draws the same symmetry as `randomly`; shifts and turns stay in their bounds and reach
     them; with everything off it changes nothing."""

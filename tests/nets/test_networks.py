@@ -40,6 +40,7 @@ def _config(size: int = 224, **net: Any) -> Config:
         (224, {"norm": "layer"}, "net.norm: 'layer' is not one of: group, batch"),
         (224, {"kind": "resnet"}, "net.kind: 'resnet' is not one of: small, densenet121"),
         (224, {"weights": "x.safetensors"}, "net.weights: need --net.norm batch"),
+        (224, {"border": True}, "net.border: only of --net.kind small"),
         (64, {"kind": "small", "margin": 0.125, "norm": "batch"}, "net.norm batch, net.weights: only of"),
         (64, {"kind": "small", "margin": 0.125, "weights": "x"}, "net.norm batch, net.weights: only of"),
         (64, {"kind": "small", "stride": 3}, "net.stride: must be 2 or 4"),

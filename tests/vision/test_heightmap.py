@@ -136,7 +136,7 @@ def test_packing_cuts_off():
         colour=jnp.array([[[-0.1, 1.2, 1.0]]]), height=jnp.array([[-0.01, 7.0]]), target=jnp.ones((1, 2), bool)
     )
     packed = heightmap.pack(obs)
-    np.testing.assert_array_equal(packed.height, [[0, 65535]])
+    np.testing.assert_array_equal(packed.height, [[0, heightmap.BEYOND_COUNT - 1]])  # not the mark of what lies beyond
     np.testing.assert_array_equal(packed.colour, [[[0, 255, 255]]])
 
 
