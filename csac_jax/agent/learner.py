@@ -1,10 +1,11 @@
 """Networks and their updates: the critic towards the TD target, the actor up the critic, targets after both.
 
-M = critics, one or two of the same shape: their parameters are stacked and the net is vmapped over them. Everything
-but the loss sees the lower of their values in each cell.
+M = critics, one or two of the same shape, their parameters stacked. Everything but the loss sees the lower of their
+values in each cell.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -141,9 +142,20 @@ def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[ja
     Q is the lower of both critics in each cell, before anything is read between cells; features are the first one's.
     """
     fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
-    outputs: Any = jax.vmap(learner.critic.apply, (0, None))(params.critic, fed.reshape(-1, *fed.shape[2:]))
+    flat = fed.reshape(-1, *fed.shape[2:])
+    outputs = _of_each_critic(lambda variables: learner.critic.apply(variables, flat), params.critic)
     q, features = jnp.min(outputs[0], axis=0), outputs[1][0]
     return q.reshape(*fed.shape[:2], *q.shape[1:]), features.reshape(*fed.shape[:2], *features.shape[1:])
+
+
+def _of_each_critic(call: Callable[[Any], Any], variables: Any) -> Any:
+    """What `call` makes of the variables of each critic, leaves [M, ...] in and out.
+
+    One after another: under vmap their convolutions become grouped ones, which take longer than both by themselves.
+    """
+    num = jax.tree.leaves(variables)[0].shape[0]
+    each = [call(jax.tree.map(lambda leaf, m=m: leaf[m], variables)) for m in range(num)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
 def _dense_maps(learner: Learner, obs: Observation, q: jax.Array, correction: jax.Array) -> DenseMaps:
@@ -220,8 +232,8 @@ def _value(learner: Learner, critic: Any, obs: Observation, action: Action) -> t
     half = jnp.mod(k, num // 2)
     fed = maps.seen(frames, obs)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(frames.tables, fed, half)
-    run = jax.vmap(networks.train, (None, 0, None))
-    (q, _), statistics = run(learner.critic, critic, one.reshape(-1, *one.shape[2:]))
+    flat = one.reshape(-1, *one.shape[2:])
+    (q, _), statistics = _of_each_critic(lambda variables: networks.train(learner.critic, variables, flat), critic)
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
     push_output = (k >= num // 2).astype(jnp.int32)
     output = jnp.where((action.primitive == Primitive.GRASP)[:, None], dense.OUTPUTS - 1, push_output)
