@@ -4,6 +4,7 @@ Look, act, simulate, remember, learn, replace finished scenes. E = scenes, B = b
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -144,13 +145,10 @@ def _learn(
 
     def update(carry, i):
         state, priority = carry
-        key_sample, key_augment, key_target = jax.random.split(jax.random.fold_in(key, i), 3)
+        *keys_draw, key_target = jax.random.split(jax.random.fold_in(key, i), 3)
         progress = state.updates.astype(jnp.float32) / total
         current = replay.replace(priority=priority)
-        slots, weights = samplers.sample(key_sample, cfg.replay, current, progress, cfg.learn.batch)
-        batch = ring.gather(replay, slots)
-        batch = program.spread.batch(batch)
-        batch = jax.vmap(augment.vary, (0, None, 0))(_keys(key_augment, cfg.learn.batch), cfg, batch)
+        slots, weights, batch = _draw(program, keys_draw, current, progress)
         state, info = learning.update_critic(key_target, learner, state, batch, weights)
         current = ring.set_priorities(current, slots, samplers.priority(cfg.replay, info.error))
         return (state, current.priority), (info, batch.obs)
@@ -166,6 +164,17 @@ def _learn(
         "q_mean": jnp.mean(info.q),
     }
     return state, priority, losses
+
+
+def _draw(
+    program: Program, keys: Sequence[jax.Array], replay: ReplayState, progress: jax.Array
+) -> tuple[jax.Array, jax.Array, Transition]:
+    """A batch as the sampler has it, augmented: slots [B], weights [B], leaves [B, ...]; two keys."""
+    cfg, (key_sample, key_augment) = program.cfg, keys
+    slots, weights = samplers.sample(key_sample, cfg.replay, replay, progress, cfg.learn.batch)
+    batch = program.spread.batch(ring.gather(replay, slots))
+    vary = jax.vmap(augment.vary, (0, None, 0))
+    return slots, weights, vary(_keys(key_augment, cfg.learn.batch), cfg, batch)
 
 
 def _best_grasps(learner: Learner, state: LearnerState, obs: Observation) -> jax.Array:

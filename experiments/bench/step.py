@@ -4,7 +4,9 @@ given, physics `auto`.
 
 Each stage of `train_step` is compiled by itself and timed beside the whole step, a compiled loop of STEPS (2) steps as
 in training, and beside a bare loop of the engine's own steps of the same scenes and set-points: in one process, turn by
-turn, the median of REPEATS (5) rounds, so that what else the machine does hits all alike. Trust ratios.
+turn, the median of REPEATS (5) rounds, so that what else the machine does hits all alike. Trust ratios. `learn` is
+taken apart once more, into single calls: `draw` a batch, its `next_value`, `update_critic` with that inside, and
+`update_actor`.
 
 With --curve the whole step alone is timed at A, 2 A, 4 A .. B scenes, blocks, cells along a side of the map, or
 transitions in the ring; contact caps grow with the blocks. On an accelerator, `peak_bytes` is of all measured so far.
@@ -41,6 +43,7 @@ from experiments.bench._options import Parser
 from experiments.bench._timing import medians
 
 CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
+_PARTS = ("draw", "next_value", "update_critic", "update_actor")  # of learning
 _SEPARATE = ("look", "act", "simulate", "reward", "remember", "learn", "replace")
 
 
@@ -159,8 +162,33 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "learn": lambda: run["learn"](key, nets, filled),
         "replace": lambda: run["replace"](keys, after),
     }
+    calls |= _learning(program, nets, filled)
     calls["bare_loop"] = _bare.loop(env.physics, scenes.scene, _bare.drives(cfg, scenes.obs.height, action))
     return calls
+
+
+def _learning(program: step.Program, nets: Any, replay: Any) -> dict[str, Callable[[], Any]]:
+    """What learning is made of, each a call of a program of its own; a call of each but `update_actor` is an update."""
+    cfg, learner = program.cfg, program.learner
+    key, keys = jax.random.key(3), jax.random.split(jax.random.key(4), cfg.learn.batch)
+    jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
+
+    def next_value(nets: Any, batch: Transition) -> jax.Array:
+        maps = learning.look(learner, nets.target, heightmap.unpack(batch.next_obs))
+        return jax.vmap(learning.next_value, (None, 0, 0))(learner, keys, maps)
+
+    draw = jit(lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5)))
+    value = jit(next_value)
+    critic = jit(lambda nets, batch, weights: learning.update_critic(key, learner, nets, batch, weights))
+    actor = jit(lambda nets, obs: learning.update_actor(learner, nets, heightmap.unpack(obs)))
+    _, weights, batch = draw(replay)
+    part = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
+    return {
+        "draw": lambda: draw(replay),
+        "next_value": lambda: value(nets, batch),
+        "update_critic": lambda: critic(nets, batch, weights),
+        "update_actor": lambda: actor(nets, part),
+    }
 
 
 def _whole(chunk: Any, state: step.TrainState) -> Callable[[], Any]:
@@ -225,6 +253,7 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     return {
         "stage_seconds": stages,
         "stage_shares": {name: value / total for name, value in stages.items()},
+        "learn_call_seconds": {name: seconds[name] for name in _PARTS},
         "step_seconds": whole,
         "sum_of_stages_over_step": total / whole,
         **_rates(cfg, whole),
