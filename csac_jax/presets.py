@@ -45,7 +45,7 @@ def fast() -> Config:
 
     Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A failed grasp costs
     more than a push that is not worth it, half of the random primitives are pushes, and blocks that leave cost. What it
-    learns, and three of its settings beside others: experiments/bench/NOTES.md.
+    learns so, and otherwise: experiments/bench/NOTES.md.
     """
     return Config(
         preset="fast",
