@@ -145,10 +145,13 @@ def compile_chunk(program: Program, given: Members, num_steps: int, mesh: Mesh |
     """A jitted function state -> (state, StepMetrics [T, S, ...]) of `num_steps` training steps of all members.
 
     The state is donated. With a mesh over seeds each device scans its own members and hears nothing of the others;
-    metrics end up on every device.
+    metrics end up on every device. Networks that take turns do so, unless numbers are traced, which cannot be lifted
+    out of a loop over members, or scenes are spread.
     """
     if mesh is not None and shard == "scenes":
         program = dataclasses.replace(program, spread=Spread(mesh))
+    elif not given.numbers:
+        program = dataclasses.replace(program, in_turn=step.takes_turns(program.cfg))
 
     def chunk(state: TrainState, given: Members) -> tuple[TrainState, StepMetrics]:
         def one(member: Members, state: TrainState) -> tuple[TrainState, StepMetrics]:

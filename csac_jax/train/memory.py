@@ -143,10 +143,11 @@ KNOBS = {"replay.capacity": 2, "learn.batch": 1, "train.scenes": 1}
 """Settings that memory falls with, and their least values."""
 
 
-def sure(cfg: Any) -> int:
-    """Bytes that a run takes for sure."""
+def sure(cfg: Any, members: int = 1) -> int:
+    """Bytes that a run takes for sure, or several side by side, whose networks may take turns."""
     slot = ring.bytes_needed(1, step.example(cfg))
-    return cfg.replay.capacity * slot + _largest_need(stages(cfg, fitted_only=True))
+    at_once = 1 if step.takes_turns(cfg) else members
+    return members * cfg.replay.capacity * slot + at_once * _largest_need(stages(cfg, fitted_only=True))
 
 
 def _value(cfg: Config, name: str) -> int:

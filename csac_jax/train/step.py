@@ -4,7 +4,8 @@ Look, act, simulate, remember, learn, replace finished scenes. E = scenes, B = b
 """
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -67,6 +68,12 @@ class Program:
     env: Env
     learner: Learner
     spread: Spread = ALONE  # of scenes and batches over devices
+    in_turn: bool = False  # of several runs side by side, the networks of one at a time
+
+
+def takes_turns(cfg: Config) -> bool:
+    """Whether runs side by side have their networks in turn: DenseNet-121 of one run keeps a device busy and fills it."""
+    return cfg.net.kind == "densenet121"
 
 
 def make(cfg: Config) -> Program:
@@ -81,7 +88,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     scenes = state.scenes
 
     # Look and act: by default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13).
-    maps = learning.look(learner, state.learner.online, scenes.obs)
+    maps = _whole(program, functools.partial(learning.look, learner))(state.learner.online, scenes.obs)
     act = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
     taken = state.step * cfg.train.scenes
     span = learner.bounds[1] - learner.bounds[0]
@@ -92,7 +99,8 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Reward and remember (lines 14-15).
     pushed = action.primitive == Primitive.PUSH
-    phi_before, phi_after = _around(learner, state.learner, scenes.obs, after.obs, pushed)
+    around = _whole(program, functools.partial(_around, learner))
+    phi_before, phi_after = around(state.learner, scenes.obs, after.obs, pushed)
     info = after.info
     changed = info.moved > environment.CHANGE_AREA
     reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))(
@@ -109,7 +117,8 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Learn (lines 16-26). During the warm-up the result is dropped: a branch would cost more than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.warmup
-    learned, priority, losses = _learn(program, key_learn, state.learner, replay)
+    learn = _whole(program, functools.partial(_learn, program))
+    learned, priority, losses = learn(key_learn, state.learner, replay)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, replay.priority)
 
@@ -134,6 +143,11 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     )
     state = TrainState(state.key, state.step + 1, scenes, learned, replay.replace(priority=priority))
     return state, metrics
+
+
+def _whole(program: Program, part: Callable[..., Any]) -> Callable[..., Any]:
+    """What the networks of one run do, kept whole where several runs are vmapped, if they are to take turns."""
+    return jax.custom_batching.sequential_vmap(part) if program.in_turn else part
 
 
 def _learn(
@@ -187,7 +201,7 @@ def _around(
 ) -> jax.Array:
     """phi_g before and after the action [2, E]; zeros if no scene was `pushed` [E] bool, since grasps need none.
 
-    With seeds side by side the branch turns into a selection: both sides run.
+    With seeds side by side the branch turns into a selection, both sides run; where they take turns it stays one.
     """
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, after)
 

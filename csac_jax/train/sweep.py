@@ -156,13 +156,14 @@ def check(plan: Plan) -> None:
 def check_memory(plan: Plan, devices: int) -> None:
     """Raises ValueError where the members of a group, spread over `devices`, are known to exceed a device's memory."""
     for given, _ in groups_of(plan._replace(seeds=1)):
-        one, available = memory.sure(given.configs[0]), memory.limit()
+        cfg, available = given.configs[0], memory.limit()
         members = -(-len(given.configs) * plan.seeds // devices)
-        if members * one > available:
-            total, there = members * one / memory.GIB, available / memory.GIB
+        total = memory.sure(cfg, members)
+        if total > available:
+            fit = sum(memory.sure(cfg, fewer) <= available for fewer in range(1, members))
             raise ValueError(
-                f"--seeds: {members} members side by side take {total:.1f} GiB, there are {there:.1f}, enough for "
-                f"{available // one}; lower --seeds or --replay.capacity, vary fewer numbers or raise --devices"
+                f"--seeds: {members} members side by side take {total / memory.GIB:.1f} GiB, there are "
+                f"{available / memory.GIB:.1f}, enough for {fit}; lower --seeds or --replay.capacity, vary fewer numbers or raise --devices"
             )
 
 

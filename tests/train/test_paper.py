@@ -1,6 +1,7 @@
 """DenseNet-121 in the training step: the preset `paper` as far as a CPU goes, and a run at the smallest size."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import NetConfig
 from csac_jax.env import Env
-from csac_jax.train import checkpoint, step
+from csac_jax.train import checkpoint, members, step
 from tests.train.test_step import assert_same, copy, equal
 
 pytestmark = pytest.mark.mjx
@@ -78,3 +79,33 @@ def test_run_with_batch_norm_resumes(tmp_path):
     assert_same(again, second)
     assert_same(repeated, metrics)
     assert jnp.any(again.learner.updates > 0)
+
+
+@pytest.mark.slow
+def test_runs_side_by_side_take_turns():
+    """Claim: of two DenseNet runs side by side each is the run that `train` makes of its seed, bit for bit, and no
+    convolution is a grouped one, as vmap would have it; numbers that differ are vmapped."""
+    smoke = presets.smoke()
+    net = NetConfig("densenet121", 4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), block_growth=4, zoom=2)
+    configs = [dataclasses.replace(smoke, net=net, seed=k) for k in range(2)]
+    program = step.make(configs[0])
+    program = dataclasses.replace(program, env=Still(configs[0], program.env.physics, program.env.scenes))
+
+    def lowered(configs):
+        (group,) = members.group(configs)
+        each = members.members(group)
+        begun = members.init(program, each)
+        return begun, members.compile_chunk(program, each, 6).lower(begun)
+
+    begun, chunk = lowered(configs)
+    assert set(re.findall(r"feature_group_count = (\d+)", chunk.as_text())) == {"1"}
+    after, metrics = chunk.compile()(begun)
+    for k, cfg in enumerate(configs):
+        one = dataclasses.replace(program, cfg=cfg)
+        alone, seen = step.compile_chunk(one, 6)(step.init(one))
+        assert_same(members.member(after, k), alone)
+        assert_same(jax.tree.map(lambda leaf, k=k: leaf[:, k], metrics), seen)
+        assert np.all(np.isfinite(seen.critic_loss))
+
+    slower = dataclasses.replace(configs[1], learn=dataclasses.replace(smoke.learn, tau=0.5))
+    assert "2" in re.findall(r"feature_group_count = (\d+)", lowered([configs[0], slower])[1].as_text())
