@@ -41,7 +41,7 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, three quarters of the scenes packed, 1,024 side by side, for one GPU.
+    """Ten blocks of all eight shapes, three quarters of the scenes packed, 2,048 side by side, for one GPU.
 
     Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A failed grasp costs
     more than a push that is not worth it, half of the random primitives are pushes, and blocks that leave cost. What it
@@ -55,16 +55,17 @@ def fast() -> Config:
             pool=4096,
             arranged=0.75,
             drop_extent=(0.1, 0.25),
+            mesh_spread=0.0,
         ),
         task=TaskConfig(max_actions=25),
-        sim=SimConfig(geom_pairs=24, contacts=80),
+        sim=SimConfig(physics="auto", geom_pairs=24, contacts=80),
         net=NetConfig(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         target=TargetConfig(gamma=0.2),
         reward=RewardConfig(nothing=-1.5, empty=-1.5, touched=-1.5, dropped=-1.0, left=1.0),
         explore=ExploreConfig(primitive_end=0.2, push_fraction=0.5, decay=0.9999),
         learn=LearnConfig(batch=64, updates=128, augment_shift=8, critics=2, loss="squared"),
         replay=ReplayConfig(capacity=65536, beta_end=(1.0, 4.0)),
-        train=TrainConfig(scenes=1024, actions=81920, warmup=4096, chunk=2, save_every=20),
+        train=TrainConfig(scenes=2048, actions=163840, warmup=4096, chunk=2, save_every=20),
     )
 
 

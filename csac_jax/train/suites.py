@@ -10,6 +10,7 @@
 a path       the user's case file.
 
 Dropped and drawn scenes follow streams of random numbers from 1 on; training's is stream 0. Cases are in no training.
+Sizes and materials of what is dropped or drawn are SceneConfig's defaults, whatever a policy was trained with.
 Every scene is turned by a random yaw, or by quarters where another turn would take a block out of the square.
 An episode may take 2.5 actions for every dropped block, or as many as in training if that is more.
 """
@@ -83,9 +84,8 @@ def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN.sim) -> Config:
 
 
 def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config:
-    """The config with these blocks in play, and actions enough to take them."""
-    extent = SceneConfig.drop_extent
-    scene = dataclasses.replace(cfg.scene, slots=slots, min_blocks=len(slots), arranged=0.0, drop_extent=extent)
+    """The config with these blocks in play, of sizes and materials as by default, and actions enough to take them."""
+    scene = SceneConfig(slots=slots, min_blocks=len(slots))
     task = dataclasses.replace(cfg.task, max_actions=max(cfg.task.max_actions, len(slots) * 5 // 2))
     return dataclasses.replace(_wide(cfg, scene, sim), task=task)
 
@@ -131,6 +131,6 @@ def _cases(cfg: Config) -> dict[str, Env]:
 
 
 def _generated(cfg: Config, episodes: int, stream: int) -> Env:
-    scene = dataclasses.replace(cfg.scene, slots=PACKED, min_blocks=environment.LEAST_ARRANGED)
+    scene = SceneConfig(slots=PACKED, min_blocks=environment.LEAST_ARRANGED)
     scenes = environment.arrangements(scene, cfg.heightmap.extent, stream, episodes)
     return _placed(cfg, scene, scenes)

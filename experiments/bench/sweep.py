@@ -1,5 +1,6 @@
 """What seeds side by side cost, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices 1 ...] [--shard
-seeds|scenes] [--steps N] [--repeats N] [--scenes E --batch B]`, PRESET `quick` if none is given.
+seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [--scenes E --batch B]`, PRESET `quick` if none is
+given, physics the preset's.
 
 For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
 and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds that the devices
@@ -50,7 +51,9 @@ def measure(program: step.Program, seeds: int, devices: int, shard: mesh.Shard, 
 
 
 def _config(options: Any) -> Config:
-    cfg = auto.resolve(presets.get(options.preset))
+    cfg = presets.get(options.preset)
+    sim = dataclasses.replace(cfg.sim, physics=options.physics or cfg.sim.physics)
+    cfg = auto.resolve(dataclasses.replace(cfg, sim=sim), max(options.devices))
     scenes, batch = options.scenes or cfg.train.scenes, options.batch or cfg.learn.batch
     train = dataclasses.replace(cfg.train, scenes=scenes, warmup=max(cfg.train.warmup, batch))
     return dataclasses.replace(cfg, train=train, learn=dataclasses.replace(cfg.learn, batch=batch))
@@ -63,6 +66,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--devices", type=int, nargs="+", default=[1])
     parser.add_argument("--shard", choices=["seeds", "scenes"], default="seeds")
+    parser.add_argument("--physics", choices=["mjx", "warp", "c", "auto"])
     for name, default in (("steps", 2), ("repeats", 3), ("scenes", 0), ("batch", 0)):
         parser.add_argument(f"--{name}", type=int, default=default)
     options = parser.parse_args(arguments)
@@ -83,4 +87,5 @@ def main(arguments: list[str]) -> None:
         if options.shard == "scenes" or seeds % devices == 0
     ]
     sizes = {"scenes": cfg.train.scenes, "batch": cfg.learn.batch, "steps": options.steps, "shard": options.shard}
+    sizes |= {"physics": cfg.sim.physics}
     print(json.dumps({"preset": cfg.preset, **sizes, "train": alone, "rows": rows, **provenance.record()}, indent=2))

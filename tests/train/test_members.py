@@ -95,7 +95,7 @@ def _alone(cfg, chunks: int = 2) -> tuple[Any, list[Any]]:
     return state, seen
 
 
-def _assert_close(a: Any, b: Any, rtol: float) -> None:
+def assert_close(a: Any, b: Any, rtol: float) -> None:
     for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(a), jax.tree.leaves(b), strict=True):
         if jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):
             one, other = jax.random.key_data(one), jax.random.key_data(other)
@@ -112,9 +112,9 @@ def test_members_are_the_runs_of_train():
     state, seen = _run(group)
     for k, cfg in enumerate(configs):
         alone, metrics = _alone(cfg)
-        _assert_close(members.member(state, k), alone, 1e-4)
+        assert_close(members.member(state, k), alone, 1e-4)
         for one, other in zip(seen, metrics, strict=True):
-            _assert_close(jax.tree.map(lambda leaf, k=k: leaf[:, k], one), other, 1e-4)
+            assert_close(jax.tree.map(lambda leaf, k=k: leaf[:, k], one), other, 1e-4)
 
 
 def test_seeds_differ_and_share_the_counter():
