@@ -72,7 +72,7 @@ class Program:
 
 
 def takes_turns(cfg: Config) -> bool:
-    """Whether runs side by side have their networks in turn: DenseNet-121 of one run keeps a device busy and fills it."""
+    """Whether runs side by side have their networks in turn: DenseNet-121 keeps a device busy, and fills it."""
     return cfg.net.kind == "densenet121"
 
 

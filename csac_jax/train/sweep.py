@@ -163,7 +163,8 @@ def check_memory(plan: Plan, devices: int) -> None:
             fit = sum(memory.sure(cfg, fewer) <= available for fewer in range(1, members))
             raise ValueError(
                 f"--seeds: {members} members side by side take {total / memory.GIB:.1f} GiB, there are "
-                f"{available / memory.GIB:.1f}, enough for {fit}; lower --seeds or --replay.capacity, vary fewer numbers or raise --devices"
+                f"{available / memory.GIB:.1f}, enough for {fit}; lower --seeds or --replay.capacity, vary fewer "
+                "numbers or raise --devices"
             )
 
 
