@@ -46,6 +46,7 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
     geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
+    subtree = model.body_subtreemass.at[0].add(jnp.sum(fields.mass - model.body_mass[bodies]))  # all; then each block
     if model.impl == mjx.Impl.JAX:
         meshes = [  # None for a mesh that no slot uses; `face` holds the corners of the faces once more
             mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
@@ -58,6 +59,7 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
         geom_rbound=model.geom_rbound.at[geoms].set(fields.rbound),
         geom_friction=model.geom_friction.at[geoms, 0].set(fields.friction),
         body_mass=model.body_mass.at[bodies].set(fields.mass),
+        body_subtreemass=subtree.at[bodies].set(fields.mass),
         body_inertia=model.body_inertia.at[bodies].set(fields.inertia),
         body_ipos=model.body_ipos.at[bodies].set(fields.com),
         body_invweight0=model.body_invweight0.at[bodies].set(fields.body_invweight),

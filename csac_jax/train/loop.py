@@ -28,6 +28,7 @@ WINDOW = 200  # grasps that the running success is taken over (CSAC sec. 4.2)
 METRICS = "metrics.jsonl"
 CONFIG = "config.json"
 LOSSES = ("critic_loss", "actor_loss")
+ILL = 1e-3  # share of a chunk's actions whose physics failed beyond which physics is to be doubted; 1e-5 is common
 
 
 class TrainingError(Exception):
@@ -118,7 +119,7 @@ def run(
     if resume:
         reporter.say(f"resumed {run_dir} at step {step} ({step * cfg.train.scenes} actions)")
     compile_seconds = 0.0
-    chunk = None
+    chunk, doubted = None, False
     with (run_dir / METRICS).open("a") as log:
         while step < total_steps(cfg) and stop.signal is None:
             if chunk is None:
@@ -133,6 +134,9 @@ def run(
             log.write(json.dumps(dataclasses.asdict(record)) + "\n")
             log.flush()
             reporter.progress(record, total_steps(cfg) * cfg.train.scenes, _eta(cfg, record))
+            if record.ill > max(ILL * (record.pushes + record.grasps), 1.0) and not doubted:
+                doubted = True
+                reporter.say(_doubt(cfg, record))
             if step % (cfg.train.save_every * cfg.train.chunk) == 0:
                 _save(cfg, run_dir, step, state, progress)
     if checkpoint.latest_step(run_dir) != step:
@@ -173,6 +177,13 @@ def compile_program(
 
 def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress) -> None:
     checkpoint.save(run_dir, step, state, cfg, progress._asdict())
+
+
+def _doubt(cfg: Config, record: Record) -> str:
+    return (
+        f"physics failed in {record.ill} of the last {record.pushes + record.grasps} actions, whose scenes were dropped: "
+        f"see `ill` in {METRICS}; compare another --sim.physics than {cfg.sim.physics} before you trust this run"
+    )
 
 
 def _check_finite(run_dir: Path, metrics: Any, step: int) -> None:

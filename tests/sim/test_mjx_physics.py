@@ -181,6 +181,34 @@ def test_meshes_are_as_large_as_the_blocks(scale: float):
             np.testing.assert_allclose(placed.min(axis=0), -scene.half_size[slot], atol=1e-6)
 
 
+def test_all_that_follows_from_blocks_is_the_scenes():
+    """Claim: whatever numbers of its model C MuJoCo derives from a scene's blocks, MJX's model of the scene has too.
+
+    Not `dof_M0`, `light_poscom0` and `geom_aabb`, the first two of which neither engine of MJX reads and the last of
+    which bounds the largest block, nor corners of meshes, which MJX scales in arrays of its own (above).
+    """
+    slots = ("box", "arch", *MESH_KINDS)
+    config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=slots, min_blocks=1))
+    world, rng = model.build(config.scene, config.sim), np.random.default_rng(0)
+    scene = layout.parked(slots)
+    scene = scene.replace(
+        half_size=scene.half_size * rng.uniform(0.9, 1.1, (len(slots), 1)).astype(np.float32),
+        density=rng.uniform(450.0, 900.0, len(slots)).astype(np.float32),
+        friction=rng.uniform(0.5, 1.0, len(slots)).astype(np.float32),
+    )
+    ours = mjx_physics.scene_model(mjx_physics.make(world, config.sim), scene)
+    exact = model.with_blocks(world, jax.device_get(model.scene_fields(world, scene)))
+    changed = set()
+    for field in dataclasses.fields(ours):
+        wanted, nominal = getattr(exact, field.name, None), getattr(world.model, field.name, None)
+        if isinstance(wanted, np.ndarray) and wanted.dtype.kind == "f" and not np.array_equal(wanted, nominal):
+            changed.add(field.name)
+            if field.name not in ("dof_M0", "light_poscom0", "geom_aabb", "mesh_vert"):
+                got = np.asarray(getattr(ours, field.name)).reshape(wanted.shape)
+                np.testing.assert_allclose(got, wanted, rtol=2e-5, atol=1e-7, err_msg=field.name)
+    assert {"geom_size", "body_mass", "body_subtreemass", "body_inertia", "dof_invweight0"} <= changed
+
+
 def test_no_contact_was_dropped(executed):
     """Claim: with few blocks the contact slots are never all in use."""
     assert not executed.trace.saturated.any()

@@ -56,11 +56,11 @@ def _init() -> State:
 
 
 class Fake:
-    """A program that draws its metrics at random, counts compilations, and can lose its loss at some step."""
+    """A program that draws its metrics at random, counts compilations, and can lose its loss or its physics."""
 
-    def __init__(self, nan_at: int = -1) -> None:
+    def __init__(self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99) -> None:
         self.compiled: list[int] = []
-        self._nan_at = nan_at
+        self._nan_at, self._ill = nan_at, (ill_from, ill_to)
 
     def compile_chunk(self, num_steps: int):
         """As `csac_jax.train.step.compile_chunk`, with the program bound."""
@@ -83,7 +83,7 @@ class Fake:
             reward=outcome.astype(jnp.float32),
             gap_disagrees=no,
             saturated=jnp.zeros(E, jnp.int32),
-            ill=no,
+            ill=no.at[0].set((state.step >= self._ill[0]) & (state.step < self._ill[1])),
             learned=state.step >= 4,
             critic_loss=loss,
             actor_loss=loss,
@@ -229,6 +229,16 @@ def test_loss_of_the_warm_up_is_not_looked_at(tmp_path: Path):
     _run(tmp_path / "run", listener, Fake(nan_at=2))
     assert listener.records[0].critic_loss is None
     assert listener.records[1].critic_loss is not None
+
+
+def test_physics_that_keeps_failing_is_said_once(tmp_path: Path):
+    """Claim: a run whose physics fails again and again says so, once; a scene that fails alone is no news."""
+    for name, fake, told in (("many", Fake(ill_from=5), 1), ("one", Fake(ill_from=5, ill_to=6), 0)):
+        listener = Listener()
+        _run(tmp_path / name, listener, fake)
+        doubts = [said for said in listener.said if "physics failed" in said]
+        assert len(doubts) == told
+    assert sum(record.ill for record in listener.records) == 1
 
 
 def test_existing_folder_is_left_alone(tmp_path: Path):
