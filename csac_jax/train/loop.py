@@ -181,8 +181,8 @@ def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress)
 
 def _doubt(cfg: Config, record: Record) -> str:
     return (
-        f"physics failed in {record.ill} of the last {record.pushes + record.grasps} actions, whose scenes were dropped: "
-        f"see `ill` in {METRICS}; compare another --sim.physics than {cfg.sim.physics} before you trust this run"
+        f"physics failed in {record.ill} of the last {record.pushes + record.grasps} actions, whose scenes were "
+        f"dropped: see `ill` in {METRICS}; try another --sim.physics than {cfg.sim.physics} before you trust this run"
     )
 
 
