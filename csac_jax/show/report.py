@@ -55,12 +55,30 @@ class Score(NamedTuple):
 
     def band(self, metric: str) -> Band | None:
         """IQM of the runs' values with its band; of a single run, the interval of its own episodes. None: no cases."""
-        entries = [one.metrics[metric] for one in self.evaluations if one.metrics.get(metric, {}).get("n")]
+        entries = self._entries(metric)
         if not entries:
             return None
         if len(entries) == 1:
             return Band(entries[0]["value"], entries[0]["low"], entries[0]["high"], 1)
-        return statistics.band([np.array([entry["value"] for entry in entries])])
+        return statistics.band([self.values(metric)])
+
+    def values(self, metric: str) -> np.ndarray:
+        """The runs' values, of those that have any."""
+        return np.array([entry["value"] for entry in self._entries(metric)])
+
+    def _entries(self, metric: str) -> list[recorded.Json]:
+        return [one.metrics[metric] for one in self.evaluations if one.metrics.get(metric, {}).get("n")]
+
+
+class Gap(NamedTuple):
+    """How far one variant is from another, of several seeds each, in the parts of a suite taken together."""
+
+    ours: Variant  # CSAC-beta with the fewest settings changed
+    theirs: Variant
+    suite: str
+    parts: tuple[str, ...]
+    world: str  # physics, robot, seed
+    bands: dict[str, Band]  # metric -> ours less theirs
 
 
 class Report(NamedTuple):
@@ -121,6 +139,39 @@ def label(variant: Variant, preset: bool = True, most: int | None = None) -> str
 # Numbers.
 
 
+def gaps(report: Report) -> list[Gap]:
+    """CSAC-beta less every other variant that was measured in the same scenes, several seeds of both: part by part,
+    then over the parts of the suite."""
+    found: list[Gap] = []
+    several = [one for one in report.scores if one.policy == "learned" and len(one.evaluations) > 1]
+    for (_, suite, world, _), scores in _grouped(several, _scenes).items():
+        by_variant: dict[Variant, list[Score]] = _grouped(scores, lambda score: score.variant)
+        first = min(by_variant, key=lambda variant: (variant.algo != "csac_beta", len(variant.changed)))
+        for other, theirs in by_variant.items():
+            of = {score.part: score for score in theirs}
+            pairs = [(score, of[score.part]) for score in by_variant[first] if score.part in of]
+            if other == first or first.algo != "csac_beta" or not pairs:
+                continue
+            for shared in [[pair] for pair in pairs] + ([pairs] if len(pairs) > 1 else []):
+                parts = tuple(score.part for score, _ in shared)
+                found.append(Gap(first, other, suite, parts, world, _bands(shared)))
+    return found
+
+
+def _scenes(score: Score) -> tuple[str, str, str, int]:
+    return score.variant.preset, score.suite, f"{score.physics}, {score.robot}, {score.seed}", score.episodes
+
+
+def _bands(pairs: Sequence[tuple[Score, Score]]) -> dict[str, Band]:
+    """The difference in every metric that all evaluations have."""
+    bands = {}
+    for metric in METRIC_NAMES:
+        ours, theirs = ([one.values(metric) for one in side] for side in zip(*pairs, strict=True))
+        if min(len(values) for values in (*ours, *theirs)) > 1:
+            bands[metric] = statistics.difference(ours, theirs)
+    return bands
+
+
 def _seeds(runs: Sequence[Run | Evaluation]) -> str:
     return ", ".join(str(seed) for seed in sorted(one.config.get("seed", 0) for one in runs))
 
@@ -158,6 +209,15 @@ def as_json(report: Report) -> dict[str, Any]:
                 "metrics": {name: found._asdict() for name in METRIC_NAMES if (found := score.band(name)) is not None},
             }
             for score in report.scores
+        ],
+        "differences": [
+            {
+                "ours": {"algo": gap.ours.algo, "changed": dict(gap.ours.changed)},
+                "theirs": {"algo": gap.theirs.algo, "changed": dict(gap.theirs.changed)},
+                **{name: getattr(gap, name) for name in ("suite", "parts", "world")},
+                "metrics": {name: band._asdict() for name, band in gap.bands.items()},
+            }
+            for gap in gaps(report)
         ],
         "provenance": [dict(zip(provenance(report)[0], row, strict=True)) for row in provenance(report)[1:]],
         "notes": report.notes,
@@ -216,6 +276,25 @@ def evaluation(report: Report) -> Table:
     return rows
 
 
+def differences(report: Report) -> Table:
+    """By how many points CSAC-beta is ahead, a row for each other variant and part, and for all parts together."""
+    titles = ["grasp success", "completion", "over reachable", "blocks / actions", "the same, completed episodes"]
+    rows = [["ahead", "of", "part", "physics, robot, seed", *titles]]
+    for gap in gaps(report):
+        part = gap.parts[0] if len(gap.parts) == 1 else f"mean of {len(gap.parts)} parts"
+        where = part if part == gap.suite else f"{gap.suite}: {part}"
+        cells = [_points(gap.bands.get(metric)) for metric in METRIC_NAMES]
+        rows.append([label(gap.ours), label(gap.theirs), where, gap.world, *cells])
+    return rows
+
+
+def _points(band: Band | None) -> str:
+    """A difference in points of per cent with its band."""
+    if band is None or band.low is None or band.high is None:
+        return "-"
+    return f"{100 * band.value:+.1f} ({100 * band.low:+.1f} to {100 * band.high:+.1f})"
+
+
 def failures(report: Report) -> Table:
     """What went wrong in evaluations that tell causes apart, as counts and what they are counts of, all runs summed."""
     scores = [score for score in report.scores if all("failures" in one.metrics for one in score.evaluations)]
@@ -268,6 +347,7 @@ def _tables(report: Report) -> dict[str, Table]:
     every = {
         "Training": training(report),
         "Evaluation": evaluation(report),
+        "Differences": differences(report),
         "Failures": failures(report),
         "Provenance": provenance(report),
     }
@@ -276,7 +356,8 @@ def _tables(report: Report) -> dict[str, Table]:
 
 EXPLAINED = (
     "Several runs: interquartile mean and, in brackets, its 95 % band (bootstrap over seeds). One run: its value, and "
-    "the 95 % interval of its episodes where it was evaluated. Metrics are defined in csac_jax/train/metrics.py. "
+    "the 95 % interval of its episodes where it was evaluated. Differences: of the interquartile means, points of per "
+    "cent, bootstrap over the seeds of both. Metrics are defined in csac_jax/train/metrics.py. "
     "Paper: numbers of CSAC's text, sec. 4.3, 4.4 and 5, of one scene and 2,500 actions; of the presets only `paper` "
     "keeps to that."
 )

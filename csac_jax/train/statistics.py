@@ -47,6 +47,24 @@ def band(strata: Sequence[np.ndarray], seed: int = 0) -> Band:
     return Band(value, float(low), float(high), fewest)
 
 
+def difference(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], seed: int = 0) -> Band:
+    """`band` of ours less `band` of theirs, whose seeds are drawn independently of ours; strata in the same order.
+
+    Raises ValueError where a stratum has fewer than two values: one seed tells nothing of the spread.
+    """
+    if min((len(stratum) for stratum in (*ours, *theirs)), default=0) < 2:
+        raise ValueError("a difference needs two values of each")
+    rng = np.random.default_rng(seed)
+
+    def drawn(strata: Sequence[np.ndarray]) -> np.ndarray:
+        draws = (np.asarray(one, float)[rng.integers(0, len(one), (RESAMPLES, len(one)))] for one in strata)
+        return np.mean([iqm(each) for each in draws], axis=0)
+
+    low, high = np.percentile(drawn(ours) - drawn(theirs), [2.5, 97.5])
+    value = band(ours).value - band(theirs).value
+    return Band(value, float(low), float(high), min(len(stratum) for stratum in (*ours, *theirs)))
+
+
 def curves(points: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, list[Band]]:
     """IQM and band of curves, one a seed, at the places x that the first one has, up to where the shortest ends.
 

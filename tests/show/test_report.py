@@ -148,8 +148,36 @@ def test_numbers_as_json(recorded: Path):
     swept = rows["seed-1/metrics.jsonl"]
     assert (swept["device"], swept["wall time"]) == ("two cards", "99 s, whole sweep")
     assert rows["vpg/metrics.jsonl"]["wall time"] == "40 s"  # no record: the log's last time
-    assert trained["settings as a command"] == "csac-jax train paper --algo csac_beta --seed 0 --sim.physics mjx"
+    assert trained["settings as a command"] == "csac-jax train paper --algo csac_beta --seed 0 --sim.physics c"
     assert rows["max/metrics.jsonl"]["settings as a command"].endswith("--sim.physics mjx --target.value max")
+
+
+def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
+    """Claim: CSAC-beta is set against every other variant of which several seeds were measured in the same scenes, part
+    by part and over all parts; what was measured once, or in other scenes, is not."""
+    assert not report.gaps(report.build(results.read([recorded])))  # VPG has one seed
+    for seed, lifted in ((1, 3), (2, 4)):
+        config = _config("vpg", seed, sim__physics="c")
+        _evaluation(recorded / "vpg" / f"more-{seed}.json", config, lifted)
+        config = _config("csac_beta", seed, sim__physics="c", target__value="max")
+        _evaluation(recorded / "max" / f"other-{seed}.json", config, lifted, episodes=20)
+    whole = report.build(results.read([recorded]))
+    found = report.gaps(whole)
+    assert [(gap.theirs.algo, gap.suite, gap.parts) for gap in found] == [
+        ("vpg", "cases", (case,)) for case in CASES
+    ] + [("vpg", "cases", CASES)]
+    for gap in found:
+        assert gap.ours.algo == "csac_beta"
+        assert not gap.ours.changed
+        band = gap.bands["grasp_success"]
+        assert band.value == pytest.approx(0.9 - 0.4)  # 10 and 8 of 10, and 5, 3 and 4
+        assert band.low is not None
+        assert band.high is not None
+        assert 0.3 <= band.low < 0.5 < band.high <= 0.7
+    rows = report.differences(whole)
+    assert [row[2] for row in rows[1:]] == ["cases: hole", "cases: row", "cases: mean of 2 parts"]
+    assert rows[1][4].startswith("+50.0 (+")
+    assert len(report.as_json(whole)["differences"]) == 3
 
 
 def test_labels():

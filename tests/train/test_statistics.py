@@ -29,3 +29,20 @@ def test_interval_is_scipys():
     ).confidence_interval
     np.testing.assert_allclose((result.low, result.high), wanted, atol=0.03)
     assert result.low < result.value < result.high
+
+
+def test_difference_is_scipys():
+    """Claim: a difference is that of the values, its interval the percentile bootstrap's over the seeds of both."""
+    rng = np.random.default_rng(5)
+    ours, theirs = rng.normal(1.0, 1.0, 16), rng.normal(0.0, 2.0, 12)
+    result = statistics.difference([ours], [theirs])
+    assert result.n == 12
+    np.testing.assert_allclose(result.value, statistics.band([ours]).value - statistics.band([theirs]).value)
+
+    def apart(x, y, axis):
+        return scipy.stats.trim_mean(x, 0.25, axis=axis) - scipy.stats.trim_mean(y, 0.25, axis=axis)
+
+    wanted = scipy.stats.bootstrap((ours, theirs), apart, method="percentile", rng=np.random.default_rng(1))
+    np.testing.assert_allclose((result.low, result.high), wanted.confidence_interval, atol=0.06)
+    with pytest.raises(ValueError, match="two values"):
+        statistics.difference([ours], [theirs[:1]])
