@@ -107,7 +107,7 @@ class SimConfig:
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not repeatable bit for bit.
     `c`: C MuJoCo on the host's cores, the reference; the compiled step calls it back. `auto`: `c` on a CPU, `warp` on
-    CUDA where it is known to be the faster one and can do the scene, else `mjx`; a run's config names the choice."""
+    one CUDA device where it is known to be the faster one and can do the scene, else `mjx`; a run's config names it."""
     robot: RobotKind = "hand"
     """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
     timestep: float = 0.004

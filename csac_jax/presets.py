@@ -44,8 +44,9 @@ def fast() -> Config:
     """Ten blocks of all eight shapes, three quarters of the scenes packed, 2,048 side by side, for one GPU.
 
     Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A failed grasp costs
-    more than a push that is not worth it, half of the random primitives are pushes, and blocks that leave cost. What it
-    learns so, and otherwise: experiments/bench/NOTES.md.
+    more than a push that is not worth it, half of the random primitives are pushes, and blocks that leave cost. Physics
+    is Warp's where it is installed, hence meshes are of one size. What it learns so, and otherwise:
+    experiments/bench/NOTES.md.
     """
     return Config(
         preset="fast",
@@ -61,7 +62,7 @@ def fast() -> Config:
         sim=SimConfig(physics="auto", geom_pairs=24, contacts=80),
         net=NetConfig(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         target=TargetConfig(gamma=0.2),
-        reward=RewardConfig(nothing=-1.5, empty=-1.5, touched=-1.5, dropped=-1.0, left=1.0),
+        reward=RewardConfig(nothing=-1.5, empty=-1.5, touched=-1.5, dropped=-1.0, left=3.0),
         explore=ExploreConfig(primitive_end=0.2, push_fraction=0.5, decay=0.9999),
         learn=LearnConfig(batch=64, updates=128, augment_shift=8, critics=2, loss="squared"),
         replay=ReplayConfig(capacity=65536, beta_end=(1.0, 4.0)),
@@ -74,7 +75,8 @@ def paper() -> Config:
 
     Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per action; places are
     explored by action noise alone, and nothing is augmented. Where the paper is silent: tau of SD3, two pixels per cell
-    as in VPG, and, ours, the batch and `policy.mask`. Its result is not recorded yet.
+    as in VPG, and, ours, the batch and `policy.mask`. Physics is C's, the fastest for one scene. Its result is not
+    recorded yet.
     """
     return Config(
         preset="paper",
@@ -103,8 +105,8 @@ def paper_small() -> Config:
     Ours, beside the net: batches of 32, and with them Adam 1e-3; no more than one update an action, and shifts of what
     is drawn from the replay, lest 2,500 actions be learned by heart; the squared error of Algorithm 1 line 21; discount
     0.2; SD3's twin critics; random places at first and exploration that ends after some 1,000 actions, as in `quick`.
-    Physics is C's, the fastest for one scene; meshes are of one size, which `sim.physics warp` needs. What each is
-    worth: experiments/bench/NOTES.md; results: experiments/results/paper-small-h200.
+    Meshes are of one size, which `sim.physics warp` needs. What each is worth: experiments/bench/NOTES.md; results:
+    experiments/results/paper-small-h200.
     """
     whole = paper()
     return dataclasses.replace(

@@ -5,23 +5,25 @@ import importlib.util
 
 import jax
 
-from csac_jax.config import Config
+from csac_jax.config import WARP_WORLDS, Config
 
-WARP_SCENES = range(256, 1 << 30)
-"""`train.scenes` at which Warp is the faster one: an action of 1,024 scenes of ten blocks takes 0.52 s on Warp, 1.46 s
-in MJX's own physics, of 4,096 scenes 0.73 s (H200, other work on it). With few scenes neither fills a GPU."""
+WARP_SCENES = range(1024, WARP_WORLDS + 1)
+"""`train.scenes` at which Warp was measured to be the faster one: an action of 1,024 scenes of ten blocks takes 0.52 s
+on Warp, 1.46 s in MJX's own physics, of 4,096 scenes 0.73 s (H200, other work on it)."""
 
 
 def resolve(cfg: Config, devices: int = 1) -> Config:
     """The config with `c`, `warp` or `mjx` in place of `auto`; any other as it is.
 
     C MuJoCo on a CPU, which steps through a scene several times as fast as MJX does there, if one device is used. Warp
-    where it was measured to be faster, on CUDA, if it is installed and can do the scene. MJX else.
+    where it was measured to be faster, on one CUDA device, if it is installed and can do the scene. MJX else.
     """
     if cfg.sim.physics != "auto":
         return cfg
     c, mjx, warp = (dataclasses.replace(cfg.sim, physics=kind) for kind in ("c", "mjx", "warp"))
-    if devices == 1 and jax.default_backend() == "cpu":
+    if devices > 1:
+        return dataclasses.replace(cfg, sim=mjx)
+    if jax.default_backend() == "cpu":
         return dataclasses.replace(cfg, sim=c)
     if cfg.train.scenes in WARP_SCENES and _warp_runs_here():
         try:

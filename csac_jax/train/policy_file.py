@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "ebfb732dbb0d5ba3e891232ba5577fb1f7aaf803709a88cf2aca9a872636f5ad"
+SHIPPED_SHA256 = "c5c582c2b047b60897a0c5df3a86003ecc51834685cb3171e72f54bf37e7555c"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 

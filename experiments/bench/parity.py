@@ -11,6 +11,7 @@ with the solver of MJX, which takes a scene as one problem where C takes each he
 
 import dataclasses
 import functools
+import gc
 import json
 import time
 from collections.abc import Callable
@@ -216,6 +217,8 @@ def main(arguments: list[str]) -> None:
     """Prints the result."""
     options = read("parity", arguments, primitives=512, poses=125, warp=False)
     physics: PhysicsKind = "warp" if options["warp"] else "mjx"
+    if options["warp"]:
+        gc.disable()  # CUDA ends the process where a program is freed while Warp records a graph
     begun = time.perf_counter()
     result: dict[str, Any] = {"physics": physics, "shapes": shapes(options["poses"], physics)}
     result["piles_of_6"] = piles(6, TEN.scene.slots[:6], options["primitives"], physics)

@@ -2,13 +2,12 @@
 seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [--scenes E --batch B]`, PRESET `quick` if none is
 given, physics the preset's.
 
-For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation,
-all at a time, and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds
-that the devices do not divide are left out. `train` is the program of one seed as `csac-jax train` has it, on one
+For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
+and, when all are compiled, the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of
+seeds that the devices do not divide are left out. `train` is the program of one seed as `csac-jax train` has it, on one
 device. Configurations follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
 """
 
-import concurrent.futures
 import dataclasses
 import functools
 import json
@@ -44,7 +43,7 @@ def _timed(chunk: Any, state: Any, repeats: int) -> dict[str, Any]:
 
 
 def measure(program: step.Program, sizes: list[tuple[int, int]], shard: mesh.Shard, steps: int, repeats: int) -> Any:
-    """`train` and a row for each number of members and of devices in `sizes`: compiled together, timed in turn."""
+    """`train` and a row for each number of members and of devices in `sizes`: all compiled, then timed in turn."""
     cfg = program.cfg
 
     def alone() -> tuple[Any, Any, Callable[[], Any]]:
@@ -60,8 +59,7 @@ def measure(program: step.Program, sizes: list[tuple[int, int]], shard: mesh.Sha
         return chunk, members.abstract(*where), functools.partial(members.init, *where)
 
     programs = [alone(), *(together(*size) for size in sizes)]
-    with concurrent.futures.ThreadPoolExecutor() as threads:
-        chunks = list(threads.map(lambda given: _compiled(*given[:2]), programs))
+    chunks = [_compiled(jitted, state) for jitted, state, _ in programs]
     rows = []
     for (chunk, compiled), (_, _, init), (seeds, devices) in zip(chunks, programs, [(1, 1), *sizes], strict=True):
         row = {"compile_seconds": compiled, **_timed(chunk, init(), repeats)}

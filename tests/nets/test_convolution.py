@@ -74,26 +74,3 @@ def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.Monk
     _, scanned = jax.jit(lambda m, k: jax.lax.scan(lambda c, _: (c, ours(m, k)), 0, length=2))(maps, kernel)
     for name, got, want in zip(("maps", "kernel"), scanned, wanted, strict=True):
         np.testing.assert_allclose(got[1], want, atol=3e-5, err_msg=name)
-
-
-@pytest.mark.parametrize("setting", SETTINGS)
-def test_seeds_side_by_side_need_no_grouped_convolution(setting, monkeypatch: pytest.MonkeyPatch):
-    """Claim: on a GPU value and gradients of several kernels, each with maps of its own, are those one by one, and
-    where stride is 1 no convolution is left, hence no grouped one."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    maps, kernels = (jnp.stack([one, 0.5 - 2.0 * one]) for one in _drawn(*setting[:3]))
-
-    def both(maps, kernel):
-        value, pull = jax.vjp(lambda maps, kernel: conv2d(maps, kernel, *setting[3:]), maps, kernel)
-        return value, pull(0.1 * value)
-
-    side_by_side = jax.jit(jax.vmap(both))
-    lowered = side_by_side.lower(maps, kernels).as_text()
-    assert ("stablehlo.convolution" in lowered) == (setting[3] > 1)
-    assert lowered.count("stablehlo.convolution") <= 1  # d loss / d maps, which the first layer's maps do not need
-    for k, one in enumerate(zip(maps, kernels, strict=True)):
-        got = jax.tree.map(lambda leaf, k=k: leaf[k], side_by_side(maps, kernels))
-        for name, mine, want in zip(
-            ("value", "maps", "kernel"), jax.tree.leaves(got), jax.tree.leaves(both(*one)), strict=True
-        ):
-            np.testing.assert_allclose(mine, want, rtol=1e-5, atol=2e-4, err_msg=name)

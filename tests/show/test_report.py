@@ -149,7 +149,7 @@ def test_numbers_as_json(recorded: Path):
     assert (swept["device"], swept["wall time"]) == ("two cards", "99 s, whole sweep")
     assert rows["vpg/metrics.jsonl"]["wall time"] == "40 s"  # no record: the log's last time
     assert trained["settings as a command"] == "csac-jax train paper --algo csac_beta --seed 0 --sim.physics c"
-    assert rows["max/metrics.jsonl"]["settings as a command"].endswith("--sim.physics mjx --target.value max")
+    assert rows["max/metrics.jsonl"]["settings as a command"].endswith("--sim.physics c --target.value max")
 
 
 def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):

@@ -20,6 +20,14 @@ def _config(kind: PhysicsKind, mesh_spread: float = 0.0, scenes: int = 256) -> C
     )
 
 
+def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
+    """Claim: where Warp is installed, `fast` runs on it on a GPU, else in MJX's own physics."""
+    monkeypatch.setattr(auto.jax, "default_backend", lambda: "gpu")
+    for installed, chosen in ((True, "warp"), (False, "mjx")):
+        monkeypatch.setattr(auto.importlib.util, "find_spec", lambda name, there=installed: object() if there else None)
+        assert auto.resolve(presets.fast()).sim.physics == chosen
+
+
 @pytest.mark.parametrize(
     ("backend", "installed", "measured", "mesh_spread", "scenes", "chosen"),
     [
@@ -34,14 +42,13 @@ def _config(kind: PhysicsKind, mesh_spread: float = 0.0, scenes: int = 256) -> C
 )
 def test_choice(monkeypatch: pytest.MonkeyPatch, backend, installed, measured, mesh_spread, scenes, chosen):
     """Claim: `auto` is `c` on a CPU, `warp` where measured to be faster, on CUDA, installed, able to do the scene; else
-    `mjx`, also on several CPU devices."""
+    `mjx`, also on several devices."""
     monkeypatch.setattr(auto.jax, "default_backend", lambda: backend)
     monkeypatch.setattr(auto.importlib.util, "find_spec", lambda name: object() if installed else None)
     monkeypatch.setattr(auto, "WARP_SCENES", measured)
     cfg = _config("auto", mesh_spread, scenes)
     assert auto.resolve(cfg) == dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=chosen))
-    several = "mjx" if chosen == "c" else chosen
-    assert auto.resolve(cfg, 2).sim.physics == several
+    assert auto.resolve(cfg, 2).sim.physics == "mjx"
 
 
 def test_other_choices_stay():
