@@ -24,6 +24,7 @@ COLOURS = dict(zip(NAMES, ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f"
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
 NAMED = 3  # settings that a legend names
 WIDE = 56  # characters of a line of a legend
+BESIDE = 6  # curves whose legend has room among them
 FOUR = ("cases", "target")  # suites whose parts are the four cases
 
 
@@ -87,7 +88,11 @@ def _lines(curves: Sequence[Curve]) -> Figure:
     axes.set(xlabel="actions", ylabel="success over the last 200 grasps, %", ylim=(0, 101))
     axes.set_xlim(left=0)
     axes.grid(alpha=0.3)
-    axes.legend(title="method (runs)", fontsize="small", loc="lower right")
+    if len(curves) <= BESIDE:
+        axes.legend(title="method (runs)", fontsize="small", loc="lower right")
+        return figure
+    figure.set_figheight(figure.get_figheight() + 0.2 * len(curves))
+    figure.legend(title="method (runs)", fontsize="small", loc="outside lower center", ncols=2)
     return figure
 
 

@@ -265,6 +265,18 @@ def test_figures(recorded: Path):
     assert ticks == [*CASES, "mean"]
 
 
+def test_legend_of_many_curves_hides_none(recorded: Path):
+    """Claim: a legend lies among a few curves, and below the axes where many curves make it large."""
+    curves = report.build(results.read([recorded])).curves
+    for number, below in ((charts.BESIDE, False), (charts.BESIDE + 1, True)):
+        figure = charts._lines((curves * 3)[:number])
+        assert (figure.axes[0].get_legend() is None) == below
+        assert bool(figure.legends) == below
+        if below:
+            figure.draw_without_rendering()
+            assert figure.legends[0].get_window_extent().y1 <= figure.axes[0].get_window_extent().y0
+
+
 def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: `report --out` writes one page with its figures inside, and the tables as text; `--json` the numbers."""
     out, numbers = tmp_path / "out", tmp_path / "report.json"
