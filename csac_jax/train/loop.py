@@ -167,7 +167,8 @@ def _resume(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, P
 def compile_program(
     cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter
 ) -> tuple[Any, float]:
-    reporter.say("compiling the training program; this takes a while, once")
+    kernels = "; then Warp builds its kernels, on a new machine for minutes" if cfg.sim.physics == "warp" else ""
+    reporter.say(f"compiling the training program; this takes a while, once{kernels}")
     begun, hits = time.perf_counter(), cache.hits()
     program = compile_chunk(cfg.train.chunk).lower(state).compile()
     seconds = time.perf_counter() - begun

@@ -241,6 +241,16 @@ def test_physics_that_keeps_failing_is_said_once(tmp_path: Path):
     assert sum(record.ill for record in listener.records) == 1
 
 
+def test_kernels_of_warp_are_announced(tmp_path: Path):
+    """Claim: before the first step on Warp, during which nothing is shown for minutes, the reason is."""
+    for physics, told in (("mjx", 0), ("warp", 1)):
+        scene = dataclasses.replace(CFG.scene, mesh_spread=0.0)
+        cfg = dataclasses.replace(CFG, scene=scene, sim=dataclasses.replace(CFG.sim, physics=physics))
+        listener = Listener(1)
+        _run(tmp_path / physics, listener, Fake(), cfg=cfg)
+        assert sum("Warp builds its kernels" in said for said in listener.said) == told
+
+
 def test_existing_folder_is_left_alone(tmp_path: Path):
     """Claim: a new run never writes into a folder that exists."""
     with pytest.raises(FileExistsError):
