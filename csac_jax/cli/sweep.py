@@ -108,8 +108,8 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     found = [(one, _parse(preset, [*flags, *one.flags])[1]) for one in combinations]
     from csac_jax.train import sweep as sweeping
 
-    devices = _devices(options)
-    each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg, devices)) for one, cfg in found]
+    devices, members = _devices(options), options.seeds * len(found)  # the most that can run side by side
+    each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg, devices, members)) for one, cfg in found]
     for setting in each:
         guards.check_physics(setting.cfg)
         guards.check_host_physics(setting.cfg, devices)
@@ -145,7 +145,7 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
         line = mesh.make(options.devices)
         for one in plan.settings:
             mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
-        sweeping.check_memory(plan, 1 if line is None or options.shard == "scenes" else line.size)
+        sweeping.check_room(plan, 1 if line is None or options.shard == "scenes" else line.size)
     trunks = {one.cfg.net: stored.weights(one.cfg) for one in plan.settings}
 
     def engine(group: members.Group) -> sweeping.Engine:

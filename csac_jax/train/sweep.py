@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, TextIO
 import jax
 import numpy as np
 
-from csac_jax.config import Config
+from csac_jax.config import WARP_WORLDS, Config
 from csac_jax.train import checkpoint, cluster, config_json, loop, memory, statistics
 from csac_jax.train.members import Engine, Group, group
 from csac_jax.train.stop import Stop
@@ -153,11 +153,17 @@ def check(plan: Plan) -> None:
     groups_of(plan._replace(seeds=1))  # seeds never make a difference
 
 
-def check_memory(plan: Plan, devices: int) -> None:
-    """Raises ValueError where the members of a group, spread over `devices`, are known to exceed a device's memory."""
+def check_room(plan: Plan, devices: int) -> None:
+    """Raises ValueError where the members of a group, spread over `devices`, are known to exceed what a device has room
+    for: its memory, or the scenes that Warp's contacts are laid out for."""
     for given, _ in groups_of(plan._replace(seeds=1)):
         cfg, available = given.configs[0], memory.limit()
         members = -(-len(given.configs) * plan.seeds // devices)
+        if cfg.sim.physics == "warp" and members * cfg.train.scenes > WARP_WORLDS:
+            raise ValueError(
+                f"--seeds: {members} members of {cfg.train.scenes} scenes side by side, Warp has room for "
+                f"{WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take --sim.physics mjx"
+            )
         total = memory.sure(cfg, members)
         if total > available:
             fit = sum(memory.sure(cfg, fewer) <= available for fewer in range(1, members))

@@ -71,7 +71,7 @@ def measure(program: step.Program, sizes: list[tuple[int, int]], shard: mesh.Sha
 def _config(options: Any) -> Config:
     cfg = presets.get(options.preset)
     sim = dataclasses.replace(cfg.sim, physics=options.physics or cfg.sim.physics)
-    cfg = auto.resolve(dataclasses.replace(cfg, sim=sim), max(options.devices))
+    cfg = auto.resolve(dataclasses.replace(cfg, sim=sim), max(options.devices), max(options.seeds))
     scenes, batch = options.scenes or cfg.train.scenes, options.batch or cfg.learn.batch
     train = dataclasses.replace(cfg.train, scenes=scenes, warmup=max(cfg.train.warmup, batch))
     return dataclasses.replace(cfg, train=train, learn=dataclasses.replace(cfg.learn, batch=batch))

@@ -49,6 +49,9 @@ def test_choice(monkeypatch: pytest.MonkeyPatch, backend, installed, measured, m
     cfg = _config("auto", mesh_spread, scenes)
     assert auto.resolve(cfg) == dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=chosen))
     assert auto.resolve(cfg, 2).sim.physics == "mjx"
+    if chosen == "warp":
+        assert auto.resolve(cfg, 1, 5000 // scenes).sim.physics == "warp"
+        assert auto.resolve(cfg, 1, 5001 // scenes + 1).sim.physics == "mjx"
 
 
 def test_other_choices_stay():

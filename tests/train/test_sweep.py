@@ -232,7 +232,21 @@ def test_members_must_fit_together(monkeypatch: pytest.MonkeyPatch):
     for seeds, devices, fits in ((2, 1, True), (3, 1, False), (3, 2, True)):  # of two settings
         plan = Plan(seeds, [_setting("a"), _setting("c", learn={"tau": 0.5})])
         if fits:
-            sweep.check_memory(plan, devices)
+            sweep.check_room(plan, devices)
         else:
             with pytest.raises(ValueError, match=r"--seeds: 6 members .* enough for 4"):
-                sweep.check_memory(plan, devices)
+                sweep.check_room(plan, devices)
+
+
+def test_members_on_warp_must_fit_its_contacts():
+    """Claim: members side by side share Warp's contacts, so that their scenes together are counted; in another physics
+    they are not."""
+    sections = {"scene": {"mesh_spread": 0.0}, "train": {"scenes": 40}, "replay": {"capacity": 64}}
+    for physics, seeds, devices, fits in (("warp", 102, 1, True), ("warp", 103, 1, False), ("warp", 103, 2, True)):
+        plan = Plan(seeds, [_setting("a", sim={"physics": physics}, **sections)])
+        if fits:
+            sweep.check_room(plan, devices)
+        else:
+            with pytest.raises(ValueError, match=r"--seeds: 103 members of 40 scenes .* room for 4096 scenes"):
+                sweep.check_room(plan, devices)
+    sweep.check_room(Plan(103, [_setting("a", sim={"physics": "mjx"}, **sections)]), 1)
