@@ -27,6 +27,9 @@ PAPER_CASES = {"completion": {"vpg": 0.60, "csac_beta": 0.90}, "action_efficienc
 """Means of the four cases, figure 9 (sec. 4.4 and 5); the text gives no numbers for the others."""
 GOOD = 0.9  # grasp success whose time is reported
 
+TITLES = ("grasp success", "completion", "over reachable", "blocks / actions", "the same, completed episodes")
+"""Of METRIC_NAMES, in tables."""
+
 Table = list[list[str]]  # rows, the header first
 
 
@@ -52,6 +55,11 @@ class Score(NamedTuple):
     robot: str
     seed: int  # of the evaluation
     episodes: int  # of each evaluation, which decide what scenes it begins with; 0 where it does not tell
+
+    @property
+    def world(self) -> str:
+        """Physics, robot and seed of the evaluation."""
+        return f"{self.physics}, {self.robot}, {self.seed}"
 
     def band(self, metric: str) -> Band | None:
         """IQM of the runs' values with its band; of a single run, the interval of its own episodes. None: no cases."""
@@ -159,7 +167,7 @@ def gaps(report: Report) -> list[Gap]:
 
 
 def _scenes(score: Score) -> tuple[str, str, str, int]:
-    return score.variant.preset, score.suite, f"{score.physics}, {score.robot}, {score.seed}", score.episodes
+    return score.variant.preset, score.suite, score.world, score.episodes
 
 
 def _bands(pairs: Sequence[tuple[Score, Score]]) -> dict[str, Band]:
@@ -267,8 +275,7 @@ def training(report: Report) -> Table:
 
 def evaluation(report: Report) -> Table:
     """What policies reached, a row per part of a suite."""
-    titles = ["grasp success", "completion", "over reachable", "blocks / actions", "the same, completed episodes"]
-    rows = [["policy", "part", "physics, robot, seed", "runs", "episodes", *titles]]
+    rows = [["policy", "part", "physics, robot, seed", "runs", "episodes", *TITLES]]
     for score in report.scores:
         episodes = score.episodes * len(score.evaluations)
         bands = [shown(score.band(metric)) for metric in METRIC_NAMES]
@@ -278,8 +285,7 @@ def evaluation(report: Report) -> Table:
 
 def differences(report: Report) -> Table:
     """By how many points CSAC-beta is ahead, a row for each other variant and part, and for all parts together."""
-    titles = ["grasp success", "completion", "over reachable", "blocks / actions", "the same, completed episodes"]
-    rows = [["ahead", "of", "part", "physics, robot, seed", *titles]]
+    rows = [["ahead", "of", "part", "physics, robot, seed", *TITLES]]
     for gap in gaps(report):
         part = gap.parts[0] if len(gap.parts) == 1 else f"mean of {len(gap.parts)} parts"
         where = part if part == gap.suite else f"{gap.suite}: {part}"
@@ -313,7 +319,7 @@ def _named(score: Score) -> list[str]:
     """The first cells of a row about a score."""
     name = score.policy if score.policy != "learned" else label(score.variant)
     part = score.part if score.part == score.suite else f"{score.suite}: {score.part}"
-    return [name, part, f"{score.physics}, {score.robot}, {score.seed}"]
+    return [name, part, score.world]
 
 
 def provenance(report: Report) -> Table:

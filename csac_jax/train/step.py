@@ -88,7 +88,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     scenes = state.scenes
 
     # Look and act: by default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13).
-    maps = _whole(program, functools.partial(learning.look, learner))(state.learner.online, scenes.obs)
+    maps = _whole(program, learning.look, learner)(state.learner.online, scenes.obs)
     act = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
     taken = state.step * cfg.train.scenes
     span = learner.bounds[1] - learner.bounds[0]
@@ -99,8 +99,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Reward and remember (lines 14-15).
     pushed = action.primitive == Primitive.PUSH
-    around = _whole(program, functools.partial(_around, learner))
-    phi_before, phi_after = around(state.learner, scenes.obs, after.obs, pushed)
+    phi_before, phi_after = _whole(program, _around, learner)(state.learner, scenes.obs, after.obs, pushed)
     info = after.info
     changed = info.moved > environment.CHANGE_AREA
     reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))(
@@ -117,8 +116,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Learn (lines 16-26). During the warm-up the result is dropped: a branch would cost more than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.warmup
-    learn = _whole(program, functools.partial(_learn, program))
-    learned, priority, losses = learn(key_learn, state.learner, replay)
+    learned, priority, losses = _whole(program, _learn, program)(key_learn, state.learner, replay)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, replay.priority)
 
@@ -145,9 +143,10 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     return state, metrics
 
 
-def _whole(program: Program, part: Callable[..., Any]) -> Callable[..., Any]:
-    """What the networks of one run do, kept whole where several runs are vmapped, if they are to take turns."""
-    return jax.custom_batching.sequential_vmap(part) if program.in_turn else part
+def _whole(program: Program, part: Callable[..., Any], static: Any) -> Callable[..., Any]:
+    """`part` of `static`: what the networks of one run do, not vmapped over several runs if these are to take turns."""
+    bound = functools.partial(part, static)
+    return jax.custom_batching.sequential_vmap(bound) if program.in_turn else bound
 
 
 def _learn(

@@ -3,17 +3,15 @@ seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [--scenes E 
 given, physics the preset's.
 
 For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
-and, when all are compiled, the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of
-seeds that the devices do not divide are left out. `train` is the program of one seed as `csac-jax train` has it, on one
-device. Configurations follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
+and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds that the devices
+do not divide are left out. `train` is the program of one seed as `csac-jax train` has it, on one device. Configurations
+follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
 """
 
 import dataclasses
-import functools
 import json
 import statistics
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -25,47 +23,31 @@ from csac_jax.train import auto, members, mesh, provenance, step
 from experiments.bench._options import Parser
 
 
-def _compiled(jitted: Any, state: Any) -> tuple[Any, float]:
-    """The program for such a state, and the seconds that took."""
+def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
+    """Seconds of the compilation and, the median, of a call that goes on where the last one ended."""
     begun = time.perf_counter()
-    return jitted.lower(state).compile(), time.perf_counter() - begun
-
-
-def _timed(chunk: Any, state: Any, repeats: int) -> dict[str, Any]:
-    """Seconds of a call that goes on where the last one ended, the median."""
+    chunk = jitted.lower(state).compile()
+    compiled = time.perf_counter() - begun
     seconds = []
     for _ in range(1 + repeats):
         begun = time.perf_counter()
         state, metrics = chunk(state)
         jax.block_until_ready((state, metrics))
         seconds.append(time.perf_counter() - begun)
-    return {"seconds": statistics.median(seconds[1:]), "temporary_bytes": chunk.memory_analysis().temp_size_in_bytes}
+    temporary = chunk.memory_analysis().temp_size_in_bytes
+    return {"compile_seconds": compiled, "seconds": statistics.median(seconds[1:]), "temporary_bytes": temporary}
 
 
-def measure(program: step.Program, sizes: list[tuple[int, int]], shard: mesh.Shard, steps: int, repeats: int) -> Any:
-    """`train` and a row for each number of members and of devices in `sizes`: all compiled, then timed in turn."""
-    cfg = program.cfg
-
-    def alone() -> tuple[Any, Any, Callable[[], Any]]:
-        init = functools.partial(step.init, program)
-        return step.compile_chunk(program, steps), jax.eval_shape(init), init
-
-    def together(seeds: int, devices: int) -> tuple[Any, Any, Callable[[], Any]]:
-        line = mesh.make(devices)
-        mesh.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
-        (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
-        where = (program, members.members(group), line, shard)
-        chunk = members.compile_chunk(*where[:2], steps, line, shard)
-        return chunk, members.abstract(*where), functools.partial(members.init, *where)
-
-    programs = [alone(), *(together(*size) for size in sizes)]
-    chunks = [_compiled(jitted, state) for jitted, state, _ in programs]
-    rows = []
-    for (chunk, compiled), (_, _, init), (seeds, devices) in zip(chunks, programs, [(1, 1), *sizes], strict=True):
-        row = {"compile_seconds": compiled, **_timed(chunk, init(), repeats)}
-        rate = seeds * cfg.train.scenes * steps / row["seconds"]
-        rows.append({"seeds": seeds, "devices": devices, **row, "actions_per_second": rate})
-    return {"train": rows[0], "rows": rows[1:]}
+def measure(program: step.Program, seeds: int, devices: int, shard: mesh.Shard, steps: int, repeats: int) -> Any:
+    """A row: `seeds` members on `devices` devices."""
+    cfg, line = program.cfg, mesh.make(devices)
+    mesh.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
+    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
+    each = members.members(group)
+    jitted = members.compile_chunk(program, each, steps, line, shard)
+    row = _timed(jitted, members.init(program, each, line, shard), repeats)
+    rate = seeds * cfg.train.scenes * steps / row["seconds"]
+    return {"seeds": seeds, "devices": devices, **row, "actions_per_second": rate}
 
 
 def _config(options: Any) -> Config:
@@ -97,13 +79,13 @@ def main(arguments: list[str]) -> None:
     except ValueError as error:
         raise BadArgumentsError(f"bench sweep: {error}") from None
     program = step.make(cfg)
-    sizes = [
-        (seeds, devices)
+    alone = _timed(step.compile_chunk(program, options.steps), step.init(program), options.repeats)
+    rows = [
+        measure(program, seeds, devices, options.shard, options.steps, options.repeats)
         for devices in options.devices
         for seeds in options.seeds
         if options.shard == "scenes" or seeds % devices == 0
     ]
-    rows = measure(program, sizes, options.shard, options.steps, options.repeats)
-    shown = {"scenes": cfg.train.scenes, "batch": cfg.learn.batch, "steps": options.steps, "shard": options.shard}
-    shown |= {"preset": cfg.preset, "physics": cfg.sim.physics}
-    print(json.dumps({**shown, **rows, **provenance.record()}, indent=2))
+    sizes = {"scenes": cfg.train.scenes, "batch": cfg.learn.batch, "steps": options.steps, "shard": options.shard}
+    sizes |= {"physics": cfg.sim.physics}
+    print(json.dumps({"preset": cfg.preset, **sizes, "train": alone, "rows": rows, **provenance.record()}, indent=2))

@@ -148,6 +148,14 @@ def test_presets_fit():
         assert memory.sure(cfg) < 16e9 or name == "fast"
 
 
+def test_runs_in_turn_share_what_a_step_needs():
+    """Claim: side by side, runs of DenseNet-121 need a ring each and one step's room, others that of each."""
+    paper, small = presets.paper(), presets.paper_small()
+    ring = paper.replay.capacity * memory.ring.bytes_needed(1, memory.step.example(paper))
+    assert memory.sure(paper, 16) - memory.sure(paper) == 15 * ring
+    assert memory.sure(small, 16) == 16 * memory.sure(small)
+
+
 def test_gradient_of_densenet_is_shown_and_refuses_nothing():
     """Claim: what nothing was fitted to is shown, but is no reason to refuse a run."""
     paper = presets.paper()

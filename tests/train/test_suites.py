@@ -45,6 +45,17 @@ def test_cases_are_the_shipped_files():
         assert env.cfg.sim.contacts >= 64
 
 
+@pytest.mark.parametrize("suite", ["random10", "generated"])
+def test_suite_is_the_same_for_every_policy(suite: str):
+    """Claim: scenes that are dropped or drawn do not depend on what a policy was trained with."""
+    alike = dataclasses.replace(CFG.scene, size_spread=0.0, mesh_spread=0.0, density=(600.0, 600.0), arranged=0.5)
+    (one,), (other,) = (
+        suites.environments(cfg, suite, 2, 0).values() for cfg in (CFG, dataclasses.replace(CFG, scene=alike))
+    )
+    jax.tree.map(np.testing.assert_array_equal, one.scenes, other.scenes)
+    assert len(np.unique(one.scenes.density)) > 2
+
+
 def test_cases_share_their_compilation():
     """Claim: all four cases have one config and one physics, so that what is compiled for one serves all."""
     first, *others = suites.environments(CFG, "cases", EPISODES, 0).values()
