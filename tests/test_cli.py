@@ -103,6 +103,8 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench step --smallest 2", "bench step: --smallest and --largest belong to --curve"),
         ("bench step --curve map --smallest 36 --largest 40", "bench step: heightmap.size: must be a multiple of 8"),
         ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
+        ("bench step --learn.critics 3", "bench step: learn.critics: must be 1 or 2"),
+        ("bench step smoke --learn.update 2", "bench step: Unrecognized options: --learn.update"),
         ("bench step fast --physics warp --curve scenes --smallest 8192 --largest 8192", "train.scenes: at most 4096"),
         ("bench memory huge", "bench memory: give names of: smoke, 64 scenes, "),
         (f"bench memory --record {__file__}", f"bench memory: {__file__} is no record of it"),

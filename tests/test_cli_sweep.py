@@ -153,8 +153,9 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     [
         ("--seeds 0", "bench sweep: --seeds, --steps, --repeats: at least 1"),
         ("--devices 4096", "bench sweep: --devices: 4096 asked for"),
-        ("fats", "bench sweep: argument preset: invalid choice: 'fats'"),
-        ("--batch 8000", "bench sweep: replay.capacity: must hold"),
+        ("fats", "bench sweep: unknown preset 'fats'"),
+        ("--learn.batch 8000 --train.warmup 8000", "bench sweep: replay.capacity: must hold"),
+        ("smoke --train.scene 4", "bench sweep: Unrecognized options: --train.scene"),
     ],
 )
 def test_bad_arguments_of_the_benchmark(capsys: pytest.CaptureFixture, arguments: str, message: str):
@@ -169,11 +170,11 @@ def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatc
     come from. A small step stands in for the learner's."""
     for name, toy in (("make", toys.program), ("begin", toys.begin), ("train_step", toys.train_step)):
         monkeypatch.setattr(step, name, toy)
-    assert cli.main(["bench", "sweep", "smoke", "--seeds", "1", "3", "--repeats", "1"]) == 0
+    assert cli.main(["bench", "sweep", "smoke", "--seeds", "1", "3", "--repeats", "1", "--train.scenes", "4"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [(row["seeds"], row["devices"]) for row in found["rows"]] == [(1, 1), (3, 1)]
     for row in found["rows"]:
-        assert row["actions_per_second"] == pytest.approx(row["seeds"] * 2 * 2 / row["seconds"])
+        assert row["actions_per_second"] == pytest.approx(row["seeds"] * 4 * 2 / row["seconds"])
     assert found["train"]["compile_seconds"] > 0.0
     assert {"preset", "device", "versions", "commit"} <= found.keys()
 

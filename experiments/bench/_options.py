@@ -1,9 +1,13 @@
-"""Arguments of benchmarks: whole numbers by name, and switches."""
+"""Arguments of benchmarks: whole numbers by name, switches, and the settings of a preset."""
 
 import argparse
+import dataclasses
+from collections.abc import Sequence
 from typing import NoReturn
 
+from csac_jax.cli import settings
 from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.config import Algo, Config
 
 
 class Parser(argparse.ArgumentParser):
@@ -26,3 +30,28 @@ def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
         if value < 1 and value is not False:
             parser.error(f"--{option}: must be at least 1")
     return options
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """A preset's settings, as `csac-jax train` takes them."""
+
+    seed: int = 0
+    algo: Algo = "csac_beta"
+
+
+_SETTINGS = settings.with_sections(_Run)
+
+
+def split(parser: Parser, arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
+    """The preset, `quick` if none stands first, what `parser` knows, and the rest, which are settings."""
+    preset, flags = settings.split(arguments)
+    return preset or "quick", *parser.parse_known_args(flags)
+
+
+def config(name: str, preset: str, flags: Sequence[str]) -> Config:
+    """The preset with settings as `csac-jax train` takes them, for the benchmark `name`. Raises BadArgumentsError."""
+    try:
+        return settings.parse(_SETTINGS, f"bench {name}", settings.preset(preset, flags), flags)[1]
+    except BadArgumentsError as error:
+        raise BadArgumentsError(f"bench {name}: {error}") from None

@@ -1,6 +1,6 @@
 """Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics mjx|warp|c|auto]
-[--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B]`, PRESET `quick` if none is
-given, physics `auto`.
+[--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B] [SETTING ...]`, PRESET `quick`
+if none is given, physics `auto`, settings as `csac-jax train` takes them: `--learn.updates 64`.
 
 Each stage of `train_step` is compiled by itself and timed beside the whole step, a compiled loop of STEPS (2) steps as
 in training, and beside a bare loop of the engine's own steps of the same scenes and set-points: in one process, turn by
@@ -32,14 +32,14 @@ from csac_jax import env as environment, presets
 from csac_jax.agent import learner as learning, policy, rewards
 from csac_jax.agent.learner import Transition
 from csac_jax.cli.errors import BadArgumentsError
-from csac_jax.config import Config
+from csac_jax.config import Config, PhysicsKind
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
 from csac_jax.sim.primitives import Action, Primitive
 from csac_jax.train import auto, cache, compiler, provenance, step
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
-from experiments.bench._options import Parser
+from experiments.bench._options import Parser, config, split
 from experiments.bench._timing import medians
 
 CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
@@ -303,34 +303,34 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
     )
 
 
-def _options(arguments: list[str]) -> argparse.Namespace:
+def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
+    """The preset, the benchmark's options and the preset's settings."""
     parser = Parser(prog="bench step", allow_abbrev=False)
-    parser.add_argument("preset", nargs="?", default="quick")
     parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"), default="auto")
     parser.add_argument("--curve", choices=tuple(CURVES))
     for name, default in {"steps": 2, "repeats": 5, "smallest": 0, "largest": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
-    options = parser.parse_args(arguments)
-    if options.preset not in presets.PRESETS:
+    preset, options, flags = split(parser, arguments)
+    if preset not in presets.PRESETS:
         raise BadArgumentsError(f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick")
     if min(options.steps, options.repeats) < 1:
         raise BadArgumentsError("bench step: --steps, --repeats: at least 1")
     if options.curve is None:
         if options.smallest or options.largest:
             raise BadArgumentsError("bench step: --smallest and --largest belong to --curve")
-        return options
+        return preset, options, flags
     smallest, largest = CURVES[options.curve]
     options.smallest, options.largest = options.smallest or smallest, options.largest or largest
     if not 1 <= options.smallest <= options.largest:
         raise BadArgumentsError("bench step: --smallest, --largest: 1 <= smallest <= largest is needed")
-    return options
+    return preset, options, flags
 
 
-def _config(options: argparse.Namespace) -> Config:
-    cfg = presets.get(options.preset)
-    if options.physics == "warp":
+def _config(preset: str, flags: list[str], physics: PhysicsKind) -> Config:
+    cfg = config("step", preset, flags)
+    if physics == "warp":
         cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, mesh_spread=0.0))
-    return auto.resolve(dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics)))
+    return auto.resolve(dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=physics)))
 
 
 def _values(smallest: int, largest: int) -> list[int]:
@@ -339,15 +339,15 @@ def _values(smallest: int, largest: int) -> list[int]:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = _options(arguments)
+    preset, options, flags = _options(arguments)
     try:
-        cfg = _config(options)
+        cfg = _config(preset, flags, options.physics)
         points = (
             [_at(cfg, options.curve, v) for v in _values(options.smallest, options.largest)] if options.curve else []
         )
     except ValueError as error:
         raise BadArgumentsError(f"bench step: {error}") from None
-    result = {"preset": options.preset, "physics": cfg.sim.physics, "scenes": cfg.train.scenes} | {
+    result = {"preset": preset, "settings": flags, "physics": cfg.sim.physics, "scenes": cfg.train.scenes} | {
         name: getattr(options, name) for name in ("steps", "repeats")
     }
     if options.curve:

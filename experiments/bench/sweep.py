@@ -1,6 +1,6 @@
 """What seeds side by side cost, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices 1 ...] [--shard
-seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [--scenes E --batch B]`, PRESET `quick` if none is
-given, physics the preset's.
+seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [SETTING ...]`, PRESET `quick` if none is given,
+physics the preset's, settings as `csac-jax train` takes them: `--train.scenes 64`.
 
 For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
 and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds that the devices
@@ -16,11 +16,10 @@ from typing import Any
 
 import jax
 
-from csac_jax import presets
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.train import auto, members, mesh, provenance, step
-from experiments.bench._options import Parser
+from experiments.bench._options import Parser, config, split
 
 
 def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
@@ -50,30 +49,26 @@ def measure(program: step.Program, seeds: int, devices: int, shard: mesh.Shard, 
     return {"seeds": seeds, "devices": devices, **row, "actions_per_second": rate}
 
 
-def _config(options: Any) -> Config:
-    cfg = presets.get(options.preset)
+def _config(preset: str, flags: list[str], options: Any) -> Config:
+    cfg = config("sweep", preset, flags)
     sim = dataclasses.replace(cfg.sim, physics=options.physics or cfg.sim.physics)
-    cfg = auto.resolve(dataclasses.replace(cfg, sim=sim), max(options.devices), max(options.seeds))
-    scenes, batch = options.scenes or cfg.train.scenes, options.batch or cfg.learn.batch
-    train = dataclasses.replace(cfg.train, scenes=scenes, warmup=max(cfg.train.warmup, batch))
-    return dataclasses.replace(cfg, train=train, learn=dataclasses.replace(cfg.learn, batch=batch))
+    return auto.resolve(dataclasses.replace(cfg, sim=sim), max(options.devices), max(options.seeds))
 
 
 def main(arguments: list[str]) -> None:
     """Prints the result. Raises BadArgumentsError for what cannot be measured."""
-    parser = Parser(prog="bench sweep", description=__doc__)
-    parser.add_argument("preset", nargs="?", default="quick", choices=presets.PRESETS)
+    parser = Parser(prog="bench sweep", description=__doc__, allow_abbrev=False)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--devices", type=int, nargs="+", default=[1])
     parser.add_argument("--shard", choices=["seeds", "scenes"], default="seeds")
     parser.add_argument("--physics", choices=["mjx", "warp", "c", "auto"])
-    for name, default in (("steps", 2), ("repeats", 3), ("scenes", 0), ("batch", 0)):
+    for name, default in (("steps", 2), ("repeats", 3)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    options = parser.parse_args(arguments)
+    preset, options, flags = split(parser, arguments)
     if min(*options.seeds, options.steps, options.repeats) < 1:
         raise BadArgumentsError("bench sweep: --seeds, --steps, --repeats: at least 1")
     try:
-        cfg = _config(options)
+        cfg = _config(preset, flags, options)
         for devices in options.devices:
             mesh.check(mesh.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch)
     except ValueError as error:
@@ -87,5 +82,5 @@ def main(arguments: list[str]) -> None:
         if options.shard == "scenes" or seeds % devices == 0
     ]
     sizes = {"scenes": cfg.train.scenes, "batch": cfg.learn.batch, "steps": options.steps, "shard": options.shard}
-    sizes |= {"physics": cfg.sim.physics}
+    sizes |= {"physics": cfg.sim.physics, "settings": flags}
     print(json.dumps({"preset": cfg.preset, **sizes, "train": alone, "rows": rows, **provenance.record()}, indent=2))
