@@ -142,10 +142,8 @@ def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[ja
     Q is the lower of both critics in each cell, before anything is read between cells; features are the first one's.
     """
     fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
-    flat = fed.reshape(-1, *fed.shape[2:])
-    outputs = _of_each_critic(lambda variables: learner.critic.apply(variables, flat), params.critic)
-    q, features = jnp.min(outputs[0], axis=0), outputs[1][0]
-    return q.reshape(*fed.shape[:2], *q.shape[1:]), features.reshape(*fed.shape[:2], *features.shape[1:])
+    q, features = _of_each_critic(lambda variables: networks.look(learner.critic, variables, fed), params.critic)
+    return jnp.min(q, axis=0), features[0]
 
 
 def _of_each_critic(call: Callable[[Any], Any], variables: Any) -> Any:

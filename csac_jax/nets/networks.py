@@ -13,6 +13,7 @@ from csac_jax.config import NetConfig
 from csac_jax.nets import dense, densenet
 
 STATISTICS = "batch_stats"
+_FULL = 640  # side in pixels of passes of which one state fills a GPU
 
 Critic = dense.Critic | densenet.Critic
 Head = dense.Head | densenet.Head
@@ -44,6 +45,26 @@ def inputs(cfg: NetConfig, colour: jax.Array, height: jax.Array, target: jax.Arr
 def learned(variables: Any) -> Any:
     """The variables that gradients change; the rest are running statistics."""
     return {"params": variables["params"]}
+
+
+def states_at_once(cfg: NetConfig, canvas: int) -> int | None:
+    """How many states, of passes of canvas x canvas cells, a critic sees at a time; None for any number.
+
+    A state of DenseNet-121 at 640 px, or a few at fewer, fills a GPU. In groups of one size all looks have the same
+    convolutions, which XLA tries out for minutes, and the memory of one group.
+    """
+    if cfg.kind == "small":
+        return None
+    return max(1, round((_FULL / (cfg.zoom * canvas)) ** 2))
+
+
+def look(net: Critic, variables: Any, fed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q [B, N, ...] and features [B, N, ...] of states of N passes each [B, N, C, C, I]."""
+    group = states_at_once(net.cfg, fed.shape[2])
+    if group is not None:
+        return jax.lax.map(lambda one: net.apply(variables, one), fed, batch_size=group)
+    flat: Any = net.apply(variables, fed.reshape(-1, *fed.shape[2:]))
+    return jax.tree.map(lambda leaf: leaf.reshape(*fed.shape[:2], *leaf.shape[1:]), flat)
 
 
 def train(net: Critic | Head, variables: Any, fed: jax.Array) -> tuple[Any, Any]:

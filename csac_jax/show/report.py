@@ -166,6 +166,23 @@ def gaps(report: Report) -> list[Gap]:
     return found
 
 
+def lead(report: Report, curve: Curve) -> Band | None:
+    """By how much CSAC-beta with the fewest settings changed ends ahead of another variant that was trained as long in
+    the same scenes and task, several seeds of both; None where there is no such pair."""
+    alike = [one for one in report.curves if _trained(one) == _trained(curve) and one.variant.algo == "csac_beta"]
+    first = min(alike, key=lambda one: len(one.variant.changed), default=curve)
+    if first is curve or min(len(first.runs), len(curve.runs)) < 2:
+        return None
+    ours, theirs = ([np.array([run.success[-1] for run in one.runs])] for one in (first, curve))
+    return statistics.difference(ours, theirs)
+
+
+def _trained(curve: Curve) -> tuple[Any, ...]:
+    """What curves must share to be compared."""
+    world = [change for change in curve.variant.changed if change[0].startswith(("task.", "scene.", recorded.SHAPE))]
+    return curve.variant.preset, int(curve.actions[-1]), *world
+
+
 def _scenes(score: Score) -> tuple[str, str, str, int]:
     return score.variant.preset, score.suite, score.world, score.episodes
 
@@ -200,6 +217,7 @@ def as_json(report: Report) -> dict[str, Any]:
                 "changed": dict(curve.variant.changed),
                 "seeds": [run.config.get("seed", 0) for run in curve.runs],
                 "final": curve.final._asdict(),
+                "ahead": None if (ahead := lead(report, curve)) is None else ahead._asdict(),
                 "seconds_to_90": [_time_to(run) for run in curve.runs],
                 "seconds": [float(run.seconds[-1]) for run in curve.runs],
                 "actions": curve.actions.tolist(),
@@ -255,7 +273,8 @@ def _range(values: Sequence[float | None]) -> str:
 
 def training(report: Report) -> Table:
     """How training went, a row per variant."""
-    rows = [["method", "seeds", "actions", f"success, last {WINDOW} grasps", "paper", "time to 90 %", "training time"]]
+    last = f"success, last {WINDOW} grasps"
+    rows = [["method", "seeds", "actions", last, "CSAC-beta ahead by", "paper", "time to 90 %", "training time"]]
     for curve in report.curves:
         mark = PAPER_TRAINING.get(curve.variant.algo) if curve.variant.method else None
         ends = sorted({int(run.actions[-1]) for run in curve.runs})
@@ -265,6 +284,7 @@ def training(report: Report) -> Table:
                 _seeds(curve.runs),
                 " to ".join(f"{end:,}" for end in ([ends[0], ends[-1]] if len(ends) > 1 else ends)),
                 shown(curve.final),
+                _points(lead(report, curve)),
                 "-" if mark is None else f"{100 * mark:.0f} %",
                 _range([_time_to(run) for run in curve.runs]),
                 _range([float(run.seconds[-1]) for run in curve.runs]),

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import Config
-from csac_jax.nets import dense
+from csac_jax.nets import dense, networks
 from csac_jax.replay import ring
 from csac_jax.train import step
 
@@ -74,17 +74,22 @@ def stages(cfg: Config, fitted_only: bool = False) -> dict[str, int]:
     actor *= (cfg.learn.actor_batch or cfg.learn.batch) / cfg.learn.batch
     if cfg.learn.updates == 1:  # no loop in between: the actor's update shares time with the critic's
         actor += value
+    group = networks.states_at_once(cfg.net, _canvas(cfg))
+    looked, drawn = (min(count, group or count) for count in (cfg.train.scenes, cfg.learn.batch))
     return {
-        "look": round(cfg.train.scenes * unit * look),
+        "look": round(looked * unit * look),
         "simulate": cfg.train.scenes * _scene(cfg),
-        "learn": round(cfg.learn.batch * unit * max(look + value, actor)),
+        "learn": round(unit * max(drawn * look + cfg.learn.batch * value, cfg.learn.batch * actor)),
     }
+
+
+def _canvas(cfg: Config) -> int:
+    return round(cfg.heightmap.size * (1.0 + cfg.net.margin) / 2.0) * 2
 
 
 def _pass_unit(cfg: Config) -> float:
     """Bytes of one channel of a pass, in the type that it computes in: the small net's maps, DenseNet-121's input."""
-    side = round(cfg.heightmap.size * (1.0 + cfg.net.margin) / 2.0) * 2
-    cells = side // cfg.net.stride if cfg.net.kind == "small" else side * cfg.net.zoom
+    cells = _canvas(cfg) // cfg.net.stride if cfg.net.kind == "small" else _canvas(cfg) * cfg.net.zoom
     return jnp.dtype(dense.compute_dtype(cfg.net)).itemsize * cells**2
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from csac_jax import presets
@@ -103,3 +104,39 @@ def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: boo
     assert q.shape == actor.shape == (1, frames.side, frames.side, dense.OUTPUTS)
     assert frames.side * networks.stride(cfg.net) == frames.tables.canvas == 96
     assert isinstance(critic, densenet.Critic if kind == "densenet121" else dense.Critic)
+
+
+def test_states_of_densenet_are_seen_in_groups():
+    """Claim: DenseNet-121 sees one state of 640 px at a time, four of 320, and what it says of each is what it says of
+    its passes by themselves; the small net sees all at once."""
+    assert networks.states_at_once(_config(224, margin=0.4286, kind="densenet121", zoom=2).net, 320) == 1
+    assert networks.states_at_once(_config(224, margin=0.4286, kind="densenet121").net, 320) == 4
+    assert networks.states_at_once(NetConfig(), 72) is None
+    net = NetConfig(kind="densenet121", block_layers=(1, 1, 1, 1), block_growth=4, head=8)
+    critic = networks.critic(net)
+    fed = jax.random.normal(jax.random.key(0), (3, 2, 32, 32, 4))
+    variables = critic.init(jax.random.key(1), fed[0])
+    for group in (1, 2, 3):
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(networks, "_FULL", 32 * group**0.5)
+            assert networks.states_at_once(net, 32) == group
+            got = networks.look(critic, variables, fed)
+        apart = [critic.apply(variables, one) for one in fed]
+        for leaf, *wanted in zip(got, *apart, strict=True):
+            np.testing.assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["small", "densenet121"])
+def test_looks_at_any_number_of_states_share_convolutions(kind: str):
+    """Claim: one state and eight go through convolutions of the same shapes with DenseNet-121, of others with the small
+    net, which takes all at once."""
+    critic = networks.critic(_config(64, kind=kind, margin=0.5, block_layers=(1, 1, 1, 1), block_growth=4).net)
+    variables = jax.eval_shape(critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
+
+    def convolutions(states: int) -> set[str]:
+        fed = jax.ShapeDtypeStruct((states, 2, 640, 640, 4), jnp.float32)
+        text = jax.jit(lambda variables, fed: networks.look(critic, variables, fed)).lower(variables, fed).as_text()
+        return {line.split(" : ")[-1] for line in text.splitlines() if "stablehlo.convolution" in line}
+
+    assert convolutions(1)
+    assert (convolutions(1) == convolutions(8)) == (kind == "densenet121")

@@ -180,6 +180,35 @@ def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
     assert len(report.as_json(whole)["differences"]) == 3
 
 
+def test_training_is_compared_where_it_is_alike(tmp_path: Path):
+    """Claim: how far CSAC-beta ends ahead is said of every variant of several seeds that was trained as long in the
+    same scenes and task: not of another task, of other scenes, of a shorter run, nor of one seed."""
+    others = {
+        "base": {},
+        "max": {"target__value": "max"},
+        "target": {"task__kind": "target"},
+        "packed": {"scene__arranged": 0.5},
+    }
+    for name, changed in others.items():
+        for seed, last in enumerate((0.9, 0.8) if name == "base" else (0.5, 0.6)):
+            _run(tmp_path / name / str(seed), _config("csac_beta", seed, **changed), [0.5, last])
+    for seed in range(2):
+        _run(tmp_path / "short" / str(seed), _config("csac_per", seed), [0.5])
+    _run(tmp_path / "once", _config("vpg", 0), [0.5, 0.5])
+    found = report.build(results.read([tmp_path]))
+    leads = {(c.variant.algo, c.variant.changed): report.lead(found, c) for c in found.curves}
+    compared = ("csac_beta", (("target.value", "max"),))
+    assert [key for key, band in leads.items() if band is not None] == [compared]
+    band = leads[compared]
+    assert band is not None
+    assert band.value == pytest.approx(0.85 - 0.55)
+    assert band.low == pytest.approx(0.2)
+    assert band.high == pytest.approx(0.4)
+    column = report.training(found)[0].index("CSAC-beta ahead by")
+    assert sorted(row[column] for row in report.training(found)[1:]) == ["+30.0 (+20.0 to +40.0)", *["-"] * 5]
+    assert sum(curve["ahead"] is not None for curve in report.as_json(found)["curves"]) == 1
+
+
 def test_labels():
     """Claim: settings that no result depends on name no variant; a label in a figure names as many as it is told to."""
     assert results.variant(_config("vpg", 0, train__chunk=7, train__save_every=3)).changed == ()

@@ -160,3 +160,12 @@ def test_gradient_of_densenet_is_shown_and_refuses_nothing():
     """Claim: what nothing was fitted to is shown, but is no reason to refuse a run."""
     paper = presets.paper()
     assert memory.stages(paper)["learn"] > 2 * memory.stages(paper, fitted_only=True)["learn"]
+
+
+def test_densenet_looks_at_one_state_after_another():
+    """Claim: a look of DenseNet-121 takes the memory of one group of states, however many scenes there are."""
+    paper = presets.paper()
+    many = dataclasses.replace(paper, train=dataclasses.replace(paper.train, scenes=8))
+    assert memory.stages(many)["look"] == memory.stages(paper)["look"]
+    coarse = dataclasses.replace(many, net=dataclasses.replace(paper.net, zoom=1))
+    assert memory.stages(coarse)["look"] == memory.stages(many)["look"]  # four states of a quarter of the pixels
