@@ -52,7 +52,7 @@ def figures(report: Report) -> list[tuple[str, str, Figure]]:
         if methods:
             title = f"Grasp success of the methods (figure 6), preset {preset}"
             found.append((f"methods-{preset}", title, _lines(methods)))
-        if len(samplers) > 1:
+        if len({curve.variant.algo for curve in samplers}) > 1:
             title = f"Grasp success of the samplers (figure 7), preset {preset}"
             found.append((f"samplers-{preset}", title, _lines(samplers)))
         if varied:

@@ -20,7 +20,7 @@ from csac_jax.config import Config
 from csac_jax.train import config_json, step
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "c5c582c2b047b60897a0c5df3a86003ecc51834685cb3171e72f54bf37e7555c"
+SHIPPED_SHA256 = "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c"
 _CONFIG = "config"  # the config's name among the file's remarks
 
 

@@ -294,6 +294,14 @@ def test_figures(recorded: Path):
     assert ticks == [*CASES, "mean"]
 
 
+def test_samplers_are_drawn_where_there_are_several(recorded: Path):
+    """Claim: figure 7 is drawn of two samplers, not of one that was trained for two lengths."""
+    _run(recorded / "long", _config("csac_beta", 0, train__actions=5000), [0.5])
+    assert "samplers-paper" not in {name for name, *_ in charts.figures(report.build(results.read([recorded])))}
+    _run(recorded / "per", _config("csac_per", 0), [0.5])
+    assert "samplers-paper" in {name for name, *_ in charts.figures(report.build(results.read([recorded])))}
+
+
 def test_legend_of_many_curves_hides_none(recorded: Path):
     """Claim: a legend lies among a few curves, and below the axes where many curves make it large."""
     curves = report.build(results.read([recorded])).curves
