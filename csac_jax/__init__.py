@@ -32,4 +32,5 @@ __version__ = "0.1.0"
 
 _guard.refuse_broken_jax()
 _guard.switch_off_broken_fusion()
+_guard.switch_off_broken_partitioner()
 _guard.widen_thread_pool()

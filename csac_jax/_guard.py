@@ -1,4 +1,4 @@
-"""Protection against faults of JAX on the CPU; imports nothing of JAX, so that it acts before JAX starts.
+"""Protection against faults of JAX; imports nothing of JAX, so that it acts before JAX starts.
 
 1. jax 0.10.2 computes wrong rows for `vmap(M @ row)` followed by a reduction (jax issue 39103), without a word.
 2. So do 0.10.1 and earlier, in the plainer case: with M 3 x 3, `vmap(sum(M @ row))` is wrong in every row beyond the
@@ -7,6 +7,9 @@
    jaxlib 0.10 and hang for ever if the pool is small: on 2 cores, two at once are enough. A pool with more threads
    than factorisations at once cures it and costs no speed. Its size is read from the environment, once, when the CPU
    client starts. Virtual devices (`DEVICES_FLAG`) share one pool and wait for one another in it.
+4. jaxlib 0.11 ends the process with a segmentation fault, on CPUs and GPUs, as it compiles a `shard_map` that takes
+   along a constant with no elements, and MJX's models have many: a pattern of Shardy, its default partitioner. The
+   one before Shardy compiles it.
 """
 
 import importlib.metadata
@@ -20,6 +23,7 @@ POOL_VARIABLE = "PJRT_NPROC"  # goes before NPROC
 USER_VARIABLES = (POOL_VARIABLE, "NPROC")  # what a user may have set
 MIN_THREADS = 8  # ours: 2 hangs and 8 does not, on 2 cores with batches of 4 and 8 scenes
 DEVICES_FLAG = "--xla_force_host_platform_device_count"
+PARTITIONER_VARIABLE, PARTITIONER_SERIES = "JAX_USE_SHARDY_PARTITIONER", "0.11."
 DEVICE_THREADS = 4  # ours, per virtual device: of eight that train together, 8 threads in all hung and 32 did not
 
 
@@ -37,6 +41,12 @@ def switch_off_broken_fusion() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if importlib.metadata.version("jaxlib").startswith(FUSION_SERIES) and FUSION_FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {FUSION_FLAG}=".lstrip()
+
+
+def switch_off_broken_partitioner() -> None:
+    """Has this jaxlib partition programs without Shardy, unless the user has chosen."""
+    if importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES):
+        os.environ.setdefault(PARTITIONER_VARIABLE, "false")
 
 
 def widen_thread_pool() -> None:

@@ -43,7 +43,7 @@ ROOT = Path(_guard.__file__).parents[1]
 
 def _python(source: str, timeout: float = 60.0, **variables: str) -> subprocess.CompletedProcess:
     """Runs `source` in a fresh Python, with no variable of the guard but `variables`."""
-    guarded = (*_guard.USER_VARIABLES, "XLA_FLAGS")
+    guarded = (*_guard.USER_VARIABLES, "XLA_FLAGS", _guard.PARTITIONER_VARIABLE)
     inherited = {name: value for name, value in os.environ.items() if name not in guarded}
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(source)],
@@ -116,3 +116,39 @@ def test_broken_jax_is_refused(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ImportError, match=r"0\.10\.2 computes wrong .* pip install") as caught:
         _guard.refuse_broken_jax()
     assert "\n" not in str(caught.value)
+
+
+EMPTY_CONSTANT = """
+import csac_jax
+import jax, numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+nothing = np.zeros((0, 3), np.float32)
+line = Mesh(np.array(jax.devices()), ("devices",))
+along = PartitionSpec("devices")
+add = jax.shard_map(lambda x: x + (nothing + x[0]).sum(), mesh=line, in_specs=along, out_specs=along, check_vma=False)
+print(jax.jit(add)(np.arange(4.0, dtype=np.float32)))
+"""
+
+
+def test_programs_of_several_devices_take_empty_constants():
+    """Claim: with the package imported a program over two devices compiles though a constant has no elements."""
+    done = _python(EMPTY_CONSTANT, XLA_FLAGS=f"{_guard.DEVICES_FLAG}=2", JAX_PLATFORMS="cpu")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "[0. 1. 2. 3.]\n"
+
+
+@pytest.mark.parametrize(
+    ("version", "before", "after"),
+    [("0.11.2", None, "false"), ("0.11.2", "true", "true"), ("0.10.1", None, None), ("0.12.0", None, None)],
+)
+def test_broken_partitioner_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, version: str, before: str | None, after: str | None
+):
+    """Claim: Shardy is switched off for jaxlib 0.11, whose Shardy ends the process, unless the user wants it."""
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
+    monkeypatch.setenv(_guard.PARTITIONER_VARIABLE, before or "")  # to be put back
+    if before is None:
+        monkeypatch.delenv(_guard.PARTITIONER_VARIABLE)
+    _guard.switch_off_broken_partitioner()
+    assert os.environ.get(_guard.PARTITIONER_VARIABLE) == after
