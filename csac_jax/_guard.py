@@ -23,8 +23,9 @@ POOL_VARIABLE = "PJRT_NPROC"  # goes before NPROC
 USER_VARIABLES = (POOL_VARIABLE, "NPROC")  # what a user may have set
 MIN_THREADS = 8  # ours: 2 hangs and 8 does not, on 2 cores with batches of 4 and 8 scenes
 DEVICES_FLAG = "--xla_force_host_platform_device_count"
-PARTITIONER_VARIABLE, PARTITIONER_SERIES = "JAX_USE_SHARDY_PARTITIONER", "0.11."
 DEVICE_THREADS = 4  # ours, per virtual device: of eight that train together, 8 threads in all hung and 32 did not
+PARTITIONER_VARIABLE = "JAX_USE_SHARDY_PARTITIONER"
+PARTITIONER_SERIES = "0.11."  # versions of jaxlib whose Shardy is seen to end the process
 
 
 def refuse_broken_jax() -> None:
