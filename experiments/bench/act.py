@@ -3,8 +3,9 @@
 
 DenseNet-121 over colour and height maps of PIXELS (224) cells, one state and STATES (64) at once, each cell ZOOM (1)
 pixels wide, maps as fine as the height map; beside it, if torch is installed, the way of VPG: each yaw, primitive and
-trunk is a pass of its own of one picture of twice the size, float32. Then the small net at the size that it is used at.
-All weights are random; the median of REPEATS (10) calls counts.
+trunk is a pass of its own of one picture of twice the size, float32. Then the small net, one critic, at the size that
+it is used at: as it is by default, in `quick` and in `fast`. All weights are random; the median of REPEATS (10) calls
+counts.
 """
 
 import dataclasses
@@ -23,7 +24,7 @@ from csac_jax.agent import learner as learning
 from csac_jax.agent.learner import Learner
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import DENSENET_STRIDE, Config, HeightmapConfig, NetConfig
-from csac_jax.train import provenance, step
+from csac_jax.train import compiler, provenance, step
 from csac_jax.vision.heightmap import Observation
 from experiments.bench._options import read
 from experiments.bench._timing import medians
@@ -73,7 +74,8 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
     params, obs = _random(abstract.online), _observations(cfg.heightmap.size, states)
     begun = time.perf_counter()
-    look = jax.jit(lambda params, obs: learning.look(learner, params, obs).q).lower(params, obs).compile()
+    jitted = jax.jit(lambda params, obs: learning.look(learner, params, obs).q, compiler_options=compiler.options(cfg))
+    look = jitted.lower(params, obs).compile()
     compiled = time.perf_counter() - begun
     seconds = medians({"look": lambda: look(params, obs)}, repeats)["look"]
     return {
@@ -96,9 +98,9 @@ def _update_memory(learner: Learner) -> int:
     return compiled.memory_analysis().temp_size_in_bytes
 
 
-def _small(states: int, repeats: int) -> dict[str, Any]:
-    """The small net as it is by default, with the map and the batch of `quick`."""
-    cfg = dataclasses.replace(presets.quick(), net=NetConfig())
+def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
+    """A small net with the map and the batch of `quick`."""
+    cfg = dataclasses.replace(presets.quick(), net=net)
     learner = learning.make(cfg)
     abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner)).online
     return {
@@ -205,11 +207,12 @@ def main(arguments: list[str]) -> None:
     ours = [_ours(cfg, states, repeats) for states in (1, options["states"])]
     vpg = _vpg(cfg.net, pixels, min(repeats, 3))
     ratios = [vpg["seconds_per_state"] / one["seconds_per_state"] for one in ours] if "missing" not in vpg else None
+    nets = {"default": NetConfig(), "quick": presets.quick().net, "fast": presets.fast().net}
     result = {
         "options": options,
         "densenet121": ours,
         "vpg_in_torch": vpg,
         "vpg_over_densenet121": ratios,
-        "small": _small(options["states"], repeats),
+        "small": {name: _small(net, options["states"], repeats) for name, net in nets.items()},
     }
     print(json.dumps(result | provenance.record(), indent=2))
