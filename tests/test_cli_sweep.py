@@ -155,6 +155,10 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
         ("--devices 4096", "bench sweep: --devices: 4096 asked for"),
         ("fats", "bench sweep: unknown preset 'fats'"),
         ("--learn.batch 8000 --train.warmup 8000", "bench sweep: replay.capacity: must hold"),
+        (
+            "fast --physics warp --seeds 2 4",
+            "--seeds: 4 members of 2048 scenes side by side, Warp has room for",
+        ),
         ("smoke --train.scene 4", "bench sweep: Unrecognized options: --train.scene"),
     ],
 )

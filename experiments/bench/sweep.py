@@ -18,7 +18,7 @@ import jax
 
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
-from csac_jax.train import auto, members, mesh, provenance, step
+from csac_jax.train import auto, grid, members, mesh, provenance, step, sweep as sweeping
 from experiments.bench._options import Parser, config, split
 
 
@@ -71,6 +71,8 @@ def main(arguments: list[str]) -> None:
         cfg = _config(preset, flags, options)
         for devices in options.devices:
             mesh.check(mesh.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch)
+            most = sweeping.Plan(max(options.seeds), [sweeping.Setting(grid.BASE, {}, cfg)])
+            sweeping.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
         raise BadArgumentsError(f"bench sweep: {error}") from None
     program = step.make(cfg)
