@@ -35,8 +35,10 @@ def run(arguments: list[str]) -> int:
     if not (found.curves or found.scores):
         raise FailedError("; ".join(found.notes))
     print(reporting.markdown(found), end="")
-    for path in reporting.write(found, options.out) if options.out is not None else ():
-        print(path)
+    if options.out is not None:
+        from csac_jax.show import page
+
+        print(*page.write(found, options.out), sep="\n")
     if options.json is not None:
         output.write_json(options.json, reporting.as_json(found))
     return 0

@@ -1,8 +1,6 @@
-"""Recorded results as numbers, tables and one page; every number comes from a file that names its provenance."""
+"""Recorded results as numbers and tables; every number comes from a file that names its provenance."""
 
-import html
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -368,7 +366,7 @@ def provenance(report: Report) -> Table:
     return rows
 
 
-def _tables(report: Report) -> dict[str, Table]:
+def tables(report: Report) -> dict[str, Table]:
     """By title; those without a row are left out."""
     every = {
         "Training": training(report),
@@ -392,48 +390,8 @@ EXPLAINED = (
 def markdown(report: Report) -> str:
     """All tables and notes."""
     parts = []
-    for title, table in _tables(report).items():
+    for title, table in tables(report).items():
         head, *rows = ["| " + " | ".join(cell.replace("|", "/") for cell in row) + " |" for row in table]
         parts.append("\n".join([f"## {title}", "", head, "|" + "---|" * len(table[0]), *rows]))
     notes = "\n".join(f"- {note}" for note in report.notes)
     return "\n\n".join([*parts, EXPLAINED, *([notes] if notes else [])]) + "\n"
-
-
-STYLE = """body { font: 15px/1.45 sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-table { border-collapse: collapse; font-size: 13px; margin: 0.5rem 0 1.5rem }
-th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: left; vertical-align: top }
-svg { max-width: 100%; height: auto }"""
-
-
-def page(report: Report, figures: dict[str, str]) -> str:
-    """One HTML page that needs no other file; figures by title, each an SVG."""
-    body = ["<h1>csac_jax: results</h1>", f"<p>{html.escape(EXPLAINED)}</p>"]
-    body += [f"<h2>{html.escape(title)}</h2>\n{svg}" for title, svg in figures.items()]
-    for title, table in _tables(report).items():
-        body.append(
-            f"<h2>{html.escape(title)}</h2>\n<table>{''.join(_row(row, i == 0) for i, row in enumerate(table))}</table>"
-        )
-    if report.notes:
-        body.append(
-            "<h2>Notes</h2>\n<ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in report.notes) + "</ul>"
-        )
-    head = f'<meta charset="utf-8"><title>csac_jax: results</title><style>{STYLE}</style>'
-    return f"<!doctype html>\n<html lang='en'><head>{head}</head>\n<body>\n" + "\n".join(body) + "\n</body></html>\n"
-
-
-def _row(cells: list[str], head: bool) -> str:
-    tag = "th" if head else "td"
-    return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>\n"
-
-
-def write(report: Report, folder: Path) -> list[Path]:
-    """Writes the page, its figures and its tables; returns the files. Needs matplotlib."""
-    from csac_jax.show import charts
-
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = charts.draw(report)
-    files = {"index.html": page(report, {chart.title: chart.svg for chart in drawn}), "results.md": markdown(report)}
-    files |= {f"{chart.name}.svg": chart.svg for chart in drawn}
-    for name, text in files.items():
-        (folder / name).write_text(text)
-    return [folder / name for name in files]
