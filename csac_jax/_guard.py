@@ -7,9 +7,9 @@
    jaxlib 0.10 and hang for ever if the pool is small: on 2 cores, two at once are enough. A pool with more threads
    than factorisations at once cures it and costs no speed. Its size is read from the environment, once, when the CPU
    client starts. Virtual devices (`DEVICES_FLAG`) share one pool and wait for one another in it.
-4. jaxlib 0.11 ends the process with a segmentation fault, on CPUs and GPUs, as it compiles a `shard_map` that takes
-   along a constant with no elements, and MJX's models have many: a pattern of Shardy, its default partitioner. The
-   one before Shardy compiles it.
+4. jaxlib 0.11 ends the process with a segmentation fault as it compiles a `shard_map` that takes along a constant with
+   no elements, and MJX's models have many: a pattern of Shardy, its default partitioner, seen on CPU devices; programs
+   on several GPUs ended alike. The partitioner before Shardy compiles it.
 """
 
 import importlib.metadata

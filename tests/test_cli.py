@@ -337,6 +337,17 @@ def test_points_of_a_curve():
         assert {name for name in names if getattr(other, name) != getattr(quick, name)} <= touched[curve]
 
 
+def test_settings_of_a_step():
+    """Claim: `bench step` takes settings as `train` does, physics among them, which --physics wins over; else physics
+    are those of `auto`."""
+    from experiments.bench import step as bench
+
+    assert bench._config("smoke", ["--learn.updates", "3"], None).learn.updates == 3
+    asked = [([], None), ([], "mjx"), (["--sim.physics", "mjx"], None), (["--sim.physics", "mjx"], "c")]
+    found = [bench._config("smoke", flags, physics).sim.physics for flags, physics in asked]
+    assert found == ["c", "mjx", "mjx", "c"]
+
+
 @pytest.mark.slow
 def test_replay_benchmark(capsys: pytest.CaptureFixture):
     """Claim: `bench replay` prints JSON with the times of every sampler and where they come from."""

@@ -13,7 +13,7 @@ from csac_jax.config import NetConfig
 from csac_jax.nets import dense, densenet
 
 STATISTICS = "batch_stats"
-_FULL = 640  # side in pixels of passes of which one state fills a GPU
+_FULL = 640  # px, ours: side of passes of which one state is seen at a time
 
 Critic = dense.Critic | densenet.Critic
 Head = dense.Head | densenet.Head
@@ -50,8 +50,8 @@ def learned(variables: Any) -> Any:
 def states_at_once(cfg: NetConfig, canvas: int) -> int | None:
     """How many states, of passes of canvas x canvas cells, a critic sees at a time; None for any number.
 
-    A state of DenseNet-121 at 640 px, or a few at fewer, fills a GPU. In groups of one size all looks have the same
-    convolutions, which XLA tries out for minutes, and the memory of one group.
+    DenseNet-121 sees groups of the pixels of one state at 640 px (ours): so all looks have the same convolutions, which
+    XLA tries out for minutes, and need the memory of one group.
     """
     if cfg.kind == "small":
         return None

@@ -31,6 +31,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from csac_jax import env as environment, presets
 from csac_jax.agent import learner as learning, policy, rewards
 from csac_jax.agent.learner import Transition
+from csac_jax.cli import parsing
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config, PhysicsKind
 from csac_jax.nets.convolution import conv2d
@@ -306,7 +307,7 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
 def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
     """The preset, the benchmark's options and the preset's settings."""
     parser = Parser(prog="bench step", allow_abbrev=False)
-    parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"), default="auto")
+    parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"))
     parser.add_argument("--curve", choices=tuple(CURVES))
     for name, default in {"steps": 2, "repeats": 5, "smallest": 0, "largest": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
@@ -326,8 +327,10 @@ def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
     return preset, options, flags
 
 
-def _config(preset: str, flags: list[str], physics: PhysicsKind) -> Config:
+def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Config:
     cfg = config("step", preset, flags)
+    if physics is None:
+        physics = cfg.sim.physics if parsing.value_of(flags, "--sim.physics") else "auto"
     if physics == "warp":
         cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, mesh_spread=0.0))
     return auto.resolve(dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=physics)))
