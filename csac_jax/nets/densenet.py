@@ -9,11 +9,14 @@ The trunks are the same program with other weights: they are stacked along an ax
 
 import functools
 import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 
 from csac_jax.config import DENSENET_STRIDE, NetConfig
 from csac_jax.nets.dense import OUTPUTS, TABLE_HEIGHT, compute_dtype
@@ -25,6 +28,7 @@ _BOTTLENECK = 4  # channels of a layer's 1 x 1 convolution per channel that the 
 _EPSILON = 1e-5  # of both norms, torchvision's
 _MOMENTUM = 0.9  # share that running statistics keep in an update, torchvision's (there written 0.1)
 _GROUPS = 32
+_KEPT = "kept"  # name of what the gradient does not make once more
 _KAIMING = nn.initializers.variance_scaling(2.0, "fan_in", "normal")  # torchvision's
 
 
@@ -44,16 +48,60 @@ def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None
     return jnp.concatenate(maps, axis=-1)
 
 
-def _norm(cfg: NetConfig, channels: int, train: bool, name: str) -> nn.Module:
-    """Norm of maps [..., channels]; `train`: batch norm takes the batch's statistics and moves the running ones."""
-    dtype = compute_dtype(cfg)
-    if cfg.norm == "batch":
-        # E x^2 - (E x)^2, Flax's default, would cost a decimal in the last block: 1.5e-4 away from Keras, not 1.3e-5.
-        return nn.BatchNorm(
-            not train, use_fast_variance=False, momentum=_MOMENTUM, epsilon=_EPSILON, dtype=dtype, name=name
+class Piece(NamedTuple):
+    """Maps [..., F] that one layer made, and the mean and the variance of each channel over them, [F] float32."""
+
+    maps: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+
+
+def _piece(maps: jax.Array) -> Piece:
+    """Maps with their statistics; both are kept for the gradient, see `Critic`.
+
+    The variance is taken about the mean: E x^2 - (E x)^2 would cost a decimal in the last block.
+    """
+    axes = tuple(range(maps.ndim - 1))
+    exact = maps.astype(jnp.float32)
+    mean = jnp.mean(exact, axes, keepdims=True)
+    variance = jnp.mean(jnp.square(exact - mean), axes)
+    return Piece(*(checkpoint_name(leaf, _KEPT) for leaf in (maps, mean.reshape(-1), variance)))
+
+
+class BatchNorm(nn.Module):
+    """Batch norm of maps [..., F] by given statistics of the batch (mean and variance, [F]), or by the running ones.
+
+    They are given, because every layer of a block norms what all before it made: so they are taken once. Variables are
+    those of `flax.linen.BatchNorm`.
+    """
+
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, maps: jax.Array, statistics: tuple[jax.Array, jax.Array] | None) -> jax.Array:
+        shape = maps.shape[-1:]
+        running = [self.variable("batch_stats", "mean", jnp.zeros, shape)]
+        running += [self.variable("batch_stats", "var", jnp.ones, shape)]
+        scale, bias = self.param("scale", nn.initializers.ones, shape), self.param("bias", nn.initializers.zeros, shape)
+        mean, variance = statistics or [variable.value for variable in running]
+        if statistics and not self.is_initializing():
+            for variable, now in zip(running, statistics, strict=True):
+                variable.value = _MOMENTUM * variable.value + (1.0 - _MOMENTUM) * now
+        mean, factor, bias = (
+            leaf.reshape((1,) * (maps.ndim - 1) + shape)
+            for leaf in (mean, scale * jax.lax.rsqrt(variance + _EPSILON), bias)
         )
-    groups = math.gcd(_GROUPS, channels)
-    return nn.GroupNorm(groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name)
+        return ((maps.astype(jnp.float32) - mean) * factor + bias).astype(self.dtype)
+
+
+def _norm(cfg: NetConfig, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
+    """Pieces joined and normed [..., F]; `train`: batch norm takes the batch's statistics, which are followed."""
+    dtype = compute_dtype(cfg)
+    maps, *statistics = (jnp.concatenate(leaves, axis=-1) for leaves in zip(*pieces, strict=True))
+    if cfg.norm == "batch":
+        return BatchNorm(dtype, name=name)(maps, (statistics[0], statistics[1]) if train else None)
+    groups = math.gcd(_GROUPS, maps.shape[-1])
+    return nn.GroupNorm(groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name)(maps)
 
 
 def _convolution(cfg: NetConfig, features: int, size: int, stride: int, name: str) -> nn.Conv:
@@ -87,30 +135,35 @@ def average_pool(maps: jax.Array) -> jax.Array:
 
 
 class DenseLayer(nn.Module):
-    """Adds `block_growth` channels to maps: [B, H, W, F] -> [B, H, W, F + block_growth]."""
+    """What a layer adds to the pieces before it: [B, H, W, .] -> [B, H, W, block_growth]."""
 
     cfg: NetConfig
 
     @nn.compact
-    def __call__(self, maps: jax.Array, train: bool) -> jax.Array:
-        growth, norm = self.cfg.block_growth, functools.partial(_norm, self.cfg, train=train)
-        hidden = nn.relu(norm(maps.shape[-1], name="norm1")(maps))
-        hidden = _convolution(self.cfg, _BOTTLENECK * growth, 1, 1, "conv1")(hidden)
-        hidden = nn.relu(norm(_BOTTLENECK * growth, name="norm2")(hidden))
-        return jnp.concatenate([maps, _convolution(self.cfg, growth, 3, 1, "conv2")(hidden)], axis=-1)
+    def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
+        growth = self.cfg.block_growth
+        hidden = nn.relu(_norm(self.cfg, pieces, train, "norm1"))
+        narrow = _piece(_convolution(self.cfg, _BOTTLENECK * growth, 1, 1, "conv1")(hidden))
+        hidden = nn.relu(_norm(self.cfg, [narrow], train, "norm2"))
+        return _piece(_convolution(self.cfg, growth, 3, 1, "conv2")(hidden))
 
 
 class DenseBlock(nn.Module):
-    """Dense layers one after the other."""
+    """Dense layers one after the other, each on the pieces of all before it.
+
+    They are joined where they are read, on the way into a norm: joined after every layer, as the paper draws it, all
+    channels would be written once more per layer.
+    """
 
     cfg: NetConfig
     layers: int
 
     @nn.compact
-    def __call__(self, maps: jax.Array, train: bool) -> jax.Array:
+    def __call__(self, maps: Piece, train: bool) -> tuple[Piece, ...]:
+        pieces: tuple[Piece, ...] = (maps,)
         for i in range(self.layers):
-            maps = DenseLayer(self.cfg, name=f"denselayer{i + 1}")(maps, train)
-        return maps
+            pieces += (DenseLayer(self.cfg, name=f"denselayer{i + 1}")(pieces, train),)
+        return pieces
 
 
 class Transition(nn.Module):
@@ -119,10 +172,10 @@ class Transition(nn.Module):
     cfg: NetConfig
 
     @nn.compact
-    def __call__(self, maps: jax.Array, train: bool) -> jax.Array:
-        channels = maps.shape[-1]
-        maps = nn.relu(_norm(self.cfg, channels, train, "norm")(maps))
-        return average_pool(_convolution(self.cfg, channels // 2, 1, 1, "conv")(maps))
+    def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
+        channels = sum(piece.maps.shape[-1] for piece in pieces)
+        maps = nn.relu(_norm(self.cfg, pieces, train, "norm"))
+        return _piece(average_pool(_convolution(self.cfg, channels // 2, 1, 1, "conv")(maps)))
 
 
 class Trunk(nn.Module):
@@ -134,12 +187,13 @@ class Trunk(nn.Module):
     def __call__(self, maps: jax.Array, train: bool = False) -> jax.Array:
         stem = 2 * self.cfg.block_growth
         maps = _convolution(self.cfg, stem, 7, 2, "conv0")(maps)
-        maps = max_pool(nn.relu(_norm(self.cfg, stem, train, "norm0")(maps)))
+        piece = _piece(max_pool(nn.relu(_norm(self.cfg, [_piece(maps)], train, "norm0"))))
+        pieces: tuple[Piece, ...] = ()
         for i, layers in enumerate(self.cfg.block_layers, start=1):
-            maps = DenseBlock(self.cfg, layers, name=f"denseblock{i}")(maps, train)
+            pieces = DenseBlock(self.cfg, layers, name=f"denseblock{i}")(piece, train)
             if i < len(self.cfg.block_layers):
-                maps = Transition(self.cfg, name=f"transition{i}")(maps, train)
-        return _norm(self.cfg, maps.shape[-1], train, "norm5")(maps)
+                piece = Transition(self.cfg, name=f"transition{i}")(pieces, train)
+        return _norm(self.cfg, pieces, train, "norm5")
 
 
 class Head(nn.Module):
@@ -153,9 +207,9 @@ class Head(nn.Module):
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
         cfg = self.cfg
-        hidden = nn.relu(_norm(cfg, features.shape[-1], train, "norm0")(features))
+        hidden = nn.relu(_norm(cfg, [_piece(features)], train, "norm0"))
         hidden = nn.Dense(cfg.head, use_bias=False, dtype=compute_dtype(cfg), name="conv0")(hidden)
-        hidden = nn.relu(_norm(cfg, cfg.head, train, "norm1")(hidden)).astype(jnp.float32)
+        hidden = nn.relu(_norm(cfg, [_piece(hidden)], train, "norm1")).astype(jnp.float32)
         small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
         maps = nn.Dense(OUTPUTS, kernel_init=small, name="conv1")(hidden)
         return _upsample(maps, DENSENET_STRIDE // (cfg.zoom * cfg.output_stride))
@@ -168,15 +222,20 @@ def _upsample(maps: jax.Array, factor: int) -> jax.Array:
 
 
 class Critic(nn.Module):
-    """Q in three maps per frame, and the features that the actor reads."""
+    """Q in three maps per frame, and the features that the actor reads.
+
+    For the gradient only what convolutions made is kept, not what norms make of it for each layer anew.
+    """
 
     cfg: NetConfig
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
         """[B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS], features [B, h, w, F]."""
+        kept = jax.checkpoint_policies.save_only_these_names(_KEPT)
+        see = nn.remat(lambda trunk, seen: trunk(seen, train), policy=kept, prevent_cse=False)
         run = nn.scan(
-            lambda trunk, carry, seen: (carry, trunk(seen, train)),
+            lambda trunk, carry, seen: (carry, see(trunk, seen)),
             variable_axes={"params": 0, "batch_stats": 0},
             split_rngs={"params": True},
         )

@@ -4,8 +4,8 @@ physics the preset's, settings as `csac-jax train` takes them: `--train.scenes 6
 
 For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
 and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds that the devices
-do not divide are left out. `train` is the program of one seed as `csac-jax train` has it, on one device. Configurations
-follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
+do not divide are left out. Beside a row of one seed on one device, `train` is its program as `csac-jax train` has it.
+Configurations follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
 """
 
 import dataclasses
@@ -76,7 +76,10 @@ def main(arguments: list[str]) -> None:
     except ValueError as error:
         raise BadArgumentsError(f"bench sweep: {error}") from None
     program = step.make(cfg)
-    alone = _timed(step.compile_chunk(program, options.steps), step.init(program), options.repeats)
+    with_train = 1 in options.seeds and 1 in options.devices
+    alone = (
+        _timed(step.compile_chunk(program, options.steps), step.init(program), options.repeats) if with_train else None
+    )
     rows = [
         measure(program, seeds, devices, options.shard, options.steps, options.repeats)
         for devices in options.devices
