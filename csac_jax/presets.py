@@ -75,8 +75,8 @@ def paper() -> Config:
 
     Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per action; places are
     explored by action noise alone, and nothing is augmented. Where the paper is silent: tau of SD3, two pixels per cell
-    and two transitions per update, as many as in VPG, and, ours, `policy.mask`. Physics is C's, the fastest for one
-    scene. Its result is not recorded yet.
+    and two transitions per update, as many as in VPG, one of them for the actor, and, ours, `policy.mask`. Physics is
+    C's, the fastest for one scene. Its result is not recorded yet.
     """
     return Config(
         preset="paper",
@@ -92,7 +92,14 @@ def paper() -> Config:
         target=TargetConfig(gamma=0.5),
         explore=ExploreConfig(place_start=0.0, decay=0.9998, push_fraction=0.5),
         learn=LearnConfig(
-            learning_rate=1e-4, actor_learning_rate=1e-4, rate_end=1.0, batch=2, updates=1, augment=False, tau=0.005
+            learning_rate=1e-4,
+            actor_learning_rate=1e-4,
+            rate_end=1.0,
+            batch=2,
+            actor_batch=1,
+            updates=1,
+            augment=False,
+            tau=0.005,
         ),
         replay=ReplayConfig(capacity=2500),
         train=TrainConfig(scenes=1, actions=2500, warmup=8, chunk=50, save_every=10),

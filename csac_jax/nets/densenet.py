@@ -4,7 +4,7 @@ One trunk each for colour, height and, in the target task, the mask; what they s
 turn it into maps, and these are brought up to a finer grid. Push and grasp come from one network. Modules are named as
 in torchvision, so that its weights fit.
 
-The trunks are the same program with other weights: they are stacked along an axis T, leaves [T, ...], and run in turn.
+The trunks are the same program with other weights: stacked along an axis T, leaves [T, ...], they run side by side.
 """
 
 import functools
@@ -104,17 +104,60 @@ def _norm(cfg: NetConfig, pieces: Sequence[Piece], train: bool, name: str) -> ja
     return nn.GroupNorm(groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name)(maps)
 
 
-def _convolution(cfg: NetConfig, features: int, size: int, stride: int, name: str) -> nn.Conv:
-    return nn.Conv(
-        features,
-        (size, size),
-        (stride, stride),
-        padding=size // 2,
-        use_bias=False,
-        dtype=compute_dtype(cfg),
-        kernel_init=_KAIMING,
-        name=name,
-    )
+class Convolution(nn.Module):
+    """Convolution without bias, zeros around, as a product: [B, H, W, I] -> [B, H / stride, W / stride, features].
+
+    XLA's own would be grouped ones here, since trunks run side by side, and those are slow on GPUs; and XLA tries out
+    what is fastest for each, which takes minutes in all.
+    """
+
+    features: int
+    size: int  # cells, side of the kernel, odd
+    stride: int
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, maps: jax.Array) -> jax.Array:
+        ins, taps = maps.shape[-1], self.size**2
+        kernel = self.param("kernel", _KAIMING, (self.size, self.size, ins, self.features)).astype(self.dtype)
+        if self.stride > 1:
+            return jnp.concatenate(windows(maps, self.size, self.stride), axis=-1) @ kernel.reshape(-1, self.features)
+        products = maps @ jnp.transpose(kernel, (2, 0, 1, 3)).reshape(ins, taps * self.features)
+        return products if taps == 1 else shift_and_add(products, self.size)
+
+
+def windows(maps: jax.Array, size: int, stride: int = 1) -> list[jax.Array]:
+    """What each tap of a kernel sees of maps [B, H, W, F], zeros around: [B, H / stride, W / stride, F], row by row."""
+    rows, cols = maps.shape[1:3]
+    padded = jnp.pad(maps, ((0, 0), (size // 2,) * 2, (size // 2,) * 2, (0, 0)))
+    return [padded[:, i : i + rows : stride, j : j + cols : stride] for i in range(size) for j in range(size)]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def shift_and_add(products: jax.Array, size: int) -> jax.Array:
+    """Sum over the taps of a kernel of what each makes of the cell it sees: [B, H, W, size^2 F] -> [B, H, W, F].
+
+    Sums are float32's. The gradient is written out: that of a slice would be a map of zeros around it, for each tap.
+    """
+    features = products.shape[-1] // size**2
+    seen = windows(products, size)
+    each = (one[..., k * features : (k + 1) * features].astype(jnp.float32) for k, one in enumerate(seen))
+    return functools.reduce(jnp.add, each).astype(products.dtype)
+
+
+def _shift_and_add_forward(products: jax.Array, size: int) -> tuple[jax.Array, None]:
+    return shift_and_add(products, size), None
+
+
+def _shift_and_add_backward(size: int, _: None, gradient: jax.Array) -> tuple[jax.Array]:
+    return (jnp.concatenate(windows(gradient, size)[::-1], axis=-1),)
+
+
+shift_and_add.defvjp(_shift_and_add_forward, _shift_and_add_backward)
+
+
+def _convolution(cfg: NetConfig, features: int, size: int, stride: int, name: str) -> Convolution:
+    return Convolution(features, size, stride, compute_dtype(cfg), name=name)
 
 
 def max_pool(maps: jax.Array) -> jax.Array:
@@ -123,10 +166,7 @@ def max_pool(maps: jax.Array) -> jax.Array:
     As the maximum of nine shifted maps: the gradient of XLA's own window needs an operation that GPUs lack when
     results are to repeat bit for bit (flax issue 4233).
     """
-    rows, cols = maps.shape[1:3]
-    padded = jnp.pad(maps, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    shifted = [padded[:, i : i + rows : 2, j : j + cols : 2] for i in range(3) for j in range(3)]
-    return functools.reduce(jnp.maximum, shifted)
+    return functools.reduce(jnp.maximum, windows(maps, 3, 2))
 
 
 def average_pool(maps: jax.Array) -> jax.Array:
@@ -151,8 +191,8 @@ class DenseLayer(nn.Module):
 class DenseBlock(nn.Module):
     """Dense layers one after the other, each on the pieces of all before it.
 
-    They are joined where they are read, on the way into a norm: joined after every layer, as the paper draws it, all
-    channels would be written once more per layer.
+    Joined after every layer, as the paper draws it, all channels would be written once more per layer. In training they
+    are joined where they are read, on the way into a norm; else each is written to its place in room for all.
     """
 
     cfg: NetConfig
@@ -160,10 +200,19 @@ class DenseBlock(nn.Module):
 
     @nn.compact
     def __call__(self, maps: Piece, train: bool) -> tuple[Piece, ...]:
+        layers = [DenseLayer(self.cfg, name=f"denselayer{i + 1}") for i in range(self.layers)]
         pieces: tuple[Piece, ...] = (maps,)
-        for i in range(self.layers):
-            pieces += (DenseLayer(self.cfg, name=f"denselayer{i + 1}")(pieces, train),)
-        return pieces
+        if train:
+            for layer in layers:
+                pieces += (layer(pieces, train),)
+            return pieces
+        width, growth = maps.maps.shape[-1], self.cfg.block_growth
+        room = jnp.pad(maps.maps, ((0, 0), (0, 0), (0, 0), (0, self.layers * growth)))
+        for layer in layers:
+            new = layer((_piece(room[..., :width]),), train).maps
+            room = room.at[..., width : width + growth].set(new)
+            width += growth
+        return (_piece(room),)
 
 
 class Transition(nn.Module):
@@ -233,13 +282,12 @@ class Critic(nn.Module):
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
         """[B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS], features [B, h, w, F]."""
         kept = jax.checkpoint_policies.save_only_these_names(_KEPT)
-        see = nn.remat(lambda trunk, seen: trunk(seen, train), policy=kept, prevent_cse=False)
-        run = nn.scan(
-            lambda trunk, carry, seen: (carry, see(trunk, seen)),
+        see = nn.vmap(
+            nn.remat(lambda trunk, seen: trunk(seen, train), policy=kept),
             variable_axes={"params": 0, "batch_stats": 0},
             split_rngs={"params": True},
         )
-        _, features = run(Trunk(self.cfg, name="trunk"), None, _trunk_inputs(self.cfg, maps))  # [T, B, h, w, f]
+        features = see(Trunk(self.cfg, name="trunk"), _trunk_inputs(self.cfg, maps))  # [T, B, h, w, f]
         features = jnp.concatenate(list(features), axis=-1)
         return Head(self.cfg, name="head")(features, train), features
 

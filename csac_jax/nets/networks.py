@@ -50,8 +50,8 @@ def learned(variables: Any) -> Any:
 def states_at_once(cfg: NetConfig, canvas: int) -> int | None:
     """How many states, of passes of canvas x canvas cells, a critic sees at a time; None for any number.
 
-    DenseNet-121 sees groups of the pixels of one state at 640 px (ours): so all looks have the same convolutions, which
-    XLA tries out for minutes, and need the memory of one group.
+    DenseNet-121 sees groups of the pixels of one state at 640 px (ours): so all looks are made of the same products,
+    which XLA tries out one by one, and need the memory of one group.
     """
     if cfg.kind == "small":
         return None
