@@ -87,11 +87,9 @@ class BatchNorm(nn.Module):
         if statistics and not self.is_initializing():
             for variable, now in zip(running, statistics, strict=True):
                 variable.value = _MOMENTUM * variable.value + (1.0 - _MOMENTUM) * now
-        mean, factor, bias = (
-            leaf.reshape((1,) * (maps.ndim - 1) + shape)
-            for leaf in (mean, scale * jax.lax.rsqrt(variance + _EPSILON), bias)
-        )
-        return ((maps.astype(jnp.float32) - mean) * factor + bias).astype(self.dtype)
+        factor = scale * jax.lax.rsqrt(variance + _EPSILON)
+        factor, shift = (leaf.reshape((1,) * (maps.ndim - 1) + shape) for leaf in (factor, bias - mean * factor))
+        return (maps.astype(jnp.float32) * factor + shift).astype(self.dtype)
 
 
 def _norm(cfg: NetConfig, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
@@ -121,9 +119,18 @@ class Convolution(nn.Module):
         ins, taps = maps.shape[-1], self.size**2
         kernel = self.param("kernel", _KAIMING, (self.size, self.size, ins, self.features)).astype(self.dtype)
         if self.stride > 1:
-            return jnp.concatenate(windows(maps, self.size, self.stride), axis=-1) @ kernel.reshape(-1, self.features)
-        products = maps @ jnp.transpose(kernel, (2, 0, 1, 3)).reshape(ins, taps * self.features)
+            return _times(jnp.concatenate(windows(maps, self.size, self.stride), axis=-1), kernel)
+        products = _times(maps, jnp.transpose(kernel, (2, 0, 1, 3)).reshape(ins, taps * self.features))
         return products if taps == 1 else shift_and_add(products, self.size)
+
+
+def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
+    """Maps [..., I] times a matrix [..., O], whose other axes have I entries together: [..., O].
+
+    As a product of two axes: over several, XLA would turn all maps about for the gradient for the matrix.
+    """
+    matrix = matrix.reshape(maps.shape[-1], -1)
+    return (maps.reshape(-1, maps.shape[-1]) @ matrix).reshape(*maps.shape[:-1], -1)
 
 
 def windows(maps: jax.Array, size: int, stride: int = 1) -> list[jax.Array]:
@@ -160,13 +167,47 @@ def _convolution(cfg: NetConfig, features: int, size: int, stride: int, name: st
     return Convolution(features, size, stride, compute_dtype(cfg), name=name)
 
 
+@jax.custom_vjp
 def max_pool(maps: jax.Array) -> jax.Array:
     """Largest of 3 x 3 cells, every second one: [B, H, W, F], H and W even, none below 0 -> [B, H / 2, W / 2, F].
 
-    As the maximum of nine shifted maps: the gradient of XLA's own window needs an operation that GPUs lack when
-    results are to repeat bit for bit (flax issue 4233).
+    The gradient goes to the first of the largest. It is written out, since that of XLA's own window needs an operation
+    that GPUs lack when results are to repeat bit for bit (flax issue 4233).
     """
     return functools.reduce(jnp.maximum, windows(maps, 3, 2))
+
+
+def _max_pool_forward(maps: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The largest, and which of the nine it is, uint8."""
+    seen = windows(maps, 3, 2)
+    largest, which = seen[0], jnp.zeros(seen[0].shape, jnp.uint8)
+    for k, one in enumerate(seen[1:], start=1):
+        which = jnp.where(one > largest, jnp.uint8(k), which)
+        largest = jnp.maximum(largest, one)
+    return largest, which
+
+
+def _max_pool_backward(which: jax.Array, gradient: jax.Array) -> tuple[jax.Array]:
+    """A cell of even row was seen by the middle row of one window alone, one of odd row by two; columns likewise."""
+    padded = [jnp.pad(leaf, ((0, 0), (0, 1), (0, 1), (0, 0))) for leaf in (which, gradient)]
+    rows, cols = which.shape[1:3]
+
+    def seen_by(down: int, right: int, tap: int) -> jax.Array:
+        index, share = (leaf[:, down : down + rows, right : right + cols] for leaf in padded)
+        return jnp.where(index == tap, share, 0)
+
+    offsets = (((0, 1),), ((0, 2), (1, 0)))  # (window further on, its row that sees the cell), by parity
+    cells = [
+        sum(seen_by(down, right, 3 * i + j) for down, i in offsets[odd_row] for right, j in offsets[odd_col])
+        for odd_row in (0, 1)
+        for odd_col in (0, 1)
+    ]
+    batch, channels = which.shape[0], which.shape[-1]
+    grid = jnp.stack(cells, axis=-2).reshape(batch, rows, cols, 2, 2, channels)
+    return (jnp.transpose(grid, (0, 1, 3, 2, 4, 5)).reshape(batch, 2 * rows, 2 * cols, channels),)
+
+
+max_pool.defvjp(_max_pool_forward, _max_pool_backward)
 
 
 def average_pool(maps: jax.Array) -> jax.Array:
@@ -191,8 +232,8 @@ class DenseLayer(nn.Module):
 class DenseBlock(nn.Module):
     """Dense layers one after the other, each on the pieces of all before it.
 
-    Joined after every layer, as the paper draws it, all channels would be written once more per layer. In training they
-    are joined where they are read, on the way into a norm; else each is written to its place in room for all.
+    They are joined where they are read, on the way into a norm: joined after every layer, as the paper draws it, all
+    channels would be written once more per layer.
     """
 
     cfg: NetConfig
@@ -200,19 +241,10 @@ class DenseBlock(nn.Module):
 
     @nn.compact
     def __call__(self, maps: Piece, train: bool) -> tuple[Piece, ...]:
-        layers = [DenseLayer(self.cfg, name=f"denselayer{i + 1}") for i in range(self.layers)]
         pieces: tuple[Piece, ...] = (maps,)
-        if train:
-            for layer in layers:
-                pieces += (layer(pieces, train),)
-            return pieces
-        width, growth = maps.maps.shape[-1], self.cfg.block_growth
-        room = jnp.pad(maps.maps, ((0, 0), (0, 0), (0, 0), (0, self.layers * growth)))
-        for layer in layers:
-            new = layer((_piece(room[..., :width]),), train).maps
-            room = room.at[..., width : width + growth].set(new)
-            width += growth
-        return (_piece(room),)
+        for i in range(self.layers):
+            pieces += (DenseLayer(self.cfg, name=f"denselayer{i + 1}")(pieces, train),)
+        return pieces
 
 
 class Transition(nn.Module):

@@ -1,10 +1,14 @@
-"""What XLA is asked for when a training program is compiled for a CPU.
+"""What XLA is asked for when a training program is compiled, where its version is seen to know it.
 
-XLA has a second library for convolutions there, which is about twice as fast as Eigen at those of the small net. It is
-no default, and versions of jaxlib differ in it, so it is asked for only where it is seen to compute right.
+On a CPU it has a second library for convolutions, which is about twice as fast as Eigen at those of the small net. It
+is no default, and versions of jaxlib differ in it, so it is asked for only where it is seen to compute right.
+
+On a GPU it would write kernels of its own for each matrix product of DenseNet-121, in many ways, and time them all
+beside the vendor's library: half of the compilation, for kernels that are no faster (`experiments/bench`).
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +19,28 @@ from csac_jax.config import Config
 from csac_jax.nets.convolution import conv2d
 
 LIBRARY = {_guard.FUSION_FLAG.lstrip("-"): "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"}
+VENDOR = {"xla_gpu_enable_triton_gemm": False}
 _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float32 gives some 1e-5
 
 
-def options(cfg: Config) -> dict[str, str] | None:
+def options(cfg: Config) -> dict[str, Any] | None:
     """Options of `jax.jit` for the config's training program; None if there is nothing to ask for.
 
-    Only with the small net: the library is slow at kernel gradients, which `conv2d` keeps away from it.
+    The library for convolutions only with the small net: it is slow at kernel gradients, which `conv2d` keeps from it.
     """
-    return dict(LIBRARY) if cfg.net.kind == "small" and has_library() else None
+    if cfg.net.kind == "small":
+        return dict(LIBRARY) if has_library() else None
+    return dict(VENDOR) if jax.default_backend() == "gpu" and _knows_vendor() else None
+
+
+@functools.cache
+def _knows_vendor() -> bool:
+    """Whether this XLA can be told to leave matrix products to the vendor's library."""
+    try:
+        jax.jit(jnp.negative, compiler_options=VENDOR).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 @functools.cache

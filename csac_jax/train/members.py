@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from csac_jax.agent import learner as learning, rewards
 from csac_jax.config import Config
-from csac_jax.train import step
+from csac_jax.train import compiler, step
 from csac_jax.train.mesh import AXIS, Shard, Spread
 from csac_jax.train.step import Program, StepMetrics, TrainState
 
@@ -160,12 +160,13 @@ def compile_chunk(program: Program, given: Members, num_steps: int, mesh: Mesh |
         every = jax.vmap(one, in_axes=(0, AXES), out_axes=(AXES, 0))
         return jax.lax.scan(lambda carry, _: every(given, carry), state, length=num_steps)
 
+    asked = compiler.options(program.cfg) if program.in_turn else None
     if mesh is None:
-        return jax.jit(lambda state: chunk(state, given), donate_argnums=0)
+        return jax.jit(lambda state: chunk(state, given), donate_argnums=0, compiler_options=asked)
     if shard == "seeds":
         chunk = _each_device(mesh, chunk)
     out = (shardings(mesh, shard), NamedSharding(mesh, PartitionSpec()))
-    return jax.jit(lambda state: chunk(state, given), donate_argnums=0, out_shardings=out)
+    return jax.jit(lambda state: chunk(state, given), donate_argnums=0, out_shardings=out, compiler_options=asked)
 
 
 def _each_device(mesh: Mesh, chunk: Any) -> Any:

@@ -84,6 +84,16 @@ def test_library_is_for_the_small_net_on_a_cpu(monkeypatch: pytest.MonkeyPatch):
     assert compiler.options(presets.quick()) is None
 
 
+@pytest.mark.parametrize(("asked", "known"), [(compiler.VENDOR, True), ({"xla_no_such_option": "1"}, False)])
+def test_products_of_densenet_are_the_vendors_on_a_gpu(monkeypatch: pytest.MonkeyPatch, asked, known: bool):
+    """Claim: on a GPU DenseNet-121 is compiled without XLA's own matrix products, if this XLA can be asked to."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(compiler, "VENDOR", asked)
+    compiler._knows_vendor.cache_clear()
+    assert compiler.options(presets.paper()) == (asked if known else None)
+    compiler._knows_vendor.cache_clear()
+
+
 def test_library_is_right_in_groups():
     """Claim: so is it for two critics side by side, whose convolutions are grouped."""
     rng = np.random.default_rng(0)
