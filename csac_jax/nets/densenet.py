@@ -24,6 +24,7 @@ from csac_jax.nets.dense import OUTPUTS, TABLE_HEIGHT, compute_dtype
 _COLOUR_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of ImageNet, as torchvision's weights want it
 _COLOUR_STD = np.array([0.229, 0.224, 0.225], np.float32)
 _HEIGHT_SCALE = 0.03  # m (VPG)
+_STEM = 7  # pixels, side of the first convolution's kernel
 _BOTTLENECK = 4  # channels of a layer's 1 x 1 convolution per channel that the layer adds
 _EPSILON = 1e-5  # of both norms, torchvision's
 _MOMENTUM = 0.9  # share that running statistics keep in an update, torchvision's (there written 0.1)
@@ -103,25 +104,44 @@ def _norm(cfg: NetConfig, pieces: Sequence[Piece], train: bool, name: str) -> ja
 
 
 class Convolution(nn.Module):
-    """Convolution without bias, zeros around, as a product: [B, H, W, I] -> [B, H / stride, W / stride, features].
+    """Convolution without bias, zeros around, as a matrix product: [B, H, W, I] -> [B, H, W, features].
 
     XLA's own would be grouped ones here, since trunks run side by side, and those are slow on GPUs; and XLA tries out
-    what is fastest for each, which takes minutes in all.
+    what is fastest for each, which takes minutes in all. What each tap makes of each cell is shifted and added.
     """
 
     features: int
     size: int  # cells, side of the kernel, odd
-    stride: int
     dtype: Any
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
         ins, taps = maps.shape[-1], self.size**2
         kernel = self.param("kernel", _KAIMING, (self.size, self.size, ins, self.features)).astype(self.dtype)
-        if self.stride > 1:
-            return _times(jnp.concatenate(windows(maps, self.size, self.stride), axis=-1), kernel)
         products = _times(maps, jnp.transpose(kernel, (2, 0, 1, 3)).reshape(ins, taps * self.features))
         return products if taps == 1 else shift_and_add(products, self.size)
+
+
+class Stem(nn.Module):
+    """The first convolution, at every second pixel: [B, H, W, I] -> [B, H / 2, W / 2, features].
+
+    Few channels come in, so what all taps see of a cell is laid side by side. With `doubled` each cell of the maps
+    stands for 2 x 2 pixels, which need not be there: [B, H, W, I] -> [B, H, W, features].
+    """
+
+    features: int
+    doubled: bool
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, maps: jax.Array) -> jax.Array:
+        kernel = self.param("kernel", _KAIMING, (_STEM, _STEM, maps.shape[-1], self.features))
+        if self.doubled:  # of the pixels around one, the first is alone in its cell, the others are two in each
+            side = (_STEM + 1) // 2
+            pairs = jnp.pad(kernel, ((1, 0), (1, 0), (0, 0), (0, 0))).reshape(side, 2, side, 2, *kernel.shape[2:])
+            kernel = jnp.sum(pairs, axis=(1, 3))
+        seen = windows(maps, len(kernel), 1 if self.doubled else 2)
+        return _times(jnp.concatenate(seen, axis=-1), kernel.astype(self.dtype))
 
 
 def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
@@ -136,7 +156,8 @@ def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
 def windows(maps: jax.Array, size: int, stride: int = 1) -> list[jax.Array]:
     """What each tap of a kernel sees of maps [B, H, W, F], zeros around: [B, H / stride, W / stride, F], row by row."""
     rows, cols = maps.shape[1:3]
-    padded = jnp.pad(maps, ((0, 0), (size // 2,) * 2, (size // 2,) * 2, (0, 0)))
+    around = (size // 2, (size - 1) // 2)
+    padded = jnp.pad(maps, ((0, 0), around, around, (0, 0)))
     return [padded[:, i : i + rows : stride, j : j + cols : stride] for i in range(size) for j in range(size)]
 
 
@@ -163,8 +184,8 @@ def _shift_and_add_backward(size: int, _: None, gradient: jax.Array) -> tuple[ja
 shift_and_add.defvjp(_shift_and_add_forward, _shift_and_add_backward)
 
 
-def _convolution(cfg: NetConfig, features: int, size: int, stride: int, name: str) -> Convolution:
-    return Convolution(features, size, stride, compute_dtype(cfg), name=name)
+def _convolution(cfg: NetConfig, features: int, size: int, name: str) -> Convolution:
+    return Convolution(features, size, compute_dtype(cfg), name=name)
 
 
 @jax.custom_vjp
@@ -224,9 +245,9 @@ class DenseLayer(nn.Module):
     def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
         growth = self.cfg.block_growth
         hidden = nn.relu(_norm(self.cfg, pieces, train, "norm1"))
-        narrow = _piece(_convolution(self.cfg, _BOTTLENECK * growth, 1, 1, "conv1")(hidden))
+        narrow = _piece(_convolution(self.cfg, _BOTTLENECK * growth, 1, "conv1")(hidden))
         hidden = nn.relu(_norm(self.cfg, [narrow], train, "norm2"))
-        return _piece(_convolution(self.cfg, growth, 3, 1, "conv2")(hidden))
+        return _piece(_convolution(self.cfg, growth, 3, "conv2")(hidden))
 
 
 class DenseBlock(nn.Module):
@@ -256,18 +277,21 @@ class Transition(nn.Module):
     def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
         channels = sum(piece.maps.shape[-1] for piece in pieces)
         maps = nn.relu(_norm(self.cfg, pieces, train, "norm"))
-        return _piece(average_pool(_convolution(self.cfg, channels // 2, 1, 1, "conv")(maps)))
+        return _piece(average_pool(_convolution(self.cfg, channels // 2, 1, "conv")(maps)))
 
 
 class Trunk(nn.Module):
-    """DenseNet-121 without its top: [B, H, W, 3] -> [B, H / 32, W / 32, 1024], after the last norm."""
+    """DenseNet-121 without its top: [B, H, W, 3] -> [B, H / 32, W / 32, 1024], after the last norm.
+
+    With `cfg.zoom` above 1 each cell of the maps stands for 2 x 2 pixels: features are [B, H / 16, W / 16, 1024].
+    """
 
     cfg: NetConfig
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> jax.Array:
         stem = 2 * self.cfg.block_growth
-        maps = _convolution(self.cfg, stem, 7, 2, "conv0")(maps)
+        maps = Stem(stem, self.cfg.zoom > 1, compute_dtype(self.cfg), name="conv0")(maps)
         piece = _piece(max_pool(nn.relu(_norm(self.cfg, [_piece(maps)], train, "norm0"))))
         pieces: tuple[Piece, ...] = ()
         for i, layers in enumerate(self.cfg.block_layers, start=1):
@@ -325,9 +349,13 @@ class Critic(nn.Module):
 
 
 def _trunk_inputs(cfg: NetConfig, maps: jax.Array) -> jax.Array:
-    """What each trunk sees [T, B, zoom C, zoom C, 3] of maps [B, C, C, I]: colour, and every other map three times."""
+    """What each trunk sees [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map three times.
+
+    z = zoom / 2, at least 1: a trunk doubles its cells itself. Turned maps are held, not turned for each window anew.
+    """
     colour, rest = (maps[..., :3], maps[..., 3:]) if cfg.colour else (maps[..., :0], maps)
     seen = [colour] if cfg.colour else []
     seen += [jnp.repeat(rest[..., i : i + 1], 3, axis=-1) for i in range(rest.shape[-1])]
-    stacked = jnp.stack(seen).astype(compute_dtype(cfg))
-    return jnp.repeat(jnp.repeat(stacked, cfg.zoom, axis=2), cfg.zoom, axis=3)
+    stacked = jax.lax.optimization_barrier(jnp.stack(seen).astype(compute_dtype(cfg)))
+    zoom = max(cfg.zoom // 2, 1)
+    return jnp.repeat(jnp.repeat(stacked, zoom, axis=2), zoom, axis=3)

@@ -178,9 +178,10 @@ def test_max_pool_is_flaxs():
 
 
 def test_trunks_see_colour_height_and_mask():
-    """Claim: a trunk each for colour, for height and for the mask, the latter two three times over, pixels repeated."""
+    """Claim: a trunk each for colour, for height and for the mask, the latter two three times over; cells are repeated
+    as far as the trunk does not double them itself."""
     maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
-    zoomed = NetConfig(kind="densenet121", zoom=2)
+    zoomed = NetConfig(kind="densenet121", zoom=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
     assert seen.shape == (3, 2, 8, 8, 3)
     np.testing.assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
@@ -190,6 +191,17 @@ def test_trunks_see_colour_height_and_mask():
     blind = NetConfig(kind="densenet121", colour=False)
     only = densenet._trunk_inputs(blind, maps[..., 3:4])
     np.testing.assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
+
+
+def test_doubled_cells_are_pixels_twice_over():
+    """Claim: a trunk that doubles its cells says of maps what one that does not says of pixels repeated."""
+    whole, doubling = (densenet.Trunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2))
+    maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
+    variables = random_variables(whole, 0, (1, 64, 64, 3))
+    repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
+    got, wanted = jax.jit(doubling.apply)(variables, maps), jax.jit(whole.apply)(variables, repeated)
+    assert got.shape == (2, 2, 3, 8)
+    np.testing.assert_allclose(got, wanted, atol=3e-4)
 
 
 def test_inputs():

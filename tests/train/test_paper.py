@@ -84,8 +84,8 @@ def test_run_with_batch_norm_resumes(tmp_path):
 
 @pytest.mark.slow
 def test_runs_side_by_side_take_turns():
-    """Claim: of two DenseNet runs side by side each is the run that `train` makes of its seed, to rounding, and no
-    convolution is a grouped one, as vmap would have it; numbers that differ are vmapped."""
+    """Claim: of two DenseNet runs side by side each is the run that `train` makes of its seed, to rounding, and products
+    are made together of its trunks alone; runs whose numbers differ are vmapped, products made of both together."""
     smoke = presets.smoke()
     net = NetConfig("densenet121", 4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), block_growth=4, zoom=2)
     configs = [dataclasses.replace(smoke, net=net, seed=k) for k in range(2)]
@@ -100,7 +100,7 @@ def test_runs_side_by_side_take_turns():
 
     with jax.debug_key_reuse(False):  # it takes a vmapped transpose of keys for a second use
         begun, chunk = lowered(configs)
-    assert set(re.findall(r"feature_group_count = (\d+)", chunk.as_text())) == {"1"}
+    assert _side_by_side(chunk) == {1}
     after, metrics = chunk.compile()(begun)
     for k, cfg in enumerate(configs):
         one = dataclasses.replace(program, cfg=cfg)
@@ -115,4 +115,10 @@ def test_runs_side_by_side_take_turns():
     slower = dataclasses.replace(configs[1], learn=dataclasses.replace(smoke.learn, tau=0.5))
     with jax.debug_key_reuse(False):
         _, vmapped = lowered([configs[0], slower])
-    assert "2" in re.findall(r"feature_group_count = (\d+)", vmapped.as_text())
+    assert _side_by_side(vmapped) == {2}
+
+
+def _side_by_side(lowered) -> set[int]:
+    """Along how many axes the first convolution's products, of 48 numbers a cell, are of matrices of their own."""
+    found = re.findall(r"dot_general.* batching_dims = \[([\d, ]*)\] .*: \(tensor<[\dx]*x48xf32>,", lowered.as_text())
+    return {len(axes.split(",")) for axes in found}
