@@ -4,7 +4,7 @@ State, ring and networks are exact: their shapes are traced. What a training ste
 of the maps that are alive at once, times their sizes, with coefficients fitted to what XLA reports for compiled stages
 on a CPU (jaxlib 0.10.1, small nets). Whole programs, to which nothing was fitted, stand beside their predictions in
 `experiments/results/bench-memory-cpu.json`. XLA shares memory between stages, so the largest need counts. Where nothing
-was fitted, DenseNet-121's gradients and GPUs, expect less.
+was fitted, DenseNet-121's gradients and GPUs, expect less: for `paper` on an H200 3.5 GB, where 2.6 were measured.
 """
 
 import dataclasses
@@ -100,19 +100,20 @@ def _pass_channels(cfg: Config) -> tuple[float, float]:
         widths = [net.stem + i * net.growth for i in range(len(net.dilations) + 1)]
         return widths[-1], sum(widths)
     trunks = int(net.colour) + 1 + int(cfg.task.kind == "target")
-    alive = 20.0  # half of what 64 states of 8 passes each take on an H200: the stem's maps, before and after its norm
-    return alive, trunks * _densenet_saved(net.block_layers, net.block_growth)
+    alive = trunks * 28.0  # half of what a look takes on an H200: the stem's maps, before and after their norm
+    return alive, trunks * (
+        _densenet_kept(net.block_layers, net.block_growth) + 300.0
+    )  # 2 and 3 transitions on an H200
 
 
-def _densenet_saved(layers: tuple[int, ...], growth: int) -> float:
-    """Channels of the size of the input that the gradient of a DenseNet trunk needs: each layer's input and bottleneck,
-    before and after their norms, and what it adds. Not fitted."""
-    width, total, cells = 2 * growth, 2 * 2 * growth / 4, 16
+def _densenet_kept(layers: tuple[int, ...], growth: int) -> float:
+    """Channels of the size of the input that a DenseNet trunk keeps for its gradient: what its convolutions made."""
+    width, cells = 2 * growth, 16
+    total = width / 4 + width / cells
     for count in layers:
-        for _ in range(count):
-            total += (2 * width + 2 * 4 * growth + growth) / cells
-            width += growth
-        width, cells = width // 2, cells * 4
+        total += count * 5 * growth / cells
+        width, cells = (width + count * growth) // 2, cells * 4
+        total += width / cells
     return total
 
 

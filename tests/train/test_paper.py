@@ -84,8 +84,8 @@ def test_run_with_batch_norm_resumes(tmp_path):
 
 @pytest.mark.slow
 def test_runs_side_by_side_take_turns():
-    """Claim: of two DenseNet runs side by side each is the run that `train` makes of its seed, to rounding, and products
-    are made together of its trunks alone; runs whose numbers differ are vmapped, products made of both together."""
+    """Claim: each of two DenseNet runs side by side is the run that `train` makes of its seed, to rounding, and its
+    products are made by itself; those of runs whose numbers differ are vmapped."""
     smoke = presets.smoke()
     net = NetConfig("densenet121", 4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), block_growth=4, zoom=2)
     configs = [dataclasses.replace(smoke, net=net, seed=k) for k in range(2)]
