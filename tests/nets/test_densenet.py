@@ -161,22 +161,6 @@ def test_number_of_parameters():
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.float32.dtype}
 
 
-def test_max_pool_is_flaxs():
-    """Claim: the maximum of shifted maps is a max pool with padding, gradient included, without the operation that GPUs
-    lack when results are to repeat."""
-    rng = np.random.default_rng(0)
-    maps = jnp.asarray(np.maximum(rng.normal(size=(2, 8, 12, 3)), 0.0), jnp.float32)
-    pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
-    np.testing.assert_array_equal(densenet.max_pool(maps), pool(maps))
-    weight = jnp.asarray(rng.normal(size=(2, 4, 6, 3)), jnp.float32)
-    losses = [lambda maps, f=f: jnp.sum(weight * f(maps)) for f in (densenet.max_pool, pool)]
-    got, wanted = (jax.jit(jax.grad(loss))(maps) for loss in losses)
-    positive = maps > 0.0  # at 0 several cells are the largest; the ReLU before takes the gradient away there
-    np.testing.assert_allclose(jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6)
-    named = ["select_and_scatter" in str(jax.make_jaxpr(jax.grad(loss))(maps)) for loss in losses]
-    assert named == [False, True]
-
-
 def test_trunks_see_colour_height_and_mask():
     """Claim: a trunk each for colour, for height and for the mask, the latter two three times over; cells are repeated
     as far as the trunk does not double them itself."""

@@ -1,0 +1,56 @@
+"""Convolutions as matrix products against XLA's own, the pool against Flax's; values and gradients."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax.nets import products
+
+
+@pytest.mark.parametrize(
+    ("module", "stride", "size"),
+    [
+        (products.Convolution(5, 1, jnp.float32), 1, 1),
+        (products.Convolution(5, 3, jnp.float32), 1, 3),
+        (products.Stem(5, False, jnp.float32), 2, 7),
+    ],
+)
+def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
+    """Claim: value, and gradients for maps and kernel, are those of a convolution with zeros around."""
+    rng = np.random.default_rng(0)
+    shapes = (2, 8, 12, 4), (size, size, 4, 5), (2, 8 // stride, 12 // stride, 5)
+    maps, kernel, gradient = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
+
+    def ours(maps: jax.Array, kernel: jax.Array) -> jax.Array:
+        return module.apply({"params": {"kernel": kernel}}, maps)
+
+    def plain(maps: jax.Array, kernel: jax.Array) -> jax.Array:
+        pad = [(size // 2, size // 2)] * 2
+        return jax.lax.conv_general_dilated(
+            maps, kernel, (stride, stride), pad, dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+
+    def both(function):
+        value, back = jax.vjp(function, maps, kernel)
+        return value, *back(gradient)
+
+    for got, wanted in zip(both(ours), both(plain), strict=True):
+        np.testing.assert_allclose(got, wanted, atol=1e-4)
+
+
+def test_max_pool_is_flaxs():
+    """Claim: the maximum of shifted maps is a max pool with padding, gradient included, without the operation that GPUs
+    lack when results are to repeat."""
+    rng = np.random.default_rng(0)
+    maps = jnp.asarray(np.maximum(rng.normal(size=(2, 8, 12, 3)), 0.0), jnp.float32)
+    pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
+    np.testing.assert_array_equal(products.max_pool(maps), pool(maps))
+    weight = jnp.asarray(rng.normal(size=(2, 4, 6, 3)), jnp.float32)
+    losses = [lambda maps, f=f: jnp.sum(weight * f(maps)) for f in (products.max_pool, pool)]
+    got, wanted = (jax.jit(jax.grad(loss))(maps) for loss in losses)
+    positive = maps > 0.0  # at 0 several cells are the largest; the ReLU before takes the gradient away there
+    np.testing.assert_allclose(jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6)
+    named = ["select_and_scatter" in str(jax.make_jaxpr(jax.grad(loss))(maps)) for loss in losses]
+    assert named == [False, True]
