@@ -15,6 +15,7 @@
 import importlib.metadata
 import os
 import re
+import sys
 
 BROKEN_JAX = ("0.10.2",)
 FUSION_FLAG = "--xla_cpu_experimental_ynn_fusion_type"  # given no types, it switches that kind of fusion off
@@ -45,9 +46,15 @@ def switch_off_broken_fusion() -> None:
 
 
 def switch_off_broken_partitioner() -> None:
-    """Has this jaxlib partition programs without Shardy, unless the user has chosen."""
-    if importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES):
-        os.environ.setdefault(PARTITIONER_VARIABLE, "false")
+    """Has this jaxlib partition programs without Shardy, unless the user has chosen.
+
+    A JAX that is imported already has read the variable, and is told.
+    """
+    if not importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES) or PARTITIONER_VARIABLE in os.environ:
+        return
+    os.environ[PARTITIONER_VARIABLE] = "false"
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update(PARTITIONER_VARIABLE.lower(), False)
 
 
 def widen_thread_pool() -> None:

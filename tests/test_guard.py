@@ -7,6 +7,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import jax
 import pytest
 
 from csac_jax import _guard
@@ -138,6 +139,15 @@ def test_programs_of_several_devices_take_empty_constants():
     assert done.stdout == "[0. 1. 2. 3.]\n"
 
 
+@pytest.fixture
+def partitioner():
+    """JAX's choice of a partitioner, put back afterwards."""
+    used = jax.config.jax_use_shardy_partitioner
+    yield
+    jax.config.update("jax_use_shardy_partitioner", used)
+
+
+@pytest.mark.usefixtures("partitioner")
 @pytest.mark.parametrize(
     ("version", "before", "after"),
     [("0.11.2", None, "false"), ("0.11.2", "true", "true"), ("0.10.1", None, None), ("0.12.0", None, None)],
@@ -152,3 +162,18 @@ def test_broken_partitioner_is_not_used(
         monkeypatch.delenv(_guard.PARTITIONER_VARIABLE)
     _guard.switch_off_broken_partitioner()
     assert os.environ.get(_guard.PARTITIONER_VARIABLE) == after
+
+
+@pytest.mark.usefixtures("partitioner")
+@pytest.mark.parametrize(("before", "after"), [(None, False), ("true", True)])
+def test_broken_partitioner_is_not_used_by_a_jax_that_runs(
+    monkeypatch: pytest.MonkeyPatch, before: str | None, after: bool
+):
+    """Claim: nor is it if JAX was imported before this package."""
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.11.2")
+    monkeypatch.setenv(_guard.PARTITIONER_VARIABLE, before or "")  # to be put back
+    if before is None:
+        monkeypatch.delenv(_guard.PARTITIONER_VARIABLE)
+    jax.config.update("jax_use_shardy_partitioner", True)
+    _guard.switch_off_broken_partitioner()
+    assert jax.config.jax_use_shardy_partitioner == after
