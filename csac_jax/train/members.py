@@ -160,7 +160,7 @@ def compile_chunk(program: Program, given: Members, num_steps: int, mesh: Mesh |
         every = jax.vmap(one, in_axes=(0, AXES), out_axes=(AXES, 0))
         return jax.lax.scan(lambda carry, _: every(given, carry), state, length=num_steps)
 
-    asked = compiler.options(program.cfg) if program.in_turn else None
+    asked = compiler.options(program.cfg) if program.in_turn else None  # what vmap makes of others is not measured
     if mesh is None:
         return jax.jit(lambda state: chunk(state, given), donate_argnums=0, compiler_options=asked)
     if shard == "seeds":

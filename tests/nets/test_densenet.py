@@ -177,15 +177,15 @@ def test_trunks_see_colour_height_and_mask():
     np.testing.assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
 
 
-def test_doubled_cells_are_pixels_twice_over():
-    """Claim: a trunk that doubles its cells says of maps what one that does not says of pixels repeated."""
+def test_a_zoomed_trunk_doubles_its_cells():
+    """Claim: with a zoom a trunk says of maps what one without says of pixels repeated."""
     whole, doubling = (densenet.Trunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2))
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
     variables = random_variables(whole, 0, (1, 64, 64, 3))
     repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
     got, wanted = jax.jit(doubling.apply)(variables, maps), jax.jit(whole.apply)(variables, repeated)
     assert got.shape == (2, 2, 3, 8)
-    np.testing.assert_allclose(got, wanted, atol=3e-4)
+    np.testing.assert_allclose(got, wanted, atol=1e-4)  # rounding, which norms of random scales amplify
 
 
 def test_inputs():
