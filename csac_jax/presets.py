@@ -64,7 +64,7 @@ def fast() -> Config:
         target=TargetConfig(gamma=0.2),
         reward=RewardConfig(nothing=-1.5, empty=-1.5, touched=-1.5, dropped=-1.0, left=3.0),
         explore=ExploreConfig(primitive_end=0.2, push_fraction=0.5, decay=0.9999),
-        learn=LearnConfig(batch=64, updates=128, augment_shift=8, critics=2, loss="squared"),
+        learn=LearnConfig(batch=64, updates=64, augment_shift=8, critics=2, loss="squared"),
         replay=ReplayConfig(capacity=65536, beta_end=(1.0, 4.0)),
         train=TrainConfig(scenes=2048, actions=163840, warmup=4096, chunk=2, save_every=20),
     )

@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from csac_jax.agent import learner as learning, rewards
 from csac_jax.config import Config
-from csac_jax.train import compiler, step
+from csac_jax.train import compiler, step, turns
 from csac_jax.train.mesh import AXIS, Shard, Spread
 from csac_jax.train.step import Program, StepMetrics, TrainState
 
@@ -148,10 +148,11 @@ def compile_chunk(program: Program, given: Members, num_steps: int, mesh: Mesh |
     metrics end up on every device. Networks that take turns do so, unless numbers are traced, which cannot be lifted
     out of a loop over members, or scenes are spread.
     """
+    here = len(given.seed) // (1 if mesh is None else mesh.size)
     if mesh is not None and shard == "scenes":
         program = dataclasses.replace(program, spread=Spread(mesh))
     elif not given.numbers:
-        program = dataclasses.replace(program, in_turn=step.takes_turns(program.cfg))
+        program = dataclasses.replace(program, at_once=turns.at_once(program.cfg, here))
 
     def chunk(state: TrainState, given: Members) -> tuple[TrainState, StepMetrics]:
         def one(member: Members, state: TrainState) -> tuple[TrainState, StepMetrics]:
@@ -160,7 +161,8 @@ def compile_chunk(program: Program, given: Members, num_steps: int, mesh: Mesh |
         every = jax.vmap(one, in_axes=(0, AXES), out_axes=(AXES, 0))
         return jax.lax.scan(lambda carry, _: every(given, carry), state, length=num_steps)
 
-    asked = compiler.options(program.cfg) if program.in_turn else None  # what vmap makes of others is not measured
+    # What a CPU's library for convolutions makes of vmapped ones is not measured.
+    asked = None if program.cfg.net.kind == "small" else compiler.options(program.cfg)
     if mesh is None:
         return jax.jit(lambda state: chunk(state, given), donate_argnums=0, compiler_options=asked)
     if shard == "seeds":

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from csac_jax.config import Config
 from csac_jax.nets import dense, networks
 from csac_jax.replay import ring
-from csac_jax.train import step
+from csac_jax.train import step, turns
 
 GIB = 2**30
 FLOAT = 4  # bytes
@@ -152,7 +152,7 @@ KNOBS = {"replay.capacity": 2, "learn.batch": 1, "train.scenes": 1}
 def sure(cfg: Any, members: int = 1) -> int:
     """Bytes that a run takes for sure, or several side by side, whose networks may take turns."""
     slot = ring.bytes_needed(1, step.example(cfg))
-    at_once = 1 if step.takes_turns(cfg) else members
+    at_once = turns.at_once(cfg, members) or members
     return members * cfg.replay.capacity * slot + at_once * _largest_need(stages(cfg, fitted_only=True))
 
 

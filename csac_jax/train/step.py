@@ -4,7 +4,6 @@ Look, act, simulate, remember, learn, replace finished scenes. E = scenes, B = b
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -15,14 +14,14 @@ from flax import struct
 
 from csac_jax import env as environment
 from csac_jax.agent import augment, learner as learning, policy, rewards
-from csac_jax.agent.learner import Learner, LearnerState, Transition
+from csac_jax.agent.learner import Learner, LearnerState, Params, Transition
 from csac_jax.config import Config
 from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action, Primitive
-from csac_jax.train import compiler
+from csac_jax.train import compiler, turns
 from csac_jax.train.mesh import ALONE, Spread
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
@@ -68,12 +67,7 @@ class Program:
     env: Env
     learner: Learner
     spread: Spread = ALONE  # of scenes and batches over devices
-    in_turn: bool = False  # of several runs side by side, the networks of one at a time
-
-
-def takes_turns(cfg: Config) -> bool:
-    """Whether runs side by side have their networks in turn: DenseNet-121 keeps a device busy, and fills it."""
-    return cfg.net.kind == "densenet121"
+    at_once: int | None = None  # of several runs side by side, the networks of so many at a time; None for all
 
 
 def make(cfg: Config) -> Program:
@@ -88,7 +82,8 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     scenes = state.scenes
 
     # Look and act: by default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13).
-    maps = _whole(program, learning.look, learner)(state.learner.online, scenes.obs)
+    look = _apart(program, lambda online, obs: learning.look(learner, online, obs))
+    maps = look(state.learner.online, scenes.obs)
     act = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
     taken = state.step * cfg.train.scenes
     span = learner.bounds[1] - learner.bounds[0]
@@ -99,7 +94,8 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Reward and remember (lines 14-15).
     pushed = action.primitive == Primitive.PUSH
-    phi_before, phi_after = _whole(program, _around, learner)(state.learner, scenes.obs, after.obs, pushed)
+    around = _apart(program, lambda *given: _around(learner, *given), one_by_one=True)
+    phi_before, phi_after = around(state.learner.target, scenes.obs, after.obs, pushed)
     info = after.info
     changed = info.moved > environment.CHANGE_AREA
     reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))(
@@ -116,7 +112,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Learn (lines 16-26). During the warm-up the result is dropped: a branch would cost more than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.warmup
-    learned, priority, losses = _whole(program, _learn, program)(key_learn, state.learner, replay)
+    learned, priority, losses = _learn(program, key_learn, state.learner, replay)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, replay.priority)
 
@@ -143,10 +139,11 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     return state, metrics
 
 
-def _whole(program: Program, part: Callable[..., Any], static: Any) -> Callable[..., Any]:
-    """`part` of `static`: what the networks of one run do, not vmapped over several runs if these are to take turns."""
-    bound = functools.partial(part, static)
-    return jax.custom_batching.sequential_vmap(bound) if program.in_turn else bound
+def _apart(program: Program, part: Callable[..., Any], one_by_one: bool = False) -> Callable[..., Any]:
+    """`part`, what the networks of one run do; of several side by side only so many at a time as the program says."""
+    if program.at_once is None:
+        return part
+    return turns.grouped(part, 1 if one_by_one else program.at_once)
 
 
 def _learn(
@@ -155,6 +152,8 @@ def _learn(
     """The critic's updates, each on a batch drawn anew, then one of the actor on the last batch, or a part of it."""
     cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
+    update_critic = _apart(program, lambda key, *given: learning.update_critic(key, learner, *given))
+    update_actor = _apart(program, lambda *given: learning.update_actor(learner, *given))
 
     def update(carry, i):
         state, priority = carry
@@ -162,14 +161,14 @@ def _learn(
         progress = state.updates.astype(jnp.float32) / total
         current = replay.replace(priority=priority)
         slots, weights, batch = _draw(program, keys_draw, current, progress)
-        state, info = learning.update_critic(key_target, learner, state, batch, weights)
+        state, info = update_critic(key_target, state, batch, weights)
         current = ring.set_priorities(current, slots, samplers.priority(cfg.replay, info.error))
         return (state, current.priority), (info, batch.obs)
 
     numbers = jnp.arange(cfg.learn.updates)
     (state, priority), (info, observations) = jax.lax.scan(update, (state, replay.priority), numbers)
     last = heightmap.unpack(jax.tree.map(lambda leaf: leaf[-1, : cfg.learn.actor_batch or None], observations))
-    state, actor_loss = learning.update_actor(learner, state, last)
+    state, actor_loss = update_actor(state, last)
     losses = {
         "critic_loss": jnp.mean(info.critic_loss),
         "actor_loss": actor_loss,
@@ -190,22 +189,20 @@ def _draw(
     return slots, weights, vary(_keys(key_augment, cfg.learn.batch), cfg, batch)
 
 
-def _best_grasps(learner: Learner, state: LearnerState, obs: Observation) -> jax.Array:
+def _best_grasps(learner: Learner, target: Params, obs: Observation) -> jax.Array:
     """phi_g of E states [E] by the target critic, eq. 16."""
-    return jax.vmap(learning.best_grasp)(learning.look(learner, state.target, obs))
+    return jax.vmap(learning.best_grasp)(learning.look(learner, target, obs))
 
 
-def _around(
-    learner: Learner, state: LearnerState, before: Observation, after: Observation, pushed: jax.Array
-) -> jax.Array:
+def _around(learner: Learner, target: Params, before: Observation, after: Observation, pushed: jax.Array) -> jax.Array:
     """phi_g before and after the action [2, E]; zeros if no scene was `pushed` [E] bool, since grasps need none.
 
-    With seeds side by side the branch turns into a selection, both sides run; where they take turns it stays one.
+    With seeds side by side the branch turns into a selection, both sides run; one by one it stays a branch.
     """
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, after)
 
     def look() -> jax.Array:
-        return jax.lax.map(lambda obs: _best_grasps(learner, state, obs), views)
+        return jax.lax.map(lambda obs: _best_grasps(learner, target, obs), views)
 
     return jax.lax.cond(jnp.any(pushed), look, lambda: jnp.zeros((2, *pushed.shape)))
 

@@ -105,7 +105,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         pushed = action.primitive == Primitive.PUSH
-        phi = step._around(learner, nets, before.obs, after.obs, pushed)
+        phi = step._around(learner, nets.target, before.obs, after.obs, pushed)
         changed = after.info.moved > environment.CHANGE_AREA
         info, of_one = after.info, jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
         return of_one(cfg.reward, action.primitive, info.outcome, info.distance, *phi, changed, info.left)

@@ -1,5 +1,6 @@
 """C MuJoCo as the reference: what is filmed of it is what it does."""
 
+import concurrent.futures
 import dataclasses
 
 import jax
@@ -103,6 +104,26 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     np.testing.assert_array_equal(after.position[3, 0], ill.position[0])
 
 
+def test_workers_are_used_again(c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch):
+    """Claim: calls leave nothing behind: small ones after large ones, and two at the same time, give the same bits."""
+    scene, _, drive = pushed
+    larger = [dataclasses.replace(scene, half_size=k * np.asarray(scene.half_size)) for k in (1.0, 1.1, 1.2)]
+    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), drive) for one in larger]
+    place = c_world.block_qpos[0]
+    wanted = [c_physics.film(c_world, its, one, drive).qpos[:, place] for one, its, _ in rows]
+    monkeypatch.setattr(c_physics.os, "sched_getaffinity", lambda _: range(3))
+    workers = c_physics.Workers(c_world.model)
+
+    def check(chosen: list[int]) -> None:
+        for i, film in zip(chosen, c_physics._films(c_world, workers, [rows[i] for i in chosen]), strict=True):
+            np.testing.assert_array_equal(film.qpos[:, place], wanted[i])
+
+    for chosen in ([0], [2, 1, 0], [1], [0, 2]):
+        check(chosen)
+    with concurrent.futures.ThreadPoolExecutor() as threads:
+        list(threads.map(check, [[0, 1, 2], [2, 0], [1]] * 4))
+
+
 def test_world_of_mjx_is_refused(world: model.World):
     """Claim: a world without touch sensors is one line that says how to build another."""
     with pytest.raises(ValueError, match=r"no touch sensors; build it with sim\.physics c"):
@@ -112,11 +133,12 @@ def test_world_of_mjx_is_refused(world: model.World):
 def test_nothing_to_move(c_world: model.World, pushed: tuple):
     """Claim: an empty table and a drive that the robot cannot follow leave the scene as it is, with a blank trace."""
     scene, fields, drive = pushed
+    workers = c_physics.Workers(c_world.model)
     cleared = dataclasses.replace(scene, in_play=np.zeros(len(c_world.slots), bool))
     still = dataclasses.replace(drive, reachable=np.array(False))
     for its, his in ((cleared, drive), (scene, still)):
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (its, fields, his))
-        pose, velocity, trace = jax.tree.map(lambda leaf: leaf[0], c_physics._run_batch(c_world, 109, *one))
+        pose, velocity, trace = jax.tree.map(lambda leaf: leaf[0], c_physics._run_batch(c_world, workers, 109, *one))
         np.testing.assert_array_equal(pose, np.concatenate([scene.position, scene.quaternion], axis=1))
         np.testing.assert_array_equal(velocity, scene.velocity)
         assert not trace.touched

@@ -95,11 +95,11 @@ def _alone(cfg, chunks: int = 2) -> tuple[Any, list[Any]]:
     return state, seen
 
 
-def assert_close(a: Any, b: Any, rtol: float) -> None:
+def assert_close(a: Any, b: Any, rtol: float, atol: float = 1e-6) -> None:
     for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(a), jax.tree.leaves(b), strict=True):
         if jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):
             one, other = jax.random.key_data(one), jax.random.key_data(other)
-        np.testing.assert_allclose(one, other, rtol, 1e-6, err_msg=jax.tree_util.keystr(path))
+        np.testing.assert_allclose(one, other, rtol, atol, err_msg=jax.tree_util.keystr(path))
 
 
 def test_members_are_the_runs_of_train():

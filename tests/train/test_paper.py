@@ -11,7 +11,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import NetConfig
 from csac_jax.env import Env
-from csac_jax.train import checkpoint, members, step
+from csac_jax.train import checkpoint, members, step, turns
 from tests.train.test_members import assert_close
 from tests.train.test_step import assert_same, copy, equal
 
@@ -83,12 +83,17 @@ def test_run_with_batch_norm_resumes(tmp_path):
 
 
 @pytest.mark.slow
-def test_runs_side_by_side_take_turns():
-    """Claim: each of two DenseNet runs side by side is the run that `train` makes of its seed, to rounding, and its
-    products are made by itself; those of runs whose numbers differ are vmapped."""
+@pytest.mark.parametrize("size", [1, 2])
+def test_runs_side_by_side_take_turns(size: int, monkeypatch: pytest.MonkeyPatch):
+    """Claim: each of four DenseNet runs side by side is the run that `train` makes of its seed, to rounding, and their
+    products are made for so many at a time; those of runs whose numbers differ are vmapped.
+
+    Products are rounded otherwise, and where a gradient is next to nothing Adam takes a step, 1e-4, either way.
+    """
+    monkeypatch.setattr(turns, "_AT_ONCE", size)
     smoke = presets.smoke()
     net = NetConfig("densenet121", 4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), block_growth=4, zoom=2)
-    configs = [dataclasses.replace(smoke, net=net, seed=k) for k in range(2)]
+    configs = [dataclasses.replace(smoke, net=net, seed=k) for k in range(4)]
     program = step.make(configs[0])
     program = dataclasses.replace(program, env=Still(configs[0], program.env.physics, program.env.scenes))
 
@@ -100,7 +105,7 @@ def test_runs_side_by_side_take_turns():
 
     with jax.debug_key_reuse(False):  # it takes a vmapped transpose of keys for a second use
         begun, chunk = lowered(configs)
-    assert _side_by_side(chunk) == {1}
+    assert _runs_together(chunk) == ({2} if size == 2 else set())
     after, metrics = chunk.compile()(begun)
     for k, cfg in enumerate(configs):
         one = dataclasses.replace(program, cfg=cfg)
@@ -109,16 +114,16 @@ def test_runs_side_by_side_take_turns():
             (members.member(after, k), alone),
             (jax.tree.map(lambda leaf, k=k: leaf[:, k], metrics), seen),
         ):
-            assert_close(mine, want, 1e-5)
+            assert_close(mine, want, 1e-3, 1e-3)
         assert np.all(np.isfinite(seen.critic_loss))
 
-    slower = dataclasses.replace(configs[1], learn=dataclasses.replace(smoke.learn, tau=0.5))
+    slower = dataclasses.replace(configs[3], learn=dataclasses.replace(smoke.learn, tau=0.5))
     with jax.debug_key_reuse(False):
-        _, vmapped = lowered([configs[0], slower])
-    assert _side_by_side(vmapped) == {2}
+        _, vmapped = lowered([*configs[:3], slower])
+    assert _runs_together(vmapped) == {4}
 
 
-def _side_by_side(lowered) -> set[int]:
-    """Along how many axes the first convolution's products, of 48 numbers a cell, are of matrices of their own."""
-    found = re.findall(r"dot_general.* batching_dims = \[([\d, ]*)\] .*: \(tensor<[\dx]*x48xf32>,", lowered.as_text())
-    return {len(axes.split(",")) for axes in found}
+def _runs_together(lowered) -> set[int]:
+    """Of how many runs the first convolution's products are made at a time, of 48 numbers a cell."""
+    two = r"dot_general.* batching_dims = \[\d+, \d+\] .*: \(tensor<(\d+)x\d+x\d+x48xf32>,"
+    return {int(runs) for runs in re.findall(two, lowered.as_text())}

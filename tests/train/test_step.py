@@ -355,8 +355,8 @@ def test_only_pushes_ask_for_the_best_grasps():
     """Claim: phi_g before and after an action is the target critic's as soon as one scene was pushed, else 0."""
     learner, state = _opinions()
     before, after = _pictures(2, seed=1), _pictures(2, seed=2)
-    around = jax.jit(lambda pushed: step._around(learner, state, before, after, pushed))
-    one = jax.jit(lambda obs: step._best_grasps(learner, state, obs))
+    around = jax.jit(lambda pushed: step._around(learner, state.target, before, after, pushed))
+    one = jax.jit(lambda obs: step._best_grasps(learner, state.target, obs))
     wanted = np.stack([one(before), one(after)])
     assert np.all(np.abs(wanted) > 1e-3)
     np.testing.assert_allclose(around(jnp.array([False, True])), wanted, rtol=1e-4, atol=1e-5)
