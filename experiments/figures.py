@@ -68,8 +68,37 @@ def steps() -> None:
         plt.close(figure)
 
 
+def sweeps() -> None:
+    """Time of a step against seeds side by side, and by how much several devices are faster than one."""
+    records = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("bench-sweep-*.json"))]
+    seeds, at = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
+    devices, over = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
+    for record in records:
+        rows, name = record["rows"], f"{record['preset']}, {record['physics']}, {record['device']}"
+        alone = [row for row in rows if row["devices"] == 1]
+        if len(alone) > 1:
+            at.plot(
+                [row["seeds"] for row in alone], [row["seconds"] / record["steps"] for row in alone], "o-", label=name
+            )
+        if len(alone) < len(rows):
+            name = f"{record['shard']}: {rows[0]['seeds']} x {record['scenes']} scenes, {record['preset']}"
+            times = [rows[0]["seconds"] / row["seconds"] for row in rows]
+            over.plot([row["devices"] for row in rows], times, "o-", label=name)
+    at.set(xlabel="seeds side by side", ylabel="time of a training step, s", yscale="log")
+    at.set_xscale("log", base=2)
+    most = max((row["devices"] for record in records for row in record["rows"]), default=1)
+    over.plot([1, most], [1, most], ":", color="grey", label="as many times as devices")
+    over.set(xlabel="devices", ylabel="times as fast as one", xticks=range(1, most + 1))
+    for panel, figure, name in ((at, seeds, "step-seeds"), (over, devices, "step-devices")):
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize="small")
+        figure.savefig(FIGURES / f"{name}.png", dpi=110, metadata={"Software": None})
+        plt.close(figure)
+
+
 if __name__ == "__main__":
     FIGURES.mkdir(exist_ok=True)
     replay()
     steps()
+    sweeps()
     charts.save(report.build(results.read([RESULTS])), FIGURES)
