@@ -1,7 +1,7 @@
 """Runs side by side whose networks have a device in turn, a few at a time.
 
-All at once, networks that fill a device by themselves take the memory of all and are little faster; one by one, their
-small products leave it waiting (`experiments/bench`).
+All at once, networks that fill a device by themselves take the memory of all for little; one by one, their many small
+products leave it waiting (`experiments/bench`).
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from csac_jax.config import Config
 
-_AT_ONCE = 8  # networks of DenseNet-121, ours: beyond these an H200 gains next to nothing
+_AT_ONCE = 5  # networks of DenseNet-121, ours: five seeds are one group, 16 are four, in some 10 GB
 
 
 def at_once(cfg: Config, members: int) -> int | None:
