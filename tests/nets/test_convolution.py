@@ -69,6 +69,7 @@ def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.Monk
     """
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     maps, kernel = _drawn(*setting[:3], *channels)
+    close = 1e-4 if backend == "gpu" and setting[2] == 8 else 3e-5  # 320 products, summed in another order
 
     def loss(conv):
         return lambda maps, kernel: jnp.sum(jnp.sin(conv(maps, kernel, *setting[3:])))
@@ -77,4 +78,4 @@ def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.Monk
     ours = jax.grad(loss(conv2d), argnums=(0, 1))
     _, scanned = jax.jit(lambda m, k: jax.lax.scan(lambda c, _: (c, ours(m, k)), 0, length=2))(maps, kernel)
     for name, got, want in zip(("maps", "kernel"), scanned, wanted, strict=True):
-        np.testing.assert_allclose(got[1], want, atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(got[1], want, atol=close, err_msg=name)

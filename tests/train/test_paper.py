@@ -115,6 +115,8 @@ def test_runs_side_by_side_take_turns(size: int, monkeypatch: pytest.MonkeyPatch
             (jax.tree.map(lambda leaf, k=k: leaf[:, k], metrics), seen),
         ):
             assert_close(mine, want, 1e-3, 1e-3)
+        for name in ("primitive", "outcome", "reward"):
+            np.testing.assert_array_equal(getattr(metrics, name)[:, k], getattr(seen, name), err_msg=name)
         assert np.all(np.isfinite(seen.critic_loss))
 
     slower = dataclasses.replace(configs[3], learn=dataclasses.replace(smoke.learn, tau=0.5))
