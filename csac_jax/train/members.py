@@ -10,12 +10,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from csac_jax.agent import learner as learning, rewards
 from csac_jax.config import Config
-from csac_jax.train import compiler, step, turns
+from csac_jax.train import compiler, lanes, step, turns
 from csac_jax.train.mesh import AXIS, Shard, Spread
 from csac_jax.train.step import Program, StepMetrics, TrainState
 
@@ -141,14 +142,21 @@ def shardings(mesh: Mesh | None, shard: Shard) -> Any:
     return _prefix(every, every, scenes)
 
 
-def compile_chunk(program: Program, given: Members, num_steps: int, mesh: Mesh | None = None, shard: Shard = "seeds"):
+def compile_chunk(
+    program: Program,
+    given: Members,
+    num_steps: int,
+    mesh: Mesh | None = None,
+    shard: Shard = "seeds",
+    in_lanes: int = 1,
+):
     """A jitted function state -> (state, StepMetrics [T, S, ...]) of `num_steps` training steps of all members.
 
     The state is donated. With a mesh over seeds each device scans its own members and hears nothing of the others;
     metrics end up on every device. Networks that take turns do so, unless numbers are traced, which cannot be lifted
-    out of a loop over members, or scenes are spread.
+    out of a loop over members, or scenes are spread. Without a mesh members may run in lanes, which divide them.
     """
-    here = len(given.seed) // (1 if mesh is None else mesh.size)
+    here = len(given.seed) // (in_lanes if mesh is None else mesh.size)
     if mesh is not None and shard == "scenes":
         program = dataclasses.replace(program, spread=Spread(mesh))
     elif not given.numbers:
@@ -163,6 +171,10 @@ def compile_chunk(program: Program, given: Members, num_steps: int, mesh: Mesh |
 
     # What a CPU's library for convolutions makes of vmapped ones is not measured.
     asked = None if program.cfg.net.kind == "small" else compiler.options(program.cfg)
+    if mesh is None and in_lanes > 1:
+        shares = [jax.tree.map(lambda leaf, part=part: leaf[part], given) for part in _parts(len(given.seed), in_lanes)]
+        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=asked)
+        return lanes.InLanes(jitted, shares, jax.jit(lambda state: _split(state, in_lanes)), jax.jit(_joined))
     if mesh is None:
         return jax.jit(lambda state: chunk(state, given), donate_argnums=0, compiler_options=asked)
     if shard == "seeds":
@@ -178,8 +190,25 @@ def _each_device(mesh: Mesh, chunk: Any) -> Any:
     return jax.shard_map(chunk, mesh=mesh, in_specs=(state, share), out_specs=(state, metrics), check_vma=False)
 
 
-def member(state: TrainState, index: int) -> TrainState:
-    """The state of one member, as `train` has it."""
+def _parts(members: int, lanes: int) -> list[slice]:
+    """The members of each lane."""
+    return [slice(k * members // lanes, (k + 1) * members // lanes) for k in range(lanes)]
+
+
+def _split(state: TrainState, lanes: int) -> list[TrainState]:
+    """The state of each lane, in memory of its own."""
+    return [jax.tree.map(jnp.copy, member(state, part)) for part in _parts(state.key.shape[0], lanes)]
+
+
+def _joined(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, StepMetrics]:
+    """What the lanes return, [S', ...] and [T, S', ...] each, as of all members."""
+    states, metrics = zip(*done, strict=True)
+    every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(one.replace(step=()) for one in states))
+    return every.replace(step=states[0].step), jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *metrics)
+
+
+def member(state: TrainState, index: int | slice) -> TrainState:
+    """The state of one member, as `train` has it, or of several."""
     parts = {"key": state.key, "scenes": state.scenes, "learner": state.learner, "replay": state.replay}
     return TrainState(step=state.step, **jax.tree.map(lambda leaf: leaf[index], parts))
 
@@ -199,6 +228,7 @@ def abstract(program: Program, given: Members, mesh: Mesh | None = None, shard: 
 def engine(given: Group, mesh: Mesh | None = None, shard: Shard = "seeds", trunk: Any = None) -> Engine:
     """What the host needs of a group's program. The environment is made here; see `step.init` for `trunk`."""
     program, each = step.make(given.configs[0]), members(given)
+    in_lanes = lanes.number(program.cfg, len(given.configs))
 
     def begin() -> TrainState:
         state = init(program, each, mesh, shard)
@@ -210,6 +240,6 @@ def engine(given: Group, mesh: Mesh | None = None, shard: Shard = "seeds", trunk
     return Engine(
         init=begin,
         abstract=lambda: abstract(program, each, mesh, shard),
-        chunk=lambda num_steps: compile_chunk(program, each, num_steps, mesh, shard),
+        chunk=lambda num_steps: compile_chunk(program, each, num_steps, mesh, shard, in_lanes),
         member=member if mesh is None else jax.jit(member, out_shardings=NamedSharding(mesh, PartitionSpec())),
     )

@@ -18,7 +18,7 @@ import jax
 
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
-from csac_jax.train import auto, grid, members, mesh, provenance, step, sweep as sweeping
+from csac_jax.train import auto, grid, lanes, members, mesh, provenance, step, sweep as sweeping
 from experiments.bench._options import Parser, config, split
 
 
@@ -43,10 +43,11 @@ def measure(program: step.Program, seeds: int, devices: int, shard: mesh.Shard, 
     mesh.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
     (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
     each = members.members(group)
-    jitted = members.compile_chunk(program, each, steps, line, shard)
+    in_lanes = lanes.number(cfg, seeds)
+    jitted = members.compile_chunk(program, each, steps, line, shard, in_lanes)
     row = _timed(jitted, members.init(program, each, line, shard), repeats)
     rate = seeds * cfg.train.scenes * steps / row["seconds"]
-    return {"seeds": seeds, "devices": devices, **row, "actions_per_second": rate}
+    return {"seeds": seeds, "devices": devices, "lanes": in_lanes, **row, "actions_per_second": rate}
 
 
 def _config(preset: str, flags: list[str], options: Any) -> Config:

@@ -1,6 +1,7 @@
 """Members of a sweep in one program, with a small step in place of the learner's."""
 
 import dataclasses
+import threading
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from csac_jax import algorithms, presets
-from csac_jax.train import members, step
+from csac_jax.train import lanes, members, step
 from csac_jax.train.members import Members
 from tests.train import toys
 
@@ -132,6 +133,57 @@ def test_seeds_differ_and_share_the_counter():
     assert (after.step.shape, int(after.step)) == ((), 4)
     for leaf in (after.scenes, after.learner["online"]):
         assert len(np.unique(np.asarray(leaf))) == leaf.size
+
+
+@pytest.mark.parametrize("differ", [False, True])
+def test_lanes_are_the_same_runs(differ: bool):
+    """Claim: in lanes members are what they are side by side, in the same order, also where numbers differ; chunks
+    follow one another, the state is used up."""
+    configs = [dataclasses.replace(toys.CFG, seed=k) for k in range(6)]
+    if differ:
+        configs[1::2] = [members.with_numbers(cfg, {"target.gamma": 0.1}) for cfg in configs[1::2]]
+    (group,) = members.group(configs)
+    wanted, seen = _run(group)
+    program, each = toys.program(group.configs[0]), members.members(group)
+    begun = state = members.init(program, each)
+    chunk = members.compile_chunk(program, each, 4, in_lanes=3).lower(state).compile()
+    for one in seen:
+        state, metrics = chunk(state)
+        assert_close(metrics, one, 1e-5)
+    assert_close(state, wanted, 1e-5)
+    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(begun))
+
+
+def test_lanes_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
+    """Claim: while the host is at work for one lane, another goes on: both meet in their callbacks, or neither ends."""
+    meeting = threading.Barrier(2)
+
+    def meet(value: np.ndarray) -> np.ndarray:
+        meeting.wait(timeout=20)
+        return np.asarray(value)
+
+    def train_step(program: step.Program, state: step.TrainState) -> Any:
+        state, metrics = toys.train_step(program, state)
+        here = jax.ShapeDtypeStruct((), np.float32)
+        met = jax.pure_callback(meet, here, state.scenes[0], vmap_method="broadcast_all")
+        return state.replace(scenes=state.scenes.at[0].set(met)), metrics
+
+    monkeypatch.setattr(step, "train_step", train_step)
+    group = _seeds(2)
+    program, each = toys.program(), members.members(group)
+    state = members.init(program, each)
+    state, _ = members.compile_chunk(program, each, 2, in_lanes=2).lower(state).compile()(state)
+    assert int(state.step) == 2
+
+
+def test_number_of_lanes(monkeypatch: pytest.MonkeyPatch):
+    """Claim: two lanes where host and device take turns and both states fit, on a GPU; else one."""
+    small, large, mjx = presets.paper_small(), presets.paper(), presets.smoke()
+    assert lanes.number(small, 4) == 1  # here
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(lanes.memory, "limit", lambda: 8 * lanes.memory.sure(small))
+    assert [lanes.number(small, members) for members in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
+    assert lanes.number(large, 2) == lanes.number(mjx, 2) == 1
 
 
 def test_settings_that_are_numbers_share_a_program():
