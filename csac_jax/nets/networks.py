@@ -69,7 +69,7 @@ def look(net: Critic, variables: Any, fed: jax.Array) -> tuple[jax.Array, jax.Ar
     """Q [B, N, ...] and features [B, N, ...] of states of N passes each [B, N, C, C, I]."""
     group = states_at_once(net.cfg, fed.shape[2])
     if group is not None:
-        return jax.lax.map(lambda one: _seen(net, variables, one), fed, batch_size=group)
+        return jax.lax.map(lambda one: _seen(net, variables, one), fed, batch_size=group if group > 1 else None)
     flat: Any = net.apply(variables, fed.reshape(-1, *fed.shape[2:]))
     return jax.tree.map(lambda leaf: leaf.reshape(*fed.shape[:2], *leaf.shape[1:]), flat)
 

@@ -59,10 +59,11 @@ def figures(report: Report) -> list[tuple[str, str, Figure]]:
             title = f"Grasp success of the variants, preset {preset}"
             base = [curve for curve in methods if curve.variant.algo in {one.variant.algo for one in varied}]
             found.append((f"variants-{preset}", title, _lines([*base, *varied])))
-    for suite in FOUR:
-        scores = [score for score in report.scores if score.suite == suite]
-        if scores:
-            found.append((f"four-cases-{suite}", f"The four cases (figure 9), suite {suite}", _cases(scores)))
+    measured = dict.fromkeys((score.suite, score.variant.preset) for score in report.scores if score.suite in FOUR)
+    for suite, preset in measured:
+        scores = [score for score in report.scores if (score.suite, score.variant.preset) == (suite, preset)]
+        title = f"The four cases (figure 9), suite {suite}, preset {preset}"
+        found.append((f"four-cases-{suite}-{preset}", title, _cases(scores)))
     return found
 
 
@@ -97,7 +98,7 @@ def _lines(curves: Sequence[Curve]) -> Figure:
 
 
 def _cases(scores: Sequence[Score]) -> Figure:
-    """Completion and action efficiency by case and variant, with bands; the paper's means of the cases as lines."""
+    """Completion and action efficiency by case and variant, with bands; the paper's means of cleared cases as lines."""
     parts = list(dict.fromkeys(score.part for score in scores))
     groups = list(dict.fromkeys(_group(score) for score in scores))
     figure, panels = plt.subplots(1, len(FIGURE_9), figsize=(11.0, 4.2), sharey=True, layout="constrained")
@@ -110,7 +111,8 @@ def _cases(scores: Sequence[Score]) -> Figure:
         panel.set_xticks(range(len(ticks)), ticks)
         panel.set(title=title, ylim=(0, 104))
         panel.grid(alpha=0.3, axis="y")
-        for algo, value in PAPER_CASES[metric].items():
+        paper = PAPER_CASES[metric] if scores[0].suite == "cases" else {}
+        for algo, value in paper.items():
             name = f"paper, mean of the cases, {NAMES[algo]}"
             panel.axhline(100 * value, color=COLOURS[algo], linestyle="--", linewidth=1, label=name)
         panel.set_xlim(-0.5, len(parts) + 0.5)

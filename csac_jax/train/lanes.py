@@ -1,7 +1,8 @@
-"""Runs side by side in lanes: while the host moves the scenes of one lane, the device is at work for another.
+"""Runs side by side in lanes: an equal share of them each, which has the program to itself.
 
-C's physics is a callback, in which a program waits for the host. So each lane, an equal share of the runs, has the
-program to itself, called by a thread of its own.
+On a GPU with C's physics, a callback in which a program waits, the host moves the scenes of one lane while the device is
+at work for another. On a CPU each run is a lane, one after the other: vmapped convolutions would become grouped ones,
+which take twice as long as one by one.
 """
 
 import dataclasses
@@ -14,18 +15,20 @@ import jax
 from csac_jax.config import Config
 from csac_jax.train import memory
 
-_MOST = 2  # ours
+_MOST = 2  # ours: lanes on a GPU
 
 
 def number(cfg: Config, members: int) -> int:
-    """How many lanes for so many runs: two where host and device take turns, on a GPU with C's physics.
+    """How many lanes so many runs are best in.
 
-    One for networks of DenseNet-121, which keep a device busy as it is, and where there is no room for their states
+    One for networks of DenseNet-121, which keep a device busy as they are, and where there is no room for the states
     twice: they are taken apart and put together again.
     """
-    if cfg.sim.physics != "c" or cfg.net.kind != "small" or jax.default_backend() != "gpu":
+    if cfg.net.kind != "small" or 2 * memory.sure(cfg, members) > memory.limit():
         return 1
-    if 2 * memory.sure(cfg, members) > memory.limit():
+    if jax.default_backend() == "cpu":
+        return members
+    if cfg.sim.physics != "c":
         return 1
     return max(lanes for lanes in range(1, _MOST + 1) if members % lanes == 0)
 
@@ -60,7 +63,8 @@ class InLanes:
         parts = jax.block_until_ready(self.split(state))
         for leaf in jax.tree.leaves(state):
             leaf.delete()
-        with ThreadPoolExecutor(len(parts)) as threads:
+        at_once = 1 if jax.default_backend() == "cpu" else len(parts)
+        with ThreadPoolExecutor(at_once) as threads:
             done = list(threads.map(self._run, parts, self.shares))
         return self.join(done)
 

@@ -169,8 +169,9 @@ def compile_chunk(
         every = jax.vmap(one, in_axes=(0, AXES), out_axes=(AXES, 0))
         return jax.lax.scan(lambda carry, _: every(given, carry), state, length=num_steps)
 
-    # What a CPU's library for convolutions makes of vmapped ones is not measured.
-    asked = None if program.cfg.net.kind == "small" else compiler.options(program.cfg)
+    # What a CPU's library for convolutions makes of vmapped ones, or on several devices, is not measured.
+    known = program.cfg.net.kind != "small" or (here == 1 and mesh is None)
+    asked = compiler.options(program.cfg) if known else None
     if mesh is None and in_lanes > 1:
         shares = [jax.tree.map(lambda leaf, part=part: leaf[part], given) for part in _parts(len(given.seed), in_lanes)]
         jitted = jax.jit(chunk, donate_argnums=0, compiler_options=asked)

@@ -280,18 +280,30 @@ def test_figures(recorded: Path):
     """Claim: figure 6 has a line per method and the paper's marks at 2,500 actions, figure 9 a mark per case."""
     found = report.build(results.read([recorded]))
     drawn = {name: figure for name, _, figure in charts.figures(found)}
-    assert set(drawn) == {"methods-paper", "variants-paper", "four-cases-cases"}
+    assert set(drawn) == {"methods-paper", "variants-paper", "four-cases-cases-paper"}
     lines = drawn["methods-paper"].axes[0].get_lines()
     marks = [line.get_xydata()[0] for line in lines if line.get_marker() == "D" and len(line.get_xydata())]
     np.testing.assert_allclose(sorted(mark.tolist() for mark in marks), [[2500, 75], [2500, 90]])
     drawn_curves = {line.get_label(): line.get_ydata().tolist() for line in lines if line.get_marker() != "D"}
     assert drawn_curves["CSAC-beta (2)"] == pytest.approx([60, 85])
     assert drawn_curves["VPG (1)"] == pytest.approx([20, 30, 40])
-    completion = drawn["four-cases-cases"].axes[0]
+    completion = drawn["four-cases-cases-paper"].axes[0]
     points = [line.get_xydata()[0] for line in completion.get_lines() if line.get_marker() == "o"]
     assert sorted(y for _, y in points) == pytest.approx([50] * 3 + [90] * 3)  # two cases and their mean, two methods
     ticks = [text.get_text() for text in completion.get_xticklabels()]
     assert ticks == [*CASES, "mean"]
+
+
+def test_cases_of_each_preset_and_task(recorded: Path):
+    """Claim: figure 9 is drawn of each preset by itself, with the paper's two means; in the target task without them."""
+    other = _config("csac_beta", 0) | {"preset": "fast"}
+    _evaluation(recorded / "fast.json", other, 7)
+    _evaluation(recorded / "target.json", other, 3, suite="target")
+    drawn = {name: figure for name, _, figure in charts.figures(report.build(results.read([recorded])))}
+    for name, marks, lines in (("cases-paper", 6, 2), ("cases-fast", 3, 2), ("target-fast", 3, 0)):
+        shown = drawn[f"four-cases-{name}"].axes[0].get_lines()
+        assert sum(line.get_marker() == "o" for line in shown) == marks
+        assert sum(line.get_linestyle() == "--" for line in shown) == lines
 
 
 def test_samplers_are_drawn_where_there_are_several(recorded: Path):
