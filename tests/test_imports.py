@@ -44,7 +44,11 @@ ONLY_IN = {
     "rich": ("show", "cli"),
     "safetensors": ("train/weights.py", "train/policy_file.py"),
 }
-JIT_IN = ("train", "env.py", "show/picture.py")  # the last draws on machines without OpenGL
+JIT_IN = (
+    *("train", "env.py"),
+    "nets/networks.py",  # a net that is seen from several places of a step is traced once
+    "show/picture.py",  # draws on machines without OpenGL
+)
 PURE = ("vision", "nets", "agent", "replay", "sim")  # no printing, no files
 NOT_PURE = ("sim/__init__.py",)  # passes on what MJX prints as it is imported
 

@@ -1,8 +1,8 @@
 """Runs side by side in lanes: an equal share of them each, which has the program to itself.
 
-On a GPU with C's physics, a callback in which a program waits, the host moves the scenes of one lane while the device is
-at work for another. On a CPU each run is a lane, one after the other: vmapped convolutions would become grouped ones,
-which take twice as long as one by one.
+On a GPU with C's physics, a callback in which a program waits, the host moves the scenes of one lane while the device
+is at work for another. On a CPU each run is a lane, one after the other: vmapped, their convolutions would become
+grouped ones, and a step of four runs would take twice as long.
 """
 
 import dataclasses

@@ -149,10 +149,10 @@ KNOBS = {"replay.capacity": 2, "learn.batch": 1, "train.scenes": 1}
 """Settings that memory falls with, and their least values."""
 
 
-def sure(cfg: Any, members: int = 1) -> int:
-    """Bytes that a run takes for sure, or several side by side, whose networks may take turns."""
+def sure(cfg: Any, members: int = 1, alike: bool = True) -> int:
+    """Bytes that a run takes for sure, or several side by side; if `alike` but for seeds, networks may take turns."""
     slot = ring.bytes_needed(1, step.example(cfg))
-    at_once = turns.at_once(cfg, members) or members
+    at_once = (alike and turns.at_once(cfg, members)) or members
     return members * cfg.replay.capacity * slot + at_once * _largest_need(stages(cfg, fitted_only=True))
 
 

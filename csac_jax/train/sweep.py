@@ -157,16 +157,16 @@ def check_room(plan: Plan, devices: int) -> None:
     """Raises ValueError where the members of a group, spread over `devices`, are known to exceed what a device has room
     for: its memory, or the scenes that Warp's contacts are laid out for."""
     for given, _ in groups_of(plan._replace(seeds=1)):
-        cfg, available = given.configs[0], memory.limit()
+        cfg, available, alike = given.configs[0], memory.limit(), not given.numbers
         members = -(-len(given.configs) * plan.seeds // devices)
         if cfg.sim.physics == "warp" and members * cfg.train.scenes > WARP_WORLDS:
             raise ValueError(
                 f"--seeds: {members} members of {cfg.train.scenes} scenes side by side, Warp has room for "
                 f"{WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take --sim.physics mjx"
             )
-        total = memory.sure(cfg, members)
+        total = memory.sure(cfg, members, alike)
         if total > available:
-            fit = sum(memory.sure(cfg, fewer) <= available for fewer in range(1, members))
+            fit = sum(memory.sure(cfg, fewer, alike) <= available for fewer in range(1, members))
             raise ValueError(
                 f"--seeds: {members} members side by side take {total / memory.GIB:.1f} GiB, there are "
                 f"{available / memory.GIB:.1f}, enough for {fit}; lower --seeds or --replay.capacity, vary fewer "

@@ -295,7 +295,7 @@ def test_figures(recorded: Path):
 
 
 def test_cases_of_each_preset_and_task(recorded: Path):
-    """Claim: figure 9 is drawn of each preset by itself, with the paper's two means; in the target task without them."""
+    """Claim: figure 9 is drawn of each preset by itself, with the paper's two means, in the target task without."""
     other = _config("csac_beta", 0) | {"preset": "fast"}
     _evaluation(recorded / "fast.json", other, 7)
     _evaluation(recorded / "target.json", other, 3, suite="target")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from csac_jax import presets
 from csac_jax.train import checkpoint, sweep
 from csac_jax.train.members import Engine, Group
 from csac_jax.train.stop import Stop
@@ -236,6 +237,20 @@ def test_members_must_fit_together(monkeypatch: pytest.MonkeyPatch):
         else:
             with pytest.raises(ValueError, match=r"--seeds: 6 members .* enough for 4"):
                 sweep.check_room(plan, devices)
+
+
+def test_networks_of_different_numbers_need_room_at_once(monkeypatch: pytest.MonkeyPatch):
+    """Claim: six seeds of DenseNet-121 have their networks at work three at a time, six of different numbers all at
+    once, for which there must be room."""
+    paper = presets.paper()
+    settings = [
+        Setting(name, {}, dataclasses.replace(paper, learn=dataclasses.replace(paper.learn, tau=tau)))
+        for name, tau in (("a", 0.1), ("b", 0.2))
+    ]
+    monkeypatch.setattr(sweep.memory, "limit", lambda: sweep.memory.sure(paper, 6))
+    sweep.check_room(Plan(6, settings[:1]), 1)
+    with pytest.raises(ValueError, match=r"--seeds: 6 members .* enough for 4"):
+        sweep.check_room(Plan(3, settings), 1)
 
 
 def test_members_on_warp_must_fit_its_contacts():
