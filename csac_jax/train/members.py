@@ -1,7 +1,8 @@
 """Many runs in one program: members that differ in their seed and in settings that are nothing but numbers.
 
-S = members. `step.train_step` is written for one of them and is vmapped here, once. Of a member's state all leaves
-have a leading axis S but `step`, which all members share: what depends on it stays one schedule for all.
+S = members. `step.train_step` is written for one of them and is vmapped here, once, over all or over those of a lane.
+Of a member's state all leaves have a leading axis S but `step`, which all members share: what depends on it stays one
+schedule for all.
 """
 
 import copy
@@ -191,14 +192,14 @@ def _each_device(mesh: Mesh, chunk: Any) -> Any:
     return jax.shard_map(chunk, mesh=mesh, in_specs=(state, share), out_specs=(state, metrics), check_vma=False)
 
 
-def _parts(members: int, lanes: int) -> list[slice]:
-    """The members of each lane."""
-    return [slice(k * members // lanes, (k + 1) * members // lanes) for k in range(lanes)]
+def _parts(num: int, in_lanes: int) -> list[slice]:
+    """Which of `num` members each lane has."""
+    return [slice(k * num // in_lanes, (k + 1) * num // in_lanes) for k in range(in_lanes)]
 
 
-def _split(state: TrainState, lanes: int) -> list[TrainState]:
+def _split(state: TrainState, in_lanes: int) -> list[TrainState]:
     """The state of each lane, in memory of its own."""
-    return [jax.tree.map(jnp.copy, member(state, part)) for part in _parts(state.key.shape[0], lanes)]
+    return [jax.tree.map(jnp.copy, member(state, part)) for part in _parts(state.key.shape[0], in_lanes)]
 
 
 def _joined(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, StepMetrics]:

@@ -5,6 +5,7 @@ physics the preset's, settings as `csac-jax train` takes them: `--train.scenes 6
 For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
 and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds that the devices
 do not divide are left out. Beside a row of one seed on one device, `train` is its program as `csac-jax train` has it.
+`lanes` tells in how many shares seeds run that have the program to themselves, see csac_jax/train/lanes.py.
 Configurations follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
 """
 
