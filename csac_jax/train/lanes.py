@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+from jax.sharding import Mesh
 
 from csac_jax.config import Config
 from csac_jax.train import memory
@@ -18,13 +19,13 @@ from csac_jax.train import memory
 _MOST = 2  # ours: lanes on a GPU
 
 
-def number(cfg: Config, members: int) -> int:
+def number(cfg: Config, members: int, mesh: Mesh | None = None) -> int:
     """How many lanes so many runs are best in.
 
-    One for networks of DenseNet-121, which keep a device busy as they are, and where there is no room for the states
-    twice: they are taken apart and put together again.
+    One on several devices, for networks of DenseNet-121, which keep a device busy as they are, and where there is no
+    room for the states twice: they are taken apart and put together again.
     """
-    if cfg.net.kind != "small" or 2 * memory.sure(cfg, members) > memory.limit():
+    if mesh is not None or cfg.net.kind != "small" or 2 * memory.sure(cfg, members) > memory.limit():
         return 1
     if jax.default_backend() == "cpu":
         return members

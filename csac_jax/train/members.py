@@ -157,7 +157,7 @@ def compile_chunk(
     metrics end up on every device. Networks that take turns do so, unless numbers are traced, which cannot be lifted
     out of a loop over members, or scenes are spread. Without a mesh members may run in lanes, which divide them.
     """
-    here = len(given.seed) // (in_lanes if mesh is None else mesh.size)
+    here = len(given.seed) // (in_lanes if mesh is None else mesh.size)  # vmapped in one program of a device
     if mesh is not None and shard == "scenes":
         program = dataclasses.replace(program, spread=Spread(mesh))
     elif not given.numbers:
@@ -230,7 +230,7 @@ def abstract(program: Program, given: Members, mesh: Mesh | None = None, shard: 
 def engine(given: Group, mesh: Mesh | None = None, shard: Shard = "seeds", trunk: Any = None) -> Engine:
     """What the host needs of a group's program. The environment is made here; see `step.init` for `trunk`."""
     program, each = step.make(given.configs[0]), members(given)
-    in_lanes = lanes.number(program.cfg, len(given.configs))
+    in_lanes = lanes.number(program.cfg, len(given.configs), mesh)
 
     def begin() -> TrainState:
         state = init(program, each, mesh, shard)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from csac_jax.config import Config
 
-_AT_ONCE = 5  # networks of DenseNet-121, ours: five seeds are one group, 16 are four, in some 10 GB
+_AT_ONCE = 5  # networks of DenseNet-121, ours: five seeds are one group, 16 are four, with 21 GB of temporaries
 
 
 def at_once(cfg: Config, members: int) -> int | None:

@@ -44,7 +44,7 @@ def measure(program: step.Program, seeds: int, devices: int, shard: mesh.Shard, 
     mesh.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
     (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
     each = members.members(group)
-    in_lanes = lanes.number(cfg, seeds)
+    in_lanes = lanes.number(cfg, seeds, line)
     jitted = members.compile_chunk(program, each, steps, line, shard, in_lanes)
     row = _timed(jitted, members.init(program, each, line, shard), repeats)
     rate = seeds * cfg.train.scenes * steps / row["seconds"]

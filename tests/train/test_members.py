@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from csac_jax import algorithms, presets
-from csac_jax.train import lanes, members, step
+from csac_jax.train import lanes, members, mesh, step
 from csac_jax.train.members import Members
 from tests.train import toys
 
@@ -180,11 +180,12 @@ def test_lanes_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
 
 def test_number_of_lanes(monkeypatch: pytest.MonkeyPatch):
     """Claim: on a CPU a lane for each; on a GPU two where host and device take turns. One where states do not fit
-    twice, and for networks that fill a device."""
+    twice, for networks that fill a device, and on several devices."""
     small, large, mjx = presets.paper_small(), presets.paper(), presets.smoke()
     monkeypatch.setattr(lanes.memory, "limit", lambda: 8 * lanes.memory.sure(small))
     assert [lanes.number(small, members) for members in (1, 3, 4, 5)] == [1, 3, 4, 1]
     assert [lanes.number(cfg, 2) for cfg in (mjx, large)] == [2, 1]
+    assert lanes.number(small, 4, mesh.Mesh(np.array(jax.devices()), (mesh.AXIS,))) == 1
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert [lanes.number(small, members) for members in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
     assert lanes.number(large, 2) == lanes.number(mjx, 2) == 1
