@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from csac_jax.config import Config
-from csac_jax.train import cache, checkpoint, config_json
+from csac_jax.train import cache, checkpoint, compiler, config_json
 from csac_jax.train.metrics import GRASP, LIFTED, OUTCOMES
 from csac_jax.train.stop import Stop
 
@@ -170,7 +170,7 @@ def compile_program(
     kernels = "; then Warp builds its kernels, on a new machine for minutes" if cfg.sim.physics == "warp" else ""
     reporter.say(f"compiling the training program; this takes a while, once{kernels}")
     begun, hits = time.perf_counter(), cache.hits()
-    program = compile_chunk(cfg.train.chunk).lower(state).compile()
+    program = compiler.lower(compile_chunk(cfg.train.chunk), state).compile()
     seconds = time.perf_counter() - begun
     reporter.say(f"compiled in {seconds:.1f} s{' (from the cache)' if cache.hits() > hits else ''}")
     return program, seconds

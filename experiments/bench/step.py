@@ -51,7 +51,7 @@ _SEPARATE = ("look", "act", "simulate", "reward", "remember", "learn", "replace"
 def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, float]]:
     """The compiled chunk, seconds to trace it and to compile it."""
     begun = time.perf_counter()
-    lowered = step.compile_chunk(program, steps).lower(state)
+    lowered = compiler.lower(step.compile_chunk(program, steps), state)
     traced = time.perf_counter()
     compiled = lowered.compile()
     return compiled, {"trace": traced - begun, "compile": time.perf_counter() - traced}

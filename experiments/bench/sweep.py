@@ -19,14 +19,14 @@ import jax
 
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
-from csac_jax.train import auto, grid, lanes, members, mesh, provenance, step, sweep as sweeping
+from csac_jax.train import auto, compiler, grid, lanes, members, mesh, provenance, step, sweep as sweeping
 from experiments.bench._options import Parser, config, split
 
 
 def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
     """Seconds of the compilation and, the median, of a call that goes on where the last one ended."""
     begun = time.perf_counter()
-    chunk = jitted.lower(state).compile()
+    chunk = compiler.lower(jitted, state).compile()
     compiled = time.perf_counter() - begun
     seconds = []
     for _ in range(1 + repeats):

@@ -1,4 +1,7 @@
-"""The second library for convolutions: right on all of the small net's, and left out where it is not to be used."""
+"""Tracing, and the second library for convolutions: right on all of the small net's, left out where it is not to be."""
+
+import contextlib
+import gc
 
 import jax
 import jax.numpy as jnp
@@ -101,3 +104,26 @@ def test_library_is_right_in_groups():
     each = jax.vmap(lambda maps, kernel: conv2d(maps, kernel, 1, 2, 2))
     wanted, got = (jax.jit(each, compiler_options=asked)(maps, kernels) for asked in (None, compiler.LIBRARY))
     np.testing.assert_allclose(got, wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize("was_on", [True, False])
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_collector_rests_while_a_program_is_traced(was_on: bool, fails: bool):
+    """Claim: it is off as the function is traced, and as it was before after that, even if that fails."""
+    seen = []
+
+    def function(x):
+        seen.append(gc.isenabled())
+        if fails:
+            raise ZeroDivisionError
+        return 2.0 * x
+
+    try:
+        if not was_on:
+            gc.disable()
+        with pytest.raises(ZeroDivisionError) if fails else contextlib.nullcontext():
+            assert compiler.lower(jax.jit(function), 1.5).compile()(1.5) == 3.0
+        assert gc.isenabled() == was_on
+    finally:
+        gc.enable()
+    assert seen == [False]
