@@ -269,13 +269,18 @@ def _scale_of_meshes(world: World, scale: jax.Array) -> jax.Array:
     return jnp.stack([scale[world.parts.slot[user[0]]] if user.size else one for user in users] or [one])
 
 
-def with_blocks(world: World, fields: BlockFields, scratch: mujoco.MjData | None = None) -> mujoco.MjModel:
-    """A copy of the world's model whose blocks have these fields (NumPy arrays).
+def with_blocks(
+    world: World,
+    fields: BlockFields,
+    scratch: mujoco.MjData | None = None,
+    into: mujoco.MjModel | None = None,
+) -> mujoco.MjModel:
+    """A copy of the world's model whose blocks have these fields (NumPy arrays), or `into`, an earlier copy, with them.
 
     MuJoCo derives the rest: C takes the mass matrix of a free body from `dof_M0`, not from its mass. What it needs room
-    for is written into `scratch`, if there is any: making room takes longer than the rest.
+    for is written into `scratch`, if there is any: making room, or a copy, takes longer than the rest.
     """
-    model = copy.copy(world.model)
+    model = into or copy.copy(world.model)
     model.geom_size[world.block_geoms], model.geom_rbound[world.block_geoms] = fields.size, fields.rbound
     model.geom_pos[world.block_geoms] = fields.centre
     model.geom_friction[world.block_geoms, 0] = fields.friction
@@ -283,7 +288,8 @@ def with_blocks(world: World, fields: BlockFields, scratch: mujoco.MjData | None
     model.body_ipos[world.block_bodies] = fields.com
     for mesh, scale in zip(range(model.nmesh), fields.mesh_scale, strict=False):
         start = model.mesh_vertadr[mesh]
-        model.mesh_vert[start : start + model.mesh_vertnum[mesh]] *= scale
+        corners = slice(start, start + model.mesh_vertnum[mesh])
+        model.mesh_vert[corners] = world.model.mesh_vert[corners] * scale
     mujoco.mj_setConst(model, scratch or mujoco.MjData(model))
     return model
 

@@ -97,6 +97,21 @@ def test_with_blocks_leaves_the_world_unchanged(world: model.World):
         np.testing.assert_array_equal(getattr(world.model, name), before[name], err_msg=name)
 
 
+def test_with_blocks_writes_over_an_earlier_copy(world: model.World):
+    """Claim: written into a copy of other blocks, a model is byte for byte the one that is made anew."""
+    earlier = model.with_blocks(world, _fields(world, _scene(scale=0.8)))
+    anew = model.with_blocks(world, _fields(world, _scene(scale=0.9)))
+    before = _bytes(earlier)
+    assert model.with_blocks(world, _fields(world, _scene(scale=0.9)), mujoco.MjData(world.model), earlier) is earlier
+    assert before != _bytes(earlier) == _bytes(anew)
+
+
+def _bytes(saved: mujoco.MjModel) -> bytes:
+    room = np.zeros(mujoco.mj_sizeModel(saved), np.uint8)
+    mujoco.mj_saveModel(saved, None, room)
+    return room.tobytes()
+
+
 def test_addresses_name_what_they_say(world: model.World):
     """Claim: the addresses of a world lead to its blocks, hand joints and pads, in order."""
     for slot in range(len(SLOTS)):

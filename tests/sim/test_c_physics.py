@@ -105,7 +105,10 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
 
 
 def test_workers_are_used_again(c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch):
-    """Claim: calls leave nothing behind: small ones after large ones, and two at the same time, give the same bits."""
+    """Claim: calls leave nothing behind: small ones after large ones, and two at the same time, give the same bits.
+
+    Nor does a scene in which the cube is out of play, and meets nothing.
+    """
     scene, _, drive = pushed
     larger = [dataclasses.replace(scene, half_size=k * np.asarray(scene.half_size)) for k in (1.0, 1.1, 1.2)]
     rows = [(one, jax.device_get(model.scene_fields(c_world, one)), drive) for one in larger]
@@ -120,6 +123,8 @@ def test_workers_are_used_again(c_world: model.World, pushed: tuple, monkeypatch
 
     for chosen in ([0], [2, 1, 0], [1], [0, 2]):
         check(chosen)
+    c_physics._films(c_world, workers, [(conftest.place(prism=(-0.1, 0.1, 0.0)), rows[0][1], drive)])
+    check([0])
     with concurrent.futures.ThreadPoolExecutor() as threads:
         list(threads.map(check, [[0, 1, 2], [2, 0], [1]] * 4))
 
