@@ -81,7 +81,7 @@ class Workers:
 class Crew:
     """Threads and what each needs room for, and a model for each scene, kept from call to call.
 
-    To make threads and room anew would be a third of the time of 16 scenes on 16 cores, to copy the models a sixth.
+    To make threads and room anew would be a third of the time of 16 scenes on 16 cores, to copy the models a seventh.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
