@@ -25,7 +25,7 @@ _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float
 
 
 def lower(jitted: Any, *given: Any) -> Any:
-    """`jitted.lower(*given)` while Python's garbage collector rests, which is a third less time.
+    """`jitted.lower(*given)` while Python's garbage collector rests, which is a quarter to two fifths less time.
 
     Tracing makes hundreds of thousands of small objects, next to none of them garbage, and the collector would go
     through them again and again.

@@ -108,14 +108,11 @@ def test_two_steps_are_learned(algo, low, high):
 
 @pytest.mark.slow
 def test_grasping_alone_fails():
-    """Claim: where only a push makes a grasp possible, grasp_only never pushes, lifts nothing and expects nothing.
-
-    A lifted block would be worth 1. The highest of all cells was 0.04 to 0.14 with four seeds.
-    """
+    """Claim: where only a push makes a grasp possible, grasp_only never pushes, lifts nothing and expects nothing."""
     learned = learn(toys.two_step, "grasp_only", actions=800, cap=CAP)
     assert learned.success == 0.0
     assert learned.pushes == [0.0] * CAP
-    np.testing.assert_allclose(learned.value, 0.0, atol=0.25)
+    np.testing.assert_allclose(learned.value, 0.0, atol=0.1)
 
 
 @pytest.mark.parametrize(
