@@ -9,7 +9,8 @@ import copy
 import dataclasses
 import functools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -25,8 +26,6 @@ from csac_jax.scene.model import HAND_GEOMS, BlockFields, World
 from csac_jax.sim import outcome
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.robot import Drive
-
-_AT_ONCE = 256  # scenes whose films are kept at a time, some 70 MB with ten blocks
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,55 +57,41 @@ class CPhysics:
         return layout.park(moved, scene.in_play), trace
 
 
+class Room(NamedTuple):
+    """What it takes to move one scene."""
+
+    exact: mujoco.MjModel  # its blocks are those of the last scene
+    data: mujoco.MjData
+    loop: rollout.Rollout  # MuJoCo's own, in the thread that calls it
+
+
 class Workers:
-    """Crews of threads that move scenes of a model: a call takes one that is idle, calls at the same time one each."""
+    """Threads that move scenes of a model, as many as there are cores, and a room for each that is at work.
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
-        self._idle: list[Crew] = []
-
-    @contextlib.contextmanager
-    def crew(self) -> Iterator["Crew"]:
-        """A crew that nobody else has meanwhile."""
-        try:
-            crew = self._idle.pop()
-        except IndexError:
-            crew = Crew(self._model)
-        try:
-            yield crew
-        finally:
-            self._idle.append(crew)
-
-
-class Crew:
-    """Threads and what each needs room for, and a model for each scene, kept from call to call.
-
-    To make threads and room anew would be a third of the time of 16 scenes on 16 cores, to copy the models a seventh.
+    Both are kept from call to call: to make threads and rooms anew would be half of the time of 16 scenes on 16 cores.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self._model, self._cores = model, len(os.sched_getaffinity(0))
-        self._spaces, self._pool = [mujoco.MjData(model)], rollout.Rollout(nthread=1)
-        self._models: list[mujoco.MjModel] = []
+        self._model = model
+        self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)))
+        self._idle: list[Room] = []
 
-    @property
-    def scratch(self) -> mujoco.MjData:
-        """Room for a calculation."""
-        return self._spaces[0]
+    def each(self, do: Callable[[Any], Any], rows: Sequence[Any]) -> list[Any]:
+        """What `do` makes of every row; calls at the same time share the threads."""
+        return list(self._threads.map(do, rows))
 
-    def models(self, num: int) -> list[mujoco.MjModel]:
-        """So many copies of the model, whose blocks are those of earlier scenes."""
-        self._models += [_lasting(copy.copy(self._model)) for _ in range(num - len(self._models))]
-        return self._models[:num]
-
-    def films(self, models: Sequence[mujoco.MjModel], starts: np.ndarray, controls: np.ndarray) -> Any:
-        """States and sensors [N, T, ...] of N models of one size, from `starts` [N, ...] by `controls` [N, T, ...]."""
-        missing = min(self._cores, len(models)) - len(self._spaces)
-        if missing > 0:
-            self._spaces += [mujoco.MjData(self._model) for _ in range(missing)]
-            self._pool.close()
-            self._pool = rollout.Rollout(nthread=len(self._spaces))
-        return self._pool.rollout(models, self._spaces, starts, controls)
+    @contextlib.contextmanager
+    def room(self) -> Iterator[Room]:
+        """A room that nobody else has meanwhile."""
+        try:
+            room = self._idle.pop()
+        except IndexError:
+            exact = _lasting(copy.copy(self._model))
+            room = Room(exact, mujoco.MjData(exact), rollout.Rollout(nthread=0))
+        try:
+            yield room
+        finally:
+            self._idle.append(room)
 
 
 def _blank(num: int) -> Trace:
@@ -129,13 +114,16 @@ def _run_batch(world: World, workers: Workers, closed_at: int, scene: Scene, fie
     axes = np.shape(drive.reachable)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[len(axes) :]), (scene, fields, drive))
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(len(rows[2].reachable))]
-    done = [_unmoved(one) for one, _, _ in each]
-    moving = [i for i, (one, _, its) in enumerate(each) if _moves(one, its)]
-    for first in range(0, len(moving), _AT_ONCE):
-        chosen = moving[first : first + _AT_ONCE]
-        for i, seen in zip(chosen, _films(world, workers, [each[i] for i in chosen]), strict=True):
-            done[i] = _judge(world, closed_at, each[i][0], seen)
+    done = workers.each(lambda row: _run(world, workers, closed_at, *row), each)
     return jax.tree.map(lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *done)
+
+
+def _run(world: World, workers: Workers, closed_at: int, scene: Scene, fields: BlockFields, drive: Drive) -> Any:
+    """Poses [N, 7], velocities [N, 6] and trace of one scene."""
+    if not _moves(scene, drive):
+        return _unmoved(scene)
+    with workers.room() as room:
+        return _judge(world, closed_at, scene, _roll(world, room, scene, fields, drive))
 
 
 def _moves(scene: Scene, drive: Drive) -> bool:
@@ -176,27 +164,34 @@ def _judge(world: World, closed_at: int, scene: Scene, film: Film) -> tuple[Any,
     return pose.astype(np.float32), velocity.astype(np.float32), Trace(**leaves)
 
 
-def _films(world: World, workers: Workers, rows: list[tuple[Scene, BlockFields, Drive]]) -> list[Film]:
-    """The films of scenes that move, on all cores.
+def _roll(world: World, room: Room, scene: Scene, fields: BlockFields, drive: Drive) -> Film:
+    """`film` of a scene that moves, by MuJoCo's own loop; parked blocks fall and meet nothing.
 
-    MuJoCo's own loop cannot slow blocks down: a scene in which one is faster than the limit is done once more, by ours.
+    That loop cannot slow blocks down. So it stops at a substep after which one is faster than the limit, and goes on
+    from there with the limited velocities and the solver's warm start: the same bits as if it had never stopped.
     """
-    with workers.crew() as crew:
-        models, starts = crew.models(len(rows)), []
-        for exact, (scene, fields, drive) in zip(models, rows, strict=True):
-            model.with_blocks(world, fields, crew.scratch, into=exact)
-            parked = np.isin(world.slot_of_geom, np.flatnonzero(~scene.in_play))  # they fall and meet nothing
-            exact.geom_contype[:] = np.where(parked, 0, world.model.geom_contype)
-            exact.geom_conaffinity[:] = np.where(parked, 0, world.model.geom_conaffinity)
-            starts.append(np.concatenate([[0.0], *_start(world, scene, drive)]))  # time, positions, velocities
-        states, sensed = crew.films(models, np.stack(starts), np.stack([drive.control for *_, drive in rows]))
-    films = []
-    for (scene, fields, drive), state, sensors in zip(rows, states, sensed, strict=True):
-        qpos, qvel = np.split(state[:, 1:], [world.model.nq], axis=1)
-        fastest = np.abs(qvel[:, world.block_dofs[scene.in_play]]).max(axis=(0, 1))
-        within = (fastest <= layout.SPEED_LIMIT).all()
-        films.append(Film(qpos, qvel, sensors) if within else film(world, fields, scene, drive))
-    return films
+    exact, data, loop = room
+    parked = np.isin(world.slot_of_geom, np.flatnonzero(~scene.in_play))
+    exact.geom_contype[:] = np.where(parked, 0, world.model.geom_contype)
+    exact.geom_conaffinity[:] = np.where(parked, 0, world.model.geom_conaffinity)
+    model.with_blocks(world, fields, data, into=exact)  # after these, of which MuJoCo derives those of bodies
+    dofs = 1 + world.model.nq + world.block_dofs[scene.in_play]  # [N in play, 6], where a state has their velocities
+    state, warm = np.concatenate([[0.0], *_start(world, scene, drive)]), np.zeros(world.model.nv)
+    parts, done, ahead = [], 0, len(drive.control)
+    while done < len(drive.control):
+        control = drive.control[None, done : done + ahead]
+        (states,), (sensed,) = loop.rollout(exact, data, state, control, initial_warmstart=warm)
+        too_fast = (np.abs(states[:, dofs]) > layout.SPEED_LIMIT).any(axis=(1, 2))
+        if too_fast[:-1].any():
+            ahead = int(np.argmax(too_fast)) + 1
+            continue
+        state, warm = states[-1], data.qacc_warmstart.copy()
+        state[dofs] = np.clip(state[dofs], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
+        parts.append((states, sensed))
+        done, ahead = done + len(states), 1 if too_fast[-1] else 2 * ahead
+    states, sensed = (np.concatenate(leaves) for leaves in zip(*parts, strict=True))
+    qpos, qvel = np.split(states[:, 1:], [world.model.nq], axis=1)
+    return Film(qpos, qvel, sensed)
 
 
 def _lasting(exact: mujoco.MjModel) -> mujoco.MjModel:

@@ -2,13 +2,14 @@
 
 import concurrent.futures
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.scene import model
+from csac_jax.scene import layout, model
 from csac_jax.sim import c_physics, primitives, robot
 from csac_jax.sim.robot import Drive
 from tests.sim import conftest
@@ -104,6 +105,39 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     np.testing.assert_array_equal(after.position[3, 0], ill.position[0])
 
 
+@pytest.mark.parametrize("metres", [0.02, 0.1, 0.3])
+def test_limit_of_speed_is_held_after_every_substep(
+    c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch, metres: float
+):
+    """Claim: MuJoCo's own loop, stopped and gone on with, gives the bits of one that limits the speed as it goes."""
+    scene, fields, drive = pushed
+    limit = np.array([metres] * 3 + [10.0 * metres] * 3, np.float32)
+    monkeypatch.setattr(layout, "SPEED_LIMIT", limit)
+    wanted = c_physics.film(c_world, fields, scene, drive)
+    (seen,) = _roll(c_world, c_physics.Workers(c_world.model), [(scene, fields, drive)])
+    places, dofs = (
+        c_world.block_qpos[0],
+        c_world.block_dofs[0],
+    )  # of the cube: parked blocks fall in one alone
+    at_limit = (np.abs(wanted.qvel[:, dofs]) == limit).any(axis=1)
+    assert at_limit.any()
+    assert (at_limit[:-1] & ~at_limit[1:]).any()  # and below it again
+    np.testing.assert_array_equal(seen.qpos[:, places], wanted.qpos[:, places])
+    np.testing.assert_array_equal(seen.qvel[:, dofs], wanted.qvel[:, dofs])
+    np.testing.assert_array_equal(seen.qpos[:, c_world.robot_qpos], wanted.qpos[:, c_world.robot_qpos])
+    np.testing.assert_array_equal(seen.sensed, wanted.sensed)
+
+
+def _roll(world: model.World, workers: c_physics.Workers, rows: list[tuple]) -> list[c_physics.Film]:
+    """The films of scenes, each in a room that a thread finds."""
+
+    def film(row: tuple) -> c_physics.Film:
+        with workers.room() as room:
+            return c_physics._roll(world, room, *row)
+
+    return workers.each(film, rows)
+
+
 def test_workers_are_used_again(c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch):
     """Claim: calls leave nothing behind: small ones after large ones, and two at the same time, give the same bits.
 
@@ -115,15 +149,15 @@ def test_workers_are_used_again(c_world: model.World, pushed: tuple, monkeypatch
     place = c_world.block_qpos[0]
     wanted = [c_physics.film(c_world, its, one, drive).qpos[:, place] for one, its, _ in rows]
     monkeypatch.setattr(c_physics.os, "sched_getaffinity", lambda _: range(3))
-    workers = c_physics.Workers(c_world.model)
+    roll = functools.partial(_roll, c_world, c_physics.Workers(c_world.model))
 
     def check(chosen: list[int]) -> None:
-        for i, film in zip(chosen, c_physics._films(c_world, workers, [rows[i] for i in chosen]), strict=True):
+        for i, film in zip(chosen, roll([rows[i] for i in chosen]), strict=True):
             np.testing.assert_array_equal(film.qpos[:, place], wanted[i])
 
     for chosen in ([0], [2, 1, 0], [1], [0, 2]):
         check(chosen)
-    c_physics._films(c_world, workers, [(conftest.place(prism=(-0.1, 0.1, 0.0)), rows[0][1], drive)])
+    roll([(conftest.place(prism=(-0.1, 0.1, 0.0)), rows[0][1], drive)] * 3)
     check([0])
     with concurrent.futures.ThreadPoolExecutor() as threads:
         list(threads.map(check, [[0, 1, 2], [2, 0], [1]] * 4))
