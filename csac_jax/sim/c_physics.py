@@ -27,6 +27,8 @@ from csac_jax.sim import outcome
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.robot import Drive
 
+_AHEAD = 48  # substeps at a time, ours: more calls of MuJoCo cost less than going back to where a block is too fast
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CPhysics:
@@ -77,8 +79,8 @@ class Workers:
         self._idle: list[Room] = []
 
     def each(self, do: Callable[[Any], Any], rows: Sequence[Any]) -> list[Any]:
-        """What `do` makes of every row; calls at the same time share the threads."""
-        return list(self._threads.map(do, rows))
+        """What `do` makes of every row; calls at the same time share the threads. A row alone needs none."""
+        return [do(row) for row in rows] if len(rows) == 1 else list(self._threads.map(do, rows))
 
     @contextlib.contextmanager
     def room(self) -> Iterator[Room]:
@@ -167,8 +169,8 @@ def _judge(world: World, closed_at: int, scene: Scene, film: Film) -> tuple[Any,
 def _roll(world: World, room: Room, scene: Scene, fields: BlockFields, drive: Drive) -> Film:
     """`film` of a scene that moves, by MuJoCo's own loop; parked blocks fall and meet nothing.
 
-    That loop cannot slow blocks down. So it stops at a substep after which one is faster than the limit, and goes on
-    from there with the limited velocities and the solver's warm start: the same bits as if it had never stopped.
+    That loop cannot slow blocks down. So it ends with a substep after which one is faster than the limit, and goes on
+    from there with the limited velocities and the solver's warm start: the same bits as if it had never ended.
     """
     exact, data, loop = room
     parked = np.isin(world.slot_of_geom, np.flatnonzero(~scene.in_play))
@@ -177,7 +179,7 @@ def _roll(world: World, room: Room, scene: Scene, fields: BlockFields, drive: Dr
     model.with_blocks(world, fields, data, into=exact)  # after these, of which MuJoCo derives those of bodies
     dofs = 1 + world.model.nq + world.block_dofs[scene.in_play]  # [N in play, 6], where a state has their velocities
     state, warm = np.concatenate([[0.0], *_start(world, scene, drive)]), np.zeros(world.model.nv)
-    parts, done, ahead = [], 0, len(drive.control)
+    parts, done, ahead = [], 0, _AHEAD
     while done < len(drive.control):
         control = drive.control[None, done : done + ahead]
         (states,), (sensed,) = loop.rollout(exact, data, state, control, initial_warmstart=warm)
@@ -188,7 +190,7 @@ def _roll(world: World, room: Room, scene: Scene, fields: BlockFields, drive: Dr
         state, warm = states[-1], data.qacc_warmstart.copy()
         state[dofs] = np.clip(state[dofs], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
         parts.append((states, sensed))
-        done, ahead = done + len(states), 1 if too_fast[-1] else 2 * ahead
+        done, ahead = done + len(states), 1 if too_fast[-1] else min(2 * ahead, _AHEAD)
     states, sensed = (np.concatenate(leaves) for leaves in zip(*parts, strict=True))
     qpos, qvel = np.split(states[:, 1:], [world.model.nq], axis=1)
     return Film(qpos, qvel, sensed)
