@@ -6,6 +6,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -161,6 +162,31 @@ def test_workers_are_used_again(c_world: model.World, pushed: tuple, monkeypatch
     check([0])
     with concurrent.futures.ThreadPoolExecutor() as threads:
         list(threads.map(check, [[0, 1, 2], [2, 0], [1]] * 4))
+
+
+def test_scenes_leave_nothing_behind_in_a_room(c_world: model.World, pushed: tuple):
+    """Claim: after any scene a room's model is, byte for byte, that of a room that never saw another."""
+    _, _, drive = pushed
+    scenes = [
+        conftest.place(cube=(0.06, 0.0, 0.0)),
+        conftest.place(prism=(-0.1, 0.1, 0.4)),
+        conftest.place(cube=(0.06, 0.0, 0.0), other=(-0.1, 0.0, 0.0), prism=(0.0, 0.1, 0.0)),
+    ]
+    scenes.append(dataclasses.replace(scenes[2], half_size=1.1 * np.asarray(scenes[2].half_size)))
+    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), drive) for one in scenes]
+
+    def after(workers: c_physics.Workers, row: tuple) -> bytes:
+        with workers.room() as room:
+            c_physics._roll(c_world, room, *row)
+            content = np.zeros(mujoco.mj_sizeModel(room.exact), np.uint8)
+            mujoco.mj_saveModel(room.exact, None, content)
+        return content.tobytes()
+
+    wanted = [after(c_physics.Workers(c_world.model), row) for row in rows]
+    assert len(set(wanted)) == len(rows)
+    used = c_physics.Workers(c_world.model)
+    for i in (0, 1, 2, 3, 2, 1, 3, 0, 2, 0):
+        assert after(used, rows[i]) == wanted[i]
 
 
 def test_world_of_mjx_is_refused(world: model.World):
