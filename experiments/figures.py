@@ -9,6 +9,7 @@ import matplotlib
 
 matplotlib.use("Agg")  # no display
 import matplotlib.pyplot as plt
+from matplotlib import ticker
 
 from csac_jax.show import charts, report, results
 
@@ -60,12 +61,29 @@ def steps() -> None:
             points = record["points"]
             what = f"{record['preset']}, {record['physics']}, {record['device']}"
             panel.plot([p[curve] for p in points], [p["step_seconds"] for p in points], "o-", label=what)
+            grown = [(p[curve] / points[0][curve]) ** (2 if curve == "map" else 1) for p in points]
+            panel.plot(
+                [p[curve] for p in points],
+                [points[0]["step_seconds"] * times for times in grown],
+                ":",
+                color="grey",
+                label="in proportion to cells" if curve == "map" else "in proportion",
+            )
         panel.set(xlabel=label, ylabel="time of a training step, s", yscale="log")
         panel.set_xscale("log", base=2)
+        _plain_numbers(panel)
         panel.grid(alpha=0.3)
         panel.legend(fontsize="small")
         figure.savefig(FIGURES / f"step-{curve}.png", dpi=110, metadata={"Software": None})
         plt.close(figure)
+
+
+def _plain_numbers(panel: Any) -> None:
+    """Ticks of logarithmic axes without powers."""
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.yaxis.set_minor_locator(ticker.LogLocator(subs=(2.0, 5.0)))
+    panel.yaxis.set_minor_formatter("{x:g}")
 
 
 def sweeps() -> None:
@@ -86,6 +104,7 @@ def sweeps() -> None:
             over.plot([row["devices"] for row in rows], times, "o-", label=name)
     at.set(xlabel="seeds side by side", ylabel="time of a training step, s", yscale="log")
     at.set_xscale("log", base=2)
+    _plain_numbers(at)
     most = max((row["devices"] for record in records for row in record["rows"]), default=1)
     over.plot([1, most], [1, most], ":", color="grey", label="as many times as devices")
     over.set(xlabel="devices", ylabel="times as fast as one", xticks=range(1, most + 1))
