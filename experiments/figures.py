@@ -57,18 +57,14 @@ def steps() -> None:
         if not records:
             continue
         figure, panel = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
+        power = 2 if curve == "map" else 1
         for record in records:
             points = record["points"]
             what = f"{record['preset']}, {record['physics']}, {record['device']}"
-            panel.plot([p[curve] for p in points], [p["step_seconds"] for p in points], "o-", label=what)
-            grown = [(p[curve] / points[0][curve]) ** (2 if curve == "map" else 1) for p in points]
-            panel.plot(
-                [p[curve] for p in points],
-                [points[0]["step_seconds"] * times for times in grown],
-                ":",
-                color="grey",
-                label="in proportion to cells" if curve == "map" else "in proportion",
-            )
+            sizes, seconds = zip(*((p[curve], p["step_seconds"]) for p in points), strict=True)
+            panel.plot(sizes, seconds, "o-", label=what)
+            grown = [seconds[0] * (size / sizes[0]) ** power for size in sizes]
+            panel.plot(sizes, grown, ":", color="grey", label="in proportion" + " to cells" * (power == 2))
         panel.set(xlabel=label, ylabel="time of a training step, s", yscale="log")
         panel.set_xscale("log", base=2)
         _plain_numbers(panel)

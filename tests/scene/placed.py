@@ -1,4 +1,4 @@
-"""Blocks of a scene in C MuJoCo, where they lie, for the tests of this folder."""
+"""Blocks of a scene in C MuJoCo, where they lie, and what a model of theirs is made of."""
 
 import jax
 import mujoco
@@ -29,3 +29,10 @@ def case_in_c(case: cases.Case) -> tuple[model.World, mujoco.MjModel, mujoco.MjD
     """The blocks of a case in C MuJoCo."""
     world = model.build(SceneConfig(slots=case.slots, min_blocks=1), SimConfig())
     return world, *in_c(world, case.scene)
+
+
+def model_bytes(exact: mujoco.MjModel) -> bytes:
+    """All of a model."""
+    content = np.zeros(mujoco.mj_sizeModel(exact), np.uint8)
+    mujoco.mj_saveModel(exact, None, content)
+    return content.tobytes()

@@ -8,6 +8,7 @@ import pytest
 from csac_jax.config import SceneConfig, SimConfig
 from csac_jax.scene import blocks, layout, model
 from csac_jax.scene.layout import Scene
+from tests.scene import placed
 
 SLOTS = ("box", "box", "arch", "prism", "half_cylinder", "cylinder")
 CONFIG = SceneConfig(slots=SLOTS, min_blocks=1)
@@ -101,15 +102,9 @@ def test_with_blocks_writes_over_an_earlier_copy(world: model.World):
     """Claim: written into a copy of other blocks, a model is byte for byte the one that is made anew."""
     earlier = model.with_blocks(world, _fields(world, _scene(scale=0.8)))
     anew = model.with_blocks(world, _fields(world, _scene(scale=0.9)))
-    before = _bytes(earlier)
+    before = placed.model_bytes(earlier)
     assert model.with_blocks(world, _fields(world, _scene(scale=0.9)), mujoco.MjData(world.model), earlier) is earlier
-    assert before != _bytes(earlier) == _bytes(anew)
-
-
-def _bytes(saved: mujoco.MjModel) -> bytes:
-    room = np.zeros(mujoco.mj_sizeModel(saved), np.uint8)
-    mujoco.mj_saveModel(saved, None, room)
-    return room.tobytes()
+    assert before != placed.model_bytes(earlier) == placed.model_bytes(anew)
 
 
 def test_addresses_name_what_they_say(world: model.World):

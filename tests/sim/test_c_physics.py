@@ -6,13 +6,13 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
 from csac_jax.scene import layout, model
 from csac_jax.sim import c_physics, primitives, robot
 from csac_jax.sim.robot import Drive
+from tests.scene import placed
 from tests.sim import conftest
 
 pytestmark = pytest.mark.mjx
@@ -116,10 +116,7 @@ def test_limit_of_speed_is_held_after_every_substep(
     monkeypatch.setattr(layout, "SPEED_LIMIT", limit)
     wanted = c_physics.film(c_world, fields, scene, drive)
     (seen,) = _roll(c_world, c_physics.Workers(c_world.model), [(scene, fields, drive)])
-    places, dofs = (
-        c_world.block_qpos[0],
-        c_world.block_dofs[0],
-    )  # of the cube: parked blocks fall in one alone
+    places, dofs = c_world.block_qpos[0], c_world.block_dofs[0]  # the cube's: parked blocks fall in one alone
     at_limit = (np.abs(wanted.qvel[:, dofs]) == limit).any(axis=1)
     assert at_limit.any()
     assert (at_limit[:-1] & ~at_limit[1:]).any()  # and below it again
@@ -178,9 +175,7 @@ def test_scenes_leave_nothing_behind_in_a_room(c_world: model.World, pushed: tup
     def after(workers: c_physics.Workers, row: tuple) -> bytes:
         with workers.room() as room:
             c_physics._roll(c_world, room, *row)
-            content = np.zeros(mujoco.mj_sizeModel(room.exact), np.uint8)
-            mujoco.mj_saveModel(room.exact, None, content)
-        return content.tobytes()
+            return placed.model_bytes(room.exact)
 
     wanted = [after(c_physics.Workers(c_world.model), row) for row in rows]
     assert len(set(wanted)) == len(rows)
