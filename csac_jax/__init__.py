@@ -1,4 +1,5 @@
-"""A robot learns to push and grasp in clutter: physics, vision, networks and learner in one JAX program.
+"""A robot learns to push and grasp in clutter: physics, vision, networks and learner in one JAX
+program.
 
 Map, in the direction of data; imports point only backwards along it:
 
@@ -16,14 +17,16 @@ Map, in the direction of data; imports point only backwards along it:
     show        progress and pictures
     cli         the command `csac-jax`, a file per subcommand
 
-Axis letters: E scenes in the batch, B learner batch, N block slots, G geoms, R rays, K rotations, H W heightmap rows
-and columns, J CEM candidates, A action dimensions, C replay capacity, S seeds, T scan time.
+Axis letters: E scenes in the batch, B learner batch, N block slots, G geoms, R rays, K rotations, H
+W heightmap rows and columns, J CEM candidates, A action dimensions, C replay capacity, S seeds, T
+scan time.
 
-Units are SI, angles rad; a name carries its unit only where it is not SI (`_mm`, `_deg`, `_px`). The frame is the
-robot base's, moved so that the centre of the workspace on the table is (0, 0, 0), z up. `T_a_b` maps b to a. Masks
-say what is true: `valid`, never `mask`.
+Units are SI, angles rad; a name carries its unit only where it is not SI (`_mm`, `_deg`, `_px`).
+The frame is the robot base's, moved so that the centre of the workspace on the table is (0, 0, 0),
+z up. `T_a_b` maps b to a. Masks say what is true: `valid`, never `mask`.
 
-Importing this package sets environment variables that JAX reads as it starts, see `_guard`: import it first.
+Importing this package sets environment variables that JAX reads as it starts, see `_guard`: import
+it first.
 """
 
 from csac_jax import _guard

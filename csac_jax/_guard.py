@@ -18,7 +18,9 @@ import re
 import sys
 
 BROKEN_JAX = ("0.10.2",)
-FUSION_FLAG = "--xla_cpu_experimental_ynn_fusion_type"  # given no types, it switches that kind of fusion off
+FUSION_FLAG = (
+    "--xla_cpu_experimental_ynn_fusion_type"  # given no types, it switches that kind of fusion off
+)
 FUSION_SERIES = "0.10."  # versions of jaxlib that are known to have the flag: XLA ends the process on one it lacks
 POOL_VARIABLE = "PJRT_NPROC"  # goes before NPROC
 USER_VARIABLES = (POOL_VARIABLE, "NPROC")  # what a user may have set
@@ -50,7 +52,10 @@ def switch_off_broken_partitioner() -> None:
 
     A JAX that is imported already has read the variable, and is told.
     """
-    if not importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES) or PARTITIONER_VARIABLE in os.environ:
+    if (
+        not importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES)
+        or PARTITIONER_VARIABLE in os.environ
+    ):
         return
     os.environ[PARTITIONER_VARIABLE] = "false"
     if "jax" in sys.modules:
@@ -64,7 +69,8 @@ def widen_thread_pool() -> None:
 
 
 def needed_threads() -> int:
-    """Threads in the pool without which batched MJX may hang, by the virtual devices that XLA is told to make."""
+    """Threads in the pool without which batched MJX may hang, by the virtual devices that XLA is
+    told to make."""
     counts = re.findall(rf"{DEVICES_FLAG}=(\d+)", os.environ.get("XLA_FLAGS", "")) or ["1"]
     return max(MIN_THREADS, DEVICE_THREADS * int(counts[-1]))
 

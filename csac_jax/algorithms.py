@@ -1,7 +1,9 @@
-"""The CSAC family and its baselines: each a function from a config to a config, for one and the same learner.
+"""The CSAC family and its baselines: each a function from a config to a config, for one and the
+same learner.
 
-A function sets what makes its algorithm; sizes, rates, exploration of places and the run's length stay the preset's, so
-that two algorithms on one preset differ in nothing else. `docs/paper.md` has the table of what differs.
+A function sets what makes its algorithm; sizes, rates, exploration of places and the run's length
+stay the preset's, so that two algorithms on one preset differ in nothing else. `docs/paper.md` has
+the table of what differs.
 """
 
 import dataclasses
@@ -11,7 +13,7 @@ from typing import Any
 from csac_jax.config import Algo, Config, RewardConfig
 
 VPG_REWARD = RewardConfig(
-    reach=0.0,
+    success_bonus=0.0,
     nothing=0.0,
     empty=0.0,
     touched=0.0,
@@ -21,12 +23,15 @@ VPG_REWARD = RewardConfig(
     push_better=1.0,
     push_worse=0.0,
 )
-"""Rewards of VPG (arXiv:1803.09956 sec. IV): 1 for a grasp that lifts, 0.5 = Gamma for a push that changes the map."""
+"""Rewards of VPG (arXiv:1803.09956 sec. IV): 1 for a grasp that lifts, 0.5 = Gamma for a push that
+changes the map."""
 
 
 def _change(cfg: Config, **sections: dict[str, Any]) -> Config:
     """The config with the given fields of the given sections changed."""
-    changed = {name: dataclasses.replace(getattr(cfg, name), **fields) for name, fields in sections.items()}
+    changed = {
+        name: dataclasses.replace(getattr(cfg, name), **fields) for name, fields in sections.items()
+    }
     return dataclasses.replace(cfg, **changed)
 
 
@@ -52,30 +57,50 @@ def csac_beta(cfg: Config) -> Config:
 
 
 def vpg(cfg: Config) -> Config:
-    """VPG, arXiv:1803.09956: best pixel, maximum target with discount 0.5 by the network itself, no actor, power law.
+    """VPG, arXiv:1803.09956: best pixel, maximum target with discount 0.5 by the network itself, no
+    actor, power law.
 
-    Deviations: Adam for SGD with momentum, batches for single transitions, random places while learning as for all.
+    Deviations: Adam for SGD with momentum, batches for single transitions, random places while
+    learning as for all.
     """
     return _change(
         dataclasses.replace(cfg, reward=VPG_REWARD),
         policy={"place": "argmax", "primitive": "argmax"},
         target={"value": "max", "gamma": 0.5},
-        explore={"noise_std": 0.0, "primitive_start": 0.5, "primitive_end": 0.1, "push_fraction": 0.5},
-        learn={"actor": False, "critics": 1, "loss": "huber", "target_update": "hard", "copy_every": 1},
-        replay={"sampler": "beta", "beta_start": (1.0, 2.0), "beta_middle": (1.0, 2.0), "beta_end": (1.0, 2.0)},
+        explore={
+            "noise_std": 0.0,
+            "epsilon_primitive_start": 0.5,
+            "epsilon_primitive_end": 0.1,
+            "push_fraction": 0.5,
+        },
+        learn={
+            "actor": False,
+            "critics": 1,
+            "loss": "huber",
+            "target_update": "hard",
+            "target_update_period": 1,
+        },
+        replay={
+            "sampler": "beta",
+            "beta_start": (1.0, 2.0),
+            "beta_middle": (1.0, 2.0),
+            "beta_end": (1.0, 2.0),
+        },
     )
 
 
 def reactive(cfg: Config) -> Config:
     """VPG's baseline P+G reactive: no future, gamma = 0.
 
-    Deviation: VPG's classifies outcomes as good or bad by cross-entropy; here their rewards are regressed.
+    Deviation: VPG's classifies outcomes as good or bad by cross-entropy; here their rewards are
+    regressed.
     """
     return _change(vpg(cfg), target={"gamma": 0.0})
 
 
 def grasp_only(cfg: Config) -> Config:
-    """The baseline Grasping-only of CSAC sec. 4.1 and VPG: greedy, deterministic, never pushes, no future.
+    """The baseline Grasping-only of CSAC sec. 4.1 and VPG: greedy, deterministic, never pushes, no
+    future.
 
     Deviation: as of `reactive`.
     """
@@ -93,7 +118,8 @@ ALGORITHMS: dict[Algo, Callable[[Config], Config]] = {
 
 
 def configure(cfg: Config, name: str) -> Config:
-    """The config made one of the algorithm `name`. Raises ValueError if there is none, naming those that there are."""
+    """The config made one of the algorithm `name`. Raises ValueError if there is none, naming those
+    that there are."""
     for algo, change in ALGORITHMS.items():
         if algo == name:
             return dataclasses.replace(change(cfg), algo=algo)

@@ -1,7 +1,8 @@
 """Poses, angles, and the map from heightmap cells to metres and back.
 
-Quaternions are (w, x, y, z), of unit length. Heightmap rows run along y and columns along x; row 0 and column 0 lie at
-the lowest y and x; a whole-numbered (row, col) is the centre of a cell. Shapes `[..., n]` may have any leading axes.
+Quaternions are (w, x, y, z), of unit length. Heightmap rows run along y and columns along x; row 0
+and column 0 lie at the lowest y and x; a whole-numbered (row, col) is the centre of a cell. Shapes
+`[..., n]` may have any leading axes.
 """
 
 import jax
@@ -42,7 +43,8 @@ def quat_from_yaw(yaw: jax.Array) -> jax.Array:
 
 
 def rotate2d(yaw: jax.Array, xy: jax.Array) -> jax.Array:
-    """Points `xy` [..., 2] m turned by `yaw` [] rad about the origin, counter-clockwise seen from above."""
+    """Points `xy` [..., 2] m turned by `yaw` [] rad about the origin, counter-clockwise seen from
+    above."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = xy[..., 0], xy[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
@@ -51,20 +53,22 @@ def rotate2d(yaw: jax.Array, xy: jax.Array) -> jax.Array:
 def wrap_angle(angle: jax.Array) -> jax.Array:
     """The same direction in [0, 2 pi) rad, any shape.
 
-    The remainder of a tiny negative angle rounds to 2 pi itself in float32, and that of a denormal stays negative: both
-    are turned into 0.
+    The remainder of a tiny negative angle rounds to 2 pi itself in float32, and that of a denormal
+    stays negative: both are turned into 0.
     """
     wrapped = jnp.mod(angle, _TURN)
     return jnp.where((wrapped >= _TURN) | (wrapped <= 0.0), 0.0, wrapped)
 
 
 def to_pixel(cfg: HeightmapConfig, xy: jax.Array) -> jax.Array:
-    """Heightmap position (row, col) [..., 2] of the points `xy` [..., 2] m; cell centres are whole numbers."""
+    """Heightmap position (row, col) [..., 2] of the points `xy` [..., 2] m; cell centres are whole
+    numbers."""
     return xy[..., ::-1] / cfg.cell + 0.5 * (cfg.size - 1)
 
 
 def from_pixel(cfg: HeightmapConfig, row_col: jax.Array) -> jax.Array:
-    """Points xy [..., 2] m of the heightmap positions `row_col` [..., 2]: x = (col + 0.5) cell - extent / 2."""
+    """Points xy [..., 2] m of the heightmap positions `row_col` [..., 2]: x = (col + 0.5) cell -
+    extent / 2."""
     return (row_col[..., ::-1] - 0.5 * (cfg.size - 1)) * cfg.cell
 
 

@@ -23,12 +23,15 @@ from csac_jax.config import (
 def quick() -> Config:
     """Learns to clear five blocks on a 2-core CPU; what was measured is in experiments/results.
 
-    Blocks of one shape are alike in size, density and friction.
-    Its discount and the end of its Beta law, (1, 4), are away from the literature's defaults; neither is shown to be
-    needed. What it costs: experiments/bench/NOTES.md. The actor learns on a part of the batch, which spares passes; the
-    net's features lie 28 mm apart, not 14, for cheaper passes, its maps' cells still 14, and its layers see as far.
+    Blocks of one shape are alike in size, density and friction. Its discount and the end of its
+    Beta law, (1, 4), are away from the literature's defaults; neither is shown to be needed. What
+    it costs: experiments/bench/NOTES.md. The actor learns on a part of the batch, which spares
+    passes; the net's features lie 28 mm apart, not 14, for cheaper passes, its maps' cells still
+    14, and its layers see as far.
     """
-    alike = SceneConfig(size_spread=0.0, mesh_spread=0.0, density=(600.0, 600.0), friction=(0.8, 0.8))
+    alike = SceneConfig(
+        size_jitter=0.0, mesh_size_jitter=0.0, density=(600.0, 600.0), friction=(0.8, 0.8)
+    )
     return Config(
         preset="quick",
         scene=alike,
@@ -41,47 +44,76 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, three quarters of the scenes packed, 2,048 side by side, for one GPU.
+    """Ten blocks of all eight shapes, three quarters of the scenes packed, 2,048 side by side, for
+    one GPU.
 
-    Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A failed grasp costs
-    more than a push that is not worth it, half of the random primitives are pushes, and blocks that leave cost. Physics
-    is Warp's where it is installed, hence meshes are of one size. What it learns so, and otherwise:
-    experiments/bench/NOTES.md.
+    Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A
+    failed grasp costs more than a push that is not worth it, half of the random primitives are
+    pushes, and blocks that leave cost. Physics is Warp's where it is installed, hence meshes are of
+    one size. What it learns so, and otherwise: experiments/bench/NOTES.md.
     """
     return Config(
         preset="fast",
         scene=SceneConfig(
-            slots=("box", "box", "arch", "prism", "box", "cylinder", "half_cylinder", "box", "box", "box"),
+            slots=(
+                "box",
+                "box",
+                "arch",
+                "prism",
+                "box",
+                "cylinder",
+                "half_cylinder",
+                "box",
+                "box",
+                "box",
+            ),
             min_blocks=10,
             pool=4096,
             arranged=0.75,
             drop_extent=(0.1, 0.25),
-            mesh_spread=0.0,
+            mesh_size_jitter=0.0,
         ),
         task=TaskConfig(max_actions=25),
         sim=SimConfig(physics="auto", geom_pairs=24, contacts=80),
         net=NetConfig(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         target=TargetConfig(gamma=0.2),
-        reward=RewardConfig(nothing=-1.5, empty=-1.5, touched=-1.5, dropped=-1.0, left=3.0),
-        explore=ExploreConfig(primitive_end=0.2, push_fraction=0.5, decay=0.9999),
+        reward=RewardConfig(
+            nothing=-1.5, empty=-1.5, touched=-1.5, dropped=-1.0, lost_block_penalty=3.0
+        ),
+        explore=ExploreConfig(epsilon_primitive_end=0.2, push_fraction=0.5, decay=0.9999),
         learn=LearnConfig(batch=64, updates=64, augment_shift=8, critics=2, loss="squared"),
         replay=ReplayConfig(capacity=65536, beta_end=(1.0, 4.0)),
-        train=TrainConfig(scenes=2048, actions=163840, warmup=4096, chunk=2, save_every=20),
+        train=TrainConfig(
+            scenes=2048, actions=163840, learning_starts=4096, chunk=2, save_every=20
+        ),
     )
 
 
 def paper() -> Config:
-    """The protocol of the paper, for one GPU: DenseNet-121 on maps of 224 cells, one scene, 2,500 actions, ten blocks.
+    """The protocol of the paper, for one GPU: DenseNet-121 on maps of 224 cells, one scene, 2,500
+    actions, ten blocks.
 
-    Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per action; places are
-    explored by action noise alone, and nothing is augmented. Where the paper is silent: tau of SD3, two pixels per cell
-    and two transitions per update, as many as in VPG, one of them for the actor, and, ours, `policy.mask`. Physics is
-    C's, the fastest for one scene. Result: experiments/results/paper-h200.
+    Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per
+    action; places are explored by action noise alone, and nothing is augmented. Where the paper is
+    silent: tau of SD3, two pixels per cell and two transitions per update, as many as in VPG, one
+    of them for the actor, and, ours, `policy.mask`. Physics is C's, the fastest for one scene.
+    Result: experiments/results/paper-h200.
     """
     return Config(
         preset="paper",
         scene=SceneConfig(
-            slots=("box", "box", "arch", "prism", "box", "cylinder", "half_cylinder", "box", "box", "box"),
+            slots=(
+                "box",
+                "box",
+                "arch",
+                "prism",
+                "box",
+                "cylinder",
+                "half_cylinder",
+                "box",
+                "box",
+                "box",
+            ),
             min_blocks=10,
             pool=256,
         ),
@@ -90,11 +122,11 @@ def paper() -> Config:
         heightmap=HeightmapConfig(size=224),
         net=NetConfig(kind="densenet121", norm="batch", head=64, margin=0.4286, zoom=2),
         target=TargetConfig(gamma=0.5),
-        explore=ExploreConfig(place_start=0.0, decay=0.9998, push_fraction=0.5),
+        explore=ExploreConfig(epsilon_place_start=0.0, decay=0.9998, push_fraction=0.5),
         learn=LearnConfig(
             learning_rate=1e-4,
             actor_learning_rate=1e-4,
-            rate_end=1.0,
+            lr_final_fraction=1.0,
             batch=2,
             actor_batch=1,
             updates=1,
@@ -102,46 +134,51 @@ def paper() -> Config:
             tau=0.005,
         ),
         replay=ReplayConfig(capacity=2500),
-        train=TrainConfig(scenes=1, actions=2500, warmup=8, chunk=50, save_every=10),
+        train=TrainConfig(scenes=1, actions=2500, learning_starts=8, chunk=50, save_every=10),
     )
 
 
 def paper_small() -> Config:
-    """The protocol of `paper` with the small net on maps of 64 cells: one scene of ten blocks, 2,500 actions.
+    """The protocol of `paper` with the small net on maps of 64 cells: one scene of ten blocks,
+    2,500 actions.
 
-    Ours, beside the net: batches of 32, and with them Adam 1e-3; no more than one update an action, and shifts of what
-    is drawn from the replay, lest 2,500 actions be learned by heart; the squared error of Algorithm 1 line 21; discount
-    0.2; SD3's twin critics; random places at first and exploration that ends after some 1,000 actions, as in `quick`.
-    Meshes are of one size, which `sim.physics warp` needs. What each is worth: experiments/bench/NOTES.md; results:
+    Ours, beside the net: batches of 32, and with them Adam 1e-3; no more than one update an action,
+    and shifts of what is drawn from the replay, lest 2,500 actions be learned by heart; the squared
+    error of Algorithm 1 line 21; discount 0.2; SD3's twin critics; random places at first and
+    exploration that ends after some 1,000 actions, as in `quick`. Meshes are of one size, which
+    `sim.physics warp` needs. What each is worth: experiments/bench/NOTES.md; results:
     experiments/results/paper-small-h200.
     """
     whole = paper()
     return dataclasses.replace(
         whole,
         preset="paper_small",
-        scene=dataclasses.replace(whole.scene, mesh_spread=0.0),
+        scene=dataclasses.replace(whole.scene, mesh_size_jitter=0.0),
         heightmap=HeightmapConfig(),
         net=NetConfig(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         target=TargetConfig(gamma=0.2),
         explore=ExploreConfig(),
         learn=LearnConfig(batch=32, updates=1, augment_shift=8, critics=2, loss="squared"),
-        train=dataclasses.replace(whole.train, warmup=32),
+        train=dataclasses.replace(whole.train, learning_starts=32),
     )
 
 
 def smoke() -> Config:
-    """The whole pipeline in 64 actions, for tests: everything small, nothing left out, nothing learned."""
+    """The whole pipeline in 64 actions, for tests: everything small, nothing left out, nothing
+    learned."""
     return Config(
         preset="smoke",
         scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=8, settle_time=1.0),
-        sim=SimConfig(grasp_phases=(20, 15, 20), push_phases=(15, 25, 15), geom_pairs=6, contacts=16),
+        sim=SimConfig(
+            grasp_phases=(20, 15, 20), push_phases=(15, 25, 15), geom_pairs=6, contacts=16
+        ),
         heightmap=HeightmapConfig(size=32),
         net=NetConfig(rotations=4, growth=4, dilations=(1, 2), stem=4, head=4),
         cem=CEMConfig(candidates=16, elites=4, rounds=2),
         target=TargetConfig(samples=8),
         learn=LearnConfig(batch=8, updates=1),
         replay=ReplayConfig(capacity=64),
-        train=TrainConfig(scenes=2, actions=64, warmup=8, chunk=4, save_every=2),
+        train=TrainConfig(scenes=2, actions=64, learning_starts=8, chunk=4, save_every=2),
     )
 
 

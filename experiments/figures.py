@@ -1,5 +1,5 @@
-"""Figures of recorded results, drawn anew by `make figures` into docs/figures: the samplers' speed, and whatever
-`csac-jax report experiments/results` draws."""
+"""Figures of recorded results, drawn anew by `make figures` into docs/figures: the samplers' speed,
+and whatever `csac-jax report experiments/results` draws."""
 
 import json
 from pathlib import Path
@@ -11,11 +11,16 @@ matplotlib.use("Agg")  # no display
 import matplotlib.pyplot as plt
 from matplotlib import ticker
 
-from csac_jax.show import charts, report, results
+from csac_jax.report import charts, report, results
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, FIGURES = ROOT / "experiments" / "results", ROOT / "docs" / "figures"
-SAMPLERS = {"uniform": "uniform", "prioritised": "prioritised", "beta": "beta", "flashbax": "prioritised, flashbax"}
+SAMPLERS = {
+    "uniform": "uniform",
+    "prioritised": "prioritised",
+    "beta": "beta",
+    "flashbax": "prioritised, flashbax",
+}
 
 
 def _read(*names: str) -> list[dict[str, Any]]:
@@ -23,12 +28,15 @@ def _read(*names: str) -> list[dict[str, Any]]:
 
 
 def replay() -> None:
-    """Time to draw 64 transitions and replace their priorities against the ring's capacity, on a CPU and a GPU."""
+    """Time to draw 64 transitions and replace their priorities against the ring's capacity, on a
+    CPU and a GPU."""
     records = {
         "2-core CPU, busy": _read("bench-replay-cpu.json"),
         "H200": _read("bench-replay-h200-12.json", "bench-replay-h200-18.json"),
     }
-    figure, panels = plt.subplots(1, len(records), figsize=(9, 3.4), sharey=True, layout="constrained")
+    figure, panels = plt.subplots(
+        1, len(records), figsize=(9, 3.4), sharey=True, layout="constrained"
+    )
     for panel, (device, parts) in zip(panels, records.items(), strict=True):
         rows = [row for part in parts for row in part["capacities"]]
         for name, label in SAMPLERS.items():
@@ -51,9 +59,13 @@ CURVES = {
 
 
 def steps() -> None:
-    """Time of a training step against what grows, one figure for each curve that `bench step --curve` recorded."""
+    """Time of a training step against what grows, one figure for each curve that `bench step
+    --curve` recorded."""
     for curve, label in CURVES.items():
-        records = [json.loads(path.read_text()) for path in sorted(RESULTS.glob(f"bench-step-*-{curve}.json"))]
+        records = [
+            json.loads(path.read_text())
+            for path in sorted(RESULTS.glob(f"bench-step-*-{curve}.json"))
+        ]
         if not records:
             continue
         figure, panel = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
@@ -64,7 +76,9 @@ def steps() -> None:
             sizes, seconds = zip(*((p[curve], p["step_seconds"]) for p in points), strict=True)
             panel.plot(sizes, seconds, "o-", label=what)
             grown = [seconds[0] * (size / sizes[0]) ** power for size in sizes]
-            panel.plot(sizes, grown, ":", color="grey", label="in proportion" + " to cells" * (power == 2))
+            panel.plot(
+                sizes, grown, ":", color="grey", label="in proportion" + " to cells" * (power == 2)
+            )
         panel.set(xlabel=label, ylabel="time of a training step, s", yscale="log")
         panel.set_xscale("log", base=2)
         _plain_numbers(panel)
@@ -83,7 +97,8 @@ def _plain_numbers(panel: Any) -> None:
 
 
 def sweeps() -> None:
-    """Time of a step against seeds side by side, and by how much several devices are faster than one."""
+    """Time of a step against seeds side by side, and by how much several devices are faster than
+    one."""
     records = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("bench-sweep-*.json"))]
     seeds, at = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
     devices, over = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
@@ -92,7 +107,10 @@ def sweeps() -> None:
         alone = [row for row in rows if row["devices"] == 1]
         if len(alone) > 1:
             at.plot(
-                [row["seeds"] for row in alone], [row["seconds"] / record["steps"] for row in alone], "o-", label=name
+                [row["seeds"] for row in alone],
+                [row["seconds"] / record["steps"] for row in alone],
+                "o-",
+                label=name,
             )
         if len(alone) < len(rows):
             name = f"{record['shard']}: {rows[0]['seeds']} x {record['scenes']} scenes, {record['preset']}"

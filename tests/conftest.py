@@ -6,7 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "0")  # tests compile what they test, their own processes too
+os.environ.setdefault(
+    "JAX_ENABLE_COMPILATION_CACHE", "0"
+)  # tests compile what they test, their own processes too
 
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 
@@ -15,7 +17,8 @@ import jax  # isort: skip
 
 @pytest.fixture(autouse=True)
 def strict_jax(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Silent broadcasting, promotion and key reuse are errors, except through the code of MJX and optax."""
+    """Silent broadcasting, promotion and key reuse are errors, except through the code of MJX and
+    optax."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(jax.debug_key_reuse(True))
         if not request.node.get_closest_marker("mjx"):

@@ -19,7 +19,7 @@ from csac_jax.config import (
     RewardConfig,
     TargetConfig,
 )
-from csac_jax.train import config_json
+from csac_jax.io import config_json
 
 DOC = Path(__file__).parents[1] / "docs/paper.md"
 NAMES = list(algorithms.ALGORITHMS)
@@ -40,7 +40,8 @@ def test_presets_are_csac_beta(preset):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_algorithms_are_idempotent_and_survive_json(name):
-    """Claim: to configure twice is to configure once; a config names its algorithm and comes back from JSON."""
+    """Claim: to configure twice is to configure once; a config names its algorithm and comes back
+    from JSON."""
     cfg = algorithms.configure(presets.quick(), name)
     assert cfg.algo == name
     assert algorithms.configure(cfg, name) == cfg
@@ -49,24 +50,41 @@ def test_algorithms_are_idempotent_and_survive_json(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_sizes_stay_the_presets(name):
-    """Claim: an algorithm changes nothing of scenes, physics, maps, nets, lengths, batches, rates and random places."""
+    """Claim: an algorithm changes nothing of scenes, physics, maps, nets, lengths, batches, rates
+    and random places."""
     before, after = presets.quick(), algorithms.configure(presets.quick(), name)
     for section in ("scene", "sim", "heightmap", "net", "cem", "train"):
         assert getattr(before, section) == getattr(after, section)
-    for field in ("batch", "updates", "learning_rate", "rate_end", "augment", "gradient_clip", "tau"):
+    for field in (
+        "batch",
+        "updates",
+        "learning_rate",
+        "lr_final_fraction",
+        "augment",
+        "gradient_clip",
+        "tau",
+    ):
         assert getattr(before.learn, field) == getattr(after.learn, field)
-    for field in ("place_start", "place_end", "decay"):
+    for field in ("epsilon_place_start", "epsilon_place_end", "decay"):
         assert getattr(before.explore, field) == getattr(after.explore, field)
     assert before.replay.capacity == after.replay.capacity
 
 
 def test_vpg_by_hand():
-    """Claim: VPG's numbers: discount 0.5, primitive at random 0.5 -> 0.1, half of those pushes, maximum over pixels by
-    the network itself, no actor, power law Beta(1, 2)."""
+    """Claim: VPG's numbers: discount 0.5, primitive at random 0.5 -> 0.1, half of those pushes,
+    maximum over pixels by the network itself, no actor, power law Beta(1, 2)."""
     cfg = algorithms.configure(presets.quick(), "vpg")
     assert (cfg.target.gamma, cfg.target.value, cfg.policy.place) == (0.5, "max", "argmax")
-    assert (cfg.explore.primitive_start, cfg.explore.primitive_end, cfg.explore.push_fraction) == (0.5, 0.1, 0.5)
-    assert (cfg.learn.target_update, cfg.learn.copy_every, cfg.learn.actor) == ("hard", 1, False)
+    assert (
+        cfg.explore.epsilon_primitive_start,
+        cfg.explore.epsilon_primitive_end,
+        cfg.explore.push_fraction,
+    ) == (0.5, 0.1, 0.5)
+    assert (cfg.learn.target_update, cfg.learn.target_update_period, cfg.learn.actor) == (
+        "hard",
+        1,
+        False,
+    )
     assert cfg.replay.sampler == "beta"
     assert cfg.replay.beta_start == cfg.replay.beta_middle == cfg.replay.beta_end == (1.0, 2.0)
 
@@ -83,28 +101,29 @@ def test_unknown_algorithm_names_the_known():
         (lambda: CEMConfig(candidates=5, elites=6), "cem.elites"),
         (lambda: CEMConfig(elites=1), "cem.elites"),
         (lambda: CEMConfig(start="somewhere"), "cem.start"),
-        (lambda: CEMConfig(spread="var"), "cem.spread"),
+        (lambda: CEMConfig(std_estimator="var"), "cem.std_estimator"),
         (lambda: PolicyConfig(place="best"), "policy.place"),
         (lambda: PolicyConfig(primitive="push"), "policy.primitive"),
         (lambda: TargetConfig(value="mean"), "target.value"),
         (lambda: TargetConfig(gamma=1.0), "target.gamma"),
         (lambda: RewardConfig(push_effect="depth"), "reward.push_effect"),
-        (lambda: RewardConfig(farthest=0.0), "reward.farthest"),
+        (lambda: RewardConfig(distance_cap=0.0), "reward.distance_cap"),
         (lambda: RewardConfig(push_level=2.0), "reward.push_level"),
-        (lambda: RewardConfig(distance=-1.0), "reward.distance"),
+        (lambda: RewardConfig(distance=-1.0), "reward.distance_weight"),
         (lambda: ExploreConfig(push_fraction=1.5), "explore.push_fraction"),
         (lambda: LearnConfig(loss="mse"), "learn.loss"),
         (lambda: LearnConfig(critics=0), "learn.critics"),
         (lambda: LearnConfig(critics=3), "learn.critics"),
         (lambda: LearnConfig(target_update="never"), "learn.target_update"),
-        (lambda: LearnConfig(copy_every=0), "learn.copy_every"),
+        (lambda: LearnConfig(target_update_period=0), "learn.target_update_period"),
         (lambda: LearnConfig(tau=0.0), "learn.tau"),
         (lambda: Config(algo="dqn"), "algo"),
         (lambda: Config(policy=PolicyConfig(primitive="grasp")), "explore.push_fraction"),
     ],
 )
 def test_bad_settings_are_refused(build, field):
-    """Claim: a setting out of range, or none of its choices, is refused as the config is built, by its name."""
+    """Claim: a setting out of range, or none of its choices, is refused as the config is built, by
+    its name."""
     with pytest.raises(ValueError, match=rf"^{field}\b"):
         build()
 
@@ -116,18 +135,23 @@ def _shown(cfg: Config, dotted: str) -> str:
 
 
 def table() -> list[str]:
-    """The rows of docs/paper.md that say what each algorithm sets, from the functions on the preset `quick`."""
+    """The rows of docs/paper.md that say what each algorithm sets, from the functions on the preset
+    `quick`."""
     configs = [algorithms.configure(presets.quick(), name) for name in NAMES]
     flat = [config_json.differences(configs[0], cfg) for cfg in configs]
     names = {name for row in flat for name in row if "." in name}
     ordered = [f"{s.name}.{f.name}" for s in dataclasses.fields(Config) if dataclasses.is_dataclass(s.type)
                for f in dataclasses.fields(s.type) if f"{s.name}.{f.name}" in names]  # fmt: skip
     head = ["| setting | " + " | ".join(NAMES) + " |", "|---" * (len(NAMES) + 1) + "|"]
-    return head + [f"| `{name}` | " + " | ".join(_shown(cfg, name) for cfg in configs) + " |" for name in ordered]
+    return head + [
+        f"| `{name}` | " + " | ".join(_shown(cfg, name) for cfg in configs) + " |"
+        for name in ordered
+    ]
 
 
 def test_document_has_the_table():
-    """Claim: the table of docs/paper.md is what the functions do to `quick`, every setting that differs."""
+    """Claim: the table of docs/paper.md is what the functions do to `quick`, every setting that
+    differs."""
     assert "\n".join(table()) in DOC.read_text()
 
 
@@ -138,5 +162,7 @@ def test_names_in_the_document_exist():
     for file, function in named:
         folder = "tests" if Path(file).name.startswith("test_") else "csac_jax"
         tree = ast.parse((DOC.parents[1] / folder / file).read_text())
-        names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        names = {
+            node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)
+        }
         assert not function or function in names, f"{file}::{function}"

@@ -1,5 +1,5 @@
-"""A config that cannot work is refused as it is built, by the name of the setting. Nets, replay, sensor, camera and
-algorithms have tables of their own beside their tests."""
+"""A config that cannot work is refused as it is built, by the name of the setting. Nets, replay,
+sensor, camera and algorithms have tables of their own beside their tests."""
 
 import dataclasses
 import re
@@ -20,7 +20,11 @@ def _config(settings: dict) -> Config:
         sections.setdefault(section, {})[field] = value
     own = sections.pop("", {})
     return dataclasses.replace(
-        cfg, **own, **{name: dataclasses.replace(getattr(cfg, name), **each) for name, each in sections.items()}
+        cfg,
+        **own,
+        **{
+            name: dataclasses.replace(getattr(cfg, name), **each) for name, each in sections.items()
+        },
     )
 
 
@@ -31,8 +35,8 @@ def _config(settings: dict) -> Config:
         ("scene.min_blocks", [0, 6]),
         ("scene.pool", [0]),
         ("scene.arranged", [-0.1, 1.1]),
-        ("scene.size_spread", [-0.1, 0.3]),
-        ("scene.mesh_spread", [-0.1, 0.3]),
+        ("scene.size_jitter", [-0.1, 0.3]),
+        ("scene.mesh_size_jitter", [-0.1, 0.3]),
         ("scene.density", [(50.0, 900.0), (900.0, 450.0), (450.0, 4000.0)]),
         ("scene.friction", [(0.05, 1.0), (1.0, 0.5), (0.5, 2.5)]),
         ("scene.drop_extent", [(0.04, 0.2), (0.2, 0.1), (0.2, 0.5)]),
@@ -40,7 +44,7 @@ def _config(settings: dict) -> Config:
         ("scene.settle_time", [0.4, 21.0]),
         ("task.kind", ["stack"]),
         ("task.max_actions", [0]),
-        ("task.max_idle", [0]),
+        ("task.max_steps_without_change", [0]),
         ("sim.physics", ["bullet"]),
         ("sim.robot", ["ur10"]),
         ("sim.timestep", [0.0004, 0.011]),
@@ -88,10 +92,10 @@ def _config(settings: dict) -> Config:
         ("reward.dead_band", [-0.1]),
         ("reward.nothing", [-0.4]),
         ("reward.lifted", [-0.1]),
-        ("explore.primitive_start", [-0.1, 1.1]),
-        ("explore.primitive_end", [-0.1, 1.1]),
-        ("explore.place_start", [-0.1, 1.1]),
-        ("explore.place_end", [-0.1, 1.1]),
+        ("explore.epsilon_primitive_start", [-0.1, 1.1]),
+        ("explore.epsilon_primitive_end", [-0.1, 1.1]),
+        ("explore.epsilon_place_start", [-0.1, 1.1]),
+        ("explore.epsilon_place_end", [-0.1, 1.1]),
         ("explore.push_fraction", [-0.1]),
         ("explore.decay", [0.0, 1.1]),
         ("explore.noise_std", [-0.1]),
@@ -99,7 +103,7 @@ def _config(settings: dict) -> Config:
         ("learn.learning_rate", [0.0]),
         ("learn.actor_learning_rate", [0.0]),
         ("learn.actor_batch", [-1]),
-        ("learn.rate_end", [0.0, 1.1]),
+        ("learn.lr_final_fraction", [0.0, 1.1]),
         ("learn.augment_shift", [-1, 65]),
         ("learn.augment_turn", [-0.1, 3.2]),
         ("learn.batch", [0]),
@@ -110,14 +114,15 @@ def _config(settings: dict) -> Config:
         ("replay.rank_by", ["age"]),
         ("train.scenes", [0]),
         ("train.actions", [0]),
-        ("train.warmup", [0]),
+        ("train.learning_starts", [0]),
         ("train.chunk", [0]),
         ("train.save_every", [0]),
         ("seed", [-1, 2**31]),
     ],
 )
 def test_values_out_of_range(name: str, values: list):
-    """Claim: a value out of range, or none of the choices, is refused in one line that names section and setting."""
+    """Claim: a value out of range, or none of the choices, is refused in one line that names
+    section and setting."""
     section, _, field = name.rpartition(".")
     for value in values:
         with pytest.raises(ValueError, match=rf"^{section}.*\b{field}\b") as refused:
@@ -128,10 +133,16 @@ def test_values_out_of_range(name: str, values: list):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"train.warmup": 31}, "learn.batch: 32 transitions cannot be drawn after train.warmup = 31"),
+        (
+            {"train.learning_starts": 31},
+            "learn.batch: 32 transitions cannot be drawn after train.learning_starts = 31",
+        ),
         ({"replay.capacity": 31}, "replay.capacity: must hold"),
         ({"replay.capacity": 40, "train.scenes": 48}, "replay.capacity: must hold"),
-        ({"sim.physics": "warp", "scene.mesh_spread": 0.1}, "scene.mesh_spread: must be 0"),
+        (
+            {"sim.physics": "warp", "scene.mesh_size_jitter": 0.1},
+            "scene.mesh_size_jitter: must be 0",
+        ),
         (
             {
                 "sim.physics": "warp",
@@ -144,12 +155,16 @@ def test_values_out_of_range(name: str, values: list):
         ),
         ({"scene.slots": ()}, "scene.slots: at least one"),
         ({"camera.size": (8192, 480)}, "camera.size: must lie"),
-        ({"sensor.position": 0.01, "sensor.rotation": 0.01}, "sensor.position, sensor.rotation: must be 0"),
+        (
+            {"sensor.position": 0.01, "sensor.rotation": 0.01},
+            "sensor.position, sensor.rotation: must be 0",
+        ),
         ({"sensor.position": 0.01}, "sensor.position, sensor.rotation: must be 0"),
     ],
 )
 def test_settings_that_do_not_go_together(settings: dict, message: str):
-    """Claim: settings that exclude one another are refused by the name of one of them, with what it takes."""
+    """Claim: settings that exclude one another are refused by the name of one of them, with what it
+    takes."""
     with pytest.raises(ValueError, match=rf"^{re.escape(message)}"):
         _config(settings)
 
@@ -157,8 +172,13 @@ def test_settings_that_do_not_go_together(settings: dict, message: str):
 @pytest.mark.parametrize(
     "settings",
     [
-        {"sim.physics": "warp", "scene.mesh_spread": 0.0},
-        {"sim.physics": "warp", "scene.mesh_spread": 0.1, "scene.slots": BOXES, "scene.min_blocks": 3},
+        {"sim.physics": "warp", "scene.mesh_size_jitter": 0.0},
+        {
+            "sim.physics": "warp",
+            "scene.mesh_size_jitter": 0.1,
+            "scene.slots": BOXES,
+            "scene.min_blocks": 3,
+        },
         {"sim.physics": "warp", "train.scenes": 4096},
         {"sim.physics": "mjx", "train.scenes": 4097, "replay.capacity": 4097},
         {"sensor.position": 0.01, "heightmap.view": "oblique"},

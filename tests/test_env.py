@@ -14,19 +14,19 @@ import pytest
 from csac_jax import env as environment
 from csac_jax.agent import rewards
 from csac_jax.config import Config, SceneConfig, TaskConfig
+from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Env, State
+from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, layout
-from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle
-from csac_jax.sim.outcome import Outcome
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.sim.primitives import Action
 
 pytestmark = pytest.mark.mjx
 
 CONFIG = Config(
     scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=16, settle_time=1.5),
-    task=TaskConfig(max_actions=6, max_idle=3),
+    task=TaskConfig(max_actions=6, max_steps_without_change=3),
 )
 SCENES = 8
 BARE = (0.15, 0.15, 0.0)  # a place where nothing lies
@@ -64,8 +64,13 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     plan = jax.jit(jax.vmap(look_and_plan)).lower(state).compile()
     begin = jax.jit(jax.vmap(env.begin)).lower(state.scene).compile()
     step = jax.jit(jax.vmap(env.step)).trace(state, plan(state))
-    into, out = (jax.tree.unflatten(jax.tree.structure(state), traced.jaxpr.out_avals) for traced in (reset, step))
-    return Lab(env, reset.lower().compile(), begin, step.lower().compile(), plan, _types(into), _types(out))
+    into, out = (
+        jax.tree.unflatten(jax.tree.structure(state), traced.jaxpr.out_avals)
+        for traced in (reset, step)
+    )
+    return Lab(
+        env, reset.lower().compile(), begin, step.lower().compile(), plan, _types(into), _types(out)
+    )
 
 
 def _cube(x: float, y: float, target: int = layout.ANY) -> Scene:
@@ -79,7 +84,8 @@ def _cube(x: float, y: float, target: int = layout.ANY) -> Scene:
 
 @pytest.mark.slow
 def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: `scene.arranged` of the scenes that resets draw from are packed arrangements, the others are dropped."""
+    """Claim: `scene.arranged` of the scenes that resets draw from are packed arrangements, the
+    others are dropped."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     scene = dataclasses.replace(CONFIG.scene, slots=("box",) * 3, min_blocks=3, pool=8)
     dropped, mixed = (
@@ -95,14 +101,18 @@ def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_arrangement_without_blocks_for_it():
-    """Claim: `scene.arranged` with blocks that allow no arrangement is one line that names the slots."""
+    """Claim: `scene.arranged` with blocks that allow no arrangement is one line that names the
+    slots."""
     two = SceneConfig(slots=("box", "prism"), min_blocks=2)
-    with pytest.raises(SceneError, match=r"scene\.arranged: scene\.slots: too few for an arrangement"):
+    with pytest.raises(
+        SceneError, match=r"scene\.arranged: scene\.slots: too few for an arrangement"
+    ):
         environment.arrangements(two, CONFIG.heightmap.extent, 0, 2)
 
 
 def test_scenes_stay_inside_however_turned(lab: Lab):
-    """Claim: a scene that a turn would take out of the square is turned by quarters, any other by any yaw."""
+    """Claim: a scene that a turn would take out of the square is turned by quarters, any other by
+    any yaw."""
     for seed, (x, quarters) in enumerate(((0.21, True), (0.15, False))):
         scene, keys = _cube(x, x), jax.random.split(jax.random.key(seed), 64)
         places = jax.vmap(lab.env.vary, (0, None))(keys, scene).position[:, 0, :2]
@@ -127,16 +137,25 @@ def _at(tree, index: int):
 @pytest.fixture(scope="module")
 def stepped(lab: Lab) -> State:
     """One step of the scenes of `_LANES`."""
-    first = lab.begin(_stack(*(_cube(*place, _TARGETS.get(name, layout.ANY)) for name, (place, *_) in _LANES.items())))
-    actions, idle = (jnp.array([lane[i] for lane in _LANES.values()], jnp.int32) for i in (1, 2))
+    first = lab.begin(
+        _stack(
+            *(_cube(*place, _TARGETS.get(name, layout.ANY)) for name, (place, *_) in _LANES.items())
+        )
+    )
+    actions, steps_without_change = (
+        jnp.array([lane[i] for lane in _LANES.values()], jnp.int32) for i in (1, 2)
+    )
     action = _actions(*((kind, pose) for *_, kind, pose in _LANES.values()))
-    return lab.step(dataclasses.replace(first, actions=actions, idle=idle), action)
+    return lab.step(
+        dataclasses.replace(first, actions=actions, steps_without_change=steps_without_change),
+        action,
+    )
 
 
-_LANES = {  # the cube's place, actions and idle actions so far, the action
+_LANES = {  # the cube's place, actions and steps_without_change actions so far, the action
     "last chance": ((0.0, 0.0), 5, 2, Primitive.GRASP, (0.01, 0.0, 0.0)),
     "cap": ((0.0, 0.0), 5, 0, Primitive.GRASP, BARE),
-    "idle": ((0.0, 0.0), 2, 2, Primitive.GRASP, BARE),
+    "steps_without_change": ((0.0, 0.0), 2, 2, Primitive.GRASP, BARE),
     "on": ((0.0, 0.0), 0, 1, Primitive.PUSH, BARE),
     "moved": ((0.06, 0.0), 0, 2, Primitive.PUSH, (0.0, 0.0, 0.0)),
     "out": ((0.19, 0.0), 0, 0, Primitive.PUSH, (0.13, 0.0, 0.0)),
@@ -152,34 +171,49 @@ def lane(stepped: State) -> Callable[[str], State]:
 
 
 def test_last_block_terminates(lane):
-    """Claim: taking the last block terminates the episode, is worth 1, and is no truncation even at the cap."""
+    """Claim: taking the last block terminates the episode, is worth 1, and is no truncation even at
+    the cap."""
     state = lane("last chance")
     assert (state.terminated, state.truncated, state.done) == (True, False, True)
-    assert (state.reward, state.info.cleared, state.info.left) == (1.0, 1, 0)
+    assert (state.reward, state.info.cleared, state.info.blocks_lost) == (1.0, 1, 0)
     assert state.info.outcome == state.info.outcome_by_gap == Outcome.LIFTED
     assert abs(state.info.distance - 0.01) < 1e-6  # the place aimed at lay 1 cm beside the cube
     assert state.obs.height.max() < 0.001
 
 
 def test_target_ends_the_episode(lane):
-    """Claim: in the target task the episode ends when the target is got, though another block is left."""
+    """Claim: in the target task the episode ends when the target is got, though another block is
+    left."""
     state = lane("got")
     assert (state.terminated, state.reward, state.info.outcome) == (True, 1.0, Outcome.LIFTED)
     np.testing.assert_array_equal(state.scene.in_play, [False, True, False])
 
 
 def test_wrong_block_is_no_success(lane):
-    """Claim: lifting another block than the target takes it away, counts as `touched` and is worth nothing."""
+    """Claim: lifting another block than the target takes it away, counts as `touched` and is worth
+    nothing."""
     state = lane("wrong")
-    assert (state.done, state.reward, state.info.cleared, state.info.outcome) == (False, 0.0, 1, Outcome.TOUCHED)
-    assert state.info.outcome_by_gap == Outcome.TOUCHED  # no disagreement: the camera sees which block is gone
+    assert (state.done, state.reward, state.info.cleared, state.info.outcome) == (
+        False,
+        0.0,
+        1,
+        Outcome.TOUCHED,
+    )
+    assert (
+        state.info.outcome_by_gap == Outcome.TOUCHED
+    )  # no disagreement: the camera sees which block is gone
     assert state.obs.target.any()
-    np.testing.assert_array_equal(state.obs.target, state.obs.height > 0.001)  # the target alone is left
+    np.testing.assert_array_equal(
+        state.obs.target, state.obs.height > 0.001
+    )  # the target alone is left
 
 
 def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
-    """Claim: after a target was got the scene goes on with another target; after any other end comes a fresh scene."""
-    env = dataclasses.replace(lab.env, cfg=dataclasses.replace(CONFIG, task=TaskConfig(kind="target")))
+    """Claim: after a target was got the scene goes on with another target; after any other end
+    comes a fresh scene."""
+    env = dataclasses.replace(
+        lab.env, cfg=dataclasses.replace(CONFIG, task=TaskConfig(kind="target"))
+    )
     restart = jax.jit(jax.vmap(env.restart))(jax.random.split(jax.random.key(0), SCENES), stepped)
     for name, stays in (("got", True), ("wrong", False), ("last chance", False)):
         new, old = (_at(state, list(_LANES).index(name)) for state in (restart, stepped))
@@ -194,59 +228,80 @@ def test_action_cap_truncates(lane):
     """Claim: an episode is cut off after max_actions actions; that does not terminate it."""
     state = lane("cap")
     assert (state.terminated, state.truncated, state.reward) == (False, True, 0.0)
-    assert (state.actions, state.idle, state.info.outcome) == (6, 1, Outcome.NOTHING)
+    assert (state.actions, state.steps_without_change, state.info.outcome) == (
+        6,
+        1,
+        Outcome.NOTHING,
+    )
 
 
 def test_idle_cap_truncates(lane):
-    """Claim: an episode is cut off after max_idle actions in a row without visible change."""
-    state = lane("idle")
-    assert (state.terminated, state.truncated, state.actions, state.idle) == (False, True, 3, 3)
+    """Claim: an episode is cut off after max_steps_without_change actions in a row without visible
+    change."""
+    state = lane("steps_without_change")
+    assert (state.terminated, state.truncated, state.actions, state.steps_without_change) == (
+        False,
+        True,
+        3,
+        3,
+    )
 
 
 def test_episode_goes_on(lane):
-    """Claim: below both caps the episode goes on, and an action without visible change counts as idle."""
+    """Claim: below both caps the episode goes on, and an action without visible change counts as
+    steps_without_change."""
     state = lane("on")
-    assert (state.done, state.actions, state.idle) == (False, 1, 2)
+    assert (state.done, state.actions, state.steps_without_change) == (False, 1, 2)
 
 
 def test_visible_change_ends_idleness(lane):
-    """Claim: an action that moves a block more than CHANGE_AREA starts the idle count anew."""
+    """Claim: an action that moves a block more than CHANGE_AREA starts the steps_without_change
+    count anew."""
     state = lane("moved")
-    assert state.info.moved > environment.CHANGE_AREA
-    assert (state.done, state.idle, state.reward) == (False, 0, 0.0)
+    assert state.info.moved > CHANGE_AREA
+    assert (state.done, state.steps_without_change, state.reward) == (False, 0, 0.0)
     assert 0.05 < state.scene.position[0, 0] - 0.06 < 0.1
 
 
 def test_block_pushed_out_leaves(lane):
-    """Claim: a block pushed out of the square is counted as left, not as cleared, and is out of play and of sight."""
+    """Claim: a block pushed out of the square is counted as left, not as cleared, and is out of
+    play and of sight."""
     state = lane("out")
-    assert (state.info.left, state.info.cleared, state.reward) == (1, 0, 0.0)
+    assert (state.info.blocks_lost, state.info.cleared, state.reward) == (1, 0, 0.0)
     np.testing.assert_array_equal(state.scene.position, layout.parking(3))
     assert not state.scene.in_play.any()
     assert state.obs.height.max() < 0.001
 
 
 def test_oracle_clears_scenes(lab: Lab):
-    """Claim: grasp by grasp a settled scene empties, each lift is worth 1, and the last one terminates the episode."""
+    """Claim: grasp by grasp a settled scene empties, each lift is worth 1, and the last one
+    terminates the episode."""
     state = lab.reset(jax.random.split(jax.random.key(3), SCENES))
     blocks, taken = np.asarray(state.scene.in_play.sum(axis=1)), np.zeros(SCENES, int)
     cleared = np.zeros(SCENES, bool)
     for _ in range(5):
         before = np.asarray(state.scene.in_play.sum(axis=1))
         state = lab.step(state, lab.oracle(state))
-        after, info = np.asarray(state.scene.in_play.sum(axis=1)), jax.tree.map(np.asarray, state.info)
-        np.testing.assert_array_equal(before - after, info.cleared + info.left)
+        after, info = (
+            np.asarray(state.scene.in_play.sum(axis=1)),
+            jax.tree.map(np.asarray, state.info),
+        )
+        np.testing.assert_array_equal(before - after, info.cleared + info.blocks_lost)
         np.testing.assert_array_equal(state.reward, (info.cleared > 0).astype(np.float32))
         np.testing.assert_array_equal(state.terminated, after == 0)
         assert not np.any(state.terminated & state.truncated)
         np.testing.assert_array_equal(state.scene.velocity[~np.asarray(state.scene.in_play)], 0.0)
-        taken, cleared = taken + np.where(cleared, 0, info.cleared), cleared | np.asarray(state.terminated)
+        taken, cleared = (
+            taken + np.where(cleared, 0, info.cleared),
+            cleared | np.asarray(state.terminated),
+        )
     assert cleared.mean() > 0.7
     np.testing.assert_array_equal(taken[cleared], blocks[cleared])
 
 
 def _graspable(height: np.ndarray) -> float:
-    """phi_g of a fixed critic: 1 if somewhere something stands with room for both fingers beside it, else 0.
+    """phi_g of a fixed critic: 1 if somewhere something stands with room for both fingers beside
+    it, else 0.
 
     Room: nothing 36 to 64 mm to either side, along x or along y.
     """
@@ -266,32 +321,39 @@ def _raft(gap: float) -> Scene:
     """Two cuboids side by side along x, 100 mm square."""
     scene = _cube(0.0, 0.0, 1)
     half = scene.half_size.at[:2].set(jnp.array(blocks.SHAPES["cuboid"].half_size))
-    position = scene.position.at[:2].set(jnp.array([[0.0, 0.5 * gap + 0.025, 0.025], [0.0, -0.5 * gap - 0.025, 0.025]]))
+    position = scene.position.at[:2].set(
+        jnp.array([[0.0, 0.5 * gap + 0.025, 0.025], [0.0, -0.5 * gap - 0.025, 0.025]])
+    )
     return scene.replace(half_size=half, position=position, target=jnp.int32(layout.ANY))
 
 
 def test_both_levels_of_a_push_are_reached(lab: Lab):
-    """Claim: physics reaches both levels of a push (CSAC eq. 16): what breaks a packing up is worth +1; what misses it,
-    or moves what could be grasped before, -1."""
+    """Claim: physics reaches both levels of a push (CSAC eq. 16): what breaks a packing up is worth
+    +1; what misses it, or moves what could be grasped before, -1."""
     raft, alone = _raft(0.0006), _cube(0.0, 0.0)
     cases = [(raft, (-0.12, 0.025, 0.0)), (raft, BARE), (alone, (-0.07, 0.0, 0.0)), (alone, BARE)]
     scenes, places = zip(*(cases * 2), strict=True)
     before = lab.begin(_stack(*scenes))
     after = lab.step(before, _actions(*((Primitive.PUSH, place) for place in places)))
-    assert not after.info.ill.any()
-    phi = [np.array([_graspable(np.asarray(row)) for row in state.obs.height[:4]]) for state in (before, after)]
+    assert not after.info.physics_diverged.any()
+    phi = [
+        np.array([_graspable(np.asarray(row)) for row in state.obs.height[:4]])
+        for state in (before, after)
+    ]
     np.testing.assert_array_equal(phi[0], [0.0, 0.0, 1.0, 1.0])
     cfg = CONFIG.reward
     zero, push = jnp.zeros(()), jnp.int32(Primitive.PUSH)
     level, reward = [], []
     for low, high, moved in zip(*phi, after.info.moved[:4], strict=True):
-        seen = (jnp.float32(low), jnp.float32(high), moved > environment.CHANGE_AREA)
+        seen = (jnp.float32(low), jnp.float32(high), moved > CHANGE_AREA)
         level.append(float(rewards.push_effect(cfg, *seen)))
-        reward.append(float(rewards.reward(cfg, push, jnp.int32(Outcome.NOTHING), zero, *seen, jnp.int32(0))))
+        reward.append(
+            float(rewards.reward(cfg, push, jnp.int32(Outcome.NOTHING), zero, *seen, jnp.int32(0)))
+        )
     assert level == [1.0, -1.0, -1.0, -1.0]
     assert reward == [0.5, -0.5, -0.5, -0.5]  # Gamma = 0.5, eq. 13
     np.testing.assert_array_equal(
-        np.asarray(after.info.moved[:4]) > environment.CHANGE_AREA, [True, False, True, False]
+        np.asarray(after.info.moved[:4]) > CHANGE_AREA, [True, False, True, False]
     )
 
 
@@ -299,7 +361,9 @@ def _leaves(state: State) -> list[bytes]:
     return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state)]
 
 
-def _spoil(state: State, action: Action, where: str, value: float, sick: int) -> tuple[State, Action]:
+def _spoil(
+    state: State, action: Action, where: str, value: float, sick: int
+) -> tuple[State, Action]:
     """State and action with `value` in the last entry of one leaf of scene `sick`."""
 
     def written(tree, leaf: str):
@@ -322,47 +386,68 @@ _ENTRIES = ("position", "quaternion", "velocity", "half_size", "density", "frict
     [
         ("action.pose", np.nan),
         *((f"scene.{leaf}", (np.nan, np.inf, 1e6)[i % 3]) for i, leaf in enumerate(_ENTRIES)),
-        *((f"scene.{leaf}", (np.nan, np.inf, 1e6)[(i + 1) % 3]) for i, leaf in enumerate(_ENTRIES[:6])),
+        *(
+            (f"scene.{leaf}", (np.nan, np.inf, 1e6)[(i + 1) % 3])
+            for i, leaf in enumerate(_ENTRIES[:6])
+        ),
         ("obs.height", np.nan),
         ("obs.height", 1e6),
         ("obs.colour", np.inf),
     ],
 )
 def test_failed_physics_stays_in_its_scene(lab: Lab, where: str, value: float):
-    """Claim: NaN, infinity or 1e6 in one scene marks that scene ill and truncates it; the others' results are the same,
-    bit for bit. What cannot be a scene is replaced by an empty one; a sound one stays as it was."""
+    """Claim: NaN, infinity or 1e6 in one scene marks that scene physics_diverged and truncates it;
+    the others' results are the same, bit for bit. What cannot be a scene is replaced by an empty
+    one; a sound one stays as it was."""
     state = lab.reset(jax.random.split(jax.random.key(4), SCENES))
     action, sick = lab.oracle(state), 2
     good = lab.step(state, action)
     bad = lab.step(*_spoil(state, action, where, value, sick))
-    np.testing.assert_array_equal(bad.info.ill, np.arange(SCENES) == sick)
-    assert not good.info.ill.any()
+    np.testing.assert_array_equal(bad.info.physics_diverged, np.arange(SCENES) == sick)
+    assert not good.info.physics_diverged.any()
     for index in range(SCENES):
         assert (_leaves(_at(good, index)) == _leaves(_at(bad, index))) == (index != sick)
-    ill = _at(bad, sick)
-    assert (ill.truncated, ill.terminated, ill.reward, ill.info.cleared, ill.info.left) == (True, False, 0.0, 0, 0)
-    for leaf in jax.tree.leaves((ill.scene, ill.obs)):
+    physics_diverged = _at(bad, sick)
+    assert (
+        physics_diverged.truncated,
+        physics_diverged.terminated,
+        physics_diverged.reward,
+        physics_diverged.info.cleared,
+        physics_diverged.info.blocks_lost,
+    ) == (True, False, 0.0, 0, 0)
+    for leaf in jax.tree.leaves((physics_diverged.scene, physics_diverged.obs)):
         assert np.isfinite(leaf).all()
-    expected = _at(state.scene, sick) if where == "action.pose" else layout.parked(CONFIG.scene.slots)
-    jax.tree.map(np.testing.assert_array_equal, ill.scene, expected)
+    expected = (
+        _at(state.scene, sick) if where == "action.pose" else layout.parked(CONFIG.scene.slots)
+    )
+    jax.tree.map(np.testing.assert_array_equal, physics_diverged.scene, expected)
 
 
 def test_target_that_is_no_slot_is_ill(lab: Lab):
-    """Claim: a target beyond the slots makes a scene ill; it does not pass for a table cleared of its target."""
+    """Claim: a target beyond the slots makes a scene physics_diverged; it does not pass for a table
+    cleared of its target."""
     scene = _stack(*[_cube(0.0, 0.0)] * SCENES)
-    wild = dataclasses.replace(scene, target=jnp.array([-1, 3, 1_000_000, -2, -(2**31), 0, -1, -1], jnp.int32))
+    wild = dataclasses.replace(
+        scene, target=jnp.array([-1, 3, 1_000_000, -2, -(2**31), 0, -1, -1], jnp.int32)
+    )
     action = _actions(*[(Primitive.PUSH, BARE)] * SCENES)
     state = lab.step(dataclasses.replace(lab.begin(scene), scene=wild), action)
     expected = np.array([False, True, True, True, True, False, False, False])
-    np.testing.assert_array_equal(state.info.ill, expected)
+    np.testing.assert_array_equal(state.info.physics_diverged, expected)
     np.testing.assert_array_equal(state.truncated, expected)
     assert not state.terminated.any()
 
 
 def test_step_is_a_fixed_point_of_types(lab: Lab):
-    """Claim: what comes out of step has the shapes, dtypes and weak types of what went in: it can be scanned."""
+    """Claim: what comes out of step has the shapes, dtypes and weak types of what went in: it can
+    be scanned."""
     assert lab.into_step == lab.out_of_step
-    assert not any(weak for _, _, weak in jax.tree.leaves(lab.into_step, is_leaf=lambda leaf: isinstance(leaf, tuple)))
+    assert not any(
+        weak
+        for _, _, weak in jax.tree.leaves(
+            lab.into_step, is_leaf=lambda leaf: isinstance(leaf, tuple)
+        )
+    )
 
 
 def test_resets_differ(lab: Lab):
@@ -371,17 +456,29 @@ def test_resets_differ(lab: Lab):
     positions = np.concatenate([state.scene.position for state in states])
     assert len({position.tobytes() for position in positions}) == len(positions)
     play = np.concatenate([state.scene.in_play for state in states])
-    heights = [tuple(np.where(valid, p[:, 2], -1.0)) for p, valid in zip(positions, play, strict=True)]
+    heights = [
+        tuple(np.where(valid, p[:, 2], -1.0)) for p, valid in zip(positions, play, strict=True)
+    ]
     pool = lab.env.scenes
     drawn = [
-        next(i for i in range(len(pool.position)) if tuple(np.where(pool.in_play[i], pool.position[i, :, 2], -1)) == h)
+        next(
+            i
+            for i in range(len(pool.position))
+            if tuple(np.where(pool.in_play[i], pool.position[i, :, 2], -1)) == h
+        )
         for h in heights
     ]
     assert len(set(drawn)) >= 20  # of 32, in 48 draws
-    yaws = [np.arctan2(*(p[v][0, :2] @ [[0, 1], [1, 0]])) for p, v in zip(positions, play, strict=True)]
-    raw = [np.arctan2(*(pool.position[i][pool.in_play[i]][0, :2] @ [[0, 1], [1, 0]])) for i in drawn]
+    yaws = [
+        np.arctan2(*(p[v][0, :2] @ [[0, 1], [1, 0]])) for p, v in zip(positions, play, strict=True)
+    ]
+    raw = [
+        np.arctan2(*(pool.position[i][pool.in_play[i]][0, :2] @ [[0, 1], [1, 0]])) for i in drawn
+    ]
     turned = np.mod(np.array(yaws) - raw, 2 * np.pi)
-    assert np.histogram(turned, bins=4, range=(0, 2 * np.pi))[0].min() >= 4  # any yaw: 12 expected in each quarter
+    assert (
+        np.histogram(turned, bins=4, range=(0, 2 * np.pi))[0].min() >= 4
+    )  # any yaw: 12 expected in each quarter
 
 
 def test_same_key_same_scene(lab: Lab):

@@ -28,7 +28,8 @@ def test_quaternions_agree_with_scipy():
 
 
 def test_yaw_turns_counter_clockwise():
-    """Claim: a yaw is a turn about z, counter-clockwise from above, the same for quaternions and for points."""
+    """Claim: a yaw is a turn about z, counter-clockwise from above, the same for quaternions and
+    for points."""
     for yaw in np.linspace(-7.0, 7.0, 15).astype(np.float32):
         reference = Rotation.from_euler("z", yaw).as_matrix()
         matrix = geometry.quat_to_matrix(geometry.quat_from_yaw(jnp.asarray(yaw)))
@@ -48,17 +49,25 @@ def test_wrapped_angle_is_in_range(angle):
     assert abs(difference) < 2e-5  # float32 holds an angle of 100 rad to 4e-6
 
 
-@pytest.mark.parametrize("cfg", [HeightmapConfig(64), HeightmapConfig(224), HeightmapConfig(16, 1.0)])
+@pytest.mark.parametrize(
+    "cfg", [HeightmapConfig(64), HeightmapConfig(224), HeightmapConfig(16, 1.0)]
+)
 def test_every_pixel_survives_the_way_to_metres_and_back(cfg):
-    """Claim: pixel -> metre -> pixel is the same pixel for every pixel, and its centre up to a 10,000th of a cell."""
-    pixel = np.stack(np.meshgrid(*[np.arange(cfg.size)] * 2, indexing="ij"), axis=-1).astype(np.float32)
-    back = np.asarray(jax.jit(lambda p: geometry.to_pixel(cfg, geometry.from_pixel(cfg, p)))(jnp.asarray(pixel)))
+    """Claim: pixel -> metre -> pixel is the same pixel for every pixel, and its centre up to a
+    10,000th of a cell."""
+    pixel = np.stack(np.meshgrid(*[np.arange(cfg.size)] * 2, indexing="ij"), axis=-1).astype(
+        np.float32
+    )
+    back = np.asarray(
+        jax.jit(lambda p: geometry.to_pixel(cfg, geometry.from_pixel(cfg, p)))(jnp.asarray(pixel))
+    )
     np.testing.assert_array_equal(np.rint(back), pixel)
     np.testing.assert_allclose(back, pixel, rtol=0, atol=1e-4)
 
 
 def test_cells_lie_where_the_convention_says():
-    """Claim: x = (col + 0.5) cell - extent / 2, rows run along y, and row 0, column 0 lie at the lowest y and x."""
+    """Claim: x = (col + 0.5) cell - extent / 2, rows run along y, and row 0, column 0 lie at the
+    lowest y and x."""
     cfg = HeightmapConfig(224)
     centres = np.asarray(geometry.cell_centres(cfg))
     assert centres.shape == (224, 224, 2)
@@ -66,4 +75,6 @@ def test_cells_lie_where_the_convention_says():
     expected = (np.arange(224) + 0.5) * 0.002 - 0.224
     np.testing.assert_allclose(centres[5, :, 0], expected, atol=1e-7)
     np.testing.assert_allclose(centres[:, 9, 1], expected, atol=1e-7)
-    np.testing.assert_allclose(geometry.to_pixel(cfg, jnp.array([-0.224, 0.0])), [111.5, -0.5], atol=1e-4)
+    np.testing.assert_allclose(
+        geometry.to_pixel(cfg, jnp.array([-0.224, 0.0])), [111.5, -0.5], atol=1e-4
+    )

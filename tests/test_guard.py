@@ -65,7 +65,9 @@ def test_batched_mjx_does_not_hang():
 
 def test_import_widens_the_pool_and_leaves_jax_alone():
     """Claim: importing the package sets the pool's size without importing JAX."""
-    done = _python("import csac_jax, os, sys; print(os.environ['PJRT_NPROC'], 'jax' in sys.modules)")
+    done = _python(
+        "import csac_jax, os, sys; print(os.environ['PJRT_NPROC'], 'jax' in sys.modules)"
+    )
     threads, jax_imported = done.stdout.split()
     assert int(threads) >= 8
     assert jax_imported == "False"
@@ -73,16 +75,17 @@ def test_import_widens_the_pool_and_leaves_jax_alone():
 
 def test_virtual_devices_widen_the_pool():
     """Claim: with virtual devices of the CPU the pool has four threads for each."""
-    done = _python("import csac_jax, os; print(os.environ['PJRT_NPROC'])", XLA_FLAGS=f"{_guard.DEVICES_FLAG}=100")
+    done = _python(
+        "import csac_jax, os; print(os.environ['PJRT_NPROC'])",
+        XLA_FLAGS=f"{_guard.DEVICES_FLAG}=100",
+    )
     assert done.stdout.split() == ["400"], done.stderr
 
 
 @pytest.mark.parametrize("name", ["PJRT_NPROC", "NPROC"])
 def test_user_setting_is_kept(name: str):
     """Claim: what the user has set decides."""
-    source = (
-        "import csac_jax, os; from csac_jax import _guard; print(os.environ.get('PJRT_NPROC'), *_guard.pool_setting())"
-    )
+    source = "import csac_jax, os; from csac_jax import _guard; print(os.environ.get('PJRT_NPROC'), *_guard.pool_setting())"
     done = _python(source, **{name: "3"})
     assert done.stdout.split() == ["3" if name == "PJRT_NPROC" else "None", name, "3"]
 
@@ -97,14 +100,19 @@ def test_flags_of_the_user_are_kept():
     """Claim: the user's XLA flags stay, and the guard's own is not repeated."""
     source = "import csac_jax, os; print(os.environ['XLA_FLAGS'])"
     done = _python(source, XLA_FLAGS="--xla_cpu_multi_thread_eigen=false")
-    added = [f"{_guard.FUSION_FLAG}="] if importlib.metadata.version("jaxlib").startswith(_guard.FUSION_SERIES) else []
+    added = (
+        [f"{_guard.FUSION_FLAG}="]
+        if importlib.metadata.version("jaxlib").startswith(_guard.FUSION_SERIES)
+        else []
+    )
     assert done.stdout.split() == ["--xla_cpu_multi_thread_eigen=false", *added]
     own = f"{_guard.FUSION_FLAG}=INDIVIDUAL_DOT"
     assert _python(source, XLA_FLAGS=own).stdout.split() == [own]
 
 
 def test_unknown_jaxlib_gets_no_flag(monkeypatch: pytest.MonkeyPatch):
-    """Claim: a jaxlib that may lack the flag is not given it: XLA ends the process on a flag it does not know."""
+    """Claim: a jaxlib that may lack the flag is not given it: XLA ends the process on a flag it
+    does not know."""
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.11.0")
     _guard.switch_off_broken_fusion()
@@ -133,7 +141,8 @@ print(jax.jit(add)(np.arange(4.0, dtype=np.float32)))
 
 
 def test_programs_of_several_devices_take_empty_constants():
-    """Claim: with the package imported a program over two devices compiles though a constant has no elements."""
+    """Claim: with the package imported a program over two devices compiles though a constant has no
+    elements."""
     done = _python(EMPTY_CONSTANT, XLA_FLAGS=f"{_guard.DEVICES_FLAG}=2", JAX_PLATFORMS="cpu")
     assert done.returncode == 0, done.stderr
     assert done.stdout == "[0. 1. 2. 3.]\n"
@@ -150,12 +159,18 @@ def partitioner():
 @pytest.mark.usefixtures("partitioner")
 @pytest.mark.parametrize(
     ("version", "before", "after"),
-    [("0.11.2", None, "false"), ("0.11.2", "true", "true"), ("0.10.1", None, None), ("0.12.0", None, None)],
+    [
+        ("0.11.2", None, "false"),
+        ("0.11.2", "true", "true"),
+        ("0.10.1", None, None),
+        ("0.12.0", None, None),
+    ],
 )
 def test_broken_partitioner_is_not_used(
     monkeypatch: pytest.MonkeyPatch, version: str, before: str | None, after: str | None
 ):
-    """Claim: Shardy is switched off for jaxlib 0.11, whose Shardy ends the process, unless the user wants it."""
+    """Claim: Shardy is switched off for jaxlib 0.11, whose Shardy ends the process, unless the user
+    wants it."""
     monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
     monkeypatch.setenv(_guard.PARTITIONER_VARIABLE, before or "")  # to be put back
     if before is None:

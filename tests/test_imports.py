@@ -17,8 +17,12 @@ PACKAGE = Path(csac_jax.__file__).parent
 ORDER = (
     ("__main__",),
     ("cli",),
-    ("show",),
-    ("train",),
+    ("render", "report"),
+    ("sweeps",),
+    ("evaluation",),
+    ("training",),
+    ("io",),
+    ("runtime",),
     ("env",),
     ("replay", "agent"),
     ("nets",),
@@ -28,6 +32,7 @@ ORDER = (
     ("geometry",),
     ("presets", "algorithms"),
     ("config",),
+    ("constants", "errors"),
     ("__init__",),
     ("_guard",),
 )
@@ -35,19 +40,23 @@ RANK = {stage: rank for rank, row in enumerate(ORDER) for stage in row}
 
 # Module -> where it may be imported, as a stage or a file.
 ONLY_IN = {
-    "mujoco": ("scene", "sim", "show"),
+    "mujoco": ("scene", "sim", "render"),
     "flax.linen": ("nets",),
     "flax.nnx": (),
     "optax": ("agent",),
-    "orbax": ("train/checkpoint.py",),
+    "orbax": ("io/checkpoint.py",),
     "tyro": ("cli",),
-    "rich": ("show", "cli"),
-    "safetensors": ("train/weights.py", "train/policy_file.py"),
+    "rich": ("report", "cli"),
+    "safetensors": ("io",),
 }
 JIT_IN = (
-    *("train", "env.py"),
+    *("training", "sweeps", "evaluation", "env.py"),
+    *(
+        "runtime/compiler.py",
+        "runtime/selftest.py",
+    ),  # small programs that show what this machine does
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
-    "show/picture.py",  # draws on machines without OpenGL
+    "render/picture.py",  # draws on machines without OpenGL
 )
 PURE = ("vision", "nets", "agent", "replay", "sim")  # no printing, no files
 NOT_PURE = ("sim/__init__.py",)  # passes on what MJX prints as it is imported
@@ -57,7 +66,9 @@ def violations(root: Path) -> list[str]:
     """Every breach of the contract under `root`, as `file:line: what`."""
     files = sorted(path for path in root.rglob("*.py"))
     return [
-        breach for path in files for breach in _file_violations(path.relative_to(root).as_posix(), path.read_text())
+        breach
+        for path in files
+        for breach in _file_violations(path.relative_to(root).as_posix(), path.read_text())
     ]
 
 
@@ -78,7 +89,8 @@ def _file_violations(name: str, source: str) -> Iterator[str]:
 
 
 def _imported(node: ast.AST) -> list[str]:
-    """Full names of what an import statement brings in; for `from a import b` both `a` and `a.b`."""
+    """Full names of what an import statement brings in; for `from a import b` both `a` and
+    `a.b`."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
     if isinstance(node, ast.ImportFrom):
@@ -154,7 +166,7 @@ def test_package_keeps_the_contract():
 
 def test_checker_reads_the_package():
     """Claim: the test above looks at every source file."""
-    assert {"cli/__init__.py", "cli/train.py", "train/loop.py", "env.py", "config.py"} <= {
+    assert {"cli/__init__.py", "cli/train.py", "training/loop.py", "env.py", "config.py"} <= {
         path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py")
     }
 
@@ -162,24 +174,24 @@ def test_checker_reads_the_package():
 @pytest.mark.parametrize(
     ("file", "source", "fault"),
     [
-        ("vision/a.py", "from csac_jax.train import loop", "train is imported"),
+        ("vision/a.py", "from csac_jax.training import loop", "training is imported"),
         ("vision/a.py", "def f():\n    import csac_jax.env", "env is imported"),
         ("agent/a.py", "from csac_jax import replay", "replay is imported"),
         ("replay/a.py", "from csac_jax.agent.cem import maximise", "agent is imported"),
         ("config.py", "from csac_jax import geometry", "geometry is imported"),
-        ("train/a.py", "from csac_jax.show import progress", "show is imported"),
-        ("train/a.py", "from csac_jax import cli", "cli is imported"),
-        ("show/a.py", "from csac_jax.cli.errors import FailedError", "cli is imported"),
+        ("training/a.py", "from csac_jax.report import progress", "report is imported"),
+        ("training/a.py", "from csac_jax import cli", "cli is imported"),
+        ("render/a.py", "from csac_jax.cli.errors import FailedError", "cli is imported"),
         ("cli/a.py", "from csac_jax import __main__", "__main__ is imported"),
-        ("show/a.py", "import tyro", "tyro is imported"),
-        ("train/a.py", "from rich.console import Console", "rich is imported"),
-        ("train/a.py", "from . import loop", "relative import"),
+        ("render/a.py", "import tyro", "tyro is imported"),
+        ("training/a.py", "from rich.console import Console", "rich is imported"),
+        ("training/a.py", "from . import loop", "relative import"),
         ("agent/a.py", "from mujoco import mjx", "mujoco is imported"),
-        ("train/a.py", "import mujoco.mjx as m", "mujoco is imported"),
+        ("training/a.py", "import mujoco.mjx as m", "mujoco is imported"),
         ("agent/a.py", "from flax import linen as nn", "flax.linen is imported"),
         ("agent/a.py", "import flax\nx = flax.linen.Dense", "flax.linen is used"),
-        ("train/a.py", "import optax", "optax is imported"),
-        ("train/loop.py", "import orbax.checkpoint as ocp", "orbax is imported"),
+        ("training/a.py", "import optax", "optax is imported"),
+        ("training/loop.py", "import orbax.checkpoint as ocp", "orbax is imported"),
         ("nets/a.py", "import safetensors.numpy", "safetensors is imported"),
         ("agent/a.py", "import jax\n@jax.jit\ndef f(x): return x", "jax.jit is used"),
         ("scene/a.py", "from jax import jit\nf = jit(abs)", "jax.jit is used"),
@@ -205,9 +217,18 @@ def test_checker_sees_a_breach(tmp_path: Path, file: str, source: str, fault: st
     ("file", "source"),
     [
         ("agent/a.py", "from flax import struct\nimport optax\nfrom csac_jax.nets import dense"),
-        ("train/checkpoint.py", "import orbax.checkpoint as ocp\nimport jax\nf = jax.jit(abs)"),
-        ("env.py", "from csac_jax import geometry\nfrom csac_jax.sim import mjx_physics\nimport csac_jax.config"),
-        ("cli/a.py", "import tyro, rich\nfrom csac_jax.cli import b\nfrom csac_jax.show import report"),
+        (
+            "io/checkpoint.py",
+            "import orbax.checkpoint as ocp\nfrom csac_jax.runtime import cluster",
+        ),
+        (
+            "env.py",
+            "from csac_jax import geometry\nfrom csac_jax.sim import mjx_physics\nimport csac_jax.config",
+        ),
+        (
+            "cli/a.py",
+            "import tyro, rich\nfrom csac_jax.cli import b\nfrom csac_jax.report import charts",
+        ),
         ("scene/a.py", "import mujoco\nfrom pathlib import Path\nprint(Path('x'))"),
     ],
 )

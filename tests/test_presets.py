@@ -3,7 +3,7 @@
 import pytest
 
 from csac_jax import presets
-from csac_jax.train import loop
+from csac_jax.training import loop
 
 
 @pytest.mark.parametrize("name", list(presets.PRESETS))
@@ -27,8 +27,9 @@ def test_unknown_preset_names_the_known():
 
 
 def test_smoke_learns_and_saves_on_the_way():
-    """Claim: `smoke` leaves nothing out: it updates, saves between chunks, and goes on after that."""
+    """Claim: `smoke` leaves nothing out: it updates, saves between chunks, and goes on after
+    that."""
     cfg = presets.smoke()
-    assert cfg.train.warmup < cfg.train.actions / 2
+    assert cfg.train.learning_starts < cfg.train.actions / 2
     assert cfg.learn.updates >= 1
     assert cfg.train.save_every * cfg.train.chunk < cfg.train.steps

@@ -1,8 +1,9 @@
-"""The deterministic policy: one pose per primitive from dense logits, by a soft-argmax around the highest of them.
+"""The deterministic policy: one pose per primitive from dense logits, by a soft-argmax around the
+highest of them.
 
-A soft-argmax over the whole map would put the mean of two peaks between them. Around the highest cell, over what falls
-off from it, it cannot, and its position still moves smoothly with the logits, so that the critic's gradient can shift
-it.
+A soft-argmax over the whole map would put the mean of two peaks between them. Around the highest
+cell, over what falls off from it, it cannot, and its position still moves smoothly with the logits,
+so that the critic's gradient can shift it.
 """
 
 import jax
@@ -15,13 +16,17 @@ from csac_jax.agent.maps import DenseMaps, Frames
 
 SHARPNESS = 10.0  # logit per unit of Q: how the critic's own map enters the actor's
 WINDOW = 2  # cells on each side of the highest one that the soft-argmax covers
-_INWARD = WINDOW + np.array([-1, -1, 0, 1, 1])  # for each row or column of the window: one step nearer to its middle
+_INWARD = WINDOW + np.array(
+    [-1, -1, 0, 1, 1]
+)  # for each row or column of the window: one step nearer to its middle
 
 
 def logits(q: jax.Array, correction: jax.Array) -> jax.Array:
-    """The actor's logits, any shape: the critic's map, without gradient, corrected by the actor's head.
+    """The actor's logits, any shape: the critic's map, without gradient, corrected by the actor's
+    head.
 
-    The deterministic policy gradient only ever moves a mode; the critic's map says where the modes are.
+    The deterministic policy gradient only ever moves a mode; the critic's map says where the modes
+    are.
     """
     return jax.lax.stop_gradient(q) * SHARPNESS + correction
 
@@ -37,7 +42,9 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
     shown = state.valid[primitive][window]
     shown |= ~jnp.any(shown)
     hill = jnp.where(shown, state.logits[primitive][window], -jnp.inf)  # [5, 5]
-    hill = jnp.minimum(hill, hill[_INWARD[:, None], _INWARD[None, :]])  # no second peak counts, behind a dip
+    hill = jnp.minimum(
+        hill, hill[_INWARD[:, None], _INWARD[None, :]]
+    )  # no second peak counts, behind a dip
     weight = jax.nn.softmax(hill.reshape(-1))  # [25]
     xy = jnp.sum(weight[:, None] * jnp.asarray(frames.xy)[window].reshape(-1, 2), axis=0)
 
@@ -48,11 +55,14 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
     return jnp.append(xy, geometry.wrap_angle(jnp.asarray(frames.yaws)[k] + turn))
 
 
-def _along_yaw(frames: Frames, state: DenseMaps, primitive: int, xy: jax.Array, yaws: jax.Array) -> jax.Array:
-    """Logits [3] at one place [2] m and three yaws [3], the middle one the best cell's; -inf where it is not valid.
+def _along_yaw(
+    frames: Frames, state: DenseMaps, primitive: int, xy: jax.Array, yaws: jax.Array
+) -> jax.Array:
+    """Logits [3] at one place [2] m and three yaws [3], the middle one the best cell's; -inf where
+    it is not valid.
 
-    Between cells only the valid ones are mixed: sum w_i l_i / sum w_i, w_i the bilinear weight of a valid cell, 0 of
-    any other. The middle one stands for all if none of the three is valid.
+    Between cells only the valid ones are mixed: sum w_i l_i / sum w_i, w_i the bilinear weight of a
+    valid cell, 0 of any other. The middle one stands for all if none of the three is valid.
     """
     valid = state.valid[primitive]
     valid |= ~jnp.any(valid)

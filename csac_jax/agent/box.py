@@ -20,5 +20,6 @@ def wrap(u: jax.Array) -> jax.Array:
 
 
 def project(u: jax.Array, wraps: jax.Array | np.ndarray) -> jax.Array:
-    """Points `u` [..., A] brought into the box: dimensions of `wraps` [A] bool wrap, the others are clipped."""
+    """Points `u` [..., A] brought into the box: dimensions of `wraps` [A] bool wrap, the others are
+    clipped."""
     return jnp.where(jnp.broadcast_to(wraps, u.shape), wrap(u), jnp.clip(u, -1.0, 1.0))

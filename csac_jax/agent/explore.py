@@ -22,7 +22,8 @@ def probability(start: float, end: float, decay: float, actions: jax.Array) -> j
 
 
 def action_noise(key: jax.Array, cfg: ExploreConfig, action: jax.Array) -> jax.Array:
-    """`action` [3], a normalised pose, plus clip(N(0, delta), -c, c) in each dimension, Algorithm 1 line 13.
+    """`action` [3], a normalised pose, plus clip(N(0, delta), -c, c) in each dimension, Algorithm 1
+    line 13.
 
     Yaw wraps, x and y stop at the walls of the box.
     """
@@ -31,23 +32,35 @@ def action_noise(key: jax.Array, cfg: ExploreConfig, action: jax.Array) -> jax.A
 
 
 def choose(
-    key: jax.Array, cfg: ExploreConfig, actions_taken: jax.Array, greedy: Greedy, random_places: jax.Array
+    key: jax.Array,
+    cfg: ExploreConfig,
+    actions_taken: jax.Array,
+    greedy: Greedy,
+    random_places: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Primitive [] int32 and normalised pose [3] to try.
 
-    The primitive is random with a probability that decays (VPG), and then a push with `push_fraction`. The pose is,
-    with another decaying probability, the random place of the primitive so chosen, as it is, else that primitive's own
-    greedy pose plus noise: a primitive that was forced still acts where it is best.
+    The primitive is random with a probability that decays (VPG), and then a push with
+    `push_fraction`. The pose is, with another decaying probability, the random place of the
+    primitive so chosen, as it is, else that primitive's own greedy pose plus noise: a primitive
+    that was forced still acts where it is best.
 
-    Args: actions_taken [] int32 by the whole run; random_places [2, 3], one normalised pose per primitive.
+    Args: actions_taken [] int32 by the whole run; random_places [2, 3], one normalised pose per
+    primitive.
     """
     key_explore, key_push, key_place, key_noise = jax.random.split(key, 4)
     explore = jax.random.bernoulli(
-        key_explore, probability(cfg.primitive_start, cfg.primitive_end, cfg.decay, actions_taken)
+        key_explore,
+        probability(
+            cfg.epsilon_primitive_start, cfg.epsilon_primitive_end, cfg.decay, actions_taken
+        ),
     )
     grasp = jnp.where(jax.random.bernoulli(key_push, cfg.push_fraction), 0, 1)
     primitive = jnp.where(explore, grasp, greedy.primitive).astype(jnp.int32)
-    elsewhere = jax.random.bernoulli(key_place, probability(cfg.place_start, cfg.place_end, cfg.decay, actions_taken))
+    elsewhere = jax.random.bernoulli(
+        key_place,
+        probability(cfg.epsilon_place_start, cfg.epsilon_place_end, cfg.decay, actions_taken),
+    )
     noisy = action_noise(key_noise, cfg, greedy.poses[primitive])
     return primitive, jnp.where(elsewhere, random_places[primitive], noisy)
 
@@ -55,7 +68,8 @@ def choose(
 def random_cell(key: jax.Array, valid: jax.Array) -> jax.Array:
     """Index [] int32, uniform over the True entries of `valid` [n]; 0 if there is none.
 
-    One random rank among the valid ones, and not the largest of n noises, whose ties would favour low indices.
+    One random rank among the valid ones, and not the largest of n noises, whose ties would favour
+    low indices.
     """
     count = jnp.cumsum(valid, dtype=jnp.int32)  # [n]
     rank = jax.random.randint(key, (), 0, jnp.maximum(count[-1], 1))

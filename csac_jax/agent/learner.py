@@ -1,7 +1,8 @@
-"""Networks and their updates: the critic towards the TD target, the actor up the critic, targets after both.
+"""Networks and their updates: the critic towards the TD target, the actor up the critic, targets
+after both.
 
-M = critics, one or two of the same shape, their parameters stacked. Everything but the loss sees the lower of their
-values in each cell.
+M = critics, one or two of the same shape, their parameters stacked. Everything but the loss sees
+the lower of their values in each cell.
 """
 
 import dataclasses
@@ -17,8 +18,9 @@ from flax import struct
 from csac_jax.agent import actor, losses, maps, rewards, softmax
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.config import Config
+from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, rotate
 from csac_jax.vision.heightmap import Observation, PackedObservation
 
@@ -36,7 +38,8 @@ class Transition:
 
 @struct.dataclass
 class Params:
-    """Variables of the networks: theta^Q and theta^mu, each with the running statistics of its batch norm, if any."""
+    """Variables of the networks: theta^Q and theta^mu, each with the running statistics of its
+    batch norm, if any."""
 
     critic: Any  # leaves [M, ...]
     actor: Any
@@ -77,14 +80,26 @@ class Learner:
 def make(cfg: Config) -> Learner:
     """The learner of a config."""
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
-    return Learner(cfg, maps.frames(cfg), networks.critic(cfg.net), networks.head(cfg.net), *_optimisers(cfg), bounds)
+    return Learner(
+        cfg,
+        maps.frames(cfg),
+        networks.critic(cfg.net),
+        networks.head(cfg.net),
+        *_optimisers(cfg),
+        bounds,
+    )
 
 
 def with_numbers(learner: Learner, cfg: Config, bounds: tuple[Any, Any]) -> Learner:
-    """The learner of a config that differs in numbers only, which may be traced, and with them the `bounds`."""
+    """The learner of a config that differs in numbers only, which may be traced, and with them the
+    `bounds`."""
     critic_optimiser, actor_optimiser = _optimisers(cfg)
     return dataclasses.replace(
-        learner, cfg=cfg, critic_optimiser=critic_optimiser, actor_optimiser=actor_optimiser, bounds=bounds
+        learner,
+        cfg=cfg,
+        critic_optimiser=critic_optimiser,
+        actor_optimiser=actor_optimiser,
+        bounds=bounds,
     )
 
 
@@ -99,10 +114,13 @@ def _optimisers(cfg: Config) -> tuple[optax.GradientTransformation, optax.Gradie
 def _optimiser(cfg: Config, rate: float, updates: int) -> optax.GradientTransformation:
     """Adam on clipped gradients, its step size falling linearly over the run's `updates`.
 
-    The many small arrays of DenseNet-121 are one vector to it: a GPU takes longer to begin with each than to change it.
+    The many small arrays of DenseNet-121 are one vector to it: a GPU takes longer to begin with
+    each than to change it.
     """
-    schedule = optax.linear_schedule(rate, rate * cfg.learn.rate_end, updates)
-    optimiser = optax.chain(optax.clip_by_global_norm(cfg.learn.gradient_clip), optax.adam(schedule))
+    schedule = optax.linear_schedule(rate, rate * cfg.learn.lr_final_fraction, updates)
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(cfg.learn.gradient_clip), optax.adam(schedule)
+    )
     return optax.flatten(optimiser) if cfg.net.kind == "densenet121" else optimiser
 
 
@@ -111,9 +129,13 @@ def init(key: jax.Array, learner: Learner) -> LearnerState:
     key_critic, key_actor = jax.random.split(key)
     side = learner.frames.tables.canvas
     size = learner.cfg.heightmap.size
-    blank_obs = Observation(jnp.zeros((size, size, 3)), jnp.zeros((size, size)), jnp.zeros((size, size), bool))
+    blank_obs = Observation(
+        jnp.zeros((size, size, 3)), jnp.zeros((size, size)), jnp.zeros((size, size), bool)
+    )
     blank = jnp.zeros((1, side, side, maps.seen(learner.frames, blank_obs).shape[-1]))
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key_critic, jnp.arange(learner.cfg.learn.critics))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(
+        key_critic, jnp.arange(learner.cfg.learn.critics)
+    )
     (_, features), critic = jax.vmap(learner.critic.init_with_output, (0, None))(keys, blank)
     online = Params(critic, learner.actor.init(key_actor, features[0]))
     return LearnerState(
@@ -125,10 +147,17 @@ def init(key: jax.Array, learner: Learner) -> LearnerState:
     )
 
 
+def abstract_params(cfg: Config) -> Params:
+    """Shapes and types of a config's networks; no arrays."""
+    return jax.eval_shape(lambda: init(jax.random.key(0), make(cfg))).online
+
+
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
-    """The state before the first update, every trunk of the critics being `trunk`, see `torchvision.variables`."""
+    """The state before the first update, every trunk of the critics being `trunk`, see
+    `torchvision.variables`."""
     online, target = (
-        params.replace(critic=networks.with_trunk(params.critic, trunk)) for params in (state.online, state.target)
+        params.replace(critic=networks.with_trunk(params.critic, trunk))
+        for params in (state.online, state.target)
     )
     return state.replace(online=online, target=target)
 
@@ -136,32 +165,44 @@ def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
 def look(learner: Learner, params: Params, obs: Observation) -> DenseMaps:
     """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
     q, features = _critic_maps(learner, params, obs)
-    correction: Any = learner.actor.apply(params.actor, features) if learner.cfg.learn.actor else jnp.zeros_like(q)
+    correction: Any = (
+        learner.actor.apply(params.actor, features)
+        if learner.cfg.learn.actor
+        else jnp.zeros_like(q)
+    )
     return _dense_maps(learner, obs, q, correction)
 
 
 def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
-    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, ., ., F] of a batch, in the frames of the passes.
+    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, ., ., F] of a batch, in the frames of the
+    passes.
 
-    Q is the lower of both critics in each cell, before anything is read between cells; features are the first one's.
+    Q is the lower of both critics in each cell, before anything is read between cells; features are
+    the first one's.
     """
     fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
-    q, features = _of_each_critic(lambda variables: networks.look(learner.critic, variables, fed), params.critic)
+    q, features = _of_each_critic(
+        lambda variables: networks.look(learner.critic, variables, fed), params.critic
+    )
     return jnp.min(q, axis=0), features[0]
 
 
 def _of_each_critic(call: Callable[[Any], Any], variables: Any) -> Any:
     """What `call` makes of the variables of each critic, leaves [M, ...] in and out.
 
-    One after another: under vmap their convolutions become grouped ones, which take longer than both by themselves.
+    One after another: under vmap their convolutions become grouped ones, which take longer than
+    both by themselves.
     """
     num = jax.tree.leaves(variables)[0].shape[0]
     each = [call(jax.tree.map(lambda leaf, m=m: leaf[m], variables)) for m in range(num)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
-def _dense_maps(learner: Learner, obs: Observation, q: jax.Array, correction: jax.Array) -> DenseMaps:
-    """The maps of all yaws from those of the passes; `correction` [B, K / 2, h, w, OUTPUTS] is the actor's."""
+def _dense_maps(
+    learner: Learner, obs: Observation, q: jax.Array, correction: jax.Array
+) -> DenseMaps:
+    """The maps of all yaws from those of the passes; `correction` [B, K / 2, h, w, OUTPUTS] is the
+    actor's."""
     unfold = jax.vmap(maps.unfold)
     find = maps.actionable if learner.cfg.policy.mask else maps.everywhere
     return DenseMaps(
@@ -191,7 +232,8 @@ def next_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
 def _max_value(learner: Learner, state: DenseMaps) -> jax.Array:
     """max Q'(s', .) [] over the dense map's valid cells, eq. 9 and VPG; over all if none is valid.
 
-    The limit of the softmax over the map: samples would miss the highest cell, and a trilinear map is highest in one.
+    The limit of the softmax over the map: samples would miss the highest cell, and a trilinear map
+    is highest in one.
     """
     chosen = np.array(maps.allowed(learner.cfg.policy))
     valid = state.valid[chosen]
@@ -207,22 +249,33 @@ def _softmax_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Ar
 
     def of(primitive: Primitive) -> tuple[jax.Array, jax.Array, jax.Array]:
         mean = maps.normalise(frames, actor.pose(frames, state, primitive))
-        noisy, log_density = softmax.noisy_actions(jax.random.fold_in(key, primitive), cfg, mean, cfg.samples)
+        noisy, log_density = softmax.noisy_actions(
+            jax.random.fold_in(key, primitive), cfg, mean, cfg.samples
+        )
         poses = jax.vmap(maps.denormalise, (None, 0))(frames, noisy)
         which = jnp.int32(primitive)
         q = jax.vmap(maps.read, (None, None, None, 0))(frames, state.q, which, poses)
-        return q, log_density, jax.vmap(maps.is_valid, (None, None, None, 0))(frames, state.valid, which, poses)
+        return (
+            q,
+            log_density,
+            jax.vmap(maps.is_valid, (None, None, None, 0))(frames, state.valid, which, poses),
+        )
 
     sampled = map(of, maps.allowed(learner.cfg.policy))
     q, log_density, valid = (jnp.concatenate(leaves) for leaves in zip(*sampled, strict=True))
     low, high = learner.bounds
     shown = valid | ~jnp.any(valid)
     inverse_temperature = softmax.scaled_inverse_temperature(cfg, high - low)
-    return softmax.expectation(jnp.where(shown, q, low), jnp.where(shown, log_density, jnp.inf), inverse_temperature)
+    return softmax.expectation(
+        jnp.where(shown, q, low), jnp.where(shown, log_density, jnp.inf), inverse_temperature
+    )
 
 
-def _value(learner: Learner, critic: Any, obs: Observation, action: Action) -> tuple[jax.Array, Any]:
-    """Q(s, a) of a batch by each critic [M, B], from two passes per state: the frames next to the action's yaw.
+def _value(
+    learner: Learner, critic: Any, obs: Observation, action: Action
+) -> tuple[jax.Array, Any]:
+    """Q(s, a) of a batch by each critic [M, B], from two passes per state: the frames next to the
+    action's yaw.
 
     The nets run as in training: beside Q, the running statistics after the batch.
     """
@@ -233,12 +286,18 @@ def _value(learner: Learner, critic: Any, obs: Observation, action: Action) -> t
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
     fed = maps.seen(frames, obs)
-    one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(frames.tables, fed, half)
+    one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(
+        frames.tables, fed, half
+    )
     flat = one.reshape(-1, *one.shape[2:])
-    (q, _), statistics = _of_each_critic(lambda variables: networks.train(learner.critic, variables, flat), critic)
+    (q, _), statistics = _of_each_critic(
+        lambda variables: networks.train(learner.critic, variables, flat), critic
+    )
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
     push_output = (k >= num // 2).astype(jnp.int32)
-    output = jnp.where((action.primitive == Primitive.GRASP)[:, None], dense.OUTPUTS - 1, push_output)
+    output = jnp.where(
+        (action.primitive == Primitive.GRASP)[:, None], dense.OUTPUTS - 1, push_output
+    )
 
     def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
         position = rotate.frame_position(jnp.asarray(frames.yaws)[half], xy)
@@ -253,7 +312,8 @@ def _value(learner: Learner, critic: Any, obs: Observation, action: Action) -> t
 def update_critic(
     key: jax.Array, learner: Learner, state: LearnerState, batch: Transition, weights: jax.Array
 ) -> tuple[LearnerState, UpdateInfo]:
-    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines 17-26.
+    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines
+    17-26.
 
     L = mean_i w_i huber(y_i - Q(s_i, a_i)) with `weights` w [B], 1 but for a prioritised replay.
     """
@@ -262,7 +322,9 @@ def update_critic(
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(batch.reward.shape[0]))
     values = jax.vmap(next_value, (None, 0, 0))(learner, keys, next_maps)
     low, high = learner.bounds
-    target = losses.td_target(batch.reward, cfg.target.gamma, batch.terminated, jnp.clip(values, low, high))
+    target = losses.td_target(
+        batch.reward, cfg.target.gamma, batch.terminated, jnp.clip(values, low, high)
+    )
     obs, critic = heightmap.unpack(batch.obs), state.online.critic
 
     def loss(learned: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
@@ -283,11 +345,15 @@ def update_critic(
     return state, UpdateInfo(critic_loss, jnp.mean(q), target - q)
 
 
-def update_actor(learner: Learner, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
-    """One step of theta^mu up the critic, Algorithm 1 lines 22-23; returns the loss [], minus the mean of Q(s, mu(s)).
+def update_actor(
+    learner: Learner, state: LearnerState, obs: Observation
+) -> tuple[LearnerState, jax.Array]:
+    """One step of theta^mu up the critic, Algorithm 1 lines 22-23; returns the loss [], minus the
+    mean of Q(s, mu(s)).
 
-    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for each primitive that the
-    policy takes. Without an actor (`learn.actor`) nothing changes and the loss is 0.
+    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for each
+    primitive that the policy takes. Without an actor (`learn.actor`) nothing changes and the loss
+    is 0.
     """
     if not learner.cfg.learn.actor:
         return state, jnp.zeros(())
@@ -299,7 +365,9 @@ def update_actor(learner: Learner, state: LearnerState, obs: Observation) -> tup
         return maps.read(learner.frames, dense_maps.q, jnp.int32(primitive), pose)
 
     def loss(learned: Any) -> tuple[jax.Array, Any]:
-        correction, statistics = networks.train(learner.actor, {**state.online.actor, **learned}, features)
+        correction, statistics = networks.train(
+            learner.actor, {**state.online.actor, **learned}, features
+        )
         dense_maps = _dense_maps(learner, obs, q, correction)
         values = [jax.vmap(lambda one, p=p: value(one, p))(dense_maps) for p in chosen]
         return -jnp.mean(jnp.stack(values)), statistics

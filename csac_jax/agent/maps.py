@@ -1,8 +1,9 @@
-"""Dense maps of one state: Q and actor logits for every primitive, yaw and cell, and reading them at an action.
+"""Dense maps of one state: Q and actor logits for every primitive, yaw and cell, and reading them
+at an action.
 
-Map k lies in frame k, the workspace turned so that yaw_k points along +column; it stays there, since turning it back
-would blur it once more. Q at a continuous action is trilinear: bilinear in the two frames next to its yaw, linear
-between them.
+Map k lies in frame k, the workspace turned so that yaw_k points along +column; it stays there,
+since turning it back would blur it once more. Q at a continuous action is trilinear: bilinear in
+the two frames next to its yaw, linear between them.
 """
 
 import dataclasses
@@ -15,9 +16,9 @@ from flax import struct
 from csac_jax import geometry
 from csac_jax.agent import box
 from csac_jax.config import Config, NetConfig, PolicyConfig
+from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
 from csac_jax.sim.outcome import BARE
-from csac_jax.sim.primitives import Primitive
 from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation
 
@@ -33,7 +34,9 @@ def allowed(cfg: PolicyConfig) -> tuple[Primitive, ...]:
 class Frames:
     """Where the cells of the dense maps lie. K = yaws, h = w = rows and columns of a map."""
 
-    tables: rotate.RotationTables  # of the first K / 2 frames: the others are the same pictures upside down
+    tables: (
+        rotate.RotationTables
+    )  # of the first K / 2 frames: the others are the same pictures upside down
     yaws: np.ndarray  # [K] rad
     net: NetConfig
     stride: int  # cells of a canvas per cell of a map, along each axis
@@ -60,7 +63,19 @@ def frames(cfg: Config) -> Frames:
     inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
     marked = cfg.task.kind == "target"
     length = cfg.sim.push_length
-    return Frames(tables, yaws.astype(np.float32), cfg.net, stride, side, cell, extent, length, marked, xy, inside)
+    return Frames(
+        tables,
+        yaws.astype(np.float32),
+        cfg.net,
+        stride,
+        side,
+        cell,
+        extent,
+        length,
+        marked,
+        xy,
+        inside,
+    )
 
 
 @struct.dataclass
@@ -74,7 +89,9 @@ class DenseMaps:
 
 def seen(frames: Frames, obs: Observation) -> jax.Array:
     """What the net is to see of an observation, [..., H, W, I]; see `inputs` of the net."""
-    return networks.inputs(frames.net, obs.colour, obs.height, obs.target if frames.marked else None)
+    return networks.inputs(
+        frames.net, obs.colour, obs.height, obs.target if frames.marked else None
+    )
 
 
 def net_inputs(frames: Frames, obs: Observation) -> jax.Array:
@@ -85,7 +102,9 @@ def net_inputs(frames: Frames, obs: Observation) -> jax.Array:
 def unfold(halves: jax.Array) -> jax.Array:
     """Net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] to the maps of all K, [P, K, h, w]."""
     ahead, back, grasp = (halves[..., output] for output in range(dense.OUTPUTS))
-    return jnp.stack([jnp.concatenate([ahead, _half_turn(back)]), jnp.concatenate([grasp, _half_turn(grasp)])])
+    return jnp.stack(
+        [jnp.concatenate([ahead, _half_turn(back)]), jnp.concatenate([grasp, _half_turn(grasp)])]
+    )
 
 
 def _half_turn(maps: jax.Array) -> jax.Array:
@@ -96,8 +115,9 @@ def _half_turn(maps: jax.Array) -> jax.Array:
 def actionable(frames: Frames, obs: Observation) -> jax.Array:
     """Cells where an action can have an effect, [P, K, h, w] bool.
 
-    Grasp: something to get, higher than 1 cm, lies under the cell. Push: something does within the push's length ahead,
-    whatever it is. Masking what is bare is SPOT's dynamic action space (arXiv:1909.04730).
+    Grasp: something to get, higher than 1 cm, lies under the cell. Push: something does within the
+    push's length ahead, whatever it is. Masking what is bare is SPOT's dynamic action space
+    (arXiv:1909.04730).
     """
     under = _under(frames, obs.height)
     wanted = _under(frames, jnp.where(obs.target, obs.height, 0.0)) if frames.marked else under
@@ -117,12 +137,16 @@ def _under(frames: Frames, height: jax.Array) -> jax.Array:
 
 
 def everywhere(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells above the workspace for each primitive, [P, K, h, w] bool, whatever is seen: no masking.
+    """Cells above the workspace for each primitive, [P, K, h, w] bool, whatever is seen: no
+    masking.
 
-    In the target task, grasps only where the target lies under the cell: phi_g of eq. 16 is that of the target.
+    In the target task, grasps only where the target lies under the cell: phi_g of eq. 16 is that of
+    the target.
     """
     inside = jnp.asarray(frames.inside)
-    grasp = inside & _under(frames, jnp.where(obs.target, obs.height, 0.0)) if frames.marked else inside
+    grasp = (
+        inside & _under(frames, jnp.where(obs.target, obs.height, 0.0)) if frames.marked else inside
+    )
     return jnp.stack([inside, grasp])
 
 
@@ -141,14 +165,19 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
         position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
         row_col = jnp.clip(rotate.to_cell(side, frames.cell, position), 0.0, side - 1.0)
         first_row = ((primitive * num + k) * side).astype(jnp.float32)
-        return rotate.bilinear(maps.reshape(-1, side), row_col + jnp.stack([first_row, jnp.zeros_like(first_row)]))
+        return rotate.bilinear(
+            maps.reshape(-1, side), row_col + jnp.stack([first_row, jnp.zeros_like(first_row)])
+        )
 
     k = lower.astype(jnp.int32)
     return (1.0 - share) * at(k) + share * at(k + 1)
 
 
-def best_over_yaws(frames: Frames, state: DenseMaps, places: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The largest valid value over the yaws at `places` [..., 2] m, and whether any is valid, both [P, ...].
+def best_over_yaws(
+    frames: Frames, state: DenseMaps, places: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The largest valid value over the yaws at `places` [..., 2] m, and whether any is valid, both
+    [P, ...].
 
     To be looked at: a picture of what the maps say, without their turned frames.
     """
@@ -156,10 +185,14 @@ def best_over_yaws(frames: Frames, state: DenseMaps, places: jax.Array) -> tuple
 
     def at(primitive: jax.Array, place: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
         pose = jnp.append(place, yaw)
-        return read(frames, state.q, primitive, pose), is_valid(frames, state.valid, primitive, pose)
+        return read(frames, state.q, primitive, pose), is_valid(
+            frames, state.valid, primitive, pose
+        )
 
     every = jax.vmap(jax.vmap(jax.vmap(at, (None, None, 0)), (None, 0, None)), (0, None, None))
-    values, valid = every(jnp.arange(NUM_PRIMITIVES), flat, jnp.asarray(frames.yaws))  # [P, places, K]
+    values, valid = every(
+        jnp.arange(NUM_PRIMITIVES), flat, jnp.asarray(frames.yaws)
+    )  # [P, places, K]
     best = jnp.max(jnp.where(valid, values, -jnp.inf), axis=-1)
     shape = (NUM_PRIMITIVES, *places.shape[:-1])
     return best.reshape(shape), jnp.any(valid, axis=-1).reshape(shape)
@@ -170,12 +203,15 @@ def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.A
     num, side = frames.yaws.shape[0], frames.side
     k = jnp.mod(jnp.round(pose[2] * (num / (2.0 * np.pi))).astype(jnp.int32), num)
     position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
-    row, col = jnp.clip(jnp.round(rotate.to_cell(side, frames.cell, position)), 0.0, side - 1.0).astype(jnp.int32)
+    row, col = jnp.clip(
+        jnp.round(rotate.to_cell(side, frames.cell, position)), 0.0, side - 1.0
+    ).astype(jnp.int32)
     return valid[primitive, k, row, col]
 
 
 def best_cells(values: jax.Array, valid: jax.Array, num: int) -> jax.Array:
-    """Flat indices [num] int32 into [K, h, w] of the largest valid values; of the largest at all if none is valid."""
+    """Flat indices [num] int32 into [K, h, w] of the largest valid values; of the largest at all if
+    none is valid."""
     masked = jnp.where(valid | ~jnp.any(valid), values, -jnp.inf)
     return jax.lax.top_k(masked.reshape(-1), num)[1].astype(jnp.int32)
 
@@ -188,7 +224,9 @@ def cell_pose(frames: Frames, index: jax.Array) -> jax.Array:
 
 def normalise(frames: Frames, pose: jax.Array) -> jax.Array:
     """Pose [3] (m, m, rad) to the box [-1, 1]^3."""
-    return box.project(jnp.append(pose[:2] / (0.5 * frames.extent), pose[2] / np.pi - 1.0), box.POSE_WRAPS)
+    return box.project(
+        jnp.append(pose[:2] / (0.5 * frames.extent), pose[2] / np.pi - 1.0), box.POSE_WRAPS
+    )
 
 
 def denormalise(frames: Frames, u: jax.Array) -> jax.Array:

@@ -1,4 +1,5 @@
-"""From dense maps to an action: a pose per primitive, then one of them, with or without exploration."""
+"""From dense maps to an action: a pose per primitive, then one of them, with or without
+exploration."""
 
 from typing import NamedTuple
 
@@ -9,7 +10,8 @@ from csac_jax.agent import actor, box, cem, explore, maps
 from csac_jax.agent.explore import Greedy
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.config import Config, PolicyConfig
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.constants import Primitive
+from csac_jax.sim.primitives import Action
 
 
 class Choice(NamedTuple):
@@ -19,15 +21,25 @@ class Choice(NamedTuple):
     values: jax.Array  # [P] Q of the poses
 
 
-def greedy(key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, idle: jax.Array) -> Choice:
+def greedy(
+    key: jax.Array,
+    cfg: Config,
+    frames: Frames,
+    state: DenseMaps,
+    penalty: float,
+    steps_without_change: jax.Array,
+) -> Choice:
     """The best pose of each primitive by `policy.place`, then a primitive by `policy.primitive`.
 
-    Args: penalty, the span of possible returns; idle [] int32, actions in a row without visible change.
+    Args: penalty, the span of possible returns; steps_without_change [] int32, actions in a row
+    without visible change.
     """
 
     def best(primitive: Primitive) -> cem.CEMResult:
         if cfg.policy.place == "cem":
-            return _search(jax.random.fold_in(key, primitive), cfg, frames, state, penalty, primitive)
+            return _search(
+                jax.random.fold_in(key, primitive), cfg, frames, state, penalty, primitive
+            )
         if cfg.policy.place == "argmax":
             return _best_pixel(frames, state, primitive)
         raise ValueError(f"policy.place: {cfg.policy.place!r} is neither 'cem' nor 'argmax'")
@@ -35,19 +47,28 @@ def greedy(key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalt
     results = [best(primitive) for primitive in Primitive]
     values = jnp.stack([result.value for result in results])
     poses = jnp.stack([result.action for result in results])
-    return Choice(Greedy(choose_primitive(cfg.policy, values, idle), poses), values)
+    return Choice(Greedy(choose_primitive(cfg.policy, values, steps_without_change), poses), values)
 
 
 def _search(
-    key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, primitive: Primitive
+    key: jax.Array,
+    cfg: Config,
+    frames: Frames,
+    state: DenseMaps,
+    penalty: float,
+    primitive: Primitive,
 ) -> cem.CEMResult:
-    """Maximises Q over the pose of a primitive by the cross-entropy method, Algorithm 1 lines 8-13."""
+    """Maximises Q over the pose of a primitive by the cross-entropy method, Algorithm 1 lines
+    8-13."""
     score, mean, start = _problem(cfg, frames, state, penalty, primitive)
     return cem.maximise(key, cfg.cem, score, mean, start, box.POSE_WRAPS)
 
 
-def candidates(key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float) -> jax.Array:
-    """Poses [P, J, 3] that the last round of `greedy`'s searches tries; the best pixel if it has none."""
+def candidates(
+    key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float
+) -> jax.Array:
+    """Poses [P, J, 3] that the last round of `greedy`'s searches tries; the best pixel if it has
+    none."""
 
     def cloud(primitive: Primitive) -> jax.Array:
         if cfg.policy.place != "cem":
@@ -66,14 +87,16 @@ def _problem(
 ) -> tuple[cem.Score, jax.Array, jax.Array]:
     """What a search maximises, its mean [A] and its starting points [P0, A].
 
-    It starts, by `cem.start`, at the actor's mean, at the map's best cells, as many as there are elites, or at both;
-    `penalty` keeps it off cells with nothing to act on.
+    It starts, by `cem.start`, at the actor's mean, at the map's best cells, as many as there are
+    elites, or at both; `penalty` keeps it off cells with nothing to act on.
     """
 
     def score(u: jax.Array) -> jax.Array:
         pose = maps.denormalise(frames, u)
         value = maps.read(frames, state.q, jnp.int32(primitive), pose)
-        return jnp.where(maps.is_valid(frames, state.valid, jnp.int32(primitive), pose), value, value - penalty)
+        return jnp.where(
+            maps.is_valid(frames, state.valid, jnp.int32(primitive), pose), value, value - penalty
+        )
 
     mean = maps.normalise(frames, actor.pose(frames, state, primitive))
     cells = maps.best_cells(state.q[primitive], state.valid[primitive], cfg.cem.elites)
@@ -90,19 +113,26 @@ def _problem(
 def _best_pixel(frames: Frames, state: DenseMaps, primitive: Primitive) -> cem.CEMResult:
     """The valid cell of largest Q as it is (VPG)."""
     cell = maps.best_cells(state.q[primitive], state.valid[primitive], 1)[0]
-    return cem.CEMResult(maps.normalise(frames, maps.cell_pose(frames, cell)), state.q[primitive].reshape(-1)[cell])
+    return cem.CEMResult(
+        maps.normalise(frames, maps.cell_pose(frames, cell)), state.q[primitive].reshape(-1)[cell]
+    )
 
 
-def choose_primitive(cfg: PolicyConfig, values: jax.Array, idle: jax.Array) -> jax.Array:
-    """Primitive [] int32 from the values [P] of the best poses and the number of actions without change, idle [].
+def choose_primitive(
+    cfg: PolicyConfig, values: jax.Array, steps_without_change: jax.Array
+) -> jax.Array:
+    """Primitive [] int32 from the values [P] of the best poses and the number of actions without
+    change, steps_without_change [].
 
-    `argmax`, the larger value; `rule`, a push if the last action changed nothing, else a grasp (CSAC sec. 3.4);
-    `grasp`, always that.
+    `argmax`, the larger value; `rule`, a push if the last action changed nothing, else a grasp
+    (CSAC sec. 3.4); `grasp`, always that.
     """
     if cfg.primitive == "argmax":
         return jnp.argmax(values).astype(jnp.int32)
     if cfg.primitive == "rule":
-        return jnp.where(idle > 0, jnp.int32(Primitive.PUSH), jnp.int32(Primitive.GRASP))
+        return jnp.where(
+            steps_without_change > 0, jnp.int32(Primitive.PUSH), jnp.int32(Primitive.GRASP)
+        )
     if cfg.primitive == "grasp":
         return jnp.int32(Primitive.GRASP)
     raise ValueError(f"policy.primitive: {cfg.primitive!r} is none of 'argmax', 'rule', 'grasp'")
@@ -112,7 +142,9 @@ def random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array
     """One random valid cell per primitive as a point of the box [P, 3]; `valid` [P, K, h, w]."""
     places = []
     for primitive in Primitive:
-        index = explore.random_cell(jax.random.fold_in(key, primitive), valid[primitive].reshape(-1))
+        index = explore.random_cell(
+            jax.random.fold_in(key, primitive), valid[primitive].reshape(-1)
+        )
         places.append(maps.normalise(frames, maps.cell_pose(frames, index)))
     return jnp.stack(places)
 
@@ -123,22 +155,27 @@ def act(
     frames: Frames,
     state: DenseMaps,
     penalty: float,
-    idle: jax.Array,
+    steps_without_change: jax.Array,
     actions_taken: jax.Array,
 ) -> Action:
     """The action to try while learning: greedy with exploration, Algorithm 1 lines 8-13."""
     key_cem, key_places, key_choose = jax.random.split(key, 3)
-    choice = greedy(key_cem, cfg, frames, state, penalty, idle)
+    choice = greedy(key_cem, cfg, frames, state, penalty, steps_without_change)
     places = random_places(key_places, frames, state.valid)
     primitive, u = explore.choose(key_choose, cfg.explore, actions_taken, choice.greedy, places)
     return Action(primitive=primitive, pose=maps.denormalise(frames, u))
 
 
 def best_action(
-    key: jax.Array, cfg: Config, frames: Frames, state: DenseMaps, penalty: float, idle: jax.Array
+    key: jax.Array,
+    cfg: Config,
+    frames: Frames,
+    state: DenseMaps,
+    penalty: float,
+    steps_without_change: jax.Array,
 ) -> Action:
     """The action of the learned policy, without exploration."""
-    choice = greedy(key, cfg, frames, state, penalty, idle)
+    choice = greedy(key, cfg, frames, state, penalty, steps_without_change)
     u = choice.greedy.poses[choice.greedy.primitive]
     return Action(primitive=choice.greedy.primitive, pose=maps.denormalise(frames, u))
 

@@ -1,7 +1,8 @@
-"""The softmax value of a state over continuous actions, CSAC Algorithm 1 line 17, as SD3 (arXiv:2010.09177).
+"""The softmax value of a state over continuous actions, CSAC Algorithm 1 line 17, as SD3
+(arXiv:2010.09177).
 
-softmax_beta(Q) = integral of exp(beta Q(a)) Q(a) da / integral of exp(beta Q(a)) da, estimated from noisy actions
-a_i ~ p with weights exp(beta Q(a_i)) / p(a_i).
+softmax_beta(Q) = integral of exp(beta Q(a)) Q(a) da / integral of exp(beta Q(a)) da, estimated from
+noisy actions a_i ~ p with weights exp(beta Q(a_i)) / p(a_i).
 """
 
 import jax
@@ -13,17 +14,22 @@ from csac_jax.config import TargetConfig
 
 
 def scaled_inverse_temperature(cfg: TargetConfig, q_range: float) -> float:
-    """beta for Q values that span `q_range`: the same beta Q, whatever the rewards' scale (ours)."""
+    """beta for Q values that span `q_range`: the same beta Q, whatever the rewards' scale
+    (ours)."""
     return cfg.inverse_temperature / q_range
 
 
-def expectation(q: jax.Array, log_density: jax.Array, inverse_temperature: jax.Array | float) -> jax.Array:
+def expectation(
+    q: jax.Array, log_density: jax.Array, inverse_temperature: jax.Array | float
+) -> jax.Array:
     """Self-normalised importance-sampled softmax_beta, [].
 
-    sum_i w_i q_i / sum_i w_i, w_i = exp(beta q_i) / p_i, line 17. The largest exponent is subtracted before exp, so
-    that no weight overflows; adding the weighted distance below the largest q keeps rounding from passing that q.
+    sum_i w_i q_i / sum_i w_i, w_i = exp(beta q_i) / p_i, line 17. The largest exponent is
+    subtracted before exp, so that no weight overflows; adding the weighted distance below the
+    largest q keeps rounding from passing that q.
 
-    Args: q [N] finite values; log_density [N] log p of the actions that were sampled; inverse_temperature [] beta.
+    Args: q [N] finite values; log_density [N] log p of the actions that were sampled;
+    inverse_temperature [] beta.
     """
     weight = jax.nn.softmax(inverse_temperature * q - log_density)  # subtracts the maximum
     top = jnp.max(q)
@@ -33,7 +39,8 @@ def expectation(q: jax.Array, log_density: jax.Array, inverse_temperature: jax.A
 def exact(q_map: jax.Array, inverse_temperature: jax.Array | float, valid: jax.Array) -> jax.Array:
     """softmax_beta over the cells of a discrete map, [].
 
-    Args: q_map [...] values, only `valid` [...] bool ones count, of which there must be one at least.
+    Args: q_map [...] values, only `valid` [...] bool ones count, of which there must be one at
+    least.
     """
     top = jnp.max(jnp.where(valid, q_map, -jnp.inf))
     below = jnp.where(valid, q_map - top, 0.0)
@@ -41,14 +48,18 @@ def exact(q_map: jax.Array, inverse_temperature: jax.Array | float, valid: jax.A
     return top + jnp.sum(weight * below) / jnp.sum(weight)
 
 
-def noisy_actions(key: jax.Array, cfg: TargetConfig, mean: jax.Array, num: int) -> tuple[jax.Array, jax.Array]:
-    """Poses around `mean` [3] = normalised (x, y, yaw), and the log density with which each was drawn.
+def noisy_actions(
+    key: jax.Array, cfg: TargetConfig, mean: jax.Array, num: int
+) -> tuple[jax.Array, jax.Array]:
+    """Poses around `mean` [3] = normalised (x, y, yaw), and the log density with which each was
+    drawn.
 
-    a = mu + eps, eps ~ N(0, std) truncated to [-clip, clip] (Algorithm 1 line 13, SD3), for x and y also to the box.
-    Deviation: line 13 clips the normal, which piles probability up on the bounds, where it has no density; and clipping
-    to the box does it again. A truncated normal has a density everywhere, p = phi(eps / std) / (std Z),
-    Z = Phi(high / std) - Phi(low / std). As low <= 0 <= high, Z is a sum of two positive terms and nothing cancels.
-    Yaw is truncated to half a turn at most, else one pose could be drawn in two ways.
+    a = mu + eps, eps ~ N(0, std) truncated to [-clip, clip] (Algorithm 1 line 13, SD3), for x and y
+    also to the box. Deviation: line 13 clips the normal, which piles probability up on the bounds,
+    where it has no density; and clipping to the box does it again. A truncated normal has a density
+    everywhere, p = phi(eps / std) / (std Z), Z = Phi(high / std) - Phi(low / std). As low <= 0 <=
+    high, Z is a sum of two positive terms and nothing cancels. Yaw is truncated to half a turn at
+    most, else one pose could be drawn in two ways.
 
     Returns: actions [num, 3] in the box; log density [num] per unit of the box.
     """
@@ -58,7 +69,9 @@ def noisy_actions(key: jax.Array, cfg: TargetConfig, mean: jax.Array, num: int) 
     low = jnp.maximum(-cfg.clip, wall_low) / cfg.std  # [3], in units of the spread
     high = jnp.minimum(cfg.clip, wall_high) / cfg.std
     shape = (num, *mean.shape)
-    noise = jax.random.truncated_normal(key, jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape), shape)
+    noise = jax.random.truncated_normal(
+        key, jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape), shape
+    )
     mass = 0.5 * (jax.lax.erf(high / np.sqrt(2.0)) - jax.lax.erf(low / np.sqrt(2.0)))  # [3], Z
     log_scale = jnp.log(mass) + np.log(cfg.std * np.sqrt(2.0 * np.pi))
     log_density = jnp.sum(-0.5 * noise**2 - log_scale[None], axis=-1)

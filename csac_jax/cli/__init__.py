@@ -1,7 +1,8 @@
-"""The command `csac-jax`. Exit codes: 0 done, 1 failed, 2 bad arguments, 130 and 143 stopped by SIGINT and SIGTERM.
+"""The command `csac-jax`. Exit codes: 0 done, 1 failed, 2 bad arguments, 130 and 143 stopped by
+SIGINT and SIGTERM.
 
-A file per command, whose `run` takes its arguments and returns the exit code. JAX is imported only once the arguments
-are known to be good, so that help and complaints come at once.
+A file per command, whose `run` takes its arguments and returns the exit code. JAX is imported only
+once the arguments are known to be good, so that help and complaints come at once.
 """
 
 import os
@@ -12,7 +13,7 @@ import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.cli import bench, doctor, evaluation, export, play, report, sweep, train
 from csac_jax.cli.errors import PROGRAM, BadArgumentsError, FailedError, complain
-from csac_jax.scene.errors import SceneError
+from csac_jax.errors import SceneError
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
@@ -45,7 +46,8 @@ A robot learns to push and grasp in clutter.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command in `argv` (without the program's name; the process's own if None); returns the exit code."""
+    """Runs the command in `argv` (without the program's name; the process's own if None); returns
+    the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         return _dispatch(arguments)
@@ -68,5 +70,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(csac_jax.__version__)
         return 0
     if arguments[0] not in COMMANDS:
-        raise BadArgumentsError(f"unknown command '{arguments[0]}'; choose one of: {', '.join(COMMANDS)}")
+        raise BadArgumentsError(
+            f"unknown command '{arguments[0]}'; choose one of: {', '.join(COMMANDS)}"
+        )
     return COMMANDS[arguments[0]](arguments[1:])

@@ -13,7 +13,9 @@ def run(arguments: list[str]) -> int:
     """Runs `main` of a script; returns the exit code."""
     scripts = {path.stem: path for path in BENCHMARKS.glob("[!_]*.py")}
     if not scripts:
-        raise BadArgumentsError(f"bench: there is nothing in {BENCHMARKS}; benchmarks come with a checkout")
+        raise BadArgumentsError(
+            f"bench: there is nothing in {BENCHMARKS}; benchmarks come with a checkout"
+        )
     names = ", ".join(sorted(scripts))
     if arguments[:1] in (["-h"], ["--help"]):
         print(f"usage: {PROGRAM} bench NAME ..., with NAME one of: {names}")

@@ -1,4 +1,5 @@
-"""`csac-jax doctor`: whether this machine computes right, and what a run will take of its memory."""
+"""`csac-jax doctor`: whether this machine computes right, and what a run will take of its
+memory."""
 
 import contextlib
 import dataclasses
@@ -17,9 +18,11 @@ _HANGS = "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8
 
 @dataclasses.dataclass(frozen=True)
 class DoctorOptions:
-    """Prints versions, devices and the protections in force, and checks that this machine computes right.
+    """Prints versions, devices and the protections in force, and checks that this machine computes
+    right.
 
-    With --preset PRESET, and settings of it as for `train`, also the memory that such a run will take."""
+    With --preset PRESET, and settings of it as for `train`, also the memory that such a run will
+    take."""
 
     json: Path | None = None
     """File to write the result to, as JSON."""
@@ -31,7 +34,7 @@ def run(arguments: list[str]) -> int:
     options = parsing.parse(DoctorOptions, own, "doctor")
     needs = {} if cfg is None else _print_memory(cfg)
     with _watchdog(90.0, _HANGS):
-        from csac_jax.train import selftest
+        from csac_jax.runtime import selftest
 
         guard = _print_machine()
         begun = time.perf_counter()
@@ -44,18 +47,23 @@ def run(arguments: list[str]) -> int:
     output.write_result(options.json, {**guard, "self_test": tests, **needs}, cfg)
     failed = [check.name for check in checks if not check.passed]
     if failed:
-        raise FailedError(f"self-test failed: {'; '.join(failed)}; do not trust results of these versions here")
+        raise FailedError(
+            f"self-test failed: {'; '.join(failed)}; do not trust results of these versions here"
+        )
     return 0
 
 
 def _split(arguments: list[str]) -> tuple[list[str], Config | None]:
-    """The arguments of `doctor` itself, and the config that the others ask for, if a preset is among them."""
+    """The arguments of `doctor` itself, and the config that the others ask for, if a preset is
+    among them."""
     preset = parsing.value_of(arguments, "--preset")
     if parsing.asks_help(arguments):
         return ["--help"], None
     if preset is None:
         if "--preset" in arguments:
-            raise BadArgumentsError(f"doctor: give a preset after --preset, one of: {settings.PRESETS}")
+            raise BadArgumentsError(
+                f"doctor: give a preset after --preset, one of: {settings.PRESETS}"
+            )
         return arguments, None
     own: list[str] = []
     others: list[str] = []
@@ -70,25 +78,32 @@ def _split(arguments: list[str]) -> tuple[list[str], Config | None]:
 
 def _print_memory(cfg: Config) -> dict[str, Any]:
     """Prints what a run will hold in memory; returns it for the JSON."""
-    from csac_jax.train import memory
+    from csac_jax.training import memory
 
     parts, available = memory.predict(cfg), memory.limit()
     total = sum(parts.values())
     listed = ", ".join(f"{name} {size / memory.GIB:.2f}" for name, size in parts.items())
-    print(f"memory     {total / memory.GIB:.2f} GiB of {available / memory.GIB:.1f} for {cfg.preset}: {listed}")
+    print(
+        f"memory     {total / memory.GIB:.2f} GiB of {available / memory.GIB:.1f} for {cfg.preset}: {listed}"
+    )
     stages = memory.stages(cfg)
-    print(f"           step: {', '.join(f'{name} {size / memory.GIB:.2f}' for name, size in stages.items())}")
+    print(
+        f"           step: {', '.join(f'{name} {size / memory.GIB:.2f}' for name, size in stages.items())}"
+    )
     return {"memory": {"bytes": parts, "step_bytes": stages, "limit_bytes": available}}
 
 
 def _print_machine() -> dict[str, Any]:
     """Prints versions, devices and the protections in force; returns these for the JSON."""
     from csac_jax import _guard
-    from csac_jax.train import compiler, provenance
+    from csac_jax.runtime import compiler, provenance
 
     record = provenance.record()
     print(f"device     {record['device']}")
-    print("versions   " + ", ".join(f"{name} {version}" for name, version in provenance.versions().items()))
+    print(
+        "versions   "
+        + ", ".join(f"{name} {version}" for name, version in provenance.versions().items())
+    )
     print(f"commit     {record['commit'] or 'none'}")
     variable, threads = _guard.pool_setting()
     guarded = threads >= _guard.needed_threads()
@@ -99,7 +114,11 @@ def _print_machine() -> dict[str, Any]:
     fast = compiler.has_library()
     print(f"training   convolutions by XLA's {'second library' if fast else 'default library'}")
     pool = {"variable": variable, "threads": threads, "guarded": guarded}
-    return {"thread_pool": pool, "xla_flags": os.environ.get("XLA_FLAGS", ""), "second_library": fast}
+    return {
+        "thread_pool": pool,
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+        "second_library": fast,
+    }
 
 
 @contextlib.contextmanager

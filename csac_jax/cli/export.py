@@ -11,7 +11,8 @@ from csac_jax.cli.errors import BadArgumentsError
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """Writes the policy that a run has learned, networks and config, into one file for `eval` and `play`."""
+    """Writes the policy that a run has learned, networks and config, into one file for `eval` and
+    `play`."""
 
     run_dir: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -26,7 +27,7 @@ def run(arguments: list[str]) -> int:
         raise BadArgumentsError(f"{options.file}: the name of a policy file ends in .safetensors")
     if options.file.exists():
         raise BadArgumentsError(f"{options.file} exists; give another name")
-    from csac_jax.train import policy_file
+    from csac_jax.io import policy_file
 
     cfg, networks = stored.policy(str(options.run_dir))
     policy_file.save(options.file, networks(), cfg)

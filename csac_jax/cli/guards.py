@@ -27,7 +27,9 @@ def check_new(folder: Path | None) -> None:
 
 def exists(folder: Path) -> BadArgumentsError:
     """The complaint about a run's folder that is there already."""
-    return BadArgumentsError(f"{folder} exists; give another --run-dir, or go on with it by --resume")
+    return BadArgumentsError(
+        f"{folder} exists; give another --run-dir, or go on with it by --resume"
+    )
 
 
 def check_physics(cfg: Config) -> None:
@@ -36,7 +38,9 @@ def check_physics(cfg: Config) -> None:
         import jax
 
         if jax.default_backend() != "gpu":
-            raise BadArgumentsError("--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx")
+            raise BadArgumentsError(
+                "--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx"
+            )
 
 
 def check_host_physics(cfg: Config, devices: int) -> None:

@@ -1,11 +1,12 @@
-"""What commands write: folders with the time in their name, JSON with its provenance, shares as text."""
+"""What commands write: folders with the time in their name, JSON with its provenance, shares as
+text."""
 
 import datetime
-import json
 from pathlib import Path
 from typing import Any
 
 from csac_jax.config import Config
+from csac_jax.io import files
 
 RUNS = Path("runs")
 
@@ -21,19 +22,11 @@ def write_result(path: Path | None, result: dict[str, Any], cfg: Config | None) 
     """Writes a result with its config and provenance, if there is a path."""
     if path is None:
         return
-    from csac_jax.train import config_json, provenance
+    from csac_jax.io import config_json
+    from csac_jax.runtime import provenance
 
     config = {} if cfg is None else {"config": config_json.to_dict(cfg)}
-    write_json(path, {**result, **config, **provenance.record()})
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes a file that appears all at once, and its folder."""
-    text = json.dumps(content, indent=2) + "\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text)
-    temporary.replace(path)
+    files.write_json(path, {**result, **config, **provenance.record()})
 
 
 def percent(value: float) -> str:

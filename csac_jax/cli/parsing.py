@@ -15,9 +15,13 @@ Arguments = TypeVar("Arguments")
 
 
 def parse(
-    kind: type[Arguments], arguments: Sequence[str], command: str, default: Any = tyro.MISSING_NONPROP
+    kind: type[Arguments],
+    arguments: Sequence[str],
+    command: str,
+    default: Any = tyro.MISSING_NONPROP,
 ) -> Arguments:
-    """`arguments` of `command` as a `kind`. Prints help and exits; bad ones raise BadArgumentsError."""
+    """`arguments` of `command` as a `kind`. Prints help and exits; bad ones raise
+    BadArgumentsError."""
     prog = f"{PROGRAM} {command}"
     if asks_help(arguments):
         tyro.cli(kind, prog=prog, args=["--help"], default=default)
@@ -37,7 +41,8 @@ def asks_help(arguments: Sequence[str]) -> bool:
 
 
 def value_of(flags: Sequence[str], name: str) -> str | None:
-    """What follows the option `name` on the command line: some options decide the defaults of all the rest."""
+    """What follows the option `name` on the command line: some options decide the defaults of all
+    the rest."""
     found = None
     for i, flag in enumerate(flags):
         if flag == name and i + 1 < len(flags):
@@ -65,10 +70,16 @@ def _one_line(box: str, prog: str) -> str:
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
     lines = [line.strip("│ ") for line in plain.splitlines() if not line.startswith(("╭", "╰"))]
     rules = [i for i, line in enumerate(lines) if re.fullmatch("[─-]{3,}", line)]
-    if "╭" not in plain and rules:  # drawn without corners: the title stands on a line of its own, over a rule
+    if (
+        "╭" not in plain and rules
+    ):  # drawn without corners: the title stands on a line of its own, over a rule
         lines, rules = lines[rules[0] + 1 :], [i - rules[0] - 1 for i in rules[1:]]
     message = " ".join(lines[: rules[0] if rules else None]).strip().rstrip(".")
     message = re.sub(r"^Error parsing [\w.]+: (?=[\w.]+: )", "", message)
-    hint = lines[lines.index("Perhaps you meant:") + 1].split()[0] if "Perhaps you meant:" in lines else None
+    hint = (
+        lines[lines.index("Perhaps you meant:") + 1].split()[0]
+        if "Perhaps you meant:" in lines
+        else None
+    )
     meant = f"; perhaps you meant {hint}" if hint else ""
     return f"{message or 'the arguments cannot be read'}{meant}; see {prog} --help"

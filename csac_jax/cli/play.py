@@ -17,14 +17,16 @@ class PlayOptions:
     """Runs one episode and says what every action did; draws it, if asked to, with no display."""
 
     scene: str = "random"
-    """What lies on the table: random (blocks dropped anew), the name of a shipped case, or a case file."""
+    """What lies on the table: random (blocks dropped anew), the name of a shipped case, or a case
+    file."""
     robot: Literal["hand", "ur5"] = "hand"
     """What moves the gripper: nothing, it floats; or the arm."""
     policy: str = "oracle"
-    """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped (learned, comes with
-    the package), the folder of a run or a policy file."""
+    """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped
+    (learned, comes with the package), the folder of a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
-    """What moves the blocks; with mjx, the motion between two states that a video shows is still C MuJoCo's."""
+    """What moves the blocks; with mjx, the motion between two states that a video shows is still C
+    MuJoCo's."""
     video: Path | None = None
     """File to write a video to, such as out.mp4."""
     png: Path | None = None
@@ -32,8 +34,8 @@ class PlayOptions:
     size: tuple[int, int] = (640, 480)
     """Width and height of picture and video, px, even numbers."""
     views: bool = True
-    """Show height map and action beside the scene; of a learned policy also Q of both primitives, best over yaws, and
-    the candidates of its search."""
+    """Show height map and action beside the scene; of a learned policy also Q of both primitives,
+    best over yaws, and the candidates of its search."""
     seed: int = 0
     """Number that the scene and the policy's noise follow from."""
     json: Path | None = None
@@ -46,15 +48,17 @@ def run(arguments: list[str]) -> int:
     _check(options)
     drawn, opengl = options.png is not None or options.video is not None, None
     if drawn:
-        from csac_jax.show import gl
+        from csac_jax.render import gl
 
         opengl = gl.choose()  # before MuJoCo is imported
     learned = options.policy not in ("oracle", "random")
     cfg, networks = stored.policy(options.policy) if learned else (presets.quick(), None)
-    cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot))
+    cfg = dataclasses.replace(
+        cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot)
+    )
     begun = time.time()
     cfg, moments = _play(options, cfg, networks)
-    from csac_jax.show import play as playing
+    from csac_jax.render import play as playing
 
     print(playing.summary(moments))
     if drawn:
@@ -81,10 +85,13 @@ def _check(options: PlayOptions) -> None:
         guards.check_extra("--video", "imageio_ffmpeg", "video")
 
 
-def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None) -> tuple[Config, list[Any]]:
+def _play(
+    options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None
+) -> tuple[Config, list[Any]]:
     """The scene's config and the moments of the episode, each printed as it happens."""
-    from csac_jax.show import play as playing
-    from csac_jax.train import cache, evaluate, suites
+    from csac_jax.evaluation import rollout, suites
+    from csac_jax.render import play as playing
+    from csac_jax.runtime import cache
 
     cache.enable()
     with as_bad_arguments(ValueError):
@@ -94,7 +101,7 @@ def _play(options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None)
     params = None if networks is None else networks()
     moments: list[Any] = []
     name = options.policy if networks is None else "learned"
-    for moment in evaluate.episode(env.cfg, env, name, params, options.seed):
+    for moment in rollout.episode(env.cfg, env, name, params, options.seed):
         moments.append(moment)
         print(playing.line(len(moments), moment), flush=True)
     return env.cfg, moments
@@ -108,4 +115,6 @@ def _case_file(scene: str) -> Path:
         return cases.shipped(scene)
     if Path(scene).is_file():
         return Path(scene)
-    raise ValueError(f"--scene: '{scene}' is neither a case file nor one of: random, {', '.join(cases.names())}")
+    raise ValueError(
+        f"--scene: '{scene}' is neither a case file nor one of: random, {', '.join(cases.names())}"
+    )

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import tyro
 
-from csac_jax.cli import guards, output, parsing
+from csac_jax.cli import guards, parsing
 from csac_jax.cli.errors import BadArgumentsError, FailedError, as_bad_arguments
+from csac_jax.io import files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,10 +26,12 @@ def run(arguments: list[str]) -> int:
     """Prints the tables, writes the page; returns the exit code."""
     options = parsing.parse(ReportOptions, arguments, "report")
     if not options.runs:
-        raise BadArgumentsError("report: give at least one folder of a run, or a file of `eval --json`")
+        raise BadArgumentsError(
+            "report: give at least one folder of a run, or a file of `eval --json`"
+        )
     if options.out is not None:
         guards.check_extra("--out", "matplotlib", "bench")
-    from csac_jax.show import report as reporting, results
+    from csac_jax.report import report as reporting, results
 
     with as_bad_arguments(ValueError):
         found = reporting.build(results.read(options.runs))
@@ -36,9 +39,9 @@ def run(arguments: list[str]) -> int:
         raise FailedError("; ".join(found.notes))
     print(reporting.markdown(found), end="")
     if options.out is not None:
-        from csac_jax.show import page
+        from csac_jax.report import page
 
         print(*page.write(found, options.out), sep="\n")
     if options.json is not None:
-        output.write_json(options.json, reporting.as_json(found))
+        files.write_json(options.json, reporting.as_json(found))
     return 0

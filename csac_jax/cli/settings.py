@@ -48,9 +48,10 @@ def parse(kind: Any, command: str, base: Config, flags: Sequence[str]) -> tuple[
 
 
 def resolve(cfg: Config, devices: int = 1, members: int = 1) -> Config:
-    """The config with what `auto` stands for here, on so many devices, of so many runs side by side."""
+    """The config with what `auto` stands for here, on so many devices, of so many runs side by
+    side."""
     if cfg.sim.physics != "auto":
         return cfg  # no need of JAX
-    from csac_jax.train import auto
+    from csac_jax.sim import auto
 
     return auto.resolve(cfg, devices, members)

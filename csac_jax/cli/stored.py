@@ -10,7 +10,7 @@ from csac_jax.config import Config
 
 def config(run_dir: Path) -> Config:
     """The config that a run was trained with."""
-    from csac_jax.train import checkpoint
+    from csac_jax.io import checkpoint
 
     if not run_dir.is_dir():
         raise FailedError(f"there is no folder {run_dir}; give the folder of a run")
@@ -19,8 +19,10 @@ def config(run_dir: Path) -> Config:
 
 
 def policy(source: str) -> tuple[Config, Callable[[], Any]]:
-    """Config of the policy in a run's folder, in a policy file or `shipped`, and what reads its networks."""
-    from csac_jax.train import checkpoint, policy_file, step
+    """Config of the policy in a run's folder, in a policy file or `shipped`, and what reads its
+    networks."""
+    from csac_jax.io import checkpoint, policy_file
+    from csac_jax.training import step
 
     path = policy_file.SHIPPED if source == "shipped" else Path(source)
     if path.is_file():
@@ -40,7 +42,7 @@ def weights(cfg: Config) -> Any:
     """Variables of the trunk that the networks begin with, None for random ones."""
     if not cfg.net.weights:
         return None
-    from csac_jax.train import weights as files
+    from csac_jax.io import weights as files
 
     with as_bad_arguments(ValueError):
         return files.read(cfg.net)

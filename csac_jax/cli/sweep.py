@@ -11,19 +11,20 @@ from csac_jax import presets
 from csac_jax.cli import guards, output, settings, stored
 from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments, as_failure
 from csac_jax.config import Algo, Config
-from csac_jax.train import grid, stop as stopping
+from csac_jax.runtime import signals as stopping
+from csac_jax.sweeps import grid
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepOptions:
-    """Trains several seeds, with several settings, side by side in one program; or goes on with a sweep that was
-    stopped. Every setting of a preset is an option."""
+    """Trains several seeds, with several settings, side by side in one program; or goes on with a
+    sweep that was stopped. Every setting of a preset is an option."""
 
     seeds: int = 4
     """Seeds of every setting: --seed, --seed + 1, ..."""
     vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=A,B,...: a setting, or algo, and the values it takes; once per setting, every combination is run. Items of a
-    tuple are parted by colons: replay.beta_end=1:4,1:12."""
+    """NAME=A,B,...: a setting, or algo, and the values it takes; once per setting, every
+    combination is run. Items of a tuple are parted by colons: replay.beta_end=1:4,1:12."""
     run_dir: Path | None = None
     """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
     resume: Path | None = None
@@ -33,20 +34,22 @@ class SweepOptions:
     devices: int | None = None
     """Devices to use; one if not given, and with several processes all that they have."""
     coordinator: str | None = None
-    """ADDRESS:PORT of the first of several processes, on one host or many; all run the same command. See
-    docs/cluster.md."""
+    """ADDRESS:PORT of the first of several processes, on one host or many; all run the same
+    command. See docs/cluster.md."""
     processes: int | None = None
     """How many processes there are."""
     process_id: int | None = None
     """Number of this process, from 0."""
     cluster: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Join the processes of a job of SLURM, Open MPI or Kubernetes: JAX finds out where they are."""
+    """Join the processes of a job of SLURM, Open MPI or Kubernetes: JAX finds out where they
+    are."""
     json: Path | None = None
     """File to write the result to, as JSON."""
     seed: int = 0
     """The first seed."""
     algo: Algo = "csac_beta"
-    """The algorithm: it changes settings of the preset, and settings given as options win over it."""
+    """The algorithm: it changes settings of the preset, and settings given as options win over
+    it."""
 
 
 _Options = settings.with_sections(SweepOptions)
@@ -56,12 +59,19 @@ def run(arguments: list[str]) -> int:
     """Trains all; returns the exit code."""
     stop = stopping.install()
     options, plan = read(arguments)
-    folder = options.resume or options.run_dir or output.new_folder(f"sweep-{plan.settings[0].cfg.preset}")
+    folder = (
+        options.resume
+        or options.run_dir
+        or output.new_folder(f"sweep-{plan.settings[0].cfg.preset}")
+    )
     begun = time.time()
     result = _sweep(options, plan, folder, stop)
-    times = {"compile_seconds": result.compile_seconds, "wall_seconds": round(time.time() - begun, 1)}
+    times = {
+        "compile_seconds": result.compile_seconds,
+        "wall_seconds": round(time.time() - begun, 1),
+    }
     summary = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
-    from csac_jax.train import cluster
+    from csac_jax.runtime import cluster
 
     if cluster.is_first():
         output.write_result(options.json, summary, None)
@@ -95,8 +105,10 @@ def _join(options: SweepOptions) -> None:
     if not options.cluster and place == (None, None, None):
         return
     if options.run_dir is None and options.resume is None:
-        raise BadArgumentsError("sweep: several processes need --run-dir, one folder that all of them see")
-    from csac_jax.train import cluster
+        raise BadArgumentsError(
+            "sweep: several processes need --run-dir, one folder that all of them see"
+        )
+    from csac_jax.runtime import cluster
 
     with as_bad_arguments(ValueError):
         cluster.join(cluster.Place(*place))
@@ -106,10 +118,16 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     with as_bad_arguments(ValueError):
         combinations = grid.settings(options.vary)
     found = [(one, _parse(preset, [*flags, *one.flags])[1]) for one in combinations]
-    from csac_jax.train import sweep as sweeping
+    from csac_jax.sweeps import sweep as sweeping
 
-    devices, members = _devices(options), options.seeds * len(found)  # the most that can run side by side
-    each = [sweeping.Setting(one.name, one.values, settings.resolve(cfg, devices, members)) for one, cfg in found]
+    devices, members = (
+        _devices(options),
+        options.seeds * len(found),
+    )  # the most that can run side by side
+    each = [
+        sweeping.Setting(one.name, one.values, settings.resolve(cfg, devices, members))
+        for one, cfg in found
+    ]
     for setting in each:
         guards.check_physics(setting.cfg)
         guards.check_host_physics(setting.cfg, devices)
@@ -126,10 +144,18 @@ def _devices(options: SweepOptions) -> int:
 
 
 def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:
-    from csac_jax.train import sweep as sweeping
+    from csac_jax.sweeps import sweep as sweeping
 
-    if preset or options.vary or options.run_dir or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
-        raise BadArgumentsError("sweep --resume: a sweep goes on with its own settings; leave all others out")
+    if (
+        preset
+        or options.vary
+        or options.run_dir
+        or options.seeds != SweepOptions.seeds
+        or cfg != presets.get("quick")
+    ):
+        raise BadArgumentsError(
+            "sweep --resume: a sweep goes on with its own settings; leave all others out"
+        )
     with as_failure(sweeping.SweepError):
         return sweeping.read_plan(folder)
 
@@ -137,19 +163,24 @@ def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: C
 def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) -> Any:
     from rich.console import Console
 
-    from csac_jax.show.progress import Terminal
-    from csac_jax.train import cache, checkpoint, cluster, loop, members, mesh, sweep as sweeping
+    from csac_jax.io import checkpoint
+    from csac_jax.report.progress import Terminal
+    from csac_jax.runtime import cache, cluster
+    from csac_jax.sweeps import replicas, sweep as sweeping
+    from csac_jax.training import loop, sharding
 
     cache.enable()
     with as_bad_arguments(ValueError):
-        line = mesh.make(options.devices)
+        line = sharding.make(options.devices)
         for one in plan.settings:
-            mesh.check(line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch)
+            sharding.check(
+                line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch
+            )
         sweeping.check_room(plan, 1 if line is None or options.shard == "scenes" else line.size)
     trunks = {one.cfg.net: stored.weights(one.cfg) for one in plan.settings}
 
-    def engine(group: members.Group) -> sweeping.Engine:
-        return members.engine(group, line, options.shard, trunks[group.configs[0].net])
+    def engine(group: replicas.Group) -> sweeping.Engine:
+        return replicas.engine(group, line, options.shard, trunks[group.configs[0].net])
 
     with (
         Terminal(Console(quiet=not cluster.is_first())) as terminal,
@@ -157,7 +188,9 @@ def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) 
     ):
         terminal.say(f"sweep {folder}")
         try:
-            result = sweeping.run(plan, folder, engine, terminal, stop, resume=options.resume is not None)
+            result = sweeping.run(
+                plan, folder, engine, terminal, stop, resume=options.resume is not None
+            )
         except FileExistsError:
             raise guards.exists(folder) from None
         for one in result.summary["settings"]:

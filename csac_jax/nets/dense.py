@@ -1,11 +1,13 @@
-"""The small dense net: densely connected convolutions with group norm, at 1/`net.stride` of its input's resolution.
+"""The small dense net: densely connected convolutions with group norm, at 1/`net.stride` of its
+input's resolution.
 
-Its maps may be finer: the last 1 x 1 convolution then gives `net.subcells`^2 values per cell of the features, laid out
-beside each other (Shi et al., arXiv:1609.05158), at next to no cost.
+Its maps may be finer: the last 1 x 1 convolution then gives `net.subcells`^2 values per cell of the
+features, laid out beside each other (Shi et al., arXiv:1609.05158), at next to no cost.
 
-It sees maps already turned to a frame, so that what it must know of a push is "ahead" and of a grasp "across". The
-frame of yaw + pi shows the same picture upside down: each pass gives three maps, push ahead, push back and grasp (a
-parallel gripper is symmetric), and K / 2 passes give all K yaws of both primitives.
+It sees maps already turned to a frame, so that what it must know of a push is "ahead" and of a
+grasp "across". The frame of yaw + pi shows the same picture upside down: each pass gives three
+maps, push ahead, push back and grasp (a parallel gripper is symmetric), and K / 2 passes give all K
+yaws of both primitives.
 """
 
 from typing import Any
@@ -31,11 +33,15 @@ def compute_dtype(cfg: NetConfig) -> Any:
     return jnp.dtype(cfg.dtype)
 
 
-def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None, border: bool) -> jax.Array:
-    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [..., H, W] m.
+def inputs(
+    colour: jax.Array | None, height: jax.Array, target: jax.Array | None, border: bool
+) -> jax.Array:
+    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [...,
+    H, W] m.
 
-    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool, + 1 with the border: 1 on the workspace. Bare table
-    is 0 in the others, like what lies outside of a turned map, where all are 0; heights below 0 are outside too.
+    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool, + 1 with the border: 1 on the
+    workspace. Bare table is 0 in the others, like what lies outside of a turned map, where all are
+    0; heights below 0 are outside too.
     """
     maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
     if colour is not None:
@@ -66,45 +72,58 @@ class Convolution(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Dense features of turned maps: [B, C, C, I] -> [B, C / stride, C / stride, stem + layers * growth]."""
+    """Dense features of turned maps: [B, C, C, I] -> [B, C / stride, C / stride, stem + layers *
+    growth]."""
 
     cfg: NetConfig
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
         cfg, stride, dtype = self.cfg, self.cfg.stride, compute_dtype(self.cfg)
-        features = Convolution(cfg.stem, 2 * stride, stride=stride, padding=stride // 2, dtype=dtype)(maps)
+        features = Convolution(
+            cfg.stem, 2 * stride, stride=stride, padding=stride // 2, dtype=dtype
+        )(maps)
         features = nn.relu(GroupNorm(dtype)(features))
         for dilation in cfg.dilations:
-            new = Convolution(cfg.growth, size=3, dilation=dilation, padding=dilation, dtype=dtype)(features)
+            new = Convolution(cfg.growth, size=3, dilation=dilation, padding=dilation, dtype=dtype)(
+                features
+            )
             features = jnp.concatenate([features, nn.relu(GroupNorm(dtype)(new))], axis=-1)
         return features
 
 
 class Head(nn.Module):
-    """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS], s = subcells; two 1 x 1 convolutions."""
+    """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS], s = subcells; two 1 x 1
+    convolutions."""
 
     cfg: NetConfig
 
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
         del train  # group norm is the same in both
-        hidden = nn.relu(nn.Dense(self.cfg.head, dtype=compute_dtype(self.cfg))(features)).astype(jnp.float32)
+        hidden = nn.relu(nn.Dense(self.cfg.head, dtype=compute_dtype(self.cfg))(features)).astype(
+            jnp.float32
+        )
         small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
-        return _spread(nn.Dense(OUTPUTS * self.cfg.subcells**2, kernel_init=small)(hidden), self.cfg.subcells)
+        return _spread(
+            nn.Dense(OUTPUTS * self.cfg.subcells**2, kernel_init=small)(hidden), self.cfg.subcells
+        )
 
 
 def _spread(maps: jax.Array, factor: int) -> jax.Array:
-    """Channels laid out as cells: [..., h, w, s s O] -> [..., s h, s w, O], s = factor; row, column, output."""
+    """Channels laid out as cells: [..., h, w, s s O] -> [..., s h, s w, O], s = factor; row,
+    column, output."""
     *batch, rows, cols, channels = maps.shape
     parts = maps.reshape(*batch, rows, cols, factor, factor, channels // factor**2)
     return jnp.swapaxes(parts, -4, -3).reshape(*batch, factor * rows, factor * cols, -1)
 
 
 class GroupNorm(nn.Module):
-    """Group norm of maps [B, H, W, F], `_GROUP` channels a group: Flax's, in 0.6 to 0.7 of its time on a CPU.
+    """Group norm of maps [B, H, W, F], `_GROUP` channels a group: Flax's, in 0.6 to 0.7 of its time
+    on a CPU.
 
-    Sums run over cells first and over a group's channels then, which XLA computes a whole row of channels at a time.
+    Sums run over cells first and over a group's channels then, which XLA computes a whole row of
+    channels at a time.
     """
 
     dtype: Any
@@ -117,7 +136,9 @@ class GroupNorm(nn.Module):
         groups = max(channels // _GROUP, 1)
         wide = maps.astype(jnp.float32)
 
-        def mean(values: jax.Array) -> jax.Array:  # [B, H, W, F] -> [B, 1, 1, F], the same within a group
+        def mean(
+            values: jax.Array,
+        ) -> jax.Array:  # [B, H, W, F] -> [B, 1, 1, F], the same within a group
             each = jnp.mean(values, axis=(1, 2)).reshape(-1, groups, channels // groups)
             return jnp.repeat(jnp.mean(each, axis=2), channels // groups, axis=1)[:, None, None]
 
@@ -137,7 +158,8 @@ class Critic(nn.Module):
         self.head = Head(self.cfg)
 
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s = subcells."""
+        """[B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s =
+        subcells."""
         del train  # group norm is the same in both
         features = self.trunk(maps)
         return self.head(features), features

@@ -1,10 +1,12 @@
-"""DenseNet-121 (Huang et al., arXiv:1608.06993, table 1) as the paper's network over turned maps, CSAC sec. 3.4.
+"""DenseNet-121 (Huang et al., arXiv:1608.06993, table 1) as the paper's network over turned maps,
+CSAC sec. 3.4.
 
-One trunk each for colour, height and, in the target task, the mask; what they see is joined, two 1 x 1 convolutions
-turn it into maps, and these are brought up to a finer grid. Push and grasp come from one network. Modules are named as
-in torchvision, so that its weights fit.
+One trunk each for colour, height and, in the target task, the mask; what they see is joined, two 1
+x 1 convolutions turn it into maps, and these are brought up to a finer grid. Push and grasp come
+from one network. Modules are named as in torchvision, so that its weights fit.
 
-The trunks are the same program with other weights: stacked along an axis T, leaves [T, ...], they run side by side.
+The trunks are the same program with other weights: stacked along an axis T, leaves [T, ...], they
+run side by side.
 """
 
 import math
@@ -21,21 +23,26 @@ from csac_jax.config import DENSENET_STRIDE, NetConfig
 from csac_jax.nets.dense import OUTPUTS, TABLE_HEIGHT, compute_dtype
 from csac_jax.nets.products import Convolution, Stem, average_pool, max_pool
 
-_COLOUR_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of ImageNet, as torchvision's weights want it
+_COLOUR_MEAN = np.array(
+    [0.485, 0.456, 0.406], np.float32
+)  # of ImageNet, as torchvision's weights want it
 _COLOUR_STD = np.array([0.229, 0.224, 0.225], np.float32)
 _HEIGHT_SCALE = 0.03  # m (VPG)
 _BOTTLENECK = 4  # channels of a layer's 1 x 1 convolution per channel that the layer adds
 _EPSILON = 1e-5  # of both norms, torchvision's
-_MOMENTUM = 0.9  # share that running statistics keep in an update, torchvision's (there written 0.1)
+_MOMENTUM = (
+    0.9  # share that running statistics keep in an update, torchvision's (there written 0.1)
+)
 _GROUPS = 32
 _KEPT = "kept"  # name of what the gradient does not make once more
 
 
 def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
-    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [..., H, W] m.
+    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [...,
+    H, W] m.
 
-    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool. Bare table is 0, like what lies outside of a turned
-    map; VPG takes a mean off the heights too.
+    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool. Bare table is 0, like what lies
+    outside of a turned map; VPG takes a mean off the heights too.
     """
     maps = [height[..., None] / _HEIGHT_SCALE]
     if colour is not None:
@@ -48,7 +55,8 @@ def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None
 
 
 class Piece(NamedTuple):
-    """Maps [..., F] that one layer made, and the mean and the variance of each channel over them, [F] float32."""
+    """Maps [..., F] that one layer made, and the mean and the variance of each channel over them,
+    [F] float32."""
 
     maps: jax.Array
     mean: jax.Array
@@ -68,37 +76,48 @@ def _piece(maps: jax.Array) -> Piece:
 
 
 class BatchNorm(nn.Module):
-    """Batch norm of maps [..., F] by given statistics of the batch (mean and variance, [F]), or by the running ones.
+    """Batch norm of maps [..., F] by given statistics of the batch (mean and variance, [F]), or by
+    the running ones.
 
-    They are given, because every layer of a block norms what all before it made: so they are taken once. Variables are
-    those of `flax.linen.BatchNorm`.
+    They are given, because every layer of a block norms what all before it made: so they are taken
+    once. Variables are those of `flax.linen.BatchNorm`.
     """
 
     dtype: Any
 
     @nn.compact
-    def __call__(self, maps: jax.Array, statistics: tuple[jax.Array, jax.Array] | None) -> jax.Array:
+    def __call__(
+        self, maps: jax.Array, statistics: tuple[jax.Array, jax.Array] | None
+    ) -> jax.Array:
         shape = maps.shape[-1:]
         running = [self.variable("batch_stats", "mean", jnp.zeros, shape)]
         running += [self.variable("batch_stats", "var", jnp.ones, shape)]
-        scale, bias = self.param("scale", nn.initializers.ones, shape), self.param("bias", nn.initializers.zeros, shape)
+        scale, bias = (
+            self.param("scale", nn.initializers.ones, shape),
+            self.param("bias", nn.initializers.zeros, shape),
+        )
         mean, variance = statistics or [variable.value for variable in running]
         if statistics and not self.is_initializing():
             for variable, now in zip(running, statistics, strict=True):
                 variable.value = _MOMENTUM * variable.value + (1.0 - _MOMENTUM) * now
         factor = scale * jax.lax.rsqrt(variance + _EPSILON)
-        factor, shift = (leaf.reshape((1,) * (maps.ndim - 1) + shape) for leaf in (factor, bias - mean * factor))
+        factor, shift = (
+            leaf.reshape((1,) * (maps.ndim - 1) + shape) for leaf in (factor, bias - mean * factor)
+        )
         return (maps.astype(jnp.float32) * factor + shift).astype(self.dtype)
 
 
 def _norm(cfg: NetConfig, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
-    """Pieces joined and normed [..., F]; `train`: batch norm takes the batch's statistics, which are followed."""
+    """Pieces joined and normed [..., F]; `train`: batch norm takes the batch's statistics, which
+    are followed."""
     dtype = compute_dtype(cfg)
     maps, *statistics = (jnp.concatenate(leaves, axis=-1) for leaves in zip(*pieces, strict=True))
     if cfg.norm == "batch":
         return BatchNorm(dtype, name=name)(maps, (statistics[0], statistics[1]) if train else None)
     groups = math.gcd(_GROUPS, maps.shape[-1])
-    return nn.GroupNorm(groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name)(maps)
+    return nn.GroupNorm(
+        groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name
+    )(maps)
 
 
 def _convolution(cfg: NetConfig, features: int, size: int, name: str) -> Convolution:
@@ -122,8 +141,8 @@ class DenseLayer(nn.Module):
 class DenseBlock(nn.Module):
     """Dense layers one after the other, each on the pieces of all before it.
 
-    They are joined where they are read, on the way into a norm: joined after every layer, as the paper draws it, all
-    channels would be written once more per layer.
+    They are joined where they are read, on the way into a norm: joined after every layer, as the
+    paper draws it, all channels would be written once more per layer.
     """
 
     cfg: NetConfig
@@ -152,7 +171,8 @@ class Transition(nn.Module):
 class Trunk(nn.Module):
     """DenseNet-121 without its top: [B, H, W, 3] -> [B, H / 32, W / 32, 1024], after the last norm.
 
-    With `cfg.zoom` above 1 each cell of the maps stands for 2 x 2 pixels: features are [B, H / 16, W / 16, 1024].
+    With `cfg.zoom` above 1 each cell of the maps stands for 2 x 2 pixels: features are [B, H / 16,
+    W / 16, 1024].
     """
 
     cfg: NetConfig
@@ -171,9 +191,11 @@ class Trunk(nn.Module):
 
 
 class Head(nn.Module):
-    """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS] float32, s = 32 / (zoom * output_stride).
+    """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS] float32, s = 32 / (zoom
+    * output_stride).
 
-    Twice norm, ReLU and a 1 x 1 convolution, then upsampling (VPG). The last convolution has a bias (ours).
+    Twice norm, ReLU and a 1 x 1 convolution, then upsampling (VPG). The last convolution has a bias
+    (ours).
     """
 
     cfg: NetConfig
@@ -198,29 +220,35 @@ def _upsample(maps: jax.Array, factor: int) -> jax.Array:
 class Critic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads.
 
-    For the gradient only what convolutions made is kept, not what norms make of it for each layer anew.
+    For the gradient only what convolutions made is kept, not what norms make of it for each layer
+    anew.
     """
 
     cfg: NetConfig
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS], features [B, h, w, F]."""
+        """[B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS], features [B, h, w,
+        F]."""
         kept = jax.checkpoint_policies.save_only_these_names(_KEPT)
         see = nn.vmap(
             nn.remat(lambda trunk, seen: trunk(seen, train), policy=kept),
             variable_axes={"params": 0, "batch_stats": 0},
             split_rngs={"params": True},
         )
-        features = see(Trunk(self.cfg, name="trunk"), _trunk_inputs(self.cfg, maps))  # [T, B, h, w, f]
+        features = see(
+            Trunk(self.cfg, name="trunk"), _trunk_inputs(self.cfg, maps)
+        )  # [T, B, h, w, f]
         features = jnp.concatenate(list(features), axis=-1)
         return Head(self.cfg, name="head")(features, train), features
 
 
 def _trunk_inputs(cfg: NetConfig, maps: jax.Array) -> jax.Array:
-    """What each trunk sees [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map three times.
+    """What each trunk sees [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map
+    three times.
 
-    z = zoom / 2, at least 1: a trunk doubles its cells itself. Turned maps are held, not turned for each window anew.
+    z = zoom / 2, at least 1: a trunk doubles its cells itself. Turned maps are held, not turned for
+    each window anew.
     """
     colour, rest = (maps[..., :3], maps[..., 3:]) if cfg.colour else (maps[..., :0], maps)
     seen = [colour] if cfg.colour else []

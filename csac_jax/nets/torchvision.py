@@ -1,7 +1,8 @@
 """Weights of DenseNet-121 in torchvision's names to the variables of a trunk.
 
-`features.denseblock1.denselayer2.conv1.weight` [O, I, k, k] is `params.denseblock1.denselayer2.conv1.kernel`
-[k, k, I, O]; a norm's `weight`, `bias`, `running_mean` and `running_var` are its scale, bias, mean and variance.
+`features.denseblock1.denselayer2.conv1.weight` [O, I, k, k] is
+`params.denseblock1.denselayer2.conv1.kernel` [k, k, I, O]; a norm's `weight`, `bias`,
+`running_mean` and `running_var` are its scale, bias, mean and variance.
 """
 
 from collections.abc import Mapping
@@ -14,7 +15,13 @@ import numpy as np
 from csac_jax.config import NetConfig
 from csac_jax.nets import densenet
 
-_LEAVES = {"kernel": "weight", "scale": "weight", "bias": "bias", "mean": "running_mean", "var": "running_var"}
+_LEAVES = {
+    "kernel": "weight",
+    "scale": "weight",
+    "bias": "bias",
+    "mean": "running_mean",
+    "var": "running_var",
+}
 
 
 def _needed(name: str) -> bool:

@@ -1,4 +1,5 @@
-"""The ring of transitions: R1 of CSAC Algorithm 1 line 14. R2, its ranked view, is the sampler's."""
+"""The ring of transitions: R1 of CSAC Algorithm 1 line 14. R2, its ranked view, is the
+sampler's."""
 
 import dataclasses
 import math
@@ -20,30 +21,41 @@ class ReplayState:
     items: Any  # pytree, leaves [C, ...]; it has a field `reward` [C] if that is what the sampler ranks by
     head: jax.Array  # [] int32, next slot written
     size: jax.Array  # [] int32, filled slots, <= C
-    priority: jax.Array  # [C] float32, what `samplers.priority` made of the last TD error; 0 beyond `size`
+    priority: (
+        jax.Array
+    )  # [C] float32, what `samplers.priority` made of the last TD error; 0 beyond `size`
 
 
 def init(cfg: ReplayConfig, example_item: Any) -> ReplayState:
     """An empty ring for items of the types and shapes of `example_item`."""
-    items = jax.tree.map(lambda leaf: jnp.zeros((cfg.capacity, *leaf.shape), leaf.dtype), example_item)
+    items = jax.tree.map(
+        lambda leaf: jnp.zeros((cfg.capacity, *leaf.shape), leaf.dtype), example_item
+    )
     return ReplayState(items, jnp.int32(0), jnp.int32(0), jnp.zeros(cfg.capacity, jnp.float32))
 
 
 def bytes_needed(capacity: int, example_item: Any) -> int:
-    """Memory of a ring of `capacity` items like `example_item`, whose leaves need no more than `shape` and `dtype`."""
-    item = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(example_item))
+    """Memory of a ring of `capacity` items like `example_item`, whose leaves need no more than
+    `shape` and `dtype`."""
+    item = sum(
+        math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(example_item)
+    )
     return capacity * (item + jnp.dtype(jnp.float32).itemsize)  # and its priority
 
 
 def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
-    """Stores the `valid` [E] bool ones of `items` (leaves [E, ...], E <= C) in consecutive slots, in their order.
+    """Stores the `valid` [E] bool ones of `items` (leaves [E, ...], E <= C) in consecutive slots,
+    in their order.
 
-    The oldest give way. New items take the largest priority stored, so that none is ranked above them. A scatter to
-    slots that are all different, never a copy of the ring: with the state donated, XLA writes in place.
+    The oldest give way. New items take the largest priority stored, so that none is ranked above
+    them. A scatter to slots that are all different, never a copy of the ring: with the state
+    donated, XLA writes in place.
     """
     capacity, num = state.priority.shape[0], valid.shape[0]
     if num > capacity:
-        raise ValueError(f"replay.capacity: {capacity} slots cannot take {num} transitions at once; raise it")
+        raise ValueError(
+            f"replay.capacity: {capacity} slots cannot take {num} transitions at once; raise it"
+        )
     position = jnp.cumsum(valid, dtype=jnp.int32)  # [E], 1 for the first valid item
     count = position[-1]
     outside = capacity + jnp.arange(num, dtype=jnp.int32)  # dropped
@@ -73,9 +85,10 @@ def largest_priority(state: ReplayState) -> jax.Array:
 def set_priorities(state: ReplayState, slots: jax.Array, priorities: jax.Array) -> ReplayState:
     """Replaces the priorities of `slots` [B] int32, all filled, by `priorities` [B], at least 0.
 
-    A slot that occurs twice keeps the larger one: two order-free scatters, `min` to 0 and `max`, as the order of
-    conflicting `set`s is undefined. One that is not finite counts as the largest that these slots have or had: the
-    transition is looked at again, no NaN gets into the ranking, and the rest of the ring need not be searched.
+    A slot that occurs twice keeps the larger one: two order-free scatters, `min` to 0 and `max`, as
+    the order of conflicting `set`s is undefined. One that is not finite counts as the largest that
+    these slots have or had: the transition is looked at again, no NaN gets into the ranking, and
+    the rest of the ring need not be searched.
     """
     finite = jnp.isfinite(priorities)
     known = jnp.where(finite, jnp.minimum(priorities, LARGEST), 0.0)

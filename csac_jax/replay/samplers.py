@@ -1,7 +1,8 @@
-"""Which transitions are replayed, Algorithm 1 lines 15-16: uniform (CSAC), prioritised (CSAC-PER), by rank (CSAC-beta).
+"""Which transitions are replayed, Algorithm 1 lines 15-16: uniform (CSAC), prioritised (CSAC-PER),
+by rank (CSAC-beta).
 
-The beta sampler sorts the ring anew for every batch: its ranks are exact, and 4,096 transitions take 1 to 2 ms on a
-CPU, where a training step takes seconds.
+The beta sampler sorts the ring anew for every batch: its ranks are exact, and 4,096 transitions
+take 1 to 2 ms on a CPU, where a training step takes seconds.
 """
 
 import itertools
@@ -15,7 +16,9 @@ from csac_jax.replay.ring import ReplayState
 
 _TRIES = 8  # candidates for a gamma variate: none of them is accepted in 1 of 10^10 draws
 RADIX = 8  # nodes summed into one; few enough to be added one by one
-BELOW_ONE = 1.0 - 2.0**-23  # largest value of a uniform draw; times any float32 sum it stays below that sum
+BELOW_ONE = (
+    1.0 - 2.0**-23
+)  # largest value of a uniform draw; times any float32 sum it stays below that sum
 
 
 class Sample(NamedTuple):
@@ -26,13 +29,14 @@ class Sample(NamedTuple):
 
 
 def priority(cfg: ReplayConfig, errors: jax.Array) -> jax.Array:
-    """What the ring keeps of TD errors [B] for `cfg.sampler`: p^alpha, p = abs(error) + floor, or abs(error).
+    """What the ring keeps of TD errors [B] for `cfg.sampler`: p^alpha, p = abs(error) + floor, or
+    abs(error).
 
-    Schaul et al. 2016, sec. 3.3, proportional variant. The power is taken here, once, as at every draw it would be
-    taken of the whole ring.
+    Schaul et al. 2016, sec. 3.3, proportional variant. The power is taken here, once, as at every
+    draw it would be taken of the whole ring.
     """
     size = jnp.abs(errors).astype(jnp.float32)
-    return (size + cfg.floor) ** cfg.alpha if cfg.sampler == "prioritised" else size
+    return (size + cfg.per_epsilon) ** cfg.alpha if cfg.sampler == "prioritised" else size
 
 
 def uniform_slots(key: jax.Array, size: jax.Array, num: int) -> jax.Array:
@@ -41,12 +45,14 @@ def uniform_slots(key: jax.Array, size: jax.Array, num: int) -> jax.Array:
 
 
 def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array:
-    """Slots drawn with P(i) = m_i / sum m, independently; Schaul et al. 2016, eq. 1 with m = p^alpha.
+    """Slots drawn with P(i) = m_i / sum m, independently; Schaul et al. 2016, eq. 1 with m =
+    p^alpha.
 
-    Every draw goes down a pyramid of sums, which is built anew from the masses: no update can leave it out of step,
-    as the differences that a sum tree is kept up by do, and in a compiled loop it costs less than their upkeep. The
-    lower half of the way has a uniform number of its own: one float32 has 2^23 values, too few for 2^17 slots.
-    Slots of no mass are never drawn. Draws are not stratified (sec. B.2.1 does): they are independent.
+    Every draw goes down a pyramid of sums, which is built anew from the masses: no update can leave
+    it out of step, as the differences that a sum tree is kept up by do, and in a compiled loop it
+    costs less than their upkeep. The lower half of the way has a uniform number of its own: one
+    float32 has 2^23 values, too few for 2^17 slots. Slots of no mass are never drawn. Draws are not
+    stratified (sec. B.2.1 does): they are independent.
 
     Args: masses [C], at least 0, and 0 where nothing is stored.
     Returns: [num] int32 slots, with repetition; slot 0 .. C - 1 if all masses are 0.
@@ -56,16 +62,20 @@ def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array
     for half, uniform in zip(_halves(levels), jax.random.uniform(key, (2, num)), strict=True):
         for level in half:
             stride = level.shape[0] // RADIX
-            children = node[None] + stride * jnp.arange(RADIX, dtype=jnp.int32)[:, None]  # [RADIX, num]
+            children = (
+                node[None] + stride * jnp.arange(RADIX, dtype=jnp.int32)[:, None]
+            )  # [RADIX, num]
             child, uniform = _pick(level.at[children].get(mode="promise_in_bounds"), uniform)
             node = node + stride * child
     return jnp.minimum(node, masses.shape[0] - 1)
 
 
 def _pyramid(masses: jax.Array) -> list[jax.Array]:
-    """Levels [RADIX n], top first, of which the last is `masses` [C] padded with 0; each has the sums of the next one.
+    """Levels [RADIX n], top first, of which the last is `masses` [C] padded with 0; each has the
+    sums of the next one.
 
-    Children of node j < n are j, j + n, j + 2 n ...: neighbours belong to different sums, which is what vectorises.
+    Children of node j < n are j, j + n, j + 2 n ...: neighbours belong to different sums, which is
+    what vectorises.
     """
     levels: list[jax.Array] = []
     while not levels or levels[-1].shape[0] > RADIX:
@@ -80,11 +90,12 @@ def _halves(levels: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
 
 
 def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Rows drawn in proportion to each column of `masses` [RADIX, num], and what is left of `uniform` [num] in 0 .. 1.
+    """Rows drawn in proportion to each column of `masses` [RADIX, num], and what is left of
+    `uniform` [num] in 0 .. 1.
 
-    The sums are made one after the other: then they never fall, a mass of 0 leaves them as they were, and the last is
-    the one that the goal stays below, so that a row of no mass is never the first to exceed it. A parallel `cumsum`
-    promises none of this.
+    The sums are made one after the other: then they never fall, a mass of 0 leaves them as they
+    were, and the last is the one that the goal stays below, so that a row of no mass is never the
+    first to exceed it. A parallel `cumsum` promises none of this.
     """
     reached = list(itertools.accumulate(masses))  # RADIX of [num]
     goal = uniform * reached[-1]
@@ -100,28 +111,36 @@ def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def weights(masses: jax.Array, exponent: jax.Array | float) -> jax.Array:
-    """Importance weights [B] of draws of `masses` [B]: w_i = (n P(i))^-beta / max_j w_j; Schaul et al. 2016, sec. 3.4.
+    """Importance weights [B] of draws of `masses` [B]: w_i = (n P(i))^-beta / max_j w_j; Schaul et
+    al. 2016, sec. 3.4.
 
-    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The largest weight is the batch's, not the ring's:
-    the ring's belongs to the least likely transition, which is hardly ever drawn, and would make all steps small.
+    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The largest weight is the
+    batch's, not the ring's: the ring's belongs to the least likely transition, which is hardly ever
+    drawn, and would make all steps small.
     """
     masses = jnp.maximum(masses, jnp.finfo(jnp.float32).tiny)  # of an empty ring all are 0
     return (jnp.min(masses) / masses) ** exponent
 
 
 def weight_exponent(cfg: ReplayConfig, progress: jax.Array) -> jax.Array:
-    """beta [] of the weights after the share `progress` [] of all updates: linear, constant outside 0 .. 1."""
-    return cfg.weight_start + (cfg.weight_end - cfg.weight_start) * jnp.clip(progress, 0.0, 1.0)
+    """beta [] of the weights after the share `progress` [] of all updates: linear, constant outside
+    0 .. 1."""
+    return cfg.is_beta_start + (cfg.is_beta_end - cfg.is_beta_start) * jnp.clip(progress, 0.0, 1.0)
 
 
 def beta_slots(
-    key: jax.Array, values: jax.Array, size: jax.Array, a: jax.Array | float, b: jax.Array | float, num: int
+    key: jax.Array,
+    values: jax.Array,
+    size: jax.Array,
+    a: jax.Array | float,
+    b: jax.Array | float,
+    num: int,
 ) -> jax.Array:
     """Slots whose rank by value follows Beta(a, b): rank 0 = largest; CSAC sec. 3.5, eq. 17.
 
-    rank = floor(n x), x ~ Beta(a, b). Beta(1, 1) is uniform, Beta(1, 2) VPG's power law. Equal values share their
-    ranks at random: by slot, the oldest would be preferred. NaN is ranked first. Slots are sorted by value with
-    those not filled last, whatever their values.
+    rank = floor(n x), x ~ Beta(a, b). Beta(1, 1) is uniform, Beta(1, 2) VPG's power law. Equal
+    values share their ranks at random: by slot, the oldest would be preferred. NaN is ranked first.
+    Slots are sorted by value with those not filled last, whatever their values.
 
     Args: values [C], any beyond `size`; size [] filled slots.
     Returns: [num] int32 slots, with repetition, all filled; slot 0 .. C - 1 if nothing is stored.
@@ -130,7 +149,9 @@ def beta_slots(
     slots = jnp.arange(values.shape[0], dtype=jnp.int32)
     descending = -jnp.where(jnp.isnan(values), jnp.inf, values)
     ties = jax.random.bits(key_ties, values.shape)
-    _, _, order = jax.lax.sort((jnp.where(slots < size, descending, jnp.inf), ties, slots), num_keys=2)
+    _, _, order = jax.lax.sort(
+        (jnp.where(slots < size, descending, jnp.inf), ties, slots), num_keys=2
+    )
     rank = (_beta(key_rank, a, b, num) * size.astype(jnp.float32)).astype(jnp.int32)
     return order[jnp.clip(rank, 0, jnp.maximum(size - 1, 0))]
 
@@ -138,7 +159,8 @@ def beta_slots(
 def _beta(key: jax.Array, a: jax.Array | float, b: jax.Array | float, num: int) -> jax.Array:
     """Draws [num] from Beta(a, b), a and b positive, as X / (X + Y) of gamma variates.
 
-    `jax.random.beta` draws again until all are accepted, a loop that a GPU waits for the host in at every turn.
+    `jax.random.beta` draws again until all are accepted, a loop that a GPU waits for the host in at
+    every turn.
     """
     key_x, key_y = jax.random.split(key)
     x, y = _log_gamma(key_x, a, num), _log_gamma(key_y, b, num)
@@ -146,10 +168,11 @@ def _beta(key: jax.Array, a: jax.Array | float, b: jax.Array | float, num: int) 
 
 
 def _log_gamma(key: jax.Array, shape: jax.Array | float, num: int) -> jax.Array:
-    """Logarithms [num] of draws from Gamma(shape, 1): Marsaglia and Tsang, ACM TOMS 26 (2000), 363-372.
+    """Logarithms [num] of draws from Gamma(shape, 1): Marsaglia and Tsang, ACM TOMS 26 (2000),
+    363-372.
 
-    The first of _TRIES candidates that is accepted, each with a probability of at least 0.95; for a shape below 1, one
-    from Gamma(shape + 1, 1) times U^(1 / shape).
+    The first of _TRIES candidates that is accepted, each with a probability of at least 0.95; for a
+    shape below 1, one from Gamma(shape + 1, 1) times U^(1 / shape).
     """
     key_normal, key_uniform, key_small = jax.random.split(key, 3)
     shape = jnp.asarray(shape, jnp.float32)
@@ -165,9 +188,11 @@ def _log_gamma(key: jax.Array, shape: jax.Array | float, num: int) -> jax.Array:
 
 
 def beta_schedule(cfg: ReplayConfig, progress: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(a, b) of the Beta law, each [], after the share `progress` [] of all updates; CSAC secs. 3.5 and 4.3.
+    """(a, b) of the Beta law, each [], after the share `progress` [] of all updates; CSAC secs. 3.5
+    and 4.3.
 
-    Linear from `beta_start` to `beta_middle` at `beta_middle_at`, and on to `beta_end` at 1; constant outside 0 .. 1.
+    Linear from `beta_start` to `beta_middle` at `beta_middle_at`, and on to `beta_end` at 1;
+    constant outside 0 .. 1.
     """
     knots = jnp.asarray([0.0, cfg.beta_middle_at, 1.0], jnp.float32)
     a, b = (
@@ -177,8 +202,11 @@ def beta_schedule(cfg: ReplayConfig, progress: jax.Array) -> tuple[jax.Array, ja
     return a, b
 
 
-def sample(key: jax.Array, cfg: ReplayConfig, state: ReplayState, progress: jax.Array, num: int) -> Sample:
-    """`num` transitions to learn from, by `cfg.sampler`, after the share `progress` [] of all updates."""
+def sample(
+    key: jax.Array, cfg: ReplayConfig, state: ReplayState, progress: jax.Array, num: int
+) -> Sample:
+    """`num` transitions to learn from, by `cfg.sampler`, after the share `progress` [] of all
+    updates."""
     if cfg.sampler == "uniform":
         return Sample(uniform_slots(key, state.size, num), jnp.ones(num))
     if cfg.sampler == "prioritised":

@@ -1,7 +1,8 @@
-"""Ordered arrangements drawn inside the compiled program: some blocks packed together, a few more lying loose beside.
+"""Ordered arrangements drawn inside the compiled program: some blocks packed together, a few more
+lying loose beside.
 
-What is packed how stands in `families`; here slots are given sizes, packed, put down somewhere on the table, and joined
-by loose ones. N = block slots, R = roles of a family.
+What is packed how stands in `families`; here slots are given sizes, packed, put down somewhere on
+the table, and joined by loose ones. N = block slots, R = roles of a family.
 """
 
 from typing import NamedTuple
@@ -21,7 +22,10 @@ BESIDE = 0.015  # m, least distance of a loose block from any other
 REACH = 0.205  # m, no packed block of any size reaches farther from the middle of the arrangement
 _MARGIN = 0.001  # m kept free along the border of the square
 _TRIES = 64  # random places tried for every loose block
-_LOOSE = (1, 3)  # most loose blocks at level 0 and at level 1, unless more are needed for `min_blocks`
+_LOOSE = (
+    1,
+    3,
+)  # most loose blocks at level 0 and at level 1, unless more are needed for `min_blocks`
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 _ON_SIDE = np.sqrt(np.array([0.5, 0.5, 0.0, 0.0], np.float32))  # a quarter turn about x
 
@@ -37,18 +41,21 @@ class Blocks(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Half sizes that slots would take: of any shape of their kind, and of a long one where the kind has several."""
+    """Half sizes that slots would take: of any shape of their kind, and of a long one where the
+    kind has several."""
 
     any: jax.Array  # [N, 3] m
     long: jax.Array  # [N, 3] m
 
 
 def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -> Scene:
-    """A random arrangement at rest inside the square of side `extent` m; vmap over keys and levels for a batch.
+    """A random arrangement at rest inside the square of side `extent` m; vmap over keys and levels
+    for a batch.
 
-    `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 30 mm to 1 mm, and adds loose ones.
-    Sizes, densities and frictions spread as in the pool. The target is the block that the others enclose. Fewer than
-    `cfg.min_blocks` are in play only where the square has no room left for loose ones.
+    `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 30 mm to 1 mm,
+    and adds loose ones. Sizes, densities and frictions spread as in the pool. The target is the
+    block that the others enclose. Fewer than `cfg.min_blocks` are in play only where the square has
+    no room left for loose ones.
 
     Raises ValueError while tracing where the slots or the square are too small.
     """
@@ -61,7 +68,9 @@ def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -
     sizes = _draw_sizes(key_sizes, cfg)
     draws = families.draw(key_pack, len(cfg.slots))
     each = [_pack(family, cfg.slots, draws, sizes, level) for family in possible]
-    chosen = jax.random.randint(key_family, (), 0, len(each))  # a batch needs them all: no lax.switch
+    chosen = jax.random.randint(
+        key_family, (), 0, len(each)
+    )  # a batch needs them all: no lax.switch
     packed, target = jax.tree.map(lambda *leaves: jnp.stack(leaves)[chosen], *each)
     border = 0.5 * extent - _MARGIN
     together = _add_loose(key_loose, cfg, border, level, _put_down(key_place, border, packed))
@@ -69,12 +78,17 @@ def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -
 
 
 def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> Sizes:
-    """A shape of each slot's kind, larger or smaller; mesh blocks of one kind alike, as in the pool."""
+    """A shape of each slot's kind, larger or smaller; mesh blocks of one kind alike, as in the
+    pool."""
     key_any, key_long, key_scale = jax.random.split(key, 3)
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
     number = np.array([len(choice) for choice in choices])
-    table = np.stack([np.resize(choice, (number.max(), 3)) for choice in choices])  # [N, choices, 3]
-    long = np.array([np.resize(choice[choice[:, 0] == choice[:, 0].max()], (2, 3)) for choice in choices])  # [N, 2, 3]
+    table = np.stack(
+        [np.resize(choice, (number.max(), 3)) for choice in choices]
+    )  # [N, choices, 3]
+    long = np.array(
+        [np.resize(choice[choice[:, 0] == choice[:, 0].max()], (2, 3)) for choice in choices]
+    )  # [N, 2, 3]
     num = len(cfg.slots)
     scale = 1.0 + blocks.spread(cfg) * jax.random.uniform(key_scale, (num,), jnp.float32, -1.0, 1.0)
     shared = blocks.size_leader(cfg.slots)
@@ -108,7 +122,11 @@ def _pack(
     out = jnp.where(used, slot, len(slots))  # dropped where not used
 
     def by_slot(values: jax.Array) -> jax.Array:
-        return jnp.zeros((len(slots), *values.shape[1:]), values.dtype).at[out].set(values, mode="drop")
+        return (
+            jnp.zeros((len(slots), *values.shape[1:]), values.dtype)
+            .at[out]
+            .set(values, mode="drop")
+        )
 
     packed = Blocks(
         centre=by_slot(centre.at[:, 2].add(feet[:, 2])),
@@ -120,8 +138,11 @@ def _pack(
     return packed, slot[target]
 
 
-def _assign(preference: jax.Array, slots: tuple[SlotKind, ...], roles: tuple[Role, ...]) -> tuple[jax.Array, jax.Array]:
-    """A different slot for every role in turn [R] int32, by `preference` [N] among its kinds; False [R]: none left."""
+def _assign(
+    preference: jax.Array, slots: tuple[SlotKind, ...], roles: tuple[Role, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """A different slot for every role in turn [R] int32, by `preference` [N] among its kinds; False
+    [R]: none left."""
     free = jnp.ones(len(slots), bool)
     chosen, found = [], []
     for role in roles:
@@ -141,11 +162,13 @@ def _feet(half: jax.Array, on_side: jax.Array) -> jax.Array:
 
 
 def _put_down(key: jax.Array, border: float, packed: Blocks) -> Blocks:
-    """The packed blocks turned as one by a random yaw and shifted to a random place within `border` m of the centre."""
+    """The packed blocks turned as one by a random yaw and shifted to a random place within `border`
+    m of the centre."""
     key_yaw, key_shift = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (), jnp.float32, 0.0, 2.0 * np.pi)
     turned = packed._replace(
-        centre=packed.centre.at[:, :2].set(geometry.rotate2d(yaw, packed.centre[:, :2])), yaw=packed.yaw + yaw
+        centre=packed.centre.at[:, :2].set(geometry.rotate2d(yaw, packed.centre[:, :2])),
+        yaw=packed.yaw + yaw,
     )
     xy, reach = turned.centre[:, :2], _reach(turned.yaw, _feet(turned.half_size, turned.on_side))
     low = jnp.min(jnp.where(packed.placed[:, None], xy - reach, jnp.inf), axis=0)
@@ -155,13 +178,19 @@ def _put_down(key: jax.Array, border: float, packed: Blocks) -> Blocks:
 
 
 def _reach(yaw: jax.Array, feet: jax.Array) -> jax.Array:
-    """Half extents [N, 2] m along the world's x and y of blocks with the half extents `feet` [N, 3], turned by [N]."""
+    """Half extents [N, 2] m along the world's x and y of blocks with the half extents `feet` [N,
+    3], turned by [N]."""
     cos, sin = jnp.abs(jnp.cos(yaw)), jnp.abs(jnp.sin(yaw))
-    return jnp.stack([cos * feet[:, 0] + sin * feet[:, 1], sin * feet[:, 0] + cos * feet[:, 1]], axis=1)
+    return jnp.stack(
+        [cos * feet[:, 0] + sin * feet[:, 1], sin * feet[:, 0] + cos * feet[:, 1]], axis=1
+    )
 
 
-def _add_loose(key: jax.Array, cfg: SceneConfig, border: float, level: jax.Array, packed: Blocks) -> Blocks:
-    """The arrangement and loose blocks beside it, in random free places; a block that finds none is left out."""
+def _add_loose(
+    key: jax.Array, cfg: SceneConfig, border: float, level: jax.Array, packed: Blocks
+) -> Blocks:
+    """The arrangement and loose blocks beside it, in random free places; a block that finds none is
+    left out."""
     key_order, key_number, key_tries = jax.random.split(key, 3)
     num = len(cfg.slots)
     order = jax.random.permutation(key_order, num)
@@ -170,7 +199,9 @@ def _add_loose(key: jax.Array, cfg: SceneConfig, border: float, level: jax.Array
     wanted = jnp.maximum(jnp.sum(packed.placed) + extra, cfg.min_blocks)
 
     def add(i: jax.Array, now: Blocks) -> Blocks:
-        found, xy, yaw = _free_place(jax.random.fold_in(key_tries, i), border, now, now.half_size[order[i]])
+        found, xy, yaw = _free_place(
+            jax.random.fold_in(key_tries, i), border, now, now.half_size[order[i]]
+        )
         joins = found & ~now.placed[order[i]] & (jnp.sum(now.placed) < wanted)
         here = joins & (np.arange(num) == order[i])
         there = jnp.concatenate([xy, now.half_size[order[i], 2:]])
@@ -183,32 +214,47 @@ def _add_loose(key: jax.Array, cfg: SceneConfig, border: float, level: jax.Array
     return jax.lax.fori_loop(0, num, add, packed)
 
 
-def _free_place(key: jax.Array, border: float, now: Blocks, half: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Whether there is room for a block of half size [3] m, and where: found [], xy [2] m, yaw [] rad."""
+def _free_place(
+    key: jax.Array, border: float, now: Blocks, half: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Whether there is room for a block of half size [3] m, and where: found [], xy [2] m, yaw []
+    rad."""
     key_xy, key_yaw = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (_TRIES,), jnp.float32, 0.0, 2.0 * np.pi)
     room = border - _reach(yaw, jnp.broadcast_to(half, (_TRIES, 3)))
     xy = jax.random.uniform(key_xy, (_TRIES, 2), jnp.float32, -1.0, 1.0) * room
     feet = _feet(now.half_size, now.on_side)[:, :2]
     to_each = jax.vmap(rectangle_gap, (None, None, None, 0, 0, 0))
-    gap = jax.vmap(to_each, (0, 0, None, None, None, None))(xy, yaw, half[:2], now.centre[:, :2], now.yaw, feet)
+    gap = jax.vmap(to_each, (0, 0, None, None, None, None))(
+        xy, yaw, half[:2], now.centre[:, :2], now.yaw, feet
+    )
     free = jnp.all((gap >= BESIDE) | ~now.placed[None], axis=1)  # [tries]
     first = jnp.argmax(free)
     return jnp.any(free), xy[first], yaw[first]
 
 
 def rectangle_gap(
-    xy: jax.Array, yaw: jax.Array, half: jax.Array, other_xy: jax.Array, other_yaw: jax.Array, other_half: jax.Array
+    xy: jax.Array,
+    yaw: jax.Array,
+    half: jax.Array,
+    other_xy: jax.Array,
+    other_yaw: jax.Array,
+    other_half: jax.Array,
 ) -> jax.Array:
-    """Gap [] m between two rectangles along the axis that parts them widest, at most their distance; < 0: they overlap.
+    """Gap [] m between two rectangles along the axis that parts them widest, at most their
+    distance; < 0: they overlap.
 
     Args: centres [2] m, yaws [] rad, half sides [2] m.
     """
-    angle = jnp.stack([yaw, yaw + 0.5 * np.pi, other_yaw, other_yaw + 0.5 * np.pi])  # the sides' normals
+    angle = jnp.stack(
+        [yaw, yaw + 0.5 * np.pi, other_yaw, other_yaw + 0.5 * np.pi]
+    )  # the sides' normals
     apart = jnp.abs(jnp.cos(angle) * (other_xy - xy)[0] + jnp.sin(angle) * (other_xy - xy)[1])
 
     def width(side_yaw: jax.Array, side: jax.Array) -> jax.Array:
-        return side[0] * jnp.abs(jnp.cos(angle - side_yaw)) + side[1] * jnp.abs(jnp.sin(angle - side_yaw))
+        return side[0] * jnp.abs(jnp.cos(angle - side_yaw)) + side[1] * jnp.abs(
+            jnp.sin(angle - side_yaw)
+        )
 
     return jnp.max(apart - width(yaw, half) - width(other_yaw, other_half))
 
@@ -217,7 +263,9 @@ def _scene(key: jax.Array, cfg: SceneConfig, together: Blocks, target: jax.Array
     """The blocks with random colours, densities and frictions; what is not placed is parked."""
     key_colour, key_density, key_friction = jax.random.split(key, 3)
     num = len(cfg.slots)
-    colours = jax.random.permutation(key_colour, max(num, len(blocks.COLOURS)))[:num] % len(blocks.COLOURS)
+    colours = jax.random.permutation(key_colour, max(num, len(blocks.COLOURS)))[:num] % len(
+        blocks.COLOURS
+    )
     tipped = jnp.where(together.on_side[:, None], _ON_SIDE[None], _UPRIGHT[None])
     yaws = jax.vmap(geometry.quat_from_yaw)(together.yaw)
     loose = Scene(

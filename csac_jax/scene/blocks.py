@@ -1,8 +1,9 @@
 """The block set of VPG (arXiv:1803.09956): eight shapes in ten colours.
 
-A slot of kind `box` may hold cube, cuboid, plank or tile; every other kind is one shape. A block's frame has its origin
-at the centre of the bounding box; what differs between scenes is `half_size`, half of that box. Boxes and arches scale
-along each axis, the other shapes as a whole. An arch is three convex parts, every other shape one.
+A slot of kind `box` may hold cube, cuboid, plank or tile; every other kind is one shape. A block's
+frame has its origin at the centre of the bounding box; what differs between scenes is `half_size`,
+half of that box. Boxes and arches scale along each axis, the other shapes as a whole. An arch is
+three convex parts, every other shape one.
 """
 
 from typing import NamedTuple
@@ -49,13 +50,26 @@ COLOURS = np.array(
     ],
     np.float32,
 ) / np.float32(255)  # [10, 3] sRGB in 0..1 (Tableau's ten, as in VPG)
-COLOUR_NAMES = ("blue", "green", "brown", "orange", "yellow", "grey", "red", "purple", "cyan", "pink")
+COLOUR_NAMES = (
+    "blue",
+    "green",
+    "brown",
+    "orange",
+    "yellow",
+    "grey",
+    "red",
+    "purple",
+    "cyan",
+    "pink",
+)
 TABLE_COLOUR = np.array([0.35, 0.33, 0.31], np.float32)
 
 
 def half_size_choices(kind: SlotKind) -> np.ndarray:
     """Nominal half sizes [choices, 3] m of the shapes that a slot of this kind may hold."""
-    return np.array([shape.half_size for shape in SHAPES.values() if shape.kind == kind], np.float32)
+    return np.array(
+        [shape.half_size for shape in SHAPES.values() if shape.kind == kind], np.float32
+    )
 
 
 # Parts: centre and half size of every convex part, in units of the block's half size.
@@ -78,7 +92,11 @@ class Parts(NamedTuple):
 
 def parts(slots: tuple[SlotKind, ...]) -> Parts:
     """The parts of the slots, slot by slot."""
-    each = [(slot, *part) for slot, kind in enumerate(slots) for part in (_ARCH if kind == "arch" else _WHOLE)]
+    each = [
+        (slot, *part)
+        for slot, kind in enumerate(slots)
+        for part in (_ARCH if kind == "arch" else _WHOLE)
+    ]
     slot, centre, half = zip(*each, strict=True)
     return Parts(np.array(slot), np.array(centre, np.float32), np.array(half, np.float32))
 
@@ -134,10 +152,11 @@ def normals(kind: SlotKind) -> np.ndarray:
 
 
 def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Faces of every part in its block's frame: a point p lies inside a part where n . p <= offset for all its faces.
+    """Faces of every part in its block's frame: a point p lies inside a part where n . p <= offset
+    for all its faces.
 
-    Args: half_size [N, 3] m.
-    Returns: normals [G, F, 3], outward unit vectors, 0 where there is no face; offsets [G, F] m. G as in `parts`.
+    Args: half_size [N, 3] m. Returns: normals [G, F, 3], outward unit vectors, 0 where there is no
+    face; offsets [G, F] m. G as in `parts`.
     """
     every = parts(slots)
     normals = np.zeros((len(every.slot), MAX_FACES, 3), np.float32)
@@ -148,22 +167,32 @@ def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.
     present = nominal < PADDING_OFFSET
     is_mesh = np.array([slots[slot] in MESH_KINDS for slot in every.slot])[:, None]
     size = half_size[every.slot]  # [G, 3]
-    reach = jnp.sum(np.abs(normals) * (every.half * size)[:, None] + normals * (every.centre * size)[:, None], axis=-1)
+    reach = jnp.sum(
+        np.abs(normals) * (every.half * size)[:, None] + normals * (every.centre * size)[:, None],
+        axis=-1,
+    )
     offsets = jnp.where(is_mesh, nominal * mesh_scale(slots, half_size)[every.slot][:, None], reach)
     return jnp.asarray(normals), jnp.where(present, offsets, PADDING_OFFSET)
 
 
 def size_leader(slots: tuple[SlotKind, ...]) -> np.ndarray:
-    """Slot [N] whose scale each slot takes: its own, but one for all slots of a mesh kind, as MJX shares their mesh."""
-    return np.array([slots.index(kind) if kind in MESH_KINDS else slot for slot, kind in enumerate(slots)])
+    """Slot [N] whose scale each slot takes: its own, but one for all slots of a mesh kind, as MJX
+    shares their mesh."""
+    return np.array(
+        [slots.index(kind) if kind in MESH_KINDS else slot for slot, kind in enumerate(slots)]
+    )
 
 
 def spread(cfg: SceneConfig) -> np.ndarray:
     """By what share the size of each slot's block may differ from nominal, [N]."""
-    return np.array([cfg.mesh_spread if kind in MESH_KINDS else cfg.size_spread for kind in cfg.slots], np.float32)
+    return np.array(
+        [cfg.mesh_size_jitter if kind in MESH_KINDS else cfg.size_jitter for kind in cfg.slots],
+        np.float32,
+    )
 
 
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:
-    """How much larger than nominal every slot's block is [N], by its height; of use for kinds that scale as a whole."""
+    """How much larger than nominal every slot's block is [N], by its height; of use for kinds that
+    scale as a whole."""
     nominal = np.array([half_size_choices(kind)[0][2] for kind in slots], np.float32)
     return half_size[:, 2] / nominal

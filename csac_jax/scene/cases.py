@@ -1,11 +1,13 @@
-"""Case files: arrangements of blocks written by hand, shipped in `scenes/cases/` or brought by the user.
+"""Case files: arrangements of blocks written by hand, shipped in `scenes/cases/` or brought by the
+user.
 
     {"name": "pair", "blocks": [
         {"shape": "cube", "colour": "red", "position": [0.03, 0, 0.025], "quaternion": [1, 0, 0, 0], "target": true},
         {"shape": "tile", "colour": "blue", "position": [-0.03, 0, 0.0125], "quaternion": [1, 0, 0, 0]}]}
 
-Shapes and colours are the names in `blocks`; a position, in metres, is that of the centre of the bounding box; a
-quaternion (w, x, y, z) is brought to unit length; `target` may be left out. Sizes, densities and frictions are nominal.
+Shapes and colours are the names in `blocks`; a position, in metres, is that of the centre of the
+bounding box; a quaternion (w, x, y, z) is brought to unit length; `target` may be left out. Sizes,
+densities and frictions are nominal.
 """
 
 import copy
@@ -32,7 +34,8 @@ _REQUIRED = ("shape", "colour", "position", "quaternion")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """An arrangement read from a file: as many slots as blocks, all in play, in the file's order. N = blocks."""
+    """An arrangement read from a file: as many slots as blocks, all in play, in the file's order. N
+    = blocks."""
 
     name: str
     slots: tuple[SlotKind, ...]
@@ -45,7 +48,8 @@ def names() -> tuple[str, ...]:
 
 
 def shipped(name: str) -> Path:
-    """File of the shipped case `name`. Raises ValueError if there is none, naming those that there are."""
+    """File of the shipped case `name`. Raises ValueError if there is none, naming those that there
+    are."""
     if name not in names():
         raise ValueError(f"unknown case '{name}'; choose one of: {', '.join(names())}")
     return model.assets() / "cases" / f"{name}.json"
@@ -54,7 +58,8 @@ def shipped(name: str) -> Path:
 def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
     """The case in the file `path`, its blocks inside the square of side `extent` m.
 
-    Raises ValueError, in one line that names the file, the block (the first is 1) and what to change.
+    Raises ValueError, in one line that names the file, the block (the first is 1) and what to
+    change.
     """
     try:
         case = _parse(_read(path))
@@ -67,11 +72,14 @@ def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
 def require_target(case: Case) -> None:
     """Raises ValueError unless one block of the case is marked as the one to get."""
     if int(case.scene.target) == layout.ANY:
-        raise ValueError(f"case '{case.name}' marks no block as the target; give one of them \"target\": true")
+        raise ValueError(
+            f"case '{case.name}' marks no block as the target; give one of them \"target\": true"
+        )
 
 
 def seat(case: Case, slots: tuple[SlotKind, ...]) -> Scene:
-    """The case's scene in other slots, each block in the first free one of its kind; slots left over are parked."""
+    """The case's scene in other slots, each block in the first free one of its kind; slots left
+    over are parked."""
     free = list(range(len(slots)))
     place = []
     for kind in case.slots:
@@ -111,7 +119,8 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """The object of these keys and values; a key given twice is an error, as one of the two would be lost."""
+    """The object of these keys and values; a key given twice is an error, as one of the two would
+    be lost."""
     keys = [key for key, _ in pairs]
     for key in keys:
         if keys.count(key) > 1:
@@ -166,13 +175,17 @@ def _parse_block(entry: Any) -> _Block:
     )
 
 
-def _check_keys(content: dict[str, Any], required: tuple[str, ...], optional: tuple[str, ...]) -> None:
+def _check_keys(
+    content: dict[str, Any], required: tuple[str, ...], optional: tuple[str, ...]
+) -> None:
     for key in required:
         if key not in content:
             raise ValueError(f'key "{key}" is missing')
     for key in content:
         if key not in required + optional:
-            raise ValueError(f"unknown key {_short(key)}; known are: {', '.join(required + optional)}")
+            raise ValueError(
+                f"unknown key {_short(key)}; known are: {', '.join(required + optional)}"
+            )
 
 
 def _choice(entry: dict[str, Any], key: str, choices: tuple[str, ...]) -> str:
@@ -187,11 +200,15 @@ def _numbers(entry: dict[str, Any], key: str, count: int) -> list[float]:
     values = entry[key]
     if isinstance(values, list) and len(values) == count:
         # the comparison keeps out NaN, and integers too large for a float
-        good = [isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= 10 for v in values]
+        good = [
+            isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= 10 for v in values
+        ]
         if all(good):
             return [float(value) for value in values]
     unit = " in metres" if key == "position" else ""
-    raise ValueError(f'"{key}" must be a list of {count} numbers{unit}, each from -10 to 10, not {_short(values)}')
+    raise ValueError(
+        f'"{key}" must be a list of {count} numbers{unit}, each from -10 to 10, not {_short(values)}'
+    )
 
 
 def _short(value: Any) -> str:
@@ -204,7 +221,9 @@ def _assemble(name: str, parsed: list[_Block]) -> Case:
     """The case of these blocks."""
     targets = [slot for slot, block in enumerate(parsed) if block.target]
     if len(targets) > 1:
-        raise ValueError(f"block {targets[1] + 1}: block {targets[0] + 1} is the target already; mark only one")
+        raise ValueError(
+            f"block {targets[1] + 1}: block {targets[0] + 1} is the target already; mark only one"
+        )
     slots = tuple(block.shape.kind for block in parsed)
     leaves: dict[str, Any] = {
         "position": np.array([block.position for block in parsed], np.float32),
@@ -225,7 +244,9 @@ def _check_places(case: Case, extent: float) -> None:
     world = model.build(SceneConfig(slots=case.slots, min_blocks=1), SimConfig())
     exact = _nominal(world, np.asarray(case.scene.half_size))
     data = mujoco.MjData(exact)
-    data.qpos[world.block_qpos] = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
+    data.qpos[world.block_qpos] = np.concatenate(
+        [case.scene.position, case.scene.quaternion], axis=1
+    )
     mujoco.mj_kinematics(exact, data)
     placed: list[list[_Part]] = []  # of the blocks so far
     for slot, kind in enumerate(case.slots):
@@ -248,7 +269,8 @@ class _Part(NamedTuple):
 
 
 def _nominal(world: World, half_size: np.ndarray) -> mujoco.MjModel:
-    """A copy of the world's model with the surfaces of blocks of nominal half sizes [N, 3] m, masses left as they are.
+    """A copy of the world's model with the surfaces of blocks of nominal half sizes [N, 3] m,
+    masses left as they are.
 
     `model.with_blocks` with its masses would do, but first compiles what takes seconds.
     """
@@ -267,11 +289,15 @@ def _check_corners(corners: np.ndarray, extent: float) -> None:
     beyond = np.abs(corners[:, :2]).max() - 0.5 * extent
     below, top = -corners[:, 2].min(), corners[:, 2].max()
     if beyond > _ROUNDING:
-        raise ValueError(f"reaches {1e3 * beyond:.1f} mm beyond the square of {extent:g} m; move it inwards")
+        raise ValueError(
+            f"reaches {1e3 * beyond:.1f} mm beyond the square of {extent:g} m; move it inwards"
+        )
     if below > MAX_OVERLAP:
         raise ValueError(f"reaches {1e3 * below:.1f} mm below the table; raise its z by as much")
     if top > _HIGHEST:
-        raise ValueError(f"reaches {top:.3f} m above the table; lower its z so that it stays below {_HIGHEST:g} m")
+        raise ValueError(
+            f"reaches {top:.3f} m above the table; lower its z so that it stays below {_HIGHEST:g} m"
+        )
 
 
 def _corners(exact: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:

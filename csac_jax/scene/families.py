@@ -1,8 +1,9 @@
-"""Families of ordered arrangements: for each, an ordered list of roles and where the blocks in them go.
+"""Families of ordered arrangements: for each, an ordered list of roles and where the blocks in them
+go.
 
-Each role takes a random free slot of its kinds. The shipped cases are held out by construction: no family packs two
-arches together, as `row`, `pinwheel` and `hole` do, and two packed prisms, as in `ridge`, always have a third block
-beside them. R = the 5 roles, N = block slots.
+Each role takes a random free slot of its kinds. The shipped cases are held out by construction: no
+family packs two arches together, as `row`, `pinwheel` and `hole` do, and two packed prisms, as in
+`ridge`, always have a third block beside them. R = the 5 roles, N = block slots.
 """
 
 from collections.abc import Callable
@@ -38,12 +39,17 @@ class Placed(NamedTuple):
 
 
 class Family(NamedTuple):
-    """A way of packing. The kinds of a role are those of a role before it, more, or wholly others."""
+    """A way of packing. The kinds of a role are those of a role before it, more, or wholly
+    others."""
 
     roles: tuple[Role, Role, Role, Role, Role]
     least: int  # roles without which there is no such arrangement, first ones
-    place: Callable[["Draws", jax.Array, jax.Array, jax.Array], Placed]  # draws, feet [R, 3] m, used [R], gap [] m
-    resize: Callable[[jax.Array], jax.Array] = lambda half: half  # [R, 3] m -> [R, 3] m, to make them fit
+    place: Callable[
+        ["Draws", jax.Array, jax.Array, jax.Array], Placed
+    ]  # draws, feet [R, 3] m, used [R], gap [] m
+    resize: Callable[[jax.Array], jax.Array] = lambda half: (
+        half
+    )  # [R, 3] m -> [R, 3] m, to make them fit
 
 
 class Draws(NamedTuple):
@@ -63,12 +69,15 @@ def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
     """The families that these slots allow. Raises ValueError where they allow none."""
     found = {name: family for name, family in FAMILIES.items() if _is_possible(family, slots)}
     if not found:
-        raise ValueError("scene.slots: too few for an arrangement; three boxes, for one, are enough")
+        raise ValueError(
+            "scene.slots: too few for an arrangement; three boxes, for one, are enough"
+        )
     return found
 
 
 def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
-    """Whether every needed role finds a slot: roles with fewer kinds choose first, so any choice of theirs will do."""
+    """Whether every needed role finds a slot: roles with fewer kinds choose first, so any choice of
+    theirs will do."""
     free = list(slots)
     for role in family.roles[: family.least]:
         fitting = [kind for kind in free if kind in role.kinds]
@@ -103,10 +112,15 @@ def _flat(feet: jax.Array, turned: jax.Array) -> jax.Array:
     return jnp.where(turned[:, None], feet[:, 1::-1], feet[:, :2])
 
 
-def _line(noise: jax.Array, width: jax.Array, used: jax.Array, gap: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Blocks of half widths `width` [R] m along a line, by `noise` [R]: centres [R] m about 0, and the middle one."""
+def _line(
+    noise: jax.Array, width: jax.Array, used: jax.Array, gap: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Blocks of half widths `width` [R] m along a line, by `noise` [R]: centres [R] m about 0, and
+    the middle one."""
     index = np.arange(ROLES)
-    is_tie = (noise[None] == noise[:, None]) & (index[None] < index[:, None])  # one scene in a million has one
+    is_tie = (noise[None] == noise[:, None]) & (
+        index[None] < index[:, None]
+    )  # one scene in a million has one
     before = used[None] & ((noise[None] < noise[:, None]) | is_tie)  # [i, j]: j comes before i
     step = jnp.where(used, 2.0 * width + gap, 0.0)
     start = jnp.sum(jnp.where(before, step[None], 0.0), axis=1)
@@ -117,16 +131,26 @@ def _line(noise: jax.Array, width: jax.Array, used: jax.Array, gap: jax.Array) -
 def _place_row(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
     """Long side to long side, not quite in line."""
     y, middle = _line(draws.order, feet[:, 1], used, gap)
-    return Placed(jnp.stack([OUT_OF_LINE * draws.jitter[:, 0], y, jnp.zeros_like(y)], 1), jnp.zeros_like(used), middle)
+    return Placed(
+        jnp.stack([OUT_OF_LINE * draws.jitter[:, 0], y, jnp.zeros_like(y)], 1),
+        jnp.zeros_like(used),
+        middle,
+    )
 
 
 def _place_ring(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """The last block enclosed by the four others: each ends at the side of the next, as the arms of a pinwheel do."""
+    """The last block enclosed by the four others: each ends at the side of the next, as the arms of
+    a pinwheel do."""
     quarter = np.arange(5)
     turned = quarter % 2 == 1  # the fifth, in the middle, is not
-    inner = jnp.where(turned[:, None], feet[4, 1::-1][None], feet[4, :2][None])  # [5, 2] the middle one, seen by each
+    inner = jnp.where(
+        turned[:, None], feet[4, 1::-1][None], feet[4, :2][None]
+    )  # [5, 2] the middle one, seen by each
     arm = jnp.stack([feet[:, 0] - inner[:, 0], inner[:, 1] + gap + feet[:, 1]], axis=1)
-    cos, sin = np.cos(0.5 * np.pi * quarter).astype(np.float32), np.sin(0.5 * np.pi * quarter).astype(np.float32)
+    cos, sin = (
+        np.cos(0.5 * np.pi * quarter).astype(np.float32),
+        np.sin(0.5 * np.pi * quarter).astype(np.float32),
+    )
     x, y = cos * arm[:, 0] - sin * arm[:, 1], sin * arm[:, 0] + cos * arm[:, 1]
     mirrored = jnp.where(draws.mirrored, -1.0, 1.0)
     around = jnp.stack([mirrored * x, y, jnp.zeros_like(x)], axis=1)
@@ -139,15 +163,20 @@ def _place_wall(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) 
     turned = draws.turned & ~is_wall
     flat = _flat(feet, turned)
     x, middle = _line(draws.order, flat[:, 0], used & ~is_wall, gap)
-    end_to_end = np.where(np.arange(used.shape[0]) == 0, -1.0, 1.0).astype(np.float32) * (flat[:, 0] + 0.5 * gap)
+    end_to_end = np.where(np.arange(used.shape[0]) == 0, -1.0, 1.0).astype(np.float32) * (
+        flat[:, 0] + 0.5 * gap
+    )
     x, y = jnp.where(is_wall, end_to_end, x), jnp.where(is_wall, -flat[:, 1], gap + flat[:, 1])
     return Placed(jnp.stack([x, y, jnp.zeros_like(y)], axis=1), turned, middle)
 
 
 def _place_nest(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """An arch on its side, its mouth towards +y; a block in the mouth; one that shuts it; two at the arch's ends."""
+    """An arch on its side, its mouth towards +y; a block in the mouth; one that shuts it; two at
+    the arch's ends."""
     arch, inner, lid = feet[0], feet[1], feet[2]
-    y_inner = jnp.minimum(gap, IN_HOLE[1]) + inner[1]  # the mouth is half as deep as the arch is high
+    y_inner = (
+        jnp.minimum(gap, IN_HOLE[1]) + inner[1]
+    )  # the mouth is half as deep as the arch is high
     front = jnp.maximum(y_inner + inner[1], jnp.max(feet[np.array([0, 3, 4]), 1]))
     zero = jnp.zeros_like(gap)
     x_ends = arch[0] + gap + feet[3:, 0]
@@ -167,7 +196,9 @@ def _place_pile(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) 
     flat, near = _flat(feet, turned), jnp.minimum(gap, STACKED_GAP)
     zero = jnp.zeros_like(gap)
     aside = flat[0, 1] + 0.5 * near
-    end = jnp.maximum(flat[0, 0], jnp.maximum(flat[2, 0], flat[3, 0]) + ASKEW)  # what is stacked may reach farther
+    end = jnp.maximum(
+        flat[0, 0], jnp.maximum(flat[2, 0], flat[3, 0]) + ASKEW
+    )  # what is stacked may reach farther
     floor = jnp.stack([zero, zero, 2.0 * feet[0, 2], 2.0 * (feet[0, 2] + feet[2, 2]), zero])
     x = jnp.stack([zero, zero, zero, zero, end + gap + flat[4, 0]])
     y = jnp.stack([-aside, aside, zero, zero, zero])
@@ -177,7 +208,8 @@ def _place_pile(draws: Draws, feet: jax.Array, used: jax.Array, gap: jax.Array) 
 
 
 def _resize_pile(half: jax.Array) -> jax.Array:
-    """The second of the two lowest blocks like the first, so that what lies across them lies flat."""
+    """The second of the two lowest blocks like the first, so that what lies across them lies
+    flat."""
     return half.at[1].set(half[0])
 
 

@@ -14,22 +14,26 @@ from csac_jax.scene import blocks
 NOMINAL_DENSITY = 600.0  # kg/m^3, wood
 NOMINAL_FRICTION = 0.8
 SPEED_LIMIT = np.array([5, 5, 5, 50, 50, 50], np.float32)
-"""Fastest that a block may be after a substep, m/s and rad/s (ours). A thin one squeezed from under the hand spins
-faster; its gyroscopic torque, which the integrator takes explicitly, would then feed it until it is NaN."""
+"""Fastest that a block may be after a substep, m/s and rad/s (ours). A thin one squeezed from under
+the hand spins faster; its gyroscopic torque, which the integrator takes explicitly, would then feed
+it until it is NaN."""
 ANY = -1
 """`Scene.target` in the clearing task."""
 
 
 @struct.dataclass
 class Scene:
-    """Blocks of one scene. N = block slots; a slot that is not in play is parked beside the table, out of view."""
+    """Blocks of one scene. N = block slots; a slot that is not in play is parked beside the table,
+    out of view."""
 
     position: jax.Array  # [N, 3] float32 m, centre of the bounding box
     quaternion: jax.Array  # [N, 4] float32 (w, x, y, z), body -> world
     velocity: jax.Array  # [N, 6] float32 linear m/s (world), angular rad/s (body)
     half_size: jax.Array  # [N, 3] float32 m, half of the bounding box
     density: jax.Array  # [N] float32 kg/m^3
-    friction: jax.Array  # [N] float32, sliding friction against table and blocks; the pads' own rules a grasp
+    friction: (
+        jax.Array
+    )  # [N] float32, sliding friction against table and blocks; the pads' own rules a grasp
     colour: jax.Array  # [N] int32, row of blocks.COLOURS
     in_play: jax.Array  # [N] bool
     target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
@@ -37,11 +41,14 @@ class Scene:
 
 def parking(num_slots: int) -> np.ndarray:
     """Parking places [N, 3] m: in the air, so that they make no contact, and far enough apart."""
-    return np.stack([3.0 + 0.3 * np.arange(num_slots), np.zeros(num_slots), np.ones(num_slots)], 1).astype(np.float32)
+    return np.stack(
+        [3.0 + 0.3 * np.arange(num_slots), np.zeros(num_slots), np.ones(num_slots)], 1
+    ).astype(np.float32)
 
 
 def parked(slots: tuple[SlotKind, ...]) -> Scene:
-    """A scene of NumPy arrays with every slot parked: shapes, sizes, densities and frictions nominal."""
+    """A scene of NumPy arrays with every slot parked: shapes, sizes, densities and frictions
+    nominal."""
     num = len(slots)
     quaternion = np.zeros((num, 4), np.float32)
     quaternion[:, 0] = 1.0
@@ -75,13 +82,16 @@ def turn(scene: Scene, yaw: jax.Array) -> Scene:
     """The scene's blocks in play, at rest, turned about the workspace centre by `yaw` [] rad."""
     turned = scene.replace(
         position=scene.position.at[:, :2].set(geometry.rotate2d(yaw, scene.position[:, :2])),
-        quaternion=jax.vmap(geometry.quat_multiply, (None, 0))(geometry.quat_from_yaw(yaw), scene.quaternion),
+        quaternion=jax.vmap(geometry.quat_multiply, (None, 0))(
+            geometry.quat_from_yaw(yaw), scene.quaternion
+        ),
     )
     return park(turned, scene.in_play)
 
 
 def mark(key: jax.Array, scene: Scene) -> Scene:
-    """The scene with one of its blocks in play, each equally likely, as the target; ANY if none is in play."""
+    """The scene with one of its blocks in play, each equally likely, as the target; ANY if none is
+    in play."""
     slot = jax.random.categorical(key, jnp.where(scene.in_play, 0.0, -jnp.inf)).astype(jnp.int32)
     return scene.replace(target=jnp.where(jnp.any(scene.in_play), slot, ANY))
 

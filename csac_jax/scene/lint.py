@@ -1,8 +1,9 @@
-"""A linter of models for MJX: what its JAX implementation lacks, or carries along and never reads, is refused.
+"""A linter of models for MJX: what its JAX implementation lacks, or carries along and never reads,
+is refused.
 
-Read off mujoco-mjx 3.17: `put_model`, `step`, and the fields of a model that no other code of MJX mentions. Where MJX
-would raise by itself, now or as it steps, the line here also says what to write instead; where it would not, blocks
-would move otherwise than in C MuJoCo without a word.
+Read off mujoco-mjx 3.17: `put_model`, `step`, and the fields of a model that no other code of MJX
+mentions. Where MJX would raise by itself, now or as it steps, the line here also says what to write
+instead; where it would not, blocks would move otherwise than in C MuJoCo without a word.
 """
 
 import itertools
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco import mjtDisableBit, mjtEnableBit, mjtGeom, mjtIntegrator, mjtObj, mjtSolver
 
-from csac_jax.scene.errors import SceneError
+from csac_jax.errors import SceneError
 
 IGNORED_OPTIONS = (
     "noslip_iterations",
@@ -26,7 +27,9 @@ IGNORED_OPTIONS = (
 )
 INTEGRATORS = {mjtIntegrator.mjINT_EULER, mjtIntegrator.mjINT_RK4, mjtIntegrator.mjINT_IMPLICITFAST}
 SOLVERS = {mjtSolver.mjSOL_NEWTON, mjtSolver.mjSOL_CG}
-ENABLE_FLAGS = {mjtEnableBit.mjENBL_INVDISCRETE}  # sleep and ipc pass `put_model`, then nothing reads them
+ENABLE_FLAGS = {
+    mjtEnableBit.mjENBL_INVDISCRETE
+}  # sleep and ipc pass `put_model`, then nothing reads them
 DISABLE_FLAGS_IGNORED = {
     mjtDisableBit.mjDSBL_MIDPHASE,
     mjtDisableBit.mjDSBL_AUTORESET,
@@ -74,7 +77,16 @@ KINDS_LACKING = {  # field of the model: (what it is of, enumeration, values tha
         "sensor",
         mujoco.mjtSensor,
         (
-            *("E_KINETIC", "E_POTENTIAL", "GEOMDIST", "GEOMFROMTO", "GEOMNORMAL", "INSIDESITE", "PLUGIN", "USER"),
+            *(
+                "E_KINETIC",
+                "E_POTENTIAL",
+                "GEOMDIST",
+                "GEOMFROMTO",
+                "GEOMNORMAL",
+                "INSIDESITE",
+                "PLUGIN",
+                "USER",
+            ),
             *(f"{of}LIMIT{what}" for of in ("JOINT", "TENDON") for what in ("FRC", "POS", "VEL")),
         ),
     ),
@@ -82,13 +94,15 @@ KINDS_LACKING = {  # field of the model: (what it is of, enumeration, values tha
 
 
 def check(model: mujoco.MjModel) -> None:
-    """Raises SceneError, one line, for the first thing in the model that MJX lacks or would ignore."""
+    """Raises SceneError, one line, for the first thing in the model that MJX lacks or would
+    ignore."""
     for fault in faults(model):
         raise SceneError(f"MJX {fault}")
 
 
 def faults(model: mujoco.MjModel) -> Iterator[str]:
-    """Everything that MJX lacks or would ignore, each with its remedy: "ignores option noslip_iterations; ..."."""
+    """Everything that MJX lacks or would ignore, each with its remedy: "ignores option
+    noslip_iterations; ..."."""
     yield from _options(model.opt)
     yield from _fields(model)
     yield from _kinds(model)
@@ -178,10 +192,19 @@ def _meeting(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
     excluded = set(model.exclude_signature.tolist())
     for one, two in itertools.combinations(np.flatnonzero(kind | affinity).tolist(), 2):
         apart = weld[one] != weld[two]
-        related = weld[one] != 0 and weld[two] != 0 and (weld[one] == parent[two] or weld[two] == parent[one])
+        related = (
+            weld[one] != 0
+            and weld[two] != 0
+            and (weld[one] == parent[two] or weld[two] == parent[one])
+        )
         mask = kind[one] & affinity[two] | kind[two] & affinity[one]
         bodies = sorted(model.geom_bodyid[[one, two]].tolist())
-        if apart and mask and not (filtered and related) and (bodies[0] << 16) + bodies[1] not in excluded:
+        if (
+            apart
+            and mask
+            and not (filtered and related)
+            and (bodies[0] << 16) + bodies[1] not in excluded
+        ):
             yield *_by_type(model, one, two), model.geom_margin[one] + model.geom_margin[two]
 
 

@@ -19,12 +19,17 @@ FINGERS = ("hand/finger_low", "hand/finger_high")
 HAND_GEOMS = ("palm", "pad_low", "pad_high")
 ROBOT_JOINTS: dict[RobotKind, tuple[str, ...]] = {
     "hand": ("hand/x", "hand/y", "hand/z", "hand/yaw", *FINGERS),
-    "ur5": tuple(f"ur5/{name}" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3"))
+    "ur5": tuple(
+        f"ur5/{name}"
+        for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3")
+    )
     + FINGERS,
 }
 LARGEST = 1.25  # size of compiled blocks relative to nominal: C culls pairs by the bounds it was compiled with
 MAX_OPENING = 0.110  # m, RG2 data sheet
-HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above all drops, or it catches the highest
+HAND_PARK_HEIGHT = (
+    10.0  # m, where the hand waits while blocks settle: above all drops, or it catches the highest
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,7 +44,9 @@ class World:
     block_qpos: np.ndarray  # [N, 7] addresses in qpos: position, quaternion
     block_dofs: np.ndarray  # [N, 6] addresses in qvel
     slot_of_geom: np.ndarray  # [geoms] slot that a geom belongs to, -1 if it is no block's
-    robot_qpos: np.ndarray  # [Q] addresses in qpos, order of ROBOT_JOINTS; the last two are the fingers
+    robot_qpos: (
+        np.ndarray
+    )  # [Q] addresses in qpos, order of ROBOT_JOINTS; the last two are the fingers
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
     mesh_scale: float  # size of compiled meshes relative to nominal
 
@@ -53,7 +60,9 @@ def assets() -> Path:
     for folder in (package.parent / "scenes", package / "_scenes"):
         if (folder / "table.xml").is_file():
             return folder
-    raise FileNotFoundError(f"the MJCF files of csac_jax are missing beside {package}; install the package again")
+    raise FileNotFoundError(
+        f"the MJCF files of csac_jax are missing beside {package}; install the package again"
+    )
 
 
 def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
@@ -64,7 +73,9 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     for mesh in part.meshes:
         mesh.scale = [_mesh_scale(sim)] * 3
     spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
-    for slot, (kind, place) in enumerate(zip(scene.slots, layout.parking(len(scene.slots)), strict=True)):
+    for slot, (kind, place) in enumerate(
+        zip(scene.slots, layout.parking(len(scene.slots)), strict=True)
+    ):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
         _add_parts(spec, body, kind)
@@ -84,7 +95,8 @@ def _mesh_scale(sim: SimConfig) -> float:
 
 
 def _add_touch_sensors(spec: mujoco.MjSpec, slots: int) -> None:
-    """A sensor [1] of how many contacts a hand geom has with a block, for each of HAND_GEOMS x slots, in that order."""
+    """A sensor [1] of how many contacts a hand geom has with a block, for each of HAND_GEOMS x
+    slots, in that order."""
     for geom in HAND_GEOMS:
         for slot in range(slots):
             sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
@@ -116,13 +128,18 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
         if kind in MESH_KINDS:
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"blocks/{kind}"
         else:
-            geom.type, geom.size, geom.pos = mujoco.mjtGeom.mjGEOM_BOX, half * largest, centre * largest
+            geom.type, geom.size, geom.pos = (
+                mujoco.mjtGeom.mjGEOM_BOX,
+                half * largest,
+                centre * largest,
+            )
 
 
 def build(scene: SceneConfig, sim: SimConfig) -> World:
     """The world of table, robot and block slots; blocks parked, at the largest size of their kind.
 
-    Raises SceneError where the physics is MJX and the MJCF has something that MJX lacks or would ignore.
+    Raises SceneError where the physics is MJX and the MJCF has something that MJX lacks or would
+    ignore.
     """
     model = _spec(scene, sim).compile()
     if sim.physics == "mjx":
@@ -150,7 +167,8 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
 
 
 def _align_inertia(model: mujoco.MjModel) -> None:
-    """Turns inertial frames that are body frames with their axes swapped (the compiler sorts by size) back."""
+    """Turns inertial frames that are body frames with their axes swapped (the compiler sorts by
+    size) back."""
     for body in range(model.nbody):
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[body])
@@ -176,14 +194,19 @@ class BlockFields:
     mesh_scale: jax.Array  # [M] relative to the compiled mesh
 
 
-def block_fields(world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array) -> BlockFields:
+def block_fields(
+    world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array
+) -> BlockFields:
     """Fields that follow from half sizes [N, 3] m, densities [N] kg/m^3 and sliding frictions [N].
 
-    Closed forms of what MuJoCo's compiler derives. Boxes: m = 8 rho a b c, I_x = m (b^2 + c^2) / 3, parts about their
-    common centre of mass by the parallel axis theorem. Meshes by their scale s: m ~ rho s^3, I ~ rho s^5. Blocks of one
-    mesh kind in a scene share their size.
+    Closed forms of what MuJoCo's compiler derives. Boxes: m = 8 rho a b c, I_x = m (b^2 + c^2) / 3,
+    parts about their common centre of mass by the parallel axis theorem. Meshes by their scale s: m
+    ~ rho s^3, I ~ rho s^5. Blocks of one mesh kind in a scene share their size.
     """
-    boxes, meshes = _box_fields(world, half_size, density, friction), _mesh_fields(world, half_size, density, friction)
+    boxes, meshes = (
+        _box_fields(world, half_size, density, friction),
+        _mesh_fields(world, half_size, density, friction),
+    )
     is_mesh = np.array([kind in MESH_KINDS for kind in world.slots])
 
     def choose(mesh: jax.Array, box: jax.Array, which: np.ndarray) -> jax.Array:
@@ -202,7 +225,9 @@ def block_fields(world: World, half_size: jax.Array, density: jax.Array, frictio
     return BlockFields(**chosen, mesh_scale=meshes.mesh_scale)
 
 
-def _box_fields(world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array) -> BlockFields:
+def _box_fields(
+    world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array
+) -> BlockFields:
     """As if every slot were made of boxes."""
     slot, num = world.parts.slot, len(world.slots)
     half = jnp.asarray(world.parts.half) * half_size[slot]
@@ -214,10 +239,13 @@ def _box_fields(world: World, half_size: jax.Array, density: jax.Array, friction
 
     mass = add(part_mass)
     com = add(part_mass[:, None] * centre) / mass[:, None]
-    square = half**2 / 3.0 + (centre - com[slot]) ** 2  # [G, 3], second moment of a part along each axis, per mass
+    square = (
+        half**2 / 3.0 + (centre - com[slot]) ** 2
+    )  # [G, 3], second moment of a part along each axis, per mass
     inertia = add(part_mass[:, None] * (jnp.sum(square, axis=1, keepdims=True) - square))
     turning = jnp.mean(1.0 / inertia, axis=1)
-    # A free joint sits at the body's origin: pushing there also turns the block, about axes square to its lever.
+    # A free joint sits at the body's origin: pushing there also turns the block, about axes square
+    # to its lever.
     lever = jnp.sum(com**2, axis=1, keepdims=True) - com**2
     moving = 1.0 / mass + jnp.sum(lever / inertia, axis=1) / 3.0
     return BlockFields(
@@ -234,14 +262,18 @@ def _box_fields(world: World, half_size: jax.Array, density: jax.Array, friction
     )
 
 
-def _mesh_fields(world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array) -> BlockFields:
+def _mesh_fields(
+    world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array
+) -> BlockFields:
     """As if every slot held a mesh: the compiled fields, scaled."""
     model, slot = world.model, world.parts.slot
     scale = blocks.mesh_scale(world.slots, half_size) / world.mesh_scale  # [N]
     heavier = density / layout.NOMINAL_DENSITY  # that of scenes/blocks.xml
     of_part, of_slot = scale[slot][:, None], scale[:, None]
     by_mass, by_inertia = heavier[:, None] * of_slot**3, heavier[:, None] * of_slot**5
-    powers = jnp.concatenate([jnp.repeat(1.0 / by_mass, 3, axis=1), jnp.repeat(1.0 / by_inertia, 3, axis=1)], axis=1)
+    powers = jnp.concatenate(
+        [jnp.repeat(1.0 / by_mass, 3, axis=1), jnp.repeat(1.0 / by_inertia, 3, axis=1)], axis=1
+    )
 
     def base(field: np.ndarray) -> jax.Array:
         return jnp.asarray(field, jnp.float32)
@@ -261,12 +293,16 @@ def _mesh_fields(world: World, half_size: jax.Array, density: jax.Array, frictio
 
 
 def _scale_of_meshes(world: World, scale: jax.Array) -> jax.Array:
-    """Scale of every mesh of the model [M]: that of the first slot that uses it, 1 where none does."""
+    """Scale of every mesh of the model [M]: that of the first slot that uses it, 1 where none
+    does."""
     users = [
-        np.flatnonzero(world.model.geom_dataid[world.block_geoms] == mesh)[:1] for mesh in range(world.model.nmesh)
+        np.flatnonzero(world.model.geom_dataid[world.block_geoms] == mesh)[:1]
+        for mesh in range(world.model.nmesh)
     ]
     one = jnp.ones(())
-    return jnp.stack([scale[world.parts.slot[user[0]]] if user.size else one for user in users] or [one])
+    return jnp.stack(
+        [scale[world.parts.slot[user[0]]] if user.size else one for user in users] or [one]
+    )
 
 
 def with_blocks(
@@ -275,16 +311,24 @@ def with_blocks(
     scratch: mujoco.MjData | None = None,
     into: mujoco.MjModel | None = None,
 ) -> mujoco.MjModel:
-    """A copy of the world's model whose blocks have these fields (NumPy arrays), or `into`, an earlier copy, with them.
+    """A copy of the world's model whose blocks have these fields (NumPy arrays), or `into`, an
+    earlier copy, with them.
 
-    MuJoCo derives the rest: C takes the mass matrix of a free body from `dof_M0`, not from its mass. What it needs room
-    for is written into `scratch`, if there is any: making room, or a copy, takes longer than the rest.
+    MuJoCo derives the rest: C takes the mass matrix of a free body from `dof_M0`, not from its
+    mass. What it needs room for is written into `scratch`, if there is any: making room, or a copy,
+    takes longer than the rest.
     """
     model = into or copy.copy(world.model)
-    model.geom_size[world.block_geoms], model.geom_rbound[world.block_geoms] = fields.size, fields.rbound
+    model.geom_size[world.block_geoms], model.geom_rbound[world.block_geoms] = (
+        fields.size,
+        fields.rbound,
+    )
     model.geom_pos[world.block_geoms] = fields.centre
     model.geom_friction[world.block_geoms, 0] = fields.friction
-    model.body_mass[world.block_bodies], model.body_inertia[world.block_bodies] = fields.mass, fields.inertia
+    model.body_mass[world.block_bodies], model.body_inertia[world.block_bodies] = (
+        fields.mass,
+        fields.inertia,
+    )
     model.body_ipos[world.block_bodies] = fields.com
     for mesh, scale in zip(range(model.nmesh), fields.mesh_scale, strict=False):
         start = model.mesh_vertadr[mesh]
@@ -296,4 +340,6 @@ def with_blocks(
 
 def scene_fields(world: World, scene: Scene) -> BlockFields:
     """The fields of one scene."""
-    return block_fields(world, *(jnp.asarray(leaf) for leaf in (scene.half_size, scene.density, scene.friction)))
+    return block_fields(
+        world, *(jnp.asarray(leaf) for leaf in (scene.half_size, scene.density, scene.friction))
+    )

@@ -1,6 +1,8 @@
-"""A pool of settled scenes: blocks dropped one above the other and left to come to rest, once per configuration.
+"""A pool of settled scenes: blocks dropped one above the other and left to come to rest, once per
+configuration.
 
-Settling runs in C MuJoCo on all cores, bit-identical for any number of threads, and is cached by content.
+Settling runs in C MuJoCo on all cores, bit-identical for any number of threads, and is cached by
+content.
 """
 
 import concurrent.futures
@@ -17,10 +19,17 @@ import mujoco
 import numpy as np
 
 from csac_jax.config import SceneConfig
+from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, layout
-from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import HAND_PARK_HEIGHT, BlockFields, World, assets, scene_fields, with_blocks
+from csac_jax.scene.model import (
+    HAND_PARK_HEIGHT,
+    BlockFields,
+    World,
+    assets,
+    scene_fields,
+    with_blocks,
+)
 
 TRAIN_STREAM = 0  # stream of random numbers of the training pool; evaluation takes 1 + its seed
 _VERSION = 5  # raise when the meaning of a cached pool changes
@@ -32,17 +41,22 @@ _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
 _MOST_DROPS = 3  # times the number of blocks: pauses that pouring a scene may take
 
 
-def settled(world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool = False) -> Scene:
-    """`count` distinct settled scenes per number of blocks, leaves [P, N, ...], from the cache or settled now.
+def settled(
+    world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool = False
+) -> Scene:
+    """`count` distinct settled scenes per number of blocks, leaves [P, N, ...], from the cache or
+    settled now.
 
     P = count for each number from `min_blocks` to N, fewest first.
 
-    Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a scene can be turned
-    by any yaw. `world` is one with the floating hand, which waits high above. The same arguments give the same scenes
-    on every machine of one kind. Raises SceneError where hardly any scene comes to rest.
+    Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a
+    scene can be turned by any yaw. `world` is one with the floating hand, which waits high above.
+    The same arguments give the same scenes on every machine of one kind. Raises SceneError where
+    hardly any scene comes to rest.
 
-    Blocks are dropped all at once, stacked up in the air; `poured` drops one after another from `drop_height` above
-    what lies there already, and those that roll off anew, for piles of more blocks than fit beside one another.
+    Blocks are dropped all at once, stacked up in the air; `poured` drops one after another from
+    `drop_height` above what lies there already, and those that roll off anew, for piles of more
+    blocks than fit beside one another.
     """
     path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count, poured)}.npz"
     cached = _read(path)
@@ -75,9 +89,13 @@ def _settle(
             # a round of piles takes minutes: no more of them than are wanted
             num = min(_ROUND, count - kept) if poured else _ROUND
             drops = [_drop(cfg, rng, in_play) for _ in range(num)]
-            fields = jax.device_get(fields_of(jax.tree.map(lambda *leaves: np.stack(leaves), *drops)))
+            fields = jax.device_get(
+                fields_of(jax.tree.map(lambda *leaves: np.stack(leaves), *drops))
+            )
             rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
-            ended = threads.map(lambda scene, row: fall(world, cfg, extent, scene, row), drops, rows)
+            ended = threads.map(
+                lambda scene, row: fall(world, cfg, extent, scene, row), drops, rows
+            )
             good = [scene for scene in ended if scene is not None]
             found, kept, dropped = found + good, kept + len(good), dropped + num
             if dropped >= 20 * _ROUND and kept < dropped / 50:
@@ -103,12 +121,15 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
     )
     leaves: dict[str, Any] = {
         "position": np.where(in_play[:, None], position, layout.parking(num)).astype(np.float32),
-        "quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).astype(np.float32),
+        "quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).astype(
+            np.float32
+        ),
         "velocity": np.zeros((num, 6), np.float32),
         "half_size": _half_sizes(cfg, rng),
         "density": rng.uniform(*cfg.density, num).astype(np.float32),
         "friction": rng.uniform(*cfg.friction, num).astype(np.float32),
-        "colour": rng.permutation(max(num, len(blocks.COLOURS)))[:num].astype(np.int32) % len(blocks.COLOURS),
+        "colour": rng.permutation(max(num, len(blocks.COLOURS)))[:num].astype(np.int32)
+        % len(blocks.COLOURS),
         "in_play": in_play,
         "target": np.int32(layout.ANY),
     }
@@ -116,14 +137,17 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 
 
 def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
-    """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; mesh blocks of one kind alike."""
+    """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; mesh blocks of one kind
+    alike."""
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
     scales = 1.0 + blocks.spread(cfg) * rng.uniform(-1.0, 1.0, len(cfg.slots))
     sizes = np.stack([kind[rng.integers(len(kind))] for kind in choices])
     return (sizes * scales[blocks.size_leader(cfg.slots)][:, None]).astype(np.float32)
 
 
-def _falling(world: World, scene: Scene, fields: BlockFields) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def _falling(
+    world: World, scene: Scene, fields: BlockFields
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The scene's blocks where they are, the hand high above."""
     model = with_blocks(world, fields)
     model.opt.iterations, model.opt.ls_iterations = 20, 20  # quality over speed: this runs once
@@ -135,7 +159,9 @@ def _falling(world: World, scene: Scene, fields: BlockFields) -> tuple[mujoco.Mj
     return model, data
 
 
-def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
+def rest(
+    world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields
+) -> Scene | None:
     """The scene after its blocks fell, None where a block is not at rest or left the workspace."""
     model, data = _falling(world, scene, fields)
     model.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
@@ -143,8 +169,11 @@ def rest(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: Bl
     return _at_rest(world, extent, scene, data)
 
 
-def pour(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields) -> Scene | None:
-    """As `rest`, the blocks dropped one after another, lowest first; one that leaves the workspace is dropped anew."""
+def pour(
+    world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields
+) -> Scene | None:
+    """As `rest`, the blocks dropped one after another, lowest first; one that leaves the workspace
+    is dropped anew."""
     model, data = _falling(world, scene, fields)
     num, still = len(scene.in_play), round(_PAUSE / model.opt.timestep)
     waiting = [int(slot) for slot in np.argsort(scene.position[:, 2]) if scene.in_play[slot]]
@@ -155,7 +184,10 @@ def pour(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: Bl
 
     def run() -> None:
         for _ in range(0, still, _PIN_EVERY):
-            data.qpos[world.block_qpos[aloft, :3]], data.qvel[world.block_dofs[aloft]] = pinned[aloft], 0.0
+            data.qpos[world.block_qpos[aloft, :3]], data.qvel[world.block_dofs[aloft]] = (
+                pinned[aloft],
+                0.0,
+            )
             mujoco.mj_step(model, data, nstep=_PIN_EVERY)
 
     for _ in range(_MOST_DROPS * len(waiting)):
@@ -163,7 +195,10 @@ def pour(world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: Bl
             slot = waiting.pop(0)
             high = data.qpos[world.block_qpos[~aloft, 2]].max(initial=0.0)
             aloft[slot], quiet = False, 0.0
-            data.qpos[world.block_qpos[slot, :3]] = [*rng.uniform(-half, half, 2), high + cfg.drop_height]
+            data.qpos[world.block_qpos[slot, :3]] = [
+                *rng.uniform(-half, half, 2),
+                high + cfg.drop_height,
+            ]
             data.qvel[world.block_dofs[slot]] = 0.0
         run()
         quiet += _PAUSE
@@ -197,9 +232,19 @@ def _cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "csac_jax" / "pools"
 
 
-def _digest(world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool) -> str:
+def _digest(
+    world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool
+) -> str:
     """Name of a pool: hash of everything that decides its content."""
-    relevant = (_VERSION, mujoco.__version__, repr(cfg), float(extent), stream, count, world.model.opt.timestep)
+    relevant = (
+        _VERSION,
+        mujoco.__version__,
+        repr(cfg),
+        float(extent),
+        stream,
+        count,
+        world.model.opt.timestep,
+    )
     content = hashlib.sha256(repr((*relevant, "poured") if poured else relevant).encode())
     for name in ("table.xml", "hand.xml", "blocks.xml"):
         content.update((assets() / name).read_bytes())
@@ -207,11 +252,14 @@ def _digest(world: World, cfg: SceneConfig, extent: float, stream: int, count: i
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
-    return hashlib.sha256(b"".join(np.ascontiguousarray(arrays[name]).tobytes() for name in sorted(arrays))).hexdigest()
+    return hashlib.sha256(
+        b"".join(np.ascontiguousarray(arrays[name]).tobytes() for name in sorted(arrays))
+    ).hexdigest()
 
 
 def _read(path: Path) -> Scene | None:
-    """The cached scenes, None where there are none or they are damaged (they are then settled anew)."""
+    """The cached scenes, None where there are none or they are damaged (they are then settled
+    anew)."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

@@ -1,4 +1,5 @@
-"""Any MuJoCo model as groups of geoms of one kind: what the raycaster takes where blocks are not all there is to see.
+"""Any MuJoCo model as groups of geoms of one kind: what the raycaster takes where blocks are not
+all there is to see.
 
 scene = solids.read(model)  # on the host, once
 scene = solids.place(scene, data.geom_xpos, data.geom_xmat)  # also inside compiled functions
@@ -56,8 +57,11 @@ class Solids:
     colour: jax.Array  # [geoms, 3] red, green, blue in 0 .. 1, by the geom's number
 
 
-def read(model: mujoco.MjModel, xpos: np.ndarray | None = None, xmat: np.ndarray | None = None) -> Solids:
-    """The visible geoms of a model, NumPy leaves, numbered as there; in the model's rest pose if no other is given.
+def read(
+    model: mujoco.MjModel, xpos: np.ndarray | None = None, xmat: np.ndarray | None = None
+) -> Solids:
+    """The visible geoms of a model, NumPy leaves, numbered as there; in the model's rest pose if no
+    other is given.
 
     Left out are geoms whose opacity is 0. A mesh is its convex hull. Args: as in `place`.
     Raises ValueError for a geom of a type that the raycaster cannot meet, with its name.
@@ -66,8 +70,12 @@ def read(model: mujoco.MjModel, xpos: np.ndarray | None = None, xmat: np.ndarray
     members: dict[Kind, list[int]] = {}
     for geom in map(int, np.flatnonzero(opacity > 0.0)):
         members.setdefault(_kind(model, geom), []).append(geom)
-    groups = tuple(_group(model, kind, np.array(geoms, np.int32)) for kind, geoms in members.items())
-    colours: Any = np.where(model.geom_matid[:, None] >= 0, _material(model), model.geom_rgba)[:, :3]
+    groups = tuple(
+        _group(model, kind, np.array(geoms, np.int32)) for kind, geoms in members.items()
+    )
+    colours: Any = np.where(model.geom_matid[:, None] >= 0, _material(model), model.geom_rgba)[
+        :, :3
+    ]
     solids = Solids(groups, colours.astype(np.float32))
     if xpos is None or xmat is None:
         data = mujoco.MjData(model)
@@ -81,13 +89,17 @@ def _kind(model: mujoco.MjModel, geom: int) -> Kind:
     if kind is None:
         name, given = model.geom(geom).name or geom, mujoco.mjtGeom(model.geom_type[geom]).name
         known = ", ".join(each.name.removeprefix("mjGEOM_").lower() for each in _KIND_OF_TYPE)
-        raise ValueError(f"geom {name}: rays do not meet type {given.removeprefix('mjGEOM_').lower()}; use: {known}")
+        raise ValueError(
+            f"geom {name}: rays do not meet type {given.removeprefix('mjGEOM_').lower()}; use: {known}"
+        )
     return kind
 
 
 def _group(model: mujoco.MjModel, kind: Kind, geoms: np.ndarray) -> Group:
     leaves: dict[str, Any] = {
-        "shape": _half_spaces(model, geoms) if kind is Kind.POLYTOPE else model.geom_size[geoms].astype(np.float32),
+        "shape": _half_spaces(model, geoms)
+        if kind is Kind.POLYTOPE
+        else model.geom_size[geoms].astype(np.float32),
         "position": np.zeros((len(geoms), 3), np.float32),
         "rotation": np.zeros((len(geoms), 3, 3), np.float32),
         "geom": geoms,
@@ -96,12 +108,15 @@ def _group(model: mujoco.MjModel, kind: Kind, geoms: np.ndarray) -> Group:
 
 
 def _half_spaces(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
-    """Faces [G, F, 4] of the convex hulls of mesh geoms; what is not there has a zero normal and bounds nothing."""
+    """Faces [G, F, 4] of the convex hulls of mesh geoms; what is not there has a zero normal and
+    bounds nothing."""
     hulls = []
     for mesh in model.geom_dataid[geoms]:
         start = model.mesh_vertadr[mesh]
         equations = ConvexHull(model.mesh_vert[start : start + model.mesh_vertnum[mesh]]).equations
-        _, kept = np.unique(equations.round(5), axis=0, return_index=True)  # the hull is triangulated
+        _, kept = np.unique(
+            equations.round(5), axis=0, return_index=True
+        )  # the hull is triangulated
         hulls.append(equations[kept] * [1.0, 1.0, 1.0, -1.0])
     faces = np.zeros((len(hulls), max(map(len, hulls)), 4), np.float32)
     faces[:, :, 3] = blocks.PADDING_OFFSET
@@ -117,7 +132,11 @@ def _material(model: mujoco.MjModel) -> np.ndarray:
 
 
 def place(solids: Solids, xpos: jax.Array | np.ndarray, xmat: jax.Array | np.ndarray) -> Solids:
-    """The same geoms at other poses: xpos [geoms, 3] m, xmat [geoms, 9] or [geoms, 3, 3] geom to world."""
+    """The same geoms at other poses: xpos [geoms, 3] m, xmat [geoms, 9] or [geoms, 3, 3] geom to
+    world."""
     rotation = xmat.reshape(-1, 3, 3)
-    moved = (group.replace(position=xpos[group.geom], rotation=rotation[group.geom]) for group in solids.groups)
+    moved = (
+        group.replace(position=xpos[group.geom], rotation=rotation[group.geom])
+        for group in solids.groups
+    )
     return solids.replace(groups=tuple(moved))

@@ -5,11 +5,14 @@ import io
 
 
 def _import_mjx_quietly() -> None:
-    """Imports MJX without its two lines about Warp, which is an extra; whatever else it prints is kept."""
+    """Imports MJX without its two lines about Warp, which is an extra; whatever else it prints is
+    kept."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         import mujoco.mjx  # noqa: F401
-    kept = [line for line in printed.getvalue().splitlines() if "No module named 'warp'" not in line]
+    kept = [
+        line for line in printed.getvalue().splitlines() if "No module named 'warp'" not in line
+    ]
     if kept:
         print("\n".join(kept))
 

@@ -1,8 +1,10 @@
-"""UR5 kinematics in closed form: where the finger tips are, and the joint angles that bring them to a pose.
+"""UR5 kinematics in closed form: where the finger tips are, and the joint angles that bring them to
+a pose.
 
-Frames: the arm's base frame has the world's axes; the tip frame is that of `scenes/rg2.xml`, between the finger tips,
-z back to the flange, fingers closing along x. Joint angles [6] rad in the maker's order and sense: shoulder pan,
-shoulder lift, elbow, wrist 1, 2, 3. Sums are written out instead of matrix products, which a GPU may round to ten bits.
+Frames: the arm's base frame has the world's axes; the tip frame is that of `scenes/rg2.xml`,
+between the finger tips, z back to the flange, fingers closing along x. Joint angles [6] rad in the
+maker's order and sense: shoulder pan, shoulder lift, elbow, wrist 1, 2, 3. Sums are written out
+instead of matrix products, which a GPU may round to ten bits.
 """
 
 import itertools
@@ -15,12 +17,18 @@ import numpy as np
 # The maker's Denavit-Hartenberg parameters, m (Universal Robots, UR5 of series 3).
 D1, A2, A3, D4, D5, D6 = 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823
 BASE = (0.6, 0.0, 0.35)  # m, ours: see scenes/README.md
-TOOL = 0.213  # m, flange to finger tips: mean of the RG2 open and closed, from its maker's description
+TOOL = (
+    0.213  # m, flange to finger tips: mean of the RG2 open and closed, from its maker's description
+)
 LIMITS = np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0], np.float32)  # rad, either way
 MAX_SPEED = np.pi  # rad/s of every joint, the maker's
-HOME = np.array([-0.183, -0.976, 1.832, -2.426, -1.571, 1.388], np.float32)  # rad, tips 0.2 m above the centre: ours
+HOME = np.array(
+    [-0.183, -0.976, 1.832, -2.426, -1.571, 1.388], np.float32
+)  # rad, tips 0.2 m above the centre: ours
 
-SINGULAR = 0.01  # sine of an angle (shoulder, elbow, wrist) below which a branch does not count: ours
+SINGULAR = (
+    0.01  # sine of an angle (shoulder, elbow, wrist) below which a branch does not count: ours
+)
 _ON_TABLE = 0.02  # m, least room between a link and the table
 _APART = 0.01  # m, least room between two links
 _FAR = 10.0  # m, positions beyond are out of reach whatever the arm does
@@ -69,7 +77,11 @@ def _frames(q: jax.Array) -> _Frames:
     """Frames of the joint angles `q` [6], by the maker's parameters."""
     cos, sin = jnp.cos(q), jnp.sin(q)
     zero, one = jnp.zeros_like(q[0]), jnp.ones_like(q[0])
-    ahead, side, up = _vector(cos[0], sin[0], zero), _vector(sin[0], -cos[0], zero), _vector(zero, zero, one)
+    ahead, side, up = (
+        _vector(cos[0], sin[0], zero),
+        _vector(sin[0], -cos[0], zero),
+        _vector(zero, zero, one),
+    )
 
     def along(angle):
         return jnp.cos(angle) * ahead + jnp.sin(angle) * up
@@ -100,7 +112,8 @@ def forward(q: jax.Array) -> Pose:
 
 
 def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
-    """Pose of a hand that points straight down with its tips at `xyz` [3] m, fingers closing along `yaw` [] rad."""
+    """Pose of a hand that points straight down with its tips at `xyz` [3] m, fingers closing along
+    `yaw` [] rad."""
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     rows = (_vector(cos, -sin, zero), _vector(sin, cos, zero), _vector(zero, zero, zero + 1.0))
     return Pose(xyz, jnp.stack(rows))
@@ -109,28 +122,37 @@ def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
 def inverse(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Joint angles of all eight branches to a pose of the tips, in closed form.
 
-    After Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013), with every arc cosine
-    in its `atan2` form: near 1, one rounding of a cosine in float32 is an angle of 3e-4. Every step takes the angles
-    found before as they are, so that what one lost to rounding the next makes up for: no refinement is needed.
+    After Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013),
+    with every arc cosine in its `atan2` form: near 1, one rounding of a cosine in float32 is an
+    angle of 3e-4. Every step takes the angles found before as they are, so that what one lost to
+    rounding the next makes up for: no refinement is needed.
 
-    Args: position [3] m; rotation [3, 3], tip to world.
-    Returns: [8, 6] rad in [-pi, pi], order of BRANCHES; [8] bool, False where the pose is out of the branch's reach or
-    within SINGULAR of where two branches meet. Angles are finite, and mean nothing, where it is False.
+    Args: position [3] m; rotation [3, 3], tip to world. Returns: [8, 6] rad in [-pi, pi], order of
+    BRANCHES; [8] bool, False where the pose is out of the branch's reach or within SINGULAR of
+    where two branches meet. Angles are finite, and mean nothing, where it is False.
     """
     columns = jnp.sum(rotation**2, axis=0)
-    sane = jnp.all(jnp.abs(position) < _FAR) & jnp.all(jnp.abs(columns - 1.0) < 0.01)  # False for NaN
+    sane = jnp.all(jnp.abs(position) < _FAR) & jnp.all(
+        jnp.abs(columns - 1.0) < 0.01
+    )  # False for NaN
     position, rotation = jnp.where(sane, position, 0.0), jnp.where(sane, rotation, jnp.eye(3))
     joints, valid = jax.vmap(_branch, (None, None, 0))(position, rotation, jnp.asarray(BRANCHES))
     return joints, valid & sane
 
 
-def _branch(position: jax.Array, rotation: jax.Array, signs: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Joint angles [6] of one branch, and if they count [] bool. Args: signs [3] of shoulder, elbow, wrist."""
+def _branch(
+    position: jax.Array, rotation: jax.Array, signs: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Joint angles [6] of one branch, and if they count [] bool. Args: signs [3] of shoulder,
+    elbow, wrist."""
     x6, y6, down = rotation[:, 0], -rotation[:, 1], -rotation[:, 2]
     from_base = position - jnp.array(BASE) - (D6 + TOOL) * down  # wrist 3
     pan, shoulder_ok = _shoulder(from_base[:2], signs[0])
     zero = jnp.zeros_like(pan)
-    ahead, side = _vector(jnp.cos(pan), jnp.sin(pan), zero), _vector(jnp.sin(pan), -jnp.cos(pan), zero)
+    ahead, side = (
+        _vector(jnp.cos(pan), jnp.sin(pan), zero),
+        _vector(jnp.sin(pan), -jnp.cos(pan), zero),
+    )
 
     wrist2, wrist3, wrist_ok = _wrist(_dot(side, x6), _dot(side, y6), _dot(side, down), signs[2])
     x5 = jnp.cos(wrist3) * x6 - jnp.sin(wrist3) * y6
@@ -145,30 +167,45 @@ def _branch(position: jax.Array, rotation: jax.Array, signs: jax.Array) -> tuple
 
 
 def _shoulder(xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Shoulder pan [] that puts wrist 3 at `xy` [2] m from the base, D4 to the side of the arm's plane."""
+    """Shoulder pan [] that puts wrist 3 at `xy` [2] m from the base, D4 to the side of the arm's
+    plane."""
     square = _dot(xy, xy)
     ok = square - D4**2 > SINGULAR**2 * square
     xy, square = jnp.where(ok, xy, jnp.array([1.0, 0.0])), jnp.where(ok, square, 1.0)
-    return jnp.arctan2(xy[1], xy[0]) + 0.5 * np.pi + sign * jnp.arctan2(jnp.sqrt(square - D4**2), D4), ok
+    return jnp.arctan2(xy[1], xy[0]) + 0.5 * np.pi + sign * jnp.arctan2(
+        jnp.sqrt(square - D4**2), D4
+    ), ok
 
 
-def _wrist(x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Wrist 2 and 3 [] from the components [] along the flange's axes of the axis that joints 2, 3 and 4 share."""
+def _wrist(
+    x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Wrist 2 and 3 [] from the components [] along the flange's axes of the axis that joints 2, 3
+    and 4 share."""
     square = x**2 + y**2
     ok = square > SINGULAR**2
     x, y, square = jnp.where(ok, x, 1.0), jnp.where(ok, y, 0.0), jnp.where(ok, square, 1.0)
     return jnp.arctan2(sign * jnp.sqrt(square), z), jnp.arctan2(-sign * y, sign * x), ok
 
 
-def _elbow(ahead: jax.Array, up: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Shoulder lift and elbow [] that put wrist 1 `ahead` [] and `up` [] m from the shoulder, in the arm's plane.
+def _elbow(
+    ahead: jax.Array, up: jax.Array, sign: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Shoulder lift and elbow [] that put wrist 1 `ahead` [] and `up` [] m from the shoulder, in
+    the arm's plane.
 
-    With r the distance, sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3), and cos^2 = (r^2 - (a2 - a3)^2) / (4 a2 a3).
+    With r the distance, sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3), and cos^2 = (r^2 - (a2 -
+    a3)^2) / (4 a2 a3).
     """
     square = ahead**2 + up**2
-    sin2, cos2 = ((A2 + A3) ** 2 - square) / (4.0 * A2 * A3), (square - (A2 - A3) ** 2) / (4.0 * A2 * A3)
+    sin2, cos2 = (
+        ((A2 + A3) ** 2 - square) / (4.0 * A2 * A3),
+        (square - (A2 - A3) ** 2) / (4.0 * A2 * A3),
+    )
     ok = jnp.minimum(sin2, cos2) > (0.5 * SINGULAR) ** 2
-    ahead, up, sin2, cos2 = (jnp.where(ok, v, w) for v, w in ((ahead, 0.5), (up, 0.0), (sin2, 0.5), (cos2, 0.5)))
+    ahead, up, sin2, cos2 = (
+        jnp.where(ok, v, w) for v, w in ((ahead, 0.5), (up, 0.0), (sin2, 0.5), (cos2, 0.5))
+    )
     sin, cos = sign * 2.0 * jnp.sqrt(sin2 * cos2), cos2 - sin2
     lift = jnp.arctan2(up, ahead) - jnp.arctan2(A3 * sin, A2 + A3 * cos)
     return lift, 2.0 * sign * jnp.arctan2(jnp.sqrt(sin2), jnp.sqrt(cos2)), ok
@@ -179,8 +216,13 @@ def _wrap(angle: jax.Array) -> jax.Array:
     return angle - _TURN * jnp.round(angle / _TURN)
 
 
-_SHOULDER_OFFSET, _FOREARM_OFFSET = 0.13585, 0.0165  # m, of the links' middles along `side`: ur_description
-_RADII = np.array([0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045, 0.045, 0.07], np.float32)  # m, of _capsules
+_SHOULDER_OFFSET, _FOREARM_OFFSET = (
+    0.13585,
+    0.0165,
+)  # m, of the links' middles along `side`: ur_description
+_RADII = np.array(
+    [0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045, 0.045, 0.07], np.float32
+)  # m, of _capsules
 # Pairs of capsules that could meet; the links' shape keeps all others apart or together.
 _PAIRS = np.array([
     *itertools.product((0,), (3, 4, 5, 6, 7, 8)),
@@ -192,22 +234,37 @@ _ABOVE_TABLE = np.array([2, 3, 4, 5, 6, 7])  # not the hand, whose place is the 
 
 
 def _capsules(q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends [9, 3] and [9, 3] m of the capsules about pedestal, shoulder, upper arm, elbow, forearm, wrist 1, wrist 2,
-    wrist 3 with the gripper's body, and open fingers; all but the last two are geoms of `scenes/ur5.xml`."""
+    """Ends [9, 3] and [9, 3] m of the capsules about pedestal, shoulder, upper arm, elbow, forearm,
+    wrist 1, wrist 2, wrist 3 with the gripper's body, and open fingers; all but the last two are
+    geoms of `scenes/ur5.xml`."""
     f = _frames(q)
     foot = jnp.array([BASE[0], BASE[1], 0.0])
     palm, tips = f.wrist3 + (D6 + TOOL - 0.115) * f.down, f.wrist3 + (D6 + TOOL - 0.07) * f.down
     outer, inner = _SHOULDER_OFFSET * f.side, _FOREARM_OFFSET * f.side
-    start = (foot, f.shoulder, f.shoulder + outer, f.elbow + outer, f.elbow + inner, f.wrist1 + inner)
-    end = (f.shoulder, f.shoulder + outer, f.elbow + outer, f.elbow + inner, f.wrist1 + inner, f.wrist2)
+    start = (
+        foot,
+        f.shoulder,
+        f.shoulder + outer,
+        f.elbow + outer,
+        f.elbow + inner,
+        f.wrist1 + inner,
+    )
+    end = (
+        f.shoulder,
+        f.shoulder + outer,
+        f.elbow + outer,
+        f.elbow + inner,
+        f.wrist1 + inner,
+        f.wrist2,
+    )
     return jnp.stack([*start, f.wrist2, f.wrist3, palm]), jnp.stack([*end, f.wrist3, palm, tips])
 
 
 def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array) -> jax.Array:
     """Distance [] m between the segments `p0` `p1` and `q0` `q1` [3] m, neither of them a point.
 
-    The nearest points of the lines, clipped to one segment, then to the other, and back (Ericson, Real-Time Collision
-    Detection, 5.1.9).
+    The nearest points of the lines, clipped to one segment, then to the other, and back (Ericson,
+    Real-Time Collision Detection, 5.1.9).
     """
     u, v, w = p1 - p0, q1 - q0, p0 - q0
     uu, uv, vv, uw, vw = _dot(u, u), _dot(u, v), _dot(v, v), _dot(u, w), _dot(v, w)
@@ -221,7 +278,8 @@ def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array
 
 
 def clearance(q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Room [] m between the table and the arm at the joint angles `q` [6] rad, and between links that could meet.
+    """Room [] m between the table and the arm at the joint angles `q` [6] rad, and between links
+    that could meet.
 
     The links are capsules; the fingers may touch the table. Negative: they overlap.
     """
@@ -229,17 +287,23 @@ def clearance(q: jax.Array) -> tuple[jax.Array, jax.Array]:
     above = jnp.minimum(start[:, 2], end[:, 2]) - jnp.asarray(_RADII)
     first, second = _PAIRS.T
     apart = jax.vmap(_segment_distance)(start[first], end[first], start[second], end[second])
-    return jnp.min(above[_ABOVE_TABLE]), jnp.min(apart - jnp.asarray(_RADII[first] + _RADII[second]))
+    return jnp.min(above[_ABOVE_TABLE]), jnp.min(
+        apart - jnp.asarray(_RADII[first] + _RADII[second])
+    )
 
 
 def clear(q: jax.Array) -> jax.Array:
-    """True where the arm at the joint angles `q` [6] rad keeps off the table and itself, [] bool."""
+    """True where the arm at the joint angles `q` [6] rad keeps off the table and itself, []
+    bool."""
     above, apart = clearance(q)
     return (above > _ON_TABLE) & (apart > _APART)
 
 
-def nearest(q_from: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The valid solution that is the least turn away from `q_from` [6] rad, each joint by the turn that suits best.
+def nearest(
+    q_from: jax.Array, solutions: jax.Array, valid: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The valid solution that is the least turn away from `q_from` [6] rad, each joint by the turn
+    that suits best.
 
     Args: solutions [8, 6] rad in [-pi, pi], valid [8] bool, as of `inverse`.
     Returns: [6] rad within LIMITS, `q_from` where nothing is valid; [] bool, if anything is.
@@ -253,28 +317,36 @@ def nearest(q_from: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[
 
 
 def trajectory(q_start: jax.Array, control: jax.Array) -> Trajectory:
-    """Joint targets that lead the tips through set-points, on the one branch that reaches all of them, or the most.
+    """Joint targets that lead the tips through set-points, on the one branch that reaches all of
+    them, or the most.
 
-    Among branches that reach as many, the one with the least motion, from `q_start` on. No branch is left on the way,
-    so there is no jump but the one from `q_start`: a set-point that the branch does not reach, or reaches only through
-    the table or itself, stops the arm where it is, for good.
+    Among branches that reach as many, the one with the least motion, from `q_start` on. No branch
+    is left on the way, so there is no jump but the one from `q_start`: a set-point that the branch
+    does not reach, or reaches only through the table or itself, stops the arm where it is, for
+    good.
 
-    Args: q_start [6] rad; control [T, 5] as in `primitives.Plan`: x, y, z m of the tips, yaw rad, half the opening m.
+    Args: q_start [6] rad; control [T, 5] as in `primitives.Plan`: x, y, z m of the tips, yaw rad,
+    half the opening m.
     """
     poses = jax.vmap(top_down)(control[:, :3], control[:, 3])
     solutions, valid = jax.vmap(inverse)(*poses)  # [T, 8, 6], [T, 8]
     valid = valid & jax.vmap(jax.vmap(clear))(solutions)
-    joints, good, motion = jax.vmap(_follow, (None, 1, 1))(q_start, solutions, valid)  # branch first
+    joints, good, motion = jax.vmap(_follow, (None, 1, 1))(
+        q_start, solutions, valid
+    )  # branch first
     reached = jnp.sum(good, axis=1)
     branch = jnp.argmin(jnp.where(reached == jnp.max(reached), motion, jnp.inf))
     target = jnp.concatenate([joints[branch], control[:, 4:]], axis=1)
     return Trajectory(target, jnp.all(good[branch]))
 
 
-def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _follow(
+    q_start: jax.Array, solutions: jax.Array, valid: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One branch [T, 6] rad as far as it is valid [T] bool, without jumps, and within LIMITS.
 
-    Returns: [T, 6] rad, held from the first set-point that fails; [T] bool, good until then; [] rad, sum of all turns.
+    Returns: [T, 6] rad, held from the first set-point that fails; [T] bool, good until then; []
+    rad, sum of all turns.
     """
     step = jnp.diff(solutions, axis=0)
     turns = jnp.cumsum(jnp.round(-step / _TURN), axis=0)  # whole, so that no rounding adds up
@@ -289,7 +361,8 @@ def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple
 
 
 def _offset(q_start: jax.Array, path: jax.Array, valid: jax.Array) -> jax.Array:
-    """Whole turns [6] that bring a path [T, 6] rad within LIMITS, as near to `q_start` [6] as may be."""
+    """Whole turns [6] that bring a path [T, 6] rad within LIMITS, as near to `q_start` [6] as may
+    be."""
     turns = jnp.arange(-2.0, 3.0)[:, None]
     low = jnp.min(jnp.where(valid[:, None], path, jnp.inf), axis=0)[None] + _TURN * turns
     high = jnp.max(jnp.where(valid[:, None], path, -jnp.inf), axis=0)[None] + _TURN * turns

@@ -26,11 +26,13 @@ class MjxPhysics:
     model: mjx.Model
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
     touch: Callable[[World, mjx.Data], tuple[jax.Array, jax.Array]]
-    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing, [] bool."""
+    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing, []
+    bool."""
     step: Callable[[mjx.Model, mjx.Data], mjx.Data] = mjx.step
 
     def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
-        """See `physics.Physics`. Products of matrices keep float32's precision: a GPU would cut them to 10 bits."""
+        """See `physics.Physics`. Products of matrices keep float32's precision: a GPU would cut
+        them to 10 bits."""
         with jax.default_matmul_precision("highest"):
             return _run(self, scene, drive)
 
@@ -46,7 +48,9 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
     geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
-    subtree = model.body_subtreemass.at[0].add(jnp.sum(fields.mass - model.body_mass[bodies]))  # all; then each block
+    subtree = model.body_subtreemass.at[0].add(
+        jnp.sum(fields.mass - model.body_mass[bodies])
+    )  # all; then each block
     if model.impl == mjx.Impl.JAX:
         meshes = [  # None for a mesh that no slot uses; `face` holds the corners of the faces once more
             mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
@@ -91,14 +95,17 @@ def _pad_contacts(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
     contact = data._impl.contact
     active = contact.dist < 0.0  # [C]
     pair = contact.geom  # [C, 2]
-    is_hand = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1) & active[None]  # [3, C]
+    is_hand = (
+        jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1) & active[None]
+    )  # [3, C]
     slots = jnp.asarray(world.slot_of_geom)[pair]  # [C, 2]
     is_block = jnp.any(slots[None] == np.arange(len(world.slots))[:, None, None], axis=-1)  # [N, C]
     return jnp.any(is_hand[:, None] & is_block[None], axis=-1), jnp.all(active)
 
 
 def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
-    """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the hand is."""
+    """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the
+    hand is."""
     world, cfg = physics.world, physics.cfg
     model = scene_model(physics, scene)
     initial = initial_data(physics, scene, drive)
@@ -109,7 +116,9 @@ def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]
     def substep(carry, x):
         data, trace = carry
         index, control = x
-        data = _restrain(world, ~scene.in_play, initial, physics.step(model, data.replace(ctrl=control)))
+        data = _restrain(
+            world, ~scene.in_play, initial, physics.step(model, data.replace(ctrl=control))
+        )
         touching, full = physics.touch(world, data)
         held = touching[1] & touching[2]
         rise = data.qpos[z_address] - scene.position[:, 2]
@@ -121,13 +130,17 @@ def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]
             rise=rise,
             gap_closed=jnp.where(index == close_end - 1, gap, trace.gap_closed),
             gap_end=gap,
-            saturated=trace.saturated + full.astype(jnp.int32),
+            contact_overflow=trace.contact_overflow + full.astype(jnp.int32),
         )
         return (data, trace), None
 
     (data, trace), _ = jax.lax.scan(
-        substep, (initial, outcome.blank(len(world.slots))), (jnp.arange(cfg.substeps), drive.control)
+        substep,
+        (initial, outcome.blank(len(world.slots))),
+        (jnp.arange(cfg.substeps), drive.control),
     )
     pose = data.qpos[world.block_qpos]
-    moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=data.qvel[world.block_dofs])
+    moved = scene.replace(
+        position=pose[:, :3], quaternion=pose[:, 3:], velocity=data.qvel[world.block_dofs]
+    )
     return layout.park(moved, scene.in_play), trace

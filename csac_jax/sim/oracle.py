@@ -1,24 +1,32 @@
-"""A grasp planner that reads block poses: the ceiling that physics allows, and the scripted hand of the tests."""
+"""A grasp planner that reads block poses: the ceiling that physics allows, and the scripted hand of
+the tests."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import HeightmapConfig, SimConfig, SlotKind
+from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
 from csac_jax.scene import blocks
 from csac_jax.scene.layout import ANY, Scene
 from csac_jax.scene.model import MAX_OPENING
-from csac_jax.sim.primitives import Action, Primitive, local_top
+from csac_jax.sim.primitives import Action, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric
-FINGER_HALF = (0.008, 0.012)  # m, half footprint of a finger tip across and along its pad, with a little room
+FINGER_HALF = (
+    0.008,
+    0.012,
+)  # m, half footprint of a finger tip across and along its pad, with a little room
 EXACT = jax.lax.Precision.HIGHEST  # a GPU would cut products of matrices to 10 bits
 ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
 
-def _support(normals: jax.Array, offsets: jax.Array, axis: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How well the best faces on both sides are square to `axis` [3] (cosine), and the block's width between them, m.
+def _support(
+    normals: jax.Array, offsets: jax.Array, axis: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """How well the best faces on both sides are square to `axis` [3] (cosine), and the block's
+    width between them, m.
 
     Args: normals [F, 3] world frame, offsets [F] m from the block's centre.
     """
@@ -28,9 +36,14 @@ def _support(normals: jax.Array, offsets: jax.Array, axis: jax.Array) -> tuple[j
 
 
 def grasp(
-    cfg: SimConfig, heightmap: HeightmapConfig, slots: tuple[SlotKind, ...], scene: Scene, height: jax.Array
+    cfg: SimConfig,
+    heightmap: HeightmapConfig,
+    slots: tuple[SlotKind, ...],
+    scene: Scene,
+    height: jax.Array,
 ) -> Action:
-    """The grasp of the block and yaw with room for both fingers, faces square to the pads, high and narrow.
+    """The grasp of the block and yaw with room for both fingers, faces square to the pads, high and
+    narrow.
 
     With a target, of the target if it can be had so, else of the block nearest to it that can.
 
@@ -55,8 +68,15 @@ def grasp(
         )
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
         fits = width < MAX_OPENING - 0.02
-        cost = 4.0 * blocked + 4.0 * ~fits + 20.0 * jnp.maximum(1.0 - square - ALIGNED, 0.0) + 10.0 * width
-        away = jnp.linalg.norm(centre - scene.position[scene.target, :2])  # of the last slot where there is no target
+        cost = (
+            4.0 * blocked
+            + 4.0 * ~fits
+            + 20.0 * jnp.maximum(1.0 - square - ALIGNED, 0.0)
+            + 10.0 * width
+        )
+        away = jnp.linalg.norm(
+            centre - scene.position[scene.target, :2]
+        )  # of the last slot where there is no target
         asked = jnp.where(scene.target == slot, 3.0, -4.0 * away)
         wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[slot, 2], asked)
         return jnp.where(scene.in_play[slot], wanted - cost, -jnp.inf)

@@ -1,10 +1,11 @@
-"""What a primitive did, by ground truth and as a robot with nothing but its finger gap would judge."""
-
-import enum
+"""What a primitive did, by ground truth and as a robot with nothing but its finger gap would
+judge."""
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from csac_jax.constants import Outcome
 
 LIFT_SHARE = 0.5  # a block counts as lifted when it rose by this share of the hand's rise
 GRIP_RISE = 0.01  # m, a held block that rose this far was grasped
@@ -12,27 +13,17 @@ BARE = 0.01  # m, a surface lower than this is bare table
 CLOSED_GAP = 0.005  # m, a smaller finger gap is a closed hand
 
 
-class Outcome(enum.IntEnum):
-    """Levels of a grasp, CSAC eq. 15, worst first."""
-
-    NOTHING = 0
-    EMPTY = 1
-    TOUCHED = 2
-    DROPPED = 3
-    LIFTED = 4
-
-
 @struct.dataclass
 class Trace:
     """What was seen while a primitive ran. N = block slots."""
 
     touched: jax.Array  # [] bool, the hand met a block
-    held_rise: jax.Array  # [N] m, farthest a block rose between both pads
+    held_rise: jax.Array  # [N] m, distance_cap a block rose between both pads
     held: jax.Array  # [N] bool, between both pads in the end
     rise: jax.Array  # [N] m, in the end
     gap_closed: jax.Array  # [] m, finger gap when the hand had closed
     gap_end: jax.Array  # [] m, finger gap in the end
-    saturated: jax.Array  # [] int32, substeps in which every contact slot was in use
+    contact_overflow: jax.Array  # [] int32, substeps in which every contact slot was in use
 
 
 def blank(num: int) -> Trace:
@@ -49,17 +40,23 @@ def lifted_blocks(trace: Trace, hand_rise: jax.Array) -> jax.Array:
 def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax.Array:
     """Outcome [] int32 by ground truth, eq. 15.
 
-    `nothing`: no block was met and the place was bare table, `surface` [] m; `empty`: no block was met where there was
-    something; `touched`: met but never lifted between the pads; `dropped`: it rose and was lost.
+    `nothing`: no block was met and the place was bare table, `surface` [] m; `empty`: no block was
+    met where there was something; `touched`: met but never lifted between the pads; `dropped`: it
+    rose and was lost.
     """
     missed = jnp.where(surface < BARE, jnp.int32(Outcome.NOTHING), jnp.int32(Outcome.EMPTY))
-    met = jnp.where(jnp.any(trace.held_rise >= GRIP_RISE), jnp.int32(Outcome.DROPPED), jnp.int32(Outcome.TOUCHED))
+    met = jnp.where(
+        jnp.any(trace.held_rise >= GRIP_RISE),
+        jnp.int32(Outcome.DROPPED),
+        jnp.int32(Outcome.TOUCHED),
+    )
     failed = jnp.where(trace.touched, met, missed)
     return jnp.where(jnp.any(lifted_blocks(trace, hand_rise)), jnp.int32(Outcome.LIFTED), failed)
 
 
 def grasp_outcome_by_gap(trace: Trace, surface: jax.Array, changed: jax.Array) -> jax.Array:
-    """Outcome [] int32 that finger gaps and the height map alone suggest; `changed` [] bool: the map moved."""
+    """Outcome [] int32 that finger gaps and the height map alone suggest; `changed` [] bool: the
+    map moved."""
     missed = jnp.where(surface < BARE, jnp.int32(Outcome.NOTHING), jnp.int32(Outcome.EMPTY))
     open_hand = jnp.where(changed, jnp.int32(Outcome.TOUCHED), missed)
     failed = jnp.where(trace.gap_closed > CLOSED_GAP, jnp.int32(Outcome.DROPPED), open_hand)

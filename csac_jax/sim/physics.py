@@ -27,15 +27,17 @@ class Physics(Protocol):
     """A world in which a robot can be moved."""
 
     def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
-        """Moves the robot, one set-point per substep; blocks that are not in play stay where they are.
+        """Moves the robot, one set-point per substep; blocks that are not in play stay where they
+        are.
 
-        Blocks that end up in the hand are still in play, hanging where the hand is. One scene; callers vmap.
+        Blocks that end up in the hand are still in play, hanging where the hand is. One scene;
+        callers vmap.
         """
 
 
 def make(world: World, cfg: SimConfig) -> Physics:
-    """The physics that the config names: `mjx`, compiled with the rest; `warp`, the same on NVIDIA's Warp; or `c`, the
-    reference, on the host's cores.
+    """The physics that the config names: `mjx`, compiled with the rest; `warp`, the same on
+    NVIDIA's Warp; or `c`, the reference, on the host's cores.
 
     Raises SceneError where `warp` is not installed.
     """
@@ -49,9 +51,15 @@ def make(world: World, cfg: SimConfig) -> Physics:
 
 
 def execute(
-    physics: Physics, cfg: SimConfig, heightmap: HeightmapConfig, scene: Scene, height: jax.Array, action: Action
+    physics: Physics,
+    cfg: SimConfig,
+    heightmap: HeightmapConfig,
+    scene: Scene,
+    height: jax.Array,
+    action: Action,
 ) -> tuple[Scene, Trace, Plan]:
-    """Runs one primitive; one that the robot cannot follow is not begun: nothing moves, nothing is touched.
+    """Runs one primitive; one that the robot cannot follow is not begun: nothing moves, nothing is
+    touched.
 
     Args: height [H, W] m, the map the action was chosen from.
     """
@@ -59,12 +67,15 @@ def execute(
     drive = robot.drive(cfg.robot, plan)
     after, trace = physics.run(scene, drive)
     still = (layout.park(scene, scene.in_play), outcome.blank(len(scene.colour)))
-    after, trace = jax.tree.map(lambda new, old: jnp.where(drive.reachable, new, old), (after, trace), still)
+    after, trace = jax.tree.map(
+        lambda new, old: jnp.where(drive.reachable, new, old), (after, trace), still
+    )
     return after, trace, plan.replace(surface=jnp.where(drive.reachable, plan.surface, 0.0))
 
 
 def healthy(scene: Scene) -> jax.Array:
-    """True where every entry of a scene is one that a scene can have, [] bool: pose, speed, size, material, index.
+    """True where every entry of a scene is one that a scene can have, [] bool: pose, speed, size,
+    material, index.
 
     Bounds, not `isfinite`, since a lane may explode and stay finite; NaN fails every comparison.
     """

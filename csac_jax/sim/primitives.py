@@ -1,6 +1,5 @@
-"""Push and grasp as one fixed-length sequence of hand set-points, so that both run in the same scan."""
-
-import enum
+"""Push and grasp as one fixed-length sequence of hand set-points, so that both run in the same
+scan."""
 
 import jax
 import jax.numpy as jnp
@@ -9,17 +8,13 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.constants import Primitive
 from csac_jax.scene.model import MAX_OPENING
 
 HAND_RADIUS = 0.09  # m, circle about the tool axis that holds the open hand
-START_GAP = 0.01  # m, between the open hand's tips and whatever lies under it when a primitive starts
-
-
-class Primitive(enum.IntEnum):
-    """Kinds of action."""
-
-    PUSH = 0
-    GRASP = 1
+START_GAP = (
+    0.01  # m, between the open hand's tips and whatever lies under it when a primitive starts
+)
 
 
 @struct.dataclass
@@ -40,7 +35,8 @@ class Plan:
 
 
 def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: float) -> jax.Array:
-    """Highest surface [] m in a square window of `side` m about `xy` [2] m of the height map [H, W] m."""
+    """Highest surface [] m in a square window of `side` m about `xy` [2] m of the height map [H, W]
+    m."""
     distance = jnp.max(jnp.abs(geometry.cell_centres(cfg) - xy[None, None]), axis=-1)
     return jnp.max(jnp.where(distance <= 0.5 * max(side, cfg.cell), height, 0.0))
 
@@ -48,8 +44,9 @@ def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: floa
 def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: Action) -> Plan:
     """Set-points of a primitive (VPG's two, arXiv:1803.09956, with the depths of the config).
 
-    Grasp: straight down with open fingers to `grasp_depth` below the surface, close, lift. Push: down with closed
-    fingers to `push_depth` below the local top, `push_length` along the yaw (end clipped to the workspace), lift.
+    Grasp: straight down with open fingers to `grasp_depth` below the surface, close, lift. Push:
+    down with closed fingers to `push_depth` below the local top, `push_length` along the yaw (end
+    clipped to the workspace), lift.
     """
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
@@ -62,21 +59,29 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
     end = jnp.where(is_grasp, xy, jnp.clip(xy + cfg.push_length * direction, -limit, limit))
     opening = jnp.where(is_grasp, 0.5 * MAX_OPENING, 0.0)
 
-    descend, act, lift = jnp.where(is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases))  # [T] each
+    descend, act, lift = jnp.where(
+        is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases)
+    )  # [T] each
     z = high + (low - high) * descend + (high - low) * lift
     place = xy[None] + act[:, None] * (end - xy)[None]
     fingers = opening * (1.0 - jnp.minimum(1.3 * act, 1.0))  # closed before the lift begins
-    control = jnp.concatenate([place, z[:, None], jnp.full_like(z, yaw)[:, None], fingers[:, None]], axis=1)
+    control = jnp.concatenate(
+        [place, z[:, None], jnp.full_like(z, yaw)[:, None], fingers[:, None]], axis=1
+    )
     start = jnp.concatenate([xy, high[None], yaw[None], opening[None]])
     return Plan(control=control, start=start, surface=surface)
 
 
 def _progress(phases: tuple[int, int, int]) -> np.ndarray:
-    """How far each phase has come, 0 to 1, at every substep: [3, T]. The last is smooth: a jerk shakes blocks loose."""
+    """How far each phase has come, 0 to 1, at every substep: [3, T]. The last is smooth: a jerk
+    shakes blocks loose."""
     times = np.arange(1, sum(phases) + 1)
     ends = np.cumsum(phases)
     linear = np.stack(
-        [np.clip((times - end + length) / length, 0, 1) for end, length in zip(ends, phases, strict=True)]
+        [
+            np.clip((times - end + length) / length, 0, 1)
+            for end, length in zip(ends, phases, strict=True)
+        ]
     )
     linear[2] = linear[2] ** 2 * (3.0 - 2.0 * linear[2])
     return linear.astype(np.float32)

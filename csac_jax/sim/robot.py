@@ -23,6 +23,8 @@ def drive(kind: RobotKind, plan: Plan) -> Drive:
     if kind == "hand":
         return Drive(jnp.append(plan.start, plan.start[4]), plan.control, jnp.ones((), bool))
     if kind == "ur5":
-        way = kinematics.trajectory(jnp.asarray(kinematics.HOME), jnp.concatenate([plan.start[None], plan.control]))
+        way = kinematics.trajectory(
+            jnp.asarray(kinematics.HOME), jnp.concatenate([plan.start[None], plan.control])
+        )
         return Drive(jnp.append(way.target[0], way.target[0, 6]), way.target[1:], way.reachable)
     raise ValueError(f"sim.robot: {kind!r} is neither 'hand' nor 'ur5'")

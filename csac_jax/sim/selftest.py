@@ -20,7 +20,8 @@ MODEL = """
 
 
 def largest_error() -> float:
-    """Largest difference of a position or a quaternion's component over all scenes after `STEPS` steps, m or 1."""
+    """Largest difference of a position or a quaternion's component over all scenes after `STEPS`
+    steps, m or 1."""
     model = mujoco.MjModel.from_xml_string(MODEL)
     qpos = np.tile(model.qpos0, (SCENES, 1))
     qpos[:, 2] += 0.01 * np.arange(SCENES)  # another height in each scene

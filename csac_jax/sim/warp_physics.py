@@ -1,7 +1,9 @@
-"""Primitives in MJX with its Warp implementation: the scan of `mjx_physics`, the contacts of another engine.
+"""Primitives in MJX with its Warp implementation: the scan of `mjx_physics`, the contacts of
+another engine.
 
-Contacts of all scenes share one array here, so that a scene cannot look its own up: sensors in the model tell which
-block the hand touches. Meshes have one size in all scenes. Not repeatable bit for bit.
+Contacts of all scenes share one array here, so that a scene cannot look its own up: sensors in the
+model tell which block the hand touches. Meshes have one size in all scenes. Not repeatable bit for
+bit.
 """
 
 import functools
@@ -12,7 +14,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from csac_jax.config import WARP_WORLDS, SimConfig
-from csac_jax.scene.errors import SceneError
+from csac_jax.errors import SceneError
 from csac_jax.scene.model import HAND_GEOMS, World
 from csac_jax.sim.mjx_physics import MjxPhysics
 
@@ -25,14 +27,19 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
     try:
         import warp
     except ImportError:
-        raise SceneError("sim.physics: warp is an extra; run: pip install 'csac-jax[warp]'") from None
+        raise SceneError(
+            "sim.physics: warp is an extra; run: pip install 'csac-jax[warp]'"
+        ) from None
     from mujoco.mjx.third_party.mujoco_warp import OverflowType
 
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of its kernels
     model = mjx.put_model(world.model, impl="warp", graph_mode=_graph_mode())
     model = model.tree_replace({"opt._impl.warn_overflow": 0})
     data = mjx.make_data(
-        world.model, impl="warp", naconmax=WARP_WORLDS * cfg.contacts, njmax=_ROWS * cfg.contacts + _OTHER_ROWS
+        world.model,
+        impl="warp",
+        naconmax=WARP_WORLDS * cfg.contacts,
+        njmax=_ROWS * cfg.contacts + _OTHER_ROWS,
     )
     lost = OverflowType.ALL & ~(
         OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
@@ -43,8 +50,9 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
 def _graph_mode() -> Any:
     """How a step becomes a CUDA graph; None, MJX's choice, on a CPU.
 
-    MJX's choice on CUDA records a graph anew for every set of buffers that XLA hands over, of which a training step has
-    many: 1,024 scenes took 3.7 s an action so, 0.52 s with one graph and its own buffers (H200, `experiments/bench`).
+    MJX's choice on CUDA records a graph anew for every set of buffers that XLA hands over, of which
+    a training step has many: 1,024 scenes took 3.7 s an action so, 0.52 s with one graph and its
+    own buffers (H200, `experiments/bench`).
     """
     if jax.default_backend() != "gpu":
         return None
@@ -54,6 +62,7 @@ def _graph_mode() -> Any:
 
 
 def _sensed(lost: int, world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """See `MjxPhysics.touch`; contacts may be missing once one of the arrays ran over that `lost` has a bit for."""
+    """See `MjxPhysics.touch`; contacts may be missing once one of the arrays ran over that `lost`
+    has a bit for."""
     touching = data.sensordata.reshape(len(HAND_GEOMS), len(world.slots)) > 0.0
     return touching, jnp.any((data._impl.overflow & lost) != 0)

@@ -1,7 +1,9 @@
-"""A pinhole camera: what it sees of a scene, as depth and colour, and its pixels as points in space.
+"""A pinhole camera: what it sees of a scene, as depth and colour, and its pixels as points in
+space.
 
-The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depths are along z, not along
-the ray: the ray of a pixel is not of unit length, but advances by 1 m in depth per unit of the caster's distance.
+The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depths are
+along z, not along the ray: the ray of a pixel is not of unit length, but advances by 1 m in depth
+per unit of the caster's distance.
 
     eye = camera.make(CameraConfig(scale=0.5))
     picture = camera.render(eye, solids.read(model, data.geom_xpos, data.geom_xmat))  # .colour [H, W, 3] in 0 .. 1
@@ -50,14 +52,17 @@ def make(cfg: CameraConfig) -> Camera:
         focal=jnp.asarray(np.array(cfg.focal) * share, jnp.float32),
         centre=jnp.asarray((np.array(cfg.centre) + 0.5) * share - 0.5, jnp.float32),
         position=jnp.asarray(cfg.position, jnp.float32),
-        rotation=jnp.asarray(level_rotation(np.array(cfg.position), np.array(cfg.look_at)), jnp.float32),
+        rotation=jnp.asarray(
+            level_rotation(np.array(cfg.position), np.array(cfg.look_at)), jnp.float32
+        ),
         width=width,
         height=height,
     )
 
 
 def level_rotation(position: np.ndarray, look_at: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3], camera to world, of a camera at `position` [3] that looks at a point, its x horizontal."""
+    """Rotation [3, 3], camera to world, of a camera at `position` [3] that looks at a point, its x
+    horizontal."""
     forward = (look_at - position) / np.linalg.norm(look_at - position)
     right = np.array([forward[1], -forward[0], 0.0]) / np.hypot(forward[0], forward[1])
     return np.stack([right, np.cross(forward, right), forward], axis=1)
@@ -68,7 +73,11 @@ def directions(camera: Camera) -> jax.Array:
     x = (jnp.arange(camera.width, dtype=jnp.float32) - camera.centre[0]) / camera.focal[0]
     y = (jnp.arange(camera.height, dtype=jnp.float32) - camera.centre[1]) / camera.focal[1]
     right, down, forward = (camera.rotation[:, axis] for axis in range(3))
-    return x[None, :, None] * right[None, None] + y[:, None, None] * down[None, None] + forward[None, None]
+    return (
+        x[None, :, None] * right[None, None]
+        + y[:, None, None] * down[None, None]
+        + forward[None, None]
+    )
 
 
 def points(camera: Camera, depth: jax.Array) -> jax.Array:
@@ -77,10 +86,13 @@ def points(camera: Camera, depth: jax.Array) -> jax.Array:
 
 
 def look(camera: Camera, cast: Callable[[jax.Array, jax.Array], Any]) -> Any:
-    """What `cast`, a function of one ray (origin [3] m, direction [3]), makes of every pixel: leaves [H, W, ...]."""
+    """What `cast`, a function of one ray (origin [3] m, direction [3]), makes of every pixel:
+    leaves [H, W, ...]."""
     one = jax.vmap(cast, in_axes=(None, 0))
     seen = one(camera.position, directions(camera).reshape(-1, 3))
-    return jax.tree.map(lambda leaf: leaf.reshape(camera.height, camera.width, *leaf.shape[1:]), seen)
+    return jax.tree.map(
+        lambda leaf: leaf.reshape(camera.height, camera.width, *leaf.shape[1:]), seen
+    )
 
 
 def render(camera: Camera, solids: Solids) -> Picture:

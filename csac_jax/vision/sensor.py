@@ -1,4 +1,5 @@
-"""What a real depth camera gets wrong, drawn from a key; what has a spread of 0 is left out of the program."""
+"""What a real depth camera gets wrong, drawn from a key; what has a spread of 0 is left out of the
+program."""
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,8 @@ from csac_jax.vision.camera import Camera
 
 
 def depth(key: jax.Array, cfg: SensorConfig, true: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Measured depths m, normal about the true ones with sigma = depth_floor + depth_square d^2, and which pixels have
-    one, bool; any shape. See SensorConfig for the source."""
+    """Measured depths m, normal about the true ones with sigma = depth_floor + depth_square d^2,
+    and which pixels have one, bool; any shape. See SensorConfig for the source."""
     key_noise, key_drop = jax.random.split(key)
     measured, kept = true, jnp.ones(true.shape, bool)
     if cfg.depth_floor > 0.0 or cfg.depth_square > 0.0:

@@ -4,7 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-LIGHT = (0.36, 0.48, 0.8)  # unit vector towards the light; oblique, so that sloping faces differ in brightness
+LIGHT = (
+    0.36,
+    0.48,
+    0.8,
+)  # unit vector towards the light; oblique, so that sloping faces differ in brightness
 AMBIENT = 0.4  # share of the colour that a face turned away from the light keeps
 SKY = np.array([0.75, 0.8, 0.85], np.float32)  # colour of what is not hit
 

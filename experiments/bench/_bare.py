@@ -1,4 +1,5 @@
-"""What physics costs by itself: plain steps from the states that an action starts from, with its set-points."""
+"""What physics costs by itself: plain steps from the states that an action starts from, with its
+set-points."""
 
 import concurrent.futures
 from collections.abc import Callable
@@ -30,13 +31,21 @@ def drives(cfg: Config, height: jax.Array, actions: Action) -> Drive:
 
 
 def loop(physics: MjxPhysics | CPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
-    """As many plain steps as an action has, of scenes and drives with leaves [E, ...]; a call runs them all."""
-    return _mjx(physics, scenes, drives) if isinstance(physics, MjxPhysics) else _c(physics, scenes, drives)
+    """As many plain steps as an action has, of scenes and drives with leaves [E, ...]; a call runs
+    them all."""
+    return (
+        _mjx(physics, scenes, drives)
+        if isinstance(physics, MjxPhysics)
+        else _c(physics, scenes, drives)
+    )
 
 
 def _mjx(physics: MjxPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
     def one(scene: Scene, drive: Drive) -> jax.Array:
-        its, data = mjx_physics.scene_model(physics, scene), mjx_physics.initial_data(physics, scene, drive)
+        its, data = (
+            mjx_physics.scene_model(physics, scene),
+            mjx_physics.initial_data(physics, scene, drive),
+        )
 
         def step(data: mjx.Data, control: jax.Array) -> tuple[mjx.Data, None]:
             return mjx.step(its, data.replace(ctrl=control)), None

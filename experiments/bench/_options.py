@@ -18,7 +18,8 @@ class Parser(argparse.ArgumentParser):
 
 
 def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
-    """The numbers given for the benchmark `name`, each at least 1, and its switches, whose default is False."""
+    """The numbers given for the benchmark `name`, each at least 1, and its switches, whose default
+    is False."""
     parser = Parser(prog=f"bench {name}", allow_abbrev=False)
     for option, default in defaults.items():
         if default is False:
@@ -44,13 +45,15 @@ _SETTINGS = settings.with_sections(_Run)
 
 
 def split(parser: Parser, arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
-    """The preset, `quick` if none stands first, what `parser` knows, and the rest, which are settings."""
+    """The preset, `quick` if none stands first, what `parser` knows, and the rest, which are
+    settings."""
     preset, flags = settings.split(arguments)
     return preset or "quick", *parser.parse_known_args(flags)
 
 
 def config(name: str, preset: str, flags: Sequence[str]) -> Config:
-    """The preset with settings as `csac-jax train` takes them, for the benchmark `name`. Raises BadArgumentsError."""
+    """The preset with settings as `csac-jax train` takes them, for the benchmark `name`. Raises
+    BadArgumentsError."""
     try:
         return settings.parse(_SETTINGS, f"bench {name}", settings.preset(preset, flags), flags)[1]
     except BadArgumentsError as error:

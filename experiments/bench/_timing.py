@@ -11,7 +11,8 @@ import jax
 def medians(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
     """Median seconds of every call until its result is there, after one that does not count.
 
-    One after the other in each of `repeats` rounds, so that what else the machine does hits all alike.
+    One after the other in each of `repeats` rounds, so that what else the machine does hits all
+    alike.
     """
     for call in calls.values():
         jax.block_until_ready(call())

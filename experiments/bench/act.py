@@ -1,11 +1,11 @@
-"""Speed of the dense Q maps of a state, 2 primitives x 16 yaws, as JSON: `csac-jax bench act [--states N] [--zoom N]
-[--pixels N] [--repeats N]`.
+"""Speed of the dense Q maps of a state, 2 primitives x 16 yaws, as JSON: `csac-jax bench act
+[--states N] [--zoom N] [--pixels N] [--repeats N]`.
 
-DenseNet-121 over colour and height maps of PIXELS (224) cells, one state and STATES (64) at once, each cell ZOOM (1)
-pixels wide, maps as fine as the height map; beside it, if torch is installed, the way of VPG: each yaw, primitive and
-trunk is a pass of its own of one picture of twice the size, float32. Then the small net, one critic, at the size that
-it is used at: as it is by default, in `quick` and in `fast`. All weights are random; the median of REPEATS (10) calls
-counts.
+DenseNet-121 over colour and height maps of PIXELS (224) cells, one state and STATES (64) at once,
+each cell ZOOM (1) pixels wide, maps as fine as the height map; beside it, if torch is installed,
+the way of VPG: each yaw, primitive and trunk is a pass of its own of one picture of twice the size,
+float32. Then the small net, one critic, at the size that it is used at: as it is by default, in
+`quick` and in `fast`. All weights are random; the median of REPEATS (10) calls counts.
 """
 
 import dataclasses
@@ -24,16 +24,20 @@ from csac_jax.agent import learner as learning
 from csac_jax.agent.learner import Learner
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import DENSENET_STRIDE, Config, HeightmapConfig, NetConfig
-from csac_jax.train import compiler, provenance, step
+from csac_jax.runtime import compiler, provenance
+from csac_jax.training import step
 from csac_jax.vision.heightmap import Observation
 from experiments.bench._options import read
 from experiments.bench._timing import medians
 
 
 def _canvas(pixels: int, multiple: int) -> int:
-    """Side of turned maps of `pixels` cells: their diagonal, rounded up; less where the margin may not be so large."""
+    """Side of turned maps of `pixels` cells: their diagonal, rounded up; less where the margin may
+    not be so large."""
     sides = range(-(-pixels // multiple) * multiple, int(1.5 * pixels) + 1, multiple)
-    return next((side for side in sides if side >= math.sqrt(2.0) * pixels), max(sides, default=pixels))
+    return next(
+        (side for side in sides if side >= math.sqrt(2.0) * pixels), max(sides, default=pixels)
+    )
 
 
 def _densenet(pixels: int, zoom: int) -> Config:
@@ -48,7 +52,8 @@ def _densenet(pixels: int, zoom: int) -> Config:
 
 
 def _random(tree: Any) -> Any:
-    """Arrays of the shapes of `tree`: norms at their start, everything else random, nothing compiled."""
+    """Arrays of the shapes of `tree`: norms at their start, everything else random, nothing
+    compiled."""
     rng = np.random.default_rng(0)
 
     def draw(path: Any, leaf: jax.ShapeDtypeStruct) -> jax.Array:
@@ -74,13 +79,17 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
     params, obs = _random(abstract.online), _observations(cfg.heightmap.size, states)
     begun = time.perf_counter()
-    jitted = jax.jit(lambda params, obs: learning.look(learner, params, obs).q, compiler_options=compiler.options(cfg))
+    jitted = jax.jit(
+        lambda params, obs: learning.look(learner, params, obs).q,
+        compiler_options=compiler.options(cfg),
+    )
     look = jitted.lower(params, obs).compile()
     compiled = time.perf_counter() - begun
     seconds = medians({"look": lambda: look(params, obs)}, repeats)["look"]
     return {
         "states": states,
-        "pixels_of_a_pass": learner.frames.tables.canvas * (cfg.net.zoom if cfg.net.kind == "densenet121" else 1),
+        "pixels_of_a_pass": learner.frames.tables.canvas
+        * (cfg.net.zoom if cfg.net.kind == "densenet121" else 1),
         "maps": list(look.out_info.shape),
         "seconds_per_state": seconds / states,
         "compile_seconds": round(compiled, 1),
@@ -92,7 +101,10 @@ def _update_memory(learner: Learner) -> int:
     """Bytes that one update of the critic needs beside the networks and the batch."""
     state = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
     size = learner.cfg.learn.batch
-    batch = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype), step.example(learner.cfg))
+    batch = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype),
+        step.example(learner.cfg),
+    )
     update = jax.jit(lambda *given: learning.update_critic(jax.random.key(0), learner, *given))
     compiled = update.lower(state, batch, jax.ShapeDtypeStruct((size,), jnp.float32)).compile()
     return compiled.memory_analysis().temp_size_in_bytes
@@ -106,7 +118,8 @@ def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
     return {
         "pixels": cfg.heightmap.size,
         "parameters": {
-            name: sum(leaf.size for leaf in jax.tree.leaves(getattr(abstract, name))) for name in ("critic", "actor")
+            name: sum(leaf.size for leaf in jax.tree.leaves(getattr(abstract, name)))
+            for name in ("critic", "actor")
         },
         "times": [_ours(cfg, 1, repeats), _ours(cfg, states, repeats)],
         "update": {"batch": cfg.learn.batch, "temporary_bytes": _update_memory(learner)},
@@ -134,10 +147,19 @@ def _torch_trunk(layers: tuple[int, ...], growth: int) -> Any:
             return torch.cat([maps, self.new(maps)], dim=1)
 
     channels = 2 * growth
-    parts = [convolution(3, channels, 7, 2), nn.BatchNorm2d(channels), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)]
+    parts = [
+        convolution(3, channels, 7, 2),
+        nn.BatchNorm2d(channels),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2, 1),
+    ]
     for i, count in enumerate(layers):
         if i:
-            parts += [nn.BatchNorm2d(channels), nn.ReLU(inplace=True), convolution(channels, channels // 2, 1)]
+            parts += [
+                nn.BatchNorm2d(channels),
+                nn.ReLU(inplace=True),
+                convolution(channels, channels // 2, 1),
+            ]
             parts += [nn.AvgPool2d(2, 2)]
             channels //= 2
         parts += [Layer(channels + j * growth) for j in range(count)]
@@ -146,7 +168,8 @@ def _torch_trunk(layers: tuple[int, ...], growth: int) -> Any:
 
 
 def _vpg(net: NetConfig, pixels: int, repeats: int) -> dict[str, Any]:
-    """Time of the Q maps of one state as VPG makes them, in PyTorch; float32, PyTorch's defaults."""
+    """Time of the Q maps of one state as VPG makes them, in PyTorch; float32, PyTorch's
+    defaults."""
     if importlib.util.find_spec("torch") is None:
         return {"missing": "torch is not installed"}
     import torch
@@ -155,7 +178,9 @@ def _vpg(net: NetConfig, pixels: int, repeats: int) -> dict[str, Any]:
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     side = math.ceil(2.0 * math.sqrt(2.0) * pixels / DENSENET_STRIDE) * DENSENET_STRIDE
-    trunks = [[_torch_trunk(net.block_layers, net.block_growth) for _ in range(2)] for _ in range(2)]
+    trunks = [
+        [_torch_trunk(net.block_layers, net.block_growth) for _ in range(2)] for _ in range(2)
+    ]
     with torch.no_grad():
         width = 2 * trunks[0][0].eval()(torch.zeros(1, 3, 64, 64)).shape[1]
     heads = [
@@ -184,7 +209,11 @@ def _vpg(net: NetConfig, pixels: int, repeats: int) -> dict[str, Any]:
                     turned = [turn(picture, angle) for picture in pictures]
                     seen = [trunk(picture) for trunk, picture in zip(pair, turned, strict=True)]
                     q = turn(head(torch.cat(seen, dim=1)), -angle)
-                    maps.append(functional.interpolate(q, scale_factor=16, mode="bilinear", align_corners=False))
+                    maps.append(
+                        functional.interpolate(
+                            q, scale_factor=16, mode="bilinear", align_corners=False
+                        )
+                    )
         if device == "cuda":
             torch.cuda.synchronize()
         return maps
@@ -206,7 +235,11 @@ def main(arguments: list[str]) -> None:
     cfg = _densenet(pixels, options["zoom"])
     ours = [_ours(cfg, states, repeats) for states in (1, options["states"])]
     vpg = _vpg(cfg.net, pixels, min(repeats, 3))
-    ratios = [vpg["seconds_per_state"] / one["seconds_per_state"] for one in ours] if "missing" not in vpg else None
+    ratios = (
+        [vpg["seconds_per_state"] / one["seconds_per_state"] for one in ours]
+        if "missing" not in vpg
+        else None
+    )
     nets = {"default": NetConfig(), "quick": presets.quick().net, "fast": presets.fast().net}
     result = {
         "options": options,

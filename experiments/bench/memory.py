@@ -2,13 +2,15 @@
 
 csac-jax bench memory [--record FILE] [NAME ...]
 
-A name is a preset's or one of `CONFIGS`; without any, all of these, ten small ones that differ in scenes, map, yaws,
-batch, blocks, net and ring. Each training step is compiled, not run, and XLA says what it holds: the state that goes
-in, results, temporaries. On an accelerator the program is run as well, on zeros, and the device's own peak stands
-beside it (`peak_bytes_in_use`, of all configs so far: give one preset at a time there).
+A name is a preset's or one of `CONFIGS`; without any, all of these, ten small ones that differ in
+scenes, map, yaws, batch, blocks, net and ring. Each training step is compiled, not run, and XLA
+says what it holds: the state that goes in, results, temporaries. On an accelerator the program is
+run as well, on zeros, and the device's own peak stands beside it (`peak_bytes_in_use`, of all
+configs so far: give one preset at a time there).
 
-With --record each config is written to FILE when it is done, and one that is there already is not compiled again: what
-was measured stays, with its commit, and is compared with what is predicted now.
+With --record each config is written to FILE when it is done, and one that is there already is not
+compiled again: what was measured stays, with its commit, and is compared with what is predicted
+now.
 """
 
 import dataclasses
@@ -27,16 +29,19 @@ from csac_jax.agent import learner as learning
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.env import Env
+from csac_jax.runtime import provenance
 from csac_jax.scene import layout, model
 from csac_jax.sim import physics
-from csac_jax.train import memory, provenance, step
+from csac_jax.training import memory, step
 from experiments.bench import _options
 
 
 def _smoke(**sections: dict[str, Any]) -> Config:
     """The preset `smoke` with other values in some sections."""
     cfg = presets.smoke()
-    parts: dict[str, Any] = {name: dataclasses.replace(getattr(cfg, name), **new) for name, new in sections.items()}
+    parts: dict[str, Any] = {
+        name: dataclasses.replace(getattr(cfg, name), **new) for name, new in sections.items()
+    }
     return dataclasses.replace(cfg, **parts)
 
 
@@ -55,19 +60,25 @@ def _boxes(count: int, **sections: dict[str, Any]) -> Config:
 
 CONFIGS: dict[str, Config] = {
     "smoke": _smoke(),
-    "64 scenes": _smoke(train={"scenes": 64, "warmup": 64}),
+    "64 scenes": _smoke(train={"scenes": 64, "learning_starts": 64}),
     "map of 64 cells": _boxes(3, heightmap={"size": 64}),
     "16 yaws": _boxes(3, net={"rotations": 16}),
-    "batch of 64": _boxes(3, learn={"batch": 64}, train={"warmup": 64}),
+    "batch of 64": _boxes(3, learn={"batch": 64}, train={"learning_starts": 64}),
     "6 boxes, 48 contacts, 32 scenes": _boxes(
-        6, sim={"contacts": 48, "geom_pairs": 12}, train={"scenes": 32, "warmup": 32}
+        6, sim={"contacts": 48, "geom_pairs": 12}, train={"scenes": 32, "learning_starts": 32}
     ),
     "net of quick": _boxes(3, net=_NET),
     "learner of quick": _boxes(
-        3, heightmap={"size": 64}, net=_NET, learn={"batch": 32, "updates": 2}, train={"scenes": 8, "warmup": 64}
+        3,
+        heightmap={"size": 64},
+        net=_NET,
+        learn={"batch": 32, "updates": 2},
+        train={"scenes": 8, "learning_starts": 64},
     ),
     "ring of 4096, 64 cells": _boxes(3, heightmap={"size": 64}, replay={"capacity": 4096}),
-    "two critics, no actor, 56 cells": _boxes(3, heightmap={"size": 56}, learn={"critics": 2, "actor": False}),
+    "two critics, no actor, 56 cells": _boxes(
+        3, heightmap={"size": 56}, learn={"critics": 2, "actor": False}
+    ),
 }
 
 
@@ -118,18 +129,24 @@ def _measured(cfg: Config) -> dict[str, Any]:
 
 
 def _compiler_options() -> dict[str, Any]:
-    """Without LLVM's optimisations on a CPU, where nothing runs: buffers are laid out before LLVM has a say."""
+    """Without LLVM's optimisations on a CPU, where nothing runs: buffers are laid out before LLVM
+    has a say."""
     return {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
 
 
 def _device_peak(compiled: Any, state: Any) -> int | None:
-    """Most bytes that the device held in this process after one step from a state of zeros; None on a CPU."""
+    """Most bytes that the device held in this process after one step from a state of zeros; None on
+    a CPU."""
     if jax.default_backend() == "cpu":
         return None
 
     def zeros(leaf: Any) -> jax.Array:
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jax.random.key(0) if leaf.shape == () else jax.random.split(jax.random.key(0), leaf.shape)
+            return (
+                jax.random.key(0)
+                if leaf.shape == ()
+                else jax.random.split(jax.random.key(0), leaf.shape)
+            )
         return jnp.zeros(leaf.shape, leaf.dtype)
 
     jax.block_until_ready(compiled(jax.tree.map(zeros, state)))
@@ -144,12 +161,18 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     known = CONFIGS | {name: _on_mjx(presets.get(name)) for name in presets.PRESETS}
     if not known.keys() >= set(options.names):
-        raise BadArgumentsError(f"bench memory: give names of: {', '.join(known)}; or none, for ten small configs")
+        raise BadArgumentsError(
+            f"bench memory: give names of: {', '.join(known)}; or none, for ten small configs"
+        )
     path = options.record
     rows = _recorded(path) if path and path.exists() else {}
     for name in options.names or CONFIGS:
         rows[name] = judged(known[name], rows[name] if name in rows else _measured(known[name]))
-        print(f"{name}: predicted / measured {rows[name]['predicted_over_measured']:.3f}", file=sys.stderr, flush=True)
+        print(
+            f"{name}: predicted / measured {rows[name]['predicted_over_measured']:.3f}",
+            file=sys.stderr,
+            flush=True,
+        )
         if path:
             path.write_text(_text(rows))
     print(_text(rows), end="")
@@ -160,10 +183,14 @@ def _recorded(path: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_text())["configs"]
     except (OSError, ValueError, KeyError, TypeError):
-        raise BadArgumentsError(f"bench memory: {path} is no record of it; give another --record") from None
+        raise BadArgumentsError(
+            f"bench memory: {path} is no record of it; give another --record"
+        ) from None
 
 
 def _text(rows: dict[str, Any]) -> str:
     """The rows as JSON, with what made them and how far the worst one is off."""
     worst = max(abs(row["predicted_over_measured"] - 1.0) for row in rows.values())
-    return json.dumps({"configs": rows, "worst_error": worst} | provenance.record(), indent=2) + "\n"
+    return (
+        json.dumps({"configs": rows, "worst_error": worst} | provenance.record(), indent=2) + "\n"
+    )

@@ -1,9 +1,10 @@
 """One physics step of MJX beside one of C MuJoCo, as JSON: `csac-jax bench one_step [--states N]`.
 
-States are recorded in C MuJoCo at a random substep of random pushes and planned grasps in settled piles of ten blocks.
-From each, both engines compute where every body is (kinematics), take one step without contacts, and one with them, the
-solver started cold. What differs after a step with contacts is measured once more with a solver that converges: what
-is left then is not the solver's. NOTES.md says what it is.
+States are recorded in C MuJoCo at a random substep of random pushes and planned grasps in settled
+piles of ten blocks. From each, both engines compute where every body is (kinematics), take one step
+without contacts, and one with them, the solver started cold. What differs after a step with
+contacts is measured once more with a solver that converges: what is left then is not the solver's.
+NOTES.md says what it is.
 """
 
 import dataclasses
@@ -16,10 +17,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from csac_jax.runtime import provenance
 from csac_jax.scene import model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import c_physics, mjx_physics, primitives, robot
-from csac_jax.train import provenance
 from experiments.bench._options import read
 from experiments.bench.parity import STREAM, TEN, Bench, pile_config
 
@@ -27,7 +28,10 @@ from mujoco import mjx  # isort: skip  (after csac_jax.sim, which imports it qui
 
 BATCH = 50
 SCENES = 128  # settled piles; each is acted on again and again
-EFFORT = {"as_configured": (TEN.sim.iterations, TEN.sim.line_search), "converged": (100, 50)}  # iterations, line search
+EFFORT = {
+    "as_configured": (TEN.sim.iterations, TEN.sim.line_search),
+    "converged": (100, 50),
+}  # iterations, line search
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,22 +53,34 @@ def record(bench: Bench, count: int) -> list[State]:
     pushes = bench.push(jax.random.split(jax.random.key(0), count), scenes)
     grasps = bench.oracle(scenes, height)
     odd = np.arange(count) // SCENES % 2 == 1
-    action = jax.tree.map(lambda a, b: jnp.where(odd.reshape(-1, *[1] * (a.ndim - 1)), a, b), pushes, grasps)
-    plan = jax.jit(jax.vmap(lambda h, a: primitives.plan(cfg.sim, cfg.heightmap, h, a)))(height, action)
+    action = jax.tree.map(
+        lambda a, b: jnp.where(odd.reshape(-1, *[1] * (a.ndim - 1)), a, b), pushes, grasps
+    )
+    plan = jax.jit(jax.vmap(lambda h, a: primitives.plan(cfg.sim, cfg.heightmap, h, a)))(
+        height, action
+    )
     drives = jax.device_get(jax.vmap(lambda one: robot.drive(cfg.sim.robot, one))(plan))
-    fields = jax.device_get(jax.jit(jax.vmap(lambda scene: model.scene_fields(world, scene)))(scenes))
+    fields = jax.device_get(
+        jax.jit(jax.vmap(lambda scene: model.scene_fields(world, scene)))(scenes)
+    )
     rng = np.random.default_rng(STREAM)
     states = []
     for i in range(count):
         scene, field, drive = jax.tree.map(lambda leaf, i=i: leaf[i], (scenes, fields, drives))
-        film, at = c_physics.film(world, field, scene, drive), int(rng.integers(cfg.sim.substeps - 1))
+        film, at = (
+            c_physics.film(world, field, scene, drive),
+            int(rng.integers(cfg.sim.substeps - 1)),
+        )
         qpos, qvel = (leaf[at].astype(np.float32) for leaf in (film.qpos, film.qvel))
         states.append(State(scene, qpos, qvel, drive.control[at + 1]))
     return states
 
 
-def _by_mjx(bench: Bench, states: list[State], contacts: bool, effort: tuple[int, int]) -> np.ndarray:
-    """Positions [S, bodies, 3] m of all bodies before and after a step, stacked: [2, S, bodies, 3]."""
+def _by_mjx(
+    bench: Bench, states: list[State], contacts: bool, effort: tuple[int, int]
+) -> np.ndarray:
+    """Positions [S, bodies, 3] m of all bodies before and after a step, stacked: [2, S, bodies,
+    3]."""
     sim = dataclasses.replace(bench.cfg.sim, iterations=effort[0], line_search=effort[1])
     world = model.build(bench.cfg.scene, sim)
     if not contacts:
@@ -86,7 +102,9 @@ def _by_mjx(bench: Bench, states: list[State], contacts: bool, effort: tuple[int
     return np.concatenate(rows).swapaxes(0, 1)
 
 
-def _by_c(bench: Bench, states: list[State], contacts: bool, effort: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _by_c(
+    bench: Bench, states: list[State], contacts: bool, effort: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """The same by C MuJoCo, and the number of contacts [S] before the step."""
     world = bench.world
     rows, touching = [], []
@@ -107,7 +125,8 @@ def _by_c(bench: Bench, states: list[State], contacts: bool, effort: tuple[int, 
 
 
 def _errors(bench: Bench, ours: np.ndarray, theirs: np.ndarray) -> dict[str, dict[str, float]]:
-    """Distances between bodies of both engines, m; the largest of each state, among blocks and among the robot's."""
+    """Distances between bodies of both engines, m; the largest of each state, among blocks and
+    among the robot's."""
     apart = np.linalg.norm(ours - theirs, axis=-1)  # [S, bodies]
     is_block = np.isin(np.arange(apart.shape[1]), bench.world.block_bodies)
     levels = (("median", 50), ("p99", 99), ("largest", 100))
@@ -126,7 +145,10 @@ def measure(count: int) -> dict[str, Any]:
     result["kinematics_m"] = _errors(bench, free[0], free_c[0][0])
     result["step_without_contacts_m"] = _errors(bench, free[1], free_c[0][1])
     for name, effort in EFFORT.items():
-        after, (after_c, touching) = _by_mjx(bench, states, True, effort), _by_c(bench, states, True, effort)
+        after, (after_c, touching) = (
+            _by_mjx(bench, states, True, effort),
+            _by_c(bench, states, True, effort),
+        )
         result[f"step_with_contacts_{name}_m"] = _errors(bench, after[1], after_c[1])
     result["contacts_median"] = float(np.median(touching))
     return result

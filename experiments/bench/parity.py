@@ -1,12 +1,14 @@
-"""Does MJX move blocks as C MuJoCo does? As JSON: `csac-jax bench parity [--primitives N] [--poses N] [--warp]`,
-N grasps and N pushes in piles of 6 and of 10, and N poses of each shape alone. With --warp MJX on Warp, on CUDA, is
-measured in place of MJX on JAX, and meshes have their nominal size.
+"""Does MJX move blocks as C MuJoCo does? As JSON: `csac-jax bench parity [--primitives N] [--poses
+N] [--warp]`, N grasps and N pushes in piles of 6 and of 10, and N poses of each shape alone. With
+--warp MJX on Warp, on CUDA, is measured in place of MJX on JAX, and meshes have their nominal size.
 
-The same settled scenes and the same actions go through both. Grasps are the planner's, which reads poses: its share of
-lifts is the ceiling that physics allows. Pushes start before a random block and go through it.
+The same settled scenes and the same actions go through both. Grasps are the planner's, which reads
+poses: its share of lifts is the ceiling that physics allows. Pushes start before a random block and
+go through it.
 
-How near two engines can come is measured beside it: C MuJoCo against itself, with every block a micrometre aside, and
-with the solver of MJX, which takes a scene as one problem where C takes each heap of touching blocks by itself.
+How near two engines can come is measured beside it: C MuJoCo against itself, with every block a
+micrometre aside, and with the solver of MJX, which takes a scene as one problem where C takes each
+heap of touching blocks by itself.
 """
 
 import dataclasses
@@ -24,13 +26,13 @@ import numpy as np
 
 from csac_jax import presets
 from csac_jax.config import Config, PhysicsKind, SceneConfig, SlotKind
+from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env
+from csac_jax.runtime import provenance
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, outcome, physics as simulation
-from csac_jax.sim.outcome import Outcome
-from csac_jax.sim.primitives import Action, Primitive
-from csac_jax.train import provenance
+from csac_jax.sim.primitives import Action
 from experiments.bench._options import read
 
 BATCH = 64
@@ -44,15 +46,18 @@ Engine = Callable[[Scene, jax.Array, Action], Any]  # scenes, heights [E, H, W] 
 
 def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind = "mjx") -> Config:
     """Scenes of `in_play` blocks in these slots, with contacts enough for ten."""
-    spread = 0.0 if physics == "warp" else SceneConfig().mesh_spread
-    scene = SceneConfig(slots=slots, min_blocks=in_play, mesh_spread=spread)
+    spread = 0.0 if physics == "warp" else SceneConfig().mesh_size_jitter
+    scene = SceneConfig(slots=slots, min_blocks=in_play, mesh_size_jitter=spread)
     sim = dataclasses.replace(TEN.sim, physics=physics)
     return dataclasses.replace(presets.get("quick"), scene=scene, sim=sim)
 
 
 def _batches(tree: Any, size: int) -> list[Any]:
     count = jax.tree.leaves(tree)[0].shape[0]
-    return [jax.tree.map(lambda leaf, i=i: leaf[i : i + size], tree) for i in range(0, count - size + 1, size)]
+    return [
+        jax.tree.map(lambda leaf, i=i: leaf[i : i + size], tree)
+        for i in range(0, count - size + 1, size)
+    ]
 
 
 class Bench:
@@ -68,7 +73,9 @@ class Bench:
         self.engines = {name: self._engine(name) for name in (cfg.sim.physics, REFERENCE)}
         solved_whole = self._engine(REFERENCE, mujoco.mjtDisableBit.mjDSBL_ISLAND)
         self.references = {
-            "c_against_itself_1um": lambda scenes, *rest: self.engines[REFERENCE](_aside(scenes), *rest),
+            "c_against_itself_1um": lambda scenes, *rest: self.engines[REFERENCE](
+                _aside(scenes), *rest
+            ),
             "c_against_itself_solved_whole": solved_whole,
         }
 
@@ -78,25 +85,34 @@ class Bench:
         world = model.build(self.cfg.scene, sim)
         world.model.opt.disableflags |= disabled
         engine = simulation.make(world, sim)
-        return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, sim, self.cfg.heightmap)))
+        return jax.jit(
+            jax.vmap(functools.partial(simulation.execute, engine, sim, self.cfg.heightmap))
+        )
 
     def run(self, engines: dict[str, Engine], scenes: Scene, actions: Action) -> dict[str, Any]:
-        """What engines make of the actions: ends [E, N, 3], outcomes [E], saturated [E], ill [E]."""
+        """What engines make of the actions: ends [E, N, 3], outcomes [E], contact_overflow [E],
+        physics_diverged [E]."""
         height = self.look(scenes)
         result = {}
         for name, engine in engines.items():
             after, trace, plan = jax.block_until_ready(engine(scenes, height, actions))
             rise = plan.start[:, 2] - jnp.min(plan.control[:, :, 2], axis=1)
             judged = jax.vmap(outcome.grasp_outcome)(trace, plan.surface, rise)
-            ill = ~jax.vmap(simulation.healthy)(after)
-            result[name] = jax.device_get((after.position, judged, trace.saturated, ill))
+            physics_diverged = ~jax.vmap(simulation.healthy)(after)
+            result[name] = jax.device_get(
+                (after.position, judged, trace.contact_overflow, physics_diverged)
+            )
         return result
 
 
 def _aside(scenes: Scene) -> Scene:
     """The same with each block in play a micrometre aside, each another way."""
     way = np.random.default_rng(STREAM).uniform(0.0, 2.0 * np.pi, scenes.position.shape[:2])
-    step = ASIDE * np.stack([np.cos(way), np.sin(way), np.zeros_like(way)], axis=-1) * scenes.in_play[..., None]
+    step = (
+        ASIDE
+        * np.stack([np.cos(way), np.sin(way), np.zeros_like(way)], axis=-1)
+        * scenes.in_play[..., None]
+    )
     return scenes.replace(position=scenes.position + step.astype(np.float32))
 
 
@@ -109,7 +125,9 @@ def _push(key: jax.Array, scene: Scene) -> Action:
     return Action(primitive=jnp.int32(Primitive.PUSH), pose=jnp.append(place, yaw))
 
 
-def piles(in_play: int, slots: tuple[SlotKind, ...], count: int, physics: PhysicsKind) -> dict[str, Any]:
+def piles(
+    in_play: int, slots: tuple[SlotKind, ...], count: int, physics: PhysicsKind
+) -> dict[str, Any]:
     """Grasps and pushes in settled piles."""
     cfg = pile_config(slots, in_play, physics)
     bench = Bench(cfg)
@@ -118,10 +136,20 @@ def piles(in_play: int, slots: tuple[SlotKind, ...], count: int, physics: Physic
     for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))
         grasps = bench.oracle(scenes, bench.look(scenes))
-        rows.append((scenes, *(bench.run(engines, scenes, act) for act in (grasps, bench.push(keys, scenes)))))
+        rows.append(
+            (
+                scenes,
+                *(bench.run(engines, scenes, act) for act in (grasps, bench.push(keys, scenes))),
+            )
+        )
     starts = np.concatenate([row[0].position for row in rows])
     grasped, pushed = (
-        {name: [np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)] for name in engines}
+        {
+            name: [
+                np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)
+            ]
+            for name in engines
+        }
         for i in (1, 2)
     )
     lifted = {name: float(np.mean(grasped[name][1] == Outcome.LIFTED)) for name in bench.engines}
@@ -135,19 +163,24 @@ def piles(in_play: int, slots: tuple[SlotKind, ...], count: int, physics: Physic
             for name in bench.references
         },
         "saturated_substeps_share": _saturated(cfg, grasped[physics], pushed[physics]),
-        "ill": int(grasped[physics][3].sum() + pushed[physics][3].sum()),
+        "physics_diverged": int(grasped[physics][3].sum() + pushed[physics][3].sum()),
     }
 
 
-def _agreement(starts: np.ndarray, grasped: tuple[list, list], pushed: tuple[list, list]) -> dict[str, Any]:
-    """How well an engine agrees with the reference in grasps and in pushes, each (the engine's runs, the other's)."""
+def _agreement(
+    starts: np.ndarray, grasped: tuple[list, list], pushed: tuple[list, list]
+) -> dict[str, Any]:
+    """How well an engine agrees with the reference in grasps and in pushes, each (the engine's
+    runs, the other's)."""
     return {
         "grasp_outcome_equal": float(np.mean(grasped[0][1] == grasped[1][1])),
         "pushed_block_apart_mm": _apart(starts, *pushed),
     }
 
 
-def _apart(starts: np.ndarray, pushed: list[np.ndarray], reference: list[np.ndarray]) -> dict[str, float]:
+def _apart(
+    starts: np.ndarray, pushed: list[np.ndarray], reference: list[np.ndarray]
+) -> dict[str, float]:
     """How far apart the two engines leave the block that the reference moved most, mm."""
     moved = np.linalg.norm(reference[0] - starts, axis=2)
     slot = moved.argmax(axis=1)
@@ -166,7 +199,8 @@ def _saturated(cfg: Config, *runs: list[np.ndarray]) -> float:
 
 
 def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
-    """Grasps of a single block of every shape, as it came to rest after a fall in any orientation."""
+    """Grasps of a single block of every shape, as it came to rest after a fall in any
+    orientation."""
     slots: tuple[SlotKind, ...] = ("box", "arch", "prism", "half_cylinder", "cylinder")
     cfg = pile_config(slots, 1, physics)
     bench = Bench(cfg)
@@ -174,9 +208,13 @@ def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each.values())
     total, size = len(blocks.SHAPES) * poses, min(BATCH, poses)
     padded = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[: -total % size]]), scenes)
-    runs = [bench.run(bench.engines, batch, bench.oracle(batch, bench.look(batch))) for batch in _batches(padded, size)]
+    runs = [
+        bench.run(bench.engines, batch, bench.oracle(batch, bench.look(batch)))
+        for batch in _batches(padded, size)
+    ]
     lifted = {
-        name: np.concatenate([run[name][1] for run in runs])[:total].reshape(-1, poses) == Outcome.LIFTED
+        name: np.concatenate([run[name][1] for run in runs])[:total].reshape(-1, poses)
+        == Outcome.LIFTED
         for name in bench.engines
     }
     return {
@@ -196,7 +234,11 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
     found: list[Scene] = []
     while len(found) < count:
         scene = layout.parked(cfg.scene.slots)
-        half, position, quaternion = scene.half_size.copy(), scene.position.copy(), scene.quaternion.copy()
+        half, position, quaternion = (
+            scene.half_size.copy(),
+            scene.position.copy(),
+            scene.quaternion.copy(),
+        )
         half[slot] = blocks.SHAPES[shape].half_size
         position[slot] = [*rng.uniform(-0.12, 0.12, 2), cfg.scene.drop_height]
         turn = rng.normal(size=4)

@@ -1,10 +1,11 @@
-"""Speed of every physics, as JSON: `csac-jax bench physics [--smallest E0] [--scenes E] [--warp]`, from a batch of E0
-(1) scenes to one of E (64), each eight times the last; with --warp MJX on Warp too, on CUDA.
+"""Speed of every physics, as JSON: `csac-jax bench physics [--smallest E0] [--scenes E] [--warp]`,
+from a batch of E0 (1) scenes to one of E (64), each eight times the last; with --warp MJX on Warp
+too, on CUDA.
 
-Each is timed as an action of the environment, heights and outcomes included, beside a bare loop of the engine's own
-steps: same model, same settled scenes with their block sizes, same set-points, same batch, same process, turn by turn.
-`share` is (actions/s x substeps) / (bare steps/s): what is left of the engine's speed. Blocks are those of the preset
-`quick`; every action is a planned grasp.
+Each is timed as an action of the environment, heights and outcomes included, beside a bare loop of
+the engine's own steps: same model, same settled scenes with their block sizes, same set-points,
+same batch, same process, turn by turn. `share` is (actions/s x substeps) / (bare steps/s): what is
+left of the engine's speed. Blocks are those of the preset `quick`; every action is a planned grasp.
 """
 
 import dataclasses
@@ -16,8 +17,8 @@ import jax
 
 from csac_jax import env as environment, presets
 from csac_jax.config import Config, PhysicsKind
+from csac_jax.runtime import provenance
 from csac_jax.sim import oracle
-from csac_jax.train import provenance
 from experiments.bench import _bare
 from experiments.bench._options import read
 from experiments.bench._timing import medians
@@ -50,6 +51,10 @@ def main(arguments: list[str]) -> None:
     options = read("physics", arguments, smallest=1, scenes=64, warp=False)
     physics: tuple[PhysicsKind, ...] = ("c", "mjx", "warp") if options["warp"] else ("c", "mjx")
     cfg = presets.get("quick")
-    batches = [options["smallest"] * 8**i for i in range(8) if options["smallest"] * 8**i <= options["scenes"]]
+    batches = [
+        options["smallest"] * 8**i
+        for i in range(8)
+        if options["smallest"] * 8**i <= options["scenes"]
+    ]
     rows = [measure(cfg, name, batch) for name in physics for batch in batches]
     print(json.dumps({"substeps": cfg.sim.substeps, "runs": rows} | provenance.record(), indent=2))

@@ -1,18 +1,19 @@
 """Speed of the raycaster, as JSON: `csac-jax bench raycast [--size N] [--scenes N] [--repeats N]`.
 
-Rays straight down through every cell of the map, at random poses of the ten blocks of the preset `fast`, and the
-table: ours gives distance and surface, `mjx.ray` distance and geom, of the same model (without the hand), vmapped over
-rays and scenes, in parts of PEER_ROWS rows a scene, since it keeps every triangle of every ray in memory. It passes
-through cylinders, of which there are none: round blocks are meshes; and it fails on models without a material, so it
-gets one.
-Calls take turns and the median counts.
+Rays straight down through every cell of the map, at random poses of the ten blocks of the preset
+`fast`, and the table: ours gives distance and surface, `mjx.ray` distance and geom, of the same
+model (without the hand), vmapped over rays and scenes, in parts of PEER_ROWS rows a scene, since it
+keeps every triangle of every ray in memory. It passes through cylinders, of which there are none:
+round blocks are meshes; and it fails on models without a material, so it gets one. Calls take turns
+and the median counts.
 
-Arithmetic limit: the rate of a float32 matrix product at full precision, 2 SIDE^3 operations, timed in the same run.
-Operations of a ray are counted from the code: every sum, product, comparison, selection, minimum, maximum and logical
-operation is one. Per plane (`enter_half_spaces` for a direction that all rays share: what depends on the direction
-alone has no ray axis): room 7 (3 products, 3 sums, a difference), crossing 1, inwards 1, face 2, enter 1, leave 2: 14.
-Per geom: valid 3, closer 2, number and selection of the surface 3, distance 1: 9. Planes that a geom lacks are computed
-as well, and counted.
+Arithmetic limit: the rate of a float32 matrix product at full precision, 2 SIDE^3 operations, timed
+in the same run. Operations of a ray are counted from the code: every sum, product, comparison,
+selection, minimum, maximum and logical operation is one. Per plane (`enter_half_spaces` for a
+direction that all rays share: what depends on the direction alone has no ray axis): room 7 (3
+products, 3 sums, a difference), crossing 1, inwards 1, face 2, enter 1, leave 2: 14. Per geom:
+valid 3, closer 2, number and selection of the surface 3, distance 1: 9. Planes that a geom lacks
+are computed as well, and counted.
 """
 
 import json
@@ -26,10 +27,10 @@ import numpy as np
 from csac_jax import geometry, presets
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import HeightmapConfig
+from csac_jax.runtime import provenance
 from csac_jax.scene import blocks, model as models
 from csac_jax.scene.model import World
 from csac_jax.sim import mjx_physics
-from csac_jax.train import provenance
 from csac_jax.vision import heightmap, raycast
 from csac_jax.vision.raycast import Polytopes
 from experiments.bench._options import read
@@ -59,7 +60,9 @@ def _origins(size: int) -> jax.Array:
 
 def _ours(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -> Call:
     """Distances and surfaces, leaves [E, R]."""
-    half_size = np.stack([models.LARGEST * blocks.half_size_choices(kind).max(axis=0) for kind in world.slots])
+    half_size = np.stack(
+        [models.LARGEST * blocks.half_size_choices(kind).max(axis=0) for kind in world.slots]
+    )
     normal, offset = blocks.half_spaces(world.slots, jnp.asarray(half_size))
     slot = world.parts.slot
 
@@ -82,9 +85,13 @@ def _peer(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -
     part = PEER_ROWS * round(len(origin) ** 0.5)
 
     def look(position: jax.Array, quaternion: jax.Array) -> Any:
-        qpos = physics.data.qpos.at[world.block_qpos].set(jnp.concatenate([position, quaternion], axis=1))
+        qpos = physics.data.qpos.at[world.block_qpos].set(
+            jnp.concatenate([position, quaternion], axis=1)
+        )
         data = mjx.kinematics(model, physics.data.replace(qpos=qpos))
-        cast = jax.vmap(lambda start: mjx.ray(model, data, start, jnp.asarray(DOWN), bodyexclude=hand))
+        cast = jax.vmap(
+            lambda start: mjx.ray(model, data, start, jnp.asarray(DOWN), bodyexclude=hand)
+        )
         found = jax.lax.map(cast, origin.reshape(-1, part, 3))
         return jax.tree.map(jnp.ravel, found)
 
@@ -104,7 +111,11 @@ def measure(size: int, scenes: int, repeats: int) -> dict[str, Any]:
     cfg = presets.get("fast")
     world = models.build(cfg.scene, cfg.sim)
     poses, origin = _poses(np.random.default_rng(0), scenes, len(world.slots)), _origins(size)
-    calls = {"ours": _ours(world, poses, origin), "mjx": _peer(world, poses, origin), "matrix_product": _limit()}
+    calls = {
+        "ours": _ours(world, poses, origin),
+        "mjx": _peer(world, poses, origin),
+        "matrix_product": _limit(),
+    }
     seconds = medians(calls, repeats)
     ours, theirs = np.asarray(calls["ours"]()[0]), np.asarray(calls["mjx"]()[0])
     rays = scenes * size * size

@@ -1,10 +1,11 @@
-"""Speed of the replay, as JSON: `csac-jax bench replay [SMALLEST LARGEST]`, capacities 2^SMALLEST (12) to
-2^LARGEST (20).
+"""Speed of the replay, as JSON: `csac-jax bench replay [SMALLEST LARGEST]`, capacities 2^SMALLEST
+(12) to 2^LARGEST (20).
 
-One step draws 64 transitions from a full ring with their weights, gathers them and replaces their priorities. The
-samplers of this package stand beside flashbax's prioritised item buffer, with the same items and exponents. Each is a
-compiled loop of steps, its state donated; calls of all take turns, so that what else the machine does hits all alike,
-and the median is reported. An item is 21 numbers: the loops time the sampling, not the copying of images.
+One step draws 64 transitions from a full ring with their weights, gathers them and replaces their
+priorities. The samplers of this package stand beside flashbax's prioritised item buffer, with the
+same items and exponents. Each is a compiled loop of steps, its state donated; calls of all take
+turns, so that what else the machine does hits all alike, and the median is reported. An item is 21
+numbers: the loops time the sampling, not the copying of images.
 """
 
 import json
@@ -19,13 +20,18 @@ import jax.numpy as jnp
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import ReplayConfig
 from csac_jax.replay import ring, samplers
-from csac_jax.train import provenance
+from csac_jax.runtime import provenance
 
 BATCH = 64
 REPEATS = 101
 STEPS = 25  # in one call: short, so that most calls are not interrupted
 SORTED = 2**15  # items that one call of the beta sampler sorts at least
-ITEM = {"obs": jnp.zeros(16), "action": jnp.zeros(3), "reward": jnp.zeros(()), "terminated": jnp.zeros((), bool)}
+ITEM = {
+    "obs": jnp.zeros(16),
+    "action": jnp.zeros(3),
+    "reward": jnp.zeros(()),
+    "terminated": jnp.zeros((), bool),
+}
 
 Step = Callable[[Any, jax.Array], Any]
 
@@ -56,7 +62,7 @@ def _flashbax(capacity: int) -> tuple[Any, Step]:
     import flashbax
 
     cfg = ReplayConfig()
-    exponent = 0.5 * (cfg.weight_start + cfg.weight_end)
+    exponent = 0.5 * (cfg.is_beta_start + cfg.is_beta_end)
     buffer = flashbax.make_prioritised_item_buffer(
         max_length=capacity,
         min_length=1,
@@ -68,22 +74,25 @@ def _flashbax(capacity: int) -> tuple[Any, Step]:
     items = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), ITEM)
     state = buffer.add(buffer.init(ITEM), items)
     errors = jnp.exp(jax.random.normal(jax.random.key(0), (capacity,)))
-    state = buffer.set_priorities(state, jnp.arange(capacity), errors + cfg.floor)
+    state = buffer.set_priorities(state, jnp.arange(capacity), errors + cfg.per_epsilon)
 
     def step(state: Any, key: jax.Array) -> Any:
         drawn = buffer.sample(state, key)
         weights = (capacity * drawn.probabilities) ** -exponent
         errors = _new_errors(drawn.indices, drawn.experience, weights / jnp.max(weights))
-        return buffer.set_priorities(state, drawn.indices, jnp.abs(errors) + cfg.floor)
+        return buffer.set_priorities(state, drawn.indices, jnp.abs(errors) + cfg.per_epsilon)
 
     return state, step
 
 
 def _timer(state: Any, step: Step, steps: int) -> Callable[[], float]:
-    """A function that runs `steps` steps, going on from the last call's state, and returns the seconds per step."""
+    """A function that runs `steps` steps, going on from the last call's state, and returns the
+    seconds per step."""
 
     def loop(state: Any, key: jax.Array) -> Any:
-        return jax.lax.scan(lambda s, i: (step(s, jax.random.fold_in(key, i)), None), state, jnp.arange(steps))[0]
+        return jax.lax.scan(
+            lambda s, i: (step(s, jax.random.fold_in(key, i)), None), state, jnp.arange(steps)
+        )[0]
 
     compiled = jax.jit(loop, donate_argnums=0)
     current = jax.block_until_ready(compiled(jax.tree.map(jnp.copy, state), jax.random.key(1)))
@@ -125,7 +134,9 @@ def _exponents(arguments: list[str]) -> range:
     if not arguments:
         return range(12, 21)
     if len(arguments) != 2 or not all(word.isdigit() for word in arguments):
-        raise BadArgumentsError("bench replay: give two exponents of 2, the smallest and the largest capacity, or none")
+        raise BadArgumentsError(
+            "bench replay: give two exponents of 2, the smallest and the largest capacity, or none"
+        )
     smallest, largest = map(int, arguments)
     if not 1 <= smallest <= largest <= 24:
         raise BadArgumentsError("bench replay: exponents must lie in 1 .. 24, the smaller first")
@@ -138,7 +149,9 @@ def main(arguments: list[str]) -> None:
     try:
         import flashbax  # noqa: F401
     except ImportError:
-        raise BadArgumentsError("bench replay needs flashbax; run: pip install 'csac-jax[bench]'") from None
+        raise BadArgumentsError(
+            "bench replay needs flashbax; run: pip install 'csac-jax[bench]'"
+        ) from None
     result = {
         "batch": BATCH,
         "item": {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in ITEM.items()},

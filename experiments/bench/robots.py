@@ -1,7 +1,9 @@
-"""Does the arm grasp as the floating hand does? As JSON: `csac-jax bench robots [--grasps N]`, in C MuJoCo.
+"""Does the arm grasp as the floating hand does? As JSON: `csac-jax bench robots [--grasps N]`, in C
+MuJoCo.
 
-The same grasps in the same settled piles of six, each pile turned by another yaw every time it is used, so that the arm
-stands otherwise. One grasp in four is beside the planned place, and turned, so that outcomes differ.
+The same grasps in the same settled piles of six, each pile turned by another yaw every time it is
+used, so that the arm stands otherwise. One grasp in four is beside the planned place, and turned,
+so that outcomes differ.
 """
 
 import collections
@@ -16,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import Config, RobotKind
+from csac_jax.constants import Outcome
 from csac_jax.env import Env
+from csac_jax.runtime import provenance
 from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, outcome, physics as simulation
-from csac_jax.sim.outcome import Outcome
 from csac_jax.sim.primitives import Action
-from csac_jax.train import provenance
 from experiments.bench._options import read
 from experiments.bench.parity import STREAM, TEN, pile_config
 
@@ -32,7 +34,9 @@ NOISE = (0.03, 0.03, 0.5)  # m, m, rad
 ROBOTS: tuple[RobotKind, ...] = ("hand", "ur5")
 
 
-def _outcomes(cfg: Config, kind: RobotKind, scenes: Scene, height: jax.Array, actions: Action) -> np.ndarray:
+def _outcomes(
+    cfg: Config, kind: RobotKind, scenes: Scene, height: jax.Array, actions: Action
+) -> np.ndarray:
     """Outcome of every grasp with this robot [n]."""
     sim = dataclasses.replace(cfg.sim, robot=kind, physics="c")
     engine = simulation.make(model.build(cfg.scene, sim), sim)
@@ -41,11 +45,15 @@ def _outcomes(cfg: Config, kind: RobotKind, scenes: Scene, height: jax.Array, ac
     @jax.vmap
     def grasp(scene: Scene, height: jax.Array, action: Action) -> jax.Array:
         _, trace, plan = simulation.execute(engine, sim, cfg.heightmap, scene, height, action)
-        return outcome.grasp_outcome(trace, plan.surface, plan.start[2] - jnp.min(plan.control[:, 2]))
+        return outcome.grasp_outcome(
+            trace, plan.surface, plan.start[2] - jnp.min(plan.control[:, 2])
+        )
 
     every = (scenes, height, actions)
     count = len(actions.primitive)
-    rows = [jax.tree.map(lambda leaf, i=i: leaf[i : i + BATCH], every) for i in range(0, count, BATCH)]
+    rows = [
+        jax.tree.map(lambda leaf, i=i: leaf[i : i + BATCH], every) for i in range(0, count, BATCH)
+    ]
     return np.concatenate([np.asarray(grasp(*row)) for row in rows])
 
 
@@ -69,7 +77,12 @@ def measure(grasps: int) -> dict[str, Any]:
         kind: {level.name.lower(): collections.Counter(rows.tolist())[level] for level in Outcome}
         for kind, rows in found.items()
     }
-    return {"grasps": grasps, "outcome_equal": float(equal.mean()), "equal": int(equal.sum()), "outcomes": counts}
+    return {
+        "grasps": grasps,
+        "outcome_equal": float(equal.mean()),
+        "equal": int(equal.sum()),
+        "outcomes": counts,
+    }
 
 
 def main(arguments: list[str]) -> None:

@@ -1,15 +1,17 @@
-"""Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics mjx|warp|c|auto]
-[--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A --largest B] [SETTING ...]`, PRESET `quick`
-if none is given, physics `auto`, settings as `csac-jax train` takes them: `--learn.updates 64`.
+"""Where the time of a training step goes, as JSON: `csac-jax bench step [PRESET] [--physics
+mjx|warp|c|auto] [--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A
+--largest B] [SETTING ...]`, PRESET `quick` if none is given, physics `auto`, settings as `csac-jax
+train` takes them: `--learn.updates 64`.
 
-Each stage of `train_step` is compiled by itself and timed beside the whole step, a compiled loop of STEPS (2) steps as
-in training, and beside a bare loop of the engine's own steps of the same scenes and set-points: in one process, turn by
-turn, the median of REPEATS (5) rounds, so that what else the machine does hits all alike. Trust ratios. `learn` is
-taken apart once more, into single calls: `draw` a batch, its `next_value`, `update_critic` with that inside, and
-`update_actor`.
+Each stage of `train_step` is compiled by itself and timed beside the whole step, a compiled loop of
+STEPS (2) steps as in training, and beside a bare loop of the engine's own steps of the same scenes
+and set-points: in one process, turn by turn, the median of REPEATS (5) rounds, so that what else
+the machine does hits all alike. Trust ratios. `learn` is taken apart once more, into single calls:
+`draw` a batch, its `next_value`, `update_critic` with that inside, and `update_actor`.
 
-With --curve the whole step alone is timed at A, 2 A, 4 A .. B scenes, blocks, cells along a side of the map, or
-transitions in the ring; contact caps grow with the blocks. On an accelerator, `peak_bytes` is of all measured so far.
+With --curve the whole step alone is timed at A, 2 A, 4 A .. B scenes, blocks, cells along a side of
+the map, or transitions in the ring; contact caps grow with the blocks. On an accelerator,
+`peak_bytes` is of all measured so far.
 """
 
 import argparse
@@ -28,16 +30,19 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
-from csac_jax import env as environment, presets
+from csac_jax import presets
 from csac_jax.agent import learner as learning, policy, rewards
 from csac_jax.agent.learner import Transition
 from csac_jax.cli import parsing
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config, PhysicsKind
+from csac_jax.constants import CHANGE_AREA, Primitive
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
-from csac_jax.sim.primitives import Action, Primitive
-from csac_jax.train import auto, cache, compiler, provenance, step
+from csac_jax.runtime import cache, compiler, provenance
+from csac_jax.sim import auto
+from csac_jax.sim.primitives import Action
+from csac_jax.training import step
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
 from experiments.bench._options import Parser, config, split
@@ -60,7 +65,11 @@ def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[s
 @contextlib.contextmanager
 def _fresh_cache() -> Iterator[None]:
     """An empty cache of compiled programs, in place of the user's."""
-    names = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", "jax_persistent_cache_min_compile_time_secs")
+    names = (
+        "jax_compilation_cache_dir",
+        "jax_enable_compilation_cache",
+        "jax_persistent_cache_min_compile_time_secs",
+    )
     before = {name: getattr(jax.config, name) for name in names}
     with tempfile.TemporaryDirectory() as folder:
         for name, value in zip(names, (folder, True, 0.0), strict=True):
@@ -76,7 +85,8 @@ def _fresh_cache() -> Iterator[None]:
 
 
 def _compile_twice(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, Any]]:
-    """The compiled chunk, and what it took with an empty cache and with a filled one, tracing anew both times."""
+    """The compiled chunk, and what it took with an empty cache and with a filled one, tracing anew
+    both times."""
     with _fresh_cache():
         _, cold = _compile(program, state, steps)
         jax.clear_caches()
@@ -86,7 +96,8 @@ def _compile_twice(program: step.Program, state: Any, steps: int) -> tuple[Any, 
 
 
 def _compile_together(programs: dict[str, tuple[Any, tuple[Any, ...]]]) -> dict[str, Any]:
-    """Compiled programs from jitted functions and the arguments, or their shapes, that each is for; all at a time."""
+    """Compiled programs from jitted functions and the arguments, or their shapes, that each is for;
+    all at a time."""
     with concurrent.futures.ThreadPoolExecutor() as threads:
         compiled = threads.map(lambda pair: pair[0].lower(*pair[1]).compile(), programs.values())
         return dict(zip(programs, compiled, strict=True))
@@ -100,24 +111,34 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     span = learner.bounds[1] - learner.bounds[0]
     choose = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
 
-    def act(keys: jax.Array, maps: Any, idle: jax.Array) -> Action:
-        return choose(keys, cfg, learner.frames, maps, span, idle, jnp.int32(0))
+    def act(keys: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
+        return choose(keys, cfg, learner.frames, maps, span, steps_without_change, jnp.int32(0))
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         pushed = action.primitive == Primitive.PUSH
         phi = step._around(learner, nets.target, before.obs, after.obs, pushed)
-        changed = after.info.moved > environment.CHANGE_AREA
+        changed = after.info.moved > CHANGE_AREA
         info, of_one = after.info, jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
-        return of_one(cfg.reward, action.primitive, info.outcome, info.distance, *phi, changed, info.left)
+        return of_one(
+            cfg.reward,
+            action.primitive,
+            info.outcome,
+            info.distance,
+            *phi,
+            changed,
+            info.blocks_lost,
+        )
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
         seen = Transition(packed[0], action, jnp.zeros(num), packed[1], after.terminated)
-        return ring.add(replay, seen, ~after.info.ill)
+        return ring.add(replay, seen, ~after.info.physics_diverged)
 
     def replace(keys: jax.Array, after: Any) -> Any:
         fresh = jax.vmap(env.restart)(keys, after)
-        return jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
+        return jax.tree.map(
+            lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after
+        )
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
@@ -130,11 +151,11 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "replace": jax.jit(replace),
     }
     maps = jax.eval_shape(stages["look"], nets.online, scenes.obs)
-    action = jax.eval_shape(stages["act"], keys, maps, scenes.idle)
+    action = jax.eval_shape(stages["act"], keys, maps, scenes.steps_without_change)
     after = jax.eval_shape(stages["simulate"], scenes, action)
     shapes = {
         "look": (nets.online, scenes.obs),
-        "act": (keys, maps, scenes.idle),
+        "act": (keys, maps, scenes.steps_without_change),
         "simulate": (scenes, action),
         "reward": (nets, scenes, action, after),
         "remember": (state.replay, scenes, action, after),
@@ -144,7 +165,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     run = _compile_together({name: (stages[name], arguments) for name, arguments in shapes.items()})
 
     maps = run["look"](nets.online, scenes.obs)
-    action = run["act"](keys, maps, scenes.idle)
+    action = run["act"](keys, maps, scenes.steps_without_change)
     after = run["simulate"](scenes, action)
     replay = run["remember"](jax.tree.map(jnp.copy, state.replay), scenes, action, after)
     filled = jax.tree.map(jnp.copy, replay)
@@ -156,7 +177,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     calls: dict[str, Callable[[], Any]] = {
         "look": lambda: run["look"](nets.online, scenes.obs),
-        "act": lambda: run["act"](keys, maps, scenes.idle),
+        "act": lambda: run["act"](keys, maps, scenes.steps_without_change),
         "simulate": lambda: run["simulate"](scenes, action),
         "reward": lambda: run["reward"](nets, scenes, action, after),
         "remember": remember_again,
@@ -164,12 +185,15 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "replace": lambda: run["replace"](keys, after),
     }
     calls |= _learning(program, nets, filled)
-    calls["bare_loop"] = _bare.loop(env.physics, scenes.scene, _bare.drives(cfg, scenes.obs.height, action))
+    calls["bare_loop"] = _bare.loop(
+        env.physics, scenes.scene, _bare.drives(cfg, scenes.obs.height, action)
+    )
     return calls
 
 
 def _learning(program: step.Program, nets: Any, replay: Any) -> dict[str, Callable[[], Any]]:
-    """What learning is made of, each a call of a program of its own; a call of each but `update_actor` is an update."""
+    """What learning is made of, each a call of a program of its own; a call of each but
+    `update_actor` is an update."""
     cfg, learner = program.cfg, program.learner
     key, keys = jax.random.key(3), jax.random.split(jax.random.key(4), cfg.learn.batch)
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
@@ -178,9 +202,13 @@ def _learning(program: step.Program, nets: Any, replay: Any) -> dict[str, Callab
         maps = learning.look(learner, nets.target, heightmap.unpack(batch.next_obs))
         return jax.vmap(learning.next_value, (None, 0, 0))(learner, keys, maps)
 
-    draw = jit(lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5)))
+    draw = jit(
+        lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
+    )
     value = jit(next_value)
-    critic = jit(lambda nets, batch, weights: learning.update_critic(key, learner, nets, batch, weights))
+    critic = jit(
+        lambda nets, batch, weights: learning.update_critic(key, learner, nets, batch, weights)
+    )
     actor = jit(lambda nets, obs: learning.update_actor(learner, nets, heightmap.unpack(obs)))
     _, weights, batch = draw(replay)
     part = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
@@ -223,20 +251,25 @@ def _memory(chunk: Any) -> dict[str, int | None]:
 
 
 def _conv_gradient(conv: Callable[[jax.Array, jax.Array], jax.Array]) -> Callable[[], Any]:
-    """Two kernel gradients of a 3 x 3 convolution, 64 maps of 36 x 36, 16 to 16 channels, in `lax.scan`."""
+    """Two kernel gradients of a 3 x 3 convolution, 64 maps of 36 x 36, 16 to 16 channels, in
+    `lax.scan`."""
     maps = jax.random.normal(jax.random.key(0), (64, 36, 36, 16))
     kernel = jax.random.normal(jax.random.key(1), (3, 3, 16, 16))
     gradient = jax.grad(lambda kernel, shift: jnp.sum(conv(maps + shift, kernel) ** 2))
 
     def loop(kernel: jax.Array) -> jax.Array:
-        return jax.lax.scan(lambda total, i: (total + gradient(kernel, i), None), kernel, jnp.arange(2.0))[0]
+        return jax.lax.scan(
+            lambda total, i: (total + gradient(kernel, i), None), kernel, jnp.arange(2.0)
+        )[0]
 
     compiled = jax.jit(loop)
     return lambda: compiled(kernel)
 
 
 def _autodiff_conv(maps: jax.Array, kernel: jax.Array) -> jax.Array:
-    return jax.lax.conv_general_dilated(maps, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+    return jax.lax.conv_general_dilated(
+        maps, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
 
 
 def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
@@ -245,12 +278,17 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     state = step.init(program)
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
-    seconds = medians({**calls, "whole": _whole(chunk, jax.tree.map(jnp.copy, state))}, repeats)  # it uses it up
+    seconds = medians(
+        {**calls, "whole": _whole(chunk, jax.tree.map(jnp.copy, state))}, repeats
+    )  # it uses it up
     whole = seconds["whole"] / steps
     stages = {name: seconds[name] for name in _SEPARATE}
     total = sum(stages.values())
     bare = seconds["bare_loop"]
-    gradients = {"ours": lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1), "autodiff": _autodiff_conv}
+    gradients = {
+        "ours": lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1),
+        "autodiff": _autodiff_conv,
+    }
     return {
         "stage_seconds": stages,
         "stage_shares": {name: value / total for name, value in stages.items()},
@@ -262,7 +300,9 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
         "bare_loop_over_simulate": bare / stages["simulate"],
         "bare_loop_over_step": bare / whole,
         "compile_seconds": compiling,
-        "conv_gradients_in_scan": medians({name: _conv_gradient(conv) for name, conv in gradients.items()}, repeats),
+        "conv_gradients_in_scan": medians(
+            {name: _conv_gradient(conv) for name, conv in gradients.items()}, repeats
+        ),
         **_memory(chunk),
     }
 
@@ -299,9 +339,12 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
     state = step.init(program)
     chunk, compiling = _compile(program, state, steps)
     seconds = medians({"whole": _whole(chunk, state)}, repeats)["whole"] / steps
-    return {curve: value, "step_seconds": seconds, **_rates(cfg, seconds), "compile_seconds": compiling} | _memory(
-        chunk
-    )
+    return {
+        curve: value,
+        "step_seconds": seconds,
+        **_rates(cfg, seconds),
+        "compile_seconds": compiling,
+    } | _memory(chunk)
 
 
 def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
@@ -313,7 +356,9 @@ def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
         parser.add_argument(f"--{name}", type=int, default=default)
     preset, options, flags = split(parser, arguments)
     if preset not in presets.PRESETS:
-        raise BadArgumentsError(f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick")
+        raise BadArgumentsError(
+            f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick"
+        )
     if min(options.steps, options.repeats) < 1:
         raise BadArgumentsError("bench step: --steps, --repeats: at least 1")
     if options.curve is None:
@@ -323,7 +368,9 @@ def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
     smallest, largest = CURVES[options.curve]
     options.smallest, options.largest = options.smallest or smallest, options.largest or largest
     if not 1 <= options.smallest <= options.largest:
-        raise BadArgumentsError("bench step: --smallest, --largest: 1 <= smallest <= largest is needed")
+        raise BadArgumentsError(
+            "bench step: --smallest, --largest: 1 <= smallest <= largest is needed"
+        )
     return preset, options, flags
 
 
@@ -332,7 +379,7 @@ def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Confi
     if physics is None:
         physics = cfg.sim.physics if parsing.value_of(flags, "--sim.physics") else "auto"
     if physics == "warp":
-        cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, mesh_spread=0.0))
+        cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, mesh_size_jitter=0.0))
     return auto.resolve(dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=physics)))
 
 
@@ -346,17 +393,23 @@ def main(arguments: list[str]) -> None:
     try:
         cfg = _config(preset, flags, options.physics)
         points = (
-            [_at(cfg, options.curve, v) for v in _values(options.smallest, options.largest)] if options.curve else []
+            [_at(cfg, options.curve, v) for v in _values(options.smallest, options.largest)]
+            if options.curve
+            else []
         )
     except ValueError as error:
         raise BadArgumentsError(f"bench step: {error}") from None
-    result = {"preset": preset, "settings": flags, "physics": cfg.sim.physics, "scenes": cfg.train.scenes} | {
-        name: getattr(options, name) for name in ("steps", "repeats")
-    }
+    result = {
+        "preset": preset,
+        "settings": flags,
+        "physics": cfg.sim.physics,
+        "scenes": cfg.train.scenes,
+    } | {name: getattr(options, name) for name in ("steps", "repeats")}
     if options.curve:
         values = _values(options.smallest, options.largest)
         rows = [
-            _point(p, options.curve, v, options.steps, options.repeats) for p, v in zip(points, values, strict=True)
+            _point(p, options.curve, v, options.steps, options.repeats)
+            for p, v in zip(points, values, strict=True)
         ]
         result |= {"curve": options.curve, "points": rows}
     else:

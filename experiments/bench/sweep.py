@@ -1,12 +1,14 @@
-"""What seeds side by side cost, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices 1 ...] [--shard
-seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [SETTING ...]`, PRESET `quick` if none is given,
-physics the preset's, settings as `csac-jax train` takes them: `--train.scenes 64`.
+"""What seeds side by side cost, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices
+1 ...] [--shard seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [SETTING ...]`,
+PRESET `quick` if none is given, physics the preset's, settings as `csac-jax train` takes them:
+`--train.scenes 64`.
 
-For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of them: its compilation
-and the median of REPEATS (3) rounds after one that is not timed. With --shard seeds, numbers of seeds that the devices
-do not divide are left out. Beside a row of one seed on one device, `train` is its program as `csac-jax train` has it.
-`lanes` tells in how many shares seeds run that have the program to themselves, see csac_jax/train/lanes.py.
-Configurations follow one another, so that on a busy machine ratios are worth less than those of `bench step`.
+For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of
+them: its compilation and the median of REPEATS (3) rounds after one that is not timed. With --shard
+seeds, numbers of seeds that the devices do not divide are left out. Beside a row of one seed on one
+device, `train` is its program as `csac-jax train` has it. `lanes` tells in how many shares seeds
+run that have the program to themselves, see csac_jax/sweeps/pipelined.py. Configurations follow one
+another, so that on a busy machine ratios are worth less than those of `bench step`.
 """
 
 import dataclasses
@@ -19,12 +21,16 @@ import jax
 
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
-from csac_jax.train import auto, compiler, grid, lanes, members, mesh, provenance, step, sweep as sweeping
+from csac_jax.runtime import compiler, provenance
+from csac_jax.sim import auto
+from csac_jax.sweeps import grid, pipelined, replicas, sweep as sweeping
+from csac_jax.training import sharding, step
 from experiments.bench._options import Parser, config, split
 
 
 def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
-    """Seconds of the compilation and, the median, of a call that goes on where the last one ended."""
+    """Seconds of the compilation and, the median, of a call that goes on where the last one
+    ended."""
     begun = time.perf_counter()
     chunk = compiler.lower(jitted, state).compile()
     compiled = time.perf_counter() - begun
@@ -35,20 +41,32 @@ def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
         jax.block_until_ready((state, metrics))
         seconds.append(time.perf_counter() - begun)
     temporary = chunk.memory_analysis().temp_size_in_bytes
-    return {"compile_seconds": compiled, "seconds": statistics.median(seconds[1:]), "temporary_bytes": temporary}
+    return {
+        "compile_seconds": compiled,
+        "seconds": statistics.median(seconds[1:]),
+        "temporary_bytes": temporary,
+    }
 
 
-def measure(program: step.Program, seeds: int, devices: int, shard: mesh.Shard, steps: int, repeats: int) -> Any:
+def measure(
+    program: step.Program, seeds: int, devices: int, shard: sharding.Shard, steps: int, repeats: int
+) -> Any:
     """A row: `seeds` members on `devices` devices."""
-    cfg, line = program.cfg, mesh.make(devices)
-    mesh.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
-    (group,) = members.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
-    each = members.members(group)
-    in_lanes = lanes.number(cfg, seeds, line)
-    jitted = members.compile_chunk(program, each, steps, line, shard, in_lanes)
-    row = _timed(jitted, members.init(program, each, line, shard), repeats)
+    cfg, line = program.cfg, sharding.make(devices)
+    sharding.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
+    (group,) = replicas.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
+    each = replicas.members(group)
+    in_lanes = pipelined.number(cfg, seeds, line)
+    jitted = replicas.compile_chunk(program, each, steps, line, shard, in_lanes)
+    row = _timed(jitted, replicas.init(program, each, line, shard), repeats)
     rate = seeds * cfg.train.scenes * steps / row["seconds"]
-    return {"seeds": seeds, "devices": devices, "lanes": in_lanes, **row, "actions_per_second": rate}
+    return {
+        "seeds": seeds,
+        "devices": devices,
+        "lanes": in_lanes,
+        **row,
+        "actions_per_second": rate,
+    }
 
 
 def _config(preset: str, flags: list[str], options: Any) -> Config:
@@ -72,7 +90,9 @@ def main(arguments: list[str]) -> None:
     try:
         cfg = _config(preset, flags, options)
         for devices in options.devices:
-            mesh.check(mesh.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch)
+            sharding.check(
+                sharding.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch
+            )
             most = sweeping.Plan(max(options.seeds), [sweeping.Setting(grid.BASE, {}, cfg)])
             sweeping.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
@@ -80,7 +100,9 @@ def main(arguments: list[str]) -> None:
     program = step.make(cfg)
     with_train = 1 in options.seeds and 1 in options.devices
     alone = (
-        _timed(step.compile_chunk(program, options.steps), step.init(program), options.repeats) if with_train else None
+        _timed(step.compile_chunk(program, options.steps), step.init(program), options.repeats)
+        if with_train
+        else None
     )
     rows = [
         measure(program, seeds, devices, options.shard, options.steps, options.repeats)
@@ -88,6 +110,16 @@ def main(arguments: list[str]) -> None:
         for seeds in options.seeds
         if options.shard == "scenes" or seeds % devices == 0
     ]
-    sizes = {"scenes": cfg.train.scenes, "batch": cfg.learn.batch, "steps": options.steps, "shard": options.shard}
+    sizes = {
+        "scenes": cfg.train.scenes,
+        "batch": cfg.learn.batch,
+        "steps": options.steps,
+        "shard": options.shard,
+    }
     sizes |= {"physics": cfg.sim.physics, "settings": flags}
-    print(json.dumps({"preset": cfg.preset, **sizes, "train": alone, "rows": rows, **provenance.record()}, indent=2))
+    print(
+        json.dumps(
+            {"preset": cfg.preset, **sizes, "train": alone, "rows": rows, **provenance.record()},
+            indent=2,
+        )
+    )

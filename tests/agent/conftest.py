@@ -21,7 +21,9 @@ def cfg() -> Config:
     """The smallest preset with eight yaws, and a run so long that no schedule moves on."""
     net = NetConfig(rotations=8, growth=4, dilations=(1, 2), stem=4, head=8)
     smoke = presets.smoke()
-    return dataclasses.replace(smoke, net=net, train=dataclasses.replace(smoke.train, actions=1_000_000))
+    return dataclasses.replace(
+        smoke, net=net, train=dataclasses.replace(smoke.train, actions=1_000_000)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -36,11 +38,15 @@ def learner(cfg: Config) -> Learner:
 
 @pytest.fixture(scope="session")
 def randomised() -> Callable[[LearnerState], LearnerState]:
-    """Gives networks whose every parameter is random, so that maps vary by about 1; target and online differ."""
+    """Gives networks whose every parameter is random, so that maps vary by about 1; target and
+    online differ."""
 
     def noisy(params, seed: int):
         rng = np.random.default_rng(seed)
-        return jax.tree.map(lambda leaf: leaf + jnp.asarray(rng.normal(scale=0.2, size=leaf.shape), leaf.dtype), params)
+        return jax.tree.map(
+            lambda leaf: leaf + jnp.asarray(rng.normal(scale=0.2, size=leaf.shape), leaf.dtype),
+            params,
+        )
 
     return lambda state: state.replace(online=noisy(state.online, 0), target=noisy(state.target, 1))
 
@@ -56,7 +62,11 @@ def observations(cfg: Config) -> Callable[[int, int], Observation]:
         for scene in range(num):
             for _ in range(4):
                 row, col = rng.integers(1, size - 7, 2)
-                block = scene, slice(row, row + rng.integers(2, 7)), slice(col, col + rng.integers(2, 7))
+                block = (
+                    scene,
+                    slice(row, row + rng.integers(2, 7)),
+                    slice(col, col + rng.integers(2, 7)),
+                )
                 height[block] = rng.uniform(0.02, 0.06)
                 colour[block] = rng.uniform(size=3)
         return Observation(

@@ -13,10 +13,11 @@ from scipy.stats import chisquare, kstest
 from csac_jax import geometry, presets
 from csac_jax.agent import augment, maps
 from csac_jax.agent.learner import Transition
+from csac_jax.constants import Primitive
 from csac_jax.env import Env
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, rotate
 
 FLAGS = list(itertools.product((False, True), repeat=3))
@@ -56,7 +57,9 @@ POSE = np.array([0.071, -0.033, 0.6])
 look = jax.jit(Env(CFG, None, None).look)
 
 
-def _transition(obs: heightmap.Observation, primitive: int = 0, pose: np.ndarray = POSE) -> Transition:
+def _transition(
+    obs: heightmap.Observation, primitive: int = 0, pose: np.ndarray = POSE
+) -> Transition:
     packed = heightmap.pack(obs)
     action = Action(primitive=jnp.int32(primitive), pose=jnp.asarray(pose, jnp.float32))
     return Transition(packed, action, jnp.float32(0.5), packed, jnp.array(True))
@@ -69,16 +72,19 @@ def transition() -> Transition:
 
 
 def _turned_scene(matrix: np.ndarray) -> Scene:
-    """The same blocks in the turned or mirrored workspace: every block is its own mirror image in its x."""
+    """The same blocks in the turned or mirrored workspace: every block is its own mirror image in
+    its x."""
     body = np.diag([np.linalg.det(matrix), 1.0, 1.0])
     return _scene(Rotation.from_matrix(matrix @ ROTATION.as_matrix() @ body), POSITION @ matrix.T)
 
 
 @pytest.mark.parametrize("flags", FLAGS)
 def test_view_is_that_of_the_mirrored_scene(transition, flags):
-    """Claim: the camera sees the mirrored, turned scene as the map turned over, to a tenth of a millimetre.
+    """Claim: the camera sees the mirrored, turned scene as the map turned over, to a tenth of a
+    millimetre.
 
-    Heights everywhere, colours of the table: the light does not turn, so that sloping faces differ in brightness.
+    Heights everywhere, colours of the table: the light does not turn, so that sloping faces differ
+    in brightness.
     """
     seen = heightmap.pack(look(_turned_scene(_matrix(flags))))
     turned = _turn(flags, transition)
@@ -101,19 +107,26 @@ def test_colours_turn_too():
         matrix = _matrix(flags)
         body = np.diag([np.linalg.det(matrix), 1.0, 1.0])
         turned = _scene(Rotation.from_matrix(matrix @ flat.as_matrix() @ body), POSITION @ matrix.T)
-        seen = heightmap.pack(look(turned.replace(position=turned.position.at[2].set(jnp.array([3.0, 0.0, 1.0])))))
-        off = np.abs(np.asarray(seen.colour, int) - np.asarray(_turn(flags, transition).obs.colour, int)).max(axis=-1)
+        seen = heightmap.pack(
+            look(turned.replace(position=turned.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))))
+        )
+        off = np.abs(
+            np.asarray(seen.colour, int) - np.asarray(_turn(flags, transition).obs.colour, int)
+        ).max(axis=-1)
         assert np.mean(off > 1) < 0.003
 
 
 @pytest.mark.parametrize("flags", FLAGS)
 def test_action_turns_with_the_scene(transition, flags):
-    """Claim: place and direction of the action are those of the turned workspace, yaw in [0, 2 pi); the rest stays."""
+    """Claim: place and direction of the action are those of the turned workspace, yaw in [0, 2 pi);
+    the rest stays."""
     matrix = _matrix(flags)[:2, :2]
     turned = _turn(flags, transition)
     x, y, yaw = np.asarray(turned.action.pose)
     np.testing.assert_allclose([x, y], matrix @ POSE[:2], atol=1e-7)
-    np.testing.assert_allclose([np.cos(yaw), np.sin(yaw)], matrix @ [np.cos(POSE[2]), np.sin(POSE[2])], atol=1e-6)
+    np.testing.assert_allclose(
+        [np.cos(yaw), np.sin(yaw)], matrix @ [np.cos(POSE[2]), np.sin(POSE[2])], atol=1e-6
+    )
     assert 0.0 <= yaw < 2.0 * np.pi
     assert turned.action.primitive == 0
     assert turned.reward == 0.5
@@ -122,7 +135,8 @@ def test_action_turns_with_the_scene(transition, flags):
 
 @pytest.mark.parametrize("flags", FLAGS)
 def test_reading_under_the_action_stays(transition, flags):
-    """Claim: the height under the action's place, and whether the action is valid, are the same before and after."""
+    """Claim: the height under the action's place, and whether the action is valid, are the same
+    before and after."""
 
     def height(transition: Transition) -> jax.Array:
         cell = geometry.to_pixel(CFG.heightmap, transition.action.pose[:2])
@@ -139,7 +153,8 @@ def test_reading_under_the_action_stays(transition, flags):
     move = jax.vmap(
         lambda pose: (
             augment.turn_over(
-                transition.replace(action=transition.action.replace(pose=pose)), *(jnp.array(flag) for flag in flags)
+                transition.replace(action=transition.action.replace(pose=pose)),
+                *(jnp.array(flag) for flag in flags),
             ).action.pose
         )
     )
@@ -155,7 +170,8 @@ def _signature(transition: Transition) -> tuple:
 
 
 def test_they_form_a_group(transition):
-    """Claim: the eight differ, each flag undoes itself, and any two in a row are one of the eight, action included."""
+    """Claim: the eight differ, each flag undoes itself, and any two in a row are one of the eight,
+    action included."""
     images = {_signature(_turn(flags, transition)): flags for flags in FLAGS}
     assert len(images) == 8
     for single in np.eye(3, dtype=bool):
@@ -174,7 +190,9 @@ def test_randomly_draws_all_eight_alike(transition):
     small = transition.replace(
         obs=jax.tree.map(
             lambda leaf: leaf[:2, :2],
-            transition.obs.replace(height=heights.at[:2, :2].set(jnp.array([[1, 2], [3, 4]], jnp.uint16))),
+            transition.obs.replace(
+                height=heights.at[:2, :2].set(jnp.array([[1, 2], [3, 4]], jnp.uint16))
+            ),
         ),
         next_obs=jax.tree.map(lambda leaf: leaf[:2, :2], transition.next_obs),
     )
@@ -196,8 +214,9 @@ def _shifted(cells: tuple[int, int]) -> Scene:
 
 @pytest.mark.parametrize("cells", [(0, 0), (2, 1), (-1, 3)])
 def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
-    """Claim: a shift by whole cells gives height, colour and target mask of the shifted scene, table that comes in
-    included, and moves the action as far; another shift takes it back, cell by cell."""
+    """Claim: a shift by whole cells gives height, colour and target mask of the shifted scene,
+    table that comes in included, and moves the action as far; another shift takes it back, cell by
+    cell."""
     moved = move(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
     seen = heightmap.pack(look(_shifted(cells)))
     for obs in (moved.obs, moved.next_obs):
@@ -206,7 +225,9 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
         off = np.abs(np.asarray(seen.colour, int) - np.asarray(obs.colour, int)).max(axis=-1)
         assert np.mean(off > 1) < 0.005
         np.testing.assert_array_equal(seen.target, obs.target)
-    np.testing.assert_allclose(moved.action.pose, np.add(POSE, [cells[1] * CELL, cells[0] * CELL, 0.0]), atol=1e-6)
+    np.testing.assert_allclose(
+        moved.action.pose, np.add(POSE, [cells[1] * CELL, cells[0] * CELL, 0.0]), atol=1e-6
+    )
     back = move(moved, jnp.float32(0.0), -jnp.array(cells, jnp.int32))
     assert _signature(back) == _signature(transition)
 
@@ -215,24 +236,33 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
 def test_quarter_turns_are_exact(transition, turns):
     """Claim: a quarter turn only permutes cells."""
     moved = move(transition, jnp.float32(turns * np.pi / 2), jnp.zeros(2, jnp.int32))
-    np.testing.assert_array_equal(moved.obs.height, np.rot90(transition.obs.height, -turns))  # rows point up
+    np.testing.assert_array_equal(
+        moved.obs.height, np.rot90(transition.obs.height, -turns)
+    )  # rows point up
     np.testing.assert_array_equal(moved.obs.colour, np.rot90(transition.obs.colour, -turns))
 
 
 @pytest.mark.parametrize("yaw", [0.1, -0.37, 1.3, 3.0])
 def test_a_turn_is_exact_in_the_action_and_nearest_in_the_map(transition, yaw):
-    """Claim: place and yaw of the action turn with the scene; a cell shows what lies at most half a cell a side from
-    its place in the map before."""
+    """Claim: place and yaw of the action turn with the scene; a cell shows what lies at most half a
+    cell a side from its place in the map before."""
     index = np.arange(32, dtype=np.uint16)
     place = np.asarray(geometry.cell_centres(CFG.heightmap))
     source = np.asarray(geometry.rotate2d(jnp.float32(-yaw), jnp.asarray(place)))
     inside = np.abs(source).max(-1) < 0.5 * CFG.heightmap.extent - 1e-6
-    for axis, ramp in enumerate((np.tile(index, (32, 1)), np.tile(index[:, None], (1, 32)))):  # x, y in low counts
+    for axis, ramp in enumerate(
+        (np.tile(index, (32, 1)), np.tile(index[:, None], (1, 32)))
+    ):  # x, y in low counts
         flat = transition.obs.replace(height=jnp.asarray(ramp))
-        moved = move(transition.replace(obs=flat, next_obs=flat), jnp.float32(yaw), jnp.zeros(2, jnp.int32))
+        moved = move(
+            transition.replace(obs=flat, next_obs=flat), jnp.float32(yaw), jnp.zeros(2, jnp.int32)
+        )
         shown = (np.asarray(moved.obs.height) + 0.5) * CELL - 0.5 * CFG.heightmap.extent
         assert np.abs(shown - source[..., axis])[inside].max() <= 0.5 * CELL + 1e-6
-        assert np.all(np.asarray(moved.obs.height)[np.abs(source).max(-1) > 0.5 * CFG.heightmap.extent + 1e-6] == 0)
+        assert np.all(
+            np.asarray(moved.obs.height)[np.abs(source).max(-1) > 0.5 * CFG.heightmap.extent + 1e-6]
+            == 0
+        )
     x, y, turned = np.asarray(moved.action.pose)
     cos, sin = np.cos(yaw), np.sin(yaw)
     np.testing.assert_allclose([x, y], np.array([[cos, -sin], [sin, cos]]) @ POSE[:2], atol=1e-6)
@@ -240,7 +270,8 @@ def test_a_turn_is_exact_in_the_action_and_nearest_in_the_map(transition, yaw):
 
 
 def test_what_would_be_cut_off_stays(transition):
-    """Claim: a shift that would push a block, the place of an action or the end of a push out leaves all as it was."""
+    """Claim: a shift that would push a block, the place of an action or the end of a push out
+    leaves all as it was."""
     still = jnp.float32(0.0)
     bare = transition.replace(
         obs=transition.obs.replace(height=jnp.zeros((32, 32), jnp.uint16)),
@@ -253,7 +284,13 @@ def test_what_would_be_cut_off_stays(transition):
         (bare, (0, 12), Primitive.GRASP, POSE, False),  # the place out
         (bare, (0, 6), Primitive.GRASP, POSE, True),
         (bare, (0, 6), Primitive.PUSH, POSE, False),  # the end of the push out
-        (bare, (0, -6), Primitive.PUSH, np.array([0.2, 0.0, 0.0]), False),  # which was cut off before
+        (
+            bare,
+            (0, -6),
+            Primitive.PUSH,
+            np.array([0.2, 0.0, 0.0]),
+            False,
+        ),  # which was cut off before
     )
     for before, cells, primitive, pose, goes in cases:
         action = Action(primitive=jnp.int32(primitive), pose=jnp.asarray(pose, jnp.float32))
@@ -264,43 +301,59 @@ def test_what_would_be_cut_off_stays(transition):
 
 
 BORDERED = dataclasses.replace(CFG, net=dataclasses.replace(CFG.net, border=True))
-move_border = jax.jit(lambda transition, cells: augment.move(BORDERED, transition, jnp.float32(0.0), cells))
+move_border = jax.jit(
+    lambda transition, cells: augment.move(BORDERED, transition, jnp.float32(0.0), cells)
+)
 
 
 def test_the_border_moves_along(transition):
-    """Claim: with `net.border` what comes in beside the workspace is marked, all else as without; the net is fed the
-    border where it would be, had the workspace moved with its blocks."""
+    """Claim: with `net.border` what comes in beside the workspace is marked, all else as without;
+    the net is fed the border where it would be, had the workspace moved with its blocks."""
     cells = jnp.array([2, 1], jnp.int32)
     moved, plain = move_border(transition, cells), move(transition, jnp.float32(0.0), cells)
     beyond = np.zeros((32, 32), bool)
     beyond[:2] = beyond[:, :1] = True
     for obs, wanted in zip((moved.obs, moved.next_obs), (plain.obs, plain.next_obs), strict=True):
         seen = heightmap.unpack(obs)
-        np.testing.assert_array_equal(seen.height, np.where(beyond, heightmap.BEYOND, heightmap.unpack(wanted).height))
-        fed = np.asarray(maps.net_inputs(maps.frames(BORDERED), seen))[0]  # the frame that is not turned
+        np.testing.assert_array_equal(
+            seen.height, np.where(beyond, heightmap.BEYOND, heightmap.unpack(wanted).height)
+        )
+        fed = np.asarray(maps.net_inputs(maps.frames(BORDERED), seen))[
+            0
+        ]  # the frame that is not turned
         np.testing.assert_array_equal(fed[..., -1], np.pad(~beyond, 2))
-        np.testing.assert_array_equal(fed[..., :-1], maps.net_inputs(FRAMES, heightmap.unpack(wanted))[0])
+        np.testing.assert_array_equal(
+            fed[..., :-1], maps.net_inputs(FRAMES, heightmap.unpack(wanted))[0]
+        )
     assert not np.array_equal(moved.obs.height, transition.obs.height)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(
-    ("cell", "step", "goes"), [(26, 1, True), (27, 1, False), (27, -1, True), (1, 1, True), (4, -1, False)]
+    ("cell", "step", "goes"),
+    [(26, 1, True), (27, 1, False), (27, -1, True), (1, 1, True), (4, -1, False)],
 )
-def test_nothing_comes_near_a_border_that_is_none(transition, axis: int, cell: int, step: int, goes: bool):
-    """Claim: with `net.border` a shift that brings what stands within 5 cm of the side it goes to is left out, as the
-    net would see a border there; at the other side, whose border moves along, it is not."""
+def test_nothing_comes_near_a_border_that_is_none(
+    transition, axis: int, cell: int, step: int, goes: bool
+):
+    """Claim: with `net.border` a shift that brings what stands within 5 cm of the side it goes to
+    is left out, as the net would see a border there; at the other side, whose border moves along,
+    it is not."""
     height = np.zeros((32, 32), np.uint16)
-    height[(cell, 16) if axis == 0 else (16, cell)] = 500  # 14 mm cells: the centre of cell 27 is 161 mm off, of 28 175
+    height[(cell, 16) if axis == 0 else (16, cell)] = (
+        500  # 14 mm cells: the centre of cell 27 is 161 mm off, of 28 175
+    )
     lone = transition.obs.replace(height=jnp.asarray(height))
     cells = jnp.array([step, 0] if axis == 0 else [0, step], jnp.int32)
-    lone = transition.replace(obs=lone, next_obs=lone, action=transition.action.replace(primitive=jnp.int32(1)))
+    lone = transition.replace(
+        obs=lone, next_obs=lone, action=transition.action.replace(primitive=jnp.int32(1))
+    )
     assert (not np.array_equal(move_border(lone, cells).obs.height, height)) == goes
 
 
 def test_vary_is_what_the_config_says(transition):
-    """Claim: by default `vary` draws the same symmetry as `randomly`; shifts and turns stay in their bounds and reach
-    them; with everything off it changes nothing."""
+    """Claim: by default `vary` draws the same symmetry as `randomly`; shifts and turns stay in
+    their bounds and reach them; with everything off it changes nothing."""
     same = jax.jit(augment.vary, static_argnums=1)
     for seed in range(3):
         default, randomly = (
@@ -309,7 +362,9 @@ def test_vary_is_what_the_config_says(transition):
         )
         jax.tree.map(np.testing.assert_array_equal, default, randomly)
     off = dataclasses.replace(CFG, learn=dataclasses.replace(CFG.learn, augment=False))
-    jax.tree.map(np.testing.assert_array_equal, same(jax.random.key(0), off, transition), transition)
+    jax.tree.map(
+        np.testing.assert_array_equal, same(jax.random.key(0), off, transition), transition
+    )
     wide = dataclasses.replace(off, learn=dataclasses.replace(off.learn, augment_shift=2))
     keys = jax.random.split(jax.random.key(1), 300)
     poses = jax.jit(jax.vmap(lambda key: augment.vary(key, wide, transition).action.pose))(keys)

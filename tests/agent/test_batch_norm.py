@@ -1,4 +1,5 @@
-"""DenseNet with batch norm in the learner: which statistics count when, and what gradients touch."""
+"""DenseNet with batch norm in the learner: which statistics count when, and what gradients
+touch."""
 
 import dataclasses
 from typing import Any
@@ -18,7 +19,14 @@ from csac_jax.vision import heightmap
 pytestmark = pytest.mark.optax
 B = 4
 NET = NetConfig(
-    kind="densenet121", norm="batch", rotations=4, block_layers=(1, 1, 1, 1), block_growth=4, head=8, margin=0.0, zoom=2
+    kind="densenet121",
+    norm="batch",
+    rotations=4,
+    block_layers=(1, 1, 1, 1),
+    block_growth=4,
+    head=8,
+    margin=0.0,
+    zoom=2,
 )
 
 
@@ -51,7 +59,9 @@ def batch(observations) -> Transition:
     pose = np.random.default_rng(5).uniform(-0.2, 0.2, (B, 3))
     return Transition(
         obs=heightmap.pack(observations(B, 1)),
-        action=Action(primitive=jnp.arange(B, dtype=jnp.int32) % 2, pose=jnp.asarray(pose, jnp.float32)),
+        action=Action(
+            primitive=jnp.arange(B, dtype=jnp.int32) % 2, pose=jnp.asarray(pose, jnp.float32)
+        ),
         reward=jnp.linspace(-1.0, 1.0, B),
         next_obs=heightmap.pack(observations(B, 2)),
         terminated=jnp.ones(B, bool),
@@ -61,7 +71,11 @@ def batch(observations) -> Transition:
 @pytest.fixture(scope="module")
 def update(learner):
     """(state, batch) -> state, info of one update of the critic."""
-    return jax.jit(lambda state, batch: learning.update_critic(jax.random.key(3), learner, state, batch, jnp.ones(B)))
+    return jax.jit(
+        lambda state, batch: learning.update_critic(
+            jax.random.key(3), learner, state, batch, jnp.ones(B)
+        )
+    )
 
 
 @pytest.fixture
@@ -70,11 +84,17 @@ def updated(state, batch, update):
 
 
 def _differ(first: Any, other: Any) -> bool:
-    return all(np.any(a != b) for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True))
+    return all(
+        np.any(a != b) for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True)
+    )
 
 
 def _kernels(variables: Any) -> list[jax.Array]:
-    return [leaf for path, leaf in jax.tree_util.tree_leaves_with_path(variables) if path[-1].key == "kernel"]
+    return [
+        leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(variables)
+        if path[-1].key == "kernel"
+    ]
 
 
 def _same(first: Any, other: Any) -> None:
@@ -82,7 +102,8 @@ def _same(first: Any, other: Any) -> None:
 
 
 def test_acting_uses_running_statistics(learner, state, observations):
-    """Claim: a state's maps do not depend on what else is looked at, but on the running statistics of both nets."""
+    """Claim: a state's maps do not depend on what else is looked at, but on the running statistics
+    of both nets."""
     look = jax.jit(lambda params, obs: learning.look(learner, params, obs))
     obs = observations(2, 4)
     others = jax.tree.map(lambda leaf: leaf.at[1].set(jnp.zeros((), leaf.dtype)), obs)
@@ -92,16 +113,22 @@ def test_acting_uses_running_statistics(learner, state, observations):
     assert np.any(np.abs(both.q[1] - one.q[1]) > 1e-2)
     for net, maps in (("critic", "q"), ("actor", "logits")):
         variables = getattr(state.online, net)
-        moved = {**variables, "batch_stats": jax.tree.map(lambda leaf: leaf + 0.3, variables["batch_stats"])}
+        moved = {
+            **variables,
+            "batch_stats": jax.tree.map(lambda leaf: leaf + 0.3, variables["batch_stats"]),
+        }
         after = look(state.online.replace(**{net: moved}), obs)
         assert np.abs(getattr(after, maps) - getattr(both, maps)).max() > 1e-2
 
 
 @pytest.mark.slow
 def test_learning_uses_the_batchs_statistics(state, batch, update, updated):
-    """Claim: while learning, Q(s, a) of a transition depends on the batch, and not on the running statistics."""
+    """Claim: while learning, Q(s, a) of a transition depends on the batch, and not on the running
+    statistics."""
     flat = jax.tree.map(lambda leaf: leaf.at[1:].set(jnp.zeros((), leaf.dtype)), batch.obs)
-    assert abs(float(update(state, batch.replace(obs=flat))[1].error[0] - updated[1].error[0])) > 1e-3
+    assert (
+        abs(float(update(state, batch.replace(obs=flat))[1].error[0] - updated[1].error[0])) > 1e-3
+    )
     critic = state.online.critic
     moved = {**critic, "batch_stats": jax.tree.map(lambda leaf: leaf + 1.0, critic["batch_stats"])}
     other = update(state.replace(online=state.online.replace(critic=moved)), batch)
@@ -110,15 +137,19 @@ def test_learning_uses_the_batchs_statistics(state, batch, update, updated):
 
 @pytest.mark.slow
 def test_gradients_change_parameters_only(learner, state, batch, update, updated):
-    """Claim: an update moves every kernel, and the running statistics to 0.9 of what they were and 0.1 of the batch's,
-    whatever the gradient; the optimisers know of no statistics."""
+    """Claim: an update moves every kernel, and the running statistics to 0.9 of what they were and
+    0.1 of the batch's, whatever the gradient; the optimisers know of no statistics."""
     before, after = state.online.critic, updated[0].online.critic
     assert _differ(_kernels(before), _kernels(after))
     shifted = jax.tree.map(lambda leaf: leaf + 1.0, before["batch_stats"])
     online = state.online.replace(critic={**before, "batch_stats": shifted})
-    again = update(state.replace(online=online), batch.replace(reward=batch.reward + 1.0))[0].online.critic
+    again = update(state.replace(online=online), batch.replace(reward=batch.reward + 1.0))[
+        0
+    ].online.critic
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a - b, 0.9, atol=1e-4), again["batch_stats"], after["batch_stats"]
+        lambda a, b: np.testing.assert_allclose(a - b, 0.9, atol=1e-4),
+        again["batch_stats"],
+        after["batch_stats"],
     )
     assert _differ(before["batch_stats"], after["batch_stats"])
     assert _differ(again["params"]["head"]["conv1"], after["params"]["head"]["conv1"])
@@ -130,7 +161,10 @@ def test_gradients_change_parameters_only(learner, state, batch, update, updated
         (fresh.online.actor, fresh.actor_optimiser),
     ):
         learned = sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
-        assert [leaf.size for leaf in jax.tree.leaves(optimiser) if leaf.ndim] == [learned, learned]  # Adam's moments
+        assert [leaf.size for leaf in jax.tree.leaves(optimiser) if leaf.ndim] == [
+            learned,
+            learned,
+        ]  # Adam's moments
 
 
 @pytest.mark.slow
@@ -139,16 +173,22 @@ def test_targets_follow_statistics_too(learner, state, updated):
     tau = learner.cfg.learn.tau
     online, target = updated[0].online.critic, state.target.critic
     wanted = jax.tree.map(lambda new, old: tau * new + (1.0 - tau) * old, online, target)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), updated[0].target.critic, wanted)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), updated[0].target.critic, wanted
+    )
     assert _differ(updated[0].target.critic["batch_stats"], target["batch_stats"])
 
 
 @pytest.mark.slow
 def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
-    """Claim: an update of the actor moves its parameters and statistics, and none of the critic's."""
+    """Claim: an update of the actor moves its parameters and statistics, and none of the
+    critic's."""
     obs = heightmap.unpack(batch.obs)
     after, _ = jax.jit(lambda state: learning.update_actor(learner, state, obs))(state)
     assert _differ(state.online.actor["batch_stats"], after.online.actor["batch_stats"])
-    assert np.any(state.online.actor["params"]["conv1"]["kernel"] != after.online.actor["params"]["conv1"]["kernel"])
+    assert np.any(
+        state.online.actor["params"]["conv1"]["kernel"]
+        != after.online.actor["params"]["conv1"]["kernel"]
+    )
     _same(state.online.critic, after.online.critic)
     _same(state.target, after.target)

@@ -15,8 +15,11 @@ CELLS = 2.0 * (jnp.arange(32, dtype=jnp.float32) + 0.5) / 32 - 1.0  # centres of
 YAWS = jnp.arange(16, dtype=jnp.float32) / 8 - 1.0
 
 
-def peaks(centres: jax.Array, heights: jax.Array, widths: jax.Array, action: jax.Array) -> jax.Array:
-    """Highest of P bell curves at `action` [3]; the maximum of the map is the largest height, at its centre."""
+def peaks(
+    centres: jax.Array, heights: jax.Array, widths: jax.Array, action: jax.Array
+) -> jax.Array:
+    """Highest of P bell curves at `action` [3]; the maximum of the map is the largest height, at
+    its centre."""
     offset = action[None] - centres
     offset = jnp.stack([offset[:, 0], offset[:, 1], box.wrap(offset[:, 2])], axis=-1)
     return jnp.max(heights * jnp.exp(-0.5 * jnp.sum(offset**2, axis=-1) / widths**2))
@@ -29,19 +32,31 @@ def best_pixels(score: cem.Score, num: int) -> jax.Array:
     return poses[jax.lax.top_k(jax.vmap(score)(poses), num)[1]]
 
 
-def search(cfg: CEMConfig, score: cem.Score, mean: jax.Array, start: jax.Array = NO_START, seed: int = 0, num: int = 1):
+def search(
+    cfg: CEMConfig,
+    score: cem.Score,
+    mean: jax.Array,
+    start: jax.Array = NO_START,
+    seed: int = 0,
+    num: int = 1,
+):
     """Results of `num` searches, leaves [num, ...]."""
     keys = jax.random.split(jax.random.key(seed), num)
-    return jax.jit(jax.vmap(lambda key: cem.maximise(key, cfg, score, mean, start, box.POSE_WRAPS)))(keys)
+    return jax.jit(
+        jax.vmap(lambda key: cem.maximise(key, cfg, score, mean, start, box.POSE_WRAPS))
+    )(keys)
 
 
 def search_random_map(key: jax.Array, num_start: int) -> tuple[jax.Array, jax.Array]:
-    """Value that the search finds on a random map of one to five peaks, and its best pixel's, in maxima."""
+    """Value that the search finds on a random map of one to five peaks, and its best pixel's, in
+    maxima."""
     key_num, key_centre, key_height, key_width, key_mean, key_search = jax.random.split(key, 6)
     present = jnp.arange(5) < jax.random.randint(key_num, (), 1, 6)
     heights = jnp.where(present, jax.random.uniform(key_height, (5,), minval=0.3, maxval=1.0), 0.0)
     widths = jax.random.uniform(key_width, (5,), minval=0.12, maxval=0.3)
-    score = functools.partial(peaks, jax.random.uniform(key_centre, (5, 3), minval=-1.0), heights, widths)
+    score = functools.partial(
+        peaks, jax.random.uniform(key_centre, (5, 3), minval=-1.0), heights, widths
+    )
     pixels = best_pixels(score, 8)
     mean = jax.random.uniform(key_mean, (3,), minval=-1.0)
     result = cem.maximise(key_search, CEMConfig(), score, mean, pixels[:num_start], box.POSE_WRAPS)
@@ -55,23 +70,31 @@ def found_on_random_maps(num_start: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_best_pixels_lead_to_the_global_peak():
-    """Claim: from the 8 best pixels of a map of one to five peaks, 98 % of searches end near the top of the highest."""
+    """Claim: from the 8 best pixels of a map of one to five peaks, 98 % of searches end near the
+    top of the highest."""
     found, pixel = found_on_random_maps(8)
     assert np.mean(found >= 0.94) >= 0.98
     assert np.all(found >= pixel)
-    assert np.mean(found >= 0.99) > 0.75 > 0.35 > np.mean(pixel >= 0.99)  # it does better than the pixel that it had
+    assert (
+        np.mean(found >= 0.99) > 0.75 > 0.35 > np.mean(pixel >= 0.99)
+    )  # it does better than the pixel that it had
 
 
 def test_peaks_are_hard_to_find_without_best_pixels():
-    """Claim: without them, from a random proposal, fewer than half do: the test above asks for something."""
+    """Claim: without them, from a random proposal, fewer than half do: the test above asks for
+    something."""
     found, _ = found_on_random_maps(0)
     assert np.mean(found >= 0.94) < 0.5
 
 
-@pytest.mark.parametrize(("mean_yaw", "peak_yaw"), [(0.9, -0.95), (-0.9, 0.95), (0.8, -1.0), (-0.8, -1.0)])
+@pytest.mark.parametrize(
+    ("mean_yaw", "peak_yaw"), [(0.9, -0.95), (-0.9, 0.95), (0.8, -1.0), (-0.8, -1.0)]
+)
 def test_yaw_is_searched_across_the_seam(mean_yaw, peak_yaw):
     """Claim: a peak on the other side of yaw = +-1 is as near as it looks on the circle."""
-    score = functools.partial(peaks, jnp.array([[0.1, -0.2, peak_yaw]]), jnp.ones(1), jnp.full(1, 0.2))
+    score = functools.partial(
+        peaks, jnp.array([[0.1, -0.2, peak_yaw]]), jnp.ones(1), jnp.full(1, 0.2)
+    )
     cfg = CEMConfig(std=0.15, rounds=4)
     found = search(cfg, score, jnp.array([0.1, -0.2, mean_yaw]), num=100)
     assert np.mean(found.value > 0.98) >= 0.98
@@ -84,14 +107,17 @@ def test_more_rounds_come_nearer(spread):
     score = functools.partial(peaks, peak[None], jnp.ones(1), jnp.ones(1))
 
     def median_miss(rounds):
-        found = search(CEMConfig(std=0.2, rounds=rounds, spread=spread), score, jnp.zeros(3), num=100)
+        found = search(
+            CEMConfig(std=0.2, rounds=rounds, std_estimator=spread), score, jnp.zeros(3), num=100
+        )
         return np.median(np.linalg.norm(found.action - peak[None], axis=-1))
 
     assert median_miss(6) < 0.02 < 0.15 < median_miss(1)
 
 
 def test_best_sample_is_kept():
-    """Claim: the result is the best sample ever seen: a needle among the starting points survives all rounds."""
+    """Claim: the result is the best sample ever seen: a needle among the starting points survives
+    all rounds."""
     needle = jnp.array([0.7, 0.7, 0.0])
 
     def score(action):
@@ -104,7 +130,9 @@ def test_best_sample_is_kept():
 
 def test_samples_stay_in_the_box():
     """Claim: no sample leaves the box: a score that pays only outside it is never paid."""
-    outside = lambda action: jnp.where(jnp.any(jnp.abs(action) > 1.0) | (action[2] == 1.0), 1.0, 0.0)  # noqa: E731
+    outside = lambda action: jnp.where(
+        jnp.any(jnp.abs(action) > 1.0) | (action[2] == 1.0), 1.0, 0.0
+    )  # noqa: E731
     cfg, mean, start = CEMConfig(std=2.0), jnp.array([1.5, -1.0, 0.99]), jnp.full((2, 3), 1.0)
     assert search(cfg, outside, mean, start).value[0] == 0.0
 
@@ -117,7 +145,8 @@ def test_nan_scores_rank_last():
 
 
 def test_no_score_at_all():
-    """Claim: if no score is a number, the action is the proposal, in the box, and the value -inf."""
+    """Claim: if no score is a number, the action is the proposal, in the box, and the value
+    -inf."""
     score = lambda action: jnp.nan * action[0]  # noqa: E731
     result = search(CEMConfig(), score, jnp.array([0.2, 2.0, 1.25]))
     np.testing.assert_allclose(result.action[0], [0.2, 1.0, -0.75], atol=1e-6)
@@ -125,9 +154,12 @@ def test_no_score_at_all():
 
 
 def test_search_goes_on_where_no_score_was_found():
-    """Claim: a round without any value leaves mean and spread as they are, so that later rounds may still find one."""
+    """Claim: a round without any value leaves mean and spread as they are, so that later rounds may
+    still find one."""
     score = lambda action: jnp.where(jnp.max(jnp.abs(action - 0.25)) < 0.06, 1.0, -jnp.inf)  # noqa: E731
-    found = search(CEMConfig(rounds=40), score, jnp.zeros(3), num=50)  # a sample hits with probability 0.0014
+    found = search(
+        CEMConfig(rounds=40), score, jnp.zeros(3), num=50
+    )  # a sample hits with probability 0.0014
     assert np.mean(found.value == 1.0) > 0.8
 
 
@@ -135,31 +167,42 @@ def test_start_must_fit():
     """Claim: more starting points than candidates is an error that names the setting."""
     with pytest.raises(ValueError, match=r"cem\.candidates"):
         cem.maximise(
-            jax.random.key(0), CEMConfig(candidates=8), jnp.sum, jnp.zeros(3), jnp.zeros((9, 3)), box.POSE_WRAPS
+            jax.random.key(0),
+            CEMConfig(candidates=8),
+            jnp.sum,
+            jnp.zeros(3),
+            jnp.zeros((9, 3)),
+            box.POSE_WRAPS,
         )
 
 
 def test_keys_differ():
     """Claim: one key gives one result, two keys two."""
-    first, again, other = (search(CEMConfig(), jnp.sum, jnp.zeros(3), seed=seed).action[0] for seed in (0, 0, 1))
+    first, again, other = (
+        search(CEMConfig(), jnp.sum, jnp.zeros(3), seed=seed).action[0] for seed in (0, 0, 1)
+    )
     np.testing.assert_array_equal(first, again)
     assert first[2] != other[2]
 
 
 def test_fit_by_hand():
-    """Claim: line 12 by hand: elites 0.1, 0.2, 0.6 have mean 0.3, deviation sqrt(0.14 / 3), absolute one 0.6 / 2."""
+    """Claim: line 12 by hand: elites 0.1, 0.2, 0.6 have mean 0.3, deviation sqrt(0.14 / 3),
+    absolute one 0.6 / 2."""
     elites, valid, wraps = jnp.array([[0.1], [0.2], [0.6]]), jnp.ones(3, bool), jnp.zeros(1, bool)
     mean, std = cem.fit(CEMConfig(), elites, valid, wraps)
-    _, mad = cem.fit(CEMConfig(spread="mad"), elites, valid, wraps)
+    _, mad = cem.fit(CEMConfig(std_estimator="mad"), elites, valid, wraps)
     np.testing.assert_allclose([mean[0], std[0], mad[0]], [0.3, np.sqrt(0.14 / 3), 0.3], rtol=1e-6)
 
 
 def test_fit_across_the_seam():
-    """Claim: elites 0.9, -0.9, -1.0 on a circle have mean 1 = -1 and the spread of -0.1, 0.1, 0; not on a line."""
+    """Claim: elites 0.9, -0.9, -1.0 on a circle have mean 1 = -1 and the spread of -0.1, 0.1, 0;
+    not on a line."""
     elites, valid = jnp.array([[0.9], [-0.9], [-1.0]]), jnp.ones(3, bool)
     mean, std = cem.fit(CEMConfig(), elites, valid, jnp.ones(1, bool))
     np.testing.assert_allclose([abs(mean[0]), std[0]], [1.0, np.sqrt(0.02 / 3)], atol=1e-6)
-    np.testing.assert_allclose(cem.fit(CEMConfig(), elites, valid, jnp.zeros(1, bool))[0], [-1.0 / 3.0], atol=1e-6)
+    np.testing.assert_allclose(
+        cem.fit(CEMConfig(), elites, valid, jnp.zeros(1, bool))[0], [-1.0 / 3.0], atol=1e-6
+    )
 
 
 def test_fit_leaves_out_invalid_elites():
@@ -168,30 +211,58 @@ def test_fit_leaves_out_invalid_elites():
     mean, _ = cem.fit(CEMConfig(), elites, jnp.array([True, True, False]), jnp.zeros(1, bool))
     np.testing.assert_allclose(mean, [0.2], atol=1e-6)
     for spread in ("std", "mad"):
-        cfg = CEMConfig(spread=spread)
-        np.testing.assert_allclose(cem.fit(cfg, elites, jnp.arange(3) < 1, jnp.zeros(1, bool))[1], [cfg.std_min])
+        cfg = CEMConfig(std_estimator=spread)
+        np.testing.assert_allclose(
+            cem.fit(cfg, elites, jnp.arange(3) < 1, jnp.zeros(1, bool))[1], [cfg.std_min]
+        )
 
 
 def test_wrap():
-    """Claim: wrapping moves by whole turns into [-1, 1), never to 1 itself, from just below the seam either."""
-    u = jnp.array([-3.2, -1.0, -0.5, 0.0, 0.99, 1.0, 1.5, 7.25, np.nextafter(np.float32(-1.0), np.float32(-2.0))])
-    np.testing.assert_allclose(box.wrap(u), [0.8, -1.0, -0.5, 0.0, 0.99, -1.0, -0.5, -0.75, 1.0], atol=1e-6)
+    """Claim: wrapping moves by whole turns into [-1, 1), never to 1 itself, from just below the
+    seam either."""
+    u = jnp.array(
+        [
+            -3.2,
+            -1.0,
+            -0.5,
+            0.0,
+            0.99,
+            1.0,
+            1.5,
+            7.25,
+            np.nextafter(np.float32(-1.0), np.float32(-2.0)),
+        ]
+    )
+    np.testing.assert_allclose(
+        box.wrap(u), [0.8, -1.0, -0.5, 0.0, 0.99, -1.0, -0.5, -0.75, 1.0], atol=1e-6
+    )
     assert np.all(box.wrap(u) < 1.0)
 
 
 def test_last_rounds_are_what_the_search_tries():
-    """Claim: `last_round` gives the samples of the last round: the best of all rounds' is the result of the search."""
-    score = functools.partial(peaks, jnp.array([[0.3, -0.2, 0.9]]), jnp.array([1.0]), jnp.array([0.3]))
+    """Claim: `last_round` gives the samples of the last round: the best of all rounds' is the
+    result of the search."""
+    score = functools.partial(
+        peaks, jnp.array([[0.3, -0.2, 0.9]]), jnp.array([1.0]), jnp.array([0.3])
+    )
     mean, start = jnp.array([-0.4, 0.5, -0.7]), jnp.array([[-0.6, 0.7, -0.4], [-0.5, 0.5, -0.5]])
     key = jax.random.key(5)
     cfgs = [CEMConfig(rounds=rounds, candidates=16) for rounds in (1, 2, 3)]
-    last = [lambda key, cfg=cfg: cem.last_round(key, cfg, score, mean, start, box.POSE_WRAPS) for cfg in cfgs]
+    last = [
+        lambda key, cfg=cfg: cem.last_round(key, cfg, score, mean, start, box.POSE_WRAPS)
+        for cfg in cfgs
+    ]
     tried = [jax.jit(one)(key) for one in last]
     assert all(actions.shape == (16, 3) for actions in tried)
     every = jnp.concatenate(tried)
-    found = jax.jit(lambda key: cem.maximise(key, cfgs[-1], score, mean, start, box.POSE_WRAPS))(key)
+    found = jax.jit(lambda key: cem.maximise(key, cfgs[-1], score, mean, start, box.POSE_WRAPS))(
+        key
+    )
     values = jax.vmap(score)(every)
     np.testing.assert_allclose(found.value, values.max(), atol=1e-6)
     np.testing.assert_allclose(found.action, every[values.argmax()], atol=1e-6)
-    away = [float(jnp.mean(jnp.linalg.norm(actions[:, :2] - jnp.array([[0.3, -0.2]]), axis=1))) for actions in tried]
+    away = [
+        float(jnp.mean(jnp.linalg.norm(actions[:, :2] - jnp.array([[0.3, -0.2]]), axis=1)))
+        for actions in tried
+    ]
     assert away[2] < away[1] < away[0]

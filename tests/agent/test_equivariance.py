@@ -22,7 +22,13 @@ SIZE = 96
 NETS = {
     "small": NetConfig(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8, margin=0.5),
     "densenet121": NetConfig(
-        kind="densenet121", rotations=K, block_layers=(1, 1, 1, 1), block_growth=8, head=8, margin=0.5, zoom=2
+        kind="densenet121",
+        rotations=K,
+        block_layers=(1, 1, 1, 1),
+        block_growth=8,
+        head=8,
+        margin=0.5,
+        zoom=2,
     ),
 }
 
@@ -38,21 +44,29 @@ class Fixed(NamedTuple):
 @pytest.fixture(scope="module", params=list(NETS))
 def net(request, cfg) -> Fixed:
     """Either net, random in every parameter; nothing but `look` is compiled."""
-    learner = learning.make(dataclasses.replace(cfg, net=NETS[request.param], heightmap=HeightmapConfig(size=SIZE)))
+    learner = learning.make(
+        dataclasses.replace(cfg, net=NETS[request.param], heightmap=HeightmapConfig(size=SIZE))
+    )
     rng = np.random.default_rng(0)
     with jax.numpy_dtype_promotion("standard"):
         abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner)).online
-    params = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), abstract)
+    params = jax.tree.map(
+        lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), abstract
+    )
     return Fixed(learner, params, jax.jit(lambda params, obs: learning.look(learner, params, obs)))
 
 
 def _hills(seed: int, yaw: float) -> Observation:
-    """One scene of five smooth coloured hills within 0.17 m of the centre, turned by `yaw`, leaves [1, ...]."""
+    """One scene of five smooth coloured hills within 0.17 m of the centre, turned by `yaw`, leaves
+    [1, ...]."""
     rng = np.random.default_rng(seed)
     size, extent = SIZE, 0.448
     along = (np.arange(size) + 0.5) / size * extent - 0.5 * extent
     x, y = along[None, :], along[:, None]
-    x, y = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x  # where it was before
+    x, y = (
+        np.cos(yaw) * x + np.sin(yaw) * y,
+        np.cos(yaw) * y - np.sin(yaw) * x,
+    )  # where it was before
     height, colour = np.zeros((size, size)), np.zeros((size, size, 3))
     for _ in range(4):
         distance, angle, turn = rng.uniform(0.0, 0.12), *rng.uniform(0.0, 2.0 * np.pi, 2)
@@ -85,23 +99,34 @@ def _best(fixed: Fixed, seen: DenseMaps, yaws: list[int]) -> tuple[int, np.ndarr
 
 def _turned(pose: np.ndarray, yaw: float) -> np.ndarray:
     cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.append(np.array([[cos, -sin], [sin, cos]]) @ pose[:2], np.mod(pose[2] + yaw, 2.0 * np.pi))
+    return np.append(
+        np.array([[cos, -sin], [sin, cos]]) @ pose[:2], np.mod(pose[2] + yaw, 2.0 * np.pi)
+    )
 
 
 def _value(fixed: Fixed, seen: DenseMaps, primitive: int, pose: np.ndarray) -> float:
-    return float(maps.read(fixed.learner.frames, seen.q[0], jnp.int32(primitive), jnp.asarray(pose, jnp.float32)))
+    return float(
+        maps.read(
+            fixed.learner.frames, seen.q[0], jnp.int32(primitive), jnp.asarray(pose, jnp.float32)
+        )
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_quarter_turn(net, seed):
-    """Claim: of a scene turned by a quarter turn each net's maps are the same, a quarter turn on, and its best action
-    is the turned one, among yaws whose pass does not turn upside down with it."""
+    """Claim: of a scene turned by a quarter turn each net's maps are the same, a quarter turn on,
+    and its best action is the turned one, among yaws whose pass does not turn upside down with
+    it."""
     first = _kept(QUARTER)
     then = [k + QUARTER for k in first]
     obs = _hills(seed, 0.0)
     before, after = net.look(net.params, obs), net.look(net.params, _quarter(obs))
-    np.testing.assert_allclose(after.q[:, :, np.array(then)], before.q[:, :, np.array(first)], atol=1e-5)
-    np.testing.assert_array_equal(after.valid[:, :, np.array(then)], before.valid[:, :, np.array(first)])
+    np.testing.assert_allclose(
+        after.q[:, :, np.array(then)], before.q[:, :, np.array(first)], atol=1e-5
+    )
+    np.testing.assert_array_equal(
+        after.valid[:, :, np.array(then)], before.valid[:, :, np.array(first)]
+    )
     assert np.std(before.q) > 0.01
     (primitive, pose), (other, turned) = _best(net, before, first), _best(net, after, then)
     assert primitive == other
@@ -110,9 +135,9 @@ def test_quarter_turn(net, seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_yaw_step(net, seed):
-    """Claim: of a smooth scene turned by one yaw step, 30 degrees here, maps change by a twentieth of their spread at
-    most, those of DenseNet by a quarter, for cells are the nearest ones; and the turned best action is worth the best
-    one within as much."""
+    """Claim: of a smooth scene turned by one yaw step, 30 degrees here, maps change by a twentieth
+    of their spread at most, those of DenseNet by a quarter, for cells are the nearest ones; and the
+    turned best action is worth the best one within as much."""
     first = _kept(1)
     then = [k + 1 for k in first]
     before, after = (net.look(net.params, _hills(seed, yaw)) for yaw in (0.0, 2.0 * np.pi / K))
@@ -126,7 +151,8 @@ def test_one_yaw_step(net, seed):
 
 
 def _symmetric(params: Any) -> Any:
-    """The small net made blind to a half turn: kernels that are their own half turn, a push back worth one ahead."""
+    """The small net made blind to a half turn: kernels that are their own half turn, a push back
+    worth one ahead."""
 
     def fold(path: Any, leaf: jax.Array) -> jax.Array:
         if leaf.ndim >= 4 and path[-1].key == "kernel":  # [M, k, k, I, O] of the critic
@@ -139,7 +165,8 @@ def _symmetric(params: Any) -> Any:
 @pytest.mark.parametrize("net", ["small"], indirect=True)
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_every_yaw_of_a_symmetric_net(net, quarters):
-    """Claim: of a small net that is blind to half turns, as the gripper is, all maps of all yaws turn with the scene.
+    """Claim: of a small net that is blind to half turns, as the gripper is, all maps of all yaws
+    turn with the scene.
 
     The features of DenseNet-121 do not lie symmetrically in its input: it has to learn this.
     """
@@ -150,4 +177,6 @@ def test_every_yaw_of_a_symmetric_net(net, quarters):
     after = net.look(params, obs)
     for name in ("q", "valid"):
         maps_before, maps_after = (np.asarray(getattr(seen, name)) for seen in (before, after))
-        np.testing.assert_allclose(np.roll(maps_before, quarters * QUARTER, axis=2), maps_after, atol=1e-5)
+        np.testing.assert_allclose(
+            np.roll(maps_before, quarters * QUARTER, axis=2), maps_after, atol=1e-5
+        )

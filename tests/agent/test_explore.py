@@ -18,7 +18,9 @@ def choices(cfg: ExploreConfig, taken: int, primitive: int = 1) -> tuple[np.ndar
     """Primitives [NUM] and poses [NUM, 3] under as many keys."""
     greedy = explore.Greedy(jnp.int32(primitive), GREEDY_POSES)
     keys = jax.random.split(jax.random.key(0), NUM)
-    choose = jax.jit(jax.vmap(lambda key: explore.choose(key, cfg, jnp.int32(taken), greedy, RANDOM_PLACES)))
+    choose = jax.jit(
+        jax.vmap(lambda key: explore.choose(key, cfg, jnp.int32(taken), greedy, RANDOM_PLACES))
+    )
     primitives, poses = choose(keys)
     return np.asarray(primitives), np.asarray(poses)
 
@@ -30,18 +32,27 @@ def assert_share(event: np.ndarray, expected: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("actions", "expected"), [(0, 0.5), (1, 0.499), (100, 0.5 * 0.998**100), (5000, 0.1), (10**6, 0.1)]
+    ("actions", "expected"),
+    [(0, 0.5), (1, 0.499), (100, 0.5 * 0.998**100), (5000, 0.1), (10**6, 0.1)],
 )
 def test_probability(actions, expected):
     """Claim: max(end, start decay^actions), by hand."""
-    np.testing.assert_allclose(explore.probability(0.5, 0.1, 0.998, jnp.int32(actions)), expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        explore.probability(0.5, 0.1, 0.998, jnp.int32(actions)), expected, rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("taken", [0, 300, 10**6])
 def test_shares_of_primitives_and_places(taken):
-    """Claim: pushes come with eps push_fraction, random places with their own eps, both as of the actions taken."""
+    """Claim: pushes come with eps push_fraction, random places with their own eps, both as of the
+    actions taken."""
     cfg = ExploreConfig(
-        primitive_start=0.5, primitive_end=0.1, place_start=0.5, place_end=0.02, decay=0.998, push_fraction=0.25
+        epsilon_primitive_start=0.5,
+        epsilon_primitive_end=0.1,
+        epsilon_place_start=0.5,
+        epsilon_place_end=0.02,
+        decay=0.998,
+        push_fraction=0.25,
     )
     primitives, poses = choices(cfg, taken)
     assert_share(primitives == 0, max(0.1, 0.5 * 0.998**taken) * 0.25)
@@ -50,8 +61,9 @@ def test_shares_of_primitives_and_places(taken):
 
 
 def test_pose_belongs_to_the_primitive():
-    """Claim: a forced primitive acts at its own greedy pose up to the noise, or at its own random place exactly."""
-    cfg = ExploreConfig(primitive_start=1.0, push_fraction=0.5)
+    """Claim: a forced primitive acts at its own greedy pose up to the noise, or at its own random
+    place exactly."""
+    cfg = ExploreConfig(epsilon_primitive_start=1.0, push_fraction=0.5)
     primitives, poses = choices(cfg, 0)
     greedy = np.asarray(GREEDY_POSES)[primitives]
     offset = (poses - greedy + 1.0) % 2.0 - 1.0
@@ -64,7 +76,13 @@ def test_pose_belongs_to_the_primitive():
 
 def test_no_exploration_is_greedy():
     """Claim: with all probabilities and the noise at 0, the greedy action is taken as it is."""
-    cfg = ExploreConfig(primitive_start=0.0, primitive_end=0.0, place_start=0.0, place_end=0.0, noise_std=0.0)
+    cfg = ExploreConfig(
+        epsilon_primitive_start=0.0,
+        epsilon_primitive_end=0.0,
+        epsilon_place_start=0.0,
+        epsilon_place_end=0.0,
+        noise_std=0.0,
+    )
     for primitive in (0, 1):
         primitives, poses = choices(cfg, 0, primitive)
         assert np.all(primitives == primitive)
@@ -72,7 +90,8 @@ def test_no_exploration_is_greedy():
 
 
 def test_action_noise_is_a_clipped_normal():
-    """Claim: in each dimension, noise has spread delta, is bounded by c, and is c as often as a normal passes it."""
+    """Claim: in each dimension, noise has spread delta, is bounded by c, and is c as often as a
+    normal passes it."""
     cfg = ExploreConfig(noise_std=0.05, noise_clip=0.1)
     keys = jax.random.split(jax.random.key(1), NUM)
     noise = np.asarray(jax.vmap(lambda key: explore.action_noise(key, cfg, jnp.zeros(3)))(keys))
@@ -89,7 +108,9 @@ def test_action_noise_stays_in_the_box():
     """Claim: x and y stop at the walls, yaw goes on on the other side."""
     keys = jax.random.split(jax.random.key(2), NUM)
     corner = jnp.array([1.0, -1.0, 0.999])
-    poses = np.asarray(jax.vmap(lambda key: explore.action_noise(key, ExploreConfig(), corner))(keys))
+    poses = np.asarray(
+        jax.vmap(lambda key: explore.action_noise(key, ExploreConfig(), corner))(keys)
+    )
     assert np.abs(poses).max() <= 1.0
     assert 0.4 < np.mean(poses[:, 0] == 1.0) < 0.6
     assert 0.4 < np.mean(poses[:, 2] < -0.8) < 0.6
@@ -106,7 +127,9 @@ def test_random_cell_is_uniform_over_valid_cells():
     assert stats.chisquare(count[np.asarray(valid)]).pvalue > 1e-4
 
 
-@pytest.mark.parametrize(("valid", "cell"), [([False] * 4, 0), ([False, False, False, True], 3), ([True], 0)])
+@pytest.mark.parametrize(
+    ("valid", "cell"), [([False] * 4, 0), ([False, False, False, True], 3), ([True], 0)]
+)
 def test_random_cell_edges(valid, cell):
     """Claim: the only valid cell is drawn, and cell 0 if there is none."""
     assert explore.random_cell(jax.random.key(0), jnp.array(valid)) == cell

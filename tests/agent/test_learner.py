@@ -12,8 +12,9 @@ from csac_jax.agent import actor, learner as learning, maps, softmax
 from csac_jax.agent.learner import Learner, LearnerState, Params, Transition
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import TargetConfig
+from csac_jax.constants import Primitive
 from csac_jax.nets import dense
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
 
 pytestmark = pytest.mark.optax
@@ -29,12 +30,17 @@ def state(learner, randomised) -> LearnerState:
 
 @pytest.fixture(scope="module")
 def batch(observations) -> Transition:
-    """B transitions: actions of both primitives anywhere in the workspace and at yaws all round; none terminated."""
+    """B transitions: actions of both primitives anywhere in the workspace and at yaws all round;
+    none terminated."""
     rng = np.random.default_rng(5)
-    pose = np.concatenate([rng.uniform(-0.2, 0.2, (B, 2)), rng.uniform(0.0, 2.0 * np.pi, (B, 1))], axis=1)
+    pose = np.concatenate(
+        [rng.uniform(-0.2, 0.2, (B, 2)), rng.uniform(0.0, 2.0 * np.pi, (B, 1))], axis=1
+    )
     return Transition(
         obs=heightmap.pack(observations(B, 1)),
-        action=Action(primitive=jnp.arange(B, dtype=jnp.int32) % 2, pose=jnp.asarray(pose, jnp.float32)),
+        action=Action(
+            primitive=jnp.arange(B, dtype=jnp.int32) % 2, pose=jnp.asarray(pose, jnp.float32)
+        ),
         reward=jnp.asarray(rng.uniform(-1.0, 2.0, B), jnp.float32),
         next_obs=heightmap.pack(observations(B, 2)),
         terminated=jnp.zeros(B, bool),
@@ -49,7 +55,9 @@ def update(learner):
     def one(state, batch, weights):
         return learning.update_critic(jax.random.key(3), learner, state, batch, weights)
 
-    return lambda state, batch, weights=None: one(state, batch, jnp.ones(B) if weights is None else weights)
+    return lambda state, batch, weights=None: one(
+        state, batch, jnp.ones(B) if weights is None else weights
+    )
 
 
 def _ended(batch: Transition) -> Transition:
@@ -60,22 +68,30 @@ def _constant(params: Params, value: float) -> Params:
     """The same networks, whose every map is `value`: all is 0 but the bias of the outputs."""
     zero = jax.tree.map(jnp.zeros_like, params.critic)
     is_bias = lambda leaf: leaf.shape[1:] == (dense.OUTPUTS,)  # noqa: E731  (axis 0 is the critics')
-    constant = jax.tree.map(lambda leaf: jnp.full_like(leaf, value) if is_bias(leaf) else leaf, zero)
+    constant = jax.tree.map(
+        lambda leaf: jnp.full_like(leaf, value) if is_bias(leaf) else leaf, zero
+    )
     return params.replace(critic=constant)
 
 
 def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
-    """Claim: Q(s, a) of the loss, from two passes, is the dense maps of the same parameters read at the action.
+    """Claim: Q(s, a) of the loss, from two passes, is the dense maps of the same parameters read at
+    the action.
 
-    Where everything ends the target is the reward, so that the error tells Q. Both primitives, poses all over.
+    Where everything ends the target is the reward, so that the error tells Q. Both primitives,
+    poses all over.
     """
     look = jax.jit(lambda params, obs: learning.look(learner, params, heightmap.unpack(obs)).q)
     read = jax.jit(jax.vmap(lambda q, p, pose: maps.read(learner.frames, q, p, pose)))
     q = look(state.online, batch.obs)
     rng = np.random.default_rng(0)
     for trial in range(12):
-        pose = np.concatenate([rng.uniform(-0.224, 0.224, (B, 2)), rng.uniform(0.0, 2.0 * np.pi, (B, 1))], axis=1)
-        action = Action(primitive=(batch.action.primitive + trial) % 2, pose=jnp.asarray(pose, jnp.float32))
+        pose = np.concatenate(
+            [rng.uniform(-0.224, 0.224, (B, 2)), rng.uniform(0.0, 2.0 * np.pi, (B, 1))], axis=1
+        )
+        action = Action(
+            primitive=(batch.action.primitive + trial) % 2, pose=jnp.asarray(pose, jnp.float32)
+        )
         tried = _ended(batch).replace(action=action)
         got = tried.reward - update(state, tried)[1].error
         np.testing.assert_allclose(got, read(q, action.primitive, action.pose), atol=2e-5)
@@ -83,36 +99,46 @@ def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
 
 
 def test_update_reports_its_loss(learner, state, batch, update):
-    """Claim: the loss is the mean Huber loss of the errors, `q` the mean value; an update is counted."""
+    """Claim: the loss is the mean Huber loss of the errors, `q` the mean value; an update is
+    counted."""
     after, info = update(state, batch)
     width = learner.cfg.learn.huber
-    np.testing.assert_allclose(info.critic_loss, np.mean(optax.huber_loss(info.error, delta=width)), rtol=1e-5)
+    np.testing.assert_allclose(
+        info.critic_loss, np.mean(optax.huber_loss(info.error, delta=width)), rtol=1e-5
+    )
     ended = update(state, _ended(batch))[1]
     np.testing.assert_allclose(ended.q, np.mean(batch.reward - ended.error), atol=1e-6)
     assert after.updates == state.updates + 1
 
 
 def test_losses_are_weighted(learner, state, batch, update):
-    """Claim: the loss is mean(weight * Huber loss), and a transition of weight 0 changes no network; errors and q are
-    those of the transitions, whatever their weights."""
+    """Claim: the loss is mean(weight * Huber loss), and a transition of weight 0 changes no
+    network; errors and q are those of the transitions, whatever their weights."""
     weights = jnp.array([0.0, 0.25, 1.0, 0.5, 0.0, 1.0])
     after, info = update(state, batch, weights)
     loss = optax.huber_loss(info.error, delta=learner.cfg.learn.huber)
-    np.testing.assert_allclose(info.critic_loss, np.mean(np.asarray(weights) * np.asarray(loss)), rtol=1e-5)
+    np.testing.assert_allclose(
+        info.critic_loss, np.mean(np.asarray(weights) * np.asarray(loss)), rtol=1e-5
+    )
     _, plain = update(state, batch)
     np.testing.assert_array_equal(info.error, plain.error)
     np.testing.assert_array_equal(info.q, plain.q)
-    other, _ = update(state, batch.replace(reward=batch.reward.at[jnp.array([0, 4])].add(3.0)), weights)
+    other, _ = update(
+        state, batch.replace(reward=batch.reward.at[jnp.array([0, 4])].add(3.0)), weights
+    )
     jax.tree.map(np.testing.assert_array_equal, after.online, other.online)
 
 
 def test_target_carries_no_gradient(learner, state, batch):
-    """Claim: the critic's loss has exactly no gradient in the target networks and the reward, but one in its own."""
+    """Claim: the critic's loss has exactly no gradient in the target networks and the reward, but
+    one in its own."""
 
     def loss(online, target, reward):
         before = state.replace(online=online, target=target)
         seen = batch.replace(reward=reward)
-        return learning.update_critic(jax.random.key(3), learner, before, seen, jnp.ones(B))[1].critic_loss
+        return learning.update_critic(jax.random.key(3), learner, before, seen, jnp.ones(B))[
+            1
+        ].critic_loss
 
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(state.online, state.target, batch.reward)
     online, target, reward = gradient
@@ -125,7 +151,11 @@ def test_critic_gradient_is_that_of_its_loss(learner, state, batch):
     """Claim: along the gradient, the reported loss changes as fast as finite differences say."""
     plain = dataclasses.replace(learner, critic_optimiser=optax.sgd(1.0))
     weights = jnp.linspace(0.2, 1.0, B)
-    run = jax.jit(lambda state: learning.update_critic(jax.random.key(3), plain, state, _ended(batch), weights))
+    run = jax.jit(
+        lambda state: learning.update_critic(
+            jax.random.key(3), plain, state, _ended(batch), weights
+        )
+    )
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.critic, after.online.critic)
     _check_slope(lambda critic: run(state.replace(online=state.online.replace(critic=critic)))[1].critic_loss,
@@ -137,16 +167,18 @@ def _check_slope(loss, params, gradient, relative: float = 1e-2, step: float = 2
     size = float(optax.tree.norm(gradient))
     assert size > 1e-4
     above, below = (
-        loss(jax.tree.map(lambda p, g, s=sign: p + s * step / size * g, params, gradient)) for sign in (1.0, -1.0)
+        loss(jax.tree.map(lambda p, g, s=sign: p + s * step / size * g, params, gradient))
+        for sign in (1.0, -1.0)
     )
     np.testing.assert_allclose((above - below) / (2.0 * step), size, rtol=relative)
 
 
 def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
-    """Claim: the policy gradient through the interpolated map is that of finite differences, to 1 in 1000.
+    """Claim: the policy gradient through the interpolated map is that of finite differences, to 1
+    in 1000.
 
-    The scenes are some in which no highest cell gives way to another within the step: there the pose jumps. The step is
-    so long that float32's rounding of the loss, 1e-8, is 1e-5 of the slope.
+    The scenes are some in which no highest cell gives way to another within the step: there the
+    pose jumps. The step is so long that float32's rounding of the loss, 1e-8, is 1e-5 of the slope.
     """
     plain = dataclasses.replace(learner, actor_optimiser=optax.sgd(1.0))
     run = jax.jit(lambda state: learning.update_actor(plain, state, observations(B, 4)))
@@ -162,16 +194,21 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
 
 
 def test_actor_climbs_the_critic(learner, state, batch):
-    """Claim: updates of the actor raise Q(s, mu(s)) and leave the critic and both targets as they are."""
+    """Claim: updates of the actor raise Q(s, mu(s)) and leave the critic and both targets as they
+    are."""
     run = jax.jit(lambda state: learning.update_actor(learner, state, heightmap.unpack(batch.obs)))
 
     @jax.jit
     def value(online: Params) -> jax.Array:
         """Mean of Q(s, mu(s)) over states and primitives."""
         seen = learning.look(learner, online, heightmap.unpack(batch.obs))
-        poses = [jax.vmap(lambda one, p=p: actor.pose(learner.frames, one, p))(seen) for p in Primitive]
+        poses = [
+            jax.vmap(lambda one, p=p: actor.pose(learner.frames, one, p))(seen) for p in Primitive
+        ]
         read = jax.vmap(maps.read, (None, 0, None, 0))
-        return jnp.mean(jnp.stack([read(learner.frames, seen.q, jnp.int32(p), poses[p]) for p in Primitive]))
+        return jnp.mean(
+            jnp.stack([read(learner.frames, seen.q, jnp.int32(p), poses[p]) for p in Primitive])
+        )
 
     current, first = run(state)
     for _ in range(60):
@@ -184,7 +221,8 @@ def test_actor_climbs_the_critic(learner, state, batch):
 
 
 def test_updates_lower_the_loss(state, batch, update):
-    """Claim: on one batch with fixed targets, 120 updates of the critic take away half of the squared error."""
+    """Claim: on one batch with fixed targets, 120 updates of the critic take away half of the
+    squared error."""
     current = state
     losses = []
     for _ in range(120):
@@ -195,22 +233,31 @@ def test_updates_lower_the_loss(state, batch, update):
 
 
 def test_target_moves_by_tau(learner, state, batch, update):
-    """Claim: theta' = tau theta + (1 - tau) theta' with the networks after the step, of critic and actor."""
+    """Claim: theta' = tau theta + (1 - tau) theta' with the networks after the step, of critic and
+    actor."""
     after, _ = update(state, batch)
     tau = learner.cfg.learn.tau
-    wanted = jax.tree.map(lambda new, old: tau * new + (1.0 - tau) * old, after.online, state.target)
-    jax.tree.map(lambda got, want: np.testing.assert_allclose(got, want, atol=1e-7), after.target, wanted)
-    moved = jax.tree.map(lambda new, old: float(np.abs(new - old).max()), after.online.critic, state.online.critic)
+    wanted = jax.tree.map(
+        lambda new, old: tau * new + (1.0 - tau) * old, after.online, state.target
+    )
+    jax.tree.map(
+        lambda got, want: np.testing.assert_allclose(got, want, atol=1e-7), after.target, wanted
+    )
+    moved = jax.tree.map(
+        lambda new, old: float(np.abs(new - old).max()), after.online.critic, state.online.critic
+    )
     assert all(change > 0.0 for change in jax.tree.leaves(moved))
 
 
 @pytest.mark.parametrize("value", [1.5, 100.0, -100.0])
 def test_bootstrap(learner, state, batch, update, value):
-    """Claim: y = r + gamma V(s') by the target critic, V kept within the possible returns; y = r after a true end."""
+    """Claim: y = r + gamma V(s') by the target critic, V kept within the possible returns; y = r
+    after a true end."""
     known = state.replace(target=_constant(state.target, value))
     half = jnp.arange(B) < B // 2
     going, ended, mixed = (
-        update(known, batch.replace(terminated=t))[1].error for t in (half & False, half | True, half)
+        update(known, batch.replace(terminated=t))[1].error
+        for t in (half & False, half | True, half)
     )
     gain = learner.cfg.target.gamma * np.clip(value, *learner.bounds)
     np.testing.assert_allclose(going - ended, gain, atol=1e-5)
@@ -221,7 +268,9 @@ def _smooth(frames) -> DenseMaps:
     """Smooth maps with a few peaks, all of whose cells are valid."""
     x, y, yaw = frames.xy[..., 0], frames.xy[..., 1], frames.yaws[:, None, None]
     push = np.sin(8.0 * x + 3.0) * np.cos(9.0 * y) + 0.3 * np.cos(yaw)
-    q = jnp.asarray(np.stack([push, np.cos(7.0 * x) * np.sin(8.0 * y - 1.0) - 0.2 * np.sin(yaw)]), jnp.float32)
+    q = jnp.asarray(
+        np.stack([push, np.cos(7.0 * x) * np.sin(8.0 * y - 1.0) - 0.2 * np.sin(yaw)]), jnp.float32
+    )
     return DenseMaps(q=q, logits=10.0 * q, valid=jnp.ones(q.shape, bool))
 
 
@@ -232,8 +281,8 @@ def _with_target(learner: Learner, **settings) -> Learner:
 
 @pytest.mark.slow
 def test_next_value_lies_within_the_map(learner):
-    """Claim: the softmax value is never outside of the map's values, grows with the inverse temperature, and comes near
-    the largest value."""
+    """Claim: the softmax value is never outside of the map's values, grows with the inverse
+    temperature, and comes near the largest value."""
     state = _smooth(learner.frames)
     low, high = float(state.q.min()), float(state.q.max())
     means = []
@@ -248,10 +297,13 @@ def test_next_value_lies_within_the_map(learner):
 
 
 def test_next_value_ignores_what_is_bare(learner):
-    """Claim: a primitive with nothing to act on does not count, whatever its map; if neither has, both do."""
+    """Claim: a primitive with nothing to act on does not count, whatever its map; if neither has,
+    both do."""
     q = jnp.stack([jnp.full((8, 18, 18), 3.0), jnp.full((8, 18, 18), 1.0)])
     assert q.shape[1:] == learner.frames.xy.shape[:3]
-    value = jax.jit(lambda valid: learning.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid)))
+    value = jax.jit(
+        lambda valid: learning.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
+    )
     grasps = jnp.zeros(q.shape, bool).at[Primitive.GRASP].set(True)
     np.testing.assert_allclose(value(grasps), 1.0, rtol=1e-5)
     np.testing.assert_allclose(value(~grasps), 3.0, rtol=1e-5)
@@ -259,7 +311,8 @@ def test_next_value_ignores_what_is_bare(learner):
 
 
 def test_best_grasp():
-    """Claim: the largest value over valid grasps, never a push's nor an invalid one's; 0 if nothing can be grasped."""
+    """Claim: the largest value over valid grasps, never a push's nor an invalid one's; 0 if nothing
+    can be grasped."""
     q = np.random.default_rng(0).normal(size=(2, 4, 6, 6)).astype(np.float32) - 3.0
     valid = np.random.default_rng(1).uniform(size=q.shape) < 0.2
     q[Primitive.PUSH] += 9.0
@@ -272,12 +325,18 @@ def test_best_grasp():
 def _changed(learner: Learner, section: str, **settings) -> Learner:
     """The same learner with other settings of one section."""
     cfg = learner.cfg
-    cfg = dataclasses.replace(cfg, **{section: dataclasses.replace(getattr(cfg, section), **settings)})
+    cfg = dataclasses.replace(
+        cfg, **{section: dataclasses.replace(getattr(cfg, section), **settings)}
+    )
     return dataclasses.replace(learner, cfg=cfg)
 
 
 def _run(learner: Learner):
-    return jax.jit(lambda state, batch: learning.update_critic(jax.random.key(3), learner, state, batch, jnp.ones(B)))
+    return jax.jit(
+        lambda state, batch: learning.update_critic(
+            jax.random.key(3), learner, state, batch, jnp.ones(B)
+        )
+    )
 
 
 def _random_maps(shape, seed: int = 0) -> DenseMaps:
@@ -289,13 +348,18 @@ def _random_maps(shape, seed: int = 0) -> DenseMaps:
 
 
 def test_max_target_is_the_best_valid_cell(learner):
-    """Claim: V(s') by `max` is NumPy's maximum over the valid cells of both primitives, the limit of the softmax over
-    the map; without a valid cell, over all."""
+    """Claim: V(s') by `max` is NumPy's maximum over the valid cells of both primitives, the limit
+    of the softmax over the map; without a valid cell, over all."""
     own, state = _with_target(learner, value="max"), _random_maps((2, 4, 6, 6))
     best = np.asarray(state.q)[np.asarray(state.valid)].max()
     assert learning.next_value(own, jax.random.key(0), state) == best
     np.testing.assert_allclose(softmax.exact(state.q, 1e6, state.valid), best, rtol=1e-6)
-    assert learning.next_value(own, jax.random.key(0), state.replace(valid=jnp.zeros(state.q.shape, bool))) == 5.0
+    assert (
+        learning.next_value(
+            own, jax.random.key(0), state.replace(valid=jnp.zeros(state.q.shape, bool))
+        )
+        == 5.0
+    )
 
 
 @pytest.mark.parametrize("value", ["max", "softmax"])
@@ -329,8 +393,9 @@ def test_squared_loss_reaches_the_update(learner, state, batch):
 
 @pytest.mark.slow
 def test_hard_targets_reach_the_update(learner, state, batch):
-    """Claim: with hard updates and C = 2, the targets stay after one update and are the networks after two."""
-    run = _run(_changed(learner, "learn", target_update="hard", copy_every=2))
+    """Claim: with hard updates and C = 2, the targets stay after one update and are the networks
+    after two."""
+    run = _run(_changed(learner, "learn", target_update="hard", target_update_period=2))
     first, _ = run(state, batch)
     jax.tree.map(np.testing.assert_array_equal, first.target, state.target)
     second, _ = run(first, batch)
@@ -344,11 +409,13 @@ def _one(params: Params, m: int) -> Params:
 
 @pytest.mark.slow
 def test_twin_critics(learner, batch, randomised):
-    """Claim: of two critics the maps are the lower value in each cell; each is trained on its own loss, towards one
-    target from the lower maps, and they differ from the start."""
+    """Claim: of two critics the maps are the lower value in each cell; each is trained on its own
+    loss, towards one target from the lower maps, and they differ from the start."""
     twin = _changed(_with_target(learner, value="max"), "learn", critics=2)
     begun = jax.jit(lambda key: learning.init(key, twin))(jax.random.key(0))
-    assert all(np.any(leaf[0] != leaf[1]) for leaf in jax.tree.leaves(begun.online.critic) if leaf.ndim > 3)
+    assert all(
+        np.any(leaf[0] != leaf[1]) for leaf in jax.tree.leaves(begun.online.critic) if leaf.ndim > 3
+    )
     with jax.numpy_dtype_promotion("standard"):
         state = randomised(begun)
     look = jax.jit(lambda params: learning.look(learner, params, heightmap.unpack(batch.next_obs)))
@@ -359,21 +426,30 @@ def test_twin_critics(learner, batch, randomised):
     run, alone = _run(twin), _run(learner)
     ended = run(state, _ended(batch))[1]
     infos = [alone(_alone(learner, state, m), _ended(batch))[1] for m in (0, 1)]
-    np.testing.assert_allclose(ended.critic_loss, sum(info.critic_loss for info in infos), rtol=1e-5)
-    np.testing.assert_allclose(ended.error, np.mean([info.error for info in infos], axis=0), atol=1e-5)
+    np.testing.assert_allclose(
+        ended.critic_loss, sum(info.critic_loss for info in infos), rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        ended.error, np.mean([info.error for info in infos], axis=0), atol=1e-5
+    )
     best = np.where(both.valid, both.q, -np.inf).reshape(B, -1).max(axis=1)
     going = run(state, batch)[1].error - ended.error
-    np.testing.assert_allclose(going, twin.cfg.target.gamma * np.clip(best, *learner.bounds), atol=1e-5)
+    np.testing.assert_allclose(
+        going, twin.cfg.target.gamma * np.clip(best, *learner.bounds), atol=1e-5
+    )
 
 
 def _alone(learner: Learner, state: LearnerState, m: int) -> LearnerState:
     """The state of a learner with critic `m` alone; its optimiser is fresh."""
     online, target = _one(state.online, m), _one(state.target, m)
-    return state.replace(online=online, target=target, critic_optimiser=learner.critic_optimiser.init(online.critic))
+    return state.replace(
+        online=online, target=target, critic_optimiser=learner.critic_optimiser.init(online.critic)
+    )
 
 
 def test_without_an_actor(learner, state, observations):
-    """Claim: without an actor the logits are the critic's map, ten to one, and an update of the actor is none."""
+    """Claim: without an actor the logits are the critic's map, ten to one, and an update of the
+    actor is none."""
     own = _changed(learner, "learn", actor=False)
     seen = jax.jit(lambda obs: learning.look(own, state.online, obs))(observations(2, 4))
     np.testing.assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
@@ -383,9 +459,12 @@ def test_without_an_actor(learner, state, observations):
 
 
 def test_without_the_mask(learner, state, observations):
-    """Claim: without masking every cell above the workspace is valid, whatever lies there; with it, far fewer are."""
+    """Claim: without masking every cell above the workspace is valid, whatever lies there; with it,
+    far fewer are."""
     own = _changed(learner, "policy", mask=False)
     valid = jax.jit(lambda obs: learning.look(own, state.online, obs))(observations(2, 4)).valid
     np.testing.assert_array_equal(valid, np.broadcast_to(learner.frames.inside, valid.shape))
-    masked = jax.jit(lambda obs: learning.look(learner, state.online, obs))(observations(2, 4)).valid
+    masked = jax.jit(lambda obs: learning.look(learner, state.online, obs))(
+        observations(2, 4)
+    ).valid
     assert np.mean(masked) < 0.7 * np.mean(valid)

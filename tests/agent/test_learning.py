@@ -1,4 +1,5 @@
-"""Every algorithm learns what it can on problems of known best policy, through the real training step."""
+"""Every algorithm learns what it can on problems of known best policy, through the real training
+step."""
 
 import functools
 from collections.abc import Callable
@@ -11,9 +12,9 @@ import pytest
 
 from csac_jax.agent import learner as learning, maps, policy
 from csac_jax.agent.learner import Learner, Params
+from csac_jax.constants import Primitive
 from csac_jax.env import State
-from csac_jax.sim.primitives import Primitive
-from csac_jax.train import step
+from csac_jax.training import step
 from tests.agent import toys
 from tests.agent.toys import Toy
 
@@ -33,15 +34,22 @@ class Learned(NamedTuple):
     value: float  # mean over first states of the best Q over the primitives that the policy takes
 
 
-def learn(problem: Callable[..., Toy], algo: str, actions: int, cap: int, push: float | None = None) -> Learned:
-    """Trains an algorithm on a problem for a number of actions and plays EPISODES fresh episodes."""
+def learn(
+    problem: Callable[..., Toy], algo: str, actions: int, cap: int, push: float | None = None
+) -> Learned:
+    """Trains an algorithm on a problem for a number of actions and plays EPISODES fresh
+    episodes."""
     cfg = toys.config(algo, actions, cap, push)
     toy, learner = problem(cfg), learning.make(cfg)
     state = step.init(step.Program(cfg, toy, learner))
     state, metrics = step.compile_chunk(step.Program(cfg, toy, learner), cfg.train.steps)(state)
     assert np.all(np.isfinite(metrics.critic_loss))
-    begun, ended, primitives = jax.jit(functools.partial(_play, toy, learner))(jax.random.key(99), state.learner.online)
-    chosen = np.array(maps.allowed(cfg.policy))  # an output of a primitive never taken is never trained
+    begun, ended, primitives = jax.jit(functools.partial(_play, toy, learner))(
+        jax.random.key(99), state.learner.online
+    )
+    chosen = np.array(
+        maps.allowed(cfg.policy)
+    )  # an output of a primitive never taken is never trained
     value = jnp.max(jnp.where(begun.valid, begun.q, -jnp.inf)[:, chosen], axis=(1, 2, 3, 4))
     return Learned(
         success=float(np.mean(ended.terminated)),
@@ -56,11 +64,22 @@ def _play(toy: Toy, learner: Learner, key: jax.Array, params: Params):
     cfg, span = toy.cfg, learner.bounds[1] - learner.bounds[0]
 
     def act(state: State, i: jax.Array) -> tuple[State, jax.Array]:
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.fold_in(key, i), jnp.arange(EPISODES))
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(
+            jax.random.fold_in(key, i), jnp.arange(EPISODES)
+        )
         best = jax.vmap(policy.best_action, (0, None, None, 0, None, 0))
-        action = best(keys, cfg, learner.frames, learning.look(learner, params, state.obs), span, state.idle)
+        action = best(
+            keys,
+            cfg,
+            learner.frames,
+            learning.look(learner, params, state.obs),
+            span,
+            state.steps_without_change,
+        )
         after = jax.vmap(toy.step)(state, action)
-        return jax.tree.map(lambda old, new: jax.vmap(jnp.where)(state.done, old, new), state, after), action.primitive
+        return jax.tree.map(
+            lambda old, new: jax.vmap(jnp.where)(state.done, old, new), state, after
+        ), action.primitive
 
     first = jax.vmap(lambda i: toy.reset(jax.random.fold_in(key, i)))(1000 + jnp.arange(EPISODES))
     last, primitives = jax.lax.scan(act, first, jnp.arange(cfg.task.max_actions))
@@ -79,7 +98,8 @@ def _play(toy: Toy, learner: Learner, key: jax.Array, params: Params):
     ],
 )
 def test_bandit_is_solved(algo, value):
-    """Claim: every algorithm finds the one good block among duds, and what lifting it earns: 2 by CSAC, 1 by VPG."""
+    """Claim: every algorithm finds the one good block among duds, and what lifting it earns: 2 by
+    CSAC, 1 by VPG."""
     learned = learn(toys.bandit, algo, actions=640, cap=1)
     assert learned.success >= 0.98
     assert learned.pushes[0] <= 0.02
@@ -98,7 +118,8 @@ def test_bandit_is_solved(algo, value):
 def test_two_steps_are_learned(algo, low, high):
     """Claim: a push that makes the only grasp possible is learned, then that grasp, in two actions.
 
-    The push is worth r + gamma V': VPG 0.5 + 0.5 = 1; CSAC 0.5 + 0.5 softmax, at most 1.5, as the softmax is at most 2.
+    The push is worth r + gamma V': VPG 0.5 + 0.5 = 1; CSAC 0.5 + 0.5 softmax, at most 1.5, as the
+    softmax is at most 2.
     """
     learned = learn(toys.two_step, algo, actions=1600, cap=CAP)
     assert learned.success >= 0.98
@@ -109,7 +130,8 @@ def test_two_steps_are_learned(algo, low, high):
 
 @pytest.mark.slow
 def test_grasping_alone_fails():
-    """Claim: where only a push makes a grasp possible, grasp_only never pushes, lifts nothing and expects nothing."""
+    """Claim: where only a push makes a grasp possible, grasp_only never pushes, lifts nothing and
+    expects nothing."""
     learned = learn(toys.two_step, "grasp_only", actions=800, cap=CAP)
     assert learned.success == 0.0
     assert learned.pushes == [0.0] * CAP
@@ -125,8 +147,8 @@ def test_grasping_alone_fails():
     ],
 )
 def test_without_a_future_a_push_must_pay_by_itself(algo, push, value, solves):
-    """Claim: with gamma = 0 the push is made if it earns 0.5 at once, and not if it costs 0.1; a gamma of 0.5 pays for
-    it: -0.1 + 0.5."""
+    """Claim: with gamma = 0 the push is made if it earns 0.5 at once, and not if it costs 0.1; a
+    gamma of 0.5 pays for it: -0.1 + 0.5."""
     learned = learn(toys.two_step, algo, actions=1200, cap=CAP, push=push)
     assert learned.success >= 0.98 if solves else learned.success == 0.0
     np.testing.assert_allclose(learned.value, value, atol=0.1)

@@ -14,7 +14,9 @@ from csac_jax.config import LearnConfig
 def test_huber_is_optax_huber(width):
     """Claim: the Huber loss and its gradient are Optax's."""
     error = jnp.array([-1e6, -3.0, -0.5, -0.1, 0.0, 0.2, 0.999, 2.0, 1e6])
-    np.testing.assert_allclose(losses.huber(error, width), optax.huber_loss(error, delta=width), rtol=1e-6)
+    np.testing.assert_allclose(
+        losses.huber(error, width), optax.huber_loss(error, delta=width), rtol=1e-6
+    )
     ours, theirs = (
         jax.grad(lambda e, f=f: jnp.sum(f(e)))(error)
         for f in (lambda e: losses.huber(e, width), lambda e: optax.huber_loss(e, delta=width))
@@ -29,20 +31,26 @@ def test_huber_by_hand():
 
 def test_huber_gradient_is_bounded():
     """Claim: the gradient is finite, at most the width, for every finite error."""
-    gradient = jax.vmap(jax.grad(lambda e: losses.huber(e, 1.0)))(jnp.array([1e30, -3e38, 1.0, 0.0]))
+    gradient = jax.vmap(jax.grad(lambda e: losses.huber(e, 1.0)))(
+        jnp.array([1e30, -3e38, 1.0, 0.0])
+    )
     np.testing.assert_allclose(gradient, [1.0, -1.0, 1.0, 0.0])
 
 
 def test_td_target_by_hand():
     """Claim: y = r + gamma V, without V after a true end, even if V is NaN there."""
     value = jnp.array([4.0, 4.0, jnp.nan])
-    target = losses.td_target(jnp.array([1.0, 1.0, -0.5]), 0.5, jnp.array([False, True, True]), value)
+    target = losses.td_target(
+        jnp.array([1.0, 1.0, -0.5]), 0.5, jnp.array([False, True, True]), value
+    )
     np.testing.assert_array_equal(target, [3.0, 1.0, -0.5])
 
 
 def test_td_target_has_no_gradient():
     """Claim: nothing is learned through the target."""
-    gradient = jax.grad(lambda v: losses.td_target(jnp.float32(1.0), 0.5, jnp.array(False), v))(jnp.float32(2.0))
+    gradient = jax.grad(lambda v: losses.td_target(jnp.float32(1.0), 0.5, jnp.array(False), v))(
+        jnp.float32(2.0)
+    )
     assert gradient == 0.0
 
 
@@ -60,16 +68,18 @@ def test_polyak_by_hand():
 
 @pytest.mark.parametrize(("loss", "expected"), [("huber", [0.125, 4.0]), ("squared", [0.25, 9.0])])
 def test_loss_of_error_by_hand(loss, expected):
-    """Claim: errors 0.5 and -3 cost 0.125 and 4 by Huber of width 2, and their squares by line 21."""
+    """Claim: errors 0.5 and -3 cost 0.125 and 4 by Huber of width 2, and their squares by line
+    21."""
     got = losses.of_error(LearnConfig(loss=loss, huber=2.0), jnp.array([0.5, -3.0]))
     np.testing.assert_array_equal(got, expected)
 
 
 @pytest.mark.parametrize("updates", [1, 2, 3, 4, 6, 7])
 def test_hard_targets_are_copied_every_c_updates(updates):
-    """Claim: targets are the online network after every third update if C = 3, bit for bit, and untouched otherwise."""
+    """Claim: targets are the online network after every third update if C = 3, bit for bit, and
+    untouched otherwise."""
     online, target = {"a": jnp.array([0.1, 7.0])}, {"a": jnp.array([3.0, -1.0])}
-    cfg = LearnConfig(target_update="hard", copy_every=3, tau=0.5)
+    cfg = LearnConfig(target_update="hard", target_update_period=3, tau=0.5)
     got = losses.follow(cfg, online, target, jnp.int32(updates))
     np.testing.assert_array_equal(got["a"], (online if updates % 3 == 0 else target)["a"])
 
@@ -77,5 +87,7 @@ def test_hard_targets_are_copied_every_c_updates(updates):
 def test_soft_targets_follow_each_update():
     """Claim: soft targets move by tau at every update, whatever C is."""
     online, target = {"a": jnp.array([1.0])}, {"a": jnp.array([0.0])}
-    cfg = LearnConfig(target_update="soft", copy_every=3, tau=0.25)
-    assert [float(losses.follow(cfg, online, target, jnp.int32(n))["a"][0]) for n in (1, 2, 3)] == [0.25] * 3
+    cfg = LearnConfig(target_update="soft", target_update_period=3, tau=0.25)
+    assert [float(losses.follow(cfg, online, target, jnp.int32(n))["a"][0]) for n in (1, 2, 3)] == [
+        0.25
+    ] * 3

@@ -9,8 +9,8 @@ import pytest
 
 from csac_jax.agent import learner as learning, maps
 from csac_jax.config import NetConfig
+from csac_jax.constants import Primitive
 from csac_jax.nets import dense
-from csac_jax.sim.primitives import Primitive
 from csac_jax.vision.heightmap import Observation
 
 GRASP, PUSH = int(Primitive.GRASP), int(Primitive.PUSH)
@@ -24,7 +24,9 @@ def _random_maps(frames: maps.Frames, seed: int = 0) -> jax.Array:
 def _read(frames: maps.Frames, values: jax.Array, primitive: int, poses: np.ndarray) -> np.ndarray:
     """Values [n] at the poses [n, 3]."""
     read = jax.jit(
-        lambda values, poses: jax.vmap(lambda pose: maps.read(frames, values, jnp.int32(primitive), pose))(poses)
+        lambda values, poses: jax.vmap(
+            lambda pose: maps.read(frames, values, jnp.int32(primitive), pose)
+        )(poses)
     )
     return np.asarray(read(values, jnp.asarray(poses, jnp.float32)))
 
@@ -42,23 +44,31 @@ def test_reading_at_a_cells_pose_gives_the_cell(frames, primitive):
     values = _random_maps(frames)
     cells = jnp.arange(values[0].size)
     poses = jax.jit(jax.vmap(lambda cell: maps.cell_pose(frames, cell)))(cells)
-    np.testing.assert_allclose(_read(frames, values, primitive, poses), values[primitive].reshape(-1), atol=1e-4)
+    np.testing.assert_allclose(
+        _read(frames, values, primitive, poses), values[primitive].reshape(-1), atol=1e-4
+    )
 
 
 def test_is_valid_at_a_cells_pose_is_the_cell(frames):
-    """Claim: `is_valid` looks at the nearest cell, also from a third of a cell and of a yaw step beside it."""
+    """Claim: `is_valid` looks at the nearest cell, also from a third of a cell and of a yaw step
+    beside it."""
     valid = _random_maps(frames) > 0.0
     cells = jnp.arange(valid[0].size)
-    shift = jnp.array([0.2 * frames.cell, -0.25 * frames.cell, 0.3 * 2.0 * np.pi / frames.yaws.size])
+    shift = jnp.array(
+        [0.2 * frames.cell, -0.25 * frames.cell, 0.3 * 2.0 * np.pi / frames.yaws.size]
+    )
     check = jax.vmap(lambda p, pose: maps.is_valid(frames, valid, p, pose), (None, 0))
     for primitive in Primitive:
         poses = jax.vmap(lambda cell: maps.cell_pose(frames, cell))(cells)
         for near in (poses, poses + shift[None]):
-            np.testing.assert_array_equal(check(jnp.int32(primitive), near), valid[primitive].reshape(-1))
+            np.testing.assert_array_equal(
+                check(jnp.int32(primitive), near), valid[primitive].reshape(-1)
+            )
 
 
 def test_read_is_linear_between_cells(frames):
-    """Claim: a map that is affine in the workspace's x and y, in every frame, is read exactly anywhere."""
+    """Claim: a map that is affine in the workspace's x and y, in every frame, is read exactly
+    anywhere."""
     plane = 2.0 * frames.xy[..., 0] - 3.0 * frames.xy[..., 1] + 0.5
     poses = _poses(300)
     got = _read(frames, jnp.asarray(np.stack([-plane, plane]), jnp.float32), GRASP, poses)
@@ -66,7 +76,8 @@ def test_read_is_linear_between_cells(frames):
 
 
 def test_read_is_linear_in_yaw_and_wraps(frames):
-    """Claim: between yaws the value is linear, between the last and the first too, and whole turns change nothing."""
+    """Claim: between yaws the value is linear, between the last and the first too, and whole turns
+    change nothing."""
     num = frames.yaws.size
     per_yaw = np.random.default_rng(3).normal(size=num)
     values = np.zeros((2, num, frames.side, frames.side))
@@ -74,11 +85,14 @@ def test_read_is_linear_in_yaw_and_wraps(frames):
     yaw = np.linspace(-2.0 * np.pi, 4.0 * np.pi, 301)
     poses = np.stack([np.full_like(yaw, 0.05), np.full_like(yaw, -0.1), yaw], axis=1)
     wanted = np.interp(yaw, frames.yaws, per_yaw, period=2.0 * np.pi)
-    np.testing.assert_allclose(_read(frames, jnp.asarray(values, jnp.float32), PUSH, poses), wanted, atol=1e-5)
+    np.testing.assert_allclose(
+        _read(frames, jnp.asarray(values, jnp.float32), PUSH, poses), wanted, atol=1e-5
+    )
 
 
 def test_read_is_trilinear_by_hand(frames):
-    """Claim: a quarter of a cell along, half a cell across and a fifth of a yaw step on, the weights are products."""
+    """Claim: a quarter of a cell along, half a cell across and a fifth of a yaw step on, the
+    weights are products."""
     values = np.asarray(_random_maps(frames, 4))
     k, row, col = 0, 7, 5
     pose = np.append(frames.xy[k, row, col] + frames.cell * np.array([0.25, 0.5]), 0.0)
@@ -88,21 +102,28 @@ def test_read_is_trilinear_by_hand(frames):
     step = 2.0 * np.pi / frames.yaws.size
     turned = pose + np.array([0.0, 0.0, 0.2 * step])
     following = _read(frames, values, GRASP, (pose + np.array([0.0, 0.0, step]))[None])
-    np.testing.assert_allclose(_read(frames, values, GRASP, turned[None]), 0.8 * here + 0.2 * following, atol=1e-5)
+    np.testing.assert_allclose(
+        _read(frames, values, GRASP, turned[None]), 0.8 * here + 0.2 * following, atol=1e-5
+    )
 
 
 def test_gradient_of_read(frames):
-    """Claim: the gradient in x, y and yaw is that of finite differences, wherever the pose is inside of a cell."""
+    """Claim: the gradient in x, y and yaw is that of finite differences, wherever the pose is
+    inside of a cell."""
     values = _random_maps(frames, 5)
     poses = _poses(400, 0.2, seed=6)
     steps = np.array([0.05 * frames.cell, 0.05 * frames.cell, 0.02])
-    gradient = jax.jit(jax.vmap(jax.grad(lambda pose: maps.read(frames, values, jnp.int32(PUSH), pose))))
+    gradient = jax.jit(
+        jax.vmap(jax.grad(lambda pose: maps.read(frames, values, jnp.int32(PUSH), pose)))
+    )
     got = np.asarray(gradient(jnp.asarray(poses, jnp.float32)))
     checked = 0
     for axis, step in enumerate(steps):
         above, below = (poses + sign * step * np.eye(3)[axis] for sign in (1.0, -1.0))
         same = np.all(_cells(frames, above) == _cells(frames, below), axis=1)
-        wanted = (_read(frames, values, PUSH, above) - _read(frames, values, PUSH, below)) / (2.0 * step)
+        wanted = (_read(frames, values, PUSH, above) - _read(frames, values, PUSH, below)) / (
+            2.0 * step
+        )
         scale = np.abs(wanted[same]).mean()
         np.testing.assert_allclose(got[same, axis], wanted[same], atol=2e-3 * scale, rtol=2e-3)
         checked += same.sum()
@@ -126,7 +147,8 @@ def _cells(frames: maps.Frames, poses: np.ndarray) -> np.ndarray:
 
 
 def test_unfolding(frames):
-    """Claim: frame k + K / 2 is frame k upside down, cells and positions alike; it pushes with the map of push back."""
+    """Claim: frame k + K / 2 is frame k upside down, cells and positions alike; it pushes with the
+    map of push back."""
     half = frames.yaws.size // 2
     shape = (half, frames.side, frames.side, dense.OUTPUTS)
     halves = np.random.default_rng(0).normal(size=shape).astype(np.float32)
@@ -139,22 +161,31 @@ def test_unfolding(frames):
 
 def test_gripper_is_symmetric(frames):
     """Claim: a grasp's value at yaw + pi is that at yaw, wherever it is read."""
-    halves = np.random.default_rng(1).normal(size=(frames.yaws.size // 2, frames.side, frames.side, dense.OUTPUTS))
+    halves = np.random.default_rng(1).normal(
+        size=(frames.yaws.size // 2, frames.side, frames.side, dense.OUTPUTS)
+    )
     values = maps.unfold(jnp.asarray(halves, jnp.float32))
     poses = _poses(100, seed=2)
     turned = poses + np.array([0.0, 0.0, np.pi])
-    np.testing.assert_allclose(_read(frames, values, GRASP, poses), _read(frames, values, GRASP, turned), atol=1e-4)
+    np.testing.assert_allclose(
+        _read(frames, values, GRASP, poses), _read(frames, values, GRASP, turned), atol=1e-4
+    )
     apart = np.abs(_read(frames, values, PUSH, poses) - _read(frames, values, PUSH, turned))
     assert apart.mean() > 0.1
 
 
-CENTRE, HALF = np.array([0.056, -0.035]), np.array([0.028, 0.021])  # m, a block that covers whole cells
+CENTRE, HALF = (
+    np.array([0.056, -0.035]),
+    np.array([0.028, 0.021]),
+)  # m, a block that covers whole cells
 
 
 def _one_block(cfg) -> Observation:
     size = cfg.heightmap.size
     along = (np.arange(size) + 0.5) * cfg.heightmap.cell - 0.5 * cfg.heightmap.extent
-    inside = (np.abs(along - CENTRE[0]) < HALF[0])[None] & (np.abs(along - CENTRE[1]) < HALF[1])[:, None]
+    inside = (np.abs(along - CENTRE[0]) < HALF[0])[None] & (np.abs(along - CENTRE[1]) < HALF[1])[
+        :, None
+    ]
     return Observation(
         colour=jnp.full((size, size, 3), 0.5),
         height=jnp.asarray(np.where(inside, 0.05, 0.0), jnp.float32),
@@ -165,13 +196,17 @@ def _one_block(cfg) -> Observation:
 def _beside(xy: np.ndarray) -> np.ndarray:
     """Distance [...] m of points [..., 2] from the block; below 0 inside."""
     off = np.abs(xy - CENTRE) - HALF
-    return np.where(np.all(off <= 0.0, axis=-1), off.max(axis=-1), np.linalg.norm(np.maximum(off, 0.0), axis=-1))
+    return np.where(
+        np.all(off <= 0.0, axis=-1), off.max(axis=-1), np.linalg.norm(np.maximum(off, 0.0), axis=-1)
+    )
 
 
 def test_grasps_are_valid_above_blocks(cfg, frames):
-    """Claim: a grasp is valid where the cell covers some of a block and nowhere else, in every frame.
+    """Claim: a grasp is valid where the cell covers some of a block and nowhere else, in every
+    frame.
 
-    A cell's corners are 0.71 of its side from its centre; turning to the nearest cell moves by that of an input cell.
+    A cell's corners are 0.71 of its side from its centre; turning to the nearest cell moves by that
+    of an input cell.
     """
     valid = np.asarray(maps.actionable(frames, _one_block(cfg)))[GRASP]
     distance = _beside(frames.xy)
@@ -185,15 +220,22 @@ def test_grasps_are_valid_above_blocks(cfg, frames):
 
 
 def test_pushes_are_valid_ahead_of_which_a_block_lies(cfg, frames):
-    """Claim: a push is valid where a block lies within its length ahead along the yaw, not behind, not beside."""
+    """Claim: a push is valid where a block lies within its length ahead along the yaw, not behind,
+    not beside."""
     valid = np.asarray(maps.actionable(frames, _one_block(cfg)))[PUSH]
     length, slack = cfg.sim.push_length, 1.5 * frames.cell
     seen = {"ahead": 0, "behind": 0, "beside": 0, "far": 0}
     for k, yaw in enumerate(frames.yaws):
-        direction, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+        direction, across = (
+            np.array([np.cos(yaw), np.sin(yaw)]),
+            np.array([-np.sin(yaw), np.cos(yaw)]),
+        )
         offset = CENTRE - frames.xy[k]
         along, beside = offset @ direction, np.abs(offset @ across)
-        extent, width = np.abs(direction) @ HALF, np.abs(across) @ HALF  # m, half the block's shadows
+        extent, width = (
+            np.abs(direction) @ HALF,
+            np.abs(across) @ HALF,
+        )  # m, half the block's shadows
         ahead = (along > 0.0) & (along < length) & (beside < 0.5 * frames.cell) & frames.inside[k]
         behind, far = along < -extent - slack, along > length + extent + slack
         off = beside > width + 2.0 * slack
@@ -211,14 +253,19 @@ def test_nothing_is_valid_outside_of_the_workspace(cfg, frames):
     full = _one_block(cfg).replace(height=jnp.full((size, size), 0.05))
     valid = np.asarray(maps.actionable(frames, full))
     assert not np.any(valid[:, np.max(np.abs(frames.xy), axis=-1) > 0.5 * cfg.heightmap.extent])
-    assert np.all(valid[GRASP] == (np.max(np.abs(frames.xy), axis=-1) <= 0.5 * cfg.heightmap.extent))
+    assert np.all(
+        valid[GRASP] == (np.max(np.abs(frames.xy), axis=-1) <= 0.5 * cfg.heightmap.extent)
+    )
     assert not np.any(maps.actionable(frames, full.replace(height=jnp.zeros((size, size)))))
 
 
 def test_without_mask_every_cell_counts(cfg, frames):
-    """Claim: with no masking every cell above the workspace counts; in the target task, grasps of the target alone."""
+    """Claim: with no masking every cell above the workspace counts; in the target task, grasps of
+    the target alone."""
     obs = _one_block(cfg)
-    obs = obs.replace(target=obs.height > 0.01, height=jnp.maximum(obs.height, 0.02))  # the target amid another block
+    obs = obs.replace(
+        target=obs.height > 0.01, height=jnp.maximum(obs.height, 0.02)
+    )  # the target amid another block
     np.testing.assert_array_equal(maps.everywhere(frames, obs), np.stack([frames.inside] * 2))
     marked = dataclasses.replace(frames, marked=True)
     valid = np.asarray(maps.everywhere(marked, obs))
@@ -234,7 +281,9 @@ def test_best_cells(frames):
     flat = np.asarray(values).reshape(-1)
     only = np.where(np.asarray(valid).reshape(-1), flat, -np.inf)
     np.testing.assert_array_equal(maps.best_cells(values, valid, 5), np.argsort(-only)[:5])
-    np.testing.assert_array_equal(maps.best_cells(values, jnp.zeros_like(valid), 5), np.argsort(-flat)[:5])
+    np.testing.assert_array_equal(
+        maps.best_cells(values, jnp.zeros_like(valid), 5), np.argsort(-flat)[:5]
+    )
 
 
 def test_normalise_is_inverse(frames):
@@ -242,24 +291,31 @@ def test_normalise_is_inverse(frames):
     poses = jnp.asarray(_poses(100), jnp.float32)
     box = jax.vmap(lambda pose: maps.normalise(frames, pose))(poses)
     assert np.all(np.abs(box) <= 1.0)
-    np.testing.assert_allclose(jax.vmap(lambda u: maps.denormalise(frames, u))(box), poses, atol=2e-6)
+    np.testing.assert_allclose(
+        jax.vmap(lambda u: maps.denormalise(frames, u))(box), poses, atol=2e-6
+    )
 
 
 @pytest.mark.optax
 @pytest.mark.slow
 def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
-    """Claim: a scene turned by one frame step gives the same maps one frame on, with a random net, the actor's too; so
-    the best action turns with the scene.
+    """Claim: a scene turned by one frame step gives the same maps one frame on, with a random net,
+    the actor's too; so the best action turns with the scene.
 
-    By 90 degrees, where turning to the nearest cell is exact. Not across the half turn: there push ahead and push back
-    come from other outputs of the net, and frames K / 2 - 1 and K - 1 have no such successor.
+    By 90 degrees, where turning to the nearest cell is exact. Not across the half turn: there push
+    ahead and push back come from other outputs of the net, and frames K / 2 - 1 and K - 1 have no
+    such successor.
     """
     four = learning.make(
-        dataclasses.replace(cfg, net=NetConfig(rotations=4, growth=4, dilations=(1, 2), stem=4, head=8))
+        dataclasses.replace(
+            cfg, net=NetConfig(rotations=4, growth=4, dilations=(1, 2), stem=4, head=8)
+        )
     )
     params = randomised(learning.init(jax.random.key(0), four)).online
     scenes = observations(2, 0)
-    turned = jax.tree.map(lambda field: jnp.rot90(field, -1, axes=(1, 2)), scenes)  # rows are y: this is +90 degrees
+    turned = jax.tree.map(
+        lambda field: jnp.rot90(field, -1, axes=(1, 2)), scenes
+    )  # rows are y: this is +90 degrees
     look = jax.jit(lambda obs: learning.look(four, params, obs))
     before, after = look(scenes), look(turned)
     for k in (0, 2):
@@ -269,14 +325,17 @@ def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
     assert np.std(before.q) > 0.05
     for primitive in Primitive:
         first, second = (
-            four.frames.xy[k].reshape(-1, 2)[np.argmax(np.where(state.valid, state.q, -np.inf)[0, primitive, k])]
+            four.frames.xy[k].reshape(-1, 2)[
+                np.argmax(np.where(state.valid, state.q, -np.inf)[0, primitive, k])
+            ]
             for state, k in ((before, 0), (after, 1))
         )
         np.testing.assert_allclose(second, [-first[1], first[0]], atol=1e-6)
 
 
 def test_best_over_yaws(frames):
-    """Claim: a place has the largest valid value of its yaws, each primitive its own, and -inf where none is valid."""
+    """Claim: a place has the largest valid value of its yaws, each primitive its own, and -inf
+    where none is valid."""
     shape = (maps.NUM_PRIMITIVES, frames.yaws.size, frames.side, frames.side)
     q, valid = np.zeros(shape, np.float32), np.zeros(shape, bool)
     q[PUSH, 3, 9, 6], q[PUSH, 1, 9, 9], q[GRASP, 3, 9, 6] = 1.0, 7.0, 0.5

@@ -11,8 +11,8 @@ from csac_jax import algorithms
 from csac_jax.agent import box, maps, policy
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import CEMConfig, ExploreConfig, PolicyConfig
+from csac_jax.constants import Primitive
 from csac_jax.sim.outcome import BARE
-from csac_jax.sim.primitives import Primitive
 
 PENALTY = 6.0
 KEYS = 20
@@ -21,7 +21,10 @@ KEYS = 20
 @pytest.fixture(scope="module")
 def best(cfg, frames):
     """Actions of DenseMaps for KEYS keys."""
-    run = jax.vmap(lambda key, state: policy.best_action(key, cfg, frames, state, PENALTY, jnp.int32(0)), (0, None))
+    run = jax.vmap(
+        lambda key, state: policy.best_action(key, cfg, frames, state, PENALTY, jnp.int32(0)),
+        (0, None),
+    )
     return jax.jit(lambda state: run(jax.random.split(jax.random.key(0), KEYS), state))
 
 
@@ -30,18 +33,25 @@ def _state(frames, seed: int) -> DenseMaps:
     rng = np.random.default_rng(seed)
     shape = (2, frames.yaws.size, frames.side, frames.side)
     q = jnp.asarray(rng.uniform(-1.0, 1.0, shape), jnp.float32)
-    return DenseMaps(q=q, logits=10.0 * q, valid=jnp.asarray(rng.uniform(size=shape) < 0.05) & frames.inside[None])
+    return DenseMaps(
+        q=q,
+        logits=10.0 * q,
+        valid=jnp.asarray(rng.uniform(size=shape) < 0.05) & frames.inside[None],
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_greedy_avoids_what_is_bare(frames, best, seed):
-    """Claim: the action is on a valid cell, though invalid ones are worth more, and no worse than the best cell."""
+    """Claim: the action is on a valid cell, though invalid ones are worth more, and no worse than
+    the best cell."""
     state = _state(frames, seed)
     state = state.replace(q=jnp.where(state.valid, state.q, 3.0))
     action = best(state)
     check = jax.vmap(lambda p, pose: maps.is_valid(frames, state.valid, p, pose))
     assert np.all(check(action.primitive, action.pose))
-    value = jax.vmap(lambda p, pose: maps.read(frames, state.q, p, pose))(action.primitive, action.pose)
+    value = jax.vmap(lambda p, pose: maps.read(frames, state.q, p, pose))(
+        action.primitive, action.pose
+    )
     assert np.all(value >= np.max(np.where(state.valid, state.q, -np.inf)) - 1e-3)
 
 
@@ -54,10 +64,14 @@ def test_greedy_picks_the_better_primitive(frames, best, primitive):
     q[primitive, 3, 9, 6] = 1.0
     q[other, 5, 8, 11] = 0.8
     valid[other, 2, 9, 9], q[other, 2, 9, 9] = 0.0, 2.0
-    state = DenseMaps(jnp.asarray(q, jnp.float32), jnp.asarray(10.0 * q, jnp.float32), jnp.asarray(valid, bool))
+    state = DenseMaps(
+        jnp.asarray(q, jnp.float32), jnp.asarray(10.0 * q, jnp.float32), jnp.asarray(valid, bool)
+    )
     action = best(state)
     assert np.all(action.primitive == primitive)
-    assert np.all(np.linalg.norm(action.pose[:, :2] - frames.xy[3, 9, 6][None], axis=1) < 0.5 * frames.cell)
+    assert np.all(
+        np.linalg.norm(action.pose[:, :2] - frames.xy[3, 9, 6][None], axis=1) < 0.5 * frames.cell
+    )
 
 
 def test_random_grasps_land_on_blocks(cfg, frames, observations):
@@ -69,37 +83,61 @@ def test_random_grasps_land_on_blocks(cfg, frames, observations):
     assert np.all(action.primitive == Primitive.GRASP)
     height, size = np.asarray(obs.height), cfg.heightmap.size
     col, row = np.asarray(action.pose[:, :2] / cfg.heightmap.cell + 0.5 * (size - 1)).T
-    for r, c in zip(row, col, strict=True):  # a cell of the maps covers about 2 x 2 of the height map, turned
+    for r, c in zip(
+        row, col, strict=True
+    ):  # a cell of the maps covers about 2 x 2 of the height map, turned
         rows, cols = slice(max(int(r) - 1, 0), int(r) + 3), slice(max(int(c) - 1, 0), int(c) + 3)
         assert height[rows, cols].max() > BARE
-    yaws = np.round(np.asarray(action.pose[:, 2]) / (2 * np.pi) * frames.yaws.size) % frames.yaws.size
+    yaws = (
+        np.round(np.asarray(action.pose[:, 2]) / (2 * np.pi) * frames.yaws.size) % frames.yaws.size
+    )
     assert set(yaws) == set(range(frames.yaws.size))
     assert np.mean(height > BARE) < 0.3  # it would be easy otherwise
 
 
 @pytest.mark.slow
 def test_without_exploration_it_acts_greedily(cfg, frames):
-    """Claim: with no noise, random primitive nor random place, what is tried is valid and worth the best value."""
+    """Claim: with no noise, random primitive nor random place, what is tried is valid and worth the
+    best value."""
     state = _state(frames, 7)
-    calm = ExploreConfig(noise_std=0.0, primitive_start=0.0, primitive_end=0.0, place_start=0.0, place_end=0.0)
+    calm = ExploreConfig(
+        noise_std=0.0,
+        epsilon_primitive_start=0.0,
+        epsilon_primitive_end=0.0,
+        epsilon_place_start=0.0,
+        epsilon_place_end=0.0,
+    )
     own = dataclasses.replace(cfg, explore=calm)
-    act = jax.jit(jax.vmap(lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(0), jnp.int32(0))))
+    act = jax.jit(
+        jax.vmap(
+            lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(0), jnp.int32(0))
+        )
+    )
     action = act(jax.random.split(jax.random.key(2), KEYS))
-    values = jax.vmap(lambda p, pose: maps.read(frames, state.q, p, pose))(action.primitive, action.pose)
-    valid = jax.vmap(lambda p, pose: maps.is_valid(frames, state.valid, p, pose))(action.primitive, action.pose)
+    values = jax.vmap(lambda p, pose: maps.read(frames, state.q, p, pose))(
+        action.primitive, action.pose
+    )
+    valid = jax.vmap(lambda p, pose: maps.is_valid(frames, state.valid, p, pose))(
+        action.primitive, action.pose
+    )
     assert np.all(valid)
     assert np.all(values >= np.max(np.where(state.valid, state.q, -np.inf)) - 1e-3)
 
 
 def _with(cfg, section: str, **settings):
     """The config with other settings of one section."""
-    return dataclasses.replace(cfg, **{section: dataclasses.replace(getattr(cfg, section), **settings)})
+    return dataclasses.replace(
+        cfg, **{section: dataclasses.replace(getattr(cfg, section), **settings)}
+    )
 
 
 def test_best_pixel(cfg, frames):
-    """Claim: with `argmax` a primitive's pose is that of NumPy's largest valid cell, exactly, whatever the key."""
+    """Claim: with `argmax` a primitive's pose is that of NumPy's largest valid cell, exactly,
+    whatever the key."""
     own, state = _with(cfg, "policy", place="argmax"), _state(frames, 4)
-    run = jax.jit(jax.vmap(lambda key: policy.greedy(key, own, frames, state, PENALTY, jnp.int32(0))))
+    run = jax.jit(
+        jax.vmap(lambda key: policy.greedy(key, own, frames, state, PENALTY, jnp.int32(0)))
+    )
     choice = run(jax.random.split(jax.random.key(0), 3))
     masked = np.where(state.valid, state.q, -np.inf)
     for p in Primitive:
@@ -111,7 +149,7 @@ def test_best_pixel(cfg, frames):
 
 
 @pytest.mark.parametrize(
-    ("rule", "values", "idle", "expected"),
+    ("rule", "values", "steps_without_change", "expected"),
     [
         ("argmax", (2.0, 1.0), 0, Primitive.PUSH),
         ("argmax", (1.0, 2.0), 5, Primitive.GRASP),
@@ -122,24 +160,36 @@ def test_best_pixel(cfg, frames):
         ("grasp", (2.0, 1.0), 3, Primitive.GRASP),
     ],
 )
-def test_choice_of_primitive(rule, values, idle, expected):
-    """Claim: `argmax` takes the larger value; `rule` pushes after no change, else grasps; `grasp` always grasps."""
-    got = policy.choose_primitive(PolicyConfig(primitive=rule), jnp.array(values), jnp.int32(idle))
+def test_choice_of_primitive(rule, values, steps_without_change, expected):
+    """Claim: `argmax` takes the larger value; `rule` pushes after no change, else grasps; `grasp`
+    always grasps."""
+    got = policy.choose_primitive(
+        PolicyConfig(primitive=rule), jnp.array(values), jnp.int32(steps_without_change)
+    )
     assert (got, got.dtype) == (expected, jnp.int32)
 
 
-@pytest.mark.parametrize("idle", [0, 1])
+@pytest.mark.parametrize("steps_without_change", [0, 1])
 @pytest.mark.slow
-def test_rule_reaches_the_action(cfg, frames, idle):
-    """Claim: what is done follows the rule with and without exploration, where values say the opposite."""
+def test_rule_reaches_the_action(cfg, frames, steps_without_change):
+    """Claim: what is done follows the rule with and without exploration, where values say the
+    opposite."""
     own = _with(cfg, "policy", primitive="rule")
-    own = _with(own, "explore", primitive_start=0.0, primitive_end=0.0)
+    own = _with(own, "explore", epsilon_primitive_start=0.0, epsilon_primitive_end=0.0)
     state = _state(frames, 5)
-    wrong = Primitive.GRASP if idle else Primitive.PUSH
+    wrong = Primitive.GRASP if steps_without_change else Primitive.PUSH
     state = state.replace(q=state.q.at[wrong].add(5.0))
-    key, count = jax.random.key(0), jnp.int32(idle)
-    best = jax.jit(lambda idle: policy.best_action(key, own, frames, state, PENALTY, idle))
-    act = jax.jit(lambda idle: policy.act(key, own, frames, state, PENALTY, idle, jnp.int32(0)))
+    key, count = jax.random.key(0), jnp.int32(steps_without_change)
+    best = jax.jit(
+        lambda steps_without_change: policy.best_action(
+            key, own, frames, state, PENALTY, steps_without_change
+        )
+    )
+    act = jax.jit(
+        lambda steps_without_change: policy.act(
+            key, own, frames, state, PENALTY, steps_without_change, jnp.int32(0)
+        )
+    )
     assert best(count).primitive == act(count).primitive == 1 - wrong
 
 
@@ -147,24 +197,35 @@ def test_grasp_only_never_pushes(cfg, frames):
     """Claim: grasp_only grasps while it explores too, where pushes are worth more."""
     own, state = algorithms.configure(cfg, "grasp_only"), _state(frames, 6)
     state = state.replace(q=state.q.at[Primitive.PUSH].add(5.0))
-    act = jax.jit(jax.vmap(lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(3), jnp.int32(0))))
+    act = jax.jit(
+        jax.vmap(
+            lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(3), jnp.int32(0))
+        )
+    )
     assert np.all(act(jax.random.split(jax.random.key(2), 200)).primitive == Primitive.GRASP)
 
 
 def _peaked(key: jax.Array, frames) -> DenseMaps:
-    """Maps of one to five peaks of different heights and widths for grasps; the actor's logits are noise."""
+    """Maps of one to five peaks of different heights and widths for grasps; the actor's logits are
+    noise."""
     key_num, key_centre, key_height, key_width, key_logits = jax.random.split(key, 5)
     present = jnp.arange(5) < jax.random.randint(key_num, (), 1, 6)
     heights = jnp.where(present, jax.random.uniform(key_height, (5,), minval=0.3, maxval=1.0), 0.0)
     widths = jax.random.uniform(key_width, (5,), minval=0.12, maxval=0.3)
     centres = jax.random.uniform(key_centre, (5, 3), minval=-1.0)
-    cells = jax.vmap(lambda i: maps.normalise(frames, maps.cell_pose(frames, i)))(jnp.arange(frames.inside.size))
+    cells = jax.vmap(lambda i: maps.normalise(frames, maps.cell_pose(frames, i)))(
+        jnp.arange(frames.inside.size)
+    )
     offset = cells[:, None] - centres[None]
     offset = jnp.where(box.POSE_WRAPS[None, None], box.wrap(offset), offset)
-    peaks = heights[None] * jnp.exp(-0.5 * jnp.sum(offset**2, axis=-1) / widths[None] ** 2)  # [K h w, 5]
+    peaks = heights[None] * jnp.exp(
+        -0.5 * jnp.sum(offset**2, axis=-1) / widths[None] ** 2
+    )  # [K h w, 5]
     grasp = jnp.max(peaks, axis=-1).reshape(frames.inside.shape)
     q = jnp.stack([jnp.full_like(grasp, -1.0), grasp])
-    return DenseMaps(q, 5.0 * jax.random.normal(key_logits, q.shape), jnp.broadcast_to(frames.inside, q.shape))
+    return DenseMaps(
+        q, 5.0 * jax.random.normal(key_logits, q.shape), jnp.broadcast_to(frames.inside, q.shape)
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,13 +237,16 @@ def _peaked(key: jax.Array, frames) -> DenseMaps:
     ],
 )
 def test_search_finds_the_highest_of_several_peaks(cfg, frames, start, least, most):
-    """Claim: with the default settings, of 1,000 searches on maps of one to five peaks at least 98 % reach the highest
-    value within 1 %, whatever the actor proposes; from an actor alone that knows nothing of it, hardly one does."""
+    """Claim: with the default settings, of 1,000 searches on maps of one to five peaks at least 98
+    % reach the highest value within 1 %, whatever the actor proposes; from an actor alone that
+    knows nothing of it, hardly one does."""
     own = dataclasses.replace(cfg, cem=CEMConfig(start=start))
 
     def reached(i: jax.Array) -> jax.Array:
         state = _peaked(jax.random.fold_in(jax.random.key(3), i), frames)
-        choice = policy.greedy(jax.random.fold_in(jax.random.key(4), i), own, frames, state, PENALTY, jnp.int32(0))
+        choice = policy.greedy(
+            jax.random.fold_in(jax.random.key(4), i), own, frames, state, PENALTY, jnp.int32(0)
+        )
         best = jnp.max(jnp.where(frames.inside, state.q[Primitive.GRASP], -jnp.inf))
         return choice.values[Primitive.GRASP] >= 0.99 * best
 
@@ -191,7 +255,8 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, start, least, mo
 
 
 def test_random_places_without_the_mask(cfg, frames):
-    """Claim: what is not masked is explored: random places of both primitives reach cells with nothing under them."""
+    """Claim: what is not masked is explored: random places of both primitives reach cells with
+    nothing under them."""
     valid = jnp.broadcast_to(frames.inside, (2, *frames.inside.shape))
     u = jax.jit(jax.vmap(lambda key: policy.random_places(key, frames, valid)))(
         jax.random.split(jax.random.key(0), 400)
@@ -200,15 +265,20 @@ def test_random_places_without_the_mask(cfg, frames):
 
 
 def test_candidates_are_those_of_the_search(cfg, frames):
-    """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same key."""
+    """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
+    key."""
     one = dataclasses.replace(cfg, cem=dataclasses.replace(cfg.cem, rounds=1, start="actor"))
     state, key = _state(frames, 0), jax.random.key(3)
     tried = jax.jit(lambda key: policy.candidates(key, one, frames, state, PENALTY))(key)
     assert tried.shape == (2, cfg.cem.candidates, 3)
-    greedy = jax.jit(lambda key: policy.greedy(key, one, frames, state, PENALTY, jnp.int32(0)).greedy.poses)
+    greedy = jax.jit(
+        lambda key: policy.greedy(key, one, frames, state, PENALTY, jnp.int32(0)).greedy.poses
+    )
     for primitive, u in zip(Primitive, greedy(key), strict=True):
         pose = maps.denormalise(frames, u)
-        assert np.min(np.abs(np.asarray(tried[primitive]) - np.asarray(pose)[None]).max(axis=1)) < 1e-5
+        assert (
+            np.min(np.abs(np.asarray(tried[primitive]) - np.asarray(pose)[None]).max(axis=1)) < 1e-5
+        )
 
 
 def test_without_a_search_there_is_one_candidate(cfg, frames):

@@ -10,21 +10,26 @@ import pytest
 from csac_jax import algorithms
 from csac_jax.agent import rewards
 from csac_jax.config import RewardConfig
-from csac_jax.sim.outcome import Outcome
+from csac_jax.constants import Outcome, Primitive
 
 CFG = RewardConfig()
 
 
-def reward(cfg, primitive, outcome=0, distance=0.0, before=0.0, after=0.0, changed=False, left=0):
+def reward(
+    cfg, primitive, outcome=0, distance=0.0, before=0.0, after=0.0, changed=False, blocks_lost=0
+):
     values = (jnp.float32(v) for v in (distance, before, after))
-    seen = jnp.asarray(changed), jnp.int32(left)
+    seen = jnp.asarray(changed), jnp.int32(blocks_lost)
     return float(rewards.reward(cfg, jnp.int32(primitive), jnp.int32(outcome), *values, *seen))
 
 
-@pytest.mark.parametrize(("outcome", "expected"), list(zip(Outcome, (-1.0, -0.5, -0.25, 0.0, 2.0), strict=True)))
+@pytest.mark.parametrize(
+    ("outcome", "expected"), list(zip(Outcome, (-1.0, -0.5, -0.25, 0.0, 2.0), strict=True))
+)
 def test_grasp_rewards(outcome, expected):
-    """Claim: eqs. 12 and 15 by hand: -1, -0.5, -0.25, 0, and 1 for the lift plus 1 for the block in the hand."""
-    assert reward(CFG, rewards.GRASP, outcome) == expected
+    """Claim: eqs. 12 and 15 by hand: -1, -0.5, -0.25, 0, and 1 for the lift plus 1 for the block in
+    the hand."""
+    assert reward(CFG, Primitive.GRASP, outcome) == expected
 
 
 @pytest.mark.parametrize("outcome", Outcome)
@@ -32,42 +37,46 @@ def test_each_outcome_has_its_own_level(outcome):
     """Claim: each outcome of a grasp is rewarded by the setting of its name."""
     cfg = RewardConfig(nothing=-5.0, empty=-4.0, touched=-3.0, dropped=-2.0, lifted=-1.0)
     assert rewards.grasp_effect(cfg, jnp.int32(outcome)) == getattr(cfg, outcome.name.lower())
-    assert rewards.LIFTED == Outcome.LIFTED
 
 
-@pytest.mark.parametrize(("after", "expected"), [(0.61, 0.5), (0.59, -0.5), (0.5, -0.5), (0.0, -0.5), (np.nan, -0.5)])
+@pytest.mark.parametrize(
+    ("after", "expected"), [(0.61, 0.5), (0.59, -0.5), (0.5, -0.5), (0.0, -0.5), (np.nan, -0.5)]
+)
 def test_push_rewards(after, expected):
-    """Claim: eq. 16 by hand: half a point for a gain above the dead band of 0.1, else half a point lost."""
-    assert reward(CFG, rewards.PUSH, before=0.5, after=after) == expected
+    """Claim: eq. 16 by hand: half a point for a gain above the dead band of 0.1, else half a point
+    lost."""
+    assert reward(CFG, Primitive.PUSH, before=0.5, after=after) == expected
 
 
 @pytest.mark.parametrize("outcome", Outcome)
 def test_push_ignores_the_outcome_of_a_grasp(outcome):
     """Claim: a push earns no reach reward and no grasp level, whatever is in `outcome`."""
-    assert reward(CFG, rewards.PUSH, outcome, after=1.0) == 0.5
+    assert reward(CFG, Primitive.PUSH, outcome, after=1.0) == 0.5
 
 
 def test_distance_is_a_loss():
-    """Claim: r = r2 - w r1: 0.2 m at w = 2 cost 0.4, of a push and of a grasp, and beyond 1 m no more than at 1 m."""
-    cfg = RewardConfig(distance=2.0)
-    near = RewardConfig(distance=2.0, farthest=0.1)
-    np.testing.assert_allclose(reward(cfg, rewards.GRASP, Outcome.LIFTED, 0.2), 1.6, rtol=1e-6)
-    np.testing.assert_allclose(reward(cfg, rewards.PUSH, distance=0.2, after=1.0), 0.1, rtol=1e-5)
+    """Claim: r = r2 - w r1: 0.2 m at w = 2 cost 0.4, of a push and of a grasp, and beyond 1 m no
+    more than at 1 m."""
+    cfg = RewardConfig(distance_weight=2.0)
+    near = RewardConfig(distance_weight=2.0, distance_cap=0.1)
+    np.testing.assert_allclose(reward(cfg, Primitive.GRASP, Outcome.LIFTED, 0.2), 1.6, rtol=1e-6)
+    np.testing.assert_allclose(reward(cfg, Primitive.PUSH, distance=0.2, after=1.0), 0.1, rtol=1e-5)
     assert rewards.base(cfg, jnp.array(False), jnp.float32(7.0)) == -2.0
-    np.testing.assert_allclose(rewards.base(near, jnp.array(False), jnp.float32(7.0)), -0.2, rtol=1e-6)
+    np.testing.assert_allclose(
+        rewards.base(near, jnp.array(False), jnp.float32(7.0)), -0.2, rtol=1e-6
+    )
 
 
-@pytest.mark.parametrize("primitive", [rewards.PUSH, rewards.GRASP])
+@pytest.mark.parametrize("primitive", [Primitive.PUSH, Primitive.GRASP])
 def test_blocks_that_left_cost_once(primitive):
-    """Claim: with `left` 0.75 an action pays 0.75 less when one block has left, or three, and nothing by default."""
-    strict = RewardConfig(left=0.75)
+    """Claim: with `left` 0.75 an action pays 0.75 less when one block has left, or three, and
+    nothing by default."""
+    strict = RewardConfig(lost_block_penalty=0.75)
     whole = reward(CFG, primitive, Outcome.LIFTED, after=1.0)
-    assert [reward(strict, primitive, Outcome.LIFTED, after=1.0, left=n) for n in (0, 1, 3)] == [
-        whole,
-        whole - 0.75,
-        whole - 0.75,
-    ]
-    assert reward(CFG, primitive, Outcome.LIFTED, after=1.0, left=2) == whole
+    assert [
+        reward(strict, primitive, Outcome.LIFTED, after=1.0, blocks_lost=n) for n in (0, 1, 3)
+    ] == [whole, whole - 0.75, whole - 0.75]
+    assert reward(CFG, primitive, Outcome.LIFTED, after=1.0, blocks_lost=2) == whole
 
 
 def test_scale():
@@ -81,19 +90,30 @@ def test_scale():
     "cfg",
     [
         CFG,
-        RewardConfig(eta0=0.5, distance=1.5),
-        RewardConfig(push_better=9.0, push_worse=2.0, nothing=1.0, empty=1.0, touched=1.0, dropped=1.0, reach=0.0),
-        RewardConfig(lifted=0.0, reach=-3.0, push_better=-0.5),
+        RewardConfig(eta0=0.5, distance_weight=1.5),
+        RewardConfig(
+            push_better=9.0,
+            push_worse=2.0,
+            nothing=1.0,
+            empty=1.0,
+            touched=1.0,
+            dropped=1.0,
+            success_bonus=0.0,
+        ),
+        RewardConfig(lifted=0.0, success_bonus=-3.0, push_better=-0.5),
         RewardConfig(eta1=-2.0),
-        RewardConfig(left=1.5),
-        RewardConfig(distance=3.0, farthest=0.5, push_level=-2.0, grasp_level=0.5, eta0=0.1),
+        RewardConfig(lost_block_penalty=1.5),
+        RewardConfig(
+            distance_weight=3.0, distance_cap=0.5, push_level=-2.0, grasp_level=0.5, eta0=0.1
+        ),
         algorithms.VPG_REWARD,
         dataclasses.replace(algorithms.VPG_REWARD, push_worse=-3.0, push_better=5.0),
     ],
 )
 @pytest.mark.parametrize("gamma", [0.0, 0.5, 0.9])
 def test_bounds_hold_and_are_reached(cfg, gamma):
-    """Claim: every discounted return of one action done 1 to 200 times lies within, and some reach both ends."""
+    """Claim: every discounted return of one action done 1 to 200 times lies within, and some reach
+    both ends."""
     single = [
         reward(cfg, primitive, outcome, distance, 0.0, after, changed, left)
         for primitive, outcome, distance, after, changed, left in itertools.product(
@@ -109,7 +129,8 @@ def test_bounds_hold_and_are_reached(cfg, gamma):
 
 
 def test_default_bounds():
-    """Claim: with the default rewards and gamma 0.5, returns lie between -2 and 4, with VPG's between 0 and 2."""
+    """Claim: with the default rewards and gamma 0.5, returns lie between -2 and 4, with VPG's
+    between 0 and 2."""
     assert rewards.bounds(CFG, 0.5) == (-2.0, 4.0)
     assert rewards.bounds(algorithms.VPG_REWARD, 0.5) == (0.0, 2.0)
 
@@ -118,20 +139,23 @@ def test_default_bounds():
 def test_vpg_grasp_rewards(outcome):
     """Claim: VPG by hand: 1 for a grasp that lifts, 0 for any other, whatever changed."""
     for changed in (False, True):
-        assert reward(algorithms.VPG_REWARD, rewards.GRASP, outcome, changed=changed) == float(
+        assert reward(algorithms.VPG_REWARD, Primitive.GRASP, outcome, changed=changed) == float(
             outcome == Outcome.LIFTED
         )
 
 
 @pytest.mark.parametrize(("changed", "expected"), [(True, 0.5), (False, 0.0)])
 def test_vpg_push_rewards(changed, expected):
-    """Claim: VPG by hand: 0.5 for a push that changed the map, else 0, whatever grasps are worth."""
+    """Claim: VPG by hand: 0.5 for a push that changed the map, else 0, whatever grasps are
+    worth."""
     for after in (0.0, 9.0):
-        assert reward(algorithms.VPG_REWARD, rewards.PUSH, after=after, changed=changed) == expected
+        assert (
+            reward(algorithms.VPG_REWARD, Primitive.PUSH, after=after, changed=changed) == expected
+        )
 
 
 @pytest.mark.parametrize("changed", [True, False])
 def test_value_and_change_are_apart(changed):
     """Claim: by `value`, a change of the map alone earns a push nothing."""
-    assert reward(CFG, rewards.PUSH, before=0.5, after=0.5, changed=changed) == -0.5
-    assert reward(CFG, rewards.PUSH, before=0.5, after=0.7, changed=changed) == 0.5
+    assert reward(CFG, Primitive.PUSH, before=0.5, after=0.5, changed=changed) == -0.5
+    assert reward(CFG, Primitive.PUSH, before=0.5, after=0.7, changed=changed) == 0.5

@@ -40,7 +40,8 @@ def sampled_noise(cfg: TargetConfig, mean: tuple[float, ...]) -> tuple[np.ndarra
 @pytest.mark.parametrize("cfg", CONFIGS)
 @pytest.mark.parametrize("mean", MEANS)
 def test_noise_is_truncated_normal(cfg, mean):
-    """Claim: noise follows SciPy's truncated normal, between its bounds, also at the walls and over half a turn."""
+    """Claim: noise follows SciPy's truncated normal, between its bounds, also at the walls and over
+    half a turn."""
     noise, _ = sampled_noise(cfg, mean)
     for dim in range(3):
         law, low, high = reference(cfg, mean, dim)
@@ -52,7 +53,8 @@ def test_noise_is_truncated_normal(cfg, mean):
 @pytest.mark.parametrize("cfg", CONFIGS)
 @pytest.mark.parametrize("mean", MEANS)
 def test_log_density_is_that_of_the_samples(cfg, mean):
-    """Claim: the log density is SciPy's, and 1 / p averages to the volume of the support: p integrates to 1."""
+    """Claim: the log density is SciPy's, and 1 / p averages to the volume of the support: p
+    integrates to 1."""
     noise, log_density = sampled_noise(cfg, mean)
     laws = [reference(cfg, mean, dim) for dim in range(3)]
     inside = [np.clip(noise[:, dim], low, high) for dim, (_, low, high) in enumerate(laws)]
@@ -72,7 +74,8 @@ def test_no_atoms_at_the_bounds():
 def test_mean_outside_the_box_is_brought_in():
     """Claim: a proposal beyond the walls counts as one on them."""
     outside, inside = (
-        noisy_actions(jax.random.key(0), CFG, jnp.array(mean), 10) for mean in ([1.3, 0.0, 1.5], [1.0, 0.0, -0.5])
+        noisy_actions(jax.random.key(0), CFG, jnp.array(mean), 10)
+        for mean in ([1.3, 0.0, 1.5], [1.0, 0.0, -0.5])
     )
     np.testing.assert_allclose(outside[0], inside[0], atol=1e-6)
     np.testing.assert_allclose(outside[1], inside[1], atol=1e-5)
@@ -85,14 +88,18 @@ def test_keys_differ():
 
 
 def test_expectation_by_hand():
-    """Claim: q = 0, 1 at beta = ln 3 gives 3/4; with p = 1/2, 1/4 the weights are 2 and 12: 12/14."""
+    """Claim: q = 0, 1 at beta = ln 3 gives 3/4; with p = 1/2, 1/4 the weights are 2 and 12:
+    12/14."""
     q, beta = jnp.array([0.0, 1.0]), float(np.log(3.0))
     np.testing.assert_allclose(softmax.expectation(q, jnp.zeros(2), beta), 0.75, rtol=1e-6)
-    np.testing.assert_allclose(softmax.expectation(q, jnp.log(jnp.array([0.5, 0.25])), beta), 12.0 / 14.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        softmax.expectation(q, jnp.log(jnp.array([0.5, 0.25])), beta), 12.0 / 14.0, rtol=1e-6
+    )
 
 
 def test_expectation_lies_between_mean_and_maximum():
-    """Claim: beta = 0 is the mean weighted by 1 / p, large beta the maximum, all others lie between, in order."""
+    """Claim: beta = 0 is the mean weighted by 1 / p, large beta the maximum, all others lie
+    between, in order."""
     key_q, key_density = jax.random.split(jax.random.key(0))
     q, log_density = jax.random.normal(key_q, (50,)), jax.random.normal(key_density, (50,))
     weight = np.exp(-np.asarray(log_density, np.float64))
@@ -114,13 +121,16 @@ def test_expectation_does_not_overflow():
 
 def test_exact_by_hand():
     """Claim: only valid cells count: q = 0, 1 of [0, 1, 5] at beta = ln 3 give 3/4."""
-    value = softmax.exact(jnp.array([[0.0, 1.0, 5.0]]), float(np.log(3.0)), jnp.array([[True, True, False]]))
+    value = softmax.exact(
+        jnp.array([[0.0, 1.0, 5.0]]), float(np.log(3.0)), jnp.array([[True, True, False]])
+    )
     np.testing.assert_allclose(value, 0.75, rtol=1e-6)
 
 
 @pytest.mark.parametrize("beta", [0.0, 2.0, 10.0])
 def test_expectation_is_that_of_the_continuous_softmax(beta):
-    """Claim: the estimate's mean is the softmax over all actions in reach, found by summing over a fine grid."""
+    """Claim: the estimate's mean is the softmax over all actions in reach, found by summing over a
+    fine grid."""
     cfg, mean = TargetConfig(std=0.2, clip=0.5), (0.8, -0.3, 0.9)
     key_wave, key_phase, key_sample = jax.random.split(jax.random.key(5), 3)
     waves = 6.0 * jax.random.normal(key_wave, (8, 2))
@@ -134,11 +144,15 @@ def test_expectation_is_that_of_the_continuous_softmax(beta):
     for dim in range(3):
         _, low, high = reference(cfg, mean, dim)
         axes.append(mean[dim] + low + (high - low) * (np.arange(48) + 0.5) / 48)
-    grid = jnp.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), jnp.float32)
+    grid = jnp.asarray(
+        np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), jnp.float32
+    )
     true = softmax.exact(jax.vmap(q)(grid), beta, jnp.ones(48**3, bool))
 
     def estimate(i):
-        actions, log_density = softmax.noisy_actions(jax.random.fold_in(key_sample, i), cfg, jnp.array(mean), 4096)
+        actions, log_density = softmax.noisy_actions(
+            jax.random.fold_in(key_sample, i), cfg, jnp.array(mean), 4096
+        )
         return softmax.expectation(jax.vmap(q)(actions), log_density, beta)
 
     estimates = np.asarray(jax.lax.map(estimate, jnp.arange(200)))
@@ -150,10 +164,14 @@ def test_inverse_temperature_follows_the_range_of_q():
     """Claim: ten times the rewards at ten times the range give ten times the softmax value."""
     q = jax.random.normal(jax.random.key(0), (50,))
     small, large = (
-        softmax.expectation(k * q, jnp.zeros(50), softmax.scaled_inverse_temperature(CFG, 6.0 * k)) for k in (1.0, 10.0)
+        softmax.expectation(k * q, jnp.zeros(50), softmax.scaled_inverse_temperature(CFG, 6.0 * k))
+        for k in (1.0, 10.0)
     )
     np.testing.assert_allclose(10.0 * small, large, rtol=1e-5)
-    assert softmax.scaled_inverse_temperature(dataclasses.replace(CFG, inverse_temperature=12.0), 6.0) == 2.0
+    assert (
+        softmax.scaled_inverse_temperature(dataclasses.replace(CFG, inverse_temperature=12.0), 6.0)
+        == 2.0
+    )
 
 
 def test_only_yaw_wraps():
@@ -162,7 +180,8 @@ def test_only_yaw_wraps():
 
 
 def _random_map(seed: int) -> tuple[jax.Array, jax.Array]:
-    """Random values [400] and a random law [400] over their cells, none of which is rare: p >= 0.1 / 400."""
+    """Random values [400] and a random law [400] over their cells, none of which is rare: p >= 0.1
+    / 400."""
     rng = np.random.default_rng(seed)
     law = 0.9 * rng.dirichlet(np.ones(400)) + 0.1 / 400
     return jnp.asarray(rng.uniform(-1.0, 2.0, 400), jnp.float32), jnp.asarray(law, jnp.float32)
@@ -183,11 +202,12 @@ def _estimates(q: jax.Array, law: jax.Array, beta: float) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_estimate_is_unbiased_on_random_maps(seed):
-    """Claim: 10,000 draws from any law over a random map estimate its exact softmax without bias, lie between mean and
-    maximum, grow with beta and tend to both.
+    """Claim: 10,000 draws from any law over a random map estimate its exact softmax without bias,
+    lie between mean and maximum, grow with beta and tend to both.
 
-    Tolerance: four standard errors of a hundred estimates, and the bias of self-normalising, which is of the order of
-    max(w) / n times the spread of q: a law of at least 0.1 / 400 makes w at most ten times too large, 10 / 10,000 0.4.
+    Tolerance: four standard errors of a hundred estimates, and the bias of self-normalising, which
+    is of the order of max(w) / n times the spread of q: a law of at least 0.1 / 400 makes w at most
+    ten times too large, 10 / 10,000 0.4.
     """
     q, law = _random_map(seed)
     everywhere = jnp.ones(q.shape, bool)
@@ -204,7 +224,8 @@ def test_estimate_is_unbiased_on_random_maps(seed):
 
 
 def test_exact_tends_to_mean_and_maximum():
-    """Claim: over a map, softmax_0 is the mean of the valid cells and softmax of a large beta their maximum."""
+    """Claim: over a map, softmax_0 is the mean of the valid cells and softmax of a large beta their
+    maximum."""
     q, _ = _random_map(0)
     valid = jnp.arange(400) % 3 == 0
     chosen = np.asarray(q)[::3]

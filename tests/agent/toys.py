@@ -1,6 +1,8 @@
-"""Two small problems of known best policy, played through the real training step: pictures in place of physics.
+"""Two small problems of known best policy, played through the real training step: pictures in place
+of physics.
 
-Blocks of one size lie on a 4 x 4 grid. A block's colour says what an action on it does, so that all is in the picture.
+Blocks of one size lie on a 4 x 4 grid. A block's colour says what an action on it does, so that all
+is in the picture.
 """
 
 import dataclasses
@@ -23,9 +25,9 @@ from csac_jax.config import (
     TaskConfig,
     TrainConfig,
 )
-from csac_jax.env import CHANGE_AREA, Info, State
-from csac_jax.sim.outcome import Outcome
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
+from csac_jax.env import Info, State
+from csac_jax.sim.primitives import Action
 from csac_jax.vision.heightmap import Observation
 
 GRID = 4  # places per side
@@ -45,7 +47,8 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class Toy:
-    """One scene: a good grasp ends the episode; a push of the latch turns the locked block into a good one.
+    """One scene: a good grasp ends the episode; a push of the latch turns the locked block into a
+    good one.
 
     Has the same `reset` and `step` as the environment.
     """
@@ -65,8 +68,12 @@ class Toy:
         """The picture of a scene."""
         size = self.cfg.heightmap.size
         cell = jnp.arange(size, dtype=jnp.int32) // (size // GRID)
-        there = (cell[:, None, None] * GRID + cell[None, :, None]) == layout.place[None, None]  # [H, W, N]
-        colour = jnp.einsum("hwn,nc->hwc", there.astype(jnp.float32), jnp.asarray(COLOURS)[layout.kind])
+        there = (cell[:, None, None] * GRID + cell[None, :, None]) == layout.place[
+            None, None
+        ]  # [H, W, N]
+        colour = jnp.einsum(
+            "hwn,nc->hwc", there.astype(jnp.float32), jnp.asarray(COLOURS)[layout.kind]
+        )
         taken = jnp.any(there, axis=-1)
         return Observation(
             colour=jnp.where(taken[..., None], colour, jnp.asarray(TABLE)[None, None]),
@@ -91,14 +98,17 @@ class Toy:
         outcome = jnp.where(lifted, jnp.int32(Outcome.LIFTED), outcome)
         opened = ~grasped & jnp.any(kind == LATCH) & jnp.any(layout.kind == LOCKED)
         layout = layout.replace(kind=jnp.where(opened & (layout.kind == LOCKED), GOOD, layout.kind))
-        actions, idle = state.actions + 1, jnp.where(lifted | opened, 0, state.idle + 1)
+        actions, steps_without_change = (
+            state.actions + 1,
+            jnp.where(lifted | opened, 0, state.steps_without_change + 1),
+        )
         return state.replace(
             scene=layout,
             obs=self.look(layout),
             terminated=lifted,
             truncated=(actions >= self.cfg.task.max_actions) & ~lifted,
             actions=actions,
-            idle=idle,
+            steps_without_change=steps_without_change,
             info=state.info.replace(
                 outcome=jnp.where(grasped, outcome, jnp.int32(Outcome.NOTHING)),
                 moved=jnp.where(opened, 2.0 * CHANGE_AREA, 0.0),
@@ -113,7 +123,8 @@ def bandit(cfg: Config) -> Toy:
 
 
 def two_step(cfg: Config) -> Toy:
-    """A block that can be grasped only after a push of another: without a push nothing is ever lifted."""
+    """A block that can be grasped only after a push of another: without a push nothing is ever
+    lifted."""
     return Toy(cfg, (LOCKED, LATCH, DUD))
 
 
@@ -124,13 +135,15 @@ def config(algo: str, actions: int, max_actions: int, push: float | None = None)
         net=NetConfig(rotations=4, growth=8, dilations=(1,), stem=8, head=16, margin=0.25),
         cem=CEMConfig(candidates=16, elites=4, rounds=2),
         target=TargetConfig(samples=16),
-        explore=ExploreConfig(push_fraction=0.5, place_end=0.1),
+        explore=ExploreConfig(push_fraction=0.5, epsilon_place_end=0.1),
         learn=LearnConfig(learning_rate=5e-3, batch=32, updates=2, tau=0.1),
         replay=ReplayConfig(capacity=1024),
         task=TaskConfig(max_actions=max_actions),
-        train=TrainConfig(scenes=8, actions=actions, warmup=64),
+        train=TrainConfig(scenes=8, actions=actions, learning_starts=64),
     )
     cfg = algorithms.configure(small, algo)
     if push is None:
         return cfg
-    return dataclasses.replace(cfg, reward=dataclasses.replace(cfg.reward, push_better=push, push_worse=push))
+    return dataclasses.replace(
+        cfg, reward=dataclasses.replace(cfg.reward, push_better=push, push_worse=push)
+    )

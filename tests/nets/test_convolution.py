@@ -20,12 +20,16 @@ SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first five
 ]
 
 
-def _drawn(rows: int, cols: int, size: int, inputs: int = 3, outputs: int = 5) -> tuple[jax.Array, jax.Array]:
+def _drawn(
+    rows: int, cols: int, size: int, inputs: int = 3, outputs: int = 5
+) -> tuple[jax.Array, jax.Array]:
     rng, shapes = np.random.default_rng(0), ((2, rows, cols, inputs), (size, size, inputs, outputs))
     return (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
 
 
-def _numpy(maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int) -> np.ndarray:
+def _numpy(
+    maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int
+) -> np.ndarray:
     """The sum over taps, cell by cell, in float64."""
     padded = np.pad(np.asarray(maps, np.float64), ((0, 0), (padding,) * 2, (padding,) * 2, (0, 0)))
     reach = dilation * (kernel.shape[0] - 1) + 1
@@ -53,29 +57,37 @@ def _plain(maps, kernel, stride, dilation, padding):
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_forward_is_numpys(setting, backend, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the value is the sum over the kernel's taps, zeros around; in the form for a CPU and in that for a GPU."""
+    """Claim: the value is the sum over the kernel's taps, zeros around; in the form for a CPU and
+    in that for a GPU."""
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     maps, kernel = _drawn(*setting[:3])
-    np.testing.assert_allclose(conv2d(maps, kernel, *setting[3:]), _numpy(maps, kernel, *setting[3:]), atol=2e-5)
+    np.testing.assert_allclose(
+        conv2d(maps, kernel, *setting[3:]), _numpy(maps, kernel, *setting[3:]), atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
 @pytest.mark.parametrize("channels", [(3, 5), (5, 3)])
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the gradients in maps and kernel are those that JAX derives from its own convolution, also inside scan.
+    """Claim: the gradients in maps and kernel are those that JAX derives from its own convolution,
+    also inside scan.
 
     In the form for a CPU and in that for a GPU, both computed here.
     """
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     maps, kernel = _drawn(*setting[:3], *channels)
-    close = 1e-4 if backend == "gpu" and setting[2] == 8 else 3e-5  # 320 products, summed in another order
+    close = (
+        1e-4 if backend == "gpu" and setting[2] == 8 else 3e-5
+    )  # 320 products, summed in another order
 
     def loss(conv):
         return lambda maps, kernel: jnp.sum(jnp.sin(conv(maps, kernel, *setting[3:])))
 
     wanted = jax.jit(jax.grad(loss(_plain), argnums=(0, 1)))(maps, kernel)
     ours = jax.grad(loss(conv2d), argnums=(0, 1))
-    _, scanned = jax.jit(lambda m, k: jax.lax.scan(lambda c, _: (c, ours(m, k)), 0, length=2))(maps, kernel)
+    _, scanned = jax.jit(lambda m, k: jax.lax.scan(lambda c, _: (c, ours(m, k)), 0, length=2))(
+        maps, kernel
+    )
     for name, got, want in zip(("maps", "kernel"), scanned, wanted, strict=True):
         np.testing.assert_allclose(got[1], want, atol=close, err_msg=name)

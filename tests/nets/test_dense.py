@@ -29,22 +29,31 @@ def _random(cfg: NetConfig) -> dict:
     """Parameters that are all random: scales and biases too, which start at 1 and 0."""
     rng = np.random.default_rng(1)
     fresh = dense.Critic(cfg).init(jax.random.key(0), jnp.zeros((1, 16, 16, CHANNELS)))
-    return jax.tree.map(lambda leaf: leaf + jnp.asarray(rng.normal(scale=0.2, size=leaf.shape), leaf.dtype), fresh)
+    return jax.tree.map(
+        lambda leaf: leaf + jnp.asarray(rng.normal(scale=0.2, size=leaf.shape), leaf.dtype), fresh
+    )
 
 
 def _apply(params: dict, maps: np.ndarray, cfg: NetConfig = CFG) -> np.ndarray:
     return np.asarray(jax.jit(dense.Critic(cfg).apply)(params, jnp.asarray(maps, jnp.float32))[0])
 
 
-def _convolve(maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int) -> np.ndarray:
+def _convolve(
+    maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int
+) -> np.ndarray:
     padded = np.pad(maps, ((0, 0), (padding,) * 2, (padding,) * 2, (0, 0)))
     size = kernel.shape[0]
-    rows, cols = ((length - dilation * (size - 1) - 1) // stride + 1 for length in padded.shape[1:3])
+    rows, cols = (
+        (length - dilation * (size - 1) - 1) // stride + 1 for length in padded.shape[1:3]
+    )
     out = np.zeros((*maps.shape[:1], rows, cols, kernel.shape[3]))
     for i in range(size):
         for j in range(size):
             top, left = i * dilation, j * dilation
-            out += padded[:, top : top + rows * stride : stride, left : left + cols * stride : stride] @ kernel[i, j]
+            out += (
+                padded[:, top : top + rows * stride : stride, left : left + cols * stride : stride]
+                @ kernel[i, j]
+            )
     return out
 
 
@@ -58,8 +67,8 @@ def _norm(maps: np.ndarray, weights: dict) -> np.ndarray:
 
 
 def _numpy_net(params: dict, maps: np.ndarray, cfg: NetConfig = CFG) -> np.ndarray:
-    """The critic's values of each cell of the features, in float64: kernels twice the stride wide lie half of it over
-    the edge."""
+    """The critic's values of each cell of the features, in float64: kernels twice the stride wide
+    lie half of it over the edge."""
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params["params"])
     trunk, head = weights["trunk"], weights["head"]
     stem = trunk["Convolution_0"]["kernel"]
@@ -74,7 +83,8 @@ def _numpy_net(params: dict, maps: np.ndarray, cfg: NetConfig = CFG) -> np.ndarr
 
 @pytest.mark.parametrize("cfg", [CFG, COARSE])
 def test_net_is_numpys(cfg: NetConfig):
-    """Claim: densely connected, group norm over the whole map, 1/stride of the resolution, three maps."""
+    """Claim: densely connected, group norm over the whole map, 1/stride of the resolution, three
+    maps."""
     maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
     got = _apply(params, maps, cfg)
     assert got.shape == (2, 16 // cfg.stride, 24 // cfg.stride, dense.OUTPUTS)
@@ -82,7 +92,8 @@ def test_net_is_numpys(cfg: NetConfig):
 
 
 def test_half_precision_is_near(params):
-    """Claim: in bfloat16, 8 bits of mantissa, maps stay float32 and within 2 % of their spread; gradients too."""
+    """Claim: in bfloat16, 8 bits of mantissa, maps stay float32 and within 2 % of their spread;
+    gradients too."""
     maps = jnp.asarray(np.random.default_rng(0).normal(size=(4, 32, 32, CHANNELS)), jnp.float32)
 
     def run(dtype: str):
@@ -100,37 +111,48 @@ def test_half_precision_is_near(params):
 
 
 def test_maps_follow_the_picture(params):
-    """Claim: a picture moved by whole cells of the maps, far from the edges, moves its maps with it.
+    """Claim: a picture moved by whole cells of the maps, far from the edges, moves its maps with
+    it.
 
-    Group norm looks at the whole map: this holds since bare table is 0 and moving the picture changes no mean. The
-    nearest 8 cells to the edges see them and are left out.
+    Group norm looks at the whole map: this holds since bare table is 0 and moving the picture
+    changes no mean. The nearest 8 cells to the edges see them and are left out.
     """
     picture = np.random.default_rng(2).normal(size=(12, 12, CHANNELS))
     here, there = np.zeros((2, 1, 80, 80, CHANNELS))
     here[0, 28:40, 30:42], there[0, 36:48, 34:46] = picture, picture
     before, after = _apply(params, here)[0], _apply(params, there)[0]
     inner = slice(8, -8)
-    np.testing.assert_allclose(np.roll(before, (4, 2), axis=(0, 1))[inner, inner], after[inner, inner], atol=2e-5)
+    np.testing.assert_allclose(
+        np.roll(before, (4, 2), axis=(0, 1))[inner, inner], after[inner, inner], atol=2e-5
+    )
     assert np.abs(before - after)[inner, inner].max() > 0.1  # it is not the same everywhere
 
 
 @pytest.mark.parametrize(("stride", "finer"), [(2, 2), (4, 2), (4, 4)])
 def test_finer_maps_lie_where_their_cells_do(stride: int, finer: int):
-    """Claim: with s maps' cells per cell of the features, cell (s r + i, s c + j) of output o is value (i, j, o) of the
-    features' cell (r, c); with s = stride the maps have the resolution of what the net sees."""
+    """Claim: with s maps' cells per cell of the features, cell (s r + i, s c + j) of output o is
+    value (i, j, o) of the features' cell (r, c); with s = stride the maps have the resolution of
+    what the net sees."""
     cfg = dataclasses.replace(COARSE, stride=stride, subcells=finer)
     maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
-    got, values = _apply(params, maps, cfg), _numpy_net(params, maps, cfg)  # values [2, h, w, s s OUTPUTS]
+    got, values = (
+        _apply(params, maps, cfg),
+        _numpy_net(params, maps, cfg),
+    )  # values [2, h, w, s s OUTPUTS]
     assert got.shape == (2, 16 * finer // stride, 24 * finer // stride, dense.OUTPUTS)
     for i in range(finer):
         for j in range(finer):
             for output in range(dense.OUTPUTS):
-                cells, channel = got[:, i::finer, j::finer, output], (finer * i + j) * dense.OUTPUTS + output
+                cells, channel = (
+                    got[:, i::finer, j::finer, output],
+                    (finer * i + j) * dense.OUTPUTS + output,
+                )
                 np.testing.assert_allclose(cells, values[..., channel], rtol=1e-3, atol=1e-4)
 
 
 def test_bare_table_is_zero():
-    """Claim: where nothing lies the net is fed 0, whatever the table's colour; a block's height comes out near 1."""
+    """Claim: where nothing lies the net is fed 0, whatever the table's colour; a block's height
+    comes out near 1."""
     height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
     fed = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, None, border=False))
     np.testing.assert_array_equal(fed[0, 0], 0.0)
@@ -139,9 +161,12 @@ def test_bare_table_is_zero():
 
 
 def test_border_is_a_map_of_its_own():
-    """Claim: with the border the net is fed 1 on the workspace, bare or not, and 0 in every map beyond it."""
+    """Claim: with the border the net is fed 1 on the workspace, bare or not, and 0 in every map
+    beyond it."""
     height = jnp.array([[0.0, 0.05], [heightmap.BEYOND, 0.001]])
-    fed = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, jnp.ones((2, 2), bool), border=True))
+    fed = np.asarray(
+        dense.inputs(jnp.full((2, 2, 3), 0.9), height, jnp.ones((2, 2), bool), border=True)
+    )
     np.testing.assert_array_equal(fed[..., -1], [[1.0, 1.0], [0.0, 1.0]])
     np.testing.assert_array_equal(fed[1, 0, :4], 0.0)
     np.testing.assert_allclose(fed[0, 1, 3], 1.0, rtol=1e-6)

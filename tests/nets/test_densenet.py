@@ -36,7 +36,9 @@ def random_variables(module: nn.Module, seed: int, *shapes: tuple[int, ...]) -> 
             values = rng.normal(scale=0.2, size=leaf.shape)
         return jnp.asarray(values, leaf.dtype)
 
-    return jax.tree_util.tree_map_with_path(draw, jax.eval_shape(module.init, jax.random.key(0), *blanks))
+    return jax.tree_util.tree_map_with_path(
+        draw, jax.eval_shape(module.init, jax.random.key(0), *blanks)
+    )
 
 
 def _keras_name(modules: tuple[str, ...]) -> str:
@@ -50,16 +52,21 @@ def _keras_name(modules: tuple[str, ...]) -> str:
 
 
 def _outputs(tree: Any, modules: tuple[str, ...] = ()) -> Iterator[tuple[str, jax.Array]]:
-    """Keras's name and output of every module in the captured intermediates but dense layers, which give what their
-    last convolution gives, whole blocks and the trunk."""
+    """Keras's name and output of every module in the captured intermediates but dense layers, which
+    give what their last convolution gives, whole blocks and the trunk."""
     for name, entry in tree.items():
         if name != "__call__":
             yield from _outputs(entry, (*modules, name))
         elif modules and not modules[-1].startswith("dense"):
-            yield _keras_name(modules), entry[0].maps if modules[-1].startswith("transition") else entry[0]
+            yield (
+                _keras_name(modules),
+                entry[0].maps if modules[-1].startswith("transition") else entry[0],
+            )
 
 
-def _weights(variables: Any, modules: tuple[str, ...] = ()) -> Iterator[tuple[str, list[np.ndarray]]]:
+def _weights(
+    variables: Any, modules: tuple[str, ...] = ()
+) -> Iterator[tuple[str, list[np.ndarray]]]:
     """Keras's name and weights of every layer that has some."""
     params, statistics = variables
     for name, entry in params.items():
@@ -67,7 +74,10 @@ def _weights(variables: Any, modules: tuple[str, ...] = ()) -> Iterator[tuple[st
             yield _keras_name((*modules, name)), [np.asarray(entry["kernel"])]
         elif "scale" in entry:
             own = statistics[name]
-            yield _keras_name((*modules, name)), [np.asarray(w) for w in (*_scale(entry), own["mean"], own["var"])]
+            yield (
+                _keras_name((*modules, name)),
+                [np.asarray(w) for w in (*_scale(entry), own["mean"], own["var"])],
+            )
         else:
             yield from _weights((entry, statistics.get(name, {})), (*modules, name))
 
@@ -77,13 +87,18 @@ def _scale(entry: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
 
 
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
-    """Compares every module with Keras's in both modes of batch norm; returns how many outputs were compared."""
+    """Compares every module with Keras's in both modes of batch norm; returns how many outputs were
+    compared."""
     cfg = NetConfig(kind="densenet121", norm="batch", block_layers=block_layers)
     trunk = densenet.Trunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(4, size, size, 3)), jnp.float32)
 
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.debug_key_reuse(False):
+    with (
+        jax.numpy_rank_promotion("allow"),
+        jax.numpy_dtype_promotion("standard"),
+        jax.debug_key_reuse(False),
+    ):
         call, names = _keras(block_layers, size, variables)
         theirs = {train: jax.tree.map(np.asarray, call(maps, train)) for train in (False, True)}
 
@@ -106,7 +121,8 @@ def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
 
 
 def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Callable, list[str]]:
-    """(maps, train) -> (outputs, statistics by layer) of Keras's net with our weights; names of the outputs."""
+    """(maps, train) -> (outputs, statistics by layer) of Keras's net with our weights; names of the
+    outputs."""
     import keras
     from keras.src.applications.densenet import DenseNet
 
@@ -116,12 +132,20 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
         layer = net.get_layer(name)
         layer.set_weights(weights)
         if len(weights) == 4:
-            layer.momentum, layer.epsilon = 0.9, 1e-5  # torchvision's in place of Keras's 0.99 and 1.001e-5
+            layer.momentum, layer.epsilon = (
+                0.9,
+                1e-5,
+            )  # torchvision's in place of Keras's 0.99 and 1.001e-5
             norms.append(name)
     kinds = ("_conv", "_bn", "_pool")
-    wanted = [layer.name for layer in net.layers if layer.name.endswith(kinds) or layer.name == "bn"]
+    wanted = [
+        layer.name for layer in net.layers if layer.name.endswith(kinds) or layer.name == "bn"
+    ]
     whole = keras.Model(net.inputs, [net.get_layer(name).output for name in wanted])
-    trained, other = ([v.value for v in group] for group in (whole.trainable_variables, whole.non_trainable_variables))
+    trained, other = (
+        [v.value for v in group]
+        for group in (whole.trainable_variables, whole.non_trainable_variables)
+    )
 
     def run(trained: Any, other: Any, maps: jax.Array, train: bool) -> Any:
         return whole.stateless_call(trained, other, maps, training=train)
@@ -130,8 +154,14 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
 
     def call(maps: jax.Array, train: bool) -> Any:
         outputs, after = compiled(trained, other, maps, train)
-        by_path = {variable.path: value for variable, value in zip(whole.non_trainable_variables, after, strict=True)}
-        statistics = {name: [by_path.get(v.path, v.value) for v in net.get_layer(name).variables] for name in norms}
+        by_path = {
+            variable.path: value
+            for variable, value in zip(whole.non_trainable_variables, after, strict=True)
+        }
+        statistics = {
+            name: [by_path.get(v.path, v.value) for v in net.get_layer(name).variables]
+            for name in norms
+        }
         return outputs, statistics
 
     return call, wanted
@@ -139,8 +169,9 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
 
 @pytest.mark.slow
 def test_every_stage_is_kerass():
-    """Claim: with weights ported, every convolution, norm and transition is Keras's within 1e-4 of the largest value,
-    batch norm both with running statistics and with the batch's, which move the running ones alike."""
+    """Claim: with weights ported, every convolution, norm and transition is Keras's within 1e-4 of
+    the largest value, batch norm both with running statistics and with the batch's, which move the
+    running ones alike."""
     assert _compare((2, 1, 1, 1), 64) == 2 + 5 * 4 + 3 * 3 + 1
 
 
@@ -151,19 +182,22 @@ def test_every_stage_of_densenet_121_is_kerass():
 
 
 def test_number_of_parameters():
-    """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running statistics."""
+    """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running
+    statistics."""
     trunk = densenet.Trunk(NetConfig(kind="densenet121", norm="batch"))
     blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
     variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
-    sizes = {name: sum(leaf.size for leaf in jax.tree.leaves(entry)) for name, entry in variables.items()}
+    sizes = {
+        name: sum(leaf.size for leaf in jax.tree.leaves(entry)) for name, entry in variables.items()
+    }
     assert sizes == {"params": PARAMETERS - 83_648, "batch_stats": 83_648}
     assert jax.eval_shape(trunk.apply, variables, blank).shape == (1, 2, 2, 1024)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.float32.dtype}
 
 
 def test_trunks_see_colour_height_and_mask():
-    """Claim: a trunk each for colour, for height and for the mask, the latter two three times over; cells are repeated
-    as far as the trunk does not double them itself."""
+    """Claim: a trunk each for colour, for height and for the mask, the latter two three times over;
+    cells are repeated as far as the trunk does not double them itself."""
     maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
     zoomed = NetConfig(kind="densenet121", zoom=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
@@ -183,24 +217,31 @@ def test_a_zoomed_trunk_doubles_its_cells():
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
     variables = random_variables(whole, 0, (1, 64, 64, 3))
     repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
-    got, wanted = jax.jit(doubling.apply)(variables, maps), jax.jit(whole.apply)(variables, repeated)
+    got, wanted = (
+        jax.jit(doubling.apply)(variables, maps),
+        jax.jit(whole.apply)(variables, repeated),
+    )
     assert got.shape == (2, 2, 3, 8)
-    np.testing.assert_allclose(got, wanted, atol=1e-4)  # rounding, which norms of random scales amplify
+    np.testing.assert_allclose(
+        got, wanted, atol=1e-4
+    )  # rounding, which norms of random scales amplify
 
 
 def test_inputs():
-    """Claim: bare table is 0; on blocks colours are normalised as ImageNet's and 3 cm of height are 1; without colour
-    only the height is left."""
+    """Claim: bare table is 0; on blocks colours are normalised as ImageNet's and 3 cm of height are
+    1; without colour only the height is left."""
     height, colour = jnp.array([[0.0, 0.03]]), jnp.full((1, 2, 3), 0.5)
     fed = np.asarray(densenet.inputs(colour, height, jnp.array([[True, False]])))
     np.testing.assert_array_equal(fed[0, 0], [0.0, 0.0, 0.0, 0.0, 1.0])
-    np.testing.assert_allclose(fed[0, 1], [0.015 / 0.229, 0.044 / 0.224, 0.094 / 0.225, 1.0, 0.0], rtol=1e-4)
+    np.testing.assert_allclose(
+        fed[0, 1], [0.015 / 0.229, 0.044 / 0.224, 0.094 / 0.225, 1.0, 0.0], rtol=1e-4
+    )
     np.testing.assert_allclose(densenet.inputs(None, height, None), [[[0.0], [1.0]]], rtol=1e-6)
 
 
 def test_trunks_have_weights_of_their_own():
-    """Claim: each trunk has its own weights, and features are joined colour first: changing what one trunk sees, or one
-    trunk's weights, changes its share of the features only."""
+    """Claim: each trunk has its own weights, and features are joined colour first: changing what
+    one trunk sees, or one trunk's weights, changes its share of the features only."""
     critic = densenet.Critic(TINY)
     maps = jnp.asarray(np.random.default_rng(2).normal(size=(1, 64, 64, 4)), jnp.float32)
     variables = random_variables(critic, 0, maps.shape)
@@ -216,19 +257,24 @@ def test_trunks_have_weights_of_their_own():
 
 @pytest.mark.parametrize(("zoom", "output_stride", "factor"), [(1, 4, 8), (2, 1, 16), (2, 16, 1)])
 def test_head_upsamples(zoom: int, output_stride: int, factor: int):
-    """Claim: maps have the resolution that `output_stride` says; they are bilinear between the features' cells, which
-    keep their places, and constant features give a constant map."""
+    """Claim: maps have the resolution that `output_stride` says; they are bilinear between the
+    features' cells, which keep their places, and constant features give a constant map."""
     cfg = NetConfig(kind="densenet121", zoom=zoom, output_stride=output_stride)
-    plane = jnp.asarray(np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None], jnp.float32)
+    plane = jnp.asarray(
+        np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None], jnp.float32
+    )
     got = np.asarray(densenet._upsample(plane, 32 // (cfg.zoom * cfg.output_stride)))[0, ..., 0]
     assert got.shape == (4 * factor, 5 * factor)
     at = [(np.arange(n * factor) + 0.5) / factor - 0.5 for n in (4, 5)]
     inner = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]
-    np.testing.assert_allclose(got[np.ix_(*inner)], np.add.outer(3.0 * at[0][inner[0]], at[1][inner[1]]), atol=1e-5)
+    np.testing.assert_allclose(
+        got[np.ix_(*inner)], np.add.outer(3.0 * at[0][inner[0]], at[1][inner[1]]), atol=1e-5
+    )
 
 
 def test_group_norm_sees_one_map():
-    """Claim: with group norm the maps of a picture do not depend on what else is in the batch, in the head either."""
+    """Claim: with group norm the maps of a picture do not depend on what else is in the batch, in
+    the head either."""
     head = densenet.Head(TINY)
     features = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, 2, 16)), jnp.float32)
     variables = random_variables(head, 0, (1, 2, 2, 16))

@@ -16,7 +16,9 @@ from csac_jax.nets import dense, densenet, networks
 
 def _config(size: int = 224, **net: Any) -> Config:
     fields = {"kind": "densenet121", "margin": 0.4286, **net}
-    return dataclasses.replace(presets.smoke(), heightmap=HeightmapConfig(size=size), net=NetConfig(**fields))
+    return dataclasses.replace(
+        presets.smoke(), heightmap=HeightmapConfig(size=size), net=NetConfig(**fields)
+    )
 
 
 @pytest.mark.parametrize(
@@ -32,8 +34,16 @@ def _config(size: int = 224, **net: Any) -> Config:
             {"margin": 0.25},
             r"net.margin: .* of 32 cells, not 80; try 0.0000 \(64 cells\), 0.5000 \(96 cel",
         ),
-        (40, {"margin": 0.0}, r"net.margin: .* multiple of 32 cells, not 40; no margin .* heightmap.size than 40"),
-        (64, {"margin": 0.125, "zoom": 2}, r"net.margin: .* multiple of 16 cells, not 72; try 0.0000"),
+        (
+            40,
+            {"margin": 0.0},
+            r"net.margin: .* multiple of 32 cells, not 40; no margin .* heightmap.size than 40",
+        ),
+        (
+            64,
+            {"margin": 0.125, "zoom": 2},
+            r"net.margin: .* multiple of 16 cells, not 72; try 0.0000",
+        ),
         (224, {"zoom": 3}, "net.zoom, net.output_stride: their product must divide 32"),
         (224, {"output_stride": 64}, "net.zoom, net.output_stride: their product must divide 32"),
         (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: at least one layer"),
@@ -42,19 +52,39 @@ def _config(size: int = 224, **net: Any) -> Config:
         (224, {"kind": "resnet"}, "net.kind: 'resnet' is not one of: small, densenet121"),
         (224, {"weights": "x.safetensors"}, "net.weights: need --net.norm batch"),
         (224, {"border": True}, "net.border: only of --net.kind small"),
-        (64, {"kind": "small", "margin": 0.125, "norm": "batch"}, "net.norm batch, net.weights: only of"),
-        (64, {"kind": "small", "margin": 0.125, "weights": "x"}, "net.norm batch, net.weights: only of"),
+        (
+            64,
+            {"kind": "small", "margin": 0.125, "norm": "batch"},
+            "net.norm batch, net.weights: only of",
+        ),
+        (
+            64,
+            {"kind": "small", "margin": 0.125, "weights": "x"},
+            "net.norm batch, net.weights: only of",
+        ),
         (64, {"kind": "small", "stride": 3}, "net.stride: must be 2 or 4"),
         (64, {"kind": "small", "subcells": 3}, "net.subcells: must divide net.stride, 2"),
         (64, {"kind": "small", "subcells": 4}, "net.subcells: must divide net.stride, 2"),
-        (64, {"kind": "small", "stride": 4, "subcells": 3}, "net.subcells: must divide net.stride, 4"),
-        (64, {"kind": "small", "margin": 0.22}, "net.margin: rotated maps of 78 cells are not a multiple of 4"),
-        (64, {"kind": "small", "margin": 0.22, "stride": 4}, "net.margin: rotated maps of 78 cells are not a multiple"),
+        (
+            64,
+            {"kind": "small", "stride": 4, "subcells": 3},
+            "net.subcells: must divide net.stride, 4",
+        ),
+        (
+            64,
+            {"kind": "small", "margin": 0.22},
+            "net.margin: rotated maps of 78 cells are not a multiple of 4",
+        ),
+        (
+            64,
+            {"kind": "small", "margin": 0.22, "stride": 4},
+            "net.margin: rotated maps of 78 cells are not a multiple",
+        ),
     ],
 )
 def test_config_that_no_net_can_have(size: int, net: dict[str, Any], message: str):
-    """Claim: sizes that the strides do not divide, and settings that do not go together, are refused in one line as the
-    config is built, with margins that would do."""
+    """Claim: sizes that the strides do not divide, and settings that do not go together, are
+    refused in one line as the config is built, with margins that would do."""
     with pytest.raises(ValueError, match=f"^{message}") as raised:
         _config(size, **net)
     assert "\n" not in str(raised.value)
@@ -72,13 +102,22 @@ def test_suggested_margins_do():
                 assert frames.tables.canvas == int(side.removesuffix(" cells)"))
 
 
-@pytest.mark.parametrize(("stride", "finer", "cells"), [(2, 1, 2), (2, 2, 1), (4, 1, 4), (4, 2, 2), (4, 4, 1)])
+@pytest.mark.parametrize(
+    ("stride", "finer", "cells"), [(2, 1, 2), (2, 2, 1), (4, 1, 4), (4, 2, 2), (4, 4, 1)]
+)
 def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
-    """Claim: a cell of the small net's maps is stride / subcells cells of its input, in frames as in what it gives."""
-    cfg = _config(64, kind="small", margin=0.125, stride=stride, subcells=finer, dilations=(1,), growth=4)
+    """Claim: a cell of the small net's maps is stride / subcells cells of its input, in frames as
+    in what it gives."""
+    cfg = _config(
+        64, kind="small", margin=0.125, stride=stride, subcells=finer, dilations=(1,), growth=4
+    )
     frames, net = maps.frames(cfg), networks.critic(cfg.net)
     (q, _), _ = jax.eval_shape(net.init_with_output, jax.random.key(0), jnp.zeros((1, 72, 72, 4)))
-    assert (frames.stride, frames.side, frames.cell) == (cells, 72 // cells, pytest.approx(0.007 * cells))
+    assert (frames.stride, frames.side, frames.cell) == (
+        cells,
+        72 // cells,
+        pytest.approx(0.007 * cells),
+    )
     assert q.shape == (1, frames.side, frames.side, dense.OUTPUTS)
 
 
@@ -86,13 +125,25 @@ def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
 @pytest.mark.parametrize("target", [True, False])
 @pytest.mark.parametrize("kind", ["small", "densenet121"])
 def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: bool):
-    """Claim: either net, with and without colour and mask, gives maps of the size that the frames say, and the actor's
-    head gives maps of the same size from its features."""
-    cfg = _config(64, kind=kind, margin=0.5, colour=colour, rotations=4, block_layers=(1, 1, 1, 1), block_growth=4)
-    cfg = dataclasses.replace(cfg, task=dataclasses.replace(cfg.task, kind="target" if target else "clear"))
+    """Claim: either net, with and without colour and mask, gives maps of the size that the frames
+    say, and the actor's head gives maps of the same size from its features."""
+    cfg = _config(
+        64,
+        kind=kind,
+        margin=0.5,
+        colour=colour,
+        rotations=4,
+        block_layers=(1, 1, 1, 1),
+        block_growth=4,
+    )
+    cfg = dataclasses.replace(
+        cfg, task=dataclasses.replace(cfg.task, kind="target" if target else "clear")
+    )
     frames = maps.frames(cfg)
     seen = jax.eval_shape(
-        lambda colour, height, mask: networks.inputs(cfg.net, colour, height, mask if frames.marked else None),
+        lambda colour, height, mask: networks.inputs(
+            cfg.net, colour, height, mask if frames.marked else None
+        ),
         jnp.zeros((1, 96, 96, 3)),
         jnp.zeros((1, 96, 96)),
         jnp.zeros((1, 96, 96), bool),
@@ -107,9 +158,12 @@ def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: boo
 
 
 def test_states_of_densenet_are_seen_in_groups():
-    """Claim: DenseNet-121 sees one state of 640 px at a time, four of 320, and what it says of each is what it says of
-    its passes by themselves; the small net sees all at once."""
-    assert networks.states_at_once(_config(224, margin=0.4286, kind="densenet121", zoom=2).net, 320) == 1
+    """Claim: DenseNet-121 sees one state of 640 px at a time, four of 320, and what it says of each
+    is what it says of its passes by themselves; the small net sees all at once."""
+    assert (
+        networks.states_at_once(_config(224, margin=0.4286, kind="densenet121", zoom=2).net, 320)
+        == 1
+    )
     assert networks.states_at_once(_config(224, margin=0.4286, kind="densenet121").net, 320) == 4
     assert networks.states_at_once(NetConfig(), 72) is None
     net = NetConfig(kind="densenet121", block_layers=(1, 1, 1, 1), block_growth=4, head=8)
@@ -128,16 +182,26 @@ def test_states_of_densenet_are_seen_in_groups():
 
 @pytest.mark.parametrize("kind", ["small", "densenet121"])
 def test_looks_at_any_number_of_states_share_products(kind: str):
-    """Claim: one state and eight go through products of the same shapes with DenseNet-121, of others with the small
-    net, which takes all at once."""
-    critic = networks.critic(_config(64, kind=kind, margin=0.5, block_layers=(1, 1, 1, 1), block_growth=4).net)
+    """Claim: one state and eight go through products of the same shapes with DenseNet-121, of
+    others with the small net, which takes all at once."""
+    critic = networks.critic(
+        _config(64, kind=kind, margin=0.5, block_layers=(1, 1, 1, 1), block_growth=4).net
+    )
     variables = jax.eval_shape(critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
 
     def products(states: int) -> set[str]:
         fed = jax.ShapeDtypeStruct((states, 2, 640, 640, 4), jnp.float32)
-        text = jax.jit(lambda variables, fed: networks.look(critic, variables, fed)).lower(variables, fed).as_text()
+        text = (
+            jax.jit(lambda variables, fed: networks.look(critic, variables, fed))
+            .lower(variables, fed)
+            .as_text()
+        )
         named = ("stablehlo.convolution", "stablehlo.dot_general")
-        return {line.split(" : ")[-1] for line in text.splitlines() if any(name in line for name in named)}
+        return {
+            line.split(" : ")[-1]
+            for line in text.splitlines()
+            if any(name in line for name in named)
+        }
 
     assert products(1)
     assert (products(1) == products(8)) == (kind == "densenet121")

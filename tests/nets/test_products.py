@@ -1,4 +1,5 @@
-"""Convolutions as matrix products against XLA's own, the pool against Flax's; values and gradients."""
+"""Convolutions as matrix products against XLA's own, the pool against Flax's; values and
+gradients."""
 
 import flax.linen as nn
 import jax
@@ -18,7 +19,8 @@ from csac_jax.nets import products
     ],
 )
 def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
-    """Claim: value, and gradients for maps and kernel, are those of a convolution with zeros around."""
+    """Claim: value, and gradients for maps and kernel, are those of a convolution with zeros
+    around."""
     rng = np.random.default_rng(0)
     shapes = (2, 8, 12, 4), (size, size, 4, 5), (2, 8 // stride, 12 // stride, 5)
     maps, kernel, gradient = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
@@ -41,10 +43,12 @@ def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
 
 
 def test_doubled_cells_are_pixels_twice_over():
-    """Claim: the first convolution says of doubled cells what it says of pixels repeated; gradients too."""
+    """Claim: the first convolution says of doubled cells what it says of pixels repeated; gradients
+    too."""
     rng = np.random.default_rng(1)
     maps, kernel, gradient = (
-        jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((2, 8, 12, 3), (7, 7, 3, 5), (2, 8, 12, 5))
+        jnp.asarray(rng.normal(size=shape), jnp.float32)
+        for shape in ((2, 8, 12, 3), (7, 7, 3, 5), (2, 8, 12, 5))
     )
 
     def see(doubled: bool, maps: jax.Array, kernel: jax.Array) -> jax.Array:
@@ -54,15 +58,18 @@ def test_doubled_cells_are_pixels_twice_over():
         return see(False, jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2), kernel)
 
     (got, got_back), (wanted, back) = (
-        jax.vjp(function, maps, kernel) for function in (lambda maps, kernel: see(True, maps, kernel), repeated)
+        jax.vjp(function, maps, kernel)
+        for function in (lambda maps, kernel: see(True, maps, kernel), repeated)
     )
     for mine, other in zip((got, *got_back(gradient)), (wanted, *back(gradient)), strict=True):
-        np.testing.assert_allclose(mine, other, atol=1e-4)  # sums of up to 192 products of numbers near 1
+        np.testing.assert_allclose(
+            mine, other, atol=1e-4
+        )  # sums of up to 192 products of numbers near 1
 
 
 def test_max_pool_is_flaxs():
-    """Claim: the maximum of shifted maps is a max pool with padding, gradient included, without the operation that GPUs
-    lack when results are to repeat."""
+    """Claim: the maximum of shifted maps is a max pool with padding, gradient included, without the
+    operation that GPUs lack when results are to repeat."""
     rng = np.random.default_rng(0)
     maps = jnp.asarray(np.maximum(rng.normal(size=(2, 8, 12, 3)), 0.0), jnp.float32)
     pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
@@ -70,8 +77,12 @@ def test_max_pool_is_flaxs():
     weight = jnp.asarray(rng.normal(size=(2, 4, 6, 3)), jnp.float32)
     losses = [lambda maps, f=f: jnp.sum(weight * f(maps)) for f in (products.max_pool, pool)]
     got, wanted = (jax.jit(jax.grad(loss))(maps) for loss in losses)
-    positive = maps > 0.0  # at 0 several cells are the largest; the ReLU before takes the gradient away there
-    np.testing.assert_allclose(jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6)
+    positive = (
+        maps > 0.0
+    )  # at 0 several cells are the largest; the ReLU before takes the gradient away there
+    np.testing.assert_allclose(
+        jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6
+    )
     named = ["select_and_scatter" in str(jax.make_jaxpr(jax.grad(loss))(maps)) for loss in losses]
     assert named == [False, True]
 
@@ -80,5 +91,7 @@ def test_max_pool_chooses_the_first_of_the_largest():
     """Claim: where several cells are the largest the gradient is the first one's, as Flax's is."""
     maps = jnp.asarray(np.random.default_rng(2).integers(1, 4, size=(2, 8, 12, 3)), jnp.float32)
     pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
-    got, wanted = (jax.grad(lambda maps, f=f: jnp.sum(f(maps)))(maps) for f in (products.max_pool, pool))
+    got, wanted = (
+        jax.grad(lambda maps, f=f: jnp.sum(f(maps)))(maps) for f in (products.max_pool, pool)
+    )
     np.testing.assert_array_equal(got, wanted)

@@ -7,7 +7,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import ReplayConfig
 from csac_jax.replay import ring
-from csac_jax.train import step
+from csac_jax.training import step
 
 
 @pytest.mark.parametrize(
@@ -22,10 +22,10 @@ from csac_jax.train import step
         ("floor", 0.0),
         ("floor", -1.0),
         ("floor", 2.0),
-        ("weight_start", -0.1),
-        ("weight_start", 1.1),
-        ("weight_end", -0.1),
-        ("weight_end", 1.1),
+        ("is_beta_start", -0.1),
+        ("is_beta_start", 1.1),
+        ("is_beta_end", -0.1),
+        ("is_beta_end", 1.1),
         ("beta_start", (0.0, 1.0)),
         ("beta_middle", (1.0, -1.0)),
         ("beta_end", (1.0, 0.0)),
@@ -41,7 +41,8 @@ def test_values_out_of_range(name, value):
 
 @pytest.mark.parametrize("preset", ["smoke", "quick"])
 def test_bytes_are_those_of_the_ring(preset):
-    """Claim: the predicted memory is that of the arrays: two maps of 6 bytes per cell, and 26 bytes besides."""
+    """Claim: the predicted memory is that of the arrays: two maps of 6 bytes per cell, and 26 bytes
+    besides."""
     cfg = presets.get(preset)
     example = step.example(cfg)
     state = jax.eval_shape(lambda: ring.init(cfg.replay, example))

@@ -13,7 +13,7 @@ from csac_jax.config import ReplayConfig
 from csac_jax.replay import ring, samplers
 
 CAPACITY, NUM, BATCH = 7, 3, 5
-CFG = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=0.7, floor=0.05)
+CFG = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=0.7, per_epsilon=0.05)
 PLAIN = ReplayConfig(capacity=CAPACITY)  # its priorities are abs(error)
 EXAMPLE = {"id": jnp.int32(0), "map": jnp.zeros((2, 2), jnp.uint16)}
 
@@ -30,7 +30,10 @@ def set_errors(state, slots, errors, cfg=PLAIN):
 def items(ids) -> dict[str, jax.Array]:
     """Items numbered `ids`; id 0 is an unwritten slot."""
     ids = jnp.asarray(ids, jnp.int32)
-    return {"id": ids, "map": jnp.broadcast_to(ids[:, None, None], (ids.size, 2, 2)).astype(jnp.uint16)}
+    return {
+        "id": ids,
+        "map": jnp.broadcast_to(ids[:, None, None], (ids.size, 2, 2)).astype(jnp.uint16),
+    }
 
 
 def filled_ring(ids) -> ring.ReplayState:
@@ -41,8 +44,9 @@ def filled_ring(ids) -> ring.ReplayState:
 
 
 class RingModel(RuleBasedStateMachine):
-    """Claim: after any sequence of adds and errors, the ring holds what a list of slots would, with the priorities
-    (abs(error) + floor)^alpha; draws are of filled slots, their weights (n P)^-beta over the batch's largest."""
+    """Claim: after any sequence of adds and errors, the ring holds what a list of slots would, with
+    the priorities (abs(error) + floor)^alpha; draws are of filled slots, their weights (n P)^-beta
+    over the batch's largest."""
 
     def __init__(self):
         super().__init__()
@@ -67,7 +71,9 @@ class RingModel(RuleBasedStateMachine):
     @rule(
         slots=st.lists(st.integers(0, CAPACITY - 1), min_size=BATCH, max_size=BATCH),
         errors=st.lists(
-            st.sampled_from([0.0, -0.25, 0.5, -2.0, 8.0, np.nan, np.inf, -np.inf]), min_size=BATCH, max_size=BATCH
+            st.sampled_from([0.0, -0.25, 0.5, -2.0, 8.0, np.nan, np.inf, -np.inf]),
+            min_size=BATCH,
+            max_size=BATCH,
         ),
     )
     def set_errors(self, slots, errors):
@@ -79,7 +85,9 @@ class RingModel(RuleBasedStateMachine):
         largest = max([*self.priority[slots], *finite])
         new = [(abs(e) + 0.05) ** 0.7 if np.isfinite(e) else largest for e in errors]
         for slot in set(slots):
-            self.priority[slot] = max(value for s, value in zip(slots, new, strict=True) if s == slot)
+            self.priority[slot] = max(
+                value for s, value in zip(slots, new, strict=True) if s == slot
+            )
 
     @rule(seed=st.integers(0, 2**31 - 1), progress=st.sampled_from([0.0, 0.25, 1.0]))
     def sample(self, seed, progress):
@@ -109,7 +117,8 @@ class TestRingModelLong(RingModel.TestCase):
 
 
 def test_valid_items_are_packed():
-    """Claim: invalid items leave no gap: ids 1 _ 3, then _ 5 6 fill slots 0 to 3; the rest stays unwritten."""
+    """Claim: invalid items leave no gap: ids 1 _ 3, then _ 5 6 fill slots 0 to 3; the rest stays
+    unwritten."""
     state = add(ring.init(CFG, EXAMPLE), items([1, 2, 3]), jnp.array([True, False, True]))
     state = add(state, items([4, 5, 6]), jnp.array([False, True, True]))
     assert state.items["id"].tolist() == [1, 3, 5, 6, 0, 0, 0]
@@ -117,21 +126,24 @@ def test_valid_items_are_packed():
 
 
 def test_oldest_is_overwritten():
-    """Claim: the ring wraps around: of items 1 to 9, 3 to 9 remain, the newest in slot (head - 1) % C."""
+    """Claim: the ring wraps around: of items 1 to 9, 3 to 9 remain, the newest in slot (head - 1) %
+    C."""
     state = filled_ring(range(1, 10))
     assert state.items["id"].tolist() == [8, 9, 3, 4, 5, 6, 7]
     assert int(gather(state, (state.head - 1)[None] % CAPACITY)["id"][0]) == 9
 
 
 def test_new_items_rank_with_the_largest_error():
-    """Claim: a new item's priority is the largest stored, that of the item which it overwrites included; 1 at first."""
+    """Claim: a new item's priority is the largest stored, that of the item which it overwrites
+    included; 1 at first."""
     assert filled_ring([1]).priority.tolist() == [1.0] + [0.0] * (CAPACITY - 1)
     state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([0.3, -0.7]))
     assert add(state, items([3]), jnp.array([True])).priority[2] == np.float32(0.7)
 
 
 def test_twice_the_same_slot_keeps_the_larger_error():
-    """Claim: of two errors for one slot the larger in size is kept, in either order, and old errors are forgotten."""
+    """Claim: of two errors for one slot the larger in size is kept, in either order, and old errors
+    are forgotten."""
     state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([9.0, 9.0]))
     for errors in ([0.1, -0.5, 0.2], [-0.5, 0.1, 0.2]):
         updated = set_errors(state, jnp.array([1, 1, 0]), jnp.array(errors))
@@ -139,8 +151,8 @@ def test_twice_the_same_slot_keeps_the_larger_error():
 
 
 def test_errors_that_are_not_numbers():
-    """Claim: NaN and infinity count as the largest that the slots of the batch have or had; huge errors are cut off, so
-    that sums are finite: the ring never holds anything else."""
+    """Claim: NaN and infinity count as the largest that the slots of the batch have or had; huge
+    errors are cut off, so that sums are finite: the ring never holds anything else."""
     state = set_errors(filled_ring([1, 2, 3]), jnp.array([0, 1, 2]), jnp.array([0.5, 4.0, 0.1]))
     for slots, errors, expected in (
         ([1, 2], [jnp.nan, 0.2], [0.5, 4.0, 0.2]),
@@ -161,11 +173,14 @@ def test_gather_returns_the_items_of_its_slots():
 
 
 def test_types_are_those_of_the_example():
-    """Claim: add and set_priorities return a state of the same types and shapes: a compiled loop takes it again."""
+    """Claim: add and set_priorities return a state of the same types and shapes: a compiled loop
+    takes it again."""
     state = ring.init(CFG, EXAMPLE)
     added = add(state, items([1]), jnp.array([True]))
     updated = set_errors(added, jnp.array([0]), jnp.array([1.0]))
-    signature = functools.partial(jax.tree.map, lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type))
+    signature = functools.partial(
+        jax.tree.map, lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type)
+    )
     assert signature(state) == signature(added) == signature(updated)
 
 
@@ -176,16 +191,25 @@ def test_too_many_items_at_once():
 
 
 def test_donated_ring_is_not_copied():
-    """Claim: with the state donated, a compiled loop of adds and error updates copies no replay memory."""
-    state = ring.init(ReplayConfig(capacity=512), {"id": jnp.int32(0), "map": jnp.zeros((64, 64), jnp.uint16)})
+    """Claim: with the state donated, a compiled loop of adds and error updates copies no replay
+    memory."""
+    state = ring.init(
+        ReplayConfig(capacity=512), {"id": jnp.int32(0), "map": jnp.zeros((64, 64), jnp.uint16)}
+    )
     new = {"id": jnp.arange(1, 9), "map": jnp.ones((8, 64, 64), jnp.uint16)}
 
     def step(state, i):
         state = ring.add(state, new, jnp.arange(8) != i)
         slots = (jnp.arange(4) * i) % state.size
-        return ring.set_priorities(state, slots, ring.gather(state, slots)["id"].astype(jnp.float32)), None
+        return ring.set_priorities(
+            state, slots, ring.gather(state, slots)["id"].astype(jnp.float32)
+        ), None
 
-    compiled = jax.jit(lambda s: jax.lax.scan(step, s, jnp.arange(4))[0], donate_argnums=0).lower(state).compile()
+    compiled = (
+        jax.jit(lambda s: jax.lax.scan(step, s, jnp.arange(4))[0], donate_argnums=0)
+        .lower(state)
+        .compile()
+    )
     memory, replay_bytes = compiled.memory_analysis(), state.items["map"].nbytes
     assert memory.alias_size_in_bytes >= replay_bytes
     assert memory.temp_size_in_bytes < replay_bytes / 2

@@ -27,7 +27,9 @@ def stored(cfg: ReplayConfig, errors, size: int | None = None) -> ring.ReplaySta
     size = errors.size if size is None else size
     filled = jnp.arange(errors.size) < size
     priority = jnp.where(filled, samplers.priority(cfg, errors), 0.0)
-    return dataclasses.replace(ring.init(cfg, jnp.int32(0)), size=jnp.int32(size), priority=priority)
+    return dataclasses.replace(
+        ring.init(cfg, jnp.int32(0)), size=jnp.int32(size), priority=priority
+    )
 
 
 def ranks(values: np.ndarray, slots: np.ndarray) -> np.ndarray:
@@ -39,7 +41,8 @@ def ranks(values: np.ndarray, slots: np.ndarray) -> np.ndarray:
 
 
 def assert_fits(cells: np.ndarray, probability: np.ndarray) -> None:
-    """Chi-square over groups of cells expected at least 20 times, and Kolmogorov over all in their order."""
+    """Chi-square over groups of cells expected at least 20 times, and Kolmogorov over all in their
+    order."""
     expected = probability / probability.sum() * cells.size
     count = np.bincount(cells, minlength=expected.size)
     assert np.all(count[expected == 0.0] == 0)
@@ -59,8 +62,11 @@ def assert_fits(cells: np.ndarray, probability: np.ndarray) -> None:
 )  # fmt: skip
 @pytest.mark.parametrize("size", [CAPACITY, 400])
 def test_ranks_follow_the_beta_law(a, b, size):
-    """Claim: rank / n ~ Beta(a, b), rank 0 the largest value, in a ring that is full or partly filled."""
-    values = np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)  # and garbage beyond `size`
+    """Claim: rank / n ~ Beta(a, b), rank 0 the largest value, in a ring that is full or partly
+    filled."""
+    values = (
+        np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)
+    )  # and garbage beyond `size`
     values[size:] *= 100.0
     slots = np.asarray(beta_slots(jax.random.key(0), jnp.array(values), jnp.int32(size), a, b, NUM))
     assert slots.min() >= 0
@@ -69,15 +75,19 @@ def test_ranks_follow_the_beta_law(a, b, size):
     assert_fits(ranks(values[:size], slots), probability)
 
 
-@pytest.mark.parametrize(("a", "b"), [(0.2, 1.0), (0.5, 0.5), (0.3, 4.0), (1.0, 12.0), (1.0, 1.0), (40.0, 3.0)])
+@pytest.mark.parametrize(
+    ("a", "b"), [(0.2, 1.0), (0.5, 0.5), (0.3, 4.0), (1.0, 12.0), (1.0, 1.0), (40.0, 3.0)]
+)
 def test_beta_draws_follow_scipys_law(a, b):
-    """Claim: draws with traced a and b have the distribution that SciPy knows, by Kolmogorov's test of 400,000."""
+    """Claim: draws with traced a and b have the distribution that SciPy knows, by Kolmogorov's test
+    of 400,000."""
     draws = jax.jit(samplers._beta, static_argnums=3)(jax.random.key(3), a, b, 400_000)
     assert stats.kstest(np.asarray(draws, np.float64), stats.beta(a, b).cdf).pvalue > P
 
 
 def test_drawing_has_no_open_loop():
-    """Claim: no sampler has a loop of unknown length, whose condition a GPU hands to the host at every turn."""
+    """Claim: no sampler has a loop of unknown length, whose condition a GPU hands to the host at
+    every turn."""
     for sampler in ("uniform", "prioritised", "beta"):
         cfg = ReplayConfig(sampler=sampler, capacity=CAPACITY)
         text = str(jax.make_jaxpr(lambda key, c=cfg: samplers.sample(key, c, stored(c, np.zeros(9)), 0.5, 64))(
@@ -102,8 +112,9 @@ LAWS = {
      ("twelve decades", 1.0, CAPACITY), ("one giant", 0.6, CAPACITY), ("one giant", 1.0, 700)],
 )  # fmt: skip
 def test_prioritised_draws_follow_the_priorities(law, alpha, size):
-    """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + floor, in a ring that is full or partly filled."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=alpha, floor=1e-6)
+    """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + floor, in a ring that is full
+    or partly filled."""
+    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=alpha, per_epsilon=1e-6)
     errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
     slots, _ = sample(jax.random.key(0), cfg, stored(cfg, errors, size), jnp.float32(0.0), NUM)
     assert slots.max() < size
@@ -122,25 +133,34 @@ def test_uniform_slots_are_uniform(size):
 def test_alpha_zero_is_uniform_over_what_is_stored():
     """Claim: alpha = 0 draws every filled slot alike, whatever its error."""
     cfg = ReplayConfig(capacity=8, sampler="prioritised", alpha=0.0)
-    assert stored(cfg, [1e-3, 1.0, 1e6, 0.0, 5.0, 5.0, 5.0, 5.0], 4).priority.tolist() == [1.0] * 4 + [0.0] * 4
+    assert (
+        stored(cfg, [1e-3, 1.0, 1e6, 0.0, 5.0, 5.0, 5.0, 5.0], 4).priority.tolist()
+        == [1.0] * 4 + [0.0] * 4
+    )
 
 
 @pytest.mark.parametrize("capacity", [2, 7, 8, 9, 64, 65, 1000, 4096])
 def test_every_capacity_has_its_pyramid(capacity):
-    """Claim: whatever the capacity, P(i) = m_i / sum m, here with masses 1, 2, 3 ...; with no mass at all, slots are
-    still slots."""
+    """Claim: whatever the capacity, P(i) = m_i / sum m, here with masses 1, 2, 3 ...; with no mass
+    at all, slots are still slots."""
     masses = np.arange(1, capacity + 1)
-    assert_fits(np.asarray(proportional_slots(jax.random.key(1), jnp.asarray(masses, jnp.float32), NUM)), masses)
+    assert_fits(
+        np.asarray(proportional_slots(jax.random.key(1), jnp.asarray(masses, jnp.float32), NUM)),
+        masses,
+    )
     nothing = np.asarray(proportional_slots(jax.random.key(1), jnp.zeros(capacity), NUM))
     assert np.all((nothing >= 0) & (nothing < capacity))
 
 
 def test_large_rings_are_drawn_evenly():
-    """Claim: neighbours in a ring of 2^17 equal priorities, 2^-17 of the whole each, are drawn alike to 0.1 %: no
-    slot pays for the 2^23 steps of a float32 uniform. By all 2^23 of them in the lower half of the way."""
+    """Claim: neighbours in a ring of 2^17 equal priorities, 2^-17 of the whole each, are drawn
+    alike to 0.1 %: no slot pays for the 2^23 steps of a float32 uniform. By all 2^23 of them in the
+    lower half of the way."""
     masses = jnp.ones(2**17)
     levels = samplers._pyramid(masses)
-    below = 8 ** len(samplers._halves(levels)[1])  # slots that the second uniform number decides between
+    below = 8 ** len(
+        samplers._halves(levels)[1]
+    )  # slots that the second uniform number decides between
     assert below <= 8**3
     count = np.bincount(np.arange(2**23) * below >> 23)
     np.testing.assert_allclose(count / count.mean(), 1.0, atol=1e-3)
@@ -148,13 +168,18 @@ def test_large_rings_are_drawn_evenly():
 
 @pytest.mark.parametrize("zeros", [0.0, 0.5, 0.95, 1.0])
 def test_what_has_no_mass_is_never_picked(zeros):
-    """Claim: of masses over twelve decades with zeros among them, none that is 0 is picked, at either end of the
-    uniform numbers too, unless all are; what is left of the number lies in 0 <= u < 1."""
+    """Claim: of masses over twelve decades with zeros among them, none that is 0 is picked, at
+    either end of the uniform numbers too, unless all are; what is left of the number lies in 0 <= u
+    < 1."""
     rng = np.random.default_rng(0)
     num = 100_000
-    masses = 10.0 ** rng.uniform(-6.0, 6.0, (samplers.RADIX, num)) * (rng.uniform(size=(samplers.RADIX, num)) >= zeros)
+    masses = 10.0 ** rng.uniform(-6.0, 6.0, (samplers.RADIX, num)) * (
+        rng.uniform(size=(samplers.RADIX, num)) >= zeros
+    )
     masses = masses.astype(np.float32)
-    uniform = np.concatenate([np.zeros(num // 4), np.full(num // 4, samplers.BELOW_ONE), rng.uniform(size=num // 2)])
+    uniform = np.concatenate(
+        [np.zeros(num // 4), np.full(num // 4, samplers.BELOW_ONE), rng.uniform(size=num // 2)]
+    )
     row, left = jax.jit(samplers._pick)(
         jnp.asarray(masses), jnp.minimum(uniform, samplers.BELOW_ONE).astype(jnp.float32)
     )
@@ -165,7 +190,8 @@ def test_what_has_no_mass_is_never_picked(zeros):
 
 
 def test_top_decile_shares():
-    """Claim: the top tenth's share is 72 % for Beta(1, 12), 19 % for (1, 2), 20.5 % for (0.5, 0.5), 10 % for (1, 1)."""
+    """Claim: the top tenth's share is 72 % for Beta(1, 12), 19 % for (1, 2), 20.5 % for (0.5, 0.5),
+    10 % for (1, 1)."""
     errors = jnp.arange(CAPACITY, 0, -1).astype(jnp.float32)  # slot = rank
     for a, b, share in ((1.0, 12.0, 0.72), (1.0, 2.0, 0.19), (0.5, 0.5, 0.205), (1.0, 1.0, 0.10)):
         slots = beta_slots(jax.random.key(1), errors, jnp.int32(CAPACITY), a, b, NUM)
@@ -174,19 +200,28 @@ def test_top_decile_shares():
 
 @pytest.mark.parametrize("sampler", ["prioritised", "beta"])
 def test_items_with_large_errors_are_drawn_most(sampler):
-    """Claim: through the ring, with items numbered from 1 and wrapped, the largest error is drawn most."""
-    cfg = ReplayConfig(capacity=8, sampler=sampler, beta_start=(1.0, 12.0), alpha=1.0, floor=1e-3)
+    """Claim: through the ring, with items numbered from 1 and wrapped, the largest error is drawn
+    most."""
+    cfg = ReplayConfig(
+        capacity=8, sampler=sampler, beta_start=(1.0, 12.0), alpha=1.0, per_epsilon=1e-3
+    )
     state = ring.init(cfg, {"id": jnp.int32(0)})
     for i in range(1, 12):
         state = ring.add(state, {"id": jnp.array([i])}, jnp.array([True]))
     ids = np.asarray(state.items["id"])
     errors = np.where(ids == 7, -5.0, 0.1 * ids)
-    state = ring.set_priorities(state, jnp.arange(8), samplers.priority(cfg, jnp.array(errors, jnp.float32)))
+    state = ring.set_priorities(
+        state, jnp.arange(8), samplers.priority(cfg, jnp.array(errors, jnp.float32))
+    )
     slots, _ = sample(jax.random.key(0), cfg, state, jnp.float32(0.0), NUM)
     count = np.bincount(ring.gather(state, slots)["id"], minlength=12)
     assert count[:4].sum() == 0
     assert count.argmax() == 7
-    share = special.betainc(1.0, 12.0, 1 / 8) if sampler == "beta" else 5.001 / (np.abs(errors).sum() + 8e-3)
+    share = (
+        special.betainc(1.0, 12.0, 1 / 8)
+        if sampler == "beta"
+        else 5.001 / (np.abs(errors).sum() + 8e-3)
+    )
     np.testing.assert_allclose(count[7] / NUM, share, atol=0.01)
 
 
@@ -212,7 +247,9 @@ def test_equal_errors_are_drawn_equally(sampler):
     cfg = ReplayConfig(capacity=20, sampler=sampler, beta_start=(1.0, 12.0))
     state = stored(cfg, jnp.ones(20), 10)
     keys = jax.random.split(jax.random.key(0), 4000)
-    slots = jax.jit(jax.vmap(lambda key: samplers.sample(key, cfg, state, jnp.float32(0.0), 1).slots))(keys)
+    slots = jax.jit(
+        jax.vmap(lambda key: samplers.sample(key, cfg, state, jnp.float32(0.0), 1).slots)
+    )(keys)
     assert_fits(np.asarray(slots).ravel(), np.ones(10))
 
 
@@ -229,11 +266,14 @@ def test_nan_is_ranked_first():
 
 @pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
 def test_errors_that_are_not_numbers(sampler):
-    """Claim: after updates with NaN and infinite errors, slots are inside, weights positive and at most 1."""
+    """Claim: after updates with NaN and infinite errors, slots are inside, weights positive and at
+    most 1."""
     cfg = ReplayConfig(capacity=8, sampler=sampler)
     state = stored(cfg, [0.5, 2.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0], 4)
     for errors in ([jnp.nan, 1.0, -2.0], [jnp.inf, -jnp.inf, jnp.nan], [jnp.nan] * 3):
-        state = ring.set_priorities(state, jnp.array([0, 2, 3]), samplers.priority(cfg, jnp.array(errors)))
+        state = ring.set_priorities(
+            state, jnp.array([0, 2, 3]), samplers.priority(cfg, jnp.array(errors))
+        )
         slots, weights = sample(jax.random.key(0), cfg, state, jnp.float32(0.5), NUM)
         assert np.all((slots >= 0) & (slots < 4))
         assert np.all((weights > 0.0) & (weights <= 1.0))
@@ -243,13 +283,21 @@ def test_errors_that_are_not_numbers(sampler):
 @pytest.mark.parametrize("size", [0, 1, 2, 7, 8])
 @pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
 def test_slots_are_always_inside(sampler, size, progress):
-    """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots. Weights are at most 1."""
+    """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots. Weights
+    are at most 1."""
     cfg = ReplayConfig(capacity=8, sampler=sampler)
-    slots, weights = sample(jax.random.key(0), cfg, stored(cfg, jnp.ones(8), size), jnp.float32(progress), 500)
+    slots, weights = sample(
+        jax.random.key(0), cfg, stored(cfg, jnp.ones(8), size), jnp.float32(progress), 500
+    )
     assert slots.dtype == np.int32
     assert slots.min() >= 0
     assert slots.max() < (size or 8)
-    assert (weights.shape, weights.dtype, weights.min(), weights.max()) == ((500,), np.float32, 1.0, 1.0)
+    assert (weights.shape, weights.dtype, weights.min(), weights.max()) == (
+        (500,),
+        np.float32,
+        1.0,
+        1.0,
+    )
     seldom = sampler == "beta" and progress == 1.0  # Beta(1, 12)
     assert size == 0 or seldom or np.unique(slots).size == size
 
@@ -257,19 +305,25 @@ def test_slots_are_always_inside(sampler, size, progress):
 @pytest.mark.parametrize("progress", [-1.0, 0.0, 0.3, 1.0, 2.0])
 @pytest.mark.parametrize("law", LAWS)
 def test_weights_by_formula(progress, law):
-    """Claim: w_i = (n P(i))^-beta / max_j w_j over the batch, beta from `weight_start` to `weight_end` in a line."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", weight_start=0.2, weight_end=0.8)
+    """Claim: w_i = (n P(i))^-beta / max_j w_j over the batch, beta from `is_beta_start` to
+    `is_beta_end` in a line."""
+    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", is_beta_start=0.2, is_beta_end=0.8)
     errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
-    slots, weights = sample(jax.random.key(0), cfg, stored(cfg, errors, 900), jnp.float32(progress), 64)
-    mass = (np.abs(errors[:900].astype(float)) + cfg.floor) ** cfg.alpha
-    expected = (900 * mass / mass.sum())[np.asarray(slots)] ** -(0.2 + 0.6 * np.clip(progress, 0.0, 1.0))
+    slots, weights = sample(
+        jax.random.key(0), cfg, stored(cfg, errors, 900), jnp.float32(progress), 64
+    )
+    mass = (np.abs(errors[:900].astype(float)) + cfg.per_epsilon) ** cfg.alpha
+    expected = (900 * mass / mass.sum())[np.asarray(slots)] ** -(
+        0.2 + 0.6 * np.clip(progress, 0.0, 1.0)
+    )
     np.testing.assert_allclose(weights, expected / expected.max(), rtol=2e-5)
     assert np.unique(weights).size > 1
 
 
 def test_full_weights_take_the_bias_away():
-    """Claim: with exponent 1, a weighted mean over prioritised draws is the mean over what is stored."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", weight_start=1.0)
+    """Claim: with exponent 1, a weighted mean over prioritised draws is the mean over what is
+    stored."""
+    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", is_beta_start=1.0)
     values = np.random.default_rng(0).uniform(1.0, 2.0, CAPACITY).astype(np.float32)
     slots, weights = sample(jax.random.key(0), cfg, stored(cfg, values**3), jnp.float32(0.0), NUM)
     plain = values[np.asarray(slots)].mean()
@@ -283,22 +337,32 @@ def test_other_samplers_do_not_weight(sampler):
     """Claim: weights of uniform and beta draws are ones, whatever the errors."""
     cfg = ReplayConfig(capacity=CAPACITY, sampler=sampler)
     state = stored(cfg, np.random.default_rng(0).normal(size=CAPACITY))
-    np.testing.assert_array_equal(sample(jax.random.key(0), cfg, state, jnp.float32(0.3), 64).weights, 1.0)
+    np.testing.assert_array_equal(
+        sample(jax.random.key(0), cfg, state, jnp.float32(0.3), 64).weights, 1.0
+    )
 
 
 @pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
 def test_batched_seeds_are_each_by_itself(sampler):
     """Claim: draws and updates of three seeds under vmap are those of each seed alone."""
     cfg = ReplayConfig(capacity=100, sampler=sampler)
-    states = [stored(cfg, np.random.default_rng(seed).normal(size=100), 70 + seed) for seed in range(3)]
+    states = [
+        stored(cfg, np.random.default_rng(seed).normal(size=100), 70 + seed) for seed in range(3)
+    ]
     keys = jax.random.split(jax.random.key(0), 3)
 
     def step(key, state):
         slots, weights = samplers.sample(key, cfg, state, jnp.float32(0.3), 32)
         errors = jnp.sin(slots.astype(jnp.float32))
-        return slots, weights, ring.set_priorities(state, slots, samplers.priority(cfg, errors)).priority
+        return (
+            slots,
+            weights,
+            ring.set_priorities(state, slots, samplers.priority(cfg, errors)).priority,
+        )
 
-    together = jax.jit(jax.vmap(step))(keys, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    together = jax.jit(jax.vmap(step))(
+        keys, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    )
     for i, (key, state) in enumerate(zip(keys, states, strict=True)):
         alone = jax.jit(step)(key, state)
         np.testing.assert_array_equal(together[0][i], alone[0])
@@ -312,19 +376,25 @@ def test_batched_seeds_are_each_by_itself(sampler):
      (1.0, (1.0, 12.0)), (2.0, (1.0, 12.0))],
 )  # fmt: skip
 def test_schedule_by_hand(progress, expected):
-    """Claim: (a, b) goes from (0.5, 0.5) to (1, 1) at 40 % and on to (1, 12), in straight lines, and stays there."""
-    np.testing.assert_allclose(samplers.beta_schedule(ReplayConfig(), jnp.float32(progress)), expected, rtol=1e-5)
+    """Claim: (a, b) goes from (0.5, 0.5) to (1, 1) at 40 % and on to (1, 12), in straight lines,
+    and stays there."""
+    np.testing.assert_allclose(
+        samplers.beta_schedule(ReplayConfig(), jnp.float32(progress)), expected, rtol=1e-5
+    )
 
 
 def test_one_law_for_the_whole_run():
     """Claim: with start, middle and end the same, (a, b) never changes: VPG's Beta(1, 2)."""
     cfg = ReplayConfig(beta_start=(1.0, 2.0), beta_middle=(1.0, 2.0), beta_end=(1.0, 2.0))
     for progress in np.linspace(-0.5, 1.5, 21):
-        np.testing.assert_array_equal(samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0])
+        np.testing.assert_array_equal(
+            samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0]
+        )
 
 
 def test_sampler_follows_the_schedule():
-    """Claim: the share of the worst tenth falls from 20.5 % over 10 % to none as training goes on."""
+    """Claim: the share of the worst tenth falls from 20.5 % over 10 % to none as training goes
+    on."""
     cfg = ReplayConfig(capacity=CAPACITY)
     state = stored(cfg, jnp.arange(CAPACITY, 0, -1))
     for progress, share in ((0.0, 0.205), (0.4, 0.10), (1.0, 0.0)):
@@ -337,42 +407,58 @@ def test_keys_differ(sampler):
     """Claim: two keys give two draws, one key one."""
     cfg = ReplayConfig(capacity=CAPACITY, sampler=sampler)
     state = stored(cfg, jnp.ones(CAPACITY))
-    first, again, other = (sample(jax.random.key(i), cfg, state, jnp.float32(0.3), 32).slots for i in (0, 0, 1))
+    first, again, other = (
+        sample(jax.random.key(i), cfg, state, jnp.float32(0.3), 32).slots for i in (0, 0, 1)
+    )
     np.testing.assert_array_equal(first, again)
     assert np.any(first != other)
 
 
 def test_unknown_sampler():
     """Claim: a sampler of another name is an error, not a silent default."""
-    with pytest.raises(ValueError, match=r"replay\.sampler: 'rank' is not one of: uniform, prioritised, beta"):
+    with pytest.raises(
+        ValueError, match=r"replay\.sampler: 'rank' is not one of: uniform, prioritised, beta"
+    ):
         dataclasses.replace(ReplayConfig(capacity=8), sampler="rank")
 
 
 @pytest.mark.slow
 def test_as_a_sum_tree_after_a_million_updates():
-    """Claim: after 1,000,000 updates with priorities from 1e-6 to 1e6, the sum of all masses and the probabilities are
-    those of flashbax's sum tree to 1e-4, and those of NumPy in float64 to 1e-5."""
+    """Claim: after 1,000,000 updates with priorities from 1e-6 to 1e6, the sum of all masses and
+    the probabilities are those of flashbax's sum tree to 1e-4, and those of NumPy in float64 to
+    1e-5."""
     sum_tree = pytest.importorskip("flashbax.buffers.sum_tree")
     capacity, batch, updates = 2**12, 64, 2**20
-    cfg = ReplayConfig(capacity=capacity, sampler="prioritised", floor=1e-9)
+    cfg = ReplayConfig(capacity=capacity, sampler="prioritised", per_epsilon=1e-9)
     rng = np.random.default_rng(0)
     priorities = (10.0 ** rng.uniform(-6.0, 6.0, (updates // batch, batch))).astype(np.float32)
-    slots = np.stack([rng.choice(capacity, batch, replace=False) for _ in range(updates // batch)]).astype(np.int32)
+    slots = np.stack(
+        [rng.choice(capacity, batch, replace=False) for _ in range(updates // batch)]
+    ).astype(np.int32)
 
     def update(carry, given):
         state, tree = carry
         masses = samplers.priority(cfg, given[1])
-        return (ring.set_priorities(state, given[0], masses), sum_tree.set_batch_scan(tree, given[0], masses)), None
+        return (
+            ring.set_priorities(state, given[0], masses),
+            sum_tree.set_batch_scan(tree, given[0], masses),
+        ), None
 
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         begun = (
             stored(cfg, jnp.ones(capacity)),
             sum_tree.set_batch_scan(
-                sum_tree.init(capacity), jnp.arange(capacity), samplers.priority(cfg, jnp.ones(capacity))
+                sum_tree.init(capacity),
+                jnp.arange(capacity),
+                samplers.priority(cfg, jnp.ones(capacity)),
             ),
         )
-        state, tree = jax.jit(functools.partial(jax.lax.scan, update))(begun, (slots, priorities))[0]
-        theirs = np.asarray(jax.vmap(functools.partial(sum_tree.get_probability, tree))(jnp.arange(capacity)), float)
+        state, tree = jax.jit(functools.partial(jax.lax.scan, update))(begun, (slots, priorities))[
+            0
+        ]
+        theirs = np.asarray(
+            jax.vmap(functools.partial(sum_tree.get_probability, tree))(jnp.arange(capacity)), float
+        )
     truth = np.ones(capacity)
     for these, new in zip(slots, priorities, strict=True):
         truth[these] = (new.astype(float) + 1e-9) ** cfg.alpha

@@ -12,7 +12,8 @@ from csac_jax.scene.layout import Scene
 def in_c(
     world: model.World, scene: Scene, fields: model.BlockFields | None = None, iterations: int = 50
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """One scene of NumPy arrays in C MuJoCo, contacts found, the hand high above, parked blocks without weight."""
+    """One scene of NumPy arrays in C MuJoCo, contacts found, the hand high above, parked blocks
+    without weight."""
     if fields is None:
         fields = jax.tree.map(np.asarray, model.scene_fields(world, scene))
     exact = model.with_blocks(world, fields)

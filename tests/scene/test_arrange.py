@@ -19,11 +19,27 @@ from tests.scene import placed
 COUNT = 200  # keys per level
 LEVELS = (0.0, 0.5, 1.0)
 MANY = SceneConfig(
-    slots=("box", "box", "box", "box", "box", "box", "arch", "arch", "prism", "prism", "cylinder", "cylinder"),
+    slots=(
+        "box",
+        "box",
+        "box",
+        "box",
+        "box",
+        "box",
+        "arch",
+        "arch",
+        "prism",
+        "prism",
+        "cylinder",
+        "cylinder",
+    ),
     min_blocks=5,
 )
-BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_spread=0.25)
-EXTENT = {MANY: HeightmapConfig().extent, BOXES: 2.0 * (arrange.REACH + 0.001)}  # the usual square, the smallest
+BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_jitter=0.25)
+EXTENT = {
+    MANY: HeightmapConfig().extent,
+    BOXES: 2.0 * (arrange.REACH + 0.001),
+}  # the usual square, the smallest
 FAR = 0.05  # m, distances are measured up to here
 TOGETHER = 0.012  # m, blocks closer than this make a cluster; loose ones keep 15 mm
 
@@ -37,7 +53,7 @@ class Drawn(NamedTuple):
     lowest: np.ndarray  # [P] m, of a corner
     overlap: np.ndarray  # [P] m, deepest contact
     distance: np.ndarray  # [P, N, N] m between blocks in play, FAR where farther or not in play
-    moved: np.ndarray  # [P] m, farthest that a block has moved after half a second
+    moved: np.ndarray  # [P] m, distance_cap that a block has moved after half a second
 
     def at(self, level: float) -> slice:
         """The scenes of this level."""
@@ -46,19 +62,25 @@ class Drawn(NamedTuple):
 
 
 def _many(cfg: SceneConfig, extent: float, keys: jax.Array, levels: jax.Array) -> Scene:
-    drawn = jax.jit(jax.vmap(lambda key, level: arrange.arrange(key, cfg, extent, level)))(keys, levels)
+    drawn = jax.jit(jax.vmap(lambda key, level: arrange.arrange(key, cfg, extent, level)))(
+        keys, levels
+    )
     return jax.device_get(drawn)
 
 
 def _measured(world: model.World, scene: Scene, fields: model.BlockFields) -> tuple:
     """Reach, lowest, overlap, distance and moved of one scene."""
     exact, data = placed.in_c(world, scene, fields, iterations=20)
-    geoms = [(g, s) for g, s in zip(world.block_geoms, world.parts.slot, strict=True) if scene.in_play[s]]
+    geoms = [
+        (g, s) for g, s in zip(world.block_geoms, world.parts.slot, strict=True) if scene.in_play[s]
+    ]
     corners = np.concatenate([cases._corners(exact, data, geom) for geom, _ in geoms])
     deepest = max(0.0, -data.contact.dist.min()) if data.ncon else 0.0
     distance = _distances(exact, data, geoms, len(world.slots))
     mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
-    moved = np.linalg.norm((data.qpos[world.block_qpos[:, :3]] - scene.position)[scene.in_play], axis=1).max()
+    moved = np.linalg.norm(
+        (data.qpos[world.block_qpos[:, :3]] - scene.position)[scene.in_play], axis=1
+    ).max()
     return np.abs(corners[:, :2]).max(), corners[:, 2].min(), deepest, distance, moved
 
 
@@ -75,15 +97,23 @@ def _distances(exact: mujoco.MjModel, data: mujoco.MjData, geoms: list, num: int
 def _examined(cfg: SceneConfig, scenes: Scene) -> Drawn:
     world = model.build(cfg, SimConfig())
     fields = jax.device_get(jax.jit(jax.vmap(functools.partial(model.scene_fields, world)))(scenes))
-    rows = [jax.tree.map(lambda leaf, i=i: leaf[i], (scenes, fields)) for i in range(len(scenes.target))]
+    rows = [
+        jax.tree.map(lambda leaf, i=i: leaf[i], (scenes, fields)) for i in range(len(scenes.target))
+    ]
     return Drawn(
-        cfg, scenes, *(np.stack(column) for column in zip(*(_measured(world, *row) for row in rows), strict=True))
+        cfg,
+        scenes,
+        *(
+            np.stack(column)
+            for column in zip(*(_measured(world, *row) for row in rows), strict=True)
+        ),
     )
 
 
 @pytest.fixture(scope="module", params=["many", pytest.param("boxes", marks=pytest.mark.slow)])
 def drawn(request: pytest.FixtureRequest) -> Drawn:
-    """Arrangements of many kinds in the usual square, and of five boxes of very different size in the smallest."""
+    """Arrangements of many kinds in the usual square, and of five boxes of very different size in
+    the smallest."""
     cfg = MANY if request.param == "many" else BOXES
     keys = jax.random.split(jax.random.key(0), len(LEVELS) * COUNT)
     return _examined(cfg, _many(cfg, EXTENT[cfg], keys, jnp.repeat(jnp.float32(LEVELS), COUNT)))
@@ -106,13 +136,15 @@ def test_blocks_are_inside_the_square(drawn: Drawn):
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_blocks_are_at_rest(drawn: Drawn, level: float):
-    """Claim: after half a second of physics, no block has moved by 5 mm in at least 97 % of the arrangements."""
+    """Claim: after half a second of physics, no block has moved by 5 mm in at least 97 % of the
+    arrangements."""
     share = np.mean(drawn.moved[drawn.at(level)] < 0.005)
     assert share >= 0.97, share
 
 
 def test_level_packs_more_and_closer(drawn: Drawn):
-    """Claim: the level closes the gaps from at most 30 mm to 1 mm, and adds blocks where there are more."""
+    """Claim: the level closes the gaps from at most 30 mm to 1 mm, and adds blocks where there are
+    more."""
     nearest = drawn.distance[np.arange(len(drawn.reach)), drawn.scenes.target].min(axis=1)
     for level, low, high in ((0.0, 0.014, 0.031), (0.5, 0.007, 0.017), (1.0, 0.0, 0.004)):
         assert low < np.median(nearest[drawn.at(level)]) < high, level
@@ -133,7 +165,8 @@ def test_no_fewer_blocks_than_asked_for(drawn: Drawn):
 
 
 def test_every_family_is_drawn_as_often(drawn: Drawn):
-    """Claim: families are equally likely; seen on piles, the only ones with a block well above the table."""
+    """Claim: families are equally likely; seen on piles, the only ones with a block well above the
+    table."""
     low = drawn.scenes.position[..., 2] - np.linalg.norm(drawn.scenes.half_size, axis=2)
     stacked = np.any((low > 0.0) & drawn.scenes.in_play, axis=1)
     share = 1.0 / len(families.available(drawn.cfg.slots))
@@ -142,18 +175,26 @@ def test_every_family_is_drawn_as_often(drawn: Drawn):
 
 
 def test_what_is_drawn_spreads_over_its_range(drawn: Drawn):
-    """Claim: box slots draw every shape, sizes, densities and frictions keep to their ranges and fill them."""
+    """Claim: box slots draw every shape, sizes, densities and frictions keep to their ranges and
+    fill them."""
     cfg, scenes = drawn.cfg, drawn.scenes
     box = np.array(cfg.slots) == "box"
     scale = scenes.half_size[:, box, None] / blocks.half_size_choices("box")
     shape = np.argmin(np.ptp(scale, axis=3), axis=2)
-    assert np.ptp(scale, axis=3).min(axis=2).max() < 1e-5  # each is a shape of the set, as a whole larger or smaller
+    assert (
+        np.ptp(scale, axis=3).min(axis=2).max() < 1e-5
+    )  # each is a shape of the set, as a whole larger or smaller
     assert np.bincount(shape.ravel(), minlength=4).min() > 0.1 * shape.size
     nominal = np.array([blocks.half_size_choices(kind)[0][2] for kind in cfg.slots])
     others = (scenes.half_size[..., 2] / nominal)[:, ~box]
     for values, (low, high) in (
         (
-            np.concatenate([scale.mean(axis=3).min(axis=2, initial=9.9, where=_is(shape)).ravel(), others.ravel()]),
+            np.concatenate(
+                [
+                    scale.mean(axis=3).min(axis=2, initial=9.9, where=_is(shape)).ravel(),
+                    others.ravel(),
+                ]
+            ),
             _sizes(cfg),
         ),
         (scenes.density, cfg.density),
@@ -171,7 +212,7 @@ def _is(shape: np.ndarray) -> np.ndarray:
 
 
 def _sizes(cfg: SceneConfig) -> tuple[float, float]:
-    return 1.0 - cfg.size_spread, 1.0 + cfg.size_spread
+    return 1.0 - cfg.size_jitter, 1.0 + cfg.size_jitter
 
 
 def test_mesh_blocks_of_one_kind_are_alike(drawn: Drawn):
@@ -187,11 +228,16 @@ def _clusters(slots: tuple, distance: np.ndarray) -> list[Counter]:
     reached = np.eye(len(slots), dtype=bool)
     for _ in slots:
         reached = reached | (reached @ near)
-    return [Counter(slots[i] for i in np.flatnonzero(row)) for row in np.unique(reached, axis=0) if row.sum() > 1]
+    return [
+        Counter(slots[i] for i in np.flatnonzero(row))
+        for row in np.unique(reached, axis=0)
+        if row.sum() > 1
+    ]
 
 
 def test_shipped_cases_are_held_out(drawn: Drawn):
-    """Claim: what a shipped case packs together is packed together in no drawn arrangement, not even the kinds."""
+    """Claim: what a shipped case packs together is packed together in no drawn arrangement, not
+    even the kinds."""
     slots = MANY.slots
     if drawn.cfg.slots != slots:
         pytest.skip("five boxes cannot make a shipped case")
@@ -224,7 +270,9 @@ def test_families_follow_from_the_slots(slots: tuple, names: set):
     assert set(families.available(slots)) == names
 
 
-@pytest.mark.parametrize("slots", [("box",), ("box", "box"), ("arch", "arch", "arch"), ("arch", "arch", "box")])
+@pytest.mark.parametrize(
+    "slots", [("box",), ("box", "box"), ("arch", "arch", "arch"), ("arch", "arch", "box")]
+)
 def test_too_few_slots_are_an_error(slots: tuple):
     """Claim: slots that allow no family are an error that names the field."""
     with pytest.raises(ValueError, match=r"scene\.slots: too few for an arrangement"):
@@ -233,7 +281,9 @@ def test_too_few_slots_are_an_error(slots: tuple):
 
 def test_too_small_a_square_is_an_error():
     """Claim: a square that an arrangement might not fit into is an error that names the field."""
-    with pytest.raises(ValueError, match=r"heightmap\.extent: arrangements need a square of at least 0\.412 m"):
+    with pytest.raises(
+        ValueError, match=r"heightmap\.extent: arrangements need a square of at least 0\.412 m"
+    ):
         arrange.arrange(jax.random.key(0), MANY, 0.4, jnp.float32(0.5))
 
 
@@ -242,12 +292,16 @@ def test_key_decides():
     """Claim: the same key gives the same scene, alone or in a batch; another key, another scene."""
     cfg = SceneConfig(slots=("box", "arch", "cylinder"), min_blocks=3)
     levels = jnp.linspace(0.0, 1.0, 8)
-    batch, again = (_many(cfg, 0.448, jax.random.split(jax.random.key(1), 8), levels) for _ in range(2))
+    batch, again = (
+        _many(cfg, 0.448, jax.random.split(jax.random.key(1), 8), levels) for _ in range(2)
+    )
     jax.tree.map(np.testing.assert_array_equal, batch, again)
     single = jax.jit(lambda key, level: arrange.arrange(key, cfg, 0.448, level))
     for i in range(8):
         alone = jax.device_get(single(jax.random.split(jax.random.key(1), 8)[i], levels[i]))
-        jax.tree.map(lambda one, row, i=i: np.testing.assert_allclose(one, row[i], atol=1e-6), alone, batch)
+        jax.tree.map(
+            lambda one, row, i=i: np.testing.assert_allclose(one, row[i], atol=1e-6), alone, batch
+        )
         assert jax.tree.map(lambda leaf: leaf.dtype, alone) == jax.tree.map(
             lambda leaf: leaf.dtype, layout.parked(cfg.slots)
         )
@@ -264,7 +318,9 @@ def test_gap_between_rectangles_is_that_of_tall_boxes():
         rng.uniform(0.0, 7.0, (300, 2)),
         rng.uniform(0.01, 0.05, (300, 2, 2)),
     )
-    ours = jax.vmap(arrange.rectangle_gap)(*(jnp.float32(v[:, i]) for i in range(2) for v in (xy, yaw, half)))
+    ours = jax.vmap(arrange.rectangle_gap)(
+        *(jnp.float32(v[:, i]) for i in range(2) for v in (xy, yaw, half))
+    )
     square = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     for i in range(300):
         corners, normals = [], []

@@ -20,13 +20,18 @@ SHIPPED = ("hole", "pinwheel", "ridge", "row")
 FLAT = [1, 0, 0, 0]
 
 
-def _block(shape: str, position: list[float], colour: str = "red", quaternion: Any = FLAT, **more: Any) -> dict:
+def _block(
+    shape: str, position: list[float], colour: str = "red", quaternion: Any = FLAT, **more: Any
+) -> dict:
     return {"shape": shape, "colour": colour, "position": position, "quaternion": quaternion} | more
 
 
 PAIR = {
     "name": "pair",
-    "blocks": [_block("cube", [0.05, 0.0, 0.025], target=True), _block("arch", [-0.05, 0.0, 0.025], "blue")],
+    "blocks": [
+        _block("cube", [0.05, 0.0, 0.025], target=True),
+        _block("arch", [-0.05, 0.0, 0.025], "blue"),
+    ],
 }
 
 
@@ -63,7 +68,8 @@ def test_shipped_case_stands_still(name: str):
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_case_has_a_target_hemmed_in(name: str):
-    """Claim: the target of a shipped case has a neighbour within 3 mm, the last block none within 50 mm."""
+    """Claim: the target of a shipped case has a neighbour within 3 mm, the last block none within
+    50 mm."""
     case = cases.load(cases.shipped(name))
     cases.require_target(case)
     gap = _gaps(case)
@@ -78,12 +84,15 @@ def _gaps(case: cases.Case) -> np.ndarray:
     for one, slot in zip(world.block_geoms, world.parts.slot, strict=True):
         for two, other in zip(world.block_geoms, world.parts.slot, strict=True):
             if slot != other:
-                gap[slot, other] = np.fmin(gap[slot, other], mujoco.mj_geomDistance(exact, data, one, two, 1.0, None))
+                gap[slot, other] = np.fmin(
+                    gap[slot, other], mujoco.mj_geomDistance(exact, data, one, two, 1.0, None)
+                )
     return gap
 
 
 def test_load_gives_what_the_file_says(tmp_path: Path):
-    """Claim: shapes, colours, poses and target are those of the file, sizes and materials nominal, all at rest."""
+    """Claim: shapes, colours, poses and target are those of the file, sizes and materials nominal,
+    all at rest."""
     half_turn = [0, 0, 0, 2.0]  # brought to unit length
     case = _load(
         tmp_path,
@@ -101,7 +110,9 @@ def test_load_gives_what_the_file_says(tmp_path: Path):
     )
     np.testing.assert_array_equal(scene.quaternion, np.float32([[0, 0, 0, 1], FLAT, FLAT]))
     shapes = ("plank", "half_cylinder", "tile")
-    np.testing.assert_array_equal(scene.half_size, np.float32([blocks.SHAPES[shape].half_size for shape in shapes]))
+    np.testing.assert_array_equal(
+        scene.half_size, np.float32([blocks.SHAPES[shape].half_size for shape in shapes])
+    )
     assert [blocks.COLOUR_NAMES[row] for row in scene.colour] == ["pink", "blue", "grey"]
     assert set(scene.density) == {np.float32(layout.NOMINAL_DENSITY)}
     assert set(scene.friction) == {np.float32(layout.NOMINAL_FRICTION)}
@@ -139,11 +150,20 @@ def _without(block: int, key: str) -> dict:
         ('{"name": "a", "name": "b", "blocks": []}', 'key "name" is given twice'),
         (_without(1, "colour"), 'block 2: key "colour" is missing'),
         (_changed(1, "tagret", True), 'block 2: unknown key "tagret"'),
-        (_changed(1, "shape", "sphere"), 'block 2: unknown shape "sphere"; choose one of: cube, cuboid'),
+        (
+            _changed(1, "shape", "sphere"),
+            'block 2: unknown shape "sphere"; choose one of: cube, cuboid',
+        ),
         (_changed(0, "shape", ["cube"]), 'block 1: unknown shape ["cube"]'),
         (_changed(0, "colour", "x" * 500), 'block 1: unknown colour "xxx'),
-        (_changed(0, "colour", [255, 0, 0]), "block 1: unknown colour [255, 0, 0]; choose one of: blue"),
-        (_changed(1, "position", [0.1, 0.1]), 'block 2: "position" must be a list of 3 numbers in metres'),
+        (
+            _changed(0, "colour", [255, 0, 0]),
+            "block 1: unknown colour [255, 0, 0]; choose one of: blue",
+        ),
+        (
+            _changed(1, "position", [0.1, 0.1]),
+            'block 2: "position" must be a list of 3 numbers in metres',
+        ),
         (_changed(1, "position", [0.1, 0.1, "0"]), 'block 2: "position" must be'),
         (_changed(1, "position", [0.1, 0.1, True]), 'block 2: "position" must be'),
         (_changed(1, "position", [0.1, 0.1, float("nan")]), 'block 2: "position" must be'),
@@ -155,7 +175,10 @@ def _without(block: int, key: str) -> dict:
         (_changed(1, "quaternion", [0, 0, 0.0, 0]), 'block 2: "quaternion" must not be zero'),
         (_changed(1, "target", 1), 'block 2: "target" must be true or false'),
         (_changed(1, "target", True), "block 2: block 1 is the target already"),
-        (_changed(0, "position", [0.203, 0.0, 0.025]), "block 1: reaches 4.0 mm beyond the square of 0.448 m"),
+        (
+            _changed(0, "position", [0.203, 0.0, 0.025]),
+            "block 1: reaches 4.0 mm beyond the square of 0.448 m",
+        ),
         (_changed(0, "position", [0.0, -0.5, 0.025]), "block 1: reaches 301.0 mm beyond"),
         (_changed(0, "position", [0.05, 0.0, 0.022]), "block 1: reaches 3.0 mm below the table"),
         (_changed(0, "position", [0.05, 0.0, 0.48]), "block 1: reaches 0.505 m above the table"),
@@ -163,7 +186,8 @@ def _without(block: int, key: str) -> dict:
     ],
 )
 def test_bad_file_is_refused_in_one_line(tmp_path: Path, content: Any, says: str):
-    """Claim: whatever is wrong with a case file is a ValueError of one line that names the file, the block and it."""
+    """Claim: whatever is wrong with a case file is a ValueError of one line that names the file,
+    the block and it."""
     path = _written(tmp_path, content)
     with pytest.raises(ValueError, match=re.escape(says)) as error:
         cases.load(path)
@@ -188,7 +212,9 @@ def test_unreadable_file_is_refused_in_one_line(tmp_path: Path):
 
 def test_unknown_name_lists_the_shipped_cases():
     """Claim: asking for a case that is not shipped names those that are."""
-    with pytest.raises(ValueError, match=r"unknown case '\.\./x'; choose one of: hole, pinwheel, ridge, row"):
+    with pytest.raises(
+        ValueError, match=r"unknown case '\.\./x'; choose one of: hole, pinwheel, ridge, row"
+    ):
         cases.shipped("../x")
 
 
@@ -202,7 +228,9 @@ def test_unknown_name_lists_the_shipped_cases():
         ("arch", 0.025, "plank"),
     ],
 )
-def test_overlap_is_measured_to_the_millimetre(tmp_path: Path, shape: str, height: float, second: str):
+def test_overlap_is_measured_to_the_millimetre(
+    tmp_path: Path, shape: str, height: float, second: str
+):
     """Claim: two blocks side by side may overlap by 2 mm, no more, whatever their shapes."""
     other = blocks.SHAPES[second].half_size
     touching = (blocks.SHAPES[shape].half_size[1] if shape != "cylinder" else 0.0224) + other[1]
@@ -217,19 +245,26 @@ def test_same_place_is_an_overlap(tmp_path: Path, shape: str):
     """Claim: a block inside another is refused, however deep."""
     half = blocks.SHAPES[shape].half_size
     with pytest.raises(ValueError, match="block 2: overlaps block 1"):
-        _load(tmp_path, _block(shape, [0.0, 0.0, half[2]]), _block(shape, [0.0, 0.0, half[2]], "blue"))
+        _load(
+            tmp_path, _block(shape, [0.0, 0.0, half[2]]), _block(shape, [0.0, 0.0, half[2]], "blue")
+        )
 
 
 @pytest.mark.parametrize("shape", blocks.SHAPES)
 def test_corners_are_those_of_the_block(tmp_path: Path, shape: str):
-    """Claim: a block of any shape, turned or not, may touch the border from inside, and reach no farther."""
+    """Claim: a block of any shape, turned or not, may touch the border from inside, and reach no
+    farther."""
     half = np.array(blocks.SHAPES[shape].half_size)
     border = 0.5 * HeightmapConfig().extent
     for turn, reach in ((0.0, half[0]), (90.0, half[1])):
-        quaternion = Rotation.from_euler("z", turn, degrees=True).as_quat(scalar_first=True).tolist()
+        quaternion = (
+            Rotation.from_euler("z", turn, degrees=True).as_quat(scalar_first=True).tolist()
+        )
         _load(tmp_path, _block(shape, [border - reach, 0.0, half[2]], "red", quaternion))
         with pytest.raises(ValueError, match=r"block 1: reaches 1\.0 mm beyond the square"):
-            _load(tmp_path, _block(shape, [border - reach + 0.001, 0.0, half[2]], "red", quaternion))
+            _load(
+                tmp_path, _block(shape, [border - reach + 0.001, 0.0, half[2]], "red", quaternion)
+            )
 
 
 def test_the_square_may_be_another(tmp_path: Path):

@@ -20,7 +20,9 @@ def scene() -> Scene:
     quaternion = rng.normal(size=(N, 4))
     loose = layout.parked(("box",) * N).replace(
         position=jnp.asarray(rng.uniform(-0.2, 0.2, (N, 3)), jnp.float32),
-        quaternion=jnp.asarray(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), jnp.float32),
+        quaternion=jnp.asarray(
+            quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), jnp.float32
+        ),
         velocity=jnp.asarray(rng.normal(size=(N, 6)), jnp.float32),
         in_play=jnp.ones(N, bool),
     )
@@ -32,7 +34,8 @@ def _rotations(scene: Scene) -> Rotation:
 
 
 def test_park_touches_only_what_leaves(scene: Scene):
-    """Claim: park parks what is not kept, at rest, never brings a block back, and leaves the others as they are."""
+    """Claim: park parks what is not kept, at rest, never brings a block back, and leaves the others
+    as they are."""
     again = layout.park(scene, jnp.ones(N, bool).at[0].set(False))
     np.testing.assert_array_equal(again.in_play, [False, False, True, False, True])
     out = np.array([0, 1, 3])
@@ -67,14 +70,20 @@ def test_turn_is_a_rotation_about_z(scene: Scene, yaw: float):
 
 
 def test_parking_is_out_of_reach_and_out_of_view():
-    """Claim: parked blocks of any size are apart from one another, beside the square and wholly above the camera."""
+    """Claim: parked blocks of any size are apart from one another, beside the square and wholly
+    above the camera."""
     place, radius = layout.parking(10), np.linalg.norm([0.05, 0.025, 0.025])
-    assert np.linalg.norm(place[:, None] - place[None], axis=-1)[~np.eye(10, dtype=bool)].min() > 2 * radius
+    assert (
+        np.linalg.norm(place[:, None] - place[None], axis=-1)[~np.eye(10, dtype=bool)].min()
+        > 2 * radius
+    )
     assert place[:, 0].min() > 0.5
     assert place[:, 2].min() - radius > VIEW_HEIGHT
 
 
 def test_inside_is_the_square():
     """Claim: a block is inside while its centre lies above the workspace square, edges included."""
-    position = jnp.array([[0.2, -0.2, 5.0], [0.201, 0.0, 0.0], [0.0, -0.201, 0.0], [-0.1, 0.1, -1.0]])
+    position = jnp.array(
+        [[0.2, -0.2, 5.0], [0.201, 0.0, 0.0], [0.0, -0.201, 0.0], [-0.1, 0.1, -1.0]]
+    )
     np.testing.assert_array_equal(layout.inside(position, 0.4), [True, False, False, True])

@@ -1,4 +1,5 @@
-"""The linter against MJX itself: what it refuses, MJX refuses too, or computes as if it were not there."""
+"""The linter against MJX itself: what it refuses, MJX refuses too, or computes as if it were not
+there."""
 
 import inspect
 from typing import Any
@@ -8,8 +9,8 @@ import pytest
 
 import csac_jax.sim  # noqa: F401  (before MJX, which it imports quietly)
 from csac_jax.config import Config, SimConfig
+from csac_jax.errors import SceneError
 from csac_jax.scene import lint, model
-from csac_jax.scene.errors import SceneError
 
 from mujoco import mjx  # isort: skip
 from mujoco.mjx._src import (  # isort: skip
@@ -45,10 +46,14 @@ BLANK = dict.fromkeys(("option", "geom", "joint", "body", "tendon", "actuator", 
 
 
 def _model(**parts: str) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(SCENE.format(**BLANK | {"integrator": "implicitfast", "flag": ""} | parts))
+    return mujoco.MjModel.from_xml_string(
+        SCENE.format(**BLANK | {"integrator": "implicitfast", "flag": ""} | parts)
+    )
 
 
-ROUND = '<body pos="0 0 0.3"><freejoint/><geom name="round" type="{}" size="0.02 0.02 0.02" {}/></body>'
+ROUND = (
+    '<body pos="0 0 0.3"><freejoint/><geom name="round" type="{}" size="0.02 0.02 0.02" {}/></body>'
+)
 MOTOR = '<general name="motor" joint="hinge" {}/>'
 NESTED = (
     '<body pos="0 2 1"><joint/><geom type="box" size="0.02 0.02 0.02" contype="0" conaffinity="4"/>'
@@ -87,23 +92,53 @@ REFUSED: list[tuple[dict[str, str], str]] = [
     ({"geom": 'fluidshape="ellipsoid"'}, "ignores geom fluidshape"),
     ({"geom": 'adhesion="1"'}, "ignores geom adhesion"),
     ({"geom": 'surfacevel="1 0 0 0 0 0"'}, "ignores geom surfacevel"),
-    ({"more": '<contact><pair geom1="table" geom2="box" gap="0.1"/></contact>'}, "ignores pair gap"),
-    ({"more": '<contact><pair geom1="table" geom2="box" adhesion="1"/></contact>'}, "ignores pair adhesion"),
-    ({"actuator": MOTOR.format('actearly="true" dyntype="integrator"')}, "ignores actuator actearly"),
+    (
+        {"more": '<contact><pair geom1="table" geom2="box" gap="0.1"/></contact>'},
+        "ignores pair gap",
+    ),
+    (
+        {"more": '<contact><pair geom1="table" geom2="box" adhesion="1"/></contact>'},
+        "ignores pair adhesion",
+    ),
+    (
+        {"actuator": MOTOR.format('actearly="true" dyntype="integrator"')},
+        "ignores actuator actearly",
+    ),
     ({"actuator": MOTOR.format('armature="1"')}, "ignores actuator armature"),
     ({"actuator": MOTOR.format('damping="1"')}, "ignores actuator damping"),
     ({"actuator": MOTOR.format('damping="0 1"')}, "ignores actuator damping of a higher order"),
     ({"actuator": MOTOR.format('delay="0.01" nsample="4"')}, "ignores actuator delay"),
-    ({"actuator": MOTOR.format('dyntype="user"')}, "lacks actuator_dyntype user of actuator 'motor'"),
-    ({"actuator": MOTOR.format('gaintype="user"')}, "lacks actuator_gaintype user of actuator 'motor'"),
-    ({"actuator": MOTOR.format('biastype="user"')}, "lacks actuator_biastype user of actuator 'motor'"),
-    ({"actuator": '<adhesion body="box" ctrlrange="0 1"/>'}, "lacks actuator_trntype body of actuator 0"),
+    (
+        {"actuator": MOTOR.format('dyntype="user"')},
+        "lacks actuator_dyntype user of actuator 'motor'",
+    ),
+    (
+        {"actuator": MOTOR.format('gaintype="user"')},
+        "lacks actuator_gaintype user of actuator 'motor'",
+    ),
+    (
+        {"actuator": MOTOR.format('biastype="user"')},
+        "lacks actuator_biastype user of actuator 'motor'",
+    ),
+    (
+        {"actuator": '<adhesion body="box" ctrlrange="0 1"/>'},
+        "lacks actuator_trntype body of actuator 0",
+    ),
     ({"more": '<sensor><user dim="1"/></sensor>'}, "lacks sensor_type user of sensor 0"),
     ({"more": '<sensor><clock delay="0.01" nsample="4"/></sensor>'}, "ignores sensor delay"),
     ({"more": '<sensor><clock interval="0.01" nsample="4"/></sensor>'}, "ignores sensor interval"),
-    ({"more": '<sensor><contact name="feel" body1="box"/></sensor>'}, "lacks contact by site, body or subtree"),
-    ({"more": '<sensor><contact geom1="box" reduce="netforce"/></sensor>'}, "lacks contact by site, body or subtree"),
-    ({"body": ROUND.format("cylinder", "")}, "lacks collisions cylinder x box (geom 'round' and geom 'box')"),
+    (
+        {"more": '<sensor><contact name="feel" body1="box"/></sensor>'},
+        "lacks contact by site, body or subtree",
+    ),
+    (
+        {"more": '<sensor><contact geom1="box" reduce="netforce"/></sensor>'},
+        "lacks contact by site, body or subtree",
+    ),
+    (
+        {"body": ROUND.format("cylinder", "")},
+        "lacks collisions cylinder x box (geom 'round' and geom 'box')",
+    ),
     ({"body": ROUND.format("ellipsoid", "")}, "lacks collisions ellipsoid x box"),
     (
         {"body": ROUND.format("cylinder", 'contype="0" conaffinity="0"')}
@@ -119,9 +154,12 @@ REFUSED: list[tuple[dict[str, str], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("parts", "line"), REFUSED, ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize(
+    ("parts", "line"), REFUSED, ids=lambda value: value if isinstance(value, str) else ""
+)
 def test_what_mjx_ignores_is_refused(parts: dict[str, str], line: str):
-    """Claim: an option that MJX ignores or lacks is refused in one line that names it and the remedy."""
+    """Claim: an option that MJX ignores or lacks is refused in one line that names it and the
+    remedy."""
     with pytest.raises(SceneError) as error:
         lint.check(_model(**parts))
     message = str(error.value)
@@ -140,11 +178,20 @@ def test_what_mjx_ignores_is_refused(parts: dict[str, str], line: str):
         {"body": ROUND.format("cylinder", 'contype="0" conaffinity="0"')},
         {"body": ROUND.format("cylinder", 'contype="2" conaffinity="2"')},
         {"body": ROUND.format("capsule", 'margin="0.01"')},
-        {"body": ROUND.format("cylinder", ""), "more": '<contact><exclude body1="box" body2="b"/></contact>'},
+        {
+            "body": ROUND.format("cylinder", ""),
+            "more": '<contact><exclude body1="box" body2="b"/></contact>',
+        },
         {"body": WEDGE.format(""), "more": CORNERS},
         {"body": NESTED},
-        {"actuator": '<position joint="hinge" kp="9" kv="1" forcerange="-1 1"/>', "joint": 'stiffness="1" damping="2"'},
-        {"more": '<sensor><contact geom1="box"/><touch site="s"/></sensor>', "body": '<site name="s" size="1"/>'},
+        {
+            "actuator": '<position joint="hinge" kp="9" kv="1" forcerange="-1 1"/>',
+            "joint": 'stiffness="1" damping="2"',
+        },
+        {
+            "more": '<sensor><contact geom1="box"/><touch site="s"/></sensor>',
+            "body": '<site name="s" size="1"/>',
+        },
     ],
 )
 def test_what_mjx_takes_is_not_refused(parts: dict[str, str]):
@@ -185,25 +232,42 @@ def _names(kind: Any) -> list[str]:
 
 
 def _missing(kind: Any, mjx_kind: Any) -> set[Any]:
-    return {getattr(kind, name) for name in _names(kind) if int(getattr(kind, name)) not in set(map(int, mjx_kind))}
+    return {
+        getattr(kind, name)
+        for name in _names(kind)
+        if int(getattr(kind, name)) not in set(map(int, mjx_kind))
+    }
 
 
 def _sources() -> str:
     """The code of MJX that computes."""
-    modules = (constraint, derivative, forward, inverse, passive, scan, sensor, smooth, solver, support)
+    modules = (
+        constraint,
+        derivative,
+        forward,
+        inverse,
+        passive,
+        scan,
+        sensor,
+        smooth,
+        solver,
+        support,
+    )
     modules += (collision_driver,)
     return "".join(inspect.getsource(module) for module in modules)
 
 
 def test_tables_are_those_of_the_installed_mjx():
-    """Claim: integrators, solvers, flags and kinds are refused exactly where MJX has no code for them."""
+    """Claim: integrators, solvers, flags and kinds are refused exactly where MJX has no code for
+    them."""
     assert (
         _missing(mujoco.mjtIntegrator, types.IntegratorType) | {mujoco.mjtIntegrator.mjINT_DISCRETE}
-        == {getattr(mujoco.mjtIntegrator, name) for name in _names(mujoco.mjtIntegrator)} - lint.INTEGRATORS
+        == {getattr(mujoco.mjtIntegrator, name) for name in _names(mujoco.mjtIntegrator)}
+        - lint.INTEGRATORS
     )  # discrete raises as it steps
-    assert {getattr(mujoco.mjtSolver, name) for name in _names(mujoco.mjtSolver)} - lint.SOLVERS == _missing(
-        mujoco.mjtSolver, types.SolverType
-    )
+    assert {
+        getattr(mujoco.mjtSolver, name) for name in _names(mujoco.mjtSolver)
+    } - lint.SOLVERS == _missing(mujoco.mjtSolver, types.SolverType)
     assert _missing(mujoco.mjtDisableBit, types.DisableBit) == lint.DISABLE_FLAGS_IGNORED
     read = _sources()
     used = {flag for flag in types.EnableBit if f"EnableBit.{flag.name}" in read}
@@ -218,16 +282,23 @@ def test_tables_are_those_of_the_installed_mjx():
     }
     for field, mjx_kind in kinds.items():
         _, kind, lacking = lint.KINDS_LACKING[field]
-        assert {value.name.split("_", 1)[1] for value in _missing(kind, mjx_kind)} == set(lacking), field
+        assert {value.name.split("_", 1)[1] for value in _missing(kind, mjx_kind)} == set(
+            lacking
+        ), field
 
 
 def test_ignored_options_are_those_without_a_field():
-    """Claim: every option of MuJoCo that MJX has no field for, or never reads, is refused unless it is the default."""
+    """Claim: every option of MuJoCo that MJX has no field for, or never reads, is refused unless it
+    is the default."""
     ours = {name for name in dir(mujoco.MjOption) if not name.startswith("_")}
     theirs = {field.name for kind in (types.Option, types.OptionJAX) for field in kind.fields()}
     only_with_override = {"o_margin", "o_solref", "o_solimp", "o_friction"}
     read = _sources()
-    unread = {name for name in ours & theirs if f"opt.{name}" not in read and f"opt._impl.{name}" not in read}
+    unread = {
+        name
+        for name in ours & theirs
+        if f"opt.{name}" not in read and f"opt._impl.{name}" not in read
+    }
     at_building = {
         "enableflags",
         "density",
@@ -235,11 +306,14 @@ def test_ignored_options_are_those_without_a_field():
         "jacobian",
         "sdf_initpoints",
     }  # read in `io`
-    assert set(lint.IGNORED_OPTIONS) == (ours - theirs) | (unread - only_with_override - at_building)
+    assert set(lint.IGNORED_OPTIONS) == (ours - theirs) | (
+        unread - only_with_override - at_building
+    )
 
 
 def test_collisions_lacking_are_those_without_a_function():
-    """Claim: pairs of geom types are refused exactly where MJX has no collision function and C MuJoCo collides."""
+    """Claim: pairs of geom types are refused exactly where MJX has no collision function and C
+    MuJoCo collides."""
     kinds = [mujoco.mjtGeom(i) for i in range(int(mujoco.mjtGeom.mjGEOM_SDF) + 1)]
     static = {mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD}
     lacking = {

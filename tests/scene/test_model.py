@@ -20,7 +20,9 @@ def world() -> model.World:
     return model.build(CONFIG, SimConfig())
 
 
-def _scene(box: str = "plank", other: str = "tile", scale: float = 0.9, density: float = 800.0) -> Scene:
+def _scene(
+    box: str = "plank", other: str = "tile", scale: float = 0.9, density: float = 800.0
+) -> Scene:
     """One of each kind, not of nominal size, density or friction."""
     scene = layout.parked(SLOTS)
     half = scene.half_size.copy()
@@ -33,7 +35,8 @@ def _scene(box: str = "plank", other: str = "tile", scale: float = 0.9, density:
 
 
 def _compiled(monkeypatch: pytest.MonkeyPatch, scene: Scene, scale: float) -> mujoco.MjModel:
-    """The same scene as MuJoCo compiles it: sizes, densities and frictions written into the spec."""
+    """The same scene as MuJoCo compiles it: sizes, densities and frictions written into the
+    spec."""
     with monkeypatch.context() as patch:
         patch.setattr(model, "LARGEST", scale)
         spec = model._spec(CONFIG, SimConfig())
@@ -51,8 +54,11 @@ def _fields(world: model.World, scene: Scene) -> model.BlockFields:
 
 
 @pytest.mark.parametrize("box", BOXES)
-def test_block_fields_are_those_of_the_compiler(world: model.World, monkeypatch: pytest.MonkeyPatch, box: str):
-    """Claim: block_fields gives what MuJoCo's compiler derives, for every shape of the set, larger or smaller."""
+def test_block_fields_are_those_of_the_compiler(
+    world: model.World, monkeypatch: pytest.MonkeyPatch, box: str
+):
+    """Claim: block_fields gives what MuJoCo's compiler derives, for every shape of the set, larger
+    or smaller."""
     scale = 1.07
     scene = _scene(box, scale=scale)
     ours, theirs = _fields(world, scene), _compiled(monkeypatch, scene, scale)
@@ -73,14 +79,27 @@ def test_block_fields_are_those_of_the_compiler(world: model.World, monkeypatch:
         np.testing.assert_allclose(mine, reference, rtol=1e-5, atol=atol)  # float32
 
 
-def test_model_with_blocks_moves_as_a_compiled_one(world: model.World, monkeypatch: pytest.MonkeyPatch):
+def test_model_with_blocks_moves_as_a_compiled_one(
+    world: model.World, monkeypatch: pytest.MonkeyPatch
+):
     """Claim: a world given block sizes afterwards moves as one that was compiled with them."""
     scene = _scene(scale=0.9)
     ends = []
-    for moved in (model.with_blocks(world, _fields(world, scene)), _compiled(monkeypatch, scene, 0.9)):
+    for moved in (
+        model.with_blocks(world, _fields(world, scene)),
+        _compiled(monkeypatch, scene, 0.9),
+    ):
         data = mujoco.MjData(moved)
         for slot in range(len(SLOTS)):
-            data.qpos[world.block_qpos[slot]] = [0.15 * slot - 0.4, 0.0, 0.06, np.cos(0.2), 0.0, np.sin(0.2), 0.0]
+            data.qpos[world.block_qpos[slot]] = [
+                0.15 * slot - 0.4,
+                0.0,
+                0.06,
+                np.cos(0.2),
+                0.0,
+                np.sin(0.2),
+                0.0,
+            ]
             data.qvel[world.block_dofs[slot]] = [0.3, 0.1, 0.0, 0.5, 1.0, -0.5]
         mujoco.mj_step(moved, data, nstep=60)  # 0.24 s: fall, tumble, first contacts
         ends.append(np.concatenate([data.qpos, data.subtree_com[world.block_bodies].ravel()]))
@@ -89,7 +108,9 @@ def test_model_with_blocks_moves_as_a_compiled_one(world: model.World, monkeypat
 
 def test_with_blocks_leaves_the_world_unchanged(world: model.World):
     """Claim: with_blocks writes into a copy."""
-    names = [name for name in dir(world.model) if isinstance(getattr(world.model, name), np.ndarray)]
+    names = [
+        name for name in dir(world.model) if isinstance(getattr(world.model, name), np.ndarray)
+    ]
     before = {name: getattr(world.model, name).copy() for name in names}
     changed = model.with_blocks(world, _fields(world, _scene()))
     assert not np.array_equal(changed.geom_size, before["geom_size"])
@@ -99,11 +120,17 @@ def test_with_blocks_leaves_the_world_unchanged(world: model.World):
 
 
 def test_with_blocks_writes_over_an_earlier_copy(world: model.World):
-    """Claim: written into a copy of other blocks, a model is byte for byte the one that is made anew."""
+    """Claim: written into a copy of other blocks, a model is byte for byte the one that is made
+    anew."""
     earlier = model.with_blocks(world, _fields(world, _scene(scale=0.8)))
     anew = model.with_blocks(world, _fields(world, _scene(scale=0.9)))
     before = placed.model_bytes(earlier)
-    assert model.with_blocks(world, _fields(world, _scene(scale=0.9)), mujoco.MjData(world.model), earlier) is earlier
+    assert (
+        model.with_blocks(
+            world, _fields(world, _scene(scale=0.9)), mujoco.MjData(world.model), earlier
+        )
+        is earlier
+    )
     assert before != placed.model_bytes(earlier) == placed.model_bytes(anew)
 
 
@@ -114,9 +141,15 @@ def test_addresses_name_what_they_say(world: model.World):
         joint = world.model.body(world.block_bodies[slot]).jntadr[0]
         assert world.block_qpos[slot, 0] == world.model.jnt_qposadr[joint]
         assert world.block_dofs[slot, 0] == world.model.jnt_dofadr[joint]
-    np.testing.assert_array_equal(world.model.geom_bodyid[world.block_geoms], world.block_bodies[world.parts.slot])
+    np.testing.assert_array_equal(
+        world.model.geom_bodyid[world.block_geoms], world.block_bodies[world.parts.slot]
+    )
     np.testing.assert_array_equal(world.slot_of_geom[world.block_geoms], world.parts.slot)
     assert np.all(np.delete(world.slot_of_geom, world.block_geoms) == -1)
     for name, qpos in zip(model.ROBOT_JOINTS["hand"], world.robot_qpos, strict=True):
         assert world.model.joint(name).qposadr[0] == qpos
-    assert [world.model.geom(i).name for i in world.hand_geoms] == ["hand/palm", "hand/pad_low", "hand/pad_high"]
+    assert [world.model.geom(i).name for i in world.hand_geoms] == [
+        "hand/palm",
+        "hand/pad_low",
+        "hand/pad_high",
+    ]

@@ -37,16 +37,23 @@ def test_depth_of_crossed_edges():
     assert min(by_faces) > 0.12  # faces alone would say more
 
 
-@pytest.mark.parametrize("kinds", [("prism", "cylinder"), ("half_cylinder", "box"), ("prism", "prism"), ("box", "box")])
+@pytest.mark.parametrize(
+    "kinds", [("prism", "cylinder"), ("half_cylinder", "box"), ("prism", "prism"), ("box", "box")]
+)
 def test_depth_is_that_of_contacts(kinds: tuple):
-    """Claim: for two blocks that overlap by up to 10 mm, the depth is that of the deepest contact of C MuJoCo."""
+    """Claim: for two blocks that overlap by up to 10 mm, the depth is that of the deepest contact
+    of C MuJoCo."""
     world = model.build(SceneConfig(slots=kinds, min_blocks=1), SimConfig())
     half = np.array([blocks.half_size_choices(kind)[0] for kind in kinds])
     exact = cases._nominal(world, half)
     data, rng, compared = mujoco.MjData(exact), np.random.default_rng(0), 0
     for turn in Rotation.random(200, rng=rng):
         data.qpos[world.block_qpos[0]] = [0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]
-        data.qpos[world.block_qpos[1]] = [*rng.uniform(-0.05, 0.05, 2), 0.34, *turn.as_quat(scalar_first=True)]
+        data.qpos[world.block_qpos[1]] = [
+            *rng.uniform(-0.05, 0.05, 2),
+            0.34,
+            *turn.as_quat(scalar_first=True),
+        ]
         mujoco.mj_kinematics(exact, data)
         mujoco.mj_collision(exact, data)
         corners = [cases._corners(exact, data, geom) for geom in world.block_geoms]
@@ -59,5 +66,7 @@ def test_depth_is_that_of_contacts(kinds: tuple):
         assert (depth <= 1e-6) == (deepest == 0.0)
         if 0.0 < depth < 0.01:
             compared += 1
-            assert deepest == pytest.approx(depth, abs=1e-4)  # theirs is found step by step, between meshes
+            assert deepest == pytest.approx(
+                depth, abs=1e-4
+            )  # theirs is found step by step, between meshes
     assert compared > 20

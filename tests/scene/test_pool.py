@@ -11,8 +11,8 @@ import pytest
 from scipy import stats
 
 from csac_jax.config import SceneConfig, SimConfig
+from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, model, pool
-from csac_jax.scene.errors import SceneError
 from csac_jax.scene.layout import Scene, parking
 from tests.scene import placed
 
@@ -50,7 +50,8 @@ def _placed(world: model.World, scenes: Scene, index: int) -> tuple[mujoco.MjMod
 
 
 def test_settled_blocks_are_at_rest(world: model.World, scenes: Scene):
-    """Claim: blocks of a settled scene lie still: half a second later none is farther than its speed allows."""
+    """Claim: blocks of a settled scene lie still: half a second later none is farther than its
+    speed allows."""
     for index in range(2 * COUNT):
         exact, data = _placed(world, scenes, index)
         mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
@@ -59,7 +60,8 @@ def test_settled_blocks_are_at_rest(world: model.World, scenes: Scene):
 
 
 def test_settled_blocks_do_not_overlap(world: model.World, scenes: Scene):
-    """Claim: no two blocks of a settled scene, and no block and the table, overlap deeper than 2 mm."""
+    """Claim: no two blocks of a settled scene, and no block and the table, overlap deeper than 2
+    mm."""
     touching = 0
     for index in range(2 * COUNT):
         _, data = _placed(world, scenes, index)
@@ -69,17 +71,21 @@ def test_settled_blocks_do_not_overlap(world: model.World, scenes: Scene):
 
 
 def test_settled_blocks_lie_within_the_radius(scenes: Scene):
-    """Claim: blocks in play lie within extent / 2 of the centre, above the table; the others are parked."""
+    """Claim: blocks in play lie within extent / 2 of the centre, above the table; the others are
+    parked."""
     play = scenes.in_play
     assert np.hypot(*scenes.position[play][:, :2].T).max() <= 0.5 * EXTENT
     assert scenes.position[play][:, 2].min() > 0.0
-    np.testing.assert_array_equal(play.sum(axis=1), np.repeat([3, 4], COUNT))  # min_blocks .. number of slots
+    np.testing.assert_array_equal(
+        play.sum(axis=1), np.repeat([3, 4], COUNT)
+    )  # min_blocks .. number of slots
     places = np.broadcast_to(parking(4), scenes.position.shape)
     np.testing.assert_array_equal(scenes.position[~play], places[~play])
 
 
 def test_no_block_lies_on_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Claim: blocks of ten, dropped from up to 1.3 m, all come down to the table: none rests on the waiting hand."""
+    """Claim: blocks of ten, dropped from up to 1.3 m, all come down to the table: none rests on the
+    waiting hand."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(pool, "_ROUND", 24)
     cfg = SceneConfig(slots=("box",) * 10, min_blocks=10)
@@ -88,12 +94,15 @@ def test_no_block_lies_on_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
 
 def test_blocks_differ_within_their_ranges(scenes: Scene):
-    """Claim: a box slot draws each of its shapes, and sizes, densities and frictions spread over their ranges."""
+    """Claim: a box slot draws each of its shapes, and sizes, densities and frictions spread over
+    their ranges."""
     nominal = blocks.half_size_choices("box")
     scale = scenes.half_size[:, 0, None] / nominal[None]  # [P, 4, 3]
     shape = np.argmin(np.ptp(scale, axis=2), axis=1)  # the one that all three axes agree on
     assert set(shape) == {0, 1, 2, 3}
-    by_slot = scenes.half_size[:, 1:, 2] / [blocks.half_size_choices(kind)[0][2] for kind in CONFIG.slots[1:]]
+    by_slot = scenes.half_size[:, 1:, 2] / [
+        blocks.half_size_choices(kind)[0][2] for kind in CONFIG.slots[1:]
+    ]
     for drawn, (low, high) in (
         (by_slot, (0.9, 1.1)),
         (scenes.density, CONFIG.density),
@@ -105,25 +114,32 @@ def test_blocks_differ_within_their_ranges(scenes: Scene):
 
 @pytest.mark.slow
 def test_same_arguments_same_scenes(world: model.World, scenes: Scene, monkeypatch, tmp_path: Path):
-    """Claim: the same arguments give the same scenes, bit for bit, settled anew or read from the cache."""
+    """Claim: the same arguments give the same scenes, bit for bit, settled anew or read from the
+    cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     anew = pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
     monkeypatch.setattr(pool, "_settle", None)  # must not be called
     cached = pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
     for other in (anew, cached):
         jax.tree.map(np.testing.assert_array_equal, scenes, other)
-        assert jax.tree.map(lambda leaf: leaf.dtype, scenes) == jax.tree.map(lambda leaf: leaf.dtype, other)
+        assert jax.tree.map(lambda leaf: leaf.dtype, scenes) == jax.tree.map(
+            lambda leaf: leaf.dtype, other
+        )
 
 
 def test_streams_share_no_scene(small: model.World):
-    """Claim: training and evaluation draw from pools that have no scene in common, nor has one pool a scene twice."""
-    both = [pool.settled(small, ONE, EXTENT, stream, 16).position for stream in (pool.TRAIN_STREAM, 1)]
+    """Claim: training and evaluation draw from pools that have no scene in common, nor has one pool
+    a scene twice."""
+    both = [
+        pool.settled(small, ONE, EXTENT, stream, 16).position for stream in (pool.TRAIN_STREAM, 1)
+    ]
     assert len({scene.tobytes() for scenes in both for scene in scenes}) == 32
 
 
 @pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
 def test_damaged_cache_is_settled_anew(small: model.World, tmp_path: Path, damage: str):
-    """Claim: a cache file that was cut short or changed is noticed, and its scenes are settled anew."""
+    """Claim: a cache file that was cut short or changed is noticed, and its scenes are settled
+    anew."""
     good = pool.settled(small, ONE, EXTENT, 0, 4)
     (path,) = tmp_path.rglob("*.npz")
     raw = path.read_bytes()
@@ -163,7 +179,9 @@ def test_cache_folder_is_private(small: model.World, tmp_path: Path):
     assert list(path.parent.iterdir()) == [path]  # nothing half-written stays
 
 
-def test_unwritable_cache_is_no_error(small: model.World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_unwritable_cache_is_no_error(
+    small: model.World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Claim: where the cache cannot be written, scenes are settled all the same."""
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
@@ -171,7 +189,8 @@ def test_unwritable_cache_is_no_error(small: model.World, tmp_path: Path, monkey
 
 
 def test_hopeless_configuration_is_one_line(small: model.World):
-    """Claim: a configuration whose blocks never come to rest ends with one line that names what to change."""
+    """Claim: a configuration whose blocks never come to rest ends with one line that names what to
+    change."""
     falling = dataclasses.replace(ONE, drop_height=1.0, settle_time=0.5)  # lands after 0.45 s
     with pytest.raises(SceneError, match=r"scene\.settle_time") as error:
         pool.settled(small, falling, EXTENT, 0, 4)
@@ -179,7 +198,8 @@ def test_hopeless_configuration_is_one_line(small: model.World):
 
 
 def test_blocks_are_dropped_close_together_or_far_apart():
-    """Claim: each scene has a square of its own in which its blocks are dropped, its side uniform in the range."""
+    """Claim: each scene has a square of its own in which its blocks are dropped, its side uniform
+    in the range."""
     cfg = SceneConfig(slots=("box",) * 8, min_blocks=8, drop_extent=(0.1, 0.4))
     rng = np.random.default_rng(0)
     reach = np.array([np.abs(pool._drop(cfg, rng, 8).position[:, :2]).max() for _ in range(400)])
@@ -188,13 +208,15 @@ def test_blocks_are_dropped_close_together_or_far_apart():
     assert reach.max() <= 0.2
 
 
-PILE = SceneConfig(slots=("box", "arch", "prism") * 4, min_blocks=12, drop_extent=(0.1, 0.1), settle_time=1.0)
+PILE = SceneConfig(
+    slots=("box", "arch", "prism") * 4, min_blocks=12, drop_extent=(0.1, 0.1), settle_time=1.0
+)
 
 
 @pytest.mark.slow
 def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Claim: poured blocks are all in play, inside the workspace, at rest, higher than one layer; scenes differ, and
-    the same stream gives the same ones."""
+    """Claim: poured blocks are all in play, inside the workspace, at rest, higher than one layer;
+    scenes differ, and the same stream gives the same ones."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     world = model.build(PILE, SimConfig())
     scenes = pool.settled(world, PILE, EXTENT, 1, 3, poured=True)
@@ -214,11 +236,14 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 def test_poured_blocks_that_leave_are_dropped_anew():
-    """Claim: where a block of nearly every scene falls outside the workspace, pouring still gives the scene."""
+    """Claim: where a block of nearly every scene falls outside the workspace, pouring still gives
+    the scene."""
     cfg = SceneConfig(slots=("box",) * 4, min_blocks=4, drop_extent=(0.448, 0.448), settle_time=1.0)
     world, rng = model.build(cfg, SimConfig()), np.random.default_rng(0)
     for _ in range(6):
         scene = pool._drop(cfg, rng, 4)
-        poured = pool.pour(world, cfg, EXTENT, scene, jax.device_get(model.scene_fields(world, scene)))
+        poured = pool.pour(
+            world, cfg, EXTENT, scene, jax.device_get(model.scene_fields(world, scene))
+        )
         assert poured is not None
         assert (np.linalg.norm(poured.position[:, :2], axis=1) <= 0.5 * EXTENT).all()

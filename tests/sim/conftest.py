@@ -1,4 +1,5 @@
-"""Scripted and settled scenes, run once in MJX as one batch, and once in C MuJoCo by the same plan."""
+"""Scripted and settled scenes, run once in MJX as one batch, and once in C MuJoCo by the same
+plan."""
 
 import dataclasses
 import functools
@@ -9,10 +10,11 @@ import numpy as np
 import pytest
 
 from csac_jax.config import Config, SceneConfig
+from csac_jax.constants import Primitive
 from csac_jax.env import Env
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, primitives, robot
+from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, robot
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, Plan
 
@@ -21,7 +23,8 @@ SETTLED = 40
 
 
 def place(**shapes: tuple[float, float, float]) -> Scene:
-    """A scene of blocks on the table at (x, y, yaw): up to two cubes, one prism; the other slots are parked."""
+    """A scene of blocks on the table at (x, y, yaw): up to two cubes, one prism; the other slots
+    are parked."""
     scene = layout.parked(CONFIG.scene.slots)
     position, quaternion = scene.position.copy(), scene.quaternion.copy()
     slots = {"cube": 0, "other": 1, "prism": 2}
@@ -32,43 +35,61 @@ def place(**shapes: tuple[float, float, float]) -> Scene:
     return scene.replace(position=position, quaternion=quaternion, in_play=in_play)
 
 
-def act(primitive: primitives.Primitive, x: float, y: float, yaw: float = 0.0) -> Action:
+def act(primitive: Primitive, x: float, y: float, yaw: float = 0.0) -> Action:
     return Action(primitive=np.int32(primitive), pose=np.float32([x, y, yaw]))
 
 
-push = functools.partial(act, primitives.Primitive.PUSH)
-grasp = functools.partial(act, primitives.Primitive.GRASP)
+push = functools.partial(act, Primitive.PUSH)
+grasp = functools.partial(act, Primitive.GRASP)
 
 
 def _kicked(scene: Scene, speed: float) -> Scene:
-    return dataclasses.replace(scene, velocity=scene.velocity + np.float32([[speed, 0, 0, 0, 0, 0], [0] * 6, [0] * 6]))
+    return dataclasses.replace(
+        scene, velocity=scene.velocity + np.float32([[speed, 0, 0, 0, 0, 0], [0] * 6, [0] * 6])
+    )
 
 
 def _spinning() -> Scene:
-    """A plank in the air, spinning about all axes as one squeezed from under the hand was seen to."""
+    """A plank in the air, spinning about all axes as one squeezed from under the hand was seen
+    to."""
     scene = place(cube=(0.1, 0.1, 0.0))
     half, position, velocity = scene.half_size.copy(), scene.position.copy(), scene.velocity.copy()
-    half[0], position[0, 2], velocity[0, 3:] = blocks.SHAPES["plank"].half_size, 0.4, [148.0, 137.0, -148.0]
+    half[0], position[0, 2], velocity[0, 3:] = (
+        blocks.SHAPES["plank"].half_size,
+        0.4,
+        [148.0, 137.0, -148.0],
+    )
     return scene.replace(half_size=half, position=position, velocity=velocity)
 
 
 CASES: dict[str, tuple[Scene, Action]] = {
     "nothing": (place(cube=(0.1, 0.1, 0.0)), grasp(-0.1, -0.1)),
-    # The window sees the corner of a cube beside the pads: 9 mm left of and above the place, 13 mm off their path.
+    # The window sees the corner of a cube beside the pads: 9 mm left of and above the place, 13 mm
+    # off their path.
     "empty": (place(cube=(-0.0205, 0.0275, 0.0)), grasp(0.0125, -0.0055, np.pi / 4)),
     "touched": (place(cube=(0.05, 0.0, 0.0)), grasp(0.0, 0.0)),  # a finger comes down on the cube
-    "dropped": (place(prism=(0.0, 0.014, 0.0)), grasp(0.0, 0.0)),  # across the slopes, off the middle: it slips out
+    "dropped": (
+        place(prism=(0.0, 0.014, 0.0)),
+        grasp(0.0, 0.0),
+    ),  # across the slopes, off the middle: it slips out
     "lifted": (place(cube=(0.0, 0.0, 0.0), other=(0.15, 0.1, 0.5)), grasp(0.0, 0.0)),
     "push": (place(cube=(0.06, 0.0, 0.0), prism=(-0.1, 0.1, 0.0)), push(0.0, 0.0)),
     "miss": (place(cube=(0.06, 0.06, 0.0)), push(0.0, 0.0)),
     "spinning": (_spinning(), push(-0.1, -0.1)),
-    "nan": (_kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), np.nan), grasp(0.15, -0.15)),
-    "exploded": (_kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), 1e3), grasp(0.15, -0.15)),
+    "nan": (
+        _kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), np.nan),
+        grasp(0.15, -0.15),
+    ),
+    "exploded": (
+        _kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), 1e3),
+        grasp(0.15, -0.15),
+    ),
 }
 
 
 class Run(NamedTuple):
-    """What a batch of primitives started from and came to, leaves [E, ...]: CASES in order, then settled scenes."""
+    """What a batch of primitives started from and came to, leaves [E, ...]: CASES in order, then
+    settled scenes."""
 
     scene: Scene
     height: np.ndarray
@@ -100,19 +121,26 @@ def execute_settled(config: Config, count: int, scripted: dict[str, tuple[Scene,
     """Runs the scripted cases and grasps in `count` settled scenes of `config`, as one batch."""
     world = model.build(config.scene, config.sim)
     per_number = count // (1 + len(config.scene.slots) - config.scene.min_blocks)
-    settled = pool.settled(world, config.scene, config.heightmap.extent, pool.TRAIN_STREAM, per_number)
+    settled = pool.settled(
+        world, config.scene, config.heightmap.extent, pool.TRAIN_STREAM, per_number
+    )
     look = jax.jit(jax.vmap(lambda scene: Env(config, None, None).look(scene).height))
     plan_grasp = functools.partial(oracle.grasp, config.sim, config.heightmap, config.scene.slots)
     grasps = _noisy(jax.jit(jax.vmap(plan_grasp))(settled, look(settled)))
     scenes, actions = settled, grasps
     if scripted:
         alone, acts = (
-            jax.tree.map(lambda *leaves: np.stack(leaves), *part) for part in zip(*scripted.values(), strict=True)
+            jax.tree.map(lambda *leaves: np.stack(leaves), *part)
+            for part in zip(*scripted.values(), strict=True)
         )
-        scenes, actions = jax.tree.map(lambda *leaves: np.concatenate(leaves), (alone, acts), (settled, grasps))
+        scenes, actions = jax.tree.map(
+            lambda *leaves: np.concatenate(leaves), (alone, acts), (settled, grasps)
+        )
     height = look(scenes)
     physics = mjx_physics.make(world, config.sim)
-    run = jax.jit(jax.vmap(functools.partial(simulation.execute, physics, config.sim, config.heightmap)))
+    run = jax.jit(
+        jax.vmap(functools.partial(simulation.execute, physics, config.sim, config.heightmap))
+    )
     return jax.tree.map(np.asarray, Run(scenes, height, actions, *run(scenes, height, actions)))
 
 
@@ -156,9 +184,14 @@ def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]
 
 @pytest.fixture(scope="session")
 def doubled_caps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
-    """Grasps in settled scenes of the default configuration, with its contact caps and with twice as many."""
+    """Grasps in settled scenes of the default configuration, with its contact caps and with twice
+    as many."""
     config = Config()
-    sim = dataclasses.replace(config.sim, geom_pairs=2 * config.sim.geom_pairs, contacts=2 * config.sim.contacts)
+    sim = dataclasses.replace(
+        config.sim, geom_pairs=2 * config.sim.geom_pairs, contacts=2 * config.sim.contacts
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        return tuple(execute_settled(c, SETTLED, {}) for c in (config, dataclasses.replace(config, sim=sim)))
+        return tuple(
+            execute_settled(c, SETTLED, {}) for c in (config, dataclasses.replace(config, sim=sim))
+        )

@@ -31,13 +31,19 @@ trajectories = jax.jit(jax.vmap(kinematics.trajectory, (None, 0)))
 
 def _random_joints(num: int, seed: int = 0) -> np.ndarray:
     """Joint angles [num, 6] rad, uniform within the limits."""
-    return (np.random.default_rng(seed).uniform(-1, 1, (num, 6)) * kinematics.LIMITS).astype(np.float32)
+    return (np.random.default_rng(seed).uniform(-1, 1, (num, 6)) * kinematics.LIMITS).astype(
+        np.float32
+    )
 
 
 def _errors(pose: Pose, other: Pose) -> tuple[np.ndarray, np.ndarray]:
     """Distances [...] m and angles [...] rad between poses [..., 3], [..., 3, 3]."""
-    turn = np.einsum("...ij,...ik->...jk", np.asarray(pose.rotation, np.float64), np.asarray(other.rotation))
-    sine = np.stack([turn[..., i, j] - turn[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=-1)
+    turn = np.einsum(
+        "...ij,...ik->...jk", np.asarray(pose.rotation, np.float64), np.asarray(other.rotation)
+    )
+    sine = np.stack(
+        [turn[..., i, j] - turn[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=-1
+    )
     angle = np.arctan2(np.linalg.norm(sine, axis=-1), np.trace(turn, axis1=-2, axis2=-1) - 1.0)
     return np.linalg.norm(np.asarray(pose.position) - np.asarray(other.position), axis=-1), angle
 
@@ -53,17 +59,25 @@ def _arm() -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(assets() / "ur5.xml"))
     wrist3 = spec.body("wrist3")
     tip = kinematics.D6 + kinematics.TOOL
-    for name, start, end, radius in (("tool", 0.0, tip - 0.115, 0.045), ("fingers", tip - 0.115, tip - 0.07, 0.07)):
-        geom = wrist3.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, 0, 0], mass=0)
+    for name, start, end, radius in (
+        ("tool", 0.0, tip - 0.115, 0.045),
+        ("fingers", tip - 0.115, tip - 0.07, 0.07),
+    ):
+        geom = wrist3.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, 0, 0], mass=0
+        )
         geom.fromto = [0, 0, start, 0, 0, end]
     return spec.compile()
 
 
 def _plans(num: int, seed: int = 0) -> primitives.Plan:
-    """Plans [num, ...] of pushes and grasps over flat surfaces; the first eight stand in the corners."""
+    """Plans [num, ...] of pushes and grasps over flat surfaces; the first eight stand in the
+    corners."""
     rng = np.random.default_rng(seed)
     pose = rng.uniform([-HALF, -HALF, 0], [HALF, HALF, 2 * np.pi], (num, 3)).astype(np.float32)
-    pose[:8, :2] = np.repeat(HALF * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], np.float32), 2, axis=0)
+    pose[:8, :2] = np.repeat(
+        HALF * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], np.float32), 2, axis=0
+    )
     actions = Action(primitive=jnp.arange(num, dtype=jnp.int32) % 2, pose=jnp.asarray(pose))
     top = rng.choice(np.float32([0.0, 0.05, 0.15]), num)
     height = jnp.asarray(np.broadcast_to(top[:, None, None], (num, MAP.size, MAP.size)))
@@ -72,14 +86,16 @@ def _plans(num: int, seed: int = 0) -> primitives.Plan:
 
 @functools.cache
 def _moves(num: int = 64) -> tuple[np.ndarray, kinematics.Trajectory]:
-    """Set-points [num, 1 + T, 5] of plans, from their start on, and the trajectories through them."""
+    """Set-points [num, 1 + T, 5] of plans, from their start on, and the trajectories through
+    them."""
     plan = _plans(num)
     control = jnp.concatenate([plan.start[:, None], plan.control], axis=1)
     return np.asarray(control), trajectories(jnp.asarray(kinematics.HOME), control)
 
 
 def test_forward_agrees_with_c():
-    """Claim: the tips are where C MuJoCo has them in the arm of `ur5.xml`, which is built of the same parameters."""
+    """Claim: the tips are where C MuJoCo has them in the arm of `ur5.xml`, which is built of the
+    same parameters."""
     model, joints = _arm(), _random_joints(1000)
     data, position, rotation = mujoco.MjData(model), [], []
     for q in joints:
@@ -93,8 +109,8 @@ def test_forward_agrees_with_c():
 
 
 def test_inverse_returns_to_the_pose():
-    """Claim: every branch that counts leads back to the pose, to rounding, in float32 and unrefined; one of them is the
-    joint angles that the pose was made from."""
+    """Claim: every branch that counts leads back to the pose, to rounding, in float32 and
+    unrefined; one of them is the joint angles that the pose was made from."""
     joints = _random_joints(10_000)
     pose = forward(joints)
     solutions, valid = map(np.asarray, inverse(*pose))
@@ -107,18 +123,24 @@ def test_inverse_returns_to_the_pose():
     sines = np.abs(np.stack([np.sin(joints[:, 2]), np.sin(joints[:, 4])]))
     generic = (sines > 0.05).all(axis=0) & valid.all(axis=1)
     assert generic.sum() > 5000
-    assert apart[generic].max() < 5e-4  # near where two branches meet, an angle is worth the root of an error
+    assert (
+        apart[generic].max() < 5e-4
+    )  # near where two branches meet, an angle is worth the root of an error
 
 
 def test_eight_branches_are_distinct():
-    """Claim: where all eight branches count, no two are the same posture, and each has the signs that name it."""
+    """Claim: where all eight branches count, no two are the same posture, and each has the signs
+    that name it."""
     solutions, valid = map(np.asarray, inverse(*forward(_random_joints(2000, 1))))
     solutions = solutions[valid.all(axis=1)]
     assert len(solutions) > 1000
     assert (np.abs(solutions) <= np.pi + 1e-6).all()
     for first in range(8):
         for second in range(first):
-            assert _angles_apart(solutions[:, first], solutions[:, second]).min() > 0.5 * kinematics.SINGULAR
+            assert (
+                _angles_apart(solutions[:, first], solutions[:, second]).min()
+                > 0.5 * kinematics.SINGULAR
+            )
     assert (np.sign(solutions[..., [2, 4]]) == kinematics.BRANCHES[:, 1:]).all()
 
 
@@ -126,8 +148,14 @@ CENTRE, ABOVE_BASE = (0.0, 0.0, 0.1), kinematics.BASE[2] + 0.5
 NOWHERE = {
     "beyond": ((-0.6, 0.0, 0.1), 0.0),
     "very far": ((1e30, 0.0, 0.1), 0.0),
-    "nearer to the axis than the wrist is wide": ((kinematics.BASE[0] + 0.5 * kinematics.D4, 0.0, ABOVE_BASE), 0.0),
-    "straight beside the axis": ((kinematics.BASE[0], kinematics.D4, ABOVE_BASE), 0.0),  # both shoulders meet
+    "nearer to the axis than the wrist is wide": (
+        (kinematics.BASE[0] + 0.5 * kinematics.D4, 0.0, ABOVE_BASE),
+        0.0,
+    ),
+    "straight beside the axis": (
+        (kinematics.BASE[0], kinematics.D4, ABOVE_BASE),
+        0.0,
+    ),  # both shoulders meet
     "nan": ((0.0, np.nan, 0.1), 0.0),
     "nan yaw": (CENTRE, np.nan),
     "infinite": ((0.0, 0.0, -np.inf), 0.0),
@@ -136,7 +164,8 @@ NOWHERE = {
 
 @pytest.mark.parametrize("name", NOWHERE)
 def test_poses_without_an_answer(name: str):
-    """Claim: poses out of reach, singular or not finite have no valid branch, and finite angles and gradients."""
+    """Claim: poses out of reach, singular or not finite have no valid branch, and finite angles and
+    gradients."""
     xyz, yaw = NOWHERE[name]
     pose = kinematics.top_down(jnp.array(xyz), jnp.array(yaw))
     solutions, valid = jax.jit(kinematics.inverse)(*pose)
@@ -154,9 +183,12 @@ def test_a_matrix_that_turns_nothing():
     assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
 
 
-@pytest.mark.parametrize(("joint", "angle"), [(2, 0.0), (2, 0.005), (4, 0.0), (4, -0.005), (4, np.pi)])
+@pytest.mark.parametrize(
+    ("joint", "angle"), [(2, 0.0), (2, 0.005), (4, 0.0), (4, -0.005), (4, np.pi)]
+)
 def test_singular_branches_are_flagged(joint: int, angle: float):
-    """Claim: of a pose with a straight elbow or wrist, the branches that meet there do not count; all stay finite."""
+    """Claim: of a pose with a straight elbow or wrist, the branches that meet there do not count;
+    all stay finite."""
     pose = kinematics.forward(jnp.array([0.3, -0.5, 1.0, -1.0, 1.0, 0.2]).at[joint].set(angle))
     solutions, valid = map(np.asarray, jax.jit(kinematics.inverse)(*pose))
     assert np.isfinite(solutions).all()
@@ -167,18 +199,20 @@ def test_singular_branches_are_flagged(joint: int, angle: float):
 
 
 def test_wrist_at_its_very_singularity():
-    """Claim: where the wrist leaves nothing to tell its angles from, they and their gradients are finite."""
+    """Claim: where the wrist leaves nothing to tell its angles from, they and their gradients are
+    finite."""
     zero, one = jnp.zeros(()), jnp.ones(())
     for output in range(2):
-        angle, slopes = jax.value_and_grad(lambda *z, output=output: kinematics._wrist(*z)[output], (0, 1, 2))(
-            zero, zero, one, one
-        )
+        angle, slopes = jax.value_and_grad(
+            lambda *z, output=output: kinematics._wrist(*z)[output], (0, 1, 2)
+        )(zero, zero, one, one)
         assert np.isfinite([angle, *slopes]).all()
     assert not kinematics._wrist(zero, zero, one, one)[2]
 
 
 def test_gradient_of_inverse():
-    """Claim: the derivative of a branch is the inverse of that of the tips' position and heading."""
+    """Claim: the derivative of a branch is the inverse of that of the tips' position and
+    heading."""
     xyz, yaw = jnp.array([0.1, -0.05, 0.1]), jnp.array(0.4)
 
     def there_and_back(xyz, yaw):
@@ -190,10 +224,13 @@ def test_gradient_of_inverse():
 
 
 def test_top_down_is_the_floating_hand():
-    """Claim: a hand that points down at a yaw stands as the floating hand of `hand.xml` does at that yaw."""
+    """Claim: a hand that points down at a yaw stands as the floating hand of `hand.xml` does at
+    that yaw."""
     model = mujoco.MjModel.from_xml_path(str(assets() / "hand.xml"))
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    for values in rng.uniform([-0.2, -0.2, 0, 0], [0.2, 0.2, 0.3, 2 * np.pi], (20, 4)).astype(np.float32):
+    for values in rng.uniform([-0.2, -0.2, 0, 0], [0.2, 0.2, 0.3, 2 * np.pi], (20, 4)).astype(
+        np.float32
+    ):
         data.qpos[:4] = values
         mujoco.mj_kinematics(model, data)
         pose = kinematics.top_down(jnp.asarray(values[:3]), jnp.asarray(values[3]))
@@ -202,7 +239,8 @@ def test_top_down_is_the_floating_hand():
 
 
 def test_whole_workspace_is_reachable():
-    """Claim: over every cell, with the tips 0.01 to 0.35 m above the table and at 16 yaws, a clear branch counts."""
+    """Claim: over every cell, with the tips 0.01 to 0.35 m above the table and at 16 yaws, a clear
+    branch counts."""
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, None, None))
@@ -218,11 +256,23 @@ def test_whole_workspace_is_reachable():
 
 def test_home_is_above_the_centre():
     """Claim: at HOME the tips are 0.2 m above the workspace centre, and the arm is clear."""
-    np.testing.assert_allclose(kinematics.forward(jnp.asarray(kinematics.HOME)).position, [0, 0, 0.2], atol=2e-3)
+    np.testing.assert_allclose(
+        kinematics.forward(jnp.asarray(kinematics.HOME)).position, [0, 0, 0.2], atol=2e-3
+    )
     assert kinematics.clear(jnp.asarray(kinematics.HOME))
 
 
-CAPSULES = ("base", "shoulder", "upper_arm", "elbow", "forearm", "wrist1", "wrist2", "tool", "fingers")
+CAPSULES = (
+    "base",
+    "shoulder",
+    "upper_arm",
+    "elbow",
+    "forearm",
+    "wrist1",
+    "wrist2",
+    "tool",
+    "fingers",
+)
 
 
 def _distances(q: np.ndarray) -> np.ndarray:
@@ -231,11 +281,17 @@ def _distances(q: np.ndarray) -> np.ndarray:
     data, ids = mujoco.MjData(model), [model.geom(name).id for name in CAPSULES]
     data.qpos[:] = q
     mujoco.mj_kinematics(model, data)
-    return np.array([[mujoco.mj_geomDistance(model, data, a, b, 2.0, None) if a != b else 0 for b in ids] for a in ids])
+    return np.array(
+        [
+            [mujoco.mj_geomDistance(model, data, a, b, 2.0, None) if a != b else 0 for b in ids]
+            for a in ids
+        ]
+    )
 
 
 def test_clearance_agrees_with_c():
-    """Claim: the room between links is that between the capsules of `ur5.xml`, above the table that below them."""
+    """Claim: the room between links is that between the capsules of `ur5.xml`, above the table that
+    below them."""
     model, joints = _arm(), _random_joints(200, 2)
     above, apart = map(np.asarray, clearance(joints))
     first, second = kinematics._PAIRS.T
@@ -265,7 +321,8 @@ def test_links_left_out_never_change():
 
 @pytest.mark.parametrize("turns", [(0, 0, 0, 0, 0, 0), (-1, 1, 0, 1, 1, -1)])
 def test_nearest_turns_least(turns: tuple[int, ...]):
-    """Claim: the nearest solution is the branch that the arm is in, each joint by the turn that it is in."""
+    """Claim: the nearest solution is the branch that the arm is in, each joint by the turn that it
+    is in."""
     q = jnp.array([0.4, -1.0, 1.7, -2.2, -1.5, 1.2]) + 2 * np.pi * jnp.array(turns, jnp.float32)
     found, reachable = kinematics.nearest(q + 0.05, *kinematics.inverse(*kinematics.forward(q)))
     assert reachable
@@ -281,7 +338,9 @@ def test_nearest_keeps_the_limits(joint: int, limit: float):
     solutions, valid = jnp.tile(solution, (8, 1)), jnp.arange(8) == 3
     found, reachable = kinematics.nearest(q.at[joint].set(0.99 * limit), solutions, valid)
     assert reachable
-    np.testing.assert_allclose(found[joint], limit + 0.1 * np.sign(limit) - np.sign(limit) * 2 * np.pi, atol=1e-5)
+    np.testing.assert_allclose(
+        found[joint], limit + 0.1 * np.sign(limit) - np.sign(limit) * 2 * np.pi, atol=1e-5
+    )
 
 
 def test_nearest_without_a_choice_stays():
@@ -298,7 +357,8 @@ def test_nearest_without_a_choice_stays():
 
 
 def test_trajectory_hits_the_set_points():
-    """Claim: the joint targets put the tips on every set-point of a plan, and hand on the fingers."""
+    """Claim: the joint targets put the tips on every set-point of a plan, and hand on the
+    fingers."""
     control, (target, reachable) = _moves()
     assert reachable.all()
     tips = jax.jit(jax.vmap(jax.vmap(kinematics.forward)))(target[..., :6])
@@ -310,8 +370,8 @@ def test_trajectory_hits_the_set_points():
 
 
 def test_trajectory_is_continuous():
-    """Claim: over flat surfaces no joint turns faster between set-points than the maker's 180 degrees per second, none
-    leaves its limits, and the arm is clear all the way."""
+    """Claim: over flat surfaces no joint turns faster between set-points than the maker's 180
+    degrees per second, none leaves its limits, and the arm is clear all the way."""
     joints = np.asarray(_moves()[1].target[..., :6])
     assert np.abs(np.diff(joints, axis=1)).max() < kinematics.MAX_SPEED * SIM.timestep
     assert (np.abs(joints) <= kinematics.LIMITS).all()
@@ -324,7 +384,8 @@ def _line(start: tuple[float, ...], end: tuple[float, ...], num: int = 50) -> ja
 
 
 def test_trajectory_keeps_to_one_branch():
-    """Claim: the branch is one that reaches every set-point, even if the arm starts in one that does not."""
+    """Claim: the branch is one that reaches every set-point, even if the arm starts in one that
+    does not."""
     control = _line((0.2, 0.0, 0.1, 0.0, 0.0), (-0.2, 0.2, 0.1, 0.0, 0.0))
     solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
     valid = np.asarray(valid & clear(solutions))
@@ -339,7 +400,8 @@ def test_trajectory_keeps_to_one_branch():
 
 
 def test_trajectory_takes_the_branch_it_is_in():
-    """Claim: of branches that reach every set-point, the one with the least motion is taken: the one the arm is in."""
+    """Claim: of branches that reach every set-point, the one with the least motion is taken: the
+    one the arm is in."""
     control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
     solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
     whole = np.flatnonzero(np.asarray(valid & clear(solutions)).all(axis=0))
@@ -350,10 +412,13 @@ def test_trajectory_takes_the_branch_it_is_in():
 
 
 def test_trajectory_leaves_a_branch_that_is_not_clear():
-    """Claim: a branch that reaches every set-point, but through the table or the arm itself, is not taken."""
+    """Claim: a branch that reaches every set-point, but through the table or the arm itself, is not
+    taken."""
     control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
     solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
-    blocked = np.flatnonzero(np.asarray(valid).all(axis=0) & ~np.asarray(clear(solutions)).any(axis=0))
+    blocked = np.flatnonzero(
+        np.asarray(valid).all(axis=0) & ~np.asarray(clear(solutions)).any(axis=0)
+    )
     assert blocked.size
     for branch in blocked:
         target, reachable = trajectory(solutions[0, branch], control)
@@ -363,7 +428,8 @@ def test_trajectory_leaves_a_branch_that_is_not_clear():
 
 @pytest.mark.parametrize("turn", [1.0, -1.0])
 def test_trajectory_stays_within_limits_as_the_hand_turns(turn: float):
-    """Claim: a hand that turns a full circle is followed without a jump, and without passing a joint's limit."""
+    """Claim: a hand that turns a full circle is followed without a jump, and without passing a
+    joint's limit."""
     start = (0.0, 0.0, 0.1, 0.0, 0.0)
     control = _line(start, (0.0, 0.0, 0.1, 2 * np.pi * turn, 0.0), 400)
     for wrist3 in (-5.0, 0.0, 5.0):
@@ -375,20 +441,26 @@ def test_trajectory_stays_within_limits_as_the_hand_turns(turn: float):
 
 @pytest.mark.parametrize("lost", [(-0.6, 0.0, 0.1, 0.0, 0.0), (np.nan, 0.0, 0.1, 0.0, 0.0)])
 def test_trajectory_stops_where_reach_ends(lost: tuple[float, ...]):
-    """Claim: from the first set-point out of reach the arm holds the last good target, and this is flagged."""
+    """Claim: from the first set-point out of reach the arm holds the last good target, and this is
+    flagged."""
     control = _line((0.0, 0.0, 0.1, 0.0, 0.05), (-0.1, 0.0, 0.1, 0.0, 0.05))
-    target, reachable = trajectory(jnp.asarray(kinematics.HOME), control.at[30:40].set(jnp.array(lost)))
+    target, reachable = trajectory(
+        jnp.asarray(kinematics.HOME), control.at[30:40].set(jnp.array(lost))
+    )
     whole, _ = trajectory(jnp.asarray(kinematics.HOME), control)
     assert not reachable
     np.testing.assert_array_equal(target[:30], whole[:30])
     np.testing.assert_array_equal(target[30:, :6], np.broadcast_to(whole[29, :6], (20, 6)))
-    nowhere, reachable = trajectory(jnp.asarray(kinematics.HOME), control.at[0].set(jnp.array(lost)))
+    nowhere, reachable = trajectory(
+        jnp.asarray(kinematics.HOME), control.at[0].set(jnp.array(lost))
+    )
     assert not reachable
     np.testing.assert_array_equal(nowhere[:, :6], np.broadcast_to(kinematics.HOME, (50, 6)))
 
 
 def test_one_scene_is_not_the_others_matter():
-    """Claim: a trajectory in a batch of 32, one of them out of reach, is the one that it is alone."""
+    """Claim: a trajectory in a batch of 32, one of them out of reach, is the one that it is
+    alone."""
     control, expected = _moves()
     control = jnp.asarray(control[:32]).at[7, :, 0].set(-5.0)
     batch = trajectories(jnp.asarray(kinematics.HOME), control)

@@ -7,8 +7,9 @@ import pytest
 from mujoco import mjx
 
 from csac_jax import env, presets
+from csac_jax.constants import Primitive
 from csac_jax.sim import mjx_physics, primitives, robot
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.sim.primitives import Action
 
 pytestmark = [pytest.mark.slow, pytest.mark.mjx]
 
@@ -16,7 +17,8 @@ SCENES = 8
 
 
 def _pushes(program: env.Env):
-    """Scenes [E], drives [E] that push low through a block of each, and data [E] before the first substep."""
+    """Scenes [E], drives [E] that push low through a block of each, and data [E] before the first
+    substep."""
     cfg = program.cfg
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf[:SCENES]), program.scenes)
     place = scenes.position[:, 0, :2] - jnp.array([[0.05, 0.0]])
@@ -38,8 +40,9 @@ def _each(tree):
 
 
 def test_batches_round_otherwise_and_contacts_amplify_it():
-    """Claim: on one device, a scene in a batch of eight and the same by itself are apart by rounding after a physics
-    step, less than 1e-6 m, and by more than 1e-4 m after a push in one of eight scenes: two layouts are two runs."""
+    """Claim: on one device, a scene in a batch of eight and the same by itself are apart by
+    rounding after a physics step, less than 1e-6 m, and by more than 1e-4 m after a push in one of
+    eight scenes: two layouts are two runs."""
     program = env.make(presets.smoke())
     physics = program.physics
     given = jax.jit(lambda: _pushes(program))()
@@ -56,6 +59,8 @@ def test_batches_round_otherwise_and_contacts_amplify_it():
     for index in np.arange(program.cfg.sim.substeps):
         together = run(*given, together, index)
         alone = [run(*one, data, index) for one, data in zip(each, alone, strict=True)]
-        apart.append(float(np.max(np.abs(together.qpos - np.concatenate([data.qpos for data in alone])))))
+        apart.append(
+            float(np.max(np.abs(together.qpos - np.concatenate([data.qpos for data in alone]))))
+        )
     assert 0.0 < apart[0] < 1e-6
     assert apart[-1] > 1e-4

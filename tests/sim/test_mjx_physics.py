@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from csac_jax.config import MESH_KINDS, Config, SceneConfig
+from csac_jax.constants import Outcome
 from csac_jax.scene import layout, model
 from csac_jax.sim import c_physics, mjx_physics, oracle, outcome, physics as simulation, robot
-from csac_jax.sim.outcome import Outcome
 
 pytestmark = pytest.mark.mjx
 
@@ -21,22 +21,28 @@ CONFIG = Config()
 
 def _outcomes(run, trace=None) -> np.ndarray:
     """Outcomes by ground truth of a batch of runs, or of other traces of the same plans."""
-    return np.asarray(jax.vmap(outcome.grasp_outcome)(trace or run.trace, run.plan.surface, run.hand_rise))
+    return np.asarray(
+        jax.vmap(outcome.grasp_outcome)(trace or run.trace, run.plan.surface, run.hand_rise)
+    )
 
 
 @pytest.mark.parametrize("level", list(Outcome), ids=lambda level: level.name.lower())
 def test_every_outcome_is_reached(executed, level: Outcome):
-    """Claim: physics reaches all five levels of a grasp (CSAC eq. 15), with the block set as it is."""
+    """Claim: physics reaches all five levels of a grasp (CSAC eq. 15), with the block set as it
+    is."""
     run = executed.case(level.name.lower())
     assert simulation.healthy(run.after)
     assert outcome.grasp_outcome(run.trace, run.plan.surface, run.hand_rise) == level
 
 
 def test_lifted_block_alone_hangs_in_the_hand(executed):
-    """Claim: after a grasp the lifted block is still in play and hangs at the hand's height; the other one lies."""
+    """Claim: after a grasp the lifted block is still in play and hangs at the hand's height; the
+    other one lies."""
     run = executed.case("lifted")
     np.testing.assert_array_equal(run.after.in_play, [True, True, False])
-    np.testing.assert_array_equal(outcome.lifted_blocks(run.trace, run.hand_rise), [True, False, False])
+    np.testing.assert_array_equal(
+        outcome.lifted_blocks(run.trace, run.hand_rise), [True, False, False]
+    )
     rise = run.after.position[:, 2] - run.scene.position[:, 2]
     np.testing.assert_allclose(rise[:2], [run.hand_rise, 0.0], atol=0.005)
     assert abs(run.trace.gap_end - 0.05) < 0.005  # the cube's width
@@ -51,10 +57,14 @@ def test_dropped_block_lies_again(executed):
 
 
 def test_push_moves_a_block_with_the_hand(executed):
-    """Claim: a push shoves what stands in its way as far as the finger goes beyond first contact, straight ahead."""
+    """Claim: a push shoves what stands in its way as far as the finger goes beyond first contact,
+    straight ahead."""
     run = executed.case("push")
     moved = run.after.position[0] - run.scene.position[0]
-    finger, face = 0.012, 0.06 - 0.025  # m ahead of the place: closed fingers' front, the cube's near face
+    finger, face = (
+        0.012,
+        0.06 - 0.025,
+    )  # m ahead of the place: closed fingers' front, the cube's near face
     np.testing.assert_allclose(moved, [0.10 - (face - finger), 0.0, 0.0], atol=0.006)
     np.testing.assert_allclose(run.after.position[2], run.scene.position[2], atol=0.001)
     assert run.trace.touched
@@ -68,7 +78,8 @@ def test_push_that_misses_moves_nothing(executed):
 
 
 def test_parked_blocks_never_move(executed):
-    """Claim: a block that is out of play stays at its place, at rest, whatever happens in the scene, and stays out."""
+    """Claim: a block that is out of play stays at its place, at rest, whatever happens in the
+    scene, and stays out."""
     parked = ~executed.scene.in_play
     assert parked.sum() > 10
     np.testing.assert_array_equal(executed.after.in_play, executed.scene.in_play)
@@ -80,7 +91,8 @@ def test_parked_blocks_never_move(executed):
 
 
 def test_failed_physics_is_flagged_alone(executed):
-    """Claim: `healthy` is false for a scene that went NaN or exploded, and true for every other one of the batch."""
+    """Claim: `healthy` is false for a scene that went NaN or exploded, and true for every other one
+    of the batch."""
     health = np.asarray(jax.vmap(simulation.healthy)(executed.after))
     names = ["nan", "exploded"]
     assert np.isfinite(executed.case("exploded").after.position).all()  # bounds, not isnan
@@ -90,7 +102,8 @@ def test_failed_physics_is_flagged_alone(executed):
 
 
 def test_products_keep_their_precision(config, world):
-    """Claim: no product of matrices of the physics or the planner runs at a GPU's reduced precision.
+    """Claim: no product of matrices of the physics or the planner runs at a GPU's reduced
+    precision.
 
     MJX itself asks for HIGH, three passes of the reduced one, in its box collisions.
     """
@@ -109,7 +122,8 @@ def test_products_keep_their_precision(config, world):
 
 
 def test_fast_spin_does_not_blow_up(executed, c_world):
-    """Claim: a thin block that comes in spinning at 250 rad/s is held to the speed limit, in MJX and in C."""
+    """Claim: a thin block that comes in spinning at 250 rad/s is held to the speed limit, in MJX
+    and in C."""
     run = executed.case("spinning")
     end, _ = c_physics.CPhysics(c_world, CONFIG.sim).run(run.scene, robot.drive("hand", run.plan))
     for after in (run.after, end):
@@ -138,8 +152,8 @@ def test_fast_spin_does_not_blow_up(executed, c_world):
     ],
 )
 def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
-    """Claim: healthy = finite, slower than MAX_SPEED, within MAX_HEIGHT of the origin if in play, of unit quaternion
-    and of a block's size."""
+    """Claim: healthy = finite, slower than MAX_SPEED, within MAX_HEIGHT of the origin if in play,
+    of unit quaternion and of a block's size."""
     scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
     scene = scene.replace(position=jnp.zeros((2, 3)), in_play=jnp.array([True, False]))
     assert simulation.healthy(scene)
@@ -150,7 +164,11 @@ def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
 @pytest.mark.parametrize(
     ("field", "value", "good"),
     [
-        *((field, value, False) for field in ("density", "friction") for value in (np.nan, np.inf, 1e6, 0.0, -1.0)),
+        *(
+            (field, value, False)
+            for field in ("density", "friction")
+            for value in (np.nan, np.inf, 1e6, 0.0, -1.0)
+        ),
         ("density", 3000.0, True),
         ("friction", 2.0, True),
         *(("colour", value, False) for value in (-1, 10, 1_000_000)),
@@ -158,7 +176,8 @@ def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
     ],
 )
 def test_healthy_materials(field: str, value: float, good: bool):
-    """Claim: a healthy scene has densities and frictions of solid things, and colours that there are."""
+    """Claim: a healthy scene has densities and frictions of solid things, and colours that there
+    are."""
     scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
     changed = getattr(scene, field).at[1].set(value)
     assert simulation.healthy(dataclasses.replace(scene, **{field: changed})) == good
@@ -166,7 +185,8 @@ def test_healthy_materials(field: str, value: float, good: bool):
 
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_meshes_are_as_large_as_the_blocks(scale: float):
-    """Claim: corners and faces that MJX collides span the block's bounding box, whatever its size in the scene."""
+    """Claim: corners and faces that MJX collides span the block's bounding box, whatever its size
+    in the scene."""
     config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=MESH_KINDS, min_blocks=1))
     world = model.build(config.scene, config.sim)
     scene = layout.parked(config.scene.slots)
@@ -182,10 +202,12 @@ def test_meshes_are_as_large_as_the_blocks(scale: float):
 
 
 def test_all_that_follows_from_blocks_is_the_scenes():
-    """Claim: whatever numbers of its model C MuJoCo derives from a scene's blocks, MJX's model of the scene has too.
+    """Claim: whatever numbers of its model C MuJoCo derives from a scene's blocks, MJX's model of
+    the scene has too.
 
-    Not `dof_M0`, `light_poscom0` and `geom_aabb`, the first two of which neither engine of MJX reads and the last of
-    which bounds the largest block, nor corners of meshes, which MJX scales in arrays of its own (above).
+    Not `dof_M0`, `light_poscom0` and `geom_aabb`, the first two of which neither engine of MJX
+    reads and the last of which bounds the largest block, nor corners of meshes, which MJX scales in
+    arrays of its own (above).
     """
     slots = ("box", "arch", *MESH_KINDS)
     config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=slots, min_blocks=1))
@@ -201,17 +223,27 @@ def test_all_that_follows_from_blocks_is_the_scenes():
     changed = set()
     for field in dataclasses.fields(ours):
         wanted, nominal = getattr(exact, field.name, None), getattr(world.model, field.name, None)
-        if isinstance(wanted, np.ndarray) and wanted.dtype.kind == "f" and not np.array_equal(wanted, nominal):
+        if (
+            isinstance(wanted, np.ndarray)
+            and wanted.dtype.kind == "f"
+            and not np.array_equal(wanted, nominal)
+        ):
             changed.add(field.name)
             if field.name not in ("dof_M0", "light_poscom0", "geom_aabb", "mesh_vert"):
                 got = np.asarray(getattr(ours, field.name)).reshape(wanted.shape)
                 np.testing.assert_allclose(got, wanted, rtol=2e-5, atol=1e-7, err_msg=field.name)
-    assert {"geom_size", "body_mass", "body_subtreemass", "body_inertia", "dof_invweight0"} <= changed
+    assert {
+        "geom_size",
+        "body_mass",
+        "body_subtreemass",
+        "body_inertia",
+        "dof_invweight0",
+    } <= changed
 
 
 def test_no_contact_was_dropped(executed):
     """Claim: with few blocks the contact slots are never all in use."""
-    assert not executed.trace.saturated.any()
+    assert not executed.trace.contact_overflow.any()
 
 
 def test_grasps_agree_with_c(grasped, grasped_in_c):
@@ -222,9 +254,12 @@ def test_grasps_agree_with_c(grasped, grasped_in_c):
 
 
 def test_displacements_agree_with_c(grasped, grasped_in_c):
-    """Claim: blocks move as far as in C MuJoCo: within 1 mm in the median scene, within 5 mm on average."""
+    """Claim: blocks move as far as in C MuJoCo: within 1 mm in the median scene, within 5 mm on
+    average."""
     play, before = grasped.scene.in_play, grasped.scene.position
-    ours, theirs = (np.linalg.norm(end - before, axis=-1) for end in (grasped.after.position, grasped_in_c[0]))
+    ours, theirs = (
+        np.linalg.norm(end - before, axis=-1) for end in (grasped.after.position, grasped_in_c[0])
+    )
     worst = np.where(play, np.abs(ours - theirs), 0.0).max(axis=1)
     assert np.median(worst) < 0.001
     assert abs(ours[play].mean() - theirs[play].mean()) < 0.005
@@ -232,8 +267,9 @@ def test_displacements_agree_with_c(grasped, grasped_in_c):
 
 @pytest.mark.slow
 def test_contact_caps_are_wide_enough(doubled_caps):
-    """Claim: twice the contact caps of the default configuration give the same outcomes, and no slot was wanting."""
+    """Claim: twice the contact caps of the default configuration give the same outcomes, and no
+    slot was wanting."""
     capped, wide = doubled_caps
     np.testing.assert_array_equal(capped.scene.position, wide.scene.position)
     np.testing.assert_array_equal(_outcomes(capped), _outcomes(wide))
-    assert not capped.trace.saturated.any()
+    assert not capped.trace.contact_overflow.any()

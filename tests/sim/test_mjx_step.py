@@ -1,4 +1,5 @@
-"""One step of our MJX beside one of C MuJoCo, from states that show what `mjx.step` does otherwise."""
+"""One step of our MJX beside one of C MuJoCo, from states that show what `mjx.step` does
+otherwise."""
 
 from typing import NamedTuple
 
@@ -18,7 +19,9 @@ pytestmark = pytest.mark.mjx
 
 CONFIG = Config(
     scene=SceneConfig(slots=("box",), min_blocks=1),
-    sim=SimConfig(iterations=50, line_search=50),  # both solvers converge: what differs is not theirs
+    sim=SimConfig(
+        iterations=50, line_search=50
+    ),  # both solvers converge: what differs is not theirs
 )
 PAD = 0.012  # m, front of the closed fingers from the hand's axis; the axis stands at the origin, tips 12 mm high
 HALF, DEEP = 0.025, 3e-4  # m, half a cube and how deep it is in what it touches
@@ -28,7 +31,8 @@ FAR = 0.3  # m, out of everything's way
 
 
 class Case(NamedTuple):
-    """A cube in the air, by place (m) and Euler angles (deg), a set-point of the fingers, and C's contacts."""
+    """A cube in the air, by place (m) and Euler angles (deg), a set-point of the fingers, and C's
+    contacts."""
 
     cube: tuple[float, float, float]
     turn: tuple[float, float, float]
@@ -40,7 +44,9 @@ CASES = {
     "face on pad": Case((PAD + HALF - DEEP, 0.004, 0.035), (0, 0, 0), contacts=4),
     "edge on pad": Case((PAD + DIAGONAL - DEEP, 0.001, 0.035), (45, 0, 0), contacts=2),
     "corner on pad": Case(
-        (PAD + DIAGONAL * np.cos(TILT) + HALF * np.sin(TILT) - DEEP, 0.0, 0.045), (45, np.degrees(TILT), 0), contacts=1
+        (PAD + DIAGONAL * np.cos(TILT) + HALF * np.sin(TILT) - DEEP, 0.0, 0.045),
+        (45, np.degrees(TILT), 0),
+        contacts=1,
     ),
     "pressing": Case((FAR, 0.1, FAR), (0, 0, 0), fingers=0.055),
 }
@@ -48,7 +54,8 @@ TOUCHING = [name for name, case in CASES.items() if case.contacts]
 
 
 class Ends(NamedTuple):
-    """What a step came to. Velocities [cases, nv] m/s and rad/s, depths of contacts that push, deepest first, m."""
+    """What a step came to. Velocities [cases, nv] m/s and rad/s, depths of contacts that push,
+    deepest first, m."""
 
     qvel: np.ndarray
     depths: list[np.ndarray]
@@ -61,7 +68,9 @@ def _state(world: model.World, case: Case) -> tuple[np.ndarray, np.ndarray]:
     qpos[world.robot_qpos] = ctrl_hand = np.array([0.0, 0.0, 0.012, 0.0, 0.0, 0.0])
     address = world.block_qpos[0]
     qpos[address[:3]] = case.cube
-    qpos[address[3:]] = Rotation.from_euler("zyx", case.turn, degrees=True).as_quat(scalar_first=True)
+    qpos[address[3:]] = Rotation.from_euler("zyx", case.turn, degrees=True).as_quat(
+        scalar_first=True
+    )
     ctrl[:4], ctrl[4] = ctrl_hand[:4], case.fingers
     return qpos, ctrl
 
@@ -84,12 +93,19 @@ def ours(world: model.World, scene: layout.Scene) -> Ends:
         its = mjx_physics.scene_model(physics, scene)
         return physics.step(its, physics.data.replace(qpos=qpos, ctrl=ctrl))
 
-    states = [np.float32(column) for column in zip(*(_state(world, case) for case in CASES.values()), strict=True)]
+    states = [
+        np.float32(column)
+        for column in zip(*(_state(world, case) for case in CASES.values()), strict=True)
+    ]
     data = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*states))
     contact = data._impl.contact
     active = contact.dist < contact.includemargin
     deep = np.sum(contact.dist < 0.0, axis=1).tolist()
-    return Ends(data.qvel, [np.sort(dist[row]) for dist, row in zip(contact.dist, active, strict=True)], deep)
+    return Ends(
+        data.qvel,
+        [np.sort(dist[row]) for dist, row in zip(contact.dist, active, strict=True)],
+        deep,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -107,20 +123,23 @@ def theirs(world: model.World, scene: layout.Scene) -> Ends:
 
 @pytest.mark.parametrize("name", TOUCHING)
 def test_contacts_are_those_of_c(name: str, ours: Ends, theirs: Ends):
-    """Claim: each point of a touch pushes once: as many contacts as in C MuJoCo, as deep to a micrometre."""
+    """Claim: each point of a touch pushes once: as many contacts as in C MuJoCo, as deep to a
+    micrometre."""
     index = list(CASES).index(name)
     assert len(theirs.depths[index]) == CASES[name].contacts
     np.testing.assert_allclose(ours.depths[index], theirs.depths[index], atol=1e-6)
 
 
 def test_repeated_points_keep_their_depth(ours: Ends):
-    """Claim: a point that MJX repeats pushes once, but keeps its depth: full slots of contacts are told by it."""
+    """Claim: a point that MJX repeats pushes once, but keeps its depth: full slots of contacts are
+    told by it."""
     assert [ours.deep[list(CASES).index(name)] for name in TOUCHING] == [4] * len(TOUCHING)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_speeds_after_a_step_are_those_of_c(name: str, ours: Ends, theirs: Ends):
-    """Claim: a step leaves the speeds that C MuJoCo leaves, at touches and with a finger at its limit of force."""
+    """Claim: a step leaves the speeds that C MuJoCo leaves, at touches and with a finger at its
+    limit of force."""
     index = list(CASES).index(name)
     assert np.abs(theirs.qvel[index]).max() > 0.01
     np.testing.assert_allclose(ours.qvel[index], theirs.qvel[index], atol=0.01)

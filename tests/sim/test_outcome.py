@@ -3,13 +3,16 @@
 import jax.numpy as jnp
 import pytest
 
+from csac_jax.constants import Outcome
 from csac_jax.sim import outcome
-from csac_jax.sim.outcome import Outcome, Trace
+from csac_jax.sim.outcome import Trace
 
 RISE = 0.10  # m, of the hand
 
 
-def _trace(touched=False, held_rise=0.0, held=False, rise=0.0, gap_closed=0.0, gap_end=0.0) -> Trace:
+def _trace(
+    touched=False, held_rise=0.0, held=False, rise=0.0, gap_closed=0.0, gap_end=0.0
+) -> Trace:
     """A trace in which block 1 of 2 has these values and block 0 lies untouched."""
     return Trace(
         touched=jnp.array(touched),
@@ -18,7 +21,7 @@ def _trace(touched=False, held_rise=0.0, held=False, rise=0.0, gap_closed=0.0, g
         rise=jnp.array([0.0, rise]),
         gap_closed=jnp.array(gap_closed),
         gap_end=jnp.array(gap_end),
-        saturated=jnp.int32(0),
+        contact_overflow=jnp.int32(0),
     )
 
 
@@ -34,14 +37,23 @@ def _trace(touched=False, held_rise=0.0, held=False, rise=0.0, gap_closed=0.0, g
         (_trace(touched=True, held_rise=0.009), 0.05, Outcome.TOUCHED),
         (_trace(touched=True, held_rise=0.011), 0.05, Outcome.DROPPED),
         (_trace(touched=True, held_rise=0.09), 0.05, Outcome.DROPPED),
-        (_trace(touched=True, held_rise=0.09, rise=0.09), 0.05, Outcome.DROPPED),  # in free fall, no longer held
-        (_trace(touched=True, held_rise=0.04, held=True, rise=0.04), 0.05, Outcome.DROPPED),  # held, far too low
+        (
+            _trace(touched=True, held_rise=0.09, rise=0.09),
+            0.05,
+            Outcome.DROPPED,
+        ),  # in free fall, no longer held
+        (
+            _trace(touched=True, held_rise=0.04, held=True, rise=0.04),
+            0.05,
+            Outcome.DROPPED,
+        ),  # held, far too low
         (_trace(touched=True, held_rise=0.06, held=True, rise=0.06), 0.05, Outcome.LIFTED),
         (_trace(touched=True, held_rise=0.06, held=True, rise=0.06), 0.0, Outcome.LIFTED),
     ],
 )
 def test_outcome_by_ground_truth(trace: Trace, surface: float, expected: Outcome):
-    """Claim: nothing, empty, touched, dropped and lifted follow from contacts and rises as grasp_outcome says."""
+    """Claim: nothing, empty, touched, dropped and lifted follow from contacts and rises as
+    grasp_outcome says."""
     assert outcome.grasp_outcome(trace, jnp.array(surface), jnp.array(RISE)) == expected
 
 
@@ -52,26 +64,42 @@ def test_outcome_by_ground_truth(trace: Trace, surface: float, expected: Outcome
         (0.0, 0.0, 0.05, False, Outcome.EMPTY),
         (0.0, 0.0, 0.05, True, Outcome.TOUCHED),
         (0.0, 0.0, 0.0, True, Outcome.TOUCHED),
-        (0.004, 0.004, 0.05, True, Outcome.TOUCHED),  # a closed hand, give or take the control error
+        (
+            0.004,
+            0.004,
+            0.05,
+            True,
+            Outcome.TOUCHED,
+        ),  # a closed hand, give or take the control error
         (0.05, 0.0, 0.05, True, Outcome.DROPPED),
         (0.05, 0.0, 0.05, False, Outcome.DROPPED),
         (0.05, 0.05, 0.05, True, Outcome.LIFTED),
         (0.05, 0.05, 0.0, False, Outcome.LIFTED),
     ],
 )
-def test_outcome_by_gap(gap_closed: float, gap_end: float, surface: float, changed: bool, expected: Outcome):
-    """Claim: the robot's own judgement takes the finger gap and the change of the map, and no ground truth."""
+def test_outcome_by_gap(
+    gap_closed: float, gap_end: float, surface: float, changed: bool, expected: Outcome
+):
+    """Claim: the robot's own judgement takes the finger gap and the change of the map, and no
+    ground truth."""
     for truth in (False, True):
         trace = _trace(truth, 0.09 * truth, truth, 0.09 * truth, gap_closed, gap_end)
-        assert outcome.grasp_outcome_by_gap(trace, jnp.array(surface), jnp.array(changed)) == expected
+        assert (
+            outcome.grasp_outcome_by_gap(trace, jnp.array(surface), jnp.array(changed)) == expected
+        )
 
 
 @pytest.mark.parametrize(
-    ("held", "rise", "lifted"), [(True, 0.051, True), (True, 0.049, False), (False, 0.09, False), (False, 0.0, False)]
+    ("held", "rise", "lifted"),
+    [(True, 0.051, True), (True, 0.049, False), (False, 0.09, False), (False, 0.0, False)],
 )
 def test_lifted_blocks(held: bool, rise: float, lifted: bool):
-    """Claim: a block is lifted when it is between the pads in the end and rose by half of the hand's rise."""
-    assert outcome.lifted_blocks(_trace(held=held, rise=rise), jnp.array(RISE)).tolist() == [False, lifted]
+    """Claim: a block is lifted when it is between the pads in the end and rose by half of the
+    hand's rise."""
+    assert outcome.lifted_blocks(_trace(held=held, rise=rise), jnp.array(RISE)).tolist() == [
+        False,
+        lifted,
+    ]
 
 
 def test_gap_agrees_with_the_truth_where_it_can(executed):

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres
 from csac_jax.scene.model import MAX_OPENING
 from csac_jax.sim import primitives
-from csac_jax.sim.primitives import Action, Plan, Primitive
+from csac_jax.sim.primitives import Action, Plan
 
 SIM = SimConfig()
 MAP = HeightmapConfig(size=224)  # 2 mm cells
@@ -24,14 +25,17 @@ def _height(*surfaces: tuple[float, float, float, float]) -> jnp.ndarray:
     return jnp.asarray(height)
 
 
-def _plan(primitive: Primitive, height: jnp.ndarray, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Plan:
+def _plan(
+    primitive: Primitive, height: jnp.ndarray, x: float = 0.0, y: float = 0.0, yaw: float = 0.0
+) -> Plan:
     action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
     return primitives.plan(SIM, MAP, height, action)
 
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_both_primitives_take_as_many_substeps(primitive: Primitive):
-    """Claim: push and grasp have the same length, that of the config, so that both run in one scan."""
+    """Claim: push and grasp have the same length, that of the config, so that both run in one
+    scan."""
     plan = _plan(primitive, _height())
     assert plan.control.shape == (SIM.substeps, 5)
     assert plan.start.shape == (5,)
@@ -50,7 +54,8 @@ def test_both_primitives_take_as_many_substeps(primitive: Primitive):
     ],
 )
 def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
-    """Claim: tips go to grasp_depth or push_depth below the local top, never below the clearance."""
+    """Claim: tips go to grasp_depth or push_depth below the local top, never below the
+    clearance."""
     plan = _plan(primitive, _height((0.0, 0.0, 0.05, top)), yaw=0.3)
     z = np.asarray(plan.control[:, Z])
     assert plan.surface == pytest.approx(top)
@@ -61,21 +66,29 @@ def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_descent_and_lift(primitive: Primitive):
-    """Claim: the descent is uniform, the tips stay low while the primitive acts, the lift starts and ends gently."""
+    """Claim: the descent is uniform, the tips stay low while the primitive acts, the lift starts
+    and ends gently."""
     phases = SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases
     plan = _plan(primitive, _height())
     z, high, low = np.asarray(plan.control[:, Z]), float(plan.start[Z]), SIM.clearance
     down, lift = phases[0], phases[0] + phases[1]
-    np.testing.assert_allclose(z[:down], high + (low - high) * np.arange(1, down + 1) / down, atol=1e-6)
+    np.testing.assert_allclose(
+        z[:down], high + (low - high) * np.arange(1, down + 1) / down, atol=1e-6
+    )
     np.testing.assert_allclose(z[down:lift], low, atol=1e-6)
     share = np.arange(1, phases[2] + 1) / phases[2]
-    np.testing.assert_allclose(z[lift:], low + (high - low) * (3 * share**2 - 2 * share**3), atol=1e-6)
+    np.testing.assert_allclose(
+        z[lift:], low + (high - low) * (3 * share**2 - 2 * share**3), atol=1e-6
+    )
 
 
 def test_grasp_closes_in_place():
-    """Claim: a grasp stays over its place at its yaw, goes down open and is closed before the lift begins."""
+    """Claim: a grasp stays over its place at its yaw, goes down open and is closed before the lift
+    begins."""
     plan = _plan(Primitive.GRASP, _height((0.05, -0.1, 0.05, 0.05)), 0.05, -0.1, 2.0)
-    np.testing.assert_allclose(plan.control[:, [X, Y, YAW]], np.tile([0.05, -0.1, 2.0], (SIM.substeps, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        plan.control[:, [X, Y, YAW]], np.tile([0.05, -0.1, 2.0], (SIM.substeps, 1)), atol=1e-6
+    )
     down, close, _ = SIM.grasp_phases
     fingers = np.asarray(plan.control[:, FINGERS])
     np.testing.assert_allclose(fingers[:down], 0.5 * MAX_OPENING)
@@ -97,7 +110,9 @@ def test_push_runs_along_the_yaw(yaw: float):
     assert not np.any(plan.control[:, FINGERS])
 
 
-@pytest.mark.parametrize(("yaw", "end"), [(0.0, (0.224, 0.2)), (np.pi / 4, (0.224, 0.224)), (np.pi, (0.1, 0.2))])
+@pytest.mark.parametrize(
+    ("yaw", "end"), [(0.0, (0.224, 0.2)), (np.pi / 4, (0.224, 0.224)), (np.pi, (0.1, 0.2))]
+)
 def test_push_ends_in_the_workspace(yaw: float, end: tuple[float, float]):
     """Claim: the end of a push is clipped to the workspace square."""
     plan = _plan(Primitive.PUSH, _height(), 0.2, 0.2, yaw)
@@ -106,7 +121,8 @@ def test_push_ends_in_the_workspace(yaw: float, end: tuple[float, float]):
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_starts_above_whatever_is_under_the_hand(primitive: Primitive):
-    """Claim: the hand starts a centimetre above the highest thing within its reach, whatever stands farther off."""
+    """Claim: the hand starts a centimetre above the highest thing within its reach, whatever stands
+    farther off."""
     near, far = (_plan(primitive, _height((x, 0.0, 0.04, 0.2))) for x in (0.09, 0.13))
     assert near.start[Z] == pytest.approx(0.21, abs=1e-6)
     assert far.start[Z] == pytest.approx(0.112, abs=1e-6)
@@ -115,15 +131,19 @@ def test_starts_above_whatever_is_under_the_hand(primitive: Primitive):
 
 @pytest.mark.parametrize(("offset", "top"), [(0.0, 0.04), (0.009, 0.04), (0.013, 0.0)])
 def test_local_top_is_that_of_the_window(offset: float, top: float):
-    """Claim: the highest surface in a window of 2 cm about the place counts, nothing beyond it, corners included."""
+    """Claim: the highest surface in a window of 2 cm about the place counts, nothing beyond it,
+    corners included."""
     height = _height((offset, -offset, 0.0022, 0.04))
     assert primitives.local_top(MAP, height, jnp.zeros(2), SIM.window) == pytest.approx(top)
 
 
 def test_local_top_of_coarse_maps():
-    """Claim: on a map whose cells are wider than the window, the cell about the place still counts."""
+    """Claim: on a map whose cells are wider than the window, the cell about the place still
+    counts."""
     coarse = HeightmapConfig(size=16)  # 28 mm cells
     height = jnp.zeros((16, 16)).at[8, 8].set(0.05)
     centre = cell_centres(coarse)[8, 8]
     for offset in (0.0, 0.0139, -0.0139):
-        assert primitives.local_top(coarse, height, centre + offset, SIM.window) == pytest.approx(0.05)
+        assert primitives.local_top(coarse, height, centre + offset, SIM.window) == pytest.approx(
+            0.05
+        )

@@ -1,4 +1,5 @@
-"""The arm of `ur5.xml` with the hand of `rg2.xml`: follows plans, grasps, and presses no harder than it should."""
+"""The arm of `ur5.xml` with the hand of `rg2.xml`: follows plans, grasps, and presses no harder
+than it should."""
 
 import functools
 
@@ -10,9 +11,10 @@ import pytest
 from mujoco import mjx
 
 from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.constants import Primitive
 from csac_jax.scene.model import assets
 from csac_jax.sim import kinematics, primitives
-from csac_jax.sim.primitives import Action, Primitive
+from csac_jax.sim.primitives import Action
 
 SIM, MAP = SimConfig(), HeightmapConfig()
 CUBE = 0.025  # m, half its side
@@ -44,17 +46,24 @@ def _model(with_block: bool = False) -> mujoco.MjModel:
 
 
 @functools.cache
-def _plan(primitive: Primitive, x: float, y: float, yaw: float, top: float) -> tuple[np.ndarray, np.ndarray]:
-    """Set-points [1 + T, 5] of a primitive over a flat surface, from its start on, and joint targets [1 + T, 7]."""
+def _plan(
+    primitive: Primitive, x: float, y: float, yaw: float, top: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Set-points [1 + T, 5] of a primitive over a flat surface, from its start on, and joint
+    targets [1 + T, 7]."""
     action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
-    plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(jnp.full((MAP.size, MAP.size), top), action)
+    plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(
+        jnp.full((MAP.size, MAP.size), top), action
+    )
     control = jnp.concatenate([plan.start[None], plan.control])
     target, reachable = _target(control)
     assert reachable
     return np.asarray(control), np.asarray(target)
 
 
-def _start(model: mujoco.MjModel, target: np.ndarray, block: tuple[float, float] = (9.0, 9.0)) -> mujoco.MjData:
+def _start(
+    model: mujoco.MjModel, target: np.ndarray, block: tuple[float, float] = (9.0, 9.0)
+) -> mujoco.MjData:
     data = mujoco.MjData(model)
     data.qpos[:FINGER] = target[0, :6]
     data.qpos[FINGER : FINGER + 2] = target[0, 6]
@@ -69,7 +78,8 @@ PLACES = [*CORNERS, (0.0, 0.0, 1.0, 0.05), (0.224, 0.0, 3.0, 0.1), (-0.1, 0.1, 4
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_arm_follows_the_plan(primitive: Primitive):
-    """Claim: as each phase of a primitive ends, the tips are within 3 mm of the set-point, whatever the place."""
+    """Claim: as each phase of a primitive ends, the tips are within 3 mm of the set-point, whatever
+    the place."""
     model = _model()
     ends = np.cumsum(SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases)
     for place in PLACES:
@@ -100,7 +110,8 @@ def test_arm_lifts_a_cube(x: float):
 
 @pytest.mark.parametrize(("x", "side"), [(-0.2, 1), (0.0, 1), (0.2, -1)])
 def test_arm_presses_within_reason(x: float, side: int):
-    """Claim: a finger that comes down on a cube neither sinks 15 mm into it nor carries it off: the arm gives way."""
+    """Claim: a finger that comes down on a cube neither sinks 15 mm into it nor carries it off: the
+    arm gives way."""
     model = _model(with_block=True)
     _, target = _plan(Primitive.GRASP, x, 0.0, 0.0, 2 * CUBE)
     data = _start(model, target, (x + side * 0.055, 0.0))
@@ -113,25 +124,42 @@ def test_arm_presses_within_reason(x: float, side: int):
 
 def test_hand_is_the_floating_one():
     """Claim: palm, pads, fingers and finger drive of `rg2.xml` are those of `hand.xml`."""
-    ours, floating = (mujoco.MjModel.from_xml_path(str(assets() / name)) for name in ("rg2.xml", "hand.xml"))
+    ours, floating = (
+        mujoco.MjModel.from_xml_path(str(assets() / name)) for name in ("rg2.xml", "hand.xml")
+    )
     for name in ("palm", "pad_low", "pad_high"):
-        for field in ("size", "pos", "friction", "solref", "priority", "contype", "conaffinity", "condim"):
-            np.testing.assert_array_equal(*(getattr(model.geom(name), field) for model in (ours, floating)), field)
+        for field in (
+            "size",
+            "pos",
+            "friction",
+            "solref",
+            "priority",
+            "contype",
+            "conaffinity",
+            "condim",
+        ):
+            np.testing.assert_array_equal(
+                *(getattr(model.geom(name), field) for model in (ours, floating)), field
+            )
     for name in ("finger_low", "finger_high"):
         for field in ("axis", "range", "limited", "damping", "pos"):
             theirs, mine = (getattr(model.joint(name), field, None) for model in (ours, floating))
             np.testing.assert_array_equal(theirs, mine, field)
         for field in ("mass", "inertia", "pos"):
-            np.testing.assert_array_equal(*(getattr(model.body(name), field) for model in (ours, floating)), field)
+            np.testing.assert_array_equal(
+                *(getattr(model.body(name), field) for model in (ours, floating)), field
+            )
     for field in ("gainprm", "biasprm", "forcerange"):
-        np.testing.assert_array_equal(*(getattr(model.actuator("finger"), field) for model in (ours, floating)), field)
+        np.testing.assert_array_equal(
+            *(getattr(model.actuator("finger"), field) for model in (ours, floating)), field
+        )
     np.testing.assert_array_equal(ours.eq_data, floating.eq_data)
     np.testing.assert_array_equal(ours.eq_solref, floating.eq_solref)
 
 
 def test_gripper_ends_at_the_flange():
-    """Claim: the tip frame is TOOL below the flange, where the visible body of the gripper ends; nothing of the arm
-    collides, and gravity is compensated in all of it."""
+    """Claim: the tip frame is TOOL below the flange, where the visible body of the gripper ends;
+    nothing of the arm collides, and gravity is compensated in all of it."""
     model = _model()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -140,7 +168,9 @@ def test_gripper_ends_at_the_flange():
     assert height == pytest.approx(kinematics.TOOL, abs=1e-6)
     body = model.geom("hand/body")
     assert body.pos[2] + body.size[2] == pytest.approx(kinematics.TOOL)
-    assert (model.geom("hand/palm").pos + model.geom("hand/palm").size)[2] == pytest.approx(body.pos[2] - body.size[2])
+    assert (model.geom("hand/palm").pos + model.geom("hand/palm").size)[2] == pytest.approx(
+        body.pos[2] - body.size[2]
+    )
     arm = [index for index in range(model.ngeom) if model.geom(index).name.startswith("ur5/")]
     assert len(arm) == 8
     assert not model.geom_contype[arm].any()
@@ -151,8 +181,9 @@ def test_gripper_ends_at_the_flange():
 @pytest.mark.mjx
 @pytest.mark.slow
 def test_arm_follows_the_plan_in_mjx():
-    """Claim: in MJX, too, the tips are within 3 mm of the set-point as each phase of a push ends. Only there: while an
-    actuator is at its limit, MJX's implicit integrator still counts its damping, and C MuJoCo does not."""
+    """Claim: in MJX, too, the tips are within 3 mm of the set-point as each phase of a push ends.
+    Only there: while an actuator is at its limit, MJX's implicit integrator still counts its
+    damping, and C MuJoCo does not."""
     model = _model()
     device, blank = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
 

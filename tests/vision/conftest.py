@@ -1,4 +1,5 @@
-"""One scene in two forms: a MuJoCo model, which is the reference, and the half-spaces that the raycaster takes."""
+"""One scene in two forms: a MuJoCo model, which is the reference, and the half-spaces that the
+raycaster takes."""
 
 from typing import NamedTuple
 
@@ -12,7 +13,11 @@ from csac_jax.vision import raycast
 
 _OCTAGON = [(np.cos(a), np.sin(a)) for a in np.pi / 4 * (np.arange(8) + 0.5)]
 _MESHES = {
-    "prism": [(x, y, z) for x, z in ((-0.0467, -0.0243), (0.0467, -0.0243), (0.0, 0.0243)) for y in (-0.025, 0.025)],
+    "prism": [
+        (x, y, z)
+        for x, z in ((-0.0467, -0.0243), (0.0467, -0.0243), (0.0, 0.0243))
+        for y in (-0.025, 0.025)
+    ],
     "octagon": [(0.0242 * x, 0.0242 * y, z) for x, y in _OCTAGON for z in (-0.025, 0.025)],
 }
 _GEOMS = (  # attributes, position, rotation vector in degrees
@@ -27,7 +32,8 @@ _FACES = 10
 
 
 class Reference(NamedTuple):
-    """The same scene for C MuJoCo (geom 0 is the table) and for the raycaster (geom i is MuJoCo's i + 1)."""
+    """The same scene for C MuJoCo (geom 0 is the table) and for the raycaster (geom i is MuJoCo's i
+    + 1)."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -40,13 +46,16 @@ class Reference(NamedTuple):
         distance = mujoco.mj_ray(self.model, self.data, start, along, None, 1, -1, geom, normal)
         return distance, int(geom[0, 0]) - 1, normal[:, 0]
 
-    def rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rays(
+        self, origins: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distances [R], geoms [R] and normals [R, 3] of many rays."""
         distance, geom, normal = zip(*map(self.ray, origins, directions), strict=True)
         return np.array(distance), np.array(geom), np.array(normal)
 
     def near_edge(self, origins: np.ndarray, directions: np.ndarray, shift: float) -> np.ndarray:
-        """[R] True where a ray that runs `shift` m beside this one meets another face or nothing."""
+        """[R] True where a ray that runs `shift` m beside this one meets another face or
+        nothing."""
         _, geom, normal = self.rays(origins, directions)
         helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
         side = np.cross(directions, helper)
@@ -54,12 +63,15 @@ class Reference(NamedTuple):
         edge = np.zeros(len(origins), bool)
         for step in (side, -side, np.cross(directions, side), -np.cross(directions, side)):
             _, other_geom, other_normal = self.rays(origins + shift * step, directions)
-            edge |= (other_geom != geom) | (np.abs(other_normal - normal).max(1) > 0.01)  # both 0 for a miss
+            edge |= (other_geom != geom) | (
+                np.abs(other_normal - normal).max(1) > 0.01
+            )  # both 0 for a miss
         return edge
 
 
 def _half_spaces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normals [F, 3] and offsets [F] of one geom in its own frame, from the convex hull of its corners."""
+    """Normals [F, 3] and offsets [F] of one geom in its own frame, from the convex hull of its
+    corners."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
         corners = model.geom_size[geom] * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     else:
@@ -73,7 +85,8 @@ def _half_spaces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarr
 
 @pytest.fixture(scope="session")
 def reference() -> Reference:
-    """Two boxes, two triangular and two octagonal prisms, standing, lying and tilted, on the table."""
+    """Two boxes, two triangular and two octagonal prisms, standing, lying and tilted, on the
+    table."""
     meshes = "".join(
         f'<mesh name="{name}" vertex="{" ".join(str(v) for p in points for v in p)}"/>'
         for name, points in _MESHES.items()

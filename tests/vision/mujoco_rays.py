@@ -33,7 +33,9 @@ def blocks_and_arm(rng: np.random.Generator) -> Placed:
     """The eight blocks in random poses under and about the UR5 with its hand, on the table."""
     scene = layout.parked(SLOTS)
     half_size = np.array([blocks.SHAPES[name].half_size for name in SHAPES], np.float32)
-    with pytest.MonkeyPatch.context() as patch:  # C's search trees follow neither rescaled meshes nor turned inertias
+    with (
+        pytest.MonkeyPatch.context() as patch
+    ):  # C's search trees follow neither rescaled meshes nor turned inertias
         patch.setattr(models, "LARGEST", 1.0)
         patch.setattr(models, "_align_inertia", lambda model: None)
         world = models.build(SceneConfig(slots=SLOTS, min_blocks=1), SimConfig(robot="ur5"))
@@ -43,14 +45,19 @@ def blocks_and_arm(rng: np.random.Generator) -> Placed:
     quaternion = rng.normal(size=(len(SHAPES), 4))
     data.qpos[world.robot_qpos] = rng.uniform(-1.5, 1.5, len(world.robot_qpos))
     data.qpos[world.robot_qpos[-2:]] = rng.uniform(0.0, 0.05)
-    data.qpos[world.block_qpos[:, :3]] = rng.uniform([-0.2, -0.2, 0.02], [0.2, 0.2, 0.2], (len(SHAPES), 3))
-    data.qpos[world.block_qpos[:, 3:]] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    data.qpos[world.block_qpos[:, :3]] = rng.uniform(
+        [-0.2, -0.2, 0.02], [0.2, 0.2, 0.2], (len(SHAPES), 3)
+    )
+    data.qpos[world.block_qpos[:, 3:]] = quaternion / np.linalg.norm(
+        quaternion, axis=1, keepdims=True
+    )
     mujoco.mj_kinematics(model, data)
     return Placed(model, data)
 
 
 def every_type(rng: np.random.Generator) -> Placed:
-    """Two of each type that the raycaster knows, of random sizes and poses; one plane has an end."""
+    """Two of each type that the raycaster knows, of random sizes and poses; one plane has an
+    end."""
     geoms = '<geom type="plane" size="0 0 1" pos="0 0 -0.3"/><geom type="plane" size="0.3 0.2 1" euler="10 20 30"/>'
     meshes = ""
     for number, kind in enumerate(("box", "sphere", "capsule", "cylinder", "mesh") * 2):
@@ -63,7 +70,9 @@ def every_type(rng: np.random.Generator) -> Placed:
             meshes += f'<mesh name="{number}" vertex="{corners}"/>'
         shape = f'mesh="{number}"' if kind == "mesh" else f'size="{size}"'
         geoms += f'<geom type="{kind}" {shape} pos="{place}" euler="{turn}"/>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><asset>{meshes}</asset><worldbody>{geoms}</worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><asset>{meshes}</asset><worldbody>{geoms}</worldbody></mujoco>"
+    )
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return Placed(model, data)
@@ -74,8 +83,11 @@ def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
     return solids.read(model, data.geom_xpos, data.geom_xmat)
 
 
-def cast(model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, direction: np.ndarray) -> Rays:
-    """R rays along `direction` [R, 3] from one `origin` [3], by C MuJoCo; `mj_multiRay` loses some at edges."""
+def cast(
+    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, direction: np.ndarray
+) -> Rays:
+    """R rays along `direction` [R, 3] from one `origin` [3], by C MuJoCo; `mj_multiRay` loses some
+    at edges."""
     num = len(direction)
     found, distance, geom, normal = (
         np.zeros((1, 1), np.int32),
@@ -92,7 +104,8 @@ def cast(model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, directi
 
 
 def bundle(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """An origin [3] on a sphere of 0.7 m about the scene, and unit directions [R, 3] to points in it; float32."""
+    """An origin [3] on a sphere of 0.7 m about the scene, and unit directions [R, 3] to points in
+    it; float32."""
     origin = rng.normal(size=3)
     origin *= 0.7 / np.linalg.norm(origin)
     origin[2] = abs(origin[2])

@@ -19,7 +19,9 @@ from tests.vision import mujoco_rays, render_depth
 _render = jax.jit(camera.render)
 
 
-def _opengl_depth(folder: Path, model: mujoco.MjModel, data: mujoco.MjData, eye: camera.Camera) -> np.ndarray:
+def _opengl_depth(
+    folder: Path, model: mujoco.MjModel, data: mujoco.MjData, eye: camera.Camera
+) -> np.ndarray:
     """Depth [H, W] m by MuJoCo's renderer; skips where there is no OpenGL without a display."""
     mujoco.mj_saveModel(model, str(folder / "model.mjb"))
     pose = np.stack([eye.position, eye.rotation[:, 2], -eye.rotation[:, 1]])
@@ -28,22 +30,31 @@ def _opengl_depth(folder: Path, model: mujoco.MjModel, data: mujoco.MjData, eye:
     files = [str(folder / name) for name in ("model.mjb", "pose.npz", "depth.npy")]
     for backend in ("egl", "osmesa"):
         environment = os.environ | {"MUJOCO_GL": backend}
-        done = subprocess.run([sys.executable, render_depth.__file__, *files], env=environment, capture_output=True)
+        done = subprocess.run(
+            [sys.executable, render_depth.__file__, *files], env=environment, capture_output=True
+        )
         if done.returncode == 0:
             return np.load(files[2])
-    pytest.skip("OpenGL works neither by EGL nor by OSMesa: " + done.stderr.decode().strip().splitlines()[-1])
+    pytest.skip(
+        "OpenGL works neither by EGL nor by OSMesa: "
+        + done.stderr.decode().strip().splitlines()[-1]
+    )
 
 
 @pytest.mark.parametrize(
-    "make", [mujoco_rays.every_type, pytest.param(mujoco_rays.blocks_and_arm, marks=pytest.mark.slow)]
+    "make",
+    [mujoco_rays.every_type, pytest.param(mujoco_rays.blocks_and_arm, marks=pytest.mark.slow)],
 )
 def test_depth_agrees_with_opengl(tmp_path, make):
-    """Claim: depths are those of MuJoCo's own renderer to 2 mm in every pixel two pixels off an edge or more."""
+    """Claim: depths are those of MuJoCo's own renderer to 2 mm in every pixel two pixels off an
+    edge or more."""
     model, data = make(np.random.default_rng(5))
     eye = camera.make(CameraConfig(scale=0.5, position=(-0.7, -0.3, 0.6), look_at=(0.1, 0.0, 0.1)))
     expected = _opengl_depth(tmp_path, model, data, eye)
     picture = jax.device_get(_render(eye, mujoco_rays.read(model, data)))
-    depth = np.where(picture.valid, picture.depth, expected.max())  # the renderer's farthest plane
+    depth = np.where(
+        picture.valid, picture.depth, expected.max()
+    )  # the renderer's distance_cap plane
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(1.0 / depth, 2, mode="edge"), (5, 5))
     bend = np.abs(windows + windows[..., ::-1, ::-1] - 2.0 / depth[..., None, None]).max((2, 3))
     clear = bend < 0.01  # the inverse depth of a plane is linear in the image
@@ -55,24 +66,34 @@ def test_depth_agrees_with_opengl(tmp_path, make):
 
 
 def test_the_default_is_the_papers_camera():
-    """Claim: 640 x 480 px, 618.62 px of focal length, at (-0.5, 0, 0.5) m, pitched 45 degrees down at the centre."""
+    """Claim: 640 x 480 px, 618.62 px of focal length, at (-0.5, 0, 0.5) m, pitched 45 degrees down
+    at the centre."""
     eye = camera.make(CameraConfig())
     assert (eye.width, eye.height) == (640, 480)
     np.testing.assert_allclose(eye.focal, 618.62)
     np.testing.assert_allclose(eye.position, [-0.5, 0.0, 0.5])
     half = np.sqrt(0.5)
-    np.testing.assert_allclose(eye.rotation, np.array([[0, -1, 0], [-half, 0, -half], [half, 0, -half]]).T, atol=1e-7)
+    np.testing.assert_allclose(
+        eye.rotation, np.array([[0, -1, 0], [-half, 0, -half], [half, 0, -half]]).T, atol=1e-7
+    )
     middle = camera.directions(eye)[239:241, 319:321].mean((0, 1))
     np.testing.assert_allclose(middle / jnp.linalg.norm(middle), [half, 0.0, -half], atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_points_project_to_their_pixels(scale):
-    """Claim: pixel -> point -> pixel is the identity at any depth and any scale, by the pinhole equation."""
-    eye = camera.make(CameraConfig(scale=scale, focal=(600.0, 620.0), centre=(330.0, 236.0), position=(0.3, 0.4, 0.5)))
+    """Claim: pixel -> point -> pixel is the identity at any depth and any scale, by the pinhole
+    equation."""
+    eye = camera.make(
+        CameraConfig(
+            scale=scale, focal=(600.0, 620.0), centre=(330.0, 236.0), position=(0.3, 0.4, 0.5)
+        )
+    )
     depth = np.random.default_rng(0).uniform(0.2, 2.0, (eye.height, eye.width)).astype(np.float32)
     points = np.asarray(camera.points(eye, jnp.asarray(depth)), np.float64)
-    x, y, z = np.moveaxis((points - np.asarray(eye.position)) @ np.asarray(eye.rotation, np.float64), -1, 0)
+    x, y, z = np.moveaxis(
+        (points - np.asarray(eye.position)) @ np.asarray(eye.rotation, np.float64), -1, 0
+    )
     np.testing.assert_allclose(z, depth, atol=1e-6)
     row, col = np.mgrid[: eye.height, : eye.width]
     # A pixel covers [i - 1/2, i + 1/2): scaling moves pixel centres accordingly.
@@ -81,7 +102,8 @@ def test_points_project_to_their_pixels(scale):
 
 
 def test_colours_are_flat_shaded():
-    """Claim: a pixel shows its geom's colour times a brightness that follows the normal, and SKY where nothing is."""
+    """Claim: a pixel shows its geom's colour times a brightness that follows the normal, and SKY
+    where nothing is."""
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1" rgba="0.2 0.4 0.8 1"/></worldbody></mujoco>'
     )
@@ -93,7 +115,10 @@ def test_colours_are_flat_shaded():
     np.testing.assert_allclose(colour[~valid], np.broadcast_to(shade.SKY, colour[~valid].shape))
     np.testing.assert_array_equal(np.asarray(picture.depth)[~valid], 0.0)
     levels = np.unique((colour[valid] / [0.2, 0.4, 0.8]).round(3))
-    expected = [0.4, 0.4 + 0.6 * 0.8]  # the side towards the camera faces away from the light, the top does not
+    expected = [
+        0.4,
+        0.4 + 0.6 * 0.8,
+    ]  # the side towards the camera faces away from the light, the top does not
     np.testing.assert_allclose(levels, expected, atol=2e-3)
 
 
@@ -112,7 +137,8 @@ def test_colours_are_flat_shaded():
     ],
 )
 def test_wrong_intrinsics_are_refused(change, message):
-    """Claim: intrinsics that belong to another image size, and other nonsense, are refused by name in one line."""
+    """Claim: intrinsics that belong to another image size, and other nonsense, are refused by name
+    in one line."""
     with pytest.raises(ValueError, match=message) as error:
         dataclasses.replace(CameraConfig(), **change)
     assert "\n" not in str(error.value)

@@ -23,11 +23,14 @@ _TABLE = np.array([0.5, 0.4, 0.3], np.float32)
 
 def _look(cfg: HeightmapConfig, polytopes: raycast.Polytopes, wanted: jax.Array | None = None):
     every = jnp.ones(polytopes.offset.shape[0], bool)
-    return heightmap.orthographic(cfg, polytopes, jnp.asarray(_TABLE), every if wanted is None else wanted)
+    return heightmap.orthographic(
+        cfg, polytopes, jnp.asarray(_TABLE), every if wanted is None else wanted
+    )
 
 
 def test_heights_agree_with_mujoco(reference):
-    """Claim: height and block of every cell, but those within 0.1 mm of an edge, are C MuJoCo's to 0.1 mm."""
+    """Claim: height and block of every cell, but those within 0.1 mm of an edge, are C MuJoCo's to
+    0.1 mm."""
     cfg = HeightmapConfig(64)
     obs = _look(cfg, reference.polytopes)
     origin = np.asarray(geometry.cell_centres(cfg), np.float64).reshape(-1, 2)
@@ -40,7 +43,9 @@ def test_heights_agree_with_mujoco(reference):
     height = np.asarray(obs.height).reshape(-1)
     np.testing.assert_allclose(height[clear], 0.5 - distance[clear], rtol=0, atol=1e-4)
     assert np.all(height[clear & (geom == raycast.TABLE)] == 0.0)
-    albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[geom]  # -1 is the last row
+    albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[
+        geom
+    ]  # -1 is the last row
     brightness = 0.4 + 0.6 * np.maximum(normal @ shade.LIGHT, 0.0)
     colour = np.asarray(obs.colour).reshape(-1, 3)
     np.testing.assert_allclose(colour[clear], (albedo * brightness[:, None])[clear], atol=1e-3)
@@ -49,10 +54,13 @@ def test_heights_agree_with_mujoco(reference):
 
 
 def _settled_pile(rng: np.random.Generator) -> tuple[Env, Scene, Placed]:
-    """Ten settled blocks of all eight shapes of nominal size, for both: geom 0 of C is the table."""
+    """Ten settled blocks of all eight shapes of nominal size, for both: geom 0 of C is the
+    table."""
     cfg = dataclasses.replace(presets.get("fast"), heightmap=HeightmapConfig(224))
-    drops = dataclasses.replace(cfg.scene, size_spread=0.0, mesh_spread=0.0)
-    with pytest.MonkeyPatch.context() as patch:  # C's search trees follow neither rescaled meshes nor turned inertias
+    drops = dataclasses.replace(cfg.scene, size_jitter=0.0, mesh_size_jitter=0.0)
+    with (
+        pytest.MonkeyPatch.context() as patch
+    ):  # C's search trees follow neither rescaled meshes nor turned inertias
         patch.setattr(model, "LARGEST", 1.0)
         patch.setattr(model, "_align_inertia", lambda model: None)
         world = model.build(drops, cfg.sim)
@@ -72,7 +80,8 @@ def _settled_pile(rng: np.random.Generator) -> tuple[Env, Scene, Placed]:
 @pytest.mark.slow
 @pytest.mark.mjx
 def test_a_settled_pile_agrees_with_mujoco():
-    """Claim: every cell of the 224-cell map of a settled pile of ten, edges apart, is as high as C MuJoCo's to 0.1 mm.
+    """Claim: every cell of the 224-cell map of a settled pile of ten, edges apart, is as high as C
+    MuJoCo's to 0.1 mm.
 
     An edge is a cell that sees another height 0.1 mm beside its centre.
     """
@@ -91,21 +100,28 @@ def test_a_settled_pile_agrees_with_mujoco():
 
 
 def test_target_mask_shows_the_target(reference):
-    """Claim: the target mask is all ones if every block is wanted, and else True just where a wanted one is seen."""
+    """Claim: the target mask is all ones if every block is wanted, and else True just where a
+    wanted one is seen."""
     cfg = HeightmapConfig(64)
     look = jax.jit(lambda wanted: _look(cfg, reference.polytopes, wanted))
     clearing = look(jnp.ones(6, bool))
     assert np.all(clearing.target)
     masks = np.stack([look(jnp.arange(6) == g).target for g in range(6)])
     assert np.all(masks.sum((1, 2)) > 10)
-    np.testing.assert_array_equal(masks.sum(0), np.asarray(clearing.height) > 0.0)  # each raised cell is one block's
+    np.testing.assert_array_equal(
+        masks.sum(0), np.asarray(clearing.height) > 0.0
+    )  # each raised cell is one block's
     row, col = np.argwhere(masks[4]).mean(0)  # the octagon that stands at x = 0.11, y = -0.07
-    np.testing.assert_allclose(geometry.from_pixel(cfg, jnp.array([row, col])), [0.11, -0.07], atol=0.003)
+    np.testing.assert_allclose(
+        geometry.from_pixel(cfg, jnp.array([row, col])), [0.11, -0.07], atol=0.003
+    )
 
 
 def test_blocks_above_the_view_are_not_seen(reference):
     """Claim: what is parked above VIEW_HEIGHT leaves no trace."""
-    parked = reference.polytopes.replace(position=reference.polytopes.position + jnp.array([[0.0, 0.0, 0.6]]))
+    parked = reference.polytopes.replace(
+        position=reference.polytopes.position + jnp.array([[0.0, 0.0, 0.6]])
+    )
     obs = _look(HeightmapConfig(64), parked)
     assert np.all(np.asarray(obs.height) == 0.0)
 
@@ -113,7 +129,8 @@ def test_blocks_above_the_view_are_not_seen(reference):
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_packing_rounds(seed):
-    """Claim: packing changes a height by at most 0.05 mm, a colour by half a level; packing again, nothing."""
+    """Claim: packing changes a height by at most 0.05 mm, a colour by half a level; packing again,
+    nothing."""
     rng = np.random.default_rng(seed)
     obs = heightmap.Observation(
         colour=jnp.asarray(rng.uniform(size=(8, 8, 3)), jnp.float32),
@@ -121,32 +138,45 @@ def test_packing_rounds(seed):
         target=jnp.asarray(rng.uniform(size=(8, 8)) < 0.5),
     )
     packed = heightmap.pack(obs)
-    assert (packed.colour.dtype, packed.height.dtype, packed.target.dtype) == (jnp.uint8, jnp.uint16, jnp.bool_)
+    assert (packed.colour.dtype, packed.height.dtype, packed.target.dtype) == (
+        jnp.uint8,
+        jnp.uint16,
+        jnp.bool_,
+    )
     back = heightmap.unpack(packed)
     np.testing.assert_allclose(back.height, obs.height, rtol=0, atol=0.05e-3 + 1e-7)
     np.testing.assert_allclose(back.colour, obs.colour, rtol=0, atol=0.5 / 255 + 1e-6)
     np.testing.assert_array_equal(back.target, obs.target)
-    for again, once in zip(jax.tree.leaves(heightmap.pack(back)), jax.tree.leaves(packed), strict=True):
+    for again, once in zip(
+        jax.tree.leaves(heightmap.pack(back)), jax.tree.leaves(packed), strict=True
+    ):
         np.testing.assert_array_equal(again, once)
 
 
 def test_packing_cuts_off():
     """Claim: values beyond the packed range are cut off, not wrapped round."""
     obs = heightmap.Observation(
-        colour=jnp.array([[[-0.1, 1.2, 1.0]]]), height=jnp.array([[-0.01, 7.0]]), target=jnp.ones((1, 2), bool)
+        colour=jnp.array([[[-0.1, 1.2, 1.0]]]),
+        height=jnp.array([[-0.01, 7.0]]),
+        target=jnp.ones((1, 2), bool),
     )
     packed = heightmap.pack(obs)
-    np.testing.assert_array_equal(packed.height, [[0, heightmap.BEYOND_COUNT - 1]])  # not the mark of what lies beyond
+    np.testing.assert_array_equal(
+        packed.height, [[0, heightmap.BEYOND_COUNT - 1]]
+    )  # not the mark of what lies beyond
     np.testing.assert_array_equal(packed.colour, [[[0, 255, 255]]])
 
 
 @pytest.mark.parametrize("size", [64, 224])
 def test_areas_survive_another_resolution(size):
-    """Claim: a block 6 cm square that moves by its own length occupies 36 cm^2 and moves 72 cm^2 at any resolution."""
+    """Claim: a block 6 cm square that moves by its own length occupies 36 cm^2 and moves 72 cm^2 at
+    any resolution."""
     cfg = HeightmapConfig(size)
     x, y = np.moveaxis(np.asarray(geometry.cell_centres(cfg)), -1, 0)
     before = jnp.asarray(np.where((np.abs(x) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32)
-    after = jnp.asarray(np.where((np.abs(x - 0.06) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32)
+    after = jnp.asarray(
+        np.where((np.abs(x - 0.06) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32
+    )
     edge = 4 * 6 * cfg.cell * 100 / 2  # half a cell along the outline, cm^2
     assert abs(float(heightmap.occupied_area(cfg, before)) - 36.0) <= edge
     assert abs(float(heightmap.moved_area(cfg, before, after)) - 72.0) <= 2 * edge
@@ -161,4 +191,6 @@ def test_area_bounds():
     np.testing.assert_allclose(area, 3 * 2.8**2, rtol=1e-5)
     height = np.zeros((16, 16), np.float32)
     height[0, :3] = [0.019, 0.021, 0.05]
-    np.testing.assert_allclose(heightmap.occupied_area(cfg, jnp.asarray(height)), 2 * 2.8**2, rtol=1e-5)
+    np.testing.assert_allclose(
+        heightmap.occupied_area(cfg, jnp.asarray(height)), 2 * 2.8**2, rtol=1e-5
+    )

@@ -1,4 +1,5 @@
-"""Height maps from points and from a camera's depth image, against NumPy and against the view from above."""
+"""Height maps from points and from a camera's depth image, against NumPy and against the view from
+above."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,9 @@ _TABLE = np.array([0.5, 0.4, 0.3], np.float32)
 _EYE, _FINE = camera.make(CameraConfig(scale=0.25)), camera.make(CameraConfig(scale=0.5))
 
 
-def _by_hand(cfg: HeightmapConfig, points: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _by_hand(
+    cfg: HeightmapConfig, points: np.ndarray, valid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Height [H, W] and which point [H, W], -1 for none, point by point."""
     height, source = np.zeros((cfg.size, cfg.size), np.float32), np.full((cfg.size, cfg.size), -1)
     top = np.full((cfg.size, cfg.size), -np.inf)
@@ -35,7 +38,8 @@ _from_points = jax.jit(heightmap.from_points, static_argnums=0)
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_points_agree_with_numpy(seed):
-    """Claim: height and source of every cell are those of a loop over the points: the highest, of ties the first."""
+    """Claim: height and source of every cell are those of a loop over the points: the highest, of
+    ties the first."""
     rng = np.random.default_rng(seed)
     cfg = HeightmapConfig(16, extent=0.5)  # a cell of 2^-5 m: dividing by it is exact
     points = rng.uniform(-0.3, 0.3, (400, 3)).astype(np.float32)
@@ -50,7 +54,8 @@ def test_points_agree_with_numpy(seed):
 
 
 def test_the_view_agrees_with_numpy(reference):
-    """Claim: from the same depth image, height, colour and target mask are those of NumPy, bit for bit.
+    """Claim: from the same depth image, height, colour and target mask are those of NumPy, bit for
+    bit.
 
     Not compiled as a whole: a fused multiply-add may move a point across the border of a cell.
     """
@@ -65,7 +70,9 @@ def test_the_view_agrees_with_numpy(reference):
     empty = source < 0
     assert 0.02 < empty.mean() < 0.5
     np.testing.assert_array_equal(obs.height, height)
-    np.testing.assert_array_equal(obs.colour, np.where(empty[..., None], 0.0, np.asarray(tables[0])[row]))
+    np.testing.assert_array_equal(
+        obs.colour, np.where(empty[..., None], 0.0, np.asarray(tables[0])[row])
+    )
     np.testing.assert_array_equal(obs.target, np.where(empty, False, np.asarray(tables[1])[row]))
     assert np.asarray(obs.target).any()
 
@@ -79,11 +86,14 @@ _views = jax.jit(
 
 
 def test_both_views_agree_where_the_camera_sees(reference):
-    """Claim: away from edges, cells that the camera sees are as high as from above, to the slope within a cell; the
-    rest is empty, and in the clearing task the target mask is all ones."""
+    """Claim: away from edges, cells that the camera sees are as high as from above, to the slope
+    within a cell; the rest is empty, and in the clearing task the target mask is all ones."""
     above, beside = jax.device_get(_views(reference.polytopes))
     filled = beside.colour.sum(-1) > 0.0
-    flat = np.abs(above.height[1:-1, 1:-1, None, None] - np.lib.stride_tricks.sliding_window_view(above.height, (3, 3)))
+    flat = np.abs(
+        above.height[1:-1, 1:-1, None, None]
+        - np.lib.stride_tricks.sliding_window_view(above.height, (3, 3))
+    )
     flat = np.pad(flat.max((2, 3)) < 0.004, 1)
     assert (filled & flat).mean() > 0.5
     off = np.abs(beside.height - above.height)[filled & flat]
@@ -94,7 +104,8 @@ def test_both_views_agree_where_the_camera_sees(reference):
 
 
 def test_a_block_casts_a_shadow():
-    """Claim: of a cube the camera sees the top where it is, and behind it nothing as far as the sight line says."""
+    """Claim: of a cube the camera sees the top where it is, and behind it nothing as far as the
+    sight line says."""
     cube = raycast.Polytopes(
         normal=jnp.asarray(np.concatenate([np.eye(3), -np.eye(3)])[None], jnp.float32),
         offset=jnp.full((1, 6), 0.025),
@@ -102,11 +113,15 @@ def test_a_block_casts_a_shadow():
         rotation=jnp.eye(3)[None],
         colour=jnp.ones((1, 3)),
     )
-    obs = jax.jit(lambda: heightmap.oblique(CFG, cube, jnp.asarray(_TABLE), jnp.ones(1, bool), _FINE))()
+    obs = jax.jit(
+        lambda: heightmap.oblique(CFG, cube, jnp.asarray(_TABLE), jnp.ones(1, bool), _FINE)
+    )()
     height, filled = np.asarray(obs.height), np.asarray(obs.colour).sum(-1) > 0.0
     x = np.asarray(geometry.cell_centres(CFG))[0, :, 0]
     middle = slice(30, 34)  # rows at y = 0
-    end = 0.025 + (0.025 + 0.5) * 0.05 / (0.5 - 0.05)  # where the line over the far top edge meets the table
+    end = 0.025 + (0.025 + 0.5) * 0.05 / (
+        0.5 - 0.05
+    )  # where the line over the far top edge meets the table
     np.testing.assert_allclose(height[middle][:, np.abs(x) < 0.02], 0.05, atol=1e-4)
     assert not filled[middle][:, (x > 0.03) & (x < end - 0.008)].any()
     assert filled[middle][:, x > end + 0.008].mean() > 0.95

@@ -13,14 +13,17 @@ _seeds = st.integers(0, 2**32 - 1)
 
 
 def _random_rays(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rays [R, 3] from a dome around the scene to points in and about it; float32 values in float64."""
+    """Rays [R, 3] from a dome around the scene to points in and about it; float32 values in
+    float64."""
     origin = rng.normal(size=(count, 3))
     origin[:, 2] = np.abs(origin[:, 2]) + 0.2
     origin *= 0.6 / np.linalg.norm(origin, axis=1, keepdims=True)
     through = rng.uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 0.25], (count, 3))
     direction = through - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return origin.astype(np.float32).astype(np.float64), direction.astype(np.float32).astype(np.float64)
+    return origin.astype(np.float32).astype(np.float64), direction.astype(np.float32).astype(
+        np.float64
+    )
 
 
 def _random_scene(rng: np.random.Generator, geoms: int = 4, faces: int = 8) -> raycast.Polytopes:
@@ -31,20 +34,27 @@ def _random_scene(rng: np.random.Generator, geoms: int = 4, faces: int = 8) -> r
     quat = rng.normal(size=(geoms, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
     return raycast.Polytopes(
-        normal=jnp.asarray(np.concatenate([np.tile(box, (geoms, 1, 1)), cuts], axis=1), jnp.float32),
+        normal=jnp.asarray(
+            np.concatenate([np.tile(box, (geoms, 1, 1)), cuts], axis=1), jnp.float32
+        ),
         offset=jnp.asarray(rng.uniform(0.01, 0.05, (geoms, faces)), jnp.float32),
-        position=jnp.asarray(rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.15], (geoms, 3)), jnp.float32),
+        position=jnp.asarray(
+            rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.15], (geoms, 3)), jnp.float32
+        ),
         rotation=jax.vmap(geometry.quat_to_matrix)(jnp.asarray(quat, jnp.float32)),
         colour=jnp.zeros((geoms, 3), jnp.float32),
     )
 
 
 def _cast(polytopes: raycast.Polytopes, origin: np.ndarray, direction: np.ndarray) -> raycast.Hit:
-    return _cast_all(polytopes, jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32))
+    return _cast_all(
+        polytopes, jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32)
+    )
 
 
 def test_rays_agree_with_mujoco(reference):
-    """Claim: geoms, distances (0.1 mm) and normals are those of C MuJoCo for every ray 0.1 mm off an edge or more."""
+    """Claim: geoms, distances (0.1 mm) and normals are those of C MuJoCo for every ray 0.1 mm off
+    an edge or more."""
     origin, direction = _random_rays(np.random.default_rng(1), 4000)
     distance, geom, normal = reference.rays(origin, direction)
     hit = _cast(reference.polytopes, origin, direction)
@@ -87,7 +97,8 @@ def _upright(reference):
 @settings(max_examples=60, deadline=None)
 @given(_seeds)
 def test_hits_lie_on_the_surface(seed):
-    """Claim: a hit lies on a plane of its geom with the hit's normal, inside of all other planes, and faces the ray."""
+    """Claim: a hit lies on a plane of its geom with the hit's normal, inside of all other planes,
+    and faces the ray."""
     rng = np.random.default_rng(seed)
     polytopes = _random_scene(rng)
     origin, direction = _random_rays(rng, 64)
@@ -97,7 +108,8 @@ def test_hits_lie_on_the_surface(seed):
         point = origin[r] + hit.distance[r] * direction[r]
         room = offset[hit.geom[r]] - normal[hit.geom[r]] @ point  # [F] m
         face = np.argmin(np.abs(normal[hit.geom[r]] - hit.normal[r]).sum(-1))
-        # Rounding of a distance of about 1 m is 1e-7 m; a plane met at a grazing angle magnifies it.
+        # Rounding of a distance of about 1 m is 1e-7 m; a plane met at a grazing angle magnifies
+        # it.
         assert abs(room[face]) < 2e-6
         assert room.min() > -1e-5
         assert hit.normal[r] @ direction[r] < 0.0
@@ -106,11 +118,14 @@ def test_hits_lie_on_the_surface(seed):
 @settings(max_examples=40, deadline=None)
 @given(_seeds, st.floats(-7.0, 7.0), st.floats(0.1, 10.0))
 def test_turned_and_scaled(seed, yaw, scale):
-    """Claim: turning scene and rays about z changes no distance, and a direction `scale` times as long divides it."""
+    """Claim: turning scene and rays about z changes no distance, and a direction `scale` times as
+    long divides it."""
     rng = np.random.default_rng(seed)
     polytopes = _random_scene(rng)
     origin, direction = _random_rays(rng, 64)
-    turn = np.asarray(geometry.quat_to_matrix(geometry.quat_from_yaw(jnp.asarray(yaw, jnp.float32))))
+    turn = np.asarray(
+        geometry.quat_to_matrix(geometry.quat_from_yaw(jnp.asarray(yaw, jnp.float32)))
+    )
     turned = polytopes.replace(
         position=jnp.asarray(np.asarray(polytopes.position) @ turn.T),
         rotation=jnp.asarray(turn[None] @ np.asarray(polytopes.rotation)),
@@ -119,7 +134,9 @@ def test_turned_and_scaled(seed, yaw, scale):
     other = _cast(turned, origin @ turn.T, scale * direction @ turn.T)
     same = np.asarray((one.geom == other.geom) & (one.valid == other.valid))
     assert same.mean() >= 0.96  # a ray at an edge may fall to either side
-    close = np.isclose(np.asarray(one.distance), scale * np.asarray(other.distance), rtol=0, atol=1e-4)
+    close = np.isclose(
+        np.asarray(one.distance), scale * np.asarray(other.distance), rtol=0, atol=1e-4
+    )
     assert (close | ~same).mean() >= 0.96
     assert not np.isnan(np.asarray(other.distance)).any()
 
@@ -127,17 +144,22 @@ def test_turned_and_scaled(seed, yaw, scale):
 @settings(max_examples=40, deadline=None)
 @given(_seeds)
 def test_more_geoms_come_no_later(seed):
-    """Claim: the nearest wins: a scene's distance is the least of its geoms' distances, each cast by itself."""
+    """Claim: the nearest wins: a scene's distance is the least of its geoms' distances, each cast
+    by itself."""
     rng = np.random.default_rng(seed)
     polytopes = _random_scene(rng)
     origin, direction = _random_rays(rng, 64)
-    alone = [_cast(jax.tree.map(lambda x, g=g: x[g : g + 1], polytopes), origin, direction).distance for g in range(4)]
+    alone = [
+        _cast(jax.tree.map(lambda x, g=g: x[g : g + 1], polytopes), origin, direction).distance
+        for g in range(4)
+    ]
     together = _cast(polytopes, origin, direction).distance
     np.testing.assert_allclose(together, np.min(alone, axis=0), rtol=1e-5)
 
 
 def test_unused_geoms_are_never_hit():
-    """Claim: a geom of unused faces alone (zero normal, positive offset) is never hit, nor does it give NaN."""
+    """Claim: a geom of unused faces alone (zero normal, positive offset) is never hit, nor does it
+    give NaN."""
     rng = np.random.default_rng(3)
     polytopes = _random_scene(rng)
     empty = polytopes.replace(normal=jnp.zeros((4, 8, 3)), offset=jnp.full((4, 8), 1e3))
@@ -158,7 +180,8 @@ def test_no_geoms_at_all():
 
 
 def test_seen_from_outside_only(reference):
-    """Claim: a ray that starts inside a block, or under the table, does not meet it; one that points away misses."""
+    """Claim: a ray that starts inside a block, or under the table, does not meet it; one that
+    points away misses."""
     down, up = jnp.array([0.0, 0.0, -1.0]), jnp.array([0.0, 0.0, 1.0])
     inside = jnp.array([0.02, 0.01, 0.025])
     hit = raycast.cast(reference.polytopes, inside, down)
@@ -175,7 +198,9 @@ def test_a_broken_scene_spoils_no_other():
     origin, direction = _random_rays(rng, 300)
     broken = polytopes.replace(position=polytopes.position.at[1].set(jnp.nan))
     gone = polytopes.replace(offset=polytopes.offset.at[1].set(-1.0))
-    for a, b in zip(*(jax.tree.leaves(_cast(p, origin, direction)) for p in (broken, gone)), strict=True):
+    for a, b in zip(
+        *(jax.tree.leaves(_cast(p, origin, direction)) for p in (broken, gone)), strict=True
+    ):
         np.testing.assert_array_equal(a, b)
 
 

@@ -18,9 +18,12 @@ def _yaw(k: int) -> float:
     return 2.0 * np.pi * k / _K
 
 
-@pytest.mark.parametrize(("size", "margin", "count"), [(64, 0.25, 16), (48, 0.0, 8), (64, 2**0.5 - 1, 16)])
+@pytest.mark.parametrize(
+    ("size", "margin", "count"), [(64, 0.25, 16), (48, 0.0, 8), (64, 2**0.5 - 1, 16)]
+)
 def test_frames_agree_with_scipy(size, margin, count):
-    """Claim: every frame is SciPy's nearest-cell rotation: cells read the same place to half a pixel a side."""
+    """Claim: every frame is SciPy's nearest-cell rotation: cells read the same place to half a
+    pixel a side."""
     tables = rotate.tables(size, 0.448, _K, count, margin)
     row, col = np.meshgrid(*[np.arange(size, dtype=np.float32)] * 2, indexing="ij")
     maps = jnp.asarray(np.stack([row, col, np.ones_like(row)], axis=-1))
@@ -29,11 +32,15 @@ def test_frames_agree_with_scipy(size, margin, count):
     assert frames.shape == (count, side, side, 3)
     for k in range(count):
         cos, sin = np.cos(_yaw(k)), np.sin(_yaw(k))
-        matrix = np.array([[cos, sin], [-sin, cos]])  # (row, col) of the frame to (row, col) of the workspace
+        matrix = np.array(
+            [[cos, sin], [-sin, cos]]
+        )  # (row, col) of the frame to (row, col) of the workspace
         offset = 0.5 * (size - 1) - matrix @ np.full(2, 0.5 * (side - 1))
 
         def scipy_frame(channel, order, matrix=matrix, offset=offset):
-            return scipy.ndimage.affine_transform(channel, matrix, offset, (side, side), order=order, cval=np.nan)
+            return scipy.ndimage.affine_transform(
+                channel, matrix, offset, (side, side), order=order, cval=np.nan
+            )
 
         inside = ~np.isnan(scipy_frame(np.asarray(row), 1))
         assert np.all(frames[k, inside, 2] == 1.0)
@@ -45,7 +52,8 @@ def test_frames_agree_with_scipy(size, margin, count):
 
 
 def test_outside_of_the_workspace_is_zero():
-    """Claim: canvas cells that see nothing of the workspace are 0, and those that do are the workspace's area."""
+    """Claim: canvas cells that see nothing of the workspace are 0, and those that do are the
+    workspace's area."""
     tables = rotate.tables(64, 0.448, _K, _K, 2**0.5 - 1)
     frames = np.asarray(rotate.rotate(tables, jnp.ones((64, 64, 2))))
     along = (np.arange(tables.canvas) + 0.5 - 0.5 * tables.canvas) / 64
@@ -58,7 +66,8 @@ def test_outside_of_the_workspace_is_zero():
 
 
 def test_quarter_turns_are_exact():
-    """Claim: frame 0 is the map itself in a border of zeros, and quarter turns only permute cells."""
+    """Claim: frame 0 is the map itself in a border of zeros, and quarter turns only permute
+    cells."""
     tables = rotate.tables(64, 0.448, _K, _K, 0.25)
     maps = np.random.default_rng(0).normal(size=(64, 64, 3)).astype(np.float32)
     frames = np.asarray(rotate.rotate(tables, jnp.asarray(maps)))
@@ -66,11 +75,14 @@ def test_quarter_turns_are_exact():
     assert np.abs(frames[0]).sum() == pytest.approx(np.abs(maps).sum(), rel=1e-5)
     for quarter in range(4):
         inner = frames[quarter * _K // 4, 8:-8, 8:-8]
-        np.testing.assert_array_equal(inner, np.rot90(maps, quarter))  # rows upward: the frame's turn undone
+        np.testing.assert_array_equal(
+            inner, np.rot90(maps, quarter)
+        )  # rows upward: the frame's turn undone
 
 
 def test_one_frame_is_that_of_all():
-    """Claim: `rotate_one` gives frame k of `rotate`, for a traced k and under vmap over maps and k."""
+    """Claim: `rotate_one` gives frame k of `rotate`, for a traced k and under vmap over maps and
+    k."""
     tables = rotate.tables(64, 0.448, _K, _K, 0.25)
     maps = jnp.asarray(np.random.default_rng(0).normal(size=(5, 64, 64, 4)), jnp.float32)
     k = jnp.array([0, 3, 15, 8, 7], jnp.int32)
@@ -88,7 +100,8 @@ def test_integer_maps_keep_their_type():
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, _K - 1), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15))
 def test_a_block_appears_where_frame_position_says(k, x, y):
-    """Claim: a block at (x, y) is seen in frame k at `to_cell(frame_position(yaw_k, xy))`, to a cell."""
+    """Claim: a block at (x, y) is seen in frame k at `to_cell(frame_position(yaw_k, xy))`, to a
+    cell."""
     cfg = HeightmapConfig(64)
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     block = raycast.Polytopes(
@@ -107,24 +120,33 @@ def test_a_block_appears_where_frame_position_says(k, x, y):
 
 @jax.jit
 def _look(block):
-    return heightmap.orthographic(HeightmapConfig(64), block, jnp.zeros(3), jnp.ones(1, bool)).height
+    return heightmap.orthographic(
+        HeightmapConfig(64), block, jnp.zeros(3), jnp.ones(1, bool)
+    ).height
 
 
 def test_an_action_points_along_the_columns():
-    """Claim: in frame k a step along yaw_k is a step along +column, and along yaw_k + 90 degrees along +row."""
+    """Claim: in frame k a step along yaw_k is a step along +column, and along yaw_k + 90 degrees
+    along +row."""
     for k in range(_K):
         yaw = jnp.asarray(_yaw(k), jnp.float32)
         place = jnp.array([0.05, -0.03])
         step = geometry.rotate2d(yaw, jnp.array([[0.1, 0.0], [0.0, 0.1]]))
-        cells = rotate.to_cell(80, 0.007, rotate.frame_position(yaw, jnp.stack([place, *(place[None] + step)])))
-        np.testing.assert_allclose(cells[1:] - cells[:1], [[0.0, 0.1 / 0.007], [0.1 / 0.007, 0.0]], atol=1e-4)
+        cells = rotate.to_cell(
+            80, 0.007, rotate.frame_position(yaw, jnp.stack([place, *(place[None] + step)]))
+        )
+        np.testing.assert_allclose(
+            cells[1:] - cells[:1], [[0.0, 0.1 / 0.007], [0.1 / 0.007, 0.0]], atol=1e-4
+        )
 
 
 def test_cells_of_frame_0_are_cells_of_the_map():
     """Claim: on a canvas without margin, `to_cell` is `geometry.to_pixel`."""
     cfg = HeightmapConfig(64)
     xy = jnp.asarray(np.random.default_rng(0).uniform(-0.2, 0.2, (20, 2)), jnp.float32)
-    np.testing.assert_allclose(rotate.to_cell(64, cfg.cell, xy), geometry.to_pixel(cfg, xy), atol=1e-5)
+    np.testing.assert_allclose(
+        rotate.to_cell(64, cfg.cell, xy), geometry.to_pixel(cfg, xy), atol=1e-5
+    )
 
 
 def test_bilinear_agrees_with_scipy():
@@ -132,15 +154,23 @@ def test_bilinear_agrees_with_scipy():
     rng = np.random.default_rng(0)
     values = rng.normal(size=(3, 12, 17)).astype(np.float32)
     row_col = rng.uniform([-3.0, -3.0], [15.0, 20.0], (3, 500, 2)).astype(np.float32)
-    row_col[:, :4] = [[0.0, 0.0], [11.0, 16.0], [4.0, 16.0], [11.0, 3.5]]  # the last cells themselves
-    read = jax.jit(jax.vmap(jax.vmap(rotate.bilinear, in_axes=(None, 0))))(jnp.asarray(values), jnp.asarray(row_col))
+    row_col[:, :4] = [
+        [0.0, 0.0],
+        [11.0, 16.0],
+        [4.0, 16.0],
+        [11.0, 3.5],
+    ]  # the last cells themselves
+    read = jax.jit(jax.vmap(jax.vmap(rotate.bilinear, in_axes=(None, 0))))(
+        jnp.asarray(values), jnp.asarray(row_col)
+    )
     for i in range(3):
         expected = scipy.ndimage.map_coordinates(values[i], row_col[i].T, order=1, mode="nearest")
         np.testing.assert_allclose(read[i], expected, atol=1e-5)
 
 
 def test_bilinear_gradient_is_the_slope():
-    """Claim: the gradient of `bilinear` in its place is the slope of the surface, in its values the four weights."""
+    """Claim: the gradient of `bilinear` in its place is the slope of the surface, in its values the
+    four weights."""
     row, col = np.meshgrid(np.arange(6.0), np.arange(7.0), indexing="ij")
     plane = jnp.asarray(2.0 * row - 3.0 * col + 1.0, jnp.float32)
     place = jnp.array([2.25, 4.5])
@@ -152,7 +182,8 @@ def test_bilinear_gradient_is_the_slope():
 
 
 def test_a_wrong_request_says_so():
-    """Claim: tables for too many frames, or for a canvas smaller than the map, are refused by name."""
+    """Claim: tables for too many frames, or for a canvas smaller than the map, are refused by
+    name."""
     with pytest.raises(ValueError, match="count"):
         rotate.tables(64, 0.448, 16, 17, 0.25)
     with pytest.raises(ValueError, match="margin"):
@@ -161,24 +192,34 @@ def test_a_wrong_request_says_so():
 
 @pytest.mark.parametrize("k", range(_K))
 def test_there_and_back(k):
-    """Claim: what frame k shows at the place of a workspace cell, read by SciPy, is that cell to half a pixel a side;
-    with a margin of sqrt(2) - 1 this holds for every cell, corners included."""
+    """Claim: what frame k shows at the place of a workspace cell, read by SciPy, is that cell to
+    half a pixel a side; with a margin of sqrt(2) - 1 this holds for every cell, corners
+    included."""
     size = 64
     tables = _ROOMY
     row, col = np.meshgrid(*[np.arange(size, dtype=np.float32)] * 2, indexing="ij")
-    frame = np.asarray(rotate.rotate_one(tables, jnp.asarray(np.stack([row, col], axis=-1)), jnp.int32(k)))
+    frame = np.asarray(
+        rotate.rotate_one(tables, jnp.asarray(np.stack([row, col], axis=-1)), jnp.int32(k))
+    )
     xy = geometry.cell_centres(HeightmapConfig(size))
-    place = rotate.to_cell(tables.canvas, tables.cell, rotate.frame_position(jnp.asarray(_yaw(k), jnp.float32), xy))
+    place = rotate.to_cell(
+        tables.canvas, tables.cell, rotate.frame_position(jnp.asarray(_yaw(k), jnp.float32), xy)
+    )
     place = np.asarray(place).round()
     assert place.min() >= 0
     assert place.max() < tables.canvas
     off = (np.asarray(place) - 0.5 * (tables.canvas - 1)) - (
-        np.asarray(rotate.frame_position(jnp.asarray(_yaw(k), jnp.float32), xy))[..., ::-1] / tables.cell
+        np.asarray(rotate.frame_position(jnp.asarray(_yaw(k), jnp.float32), xy))[..., ::-1]
+        / tables.cell
     )
-    shift = np.asarray(geometry.rotate2d(jnp.asarray(_yaw(k), jnp.float32), jnp.asarray(off[..., ::-1])))[..., ::-1]
+    shift = np.asarray(
+        geometry.rotate2d(jnp.asarray(_yaw(k), jnp.float32), jnp.asarray(off[..., ::-1]))
+    )[..., ::-1]
     inner = np.s_[1:-1, 1:-1]  # beside the rim the nearest canvas cell may look past it
     for channel, exact in enumerate((row, col)):
-        read = scipy.ndimage.map_coordinates(frame[..., channel], np.moveaxis(place, -1, 0), order=1)
+        read = scipy.ndimage.map_coordinates(
+            frame[..., channel], np.moveaxis(place, -1, 0), order=1
+        )
         assert np.abs(read - exact - shift[..., channel])[inner].max() <= 0.5 + 1e-3
 
 
@@ -186,11 +227,14 @@ _ROOMY = rotate.tables(64, 0.448, _K, _K, 2**0.5 - 1)
 
 
 def test_a_small_margin_loses_corners():
-    """Claim: a margin of sqrt(2) - 1 shows the workspace's corners in every frame, one of 1/8 does not in frame 2."""
+    """Claim: a margin of sqrt(2) - 1 shows the workspace's corners in every frame, one of 1/8 does
+    not in frame 2."""
     corners = np.zeros((64, 64, 1), np.float32)
     corners[[0, 0, -1, -1], [0, -1, 0, -1]] = 1.0
     corners[[1, 1, -2, -2], [1, -2, 1, -2]] = 1.0
     for tables, kept in ((_ROOMY, True), (rotate.tables(64, 0.448, _K, _K, 0.125), False)):
         frames = np.asarray(rotate.rotate(tables, jnp.asarray(corners)))
-        quarters = np.stack([np.rot90(frames[2, :, :, 0], turn)[: tables.canvas // 4] for turn in range(4)])
+        quarters = np.stack(
+            [np.rot90(frames[2, :, :, 0], turn)[: tables.canvas // 4] for turn in range(4)]
+        )
         assert np.all(quarters.sum((1, 2)) >= 1.0) == kept

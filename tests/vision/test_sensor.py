@@ -24,8 +24,8 @@ SMALL = HeightmapConfig(32)
 
 @pytest.mark.parametrize("distance", [0.3, 1.0, 2.0])
 def test_depth_errors_grow_with_the_square(distance):
-    """Claim: depths are normal about the true ones with sigma = depth_floor + depth_square d^2, and the stated share
-    is dropped."""
+    """Claim: depths are normal about the true ones with sigma = depth_floor + depth_square d^2, and
+    the stated share is dropped."""
     true = jnp.full((200, 200), distance)
     measured, kept = sensor.depth(jax.random.key(0), ERRORS, true)
     sigma = 0.001 + 0.0014 * distance**2
@@ -34,7 +34,8 @@ def test_depth_errors_grow_with_the_square(distance):
 
 
 def test_the_camera_is_jittered():
-    """Claim: place and orientation scatter about the believed ones with the stated spreads, as rotations."""
+    """Claim: place and orientation scatter about the believed ones with the stated spreads, as
+    rotations."""
     errors, eye = SensorConfig(position=0.01, rotation=0.02), camera.make(CameraConfig())
     keys = jax.random.split(jax.random.key(1), 3000)
     real = jax.jit(jax.vmap(lambda key: sensor.pose(key, errors, eye)))(keys)
@@ -53,7 +54,10 @@ def test_colours_change_together():
     gains = np.asarray(sensor.colour(jax.random.key(2), ERRORS, true)) / np.asarray(true)
     np.testing.assert_allclose(gains, np.broadcast_to(gains[0, 0], gains.shape), rtol=1e-5)
     assert len(np.unique(gains[0, 0].round(4))) == 3
-    assert np.asarray(sensor.colour(jax.random.key(2), SensorConfig(colour=0.5), 10.0 * true)).max() <= 1.0
+    assert (
+        np.asarray(sensor.colour(jax.random.key(2), SensorConfig(colour=0.5), 10.0 * true)).max()
+        <= 1.0
+    )
 
 
 def test_no_errors_change_nothing():
@@ -96,11 +100,16 @@ _PUSH = Action(primitive=jnp.int32(0), pose=jnp.array([0.15, 0.15, 0.0]))
     ("view", "errors"),
     [
         (SMALL, ERRORS),
-        pytest.param(OBLIQUE, dataclasses.replace(ERRORS, position=0.005, rotation=0.01), marks=pytest.mark.slow),
+        pytest.param(
+            OBLIQUE,
+            dataclasses.replace(ERRORS, position=0.005, rotation=0.01),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_views_differ_from_step_to_step(view, errors):
-    """Claim: every view of an episode has errors of its own, that of another episode others; the same key, the same."""
+    """Claim: every view of an episode has errors of its own, that of another episode others; the
+    same key, the same."""
     env = _env(heightmap=view, sensor=errors)
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     first, other, again = (reset(jax.random.key(seed)) for seed in (0, 1, 0))
@@ -139,15 +148,22 @@ def test_without_errors_there_is_no_randomness():
     env = _env()
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert state.noise is None
-    stepped = str(jax.make_jaxpr(env.step)(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state), _PUSH))
+    stepped = str(
+        jax.make_jaxpr(env.step)(
+            jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state), _PUSH
+        )
+    )
     assert "random" not in stepped
     noisy = _env(sensor=ERRORS)
-    begin = jax.make_jaxpr(lambda key: noisy.begin(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), noisy.scenes), key))
+    begin = jax.make_jaxpr(
+        lambda key: noisy.begin(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), noisy.scenes), key)
+    )
     assert "random" in str(begin(jax.random.key(0)))
 
 
 def test_the_config_chooses_the_view():
-    """Claim: the environment looks from above by default, and through the config's camera if the view is oblique."""
+    """Claim: the environment looks from above by default, and through the config's camera if the
+    view is oblique."""
     env = _env(heightmap=OBLIQUE)
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
     above, beside = (jax.jit(each.look)(scene) for each in (_env(), env))
@@ -157,7 +173,8 @@ def test_the_config_chooses_the_view():
 
 
 def test_an_episode_with_errors_needs_a_key():
-    """Claim: beginning an episode without a key says so, instead of showing every episode the same errors."""
+    """Claim: beginning an episode without a key says so, instead of showing every episode the same
+    errors."""
     env = _env(sensor=ERRORS)
     with pytest.raises(ValueError, match=r"sensor.*key"):
         env.begin(jax.tree.map(lambda leaf: leaf[0], env.scenes))
@@ -168,19 +185,30 @@ def test_an_episode_with_errors_needs_a_key():
     [
         (lambda: SensorConfig(dropped=1.0), "sensor.dropped"),
         (lambda: SensorConfig(depth_square=-0.1), "sensor.depth_square"),
-        (lambda: Config(sensor=SensorConfig(rotation=0.01)), "sensor.position, sensor.rotation.*ortho"),
+        (
+            lambda: Config(sensor=SensorConfig(rotation=0.01)),
+            "sensor.position, sensor.rotation.*ortho",
+        ),
         (lambda: HeightmapConfig(view="side"), "heightmap.view"),
         (lambda: HeightmapConfig(size=60), "heightmap.size"),
         (lambda: dataclasses.replace(Config(), heightmap=HeightmapConfig(size=80)), "net.margin"),
         (
-            lambda: dataclasses.replace(Config(), net=dataclasses.replace(Config().net, rotations=202)),
+            lambda: dataclasses.replace(
+                Config(), net=dataclasses.replace(Config().net, rotations=202)
+            ),
             "net.rotations: at most 200",
         ),
-        (lambda: dataclasses.replace(Config(), net=dataclasses.replace(Config().net, rotations=15)), "net.rotations"),
+        (
+            lambda: dataclasses.replace(
+                Config(), net=dataclasses.replace(Config().net, rotations=15)
+            ),
+            "net.rotations",
+        ),
     ],
 )
 def test_bad_settings_are_refused(build, message):
-    """Claim: what the sensor, the view, the strides or the even spacing of yaws cannot do is refused in one line."""
+    """Claim: what the sensor, the view, the strides or the even spacing of yaws cannot do is
+    refused in one line."""
     with pytest.raises(ValueError, match=message) as error:
         build()
     assert "\n" not in str(error.value)

@@ -1,0 +1,25 @@
+"""Names and numbers that several stages share; imports nothing, so that reports need no JAX."""
+
+import enum
+
+
+class Primitive(enum.IntEnum):
+    """Kinds of action."""
+
+    PUSH = 0
+    GRASP = 1
+
+
+class Outcome(enum.IntEnum):
+    """Levels of a grasp, CSAC eq. 15, worst first."""
+
+    NOTHING = 0
+    EMPTY = 1
+    TOUCHED = 2
+    DROPPED = 3
+    LIFTED = 4
+
+
+OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome)
+CHANGE_AREA = 12.0  # cm^2 of the height map that must move for an action to count as a change (VPG)
+GRASP_WINDOW = 200  # grasps that the running success is taken over (CSAC sec. 4.2)

@@ -1,0 +1,46 @@
+"""Files of a run, written so that they are never seen half-written. Needs no JAX.
+
+RUN/config.json     the config, for people; the checkpoint holds its own copy
+RUN/metrics.jsonl   one `loop.Record` per chunk
+RUN/checkpoints/    see `checkpoint`
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+CONFIG = "config.json"
+METRICS = "metrics.jsonl"
+
+
+def replace(path: Path, content: str | bytes) -> None:
+    """Writes a file such that it appears all at once; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+    os.replace(temporary, path)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes a file of indented JSON; see `replace`."""
+    replace(path, json.dumps(content, indent=2) + "\n")
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics.jsonl; one that was cut off while being written is left out."""
+    return list(_complete_lines(path))
+
+
+def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
+    for line in path.read_text().splitlines():
+        with contextlib.suppress(ValueError):
+            yield json.loads(line)
+
+
+def truncate_log(path: Path, step: int) -> None:
+    """Keeps the lines of steps up to `step`."""
+    lines = _complete_lines(path) if path.exists() else ()
+    replace(path, "".join(json.dumps(line) + "\n" for line in lines if line["step"] <= step))

@@ -1,0 +1,34 @@
+"""Pretrained weights from a file that the user brings."""
+
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.numpy
+
+from csac_jax.config import NetConfig
+from csac_jax.nets import torchvision
+
+
+def read(cfg: NetConfig) -> Any:
+    """Variables of a trunk from the file `net.weights`. Nothing in the file is executed.
+
+    Raises ValueError in one line, naming the tensor if one is missing, extra or misshapen.
+    """
+    path = Path(cfg.weights)
+    try:
+        tensors = safetensors.numpy.load_file(path)
+    except (
+        OSError,
+        KeyError,
+        safetensors.SafetensorError,
+    ) as error:  # KeyError: a type that NumPy lacks
+        raise ValueError(
+            f"net.weights: {path} cannot be read as .safetensors ({error}); give another file"
+        ) from error
+    try:
+        return torchvision.variables(cfg, tensors)
+    except ValueError as error:
+        raise ValueError(
+            f"net.weights: in {path}, {error}; bring torchvision's densenet121 with the layers of net.block_layers"
+        ) from error

@@ -1,0 +1,86 @@
+"""How a training program is traced, and what XLA is asked for when it is compiled, where it is seen
+to know it.
+
+On a CPU it has a second library for convolutions, which is about twice as fast as Eigen at those of
+the small net. It is no default, and versions of jaxlib differ in it, so it is asked for only where
+it is seen to compute right.
+
+On a GPU it would write kernels of its own for each matrix product of DenseNet-121, in many ways,
+and time them all beside the vendor's library: half of the compilation, for kernels that are no
+faster (`experiments/bench`).
+"""
+
+import functools
+import gc
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax import _guard
+from csac_jax.config import Config
+from csac_jax.nets.convolution import conv2d
+
+LIBRARY = {_guard.FUSION_FLAG.lstrip("-"): "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"}
+VENDOR = {"xla_gpu_enable_triton_gemm": False}
+_BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float32 gives some 1e-5
+
+
+def lower(jitted: Any, *given: Any) -> Any:
+    """`jitted.lower(*given)` while Python's garbage collector rests, which is a quarter to two
+    fifths less time.
+
+    Tracing makes hundreds of thousands of small objects, next to none of them garbage, and the
+    collector would go through them again and again.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        return jitted.lower(*given)
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def options(cfg: Config) -> dict[str, Any] | None:
+    """Options of `jax.jit` for the config's training program; None if there is nothing to ask for.
+
+    The library for convolutions only with the small net: it is slow at kernel gradients, which
+    `conv2d` keeps from it.
+    """
+    if cfg.net.kind == "small":
+        return dict(LIBRARY) if has_library() else None
+    return dict(VENDOR) if jax.default_backend() == "gpu" and _knows_vendor() else None
+
+
+@functools.cache
+def _knows_vendor() -> bool:
+    """Whether this XLA can be told to leave matrix products to the vendor's library."""
+    try:
+        jax.jit(jnp.negative, compiler_options=VENDOR).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+@functools.cache
+def has_library() -> bool:
+    """Whether the back end is a CPU, its XLA knows the library, and a small convolution by it is
+    right."""
+    if jax.default_backend() != "cpu":
+        return False
+    rng = np.random.default_rng(0)
+    maps, kernel = (
+        rng.normal(size=shape).astype(np.float32) for shape in ((1, 8, 8, 40), (3, 3, 40, 24))
+    )
+    try:
+        program = jax.jit(
+            lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1), compiler_options=LIBRARY
+        )
+        got = np.asarray(program(jnp.asarray(maps), jnp.asarray(kernel)))
+    except jax.errors.JaxRuntimeError:
+        return False
+    padded = np.pad(maps.astype(np.float64), ((0, 0), (1, 1), (1, 1), (0, 0)))
+    wanted = sum(padded[:, i : i + 8, j : j + 8] @ kernel[i, j] for i in range(3) for j in range(3))
+    return bool(np.max(np.abs(got - wanted)) < _BOUND)

@@ -1,0 +1,62 @@
+"""Stopping on SIGINT and SIGTERM: the first asks the loop to save and end, a second of its kind
+ends at once.
+
+Python runs its own signal handlers only between bytecodes, so not while XLA compiles or a chunk
+runs. The C handler behind `signal.set_wakeup_fd` is not held up by that: it writes the signal's
+number into a socket, which a thread reads.
+"""
+
+import os
+import signal
+import socket
+import sys
+import threading
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stop:
+    """What the loop looks at between chunks. `signal` is the number of the first signal, None
+    before there is one."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """130 for SIGINT, 143 for SIGTERM, 0 if there was none."""
+        return 0 if self.signal is None else 128 + self.signal
+
+
+def install() -> Stop:
+    """Starts listening; call it in the main thread, as early as possible. Returns the flag that
+    signals set."""
+    stop = Stop()
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    signal.set_wakeup_fd(writer.fileno())
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: None)
+    threading.Thread(
+        target=_listen, args=(stop, reader, writer), daemon=True, name="signals"
+    ).start()
+    return stop
+
+
+def _listen(stop: Stop, reader: socket.socket, writer: socket.socket) -> None:
+    """Reads signal numbers for ever. Holds `writer` so that it stays open as long as signals may
+    come."""
+    seen: set[int] = set()
+    while writer.fileno() >= 0:
+        for number in reader.recv(64):
+            if number in seen:
+                os._exit(128 + number)
+            if number in SIGNALS:
+                seen.add(number)
+                stop.signal = stop.signal or number
+                name = signal.Signals(number).name
+                print(
+                    f"{name}: saving after this chunk; once more to end at once",
+                    file=sys.stderr,
+                    flush=True,
+                )

@@ -1,0 +1,623 @@
+"""The command line: bad input is one line and an exit code, and nothing is overwritten."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import csac_jax
+from csac_jax import algorithms, cli, presets
+from csac_jax.cli import bench, evaluation, play, stored, sweep, train
+from csac_jax.config import Config, SceneConfig
+from csac_jax.evaluation import rollout
+from csac_jax.io import checkpoint
+from csac_jax.runtime import signals
+from csac_jax.scene import pool
+
+ROOT = Path(csac_jax.__file__).parents[1]
+SMOKE = presets.smoke()
+
+
+@pytest.fixture(autouse=True)
+def no_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Bad input must be seen before anything is trained; no test of this file trains or takes over
+    signals."""
+
+    def forbidden(*_):
+        raise AssertionError("training began")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "_train", forbidden)
+    monkeypatch.setattr(signals, "install", signals.Stop)
+
+
+def _fails(capsys: pytest.CaptureFixture, *arguments: str) -> tuple[int, str]:
+    """Exit code and the one line on stderr."""
+    code = cli.main(arguments)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("csac-jax: ")
+    assert captured.err.count("\n") == 1, captured.err
+    return code, captured.err
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    """A run of `smoke` with one checkpoint."""
+    folder = tmp_path / "runs" / "one"
+    checkpoint.save(
+        folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, SMOKE, {"seconds": 1.0, "grasps": []}
+    )
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            "trian quick",
+            "unknown command 'trian'; choose one of: train, sweep, eval, play, report, export, doctor",
+        ),
+        ("train", "give a preset first, one of: smoke, quick"),
+        ("train --seed 3", "give a preset first, one of: smoke, quick"),
+        ("train quik", "unknown preset 'quik'; choose one of: smoke, quick"),
+        (
+            "train quick --learn.bath 3",
+            "--learn.bath, 3; perhaps you meant --learn.batch; see csac-jax train quick --help",
+        ),
+        ("train quick --preset smoke", "--preset"),
+        ("train quick --learn.batch", "--learn.batch"),
+        ("train quick --learn.batch many", "--learn.batch: invalid literal for int"),
+        ("train quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("train quick --learn.batch 65", "learn.batch: 65 transitions cannot be drawn"),
+        (
+            "train quick --scene.slots box ball",
+            "invalid choice 'ball' for argument '--scene.slots'",
+        ),
+        (
+            "train quick --replay.sampler best",
+            "invalid choice 'best' for argument '--replay.sampler'",
+        ),
+        ("train quick --replay.alpha 1.5", "replay.alpha: must lie in 0 .. 1"),
+        ("train quick --replay.capacity 0", "replay.capacity: must lie in 2 .. 2^30"),
+        ("train quick --seed -1", "seed: must lie in 0 .. 2147483647"),
+        ("train quick smoke", "Unrecognized options: smoke"),
+        (
+            "train quick --algo dqn",
+            "unknown algorithm 'dqn'; choose one of: csac, csac_per, csac_beta, vpg, grasp_only",
+        ),
+        ("train quick --algo=", "unknown algorithm ''"),
+        ("train quick --algo", "Missing value for argument '--algo'"),
+        (
+            "train quick --algo grasp_only --explore.push-fraction 0.2",
+            "explore.push_fraction: must be 0 where",
+        ),
+        ("train quick --learn.actor-batch 33", "learn.actor_batch: must not exceed learn.batch"),
+        ("train quick --learn.critics 3", "learn.critics: must be 1 or 2"),
+        ("train quick --learn.loss mse", "invalid choice 'mse' for argument '--learn.loss'"),
+        ("train quick --cem.elites 65", "cem.elites: must lie in 2 .. cem.candidates"),
+        (
+            "train quick --run-dir .",
+            ". exists; give another --run-dir, or go on with it by --resume",
+        ),
+        ("eval", "Folder of the run"),
+        ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
+        ("eval . --episodes 0", "--episodes: at least 1"),
+        ("eval . --seed -2", "--seed: must lie in"),
+        ("eval . --seed 2147483647", "--seed: must lie in"),
+        (
+            "eval shipped --suite nowhere",
+            "--suite: 'nowhere' is neither a case file nor one of: own, random10",
+        ),
+        ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
+        ("doctor --fix", "Unrecognized options: --fix"),
+        (
+            "train smoke --sim.physics warp",
+            "scene.mesh_size_jitter: must be 0 where sim.physics is warp",
+        ),
+        (
+            "train smoke --sim.physics warp --scene.mesh-size-jitter 0",
+            "--sim.physics: warp computes on CUDA",
+        ),
+        ("bench", "bench: unknown benchmark ''; choose one of: "),
+        ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),
+        ("bench step slow", "bench step: give one preset of: smoke, quick, fast"),
+        ("bench step --curve length", "bench step: argument --curve: invalid choice: 'length'"),
+        ("bench step --smallest 2", "bench step: --smallest and --largest belong to --curve"),
+        (
+            "bench step --curve map --smallest 36 --largest 40",
+            "bench step: heightmap.size: must be a multiple of 8",
+        ),
+        ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
+        ("bench step --learn.critics 3", "bench step: learn.critics: must be 1 or 2"),
+        ("bench step smoke --learn.update 2", "bench step: Unrecognized options: --learn.update"),
+        (
+            "bench step fast --physics warp --curve scenes --smallest 8192 --largest 8192",
+            "train.scenes: at most 4096",
+        ),
+        ("bench memory huge", "bench memory: give names of: smoke, 64 scenes, "),
+        (f"bench memory --record {__file__}", f"bench memory: {__file__} is no record of it"),
+        ("doctor --preset", "doctor: give a preset after --preset, one of: smoke, quick"),
+        ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
+        ("doctor --preset quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
+        ("bench soak --actions 0", "bench soak: --actions: must be at least 1"),
+        (
+            "bench act --pixels 40",
+            "bench act: net.margin: DenseNet-121 needs maps of a multiple of 32 cells, not 40",
+        ),
+        (
+            "bench act --zoom 64",
+            "bench act: net.zoom, net.output_stride: their product must divide 32",
+        ),
+        (
+            "train paper --net.margin 0.1",
+            "net.margin: DenseNet-121 needs maps of a multiple of 16 cells, not 246",
+        ),
+        ("bench parity --poses x", "bench parity: argument --poses: invalid int value: 'x'"),
+        ("bench replay 12", "bench replay: give two exponents of 2"),
+        ("bench replay 14 12", "bench replay: exponents must lie in 1 .. 24"),
+    ],
+)
+def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
+    """Claim: bad arguments are one line that names the thing, and exit code 2."""
+    code, line = _fails(capsys, *arguments.split())
+    assert code == 2
+    assert message in line
+
+
+READERS = ["train --resume {}", "eval {}", "export {} p.safetensors", "play --policy {}"]
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_missing_run(capsys: pytest.CaptureFixture, tmp_path: Path, command: str):
+    """Claim: a run that is not there, or has no checkpoint, is one line and exit code 1."""
+    code, line = _fails(capsys, *command.format("nowhere").split())
+    assert (code, "there is no folder nowhere" in line) == (1, True)
+    (tmp_path / "empty").mkdir()
+    code, line = _fails(capsys, *command.format("empty").split())
+    assert (code, "there is no checkpoint" in line) == (1, True)
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_damaged_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path, command: str):
+    """Claim: a damaged checkpoint is one line and exit code 1."""
+    (run_dir / "checkpoints/4" / checkpoint.MANIFEST).unlink()
+    code, line = _fails(capsys, *command.format(run_dir).split())
+    assert (code, "half-written" in line) == (1, True)
+
+
+@pytest.mark.slow
+def test_scenes_that_never_settle(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, run_dir: Path
+):
+    """Claim: blocks that do not come to rest are a failure of one line that names what to change,
+    not a traceback."""
+    falling = SceneConfig(
+        slots=("box",), min_blocks=1, drop_height=1.0, settle_time=0.5
+    )  # lands after 0.45 s
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(pool, "_ROUND", 8)
+    monkeypatch.setattr(stored, "config", lambda _: dataclasses.replace(SMOKE, scene=falling))
+    code, line = _fails(capsys, "eval", str(run_dir), "--policy", "random")
+    assert code == 1
+    assert "scene.settle_time" in line
+
+
+@pytest.mark.parametrize(
+    ("flags", "names"),
+    [
+        (["--learn.tau", "0.5", "--seed", "3"], "seed, learn.tau"),
+        (["--cem.rounds", "4"], "cem.rounds"),
+    ],
+)
+def test_resume_with_other_settings(
+    capsys: pytest.CaptureFixture, run_dir: Path, flags: list[str], names: str
+):
+    """Claim: to resume with settings that are not the run's is exit code 2, and every one that
+    differs is named."""
+    code, line = _fails(capsys, "train", "--resume", str(run_dir), *flags)
+    assert (code, f"other values of {names};" in line) == (2, True)
+
+
+def test_resume_with_another_preset(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: to resume with a preset that is not the run's is exit code 2."""
+    code, line = _fails(capsys, "train", "quick", "--resume", str(run_dir))
+    assert (code, "other values of preset;" in line) == (2, True)
+
+
+def test_resume_excludes_run_dir(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: --resume and --run-dir exclude one another."""
+    code, line = _fails(capsys, "train", "--resume", str(run_dir), "--run-dir", "x")
+    assert (code, "exclude one another" in line) == (2, True)
+
+
+def test_nothing_is_overwritten(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: refused arguments change no file of the run."""
+    before = {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
+    _fails(capsys, "train", "smoke", "--run-dir", str(run_dir))
+    _fails(capsys, "train", "--resume", str(run_dir), "--seed", "9")
+    assert {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("flag", ["--resume {}", "--resume={}"])
+@pytest.mark.parametrize("preset", ["", "smoke "])
+def test_resume_takes_the_config_of_the_run(run_dir: Path, flag: str, preset: str):
+    """Claim: a resumed run needs no settings, and may be given its own."""
+    own = "--learn.batch 8 --seed 0"
+    for arguments in (preset + flag.format(run_dir), f"{preset}{flag.format(run_dir)} {own}"):
+        options, cfg = train.read(arguments.split())
+        assert cfg == SMOKE
+        assert options.resume == run_dir
+
+
+def test_flags_reach_the_config():
+    """Claim: settings on the command line reach the config, the rest is the preset's."""
+    flags = "--seed 3 --learn.batch 4 --scene.slots box prism --replay.beta-end 2 3"
+    _, cfg = train.read(["smoke", *flags.split()])
+    assert cfg == dataclasses.replace(
+        SMOKE,
+        seed=3,
+        learn=dataclasses.replace(SMOKE.learn, batch=4),
+        scene=dataclasses.replace(SMOKE.scene, slots=("box", "prism")),
+        replay=dataclasses.replace(SMOKE.replay, beta_end=(2.0, 3.0)),
+    )
+
+
+@pytest.mark.parametrize("flag", ["--algo vpg", "--algo=vpg", "--algo csac --algo vpg"])
+def test_algorithm_reaches_the_config(flag: str):
+    """Claim: --algo makes the preset one of that algorithm, and settings given as well win over it,
+    before or after."""
+    wanted = algorithms.configure(SMOKE, "vpg")
+    assert train.read(["smoke", *flag.split()])[1] == wanted
+    own = dataclasses.replace(wanted, target=dataclasses.replace(wanted.target, gamma=0.3))
+    for arguments in (f"smoke {flag} --target.gamma 0.3", f"smoke --target.gamma 0.3 {flag}"):
+        assert train.read(arguments.split())[1] == own
+    assert train.read(["smoke"])[1] == SMOKE
+
+
+def test_resumed_run_keeps_its_algorithm(capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Claim: a run goes on with the algorithm it was begun with; to ask for another is exit code
+    2."""
+    cfg, folder = algorithms.configure(SMOKE, "vpg"), tmp_path / "runs" / "two"
+    checkpoint.save(
+        folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []}
+    )
+    for flags in ([], ["--algo", "vpg"]):
+        assert train.read(["--resume", str(folder), *flags])[1] == cfg
+    code, line = _fails(capsys, "train", "--resume", str(folder), "--algo", "csac")
+    assert (code, "other values of algo;" in line) == (2, True)
+
+
+def test_help_names_the_algorithms(capsys: pytest.CaptureFixture):
+    """Claim: every algorithm is named by the help of the program."""
+    assert cli.main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in algorithms.ALGORITHMS)
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: every setting of a config is a flag of `train`, and none but these and the options."""
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["train", "quick", "--help"])
+    assert ended.value.code in (0, None)
+    shown = capsys.readouterr().out
+    for field in dataclasses.fields(Config):
+        if dataclasses.is_dataclass(field.type):
+            for setting in dataclasses.fields(field.type):
+                assert f"{_flag(f'{field.name}.{setting.name}')}" in shown
+    assert "--seed" in shown
+    assert "--algo {csac,csac_per,csac_beta,vpg,grasp_only,reactive}" in shown
+    assert "--preset" not in shown
+
+
+def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Claim: a ring that memory cannot hold is refused before anything is compiled or written: one
+    line with the setting and the largest capacity that would do, exit code 2; that capacity
+    passes."""
+    from csac_jax.training import memory
+
+    code, line = _fails(capsys, "train", "quick", "--replay.capacity", str(2**30))
+    assert code == 2
+    match = re.fullmatch(
+        r"csac-jax: replay.capacity: .* GiB, .*; lower --replay.capacity from \d+ to (\d+) .*\n",
+        line,
+    )
+    assert match
+    assert list(tmp_path.iterdir()) == []
+    quick = presets.quick()
+    for extra in (0, 1):
+        capacity = int(match[1]) + extra
+        cfg = dataclasses.replace(
+            quick, replay=dataclasses.replace(quick.replay, capacity=capacity)
+        )
+        with (
+            pytest.raises(ValueError, match=r"replay\.capacity")
+            if extra
+            else contextlib.nullcontext()
+        ):
+            memory.check(cfg)
+
+
+def test_limit_of_the_device_goes_first(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a device that states its memory is believed, this machine's own counts for one that
+    does not."""
+    from csac_jax.training import memory
+
+    class Device:
+        def __init__(self, stats):
+            self.memory_stats = lambda: stats
+
+    for stats in (None, {}, {"bytes_limit": 10**9}):
+        monkeypatch.setattr(memory.jax, "devices", lambda stats=stats: [Device(stats)])
+        own = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        assert memory.limit() == (10**9 if stats else own)
+
+
+def test_benchmark_is_run_with_its_arguments(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Claim: `bench NAME ...` calls `main` of that file of the checkout; without a checkout it is
+    one line."""
+    monkeypatch.setattr(bench, "BENCHMARKS", tmp_path / "bench")
+    code, line = _fails(capsys, "bench", "one")
+    assert (code, "come with a checkout" in line) == (2, True)
+    (tmp_path / "bench").mkdir()
+    (tmp_path / "bench/one.py").write_text(
+        "import json\ndef main(arguments):\n    print(json.dumps(arguments))\n"
+    )
+    (tmp_path / "bench/_helper.py").write_text("")
+    assert cli.main(["bench", "one", "a", "--b"]) == 0
+    assert json.loads(capsys.readouterr().out) == ["a", "--b"]
+    assert cli.main(["bench", "--help"]) == 0
+    assert capsys.readouterr().out == "usage: csac-jax bench NAME ..., with NAME one of: one\n"
+
+
+def test_points_of_a_curve():
+    """Claim: a curve's points are its first value and doublings of it; only what it is named after
+    changes, and contact caps with the blocks."""
+    from experiments.bench import step as bench
+
+    assert bench._values(3, 13) == [3, 6, 12]
+    quick = presets.quick()
+    assert bench._at(quick, "scenes", 32).train.scenes == 32
+    assert bench._at(quick, "scenes", 2**13).replay.capacity == 2**13
+    assert bench._at(quick, "map", 128).heightmap.size == 128
+    assert bench._at(quick, "capacity", 64).replay.capacity == 64
+    twice = bench._at(quick, "blocks", 10)
+    assert (len(twice.scene.slots), twice.scene.min_blocks) == (10, 10)
+    assert (twice.sim.geom_pairs, twice.sim.contacts) == (
+        2 * quick.sim.geom_pairs,
+        2 * quick.sim.contacts,
+    )
+    for curve in bench.CURVES:
+        other = bench._at(quick, curve, 8 if curve == "blocks" else 64)
+        touched = {
+            "scenes": {"train", "replay"},
+            "blocks": {"scene", "sim"},
+            "map": set(),
+            "capacity": {"replay"},
+        }
+        names = [field.name for field in dataclasses.fields(Config)]
+        assert {name for name in names if getattr(other, name) != getattr(quick, name)} <= touched[
+            curve
+        ]
+
+
+def test_settings_of_a_step():
+    """Claim: `bench step` takes settings as `train` does, physics among them, which --physics wins
+    over; else physics are those of `auto`."""
+    from experiments.bench import step as bench
+
+    assert bench._config("smoke", ["--learn.updates", "3"], None).learn.updates == 3
+    asked = [
+        ([], None),
+        ([], "mjx"),
+        (["--sim.physics", "mjx"], None),
+        (["--sim.physics", "mjx"], "c"),
+    ]
+    found = [bench._config("smoke", flags, physics).sim.physics for flags, physics in asked]
+    assert found == ["c", "mjx", "mjx", "c"]
+
+
+@pytest.mark.slow
+def test_replay_benchmark(capsys: pytest.CaptureFixture):
+    """Claim: `bench replay` prints JSON with the times of every sampler and where they come
+    from."""
+    pytest.importorskip("flashbax")
+    jax = pytest.importorskip("jax")
+    with (
+        jax.numpy_rank_promotion("allow"),
+        jax.numpy_dtype_promotion("standard"),
+    ):  # flashbax is not strict
+        assert cli.main(["bench", "replay", "6", "7"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [row["capacity"] for row in result["capacities"]] == [64, 128]
+    for row in result["capacities"]:
+        assert row["median_seconds"].keys() == {"uniform", "prioritised", "beta", "flashbax"}
+        assert min(row["median_seconds"].values()) > 0.0
+    assert {"device", "versions", "commit", "item", "batch", "repeats"} <= result.keys()
+
+
+def test_automatic_physics_is_resolved(tmp_path: Path):
+    """Claim: `--sim.physics auto` reaches a run as what it stands for here, and may be asked for
+    again when the run is resumed; the first line of a run says what it runs on."""
+    _, cfg = train.read(["smoke", "--sim.physics", "auto", "--seed", "3"])
+    in_c = dataclasses.replace(SMOKE.sim, physics="c")
+    assert cfg == dataclasses.replace(SMOKE, seed=3, sim=in_c)
+    folder = tmp_path / "runs" / "three"
+    checkpoint.save(
+        folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []}
+    )
+    assert train.read(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
+    assert sweep.read(["smoke", "--sim.physics", "auto"])[1].settings[0].cfg.sim == in_c
+    line = train.first_line(folder, cfg)
+    wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics c, on 1 x cpu (cpu)"
+    assert line == f"run {folder}: {wanted}"
+
+
+def test_default_run_dirs_do_not_collide(tmp_path: Path):
+    """Claim: two runs begun in the same second get folders of their own."""
+    first = train.new_run_dir(SMOKE)
+    assert first.name.startswith("smoke-0-20")
+    first.mkdir(parents=True)
+    assert train.new_run_dir(SMOKE) != first
+
+
+def test_help_comes_without_jax():
+    """Claim: help and complaints do not wait for JAX."""
+    source = """
+import contextlib, io, sys
+from csac_jax import cli
+for line in ("", "--help", "train --help", "eval --help", "train quick --learn.bath 3", "eval x -y"):
+    nothing = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(nothing), contextlib.redirect_stderr(nothing):
+        cli.main(line.split())
+print("jax" in sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", source], capture_output=True, text=True, timeout=60, cwd=ROOT
+    )
+    assert done.stdout == "False\n", done.stderr
+
+
+def test_reader_that_stops_reading_is_no_error():
+    """Claim: `csac-jax --help | head -1` prints no traceback and no complaint."""
+    command = f"{sys.executable} -m csac_jax train --help | head -1"
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, timeout=60, cwd=ROOT
+    )
+    assert done.stdout.startswith("usage: csac-jax train")
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("code", [0, 130, 143])
+def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int):
+    """Claim: a stopped run exits with 128 + the signal; --json has the result, the config and where
+    it comes from."""
+    from csac_jax.training import loop
+
+    def trained(options, cfg, run_dir, stop, trunk):
+        stop.signal = code - 128 if code else None
+        return loop.Summary(4, 8, 1.5, 0.5, None, 0, stop.signal)
+
+    monkeypatch.setattr(train, "_train", trained)
+    assert cli.main(["train", "smoke", "--seed", "3", "--json", "out/result.json"]) == code
+    result = json.loads((tmp_path / "out/result.json").read_text())
+    assert (result["actions"], result["config"]["seed"], result["config"]["preset"]) == (
+        8,
+        3,
+        "smoke",
+    )
+    assert {"device", "versions", "commit", "run_dir", "wall_seconds"} <= result.keys()
+    assert json.loads((tmp_path / result["run_dir"] / "train.json").read_text()) == result
+
+
+@pytest.mark.mjx
+def test_doctor_passes(capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Claim: on a sound machine `doctor` exits with 0 and names what it checked."""
+    assert cli.main(["doctor", "--json", "doctor.json"]) == 0
+    shown = capsys.readouterr().out
+    assert "jax 0." in shown
+    assert shown.count("ok  ") == 3
+    result = json.loads((tmp_path / "doctor.json").read_text())
+    assert result["thread_pool"]["guarded"]
+    assert all(check["passed"] for check in result["self_test"])
+
+
+def test_doctor_shows_memory(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Claim: `doctor --preset X`, with any settings, says what such a run will hold in memory, part
+    by part."""
+    from csac_jax.runtime import selftest
+
+    monkeypatch.setattr(selftest, "CHECKS", ())
+    flags = "--preset smoke --scene.slots box box --scene.min-blocks 1 --json doctor.json --replay.capacity 128"
+    assert cli.main(["doctor", *flags.split()]) == 0
+    assert re.search(
+        r"memory +0\.00 GiB of [\d.]+ for smoke: replay 0\.00, scenes", capsys.readouterr().out
+    )
+    result = json.loads((tmp_path / "doctor.json").read_text())
+    assert result["config"]["scene"]["slots"] == ["box", "box"]
+    cells, obs = 32 * 32, 2
+    transition = (
+        cells * obs * (3 + 2 + 1) + 4 + 12 + 4 + 1 + 4
+    )  # packed maps, action, reward, end, priority
+    assert result["memory"]["bytes"]["replay"] == 128 * transition + 8  # head and size
+
+
+@pytest.mark.parametrize(("found", "said"), [(True, "second library"), (False, "default library")])
+def test_doctor_names_the_library(
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    found: bool,
+    said: str,
+):
+    """Claim: `doctor` says by which of XLA's libraries training computes convolutions."""
+    from csac_jax.runtime import compiler, selftest
+
+    monkeypatch.setattr(selftest, "CHECKS", ())
+    monkeypatch.setattr(compiler, "has_library", lambda: found)
+    assert cli.main(["doctor", "--json", "doctor.json"]) == 0
+    assert f"training   convolutions by XLA's {said}" in capsys.readouterr().out
+    assert json.loads((tmp_path / "doctor.json").read_text())["second_library"] is found
+
+
+@pytest.mark.parametrize("error", [1.0, float("nan")])
+def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, error: float):
+    """Claim: a check that fails, or gives NaN, is exit code 1 and one line that names it."""
+    from csac_jax.runtime import selftest
+
+    monkeypatch.setattr(
+        selftest, "CHECKS", (("sums", lambda: error, 0.5), ("products", lambda: 0.0, 0.5))
+    )
+    assert cli.main(["doctor"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert "self-test failed: sums;" in captured.err
+
+
+def test_summary_is_printed(capsys: pytest.CaptureFixture):
+    """Claim: `eval` prints every metric, and a dash for one without cases."""
+    from csac_jax.evaluation import metrics
+
+    summary = {
+        "grasp_success": metrics.wilson(9, 10),
+        "completion": metrics.wilson(0, 0),
+        "outcomes": {"lifted": 9},
+        "counts": {"grasps": 10},
+    }
+    evaluation.print_summary("random in 1 episode", summary)
+    shown = capsys.readouterr().out
+    assert "90.0 %" in shown
+    assert "lifted 9" in shown
+    assert "-" in next(line for line in shown.splitlines() if "completion" in line)
+
+
+@pytest.mark.parametrize(("scene", "any_yaw"), [("row", False), ("random", True)])
+def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str, any_yaw: bool):
+    """Claim: `play` turns a case by quarters at most, so that it can be known again, and a random
+    scene by any yaw."""
+    turned = []
+
+    def episode(_, env, *__):
+        turned.append(env.any_yaw)
+        yield from ()
+
+    monkeypatch.setattr(rollout, "episode", episode)
+    physics = dataclasses.replace(SMOKE.sim, physics="c")
+    play._play(play.PlayOptions(scene=scene), dataclasses.replace(SMOKE, sim=physics), None)
+    assert turned == [any_yaw]

@@ -1,0 +1,215 @@
+"""The command line where something goes wrong that no argument shows: one line and an exit code."""
+
+import importlib.util
+import io
+import os
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+import csac_jax
+from csac_jax import cli, presets
+from csac_jax.cli import doctor, errors
+from csac_jax.errors import SceneError
+from csac_jax.io import checkpoint, policy_file
+from csac_jax.runtime import cache, signals
+from csac_jax.training import loop, step
+
+SMOKE = presets.smoke()
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """An empty folder; no signals are taken over."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(signals, "install", signals.Stop)
+
+
+def _raises(error: BaseException):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (errors.BadArgumentsError("no"), 2, "no"),
+        (errors.FailedError("two\n  lines"), 1, "two lines"),
+        (SceneError("never at rest"), 1, "never at rest"),
+        (
+            PermissionError(13, "Permission denied", "a.json"),
+            1,
+            "[Errno 13] Permission denied: 'a.json'",
+        ),
+        (KeyboardInterrupt(), 130, "stopped"),
+    ],
+)
+def test_exit_codes(
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    code: int,
+    line: str,
+):
+    """Claim: what a command raises is an exit code and one line, however many its message has."""
+    monkeypatch.setitem(cli.COMMANDS, "doctor", _raises(error))
+    assert cli.main(["doctor"]) == code
+    assert capsys.readouterr() == ("", f"csac-jax: {line}\n")
+
+
+@pytest.mark.parametrize(("arguments", "code"), [([], 2), (["-h"], 0), (["--help"], 0)])
+def test_usage(capsys: pytest.CaptureFixture, arguments: list[str], code: int):
+    """Claim: the usage, with every command in it, is shown when it is asked for; and with exit code
+    2 if nothing is."""
+    assert cli.main(arguments) == code
+    shown, complaint = capsys.readouterr()
+    assert complaint == ""
+    commands = [
+        line.split()[0] for line in shown.splitlines() if line.startswith("  ") and line[2] != " "
+    ]
+    assert sorted(set(commands)) == sorted(cli.COMMANDS)
+
+
+def test_version(capsys: pytest.CaptureFixture):
+    """Claim: `--version` prints the version and nothing else."""
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr() == (f"{csac_jax.__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option", "extra"),
+    [
+        ("train smoke --tensorboard", "--tensorboard", "tensorboard"),
+        ("report . --out page", "--out", "bench"),
+    ],
+)
+def test_missing_extra(
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: str,
+    option: str,
+    extra: str,
+):
+    """Claim: an option that needs an extra says how to get it."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert cli.main(arguments.split()) == 2
+    wanted = f"csac-jax: {option} needs an extra; run: pip install 'csac-jax[{extra}]'\n"
+    assert capsys.readouterr() == ("", wanted)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (
+            FileExistsError(),
+            2,
+            "there exists; give another --run-dir, or go on with it by --resume",
+        ),
+        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
+        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
+    ],
+)
+def test_training_that_fails(
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    code: int,
+    line: str,
+):
+    """Claim: a run that fails is one line and an exit code; a folder that someone else has made
+    meanwhile as well."""
+    monkeypatch.setattr(cache, "enable", lambda: None)
+    monkeypatch.setattr(step, "make", lambda cfg: None)
+    monkeypatch.setattr(loop, "run", _raises(error))
+    assert cli.main(["train", "smoke", "--run-dir", "there"]) == code
+    assert capsys.readouterr().err == f"csac-jax: {line}\n"
+
+
+def test_networks_that_cannot_be_restored(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: a run whose config can be read and whose networks cannot is one line and exit code 1;
+    nothing is made."""
+    checkpoint.save(
+        Path("run"),
+        4,
+        {"step": checkpoint.jax.numpy.int32(4)},
+        SMOKE,
+        {"seconds": 1.0, "grasps": []},
+    )
+    monkeypatch.setattr(checkpoint, "restore", _raises(checkpoint.CheckpointError("4 is damaged")))
+    assert cli.main(["export", "run", "p.safetensors"]) == 1
+    assert capsys.readouterr() == ("", "csac-jax: 4 is damaged\n")
+    assert not Path("p.safetensors").exists()
+
+
+@pytest.mark.parametrize("command", ["eval {}", "play --policy {}", "export {} p.safetensors"])
+def test_file_that_holds_no_policy(capsys: pytest.CaptureFixture, command: str):
+    """Claim: a file that is no policy is one line and exit code 1."""
+    Path("x.safetensors").write_bytes(b"\x80\x04not this")
+    assert cli.main(command.format("x.safetensors").split()) == 1
+    shown, complaint = capsys.readouterr()
+    assert complaint.startswith("csac-jax: x.safetensors cannot be read as .safetensors")
+    assert (shown, complaint.count("\n")) == ("", 1)
+
+
+def test_export_overwrites_nothing(capsys: pytest.CaptureFixture):
+    """Claim: `export` refuses a file that exists, and leaves it as it is."""
+    Path("p.safetensors").write_text("mine")
+    assert cli.main(["export", str(policy_file.SHIPPED), "p.safetensors"]) == 2
+    assert capsys.readouterr() == ("", "csac-jax: p.safetensors exists; give another name\n")
+    assert Path("p.safetensors").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            "train quick --learn.bath 3",
+            "Unrecognized options: --learn.bath, 3; perhaps you meant --learn.batch",
+        ),
+        ("train quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        (f"train quick {'x' * 60}", f"Unrecognized options: {'x' * 60}"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+@pytest.mark.parametrize("columns", [None, "40"])
+def test_complaint_is_the_same_on_any_terminal(
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: str,
+    line: str,
+    encoding: str,
+    columns: str | None,
+):
+    """Claim: the parser's complaint is the whole message in one line, however wide the terminal is
+    and whether or not it draws boxes; the terminal's width stays what it was."""
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    if columns is None:
+        monkeypatch.delenv("COLUMNS", raising=False)
+    else:
+        monkeypatch.setenv("COLUMNS", columns)
+    assert cli.main(arguments.split()) == 2
+    assert capsys.readouterr().err == f"csac-jax: {line}; see csac-jax train quick --help\n"
+    assert os.environ.get("COLUMNS") == columns
+
+
+def test_watchdog_barks(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a self-test that hangs ends the process with one line and exit code 1; after one that
+    ends in time nothing waits any more."""
+    codes: list[int] = []
+    barked = threading.Event()
+    monkeypatch.setattr(os, "_exit", lambda code: (codes.append(code), barked.set()))
+    before = set(threading.enumerate())
+    with doctor._watchdog(60.0, "in time"):
+        (timer,) = set(threading.enumerate()) - before
+    timer.join(30.0)
+    assert not timer.is_alive()
+    with doctor._watchdog(0.05, "it hangs"):
+        assert barked.wait(30.0)
+    assert codes == [1]
+    assert capsys.readouterr().err == "csac-jax: it hangs\n"

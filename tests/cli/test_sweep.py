@@ -1,0 +1,249 @@
+"""`csac-jax sweep`: bad input is one line, exit code 2 and nothing started; settings reach their
+configs."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from csac_jax import algorithms, cli, presets
+from csac_jax.cli import sweep as command
+from csac_jax.io import checkpoint
+from csac_jax.runtime import signals
+from csac_jax.sweeps import sweep
+from csac_jax.training import loop, step
+from tests.training import toys
+
+SMOKE = presets.smoke()
+RUN = sweep.run
+
+
+@pytest.fixture(autouse=True)
+def nothing_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """No test of this file trains or takes over signals."""
+
+    def forbidden(*_, **__):
+        raise AssertionError("the sweep began")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sweep, "run", forbidden)
+    monkeypatch.setattr(signals, "install", signals.Stop)
+
+
+def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
+    code = cli.main(["sweep", *arguments.split()])
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    assert list(Path().iterdir()) == []
+    return code, captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "sweep: give a preset first, one of: smoke, quick"),
+        ("smoke --seeds 0", "--seeds: at least 1"),
+        ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
+        (
+            "smoke --net.kind densenet121 --net.norm batch --net.margin 0 --net.weights none.safetensors",
+            "net.weights: none.safetensors cannot be read as .safetensors",
+        ),
+        (
+            "smoke --vary learn.tua=0.1",
+            "--vary: 'learn.tua' is no setting; perhaps you meant learn.tau",
+        ),
+        ("smoke --vary learn.tau=", "--vary learn.tau=: give a setting and its values"),
+        ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
+        ("smoke --vary learn.tau=0.1,2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
+        ("smoke --vary learn.tau=0.1,0.10", "--vary: two settings have the same values"),
+        ("smoke --devices 4096", "--devices: 4096 asked for, there are "),
+        (
+            "smoke --sim.physics c --devices 2",
+            "--sim.physics: c computes on the host's cores, for one device",
+        ),
+        ("smoke --seeds 100000", "lower --seeds or --replay.capacity, vary fewer numbers"),
+        ("smoke --cluster", "several processes need --run-dir"),
+        (
+            "smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2",
+            "--process-id: must lie in 0 .. 1",
+        ),
+        ("smoke --run-dir .", ". exists; give another --run-dir"),
+        ("--resume x --learn.tau 0.1", "leave all others out"),
+        ("--resume x --seeds 5", "leave all others out"),
+        ("--resume x --run-dir y", "leave all others out"),
+        ("--resume x --vary learn.tau=0.1", "leave all others out"),
+        ("quick --resume x", "leave all others out"),
+    ],
+)
+def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
+    """Claim: what cannot be swept is one line that names the thing, exit code 2, and no folder is
+    made."""
+    code, line = _fails(capsys, arguments)
+    assert code == 2
+    assert message in line
+
+
+def test_no_sweep_to_resume(capsys: pytest.CaptureFixture):
+    """Claim: a folder without a sweep is one line and exit code 1."""
+    code, line = _fails(capsys, "--resume nowhere")
+    assert (code, "there is no sweep.json in nowhere" in line) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (FileExistsError(), 2, "there exists; give another --run-dir"),
+        (sweep.SweepError("all are lost"), 1, "all are lost"),
+        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
+        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
+    ],
+)
+def test_failures(
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    code: int,
+    message: str,
+):
+    """Claim: a sweep that fails is one line and an exit code; a folder that someone else has made
+    meanwhile as well."""
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(sweep, "run", fail)
+    assert cli.main(["sweep", "smoke", "--run-dir", "there"]) == code
+    assert capsys.readouterr().err.startswith(f"csac-jax: {message}")
+
+
+def test_settings_reach_their_configs():
+    """Claim: each setting is the preset with its algorithm, the flags for all, and its own values,
+    which win."""
+    flags = "--seeds 3 --seed 7 --learn.batch 4 --vary algo=csac,vpg --vary target.gamma=0.1,0.3"
+    options, plan = command.read(["smoke", *flags.split()])
+    assert (options.seeds, plan.seeds, options.devices, options.shard) == (3, 3, None, "seeds")
+    wanted = []
+    for algo in ("csac", "vpg"):
+        cfg = algorithms.configure(SMOKE, algo)
+        cfg = dataclasses.replace(cfg, seed=7, learn=dataclasses.replace(cfg.learn, batch=4))
+        wanted += [
+            dataclasses.replace(cfg, target=dataclasses.replace(cfg.target, gamma=gamma))
+            for gamma in (0.1, 0.3)
+        ]
+    assert [one.cfg for one in plan.settings] == wanted
+    assert plan.settings[1].name == "algo=csac,target.gamma=0.3"
+    assert [one.cfg.seed for one in sweep.members_of(plan)[:3]] == [7, 8, 9]
+
+
+def test_plan_survives_its_file(tmp_path: Path):
+    """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
+    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
+    (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
+    assert command.read(["--resume", str(tmp_path)])[1] == plan
+
+
+@pytest.mark.optax
+def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a sweep that is stopped by a signal exits with 130 or 143 and says how to go on;
+    resumed, it ends with 0 and its results. A small step stands in for the learner's."""
+    monkeypatch.setattr(sweep, "run", RUN)
+    for name, toy in (
+        ("make", toys.program),
+        ("begin", toys.begin),
+        ("train_step", toys.train_step),
+    ):
+        monkeypatch.setattr(step, name, toy)
+    for number in (2, 15):
+        stopped = signals.Stop()
+        stopped.signal = number
+        monkeypatch.setattr(signals, "install", lambda stopped=stopped: stopped)
+        first = (
+            ["smoke", "--seeds", "2", "--run-dir", "run"] if number == 2 else ["--resume", "run"]
+        )
+        assert cli.main(["sweep", *first]) == 128 + number
+        assert "go on with: csac-jax sweep --resume run" in capsys.readouterr().out
+    monkeypatch.setattr(signals, "install", signals.Stop)
+    assert cli.main(["sweep", "--resume", "run", "--json", "out.json"]) == 0
+    assert "interquartile mean of 2 seeds" in capsys.readouterr().out
+    result = json.loads(Path("out.json").read_text())
+    assert result["complete"]
+    assert len(result["compile_seconds"]) == 1
+    assert [row["run_dir"] for row in result["settings"][0]["members"]] == [
+        "base/seed-0",
+        "base/seed-1",
+    ]
+    assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--seeds 0", "bench sweep: --seeds, --steps, --repeats: at least 1"),
+        ("--devices 4096", "bench sweep: --devices: 4096 asked for"),
+        ("fats", "bench sweep: unknown preset 'fats'"),
+        (
+            "--learn.batch 8000 --train.learning_starts 8000",
+            "bench sweep: replay.capacity: must hold",
+        ),
+        (
+            "fast --physics warp --seeds 2 4",
+            "--seeds: 4 members of 2048 scenes side by side, Warp has room for",
+        ),
+        ("smoke --train.scene 4", "bench sweep: Unrecognized options: --train.scene"),
+    ],
+)
+def test_bad_arguments_of_the_benchmark(
+    capsys: pytest.CaptureFixture, arguments: str, message: str
+):
+    """Claim: what `bench sweep` cannot measure is one line and exit code 2."""
+    assert cli.main(["bench", "sweep", *arguments.split()]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.optax
+def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `bench sweep` prints a row for each number of seeds, and the run of one seed by
+    itself, with where they come from. A small step stands in for the learner's."""
+    for name, toy in (
+        ("make", toys.program),
+        ("begin", toys.begin),
+        ("train_step", toys.train_step),
+    ):
+        monkeypatch.setattr(step, name, toy)
+    assert (
+        cli.main(
+            [
+                "bench",
+                "sweep",
+                "smoke",
+                "--seeds",
+                "1",
+                "3",
+                "--repeats",
+                "1",
+                "--train.scenes",
+                "4",
+            ]
+        )
+        == 0
+    )
+    found = json.loads(capsys.readouterr().out)
+    assert [(row["seeds"], row["devices"]) for row in found["rows"]] == [(1, 1), (3, 1)]
+    for row in found["rows"]:
+        assert row["actions_per_second"] == pytest.approx(row["seeds"] * 4 * 2 / row["seconds"])
+    assert found["train"]["compile_seconds"] > 0.0
+    assert {"preset", "device", "versions", "commit"} <= found.keys()
+
+
+def test_devices_of_other_processes_count():
+    """Claim: C's physics, for one device, is neither chosen nor allowed where processes or devices
+    are several."""
+    several = ({"devices": 2}, {"processes": 2}, {"cluster": True}, {"devices": 1, "processes": 2})
+    assert all(command._devices(command.SweepOptions(**options)) > 1 for options in several)
+    assert {
+        command._devices(command.SweepOptions(**one))
+        for one in ({}, {"devices": 1}, {"processes": 1})
+    } == {1}

@@ -1,0 +1,139 @@
+"""Metrics of an evaluation, against SciPy and by hand."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from csac_jax.evaluation import metrics
+from csac_jax.evaluation.metrics import Episodes
+
+
+@pytest.mark.parametrize(
+    ("successes", "n"), [(0, 1), (1, 1), (0, 50), (50, 50), (1, 7), (47, 50), (1234, 4321)]
+)
+def test_wilson_agrees_with_scipy(successes: int, n: int):
+    """Claim: the interval of a share is Wilson's 95 % interval."""
+    wanted = scipy.stats.binomtest(successes, n).proportion_ci(0.95, method="wilson")
+    got = metrics.wilson(successes, n)
+    np.testing.assert_allclose([got["low"], got["high"]], [wanted.low, wanted.high], atol=1e-12)
+    assert got["value"] == successes / n
+    assert got["n"] == n
+
+
+def test_no_cases_no_value():
+    """Claim: where there are no cases, n is 0 and there is no value."""
+    assert metrics.wilson(0, 0) == {"value": None, "low": None, "high": None, "n": 0}
+    assert metrics.bootstrap_ratio(np.zeros(0), np.zeros(0), 0)["value"] is None
+
+
+def test_bootstrap_covers_the_truth():
+    """Claim: in about 95 of 100 repetitions the interval holds the true ratio."""
+    drawn = np.random.default_rng(0)
+    covered = 0
+    for seed in range(200):
+        actions = drawn.integers(3, 12, 60)
+        got = metrics.bootstrap_ratio(drawn.binomial(actions, 0.6), actions, 60, seed)
+        covered += got["low"] <= 0.6 <= got["high"]
+    assert 180 <= covered <= 198  # 190 +- 3 deviations of a binomial
+
+
+def test_bootstrap_repeats():
+    """Claim: the interval is the same each time, and another with another seed."""
+    above, below = np.arange(10), np.arange(10) + 5
+    assert metrics.bootstrap_ratio(above, below, 10, 1) == metrics.bootstrap_ratio(
+        above, below, 10, 1
+    )
+    assert metrics.bootstrap_ratio(above, below, 10, 1) != metrics.bootstrap_ratio(
+        above, below, 10, 2
+    )
+
+
+def _episodes() -> Episodes:
+    """Three episodes, with rubbish beyond their ends.
+
+    0: push, lift, lift: both blocks taken in 3 actions.  1: dropped, lift: one taken, the other
+    left the square. 2: nothing, empty, touched as the block was a wrong one, push: nothing taken of
+    2 blocks, ended by the action cap.
+    """
+    return Episodes(
+        valid=np.array([[1, 1, 1, 0], [1, 1, 0, 0], [1, 1, 1, 1]], bool),
+        primitive=np.array([[0, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0]], np.int32),
+        outcome=np.array([[4, 4, 4, 4], [3, 4, 4, 4], [0, 1, 2, 4]], np.int32),
+        cleared=np.array([[0, 1, 1, 9], [0, 1, 9, 9], [0, 0, 0, 0]], np.int32),
+        blocks=np.array([2, 2, 2], np.int32),
+        completed=np.array([True, True, False]),
+        blocks_lost=np.array([0, 1, 0], np.int32),
+        changed=np.array([[0, 1, 1, 1], [0, 1, 0, 0], [0, 0, 0, 0]], bool),
+        wrong=np.array([[1, 0, 0, 1], [0, 0, 1, 1], [0, 0, 1, 0]], bool),
+        ending=np.array([0, 0, 1], np.int32),
+    )
+
+
+def test_summary_by_hand():
+    """Claim: every metric is what its definition says, worked out by hand."""
+    got = metrics.summarise(_episodes())
+    values = {name: (entry["value"], entry["n"]) for name, entry in got.items() if "value" in entry}
+    assert values == {
+        "grasp_success": (3 / 7, 7),  # lifts at 0.1, 0.2 and 1.1 of 2 + 2 + 3 grasps
+        "completion": (1 / 3, 3),
+        "completion_reachable": (2 / 3, 3),
+        "action_efficiency": (3 / 9, 9),  # 3 blocks in 3 + 2 + 4 actions
+        "action_efficiency_completed": (2 / 3, 1),  # 2 blocks in 3 actions, of episode 0 alone
+    }
+    assert got["outcomes"] == {"nothing": 1, "empty": 1, "touched": 1, "dropped": 1, "lifted": 3}
+    assert got["counts"] == {
+        "episodes": 3,
+        "blocks": 6,
+        "pushes": 2,
+        "grasps": 7,
+        "taken": 3,
+        "blocks_lost": 1,
+    }
+
+
+def test_failures_by_hand():
+    """Claim: every cause of failure is what its definition says, worked out by hand; no action has
+    two."""
+    got = metrics.summarise(_episodes())["failures"]
+    assert {name: (entry["value"] * entry["n"], entry["n"]) for name, entry in got.items()} == {
+        "grasp_nothing": (1, 7),
+        "grasp_empty": (1, 7),
+        "grasp_touched": (0, 7),  # the only one brought a wrong block
+        "grasp_dropped": (1, 7),
+        "grasp_wrong_block": (1, 7),
+        "push_no_change": (2, 2),
+        "block_lost": (1, 6),
+        "episode_action_cap": (1, 3),
+        "episode_no_change_cap": (0, 3),
+        "episode_physics_diverged": (0, 3),
+    }
+    for entry in got.values():
+        assert entry["low"] <= entry["value"] <= entry["high"]
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_every_ending_is_counted(number: int):
+    """Claim: of the endings, each that is a failure has its own share of the episodes."""
+    got = metrics.summarise(_episodes()._replace(ending=np.full(3, number, np.int32)))["failures"]
+    ends = {name: entry["value"] for name, entry in got.items() if name.startswith("episode_")}
+    assert ends == {
+        f"episode_{name}": float(i == number) for i, name in enumerate(metrics.ENDINGS) if i > 0
+    }
+
+
+def test_intervals_hold_their_values():
+    """Claim: every interval holds its value."""
+    for entry in metrics.summarise(_episodes()).values():
+        if "value" in entry:
+            assert entry["low"] <= entry["value"] <= entry["high"]
+
+
+def test_no_grasps():
+    """Claim: a policy that only pushes has no grasp success, and the other metrics still stand."""
+    episodes = _episodes()._replace(
+        primitive=np.zeros((3, 4), np.int32), completed=np.zeros(3, bool)
+    )
+    got = metrics.summarise(episodes)
+    assert got["grasp_success"]["n"] == 0
+    assert got["action_efficiency_completed"]["n"] == 0
+    assert got["completion"]["value"] == 0.0

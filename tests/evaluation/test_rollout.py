@@ -1,0 +1,201 @@
+"""Episodes of fixed policies."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import env as environment, presets
+from csac_jax.agent import learner as learning
+from csac_jax.config import TaskConfig
+from csac_jax.constants import Outcome, Primitive
+from csac_jax.env import Env, State
+from csac_jax.evaluation import rollout
+from csac_jax.evaluation.metrics import Episodes
+from csac_jax.scene import layout
+from csac_jax.sim.primitives import Action
+
+pytestmark = pytest.mark.mjx
+
+CFG = dataclasses.replace(
+    presets.smoke(), task=TaskConfig(max_actions=6, max_steps_without_change=3)
+)
+EPISODES = 5
+REACH = 0.012  # m
+
+
+class Magnet(Env):
+    """No physics: a grasp within REACH of a block's centre takes it, all else does nothing."""
+
+    def step(self, state: State, action: Action) -> State:
+        off = jnp.linalg.norm(state.scene.position[:, :2] - action.pose[None, :2], axis=1)
+        taken = state.scene.in_play & (off < REACH) & (action.primitive == Primitive.GRASP)
+        scene = layout.park(state.scene, ~taken)
+        actions, steps_without_change = (
+            state.actions + 1,
+            jnp.where(jnp.any(taken), 0, state.steps_without_change + 1),
+        )
+        terminated = ~jnp.any(scene.in_play)
+        capped = (actions >= self.cfg.task.max_actions) | (
+            steps_without_change >= self.cfg.task.max_steps_without_change
+        )
+        outcome = jnp.where(jnp.any(taken), jnp.int32(Outcome.LIFTED), jnp.int32(Outcome.EMPTY))
+        return state.replace(
+            scene=scene,
+            obs=self.look(scene),
+            terminated=terminated,
+            truncated=capped & ~terminated,
+            actions=actions,
+            steps_without_change=steps_without_change,
+            reward=jnp.any(taken).astype(jnp.float32),
+            info=state.info.replace(
+                outcome=outcome,
+                cleared=jnp.sum(taken, dtype=jnp.int32),
+                moved=jnp.where(jnp.any(taken), 25.0, 0.0),
+            ),
+        )
+
+
+@pytest.fixture(scope="module")
+def magnet() -> Magnet:
+    made = environment.make(CFG, stream=1, scenes=EPISODES)
+    return Magnet(made.cfg, made.physics, made.scenes)
+
+
+@pytest.fixture(scope="module")
+def random(magnet) -> Episodes:
+    with jax.debug_key_reuse(True):
+        return rollout.rollout(CFG, magnet, "random", None, EPISODES, 0)
+
+
+def assert_consistent(episodes: Episodes, max_actions: int) -> None:
+    """What holds of every record of episodes."""
+    actions = episodes.valid.sum(axis=1)
+    np.testing.assert_array_equal(
+        episodes.valid, np.arange(max_actions)[None] < actions[:, None]
+    )  # a prefix
+    assert np.all(actions >= 1)
+    assert not np.any(episodes.cleared[~episodes.valid])
+    taken = episodes.cleared.sum(axis=1)
+    np.testing.assert_array_equal(
+        (taken + episodes.blocks_lost == episodes.blocks), episodes.completed
+    )
+    assert np.all(taken + episodes.blocks_lost <= episodes.blocks)
+    grasps = episodes.valid & (episodes.primitive == Primitive.GRASP)
+    np.testing.assert_array_equal(
+        (episodes.cleared > 0), grasps & (episodes.outcome == Outcome.LIFTED)
+    )
+
+
+def _blocks(env: Env) -> np.ndarray:
+    """Blocks in the scenes of EPISODES episodes: the pool has six, three of two blocks and three of
+    three."""
+    in_play = env.scenes.in_play.sum(axis=1)
+    np.testing.assert_array_equal(in_play, [2, 2, 2, 3, 3, 3])
+    return in_play[[0, 1, 2, 3, 4]]
+
+
+def test_oracle_by_hand(magnet):
+    """Claim: where a grasp above a block always takes it, the oracle takes one block with each
+    action, and all."""
+    episodes = rollout.rollout(CFG, magnet, "oracle", None, EPISODES, 0)
+    assert_consistent(episodes, CFG.task.max_actions)
+    np.testing.assert_array_equal(episodes.blocks, _blocks(magnet))
+    assert np.all(episodes.completed)
+    np.testing.assert_array_equal(episodes.valid.sum(axis=1), episodes.blocks)
+    np.testing.assert_array_equal(episodes.cleared[episodes.valid], 1)
+
+
+def test_random_episodes_end_at_the_caps(magnet, random):
+    """Claim: records are consistent; an episode that is not completed ran to the action cap or the
+    no-change cap."""
+    assert_consistent(random, CFG.task.max_actions)
+    assert random.valid.shape == (EPISODES, CFG.task.max_actions)
+    assert not np.all(random.completed)
+    for i, (cleared, valid) in enumerate(zip(random.cleared, random.valid, strict=True)):
+        num = valid.sum()
+        steps_without_change = num >= CFG.task.max_steps_without_change and not np.any(
+            cleared[num - CFG.task.max_steps_without_change : num]
+        )
+        capped = 1 if num == CFG.task.max_actions else 2 if steps_without_change else None
+        assert random.ending[i] == (0 if random.completed[i] else capped)
+    np.testing.assert_array_equal(random.changed & random.valid, random.cleared > 0)
+    assert not random.wrong.any()
+
+
+def test_same_seed_same_episodes(magnet, random):
+    """Claim: the same seed gives the same episodes, another seed others; in parts too, all of them
+    are run."""
+    again, other = (rollout.rollout(CFG, magnet, "random", None, EPISODES, seed) for seed in (0, 1))
+    for a, b in zip(random, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert any(not np.array_equal(a, b) for a, b in zip(random, other, strict=True))
+
+
+def test_batches_do_not_matter(magnet, random, monkeypatch):
+    """Claim: what an episode draws does not depend on how many run side by side, nor on one left
+    over."""
+    begin, key = rollout._program(magnet, "random").begin, jax.random.key(0)
+    rows = [
+        jax.tree.map(lambda leaf, some=some: leaf[some], magnet.scenes)
+        for some in (slice(0, 5), slice(3, 5))
+    ]
+    whole, part = begin(key, jnp.arange(5), rows[0]), begin(key, jnp.arange(3, 5), rows[1])
+    np.testing.assert_allclose(whole.scene.position[3:], part.scene.position, atol=1e-6)
+    monkeypatch.setattr(rollout, "SIDE_BY_SIDE", 3)
+    for together, apart in zip(
+        random, rollout.rollout(CFG, magnet, "random", None, EPISODES, 0), strict=True
+    ):
+        np.testing.assert_array_equal(together, apart)
+
+
+@pytest.mark.slow
+def test_endings_by_hand(magnet):
+    """Claim: with two actions at most, scenes of two blocks are cleared and those of three are cut
+    off by that cap."""
+    cfg = dataclasses.replace(CFG, task=TaskConfig(max_actions=2, max_steps_without_change=2))
+    short = Magnet(cfg, magnet.physics, magnet.scenes)
+    episodes = rollout.rollout(cfg, short, "oracle", None, EPISODES, 0)
+    np.testing.assert_array_equal(episodes.ending, np.where(_blocks(magnet) == 2, 0, 1))
+
+
+@pytest.mark.slow
+def test_more_episodes_than_run_at_once(magnet, monkeypatch):
+    """Claim: episodes beyond those that run side by side follow in order, each from its own
+    scene."""
+    monkeypatch.setattr(rollout, "SIDE_BY_SIDE", 3)
+    episodes = rollout.rollout(CFG, magnet, "oracle", None, EPISODES, 0)
+    np.testing.assert_array_equal(episodes.blocks, _blocks(magnet))
+    assert np.all(episodes.completed)
+
+
+@pytest.mark.slow
+def test_learned_needs_its_networks_only(magnet):
+    """Claim: the learned policy runs from parameters alone and gives consistent records."""
+    learner = learning.make(CFG)
+    params = jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)).online
+    assert_consistent(
+        rollout.rollout(CFG, magnet, "learned", params, EPISODES, 0), CFG.task.max_actions
+    )
+
+
+def test_unknown_policy(magnet):
+    """Claim: a policy that there is not is a ValueError that names those that there are."""
+    with pytest.raises(ValueError, match="'best' is not one of: learned, random, oracle"):
+        rollout.rollout(CFG, magnet, "best", None, 1, 0)
+
+
+@pytest.mark.slow
+def test_oracle_beats_random_in_physics():
+    """Claim: in physics too the oracle clears more blocks per action than random grasps above
+    blocks."""
+    cfg = presets.smoke()
+    env = environment.make(cfg, stream=1, scenes=12)
+    oracle, random = (rollout.rollout(cfg, env, name, None, 12, 0) for name in ("oracle", "random"))
+    for episodes in (oracle, random):
+        assert_consistent(episodes, cfg.task.max_actions)
+    efficiency = [e.cleared.sum() / e.valid.sum() for e in (oracle, random)]
+    assert efficiency[0] > 1.3 * efficiency[1]
+    assert oracle.completed.mean() >= 0.75

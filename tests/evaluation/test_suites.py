@@ -1,0 +1,184 @@
+"""The scenes that policies are measured on."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import presets
+from csac_jax.config import Config, TaskConfig
+from csac_jax.evaluation import rollout, suites
+from csac_jax.scene import cases, layout, pool
+
+pytestmark = pytest.mark.mjx
+
+SMOKE = presets.smoke()
+CFG = dataclasses.replace(SMOKE, sim=dataclasses.replace(SMOKE.sim, physics="c"))
+TARGET = dataclasses.replace(CFG, task=TaskConfig(kind="target"))
+EPISODES = 5
+
+
+def _varied(cfg: Config, name: str, count: int = 40):
+    env = suites.environments(cfg, "cases", EPISODES, 0)[name]
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
+    return scene, jax.device_get(
+        jax.vmap(env.vary, (0, None))(jax.random.split(jax.random.key(0), count), scene)
+    )
+
+
+def test_cases_are_the_shipped_files():
+    """Claim: the suite `cases` has one part per shipped case, which holds its blocks and nothing
+    else."""
+    parts = suites.environments(CFG, "cases", EPISODES, 0)
+    assert tuple(parts) == cases.names()
+    for name, env in parts.items():
+        wanted = cases.load(cases.shipped(name), CFG.heightmap.extent)
+        scene = jax.tree.map(lambda leaf: leaf[0], env.scenes)
+        places = [
+            block["position"] for block in json.loads(cases.shipped(name).read_text())["blocks"]
+        ]
+        order = [int(np.argmin(np.linalg.norm(scene.position - place, axis=1))) for place in places]
+        assert sorted(order) == np.flatnonzero(scene.in_play).tolist()
+        assert [env.cfg.scene.slots[slot] for slot in order] == list(wanted.slots)
+        for field in ("position", "quaternion", "half_size", "colour"):
+            np.testing.assert_array_equal(
+                getattr(scene, field)[order], getattr(wanted.scene, field)
+            )
+        assert order[int(wanted.scene.target)] == scene.target
+        assert env.cfg.sim.contacts >= 64
+
+
+@pytest.mark.parametrize("suite", ["random10", "generated"])
+def test_suite_is_the_same_for_every_policy(suite: str):
+    """Claim: scenes that are dropped or drawn do not depend on what a policy was trained with."""
+    alike = dataclasses.replace(
+        CFG.scene, size_jitter=0.0, mesh_size_jitter=0.0, density=(600.0, 600.0), arranged=0.5
+    )
+    (one,), (other,) = (
+        suites.environments(cfg, suite, 2, 0).values()
+        for cfg in (CFG, dataclasses.replace(CFG, scene=alike))
+    )
+    jax.tree.map(np.testing.assert_array_equal, one.scenes, other.scenes)
+    assert len(np.unique(one.scenes.density)) > 2
+
+
+def test_cases_share_their_compilation():
+    """Claim: all four cases have one config and one physics, so that what is compiled for one
+    serves all."""
+    first, *others = suites.environments(CFG, "cases", EPISODES, 0).values()
+    assert all(env.cfg == first.cfg and env.physics is first.physics for env in others)
+    begun = rollout._cached.cache_info().misses
+    for env in (first, *others):
+        rollout._program(env, "oracle")
+    assert rollout._cached.cache_info().misses == begun + 1
+
+
+def test_cases_are_turned_as_a_whole():
+    """Claim: an episode begins with the case turned by any yaw, all blocks alike, so that no two
+    episodes are the same and all stay inside."""
+    scene, turned = _varied(CFG, "row")
+    lies = np.asarray(scene.in_play)
+    before, after = np.asarray(scene.position)[lies], turned.position[:, lies]
+    yaws = np.arctan2(after[..., 1], after[..., 0]) - np.arctan2(
+        before[:, 1], before[:, 0]
+    )  # [episodes, blocks]
+    np.testing.assert_allclose(
+        np.exp(1j * yaws), np.broadcast_to(np.exp(1j * yaws[:, :1]), yaws.shape), atol=1e-3
+    )
+    assert len(np.unique(np.mod(yaws[:, 0], 2.0 * np.pi).round(3))) > 35
+    assert (
+        np.histogram(np.mod(yaws[:, 0], 2.0 * np.pi), bins=4, range=(0, 2.0 * np.pi))[0].min() >= 3
+    )  # 10 expected
+    assert np.abs(after[..., :2]).max() <= 0.5 * CFG.heightmap.extent
+
+
+def test_target_is_the_cases_own():
+    """Claim: the target task asks for the block that the file marks, the clearing task for any."""
+    scene, turned = _varied(TARGET, "hole")
+    assert (turned.target == scene.target).all()
+    assert scene.target != layout.ANY
+    assert (_varied(CFG, "hole")[1].target == layout.ANY).all()
+
+
+@pytest.mark.slow
+def test_generated_scenes_follow_the_seed():
+    """Claim: the suite `generated` is the same for the same seed, another for another, and harder
+    towards its end."""
+    first, again, other = (
+        suites.environments(CFG, "generated", 30, seed)["generated"].scenes for seed in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(first.position, again.position)
+    assert len({scene.tobytes() for scene in (*first.position, *other.position)}) == 60
+    in_play = first.in_play.sum(axis=1)
+    assert in_play[20:].mean() > in_play[:10].mean()
+
+
+def test_users_case_file(tmp_path: Path):
+    """Claim: a case file of the user's is a suite by itself."""
+    path = tmp_path / "mine.json"
+    block = {
+        "shape": "cube",
+        "colour": "red",
+        "position": [0.0, 0.1, 0.025],
+        "quaternion": [1, 0, 0, 0],
+    }
+    path.write_text(json.dumps({"name": "mine", "blocks": [block]}))
+    (env,) = suites.environments(CFG, str(path), EPISODES, 0).values()
+    assert env.cfg.scene.slots == ("box",)
+    with pytest.raises(ValueError, match="target"):
+        suites.environments(TARGET, str(path), EPISODES, 0)
+
+
+@pytest.mark.parametrize(("suite", "blocks", "most"), [("random10", 10, 25), ("random30", 30, 75)])
+def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int, most: int):
+    """Claim: random10 and random30 hold ten and thirty blocks of all kinds, contacts and actions
+    enough for them, and scenes of a stream that is not the training's; none is arranged, whatever
+    the training's are."""
+    asked = []
+
+    def settled(world, cfg, extent, stream, count, poured=False):
+        asked.append((cfg.slots, cfg.min_blocks, stream, count, poured))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.slots))
+
+    monkeypatch.setattr(pool, "settled", settled)
+    packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))
+    (env,) = suites.environments(packed, suite, EPISODES, 0).values()
+    ((slots, least, stream, count, poured),) = asked
+    assert (len(slots), least, count, poured) == (blocks, blocks, EPISODES, suite == "random30")
+    assert set(slots) == {"box", "arch", "prism", "half_cylinder", "cylinder"}
+    assert stream != pool.TRAIN_STREAM
+    assert env.cfg.task.max_actions == most
+    assert env.cfg.sim.contacts >= 8 * blocks
+    long = dataclasses.replace(CFG, task=TaskConfig(max_actions=90))
+    assert suites.environments(long, suite, EPISODES, 0)[suite].cfg.task.max_actions == 90
+
+
+def test_target_suite(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the suite `target` is the cases and random10, one marked block each, within 5 actions;
+    a policy that was trained to clear the table is refused, one that reads the blocks' poses is
+    not."""
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN.scene.slots))
+    everyone = blank.replace(in_play=np.ones_like(blank.in_play))
+    monkeypatch.setattr(pool, "settled", lambda *_, **__: everyone)
+    for cfg, policy in ((TARGET, "learned"), (CFG, "oracle"), (CFG, "random")):
+        parts = suites.environments(cfg, "target", EPISODES, 0, policy)
+        assert tuple(parts) == (*cases.names(), "random10")
+        for env in parts.values():
+            assert (env.cfg.task.kind, env.cfg.task.max_actions) == ("target", 5)
+            scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
+            varied = env.vary(jax.random.key(0), scene)
+            assert scene.in_play[varied.target]
+    with pytest.raises(
+        ValueError, match=r"^--suite: target needs a policy trained with --task.kind target"
+    ):
+        suites.environments(CFG, "target", EPISODES, 0)
+
+
+def test_unknown_suite():
+    """Claim: a suite that is none is refused with the names of those that there are."""
+    with pytest.raises(ValueError, match=r"'hard'.*random10, random30, cases, target, generated"):
+        suites.environments(CFG, "hard", EPISODES, 0)

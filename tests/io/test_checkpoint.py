@@ -1,0 +1,230 @@
+"""Checkpoints: what comes back, and what is refused."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from csac_jax import presets
+from csac_jax.io import checkpoint
+from csac_jax.io.checkpoint import CheckpointError
+
+CFG = presets.smoke()
+
+
+class Moments(NamedTuple):
+    mean: jax.Array
+    count: jax.Array
+
+
+@struct.dataclass
+class State:
+    key: jax.Array
+    keys: jax.Array
+    step: jax.Array
+    moments: tuple[Moments, tuple[()]]
+    params: dict[str, jax.Array]
+
+
+def _state(seed: int = 0) -> State:
+    """A state with the kinds of leaves that a run has: keys, nested containers, small dtypes,
+    NaN."""
+    key = jax.random.key(seed)
+    drawn = np.random.default_rng(seed)
+    return State(
+        key=key,
+        keys=jax.random.split(jax.random.fold_in(key, 1), 3),
+        step=jnp.int32(7),
+        moments=(Moments(jnp.asarray(drawn.normal(size=(3, 5)), jnp.float32), jnp.uint8(200)), ()),
+        params={
+            "w.x": jnp.asarray(drawn.normal(size=4), jnp.bfloat16),
+            "b": jnp.array([True, False]),
+            "nan": jnp.array([jnp.nan, -0.0], jnp.float32),
+            "heights": jnp.asarray(drawn.integers(0, 2**16, (2, 64, 64)), jnp.uint16),
+        },
+    )
+
+
+def _bits(leaf: jax.Array) -> tuple[str, tuple[int, ...], bytes]:
+    raw = (
+        jax.random.key_data(leaf)
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        else leaf
+    )
+    return str(leaf.dtype), leaf.shape, np.asarray(raw).tobytes()
+
+
+def _same(a: State, b: State) -> bool:
+    return jax.tree.structure(a) == jax.tree.structure(b) and jax.tree.leaves(
+        jax.tree.map(_bits, a)
+    ) == jax.tree.leaves(jax.tree.map(_bits, b))
+
+
+def _abstract(seed: int = 0) -> State:
+    return jax.eval_shape(lambda: _state(seed))
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    """A run with checkpoints of steps 4 and 8."""
+    for step in (4, 8):
+        checkpoint.save(tmp_path, step, _state(step), CFG, {"seconds": step / 2, "grasps": [0, 1]})
+    return tmp_path
+
+
+def _data_file(run_dir: Path, step: int) -> Path:
+    """The largest file of a step: array data."""
+    files = [
+        path
+        for path in (run_dir / "checkpoints" / str(step) / "state").rglob("*")
+        if path.is_file()
+    ]
+    return max(files, key=lambda path: path.stat().st_size)
+
+
+def test_state_comes_back_bit_for_bit(run_dir: Path):
+    """Claim: every leaf comes back with its bits, dtype and place; keys are typed keys again."""
+    state, extra = checkpoint.restore(run_dir, _abstract())
+    assert _same(state, _state(8))
+    assert not _same(state, _state(4))
+    assert extra == {"seconds": 4.0, "grasps": [0, 1]}
+    assert jax.random.bits(state.key) == jax.random.bits(_state(8).key)
+
+
+def test_older_step_by_name(run_dir: Path):
+    """Claim: an older step is restored if it is asked for."""
+    state, _ = checkpoint.restore(run_dir, _abstract(), step=4)
+    assert _same(state, _state(4))
+
+
+def test_config_comes_back(run_dir: Path):
+    """Claim: the config is read from the checkpoint alone."""
+    assert checkpoint.load_config(run_dir) == CFG
+
+
+def test_relative_folder(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the run's folder may be given relative to the working directory."""
+    monkeypatch.chdir(run_dir.parent)
+    assert checkpoint.load_config(Path(run_dir.name)) == CFG
+
+
+def test_last_two_are_kept(run_dir: Path):
+    """Claim: the last two steps are kept."""
+    checkpoint.save(run_dir, 12, _state(), CFG, {})
+    assert sorted(
+        path.name for path in (run_dir / "checkpoints").iterdir() if path.name.isdigit()
+    ) == ["12", "8"]
+    assert checkpoint.latest_step(run_dir) == 12
+
+
+def test_temporary_folders_are_removed(run_dir: Path):
+    """Claim: what a killed save left behind is no step, and the next save removes it."""
+    left = run_dir / "checkpoints" / "10.orbax-checkpoint-tmp"
+    left.mkdir()
+    assert checkpoint.latest_step(run_dir) == 8
+    assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(8))
+    assert left.exists()  # a reader leaves a running writer alone
+    checkpoint.save(run_dir, 12, _state(), CFG, {})
+    assert not left.exists()
+
+
+@pytest.mark.parametrize("position", [0.0, 0.5, 0.99])
+def test_flipped_bit_is_refused(run_dir: Path, position: float):
+    """Claim: a flipped bit is an error of one line that names the file and the newest sound
+    step."""
+    file = _data_file(run_dir, 8)
+    data = bytearray(file.read_bytes())
+    data[int(position * len(data))] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(
+        CheckpointError, match=rf"8 is damaged.*{file.name} has changed.*from step 4"
+    ) as caught:
+        checkpoint.restore(run_dir, _abstract())
+    assert "\n" not in str(caught.value)
+    with pytest.raises(CheckpointError, match="damaged"):
+        checkpoint.load_config(run_dir)
+
+
+def test_truncated_file_is_refused(run_dir: Path):
+    """Claim: a cut-off file is an error."""
+    file = _data_file(run_dir, 8)
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="has changed"):
+        checkpoint.restore(run_dir, _abstract())
+
+
+def test_deleted_file_is_refused(run_dir: Path):
+    """Claim: a missing file is an error that names it."""
+    file = _data_file(run_dir, 8)
+    file.unlink()
+    with pytest.raises(CheckpointError, match=f"{file.name} is missing"):
+        checkpoint.restore(run_dir, _abstract())
+
+
+def test_half_written_step_is_refused(run_dir: Path):
+    """Claim: a step without its manifest is half-written; no older one is taken in its place."""
+    (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).unlink()
+    with pytest.raises(CheckpointError, match=r"half-written.*from step 4.*delete"):
+        checkpoint.restore(run_dir, _abstract())
+
+
+def test_remedy_works(run_dir: Path):
+    """Claim: deleting the folder that the message names makes the run go on from the older step."""
+    _data_file(run_dir, 8).unlink()
+    (run_dir / "checkpoints" / "8").rename(run_dir / "elsewhere")
+    assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(4))
+
+
+def test_no_sound_step_is_left(run_dir: Path):
+    """Claim: with no sound step left the message says so."""
+    for step in (4, 8):
+        _data_file(run_dir, step).unlink()
+    with pytest.raises(CheckpointError, match="train anew"):
+        checkpoint.restore(run_dir, _abstract())
+
+
+def test_missing_checkpoint(tmp_path: Path):
+    """Claim: a folder without a checkpoint, or without the step asked for, is an error that says
+    so."""
+    assert checkpoint.latest_step(tmp_path) is None
+    with pytest.raises(CheckpointError, match="there is no checkpoint under"):
+        checkpoint.load_config(tmp_path)
+    checkpoint.save(tmp_path, 4, _state(), CFG, {})
+    with pytest.raises(CheckpointError, match="no checkpoint of step 5"):
+        checkpoint.restore(tmp_path, _abstract(), step=5)
+
+
+def test_other_dtype_or_shape_is_refused(run_dir: Path):
+    """Claim: a leaf of another dtype or shape, one too many or too few is an error, not a cast."""
+    wanted = _abstract()
+    for change, message in (
+        (
+            {"step": jax.ShapeDtypeStruct((), jnp.float32)},
+            r"step as int32\[\], the program needs float32\[\]",
+        ),
+        (
+            {"step": jax.ShapeDtypeStruct((2,), jnp.int32)},
+            r"step as int32\[\], the program needs int32\[2\]",
+        ),
+        ({"params": {**wanted.params, "c": wanted.step}}, r"params\.c as nothing"),
+        ({"params": {"b": wanted.params["b"]}}, "the program needs nothing"),
+        ({"key": jax.eval_shape(lambda: jax.random.key(0, impl="rbg"))}, r"key as key<fry>\[\]"),
+    ):
+        with pytest.raises(CheckpointError, match=message):
+            checkpoint.restore(run_dir, dataclasses.replace(wanted, **change))
+
+
+def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a config with a setting that this version does not know is an error that names it."""
+    good = checkpoint.config_json.to_dict
+    monkeypatch.setattr(checkpoint.config_json, "to_dict", lambda cfg: {**good(cfg), "sweep": 1})
+    folder = checkpoint.save(tmp_path, 4, _state(), CFG, {})
+    assert json.loads((folder / checkpoint.MANIFEST).read_text())
+    with pytest.raises(CheckpointError, match=r"another version.*sweep: unknown setting"):
+        checkpoint.load_config(tmp_path)

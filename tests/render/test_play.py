@@ -1,0 +1,106 @@
+"""`csac-jax play` from the arguments to the files, with our rays."""
+
+import json
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from csac_jax import cli
+from csac_jax.render import gl, play
+
+pytestmark = pytest.mark.mjx
+
+CUBE = {
+    "shape": "cube",
+    "colour": "red",
+    "position": [0.05, 0.0, 0.025],
+    "quaternion": [1, 0, 0, 0],
+}
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder with the case of one cube, on a machine with no OpenGL."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gl, "choose", lambda: None)
+    (tmp_path / "cube.json").write_text(json.dumps({"name": "cube", "blocks": [CUBE]}))
+    return tmp_path
+
+
+def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
+    """Claim: with no OpenGL, the planner takes a cube: a line per action, picture, video of the
+    whole motion, JSON."""
+    files = ["--png", "a/b.png", "--video", "a/b.mp4", "--json", "a/b.json"]
+    assert cli.main(["play", "--scene", "cube.json", "--size", "96", "64", *files]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert "grasp at x " in lines[0]
+    assert "lifted (red); reward +1.00; 0 blocks left" in lines[0]
+    assert lines[1] == "the table is clear after 1 actions, 1 blocks taken"
+    result = json.loads((here / "a" / "b.json").read_text())
+    assert (result["actions"], result["cleared"], result["completed"], result["renderer"]) == (
+        1,
+        1,
+        True,
+        "rays",
+    )
+    assert (
+        imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + play.HOLD
+    )  # 4 ms a substep, 25 a second
+    frames = imageio_ffmpeg.read_frames("a/b.mp4")
+    width, height = next(frames)["size"]
+    assert (width, height) == (
+        96 + 64,
+        64 + 16,
+    )  # the height map to the right, two lines of text below
+    pictures = [
+        np.frombuffer(frame, np.uint8).reshape(height, width, 3)[:64, :96] for frame in frames
+    ]
+    red = [np.argwhere(_is_red(image)) for image in pictures]
+    row = [places[:, 0].mean() for places in red]
+    assert row[-1] < row[0] - 5  # the cube is seen to rise
+
+
+def _is_red(image: np.ndarray) -> np.ndarray:
+    return image[..., 0] > 40 + image[..., 1:].max(axis=2).astype(int)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (
+            "--scene nowhere",
+            2,
+            "--scene: 'nowhere' is neither a case file nor one of: random, hole",
+        ),
+        ("--size 95 64", 2, "--size: both numbers must be even"),
+        ("--seed -1", 2, "--seed: must lie in"),
+        ("--policy nowhere", 1, "there is no folder nowhere"),
+        ("--robot ur10", 2, "robot"),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    here, capsys: pytest.CaptureFixture, arguments: str, code: int, message: str
+):
+    """Claim: what cannot be played is one line that names it, before anything is simulated."""
+    assert cli.main(["play", *arguments.split()]) == code
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_video_without_the_extra_names_it(
+    here, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: without ffmpeg's wheel, --video says in one line how to get it, before anything is
+    simulated."""
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert cli.main(["play", "--scene", "cube.json", "--video", "a.mp4"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == "csac-jax: --video needs an extra; run: pip install 'csac-jax[video]'\n"
+    assert captured.out == ""

@@ -1,0 +1,440 @@
+"""`csac-jax report` from recorded files to tables, figures and page."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from csac_jax import algorithms, cli, presets
+from csac_jax.cli import train
+from csac_jax.config import Algo
+from csac_jax.evaluation import metrics, statistics
+from csac_jax.io import config_json
+from csac_jax.report import charts, report, results
+
+CASES = ("hole", "row")
+
+
+def _config(algo: Algo, seed: int, **changed: Any) -> dict[str, Any]:
+    config = config_json.to_dict(algorithms.configure(presets.get("paper"), algo))
+    config["seed"] = seed
+    for name, value in changed.items():
+        section, _, field = name.partition("__")
+        config[section][field] = value
+    return config
+
+
+def _run(
+    folder: Path, config: dict[str, Any], success: list[float], record: dict[str, Any] | None = None
+) -> None:
+    """A run's folder as `train` writes it: 100 actions and 10 s a chunk, none but pushes in the
+    first."""
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps(config))
+    if record is not None:
+        (folder / "train.json").write_text(
+            json.dumps({"wall_seconds": 77.0, "config": config, **record})
+        )
+    lines = [
+        {
+            "actions": 100 * (i + 1),
+            "seconds": 10.0 * (i + 1),
+            "grasp_success": value,
+            "grasps_counted": 200,
+        }
+        for i, value in enumerate([None, *success])
+    ]
+    (folder / "metrics.jsonl").write_text(
+        "".join(json.dumps(line) + "\n" for line in lines) + '{"actions": 9'
+    )
+
+
+def _evaluation(
+    path: Path,
+    config: dict[str, Any],
+    lifted: int,
+    suite: str = "cases",
+    policy: str = "learned",
+    episodes: int = 10,
+) -> None:
+    """What `eval --json` writes: 10 grasps in each case, so many of them lifts."""
+    share = metrics.wilson(lifted, 10)
+    part = dict.fromkeys(results.METRIC_NAMES, share) | {"counts": {"episodes": episodes}}
+    part["failures"] = {"grasp_dropped": metrics.wilson(10 - lifted, 10)}
+    asked = {
+        "policy": policy,
+        "suite": suite,
+        "seed": 5,
+        "seconds": 3.0,
+        "device": "a card",
+        "commit": "0123456789abc",
+    }
+    path.write_text(json.dumps({**asked, "parts": dict.fromkeys(CASES, part), "config": config}))
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    """Two seeds of CSAC-beta, one of which ended early; one of VPG; one ablation; evaluations of
+    the first three."""
+    root = tmp_path / "sweep"
+    _run(
+        root / "beta" / "seed-0",
+        _config("csac_beta", 0),
+        [0.5, 0.8, 0.95],
+        {"device": "a card", "commit": "abc"},
+    )
+    _run(root / "beta" / "seed-1", _config("csac_beta", 1), [0.7, 0.9])
+    (root / "train.json").write_text(
+        json.dumps({"settings": [], "wall_seconds": 99.0, "device": "two cards"})
+    )
+    _run(root / "vpg", _config("vpg", 0), [0.2, 0.3, 0.4])
+    _run(root / "max", _config("csac_beta", 0, target__value="max"), [0.1, 0.2, 0.3])
+    for name, algo, seed, lifted in (
+        ("beta/seed-0", "csac_beta", 0, 10),
+        ("beta/seed-1", "csac_beta", 1, 8),
+    ):
+        _evaluation(root / name / "eval.json", _config(algo, seed, sim__physics="c"), lifted)  # type: ignore[arg-type]
+    _evaluation(root / "vpg" / "eval.json", _config("vpg", 0, sim__physics="c"), 5)
+    (root / "vpg" / "checkpoints").mkdir()
+    (root / "vpg" / "checkpoints" / "metrics.jsonl").write_text("not a log\n")
+    return root
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8, 11])
+def test_iqm_is_scipys_trimmed_mean(n: int):
+    """Claim: the interquartile mean leaves out a quarter of the values, rounded down, at either
+    end."""
+    values = np.random.default_rng(n).normal(size=(3, n))
+    np.testing.assert_allclose(
+        statistics.iqm(values), scipy.stats.trim_mean(values, 0.25, axis=1), atol=1e-12
+    )
+
+
+def test_band_covers_the_truth():
+    """Claim: of ten seeds, the band holds the mean of a symmetric law in about 9 of 10
+    repetitions."""
+    drawn = np.random.default_rng(0)
+    covered = 0
+    for _ in range(200):
+        found = statistics.band([drawn.normal(0.6, 0.1, 10), drawn.normal(0.4, 0.1, 10)])
+        assert found.low is not None
+        assert found.high is not None
+        covered += found.low <= 0.5 <= found.high
+    assert 165 <= covered <= 198
+
+
+def test_band_draws_within_strata():
+    """Claim: seeds are drawn anew within each task: tasks that differ add nothing to the band, and
+    none is left out."""
+    found = statistics.band([np.full(5, 0.1), np.full(5, 0.9), np.full(5, 0.8), np.full(5, 0.8)])
+    assert found == pytest.approx((0.65, 0.65, 0.65, 5))
+
+
+def test_one_seed_has_no_band():
+    """Claim: with one seed there is a value and no band, with none an error."""
+    assert statistics.band([np.array([0.7])]) == (0.7, None, None, 1)
+    with pytest.raises(ValueError, match="no values"):
+        statistics.band([np.zeros(0)])
+
+
+def test_runs_are_grouped_by_what_they_are(recorded: Path):
+    """Claim: runs that differ in their seed alone are one curve, the IQM of both up to where the
+    shorter ends."""
+    found = report.build(results.read([recorded]))
+    curves = {report.label(curve.variant, preset=False): curve for curve in found.curves}
+    assert set(curves) == {"CSAC-beta", "VPG", "CSAC-beta, target.value max"}
+    both = curves["CSAC-beta"]
+    assert both.actions.tolist() == [200, 300]
+    assert [band.value for band in both.success] == pytest.approx([0.6, 0.85])
+    assert (both.success[0].low, both.success[0].high) == pytest.approx((0.5, 0.7))
+    assert both.final.value == pytest.approx(0.925)
+    assert [run.seconds[-1] for run in both.runs] == [40.0, 30.0]
+
+
+def test_one_policy_measured_twice_is_not_two_runs(recorded: Path):
+    """Claim: evaluations of other lengths, and so of other scenes, stand beside each other and are
+    not averaged."""
+    _evaluation(
+        recorded / "vpg" / "longer.json", _config("vpg", 0, sim__physics="c"), 9, episodes=40
+    )
+    scores = [
+        one for one in report.build(results.read([recorded])).scores if one.variant.algo == "vpg"
+    ]
+    assert sorted((one.part, one.episodes) for one in scores) == sorted(
+        (case, n) for case in CASES for n in (10, 40)
+    )
+    assert {
+        (one.episodes, len(one.evaluations), one.band("completion").value) for one in scores
+    } == {(10, 1, 0.5), (40, 1, 0.9)}
+
+
+def test_numbers_as_json(recorded: Path):
+    """Claim: the JSON has every curve and score with its seeds, and where each number comes
+    from."""
+    content = json.loads(json.dumps(report.as_json(report.build(results.read([recorded])))))
+    beta = next(c for c in content["curves"] if c["algo"] == "csac_beta" and not c["changed"])
+    assert (beta["seeds"], beta["seconds_to_90"]) == ([0, 1], [40.0, 30.0])
+    scores = {(score["algo"], score["part"]): score for score in content["scores"]}
+    assert set(scores) == {(algo, case) for algo in ("csac_beta", "vpg") for case in CASES}
+    hole = scores["csac_beta", "hole"]
+    assert (hole["physics"], hole["seed"], hole["seeds"]) == ("c", 5, [0, 1])
+    assert hole["metrics"]["completion"] == pytest.approx(
+        {"value": 0.9, "low": 0.8, "high": 1.0, "n": 2}
+    )
+    alone, wilson = scores["vpg", "row"]["metrics"]["completion"], metrics.wilson(5, 10)
+    assert alone == pytest.approx(
+        {"value": 0.5, "low": wilson["low"], "high": wilson["high"], "n": 1}
+    )
+    rows = {row["file"]: row for row in content["provenance"]}
+    trained = rows["seed-0/metrics.jsonl"]
+    assert (trained["device"], trained["commit"], trained["wall time"]) == ("a card", "abc", "77 s")
+    swept = rows["seed-1/metrics.jsonl"]
+    assert (swept["device"], swept["wall time"]) == ("two cards", "99 s, whole sweep")
+    assert rows["vpg/metrics.jsonl"]["wall time"] == "40 s"  # no record: the log's last time
+    assert (
+        trained["settings as a command"]
+        == "csac-jax train paper --algo csac_beta --seed 0 --sim.physics c"
+    )
+    assert rows["max/metrics.jsonl"]["settings as a command"].endswith(
+        "--sim.physics c --target.value max"
+    )
+
+
+def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
+    """Claim: CSAC-beta is set against every other variant of which several seeds were measured in
+    the same scenes, part by part and over all parts; what was measured once, or in other scenes, is
+    not."""
+    assert not report.gaps(report.build(results.read([recorded])))  # VPG has one seed
+    for seed, lifted in ((1, 3), (2, 4)):
+        config = _config("vpg", seed, sim__physics="c")
+        _evaluation(recorded / "vpg" / f"more-{seed}.json", config, lifted)
+        config = _config("csac_beta", seed, sim__physics="c", target__value="max")
+        _evaluation(recorded / "max" / f"other-{seed}.json", config, lifted, episodes=20)
+    whole = report.build(results.read([recorded]))
+    found = report.gaps(whole)
+    assert [(gap.theirs.algo, gap.suite, gap.parts) for gap in found] == [
+        ("vpg", "cases", (case,)) for case in CASES
+    ] + [("vpg", "cases", CASES)]
+    for gap in found:
+        assert gap.ours.algo == "csac_beta"
+        assert not gap.ours.changed
+        band = gap.bands["grasp_success"]
+        assert band.value == pytest.approx(0.9 - 0.4)  # 10 and 8 of 10, and 5, 3 and 4
+        assert band.low is not None
+        assert band.high is not None
+        assert 0.3 <= band.low < 0.5 < band.high <= 0.7
+    rows = report.differences(whole)
+    assert [row[2] for row in rows[1:]] == ["cases: hole", "cases: row", "cases: mean of 2 parts"]
+    assert rows[1][4].startswith("+50.0 (+")
+    assert len(report.as_json(whole)["differences"]) == 3
+
+
+def test_training_is_compared_where_it_is_alike(tmp_path: Path):
+    """Claim: how far CSAC-beta ends ahead is said of every variant of several seeds that was
+    trained as long in the same scenes and task: not of another task, of other scenes, of a shorter
+    run, nor of one seed."""
+    others = {
+        "base": {},
+        "max": {"target__value": "max"},
+        "target": {"task__kind": "target"},
+        "packed": {"scene__arranged": 0.5},
+    }
+    for name, changed in others.items():
+        for seed, last in enumerate((0.9, 0.8) if name == "base" else (0.5, 0.6)):
+            _run(tmp_path / name / str(seed), _config("csac_beta", seed, **changed), [0.5, last])
+    for seed in range(2):
+        _run(tmp_path / "short" / str(seed), _config("csac_per", seed), [0.5])
+    _run(tmp_path / "once", _config("vpg", 0), [0.5, 0.5])
+    found = report.build(results.read([tmp_path]))
+    leads = {(c.variant.algo, c.variant.changed): report.lead(found, c) for c in found.curves}
+    compared = ("csac_beta", (("target.value", "max"),))
+    assert [key for key, band in leads.items() if band is not None] == [compared]
+    band = leads[compared]
+    assert band is not None
+    assert band.value == pytest.approx(0.85 - 0.55)
+    assert band.low == pytest.approx(0.2)
+    assert band.high == pytest.approx(0.4)
+    column = report.training(found)[0].index("CSAC-beta ahead by")
+    assert sorted(row[column] for row in report.training(found)[1:]) == [
+        "+30.0 (+20.0 to +40.0)",
+        *["-"] * 5,
+    ]
+    assert sum(curve["ahead"] is not None for curve in report.as_json(found)["curves"]) == 1
+
+
+def test_labels():
+    """Claim: settings that no result depends on name no variant; a label in a figure names as many
+    as it is told to."""
+    assert results.variant(_config("vpg", 0, train__chunk=7, train__save_every=3)).changed == ()
+    changed = {"net__head": 16, "net__growth": 8, "learn__batch": 4, "learn__tau": 0.5}
+    variant = results.variant(_config("vpg", 0, **changed))
+    assert set(report.label(variant).split(", ")[1:]) == {
+        "net.head 16",
+        "net.growth 8",
+        "learn.batch 4",
+        "learn.tau 0.5",
+    }
+    short = report.label(variant, preset=False, most=3)
+    assert (short.count(", "), short[-12:]) == (4, ", others (1)")
+    assert report.label(variant, preset=False, most=4) == report.label(variant, preset=False)
+
+
+def test_command_gives_the_config_back():
+    """Claim: the command in the provenance, parsed, is the run's config."""
+    changed = {
+        "policy__mask": False,
+        "replay__beta_end": [1.0, 6.0],
+        "train__actions": 900,
+        "net__head": 16,
+    }
+    config = _config("csac_per", 7, **changed)
+    run = results.Run(Path("x"), config, *[np.zeros(1)] * 4, record={})
+    program, command, *flags = results.command(run).split()
+    assert (program, command) == ("csac-jax", "train")
+    assert config_json.to_dict(train.read(flags)[1]) == config
+
+
+def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: an empty folder, runs of different lengths, one of a kind, one not evaluated: one line
+    each."""
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bare").mkdir()
+    (tmp_path / "bare" / "metrics.jsonl").write_text('{"actions": 1, "grasp_success": 1.0}\n')
+    assert cli.main(["report", str(recorded), str(tmp_path / "empty"), str(tmp_path / "bare")]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("- ")]
+    wanted = (
+        "empty: nothing is recorded",
+        "bare/metrics.jsonl: no config",
+        "bare: nothing is recorded",
+        "max/metrics.jsonl: not evaluated; run: csac-jax eval",
+        "CSAC-beta (paper): runs end at 300, 400 actions; their curve is drawn up to 300",
+        "VPG (paper): one run only",
+        "CSAC-beta (paper), target.value max: one run only",
+    )
+    assert len(notes) == len(wanted)
+    for text in wanted:
+        assert sum(text in note for note in notes) == 1, text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        ([], 2, "at least one folder"),
+        (["nowhere"], 2, "no file or folder nowhere"),
+        (["."], 1, "nothing is recorded"),
+    ],
+)
+def test_nothing_to_report(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    arguments: list,
+    code: int,
+    said: str,
+):
+    """Claim: without anything to report there is one line that says so, and an exit code."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["report", *arguments]) == code
+    complaint = capsys.readouterr().err
+    assert said in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_figures(recorded: Path):
+    """Claim: figure 6 has a line per method and the paper's marks at 2,500 actions, figure 9 a mark
+    per case."""
+    found = report.build(results.read([recorded]))
+    drawn = {name: figure for name, _, figure in charts.figures(found)}
+    assert set(drawn) == {"methods-paper", "variants-paper", "four-cases-cases-paper"}
+    lines = drawn["methods-paper"].axes[0].get_lines()
+    marks = [
+        line.get_xydata()[0]
+        for line in lines
+        if line.get_marker() == "D" and len(line.get_xydata())
+    ]
+    np.testing.assert_allclose(sorted(mark.tolist() for mark in marks), [[2500, 75], [2500, 90]])
+    drawn_curves = {
+        line.get_label(): line.get_ydata().tolist() for line in lines if line.get_marker() != "D"
+    }
+    assert drawn_curves["CSAC-beta (2)"] == pytest.approx([60, 85])
+    assert drawn_curves["VPG (1)"] == pytest.approx([20, 30, 40])
+    completion = drawn["four-cases-cases-paper"].axes[0]
+    points = [line.get_xydata()[0] for line in completion.get_lines() if line.get_marker() == "o"]
+    assert sorted(y for _, y in points) == pytest.approx(
+        [50] * 3 + [90] * 3
+    )  # two cases and their mean, two methods
+    ticks = [text.get_text() for text in completion.get_xticklabels()]
+    assert ticks == [*CASES, "mean"]
+
+
+def test_cases_of_each_preset_and_task(recorded: Path):
+    """Claim: figure 9 is drawn of each preset by itself, with the paper's two means, in the target
+    task without."""
+    other = _config("csac_beta", 0) | {"preset": "fast"}
+    _evaluation(recorded / "fast.json", other, 7)
+    _evaluation(recorded / "target.json", other, 3, suite="target")
+    drawn = {
+        name: figure for name, _, figure in charts.figures(report.build(results.read([recorded])))
+    }
+    for name, marks, lines in (("cases-paper", 6, 2), ("cases-fast", 3, 2), ("target-fast", 3, 0)):
+        shown = drawn[f"four-cases-{name}"].axes[0].get_lines()
+        assert sum(line.get_marker() == "o" for line in shown) == marks
+        assert sum(line.get_linestyle() == "--" for line in shown) == lines
+
+
+def test_samplers_are_drawn_where_there_are_several(recorded: Path):
+    """Claim: figure 7 is drawn of two samplers, not of one that was trained for two lengths."""
+    _run(recorded / "long", _config("csac_beta", 0, train__actions=5000), [0.5])
+    assert "samplers-paper" not in {
+        name for name, *_ in charts.figures(report.build(results.read([recorded])))
+    }
+    _run(recorded / "per", _config("csac_per", 0), [0.5])
+    assert "samplers-paper" in {
+        name for name, *_ in charts.figures(report.build(results.read([recorded])))
+    }
+
+
+def test_legend_of_many_curves_hides_none(recorded: Path):
+    """Claim: a legend lies among a few curves, and below the axes where many curves make it
+    large."""
+    curves = report.build(results.read([recorded])).curves
+    for number, below in ((charts.BESIDE, False), (charts.BESIDE + 1, True)):
+        figure = charts._lines((curves * 3)[:number])
+        assert (figure.axes[0].get_legend() is None) == below
+        assert bool(figure.legends) == below
+        if below:
+            figure.draw_without_rendering()
+            assert figure.legends[0].get_window_extent().y1 <= figure.axes[0].get_window_extent().y0
+
+
+def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: `report --out` writes one page with its figures inside, and the tables as text;
+    `--json` the numbers."""
+    out, numbers = tmp_path / "out", tmp_path / "report.json"
+    assert cli.main(["report", str(recorded), "--out", str(out), "--json", str(numbers)]) == 0
+    page = (out / "index.html").read_text()
+    assert page.count("<svg") == 3
+    assert "src=" not in page
+    assert "92.5 %" in page
+    shown = capsys.readouterr().out
+    assert (out / "results.md").read_text() in shown
+    assert "grasp dropped" in shown
+    assert "2 / 20" in shown  # of CSAC-beta: 0 and 2 of 10 grasps in each case
+    assert len(json.loads(numbers.read_text())["curves"]) == 3
+
+
+def test_reads_without_jax(recorded: Path):
+    """Claim: a report needs no JAX and no MuJoCo."""
+    code = (
+        "import sys; from csac_jax import cli; code = cli.main(['report', sys.argv[1]]); "
+        "sys.exit(code or 3 * bool({'jax', 'mujoco'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(recorded)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr

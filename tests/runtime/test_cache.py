@@ -1,0 +1,109 @@
+"""The cache of compiled programs, in fresh processes; the suite itself runs without it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+from csac_jax.runtime import cache
+
+ROOT = Path(cache.__file__).parents[2]
+
+PROGRAM = """
+import csac_jax, hashlib, json, time
+from csac_jax.train import cache
+import jax, jax.numpy as jnp
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+folder = cache.enable()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+rows = jnp.linspace(0.0, 1.0, 5000).reshape(50, 100)
+begun = time.perf_counter()
+step = lambda x, _: (jnp.tanh(x @ jnp.sort(x.T) / 50) @ x[:50] * 0.5 + jnp.cumsum(x, 1) * 0.01, x.sum())
+program = jax.jit(lambda x: jax.lax.scan(step, x, length=20), donate_argnums=0).lower(rows).compile()
+before = cache.hits()
+result = hashlib.sha256(b"".join(bytes(memoryview(jax.device_get(leaf))) for leaf in program(rows))).hexdigest()
+print(json.dumps({"folder": folder and str(folder), "hits": before, "result": result}))
+"""
+
+
+def _run(tmp_path: Path, **variables: str) -> dict:
+    """What PROGRAM prints in a fresh process whose cache directory is `tmp_path`; nothing may be on
+    stderr."""
+    settings = {"XDG_CACHE_HOME": str(tmp_path), "JAX_ENABLE_COMPILATION_CACHE": "1", **variables}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", PROGRAM],
+        env={**os.environ, **settings},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout) | {"stderr": done.stderr}
+
+
+def test_second_process_finds_the_program(tmp_path: Path):
+    """Claim: a second process takes the program from the cache and gets the same result, bit for
+    bit; only the user can read the folder; damaged entries are compiled anew and change nothing."""
+    first, second = _run(tmp_path), _run(tmp_path)
+    assert first["hits"] == 0
+    assert second["hits"] > 0
+    assert first["result"] == second["result"]
+    assert first["stderr"] == second["stderr"] == ""
+    folder = Path(first["folder"])
+    assert folder.parent == tmp_path / "csac_jax" / "xla"
+    assert folder.parent.stat().st_mode & 0o77 == 0
+    assert folder.stat().st_mode & 0o77 == 0
+    for i, path in enumerate(sorted(folder.glob("*-cache"))):
+        whole = bytearray(path.read_bytes())
+        whole[len(whole) // 2] ^= 0xFF
+        path.write_bytes(whole if i % 2 else whole[: len(whole) // 2])
+    third = _run(tmp_path)
+    assert third["hits"] == 0
+    assert third["result"] == first["result"]
+
+
+def test_folder_of_the_user_is_kept(tmp_path: Path):
+    """Claim: JAX_COMPILATION_CACHE_DIR decides; JAX_ENABLE_COMPILATION_CACHE=0 switches the cache
+    off."""
+    own = tmp_path / "own"
+    assert _run(tmp_path, JAX_COMPILATION_CACHE_DIR=str(own))["folder"] == str(own)
+    assert list(own.glob("*-cache"))
+    assert _run(tmp_path, JAX_ENABLE_COMPILATION_CACHE="0")["folder"] is None
+    assert not (tmp_path / "csac_jax").exists()
+
+
+def test_folder_that_cannot_be_made(tmp_path: Path):
+    """Claim: where the folder cannot be made, programs run as without a cache."""
+    (tmp_path / "csac_jax").write_text("in the way")
+    assert _run(tmp_path)["folder"] is None
+
+
+def test_processors_do_not_share(monkeypatch: pytest.MonkeyPatch):
+    """Claim: another processor, or another number of threads, has a folder of its own."""
+    here = cache._folder()
+    monkeypatch.setattr(cache, "_processor", lambda: ("model name: another",))
+    other = cache._folder()
+    monkeypatch.undo()
+    monkeypatch.setenv("PJRT_NPROC", "77")
+    assert len({here, other, cache._folder()}) == 3
+    assert any("flags" in line for line in cache._processor()) or not Path("/proc/cpuinfo").exists()
+
+
+def test_oldest_entries_go_first(tmp_path: Path):
+    """Claim: entries are deleted, oldest first, until the rest is no larger than it may be."""
+    for i in range(5):
+        (tmp_path / f"{i}-cache").write_bytes(bytes(100))
+        os.utime(tmp_path / f"{i}-cache", (i, i))
+    cache._prune(tmp_path, 250)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["3-cache", "4-cache"]
+
+
+def test_suite_runs_without_the_cache():
+    """Claim: the tests compile what they test."""
+    assert cache.enable() is None
+    assert jax.config.jax_compilation_cache_dir is None

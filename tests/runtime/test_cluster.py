@@ -1,0 +1,110 @@
+"""Several processes on one machine, with a small step in place of the learner's."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import csac_jax
+from csac_jax.io import files
+from csac_jax.runtime import cluster
+from csac_jax.sweeps.sweep import SUMMARY
+
+ROOT = Path(csac_jax.__file__).parents[1]
+UNTIMED = ("seconds", "actions_per_second")
+
+
+def _free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def _sweep(folder: Path, processes: int, shard: str = "seeds", after: int = 0) -> list[int]:
+    """Exit codes of the processes of a sweep."""
+    place = [f"127.0.0.1:{_free_port()}", str(processes)]
+    runs = []
+    for number in range(processes):
+        own = [*place, str(number)] if processes > 1 else []
+        command = [
+            sys.executable,
+            "-m",
+            "tests.sweeps.one_process",
+            str(folder),
+            str(after),
+            shard,
+            *own,
+        ]
+        variables = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        variables.pop("XLA_FLAGS", None)
+        runs.append(
+            subprocess.Popen(command, cwd=ROOT, env=variables, stderr=subprocess.PIPE, text=True)
+        )
+    try:
+        said = [run.communicate(timeout=300)[1] for run in runs]
+    finally:
+        for run in runs:
+            run.kill()
+    assert all(run.returncode in (0, 15) for run in runs), said
+    return [run.returncode for run in runs]
+
+
+def _logs(folder: Path) -> dict[str, list[dict]]:
+    """Every member's lines, without what depends on the clock."""
+    found = {path.parent.name: files.read_log(path) for path in folder.rglob("metrics.jsonl")}
+    return {
+        name: [{k: v for k, v in line.items() if k not in UNTIMED} for line in log]
+        for name, log in found.items()
+    }
+
+
+def _assert_close(ours: dict[str, list[dict]], theirs: dict[str, list[dict]]) -> None:
+    assert ours.keys() == theirs.keys() == {"seed-0", "seed-1"}
+    for name, log in ours.items():
+        assert len(log) == len(theirs[name]) == 3
+        for line, other in zip(log, theirs[name], strict=True):
+            assert line.keys() == other.keys()
+            for key, value in line.items():
+                if isinstance(value, float):
+                    np.testing.assert_allclose(value, other[key], 1e-5, err_msg=key)
+                else:
+                    assert value == other[key], key
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shard", ["seeds", "scenes"])
+def test_two_processes_are_one(shard: str, tmp_path: Path):
+    """Claim: a sweep over two processes has the metrics of one over a single process, to the
+    rounding of sums in another order; stopped by a signal to one of them, both save and end, and it
+    resumes as if nothing had happened."""
+    assert _sweep(tmp_path / "one", 1) == [0]
+    assert _sweep(tmp_path / "two", 2, shard) == [0, 0]
+    _assert_close(_logs(tmp_path / "two"), _logs(tmp_path / "one"))
+    assert _sweep(tmp_path / "again", 2, shard, after=1) == [15, 15]
+    assert all(len(log) == 1 for log in _logs(tmp_path / "again").values())
+    assert _sweep(tmp_path / "again", 2, shard) == [0, 0]
+    assert _logs(tmp_path / "again") == _logs(tmp_path / "two")
+    assert sorted(path.name for path in (tmp_path / "two").iterdir()) == [
+        "a",
+        "groups",
+        SUMMARY,
+        "sweep.json",
+    ]
+
+
+def test_number_beyond_the_processes():
+    """Claim: a process whose number is not among those that there are is refused before it waits
+    for anybody."""
+    with pytest.raises(ValueError, match=r"--process-id: must lie in 0 \.\. 1, not 2"):
+        cluster.join(cluster.Place("127.0.0.1:1", 2, 2))
+
+
+def test_one_process_agrees_with_itself():
+    """Claim: without other processes nobody is asked."""
+    assert [cluster.agree(signal) for signal in (None, 2, 15)] == [None, 2, 15]
+    assert cluster.is_first()
+    cluster.wait("nobody")

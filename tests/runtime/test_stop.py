@@ -1,0 +1,67 @@
+"""Signals, in processes of their own."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+# Computes in C code, which Python's own signal handlers cannot interrupt, as they cannot interrupt
+# XLA.
+PROGRAM = """
+import hashlib, sys, time
+from csac_jax.train import stop
+flag = stop.install()
+print("ready", flush=True)
+hashlib.pbkdf2_hmac("sha256", b"", b"", int(sys.argv[1]))
+time.sleep(1.0)  # so that the thread that listens has had its turn
+sys.exit(flag.exit_code)
+"""
+SHORT, LONG = 1_000_000, 200_000_000  # rounds: about 0.3 s and a minute
+
+
+def _start(rounds: int) -> subprocess.Popen:
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(rounds)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_first_signal_sets_the_flag(number: signal.Signals, code: int):
+    """Claim: the first signal lets the program come to its end, which is told of it, and says
+    so."""
+    process = _start(SHORT)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == code
+    assert number.name in errors
+
+
+def test_second_signal_of_a_kind_ends_at_once():
+    """Claim: a second signal of the same kind ends the process even while C code runs."""
+    process = _start(LONG)
+    begun = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=15)
+    assert process.returncode == 130
+    assert time.monotonic() - begun < 10.0
+
+
+def test_signal_of_another_kind_does_not_end_at_once():
+    """Claim: SIGTERM after SIGINT changes nothing: the program still comes to its end, as
+    SIGINT's."""
+    process = _start(SHORT)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=20)
+    assert process.returncode == 130

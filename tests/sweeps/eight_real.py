@@ -1,0 +1,66 @@
+"""Run with eight virtual devices: training steps of `smoke` with a scene on each of them and with
+all on one; prints, as JSON, how they differ.
+
+python -m tests.sweeps.eight_real
+
+Physics are C's, which take scenes one by one: MJX rounds a batch of one scene otherwise than one of
+eight.
+"""
+
+import dataclasses
+import json
+from typing import Any
+
+import csac_jax  # noqa: F401  (before JAX)
+
+import jax  # isort: skip
+import numpy as np
+
+from csac_jax import presets
+from csac_jax.config import Config
+from csac_jax.sweeps import replicas
+from csac_jax.training import sharding, step
+from tests.sweeps.eight_devices import _difference
+
+SCENES = 8
+STEPS = 8
+
+
+def config() -> Config:
+    """`smoke` with eight scenes; it learns from the first step on."""
+    cfg = presets.smoke()
+    return dataclasses.replace(
+        cfg,
+        sim=dataclasses.replace(cfg.sim, physics="c"),
+        train=dataclasses.replace(cfg.train, scenes=SCENES, actions=SCENES * STEPS),
+    )
+
+
+def run(program: step.Program, devices: int) -> tuple[Any, Any]:
+    """State and metrics [T, 1, ...] after STEPS steps."""
+    (group,) = replicas.group([program.cfg])
+    each, line = replicas.members(group), sharding.make(devices)
+    state = replicas.init(program, each, line, "scenes")
+    return jax.device_get(replicas.compile_chunk(program, each, STEPS, line, "scenes")(state))
+
+
+def compare(one: tuple[Any, Any], other: tuple[Any, Any]) -> dict[str, Any]:
+    """What differs: entries of metrics that are counted or told apart, floats relative to the
+    larger of 1 and them."""
+    (state, seen), (others_state, others_seen) = one, other
+    pairs = list(zip(seen, others_seen, strict=True))
+    floats = [pair for pair in pairs if pair[0].dtype == np.float32]
+    return {
+        "counts": sum(int(np.sum(x != y)) for x, y in pairs if x.dtype != np.float32),
+        "metrics": _difference([x for x, _ in floats], [y for _, y in floats]),
+        "scenes": _difference(state.scenes, others_state.scenes),
+        "stored": _difference(state.replay.items, others_state.replay.items),
+        "critic": _difference(state.learner.online.critic, others_state.learner.online.critic),
+        "learned": int(np.sum(seen.learned)),
+        "grasps": int(np.sum(seen.primitive)),
+    }
+
+
+if __name__ == "__main__":
+    made = step.make(config())
+    print(json.dumps({"devices": len(jax.devices()), **compare(run(made, 1), run(made, SCENES))}))

@@ -1,0 +1,50 @@
+"""One process of a sweep, with a small step in place of the learner's.
+
+python -m tests.sweeps.one_process FOLDER STOP_AFTER SHARD [COORDINATOR PROCESSES PROCESS_ID]
+"""
+
+import sys
+from pathlib import Path
+
+import csac_jax  # noqa: F401  (before JAX)
+from csac_jax.runtime import cluster
+from csac_jax.runtime.signals import Stop
+from csac_jax.sweeps import replicas, sweep
+from csac_jax.training import sharding, step
+from tests.training import toys
+
+
+class Reporter:
+    """Says nothing; as the last process, stops the sweep after some chunks."""
+
+    def __init__(self, stop: Stop, after: int) -> None:
+        self._stop, self._after = stop, after
+
+    def say(self, text: str) -> None:
+        """Reporter."""
+
+    def progress(self, record: object, total_actions: int, eta: float) -> None:
+        """Reporter."""
+        self._after -= 1
+        if self._after == 0:
+            self._stop.signal = 15
+
+
+def main(folder: str, after: str, shard: str, *place: str) -> int:
+    """Exit code: 0 if the sweep is done, 15 if it was stopped."""
+    if place:
+        cluster.join(cluster.Place(place[0], int(place[1]), int(place[2])))
+    step.begin, step.train_step, step.make = toys.begin, toys.train_step, toys.program
+    line, stop = sharding.make(None), Stop()
+    assert (line is not None) == bool(place)
+    plan = sweep.Plan(2, [sweep.Setting("a", {}, toys.CFG)])
+    last = not place or place[2] == "1"
+    reporter = Reporter(stop, int(after) if last else 0)
+    resume = (Path(folder) / sweep.PLAN).exists()
+    cluster.wait("looked")
+    engine = lambda group: replicas.engine(group, line, shard)  # noqa: E731
+    return sweep.run(plan, Path(folder), engine, reporter, stop, resume).stopped_by or 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,63 @@
+"""What --vary asks for."""
+
+import pytest
+
+from csac_jax.sweeps import grid
+
+
+def test_every_combination():
+    """Claim: every combination of the values, the last name's changing fastest, each with the flags
+    of the parser."""
+    found = grid.settings(["replay.sampler=uniform,beta", "learn.learning-rate=1e-3,-1"])
+    assert [one.values for one in found] == [
+        {"replay.sampler": sampler, "learn.learning_rate": rate}
+        for sampler in ("uniform", "beta")
+        for rate in ("1e-3", "-1")
+    ]
+    assert found[1].name == "replay.sampler=uniform,learn.learning_rate=-1"
+    assert found[1].flags == ["--replay.sampler", "uniform", "--learn.learning-rate", "-1"]
+
+
+def test_nothing_varied_is_one_setting():
+    """Claim: with nothing to vary there is one setting, with no flags."""
+    assert grid.settings([]) == [grid.Setting("base", {}, [])]
+
+
+def test_kinds_of_values():
+    """Claim: tuples are parted by colons, switches are true or false, the algorithm is varied by
+    its name."""
+    flags = [one.flags for one in grid.settings(["replay.beta_end=1:4,1:12"])]
+    assert flags == [["--replay.beta-end", "1", "4"], ["--replay.beta-end", "1", "12"]]
+    flags = [one.flags for one in grid.settings(["learn.actor=true,false"])]
+    assert flags == [["--learn.actor"], ["--learn.no-actor"]]
+    assert grid.settings(["algo=csac_per"])[0].flags == ["--algo", "csac_per"]
+
+
+def test_long_names_give_way_to_numbers():
+    """Claim: a folder's name stays short, however much is varied."""
+    names = ("beta_start", "beta_middle", "beta_end")
+    found = grid.settings([f"replay.{name}=1.2345678901:2.3456789012,1:2" for name in names])
+    assert [one.name for one in found] == [f"setting-{i}" for i in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("varied", "message"),
+    [
+        (["learn.tua=1"], "'learn.tua' is no setting; perhaps you meant learn.tau"),
+        (["learn=1"], "'learn' is no setting"),
+        (["seed=1,2"], "seeds are varied by --seeds"),
+        (["learn.tau"], "give a setting and its values"),
+        (["learn.tau="], "give a setting and its values"),
+        (["learn.tau=0.1,,0.2"], "give a setting and its values"),
+        (["learn.tau=0.1,0.1"], "a value is given twice"),
+        (["learn.tau=0.1", "learn.tau=0.2"], "a setting is given twice"),
+        (["learn.actor=yes"], "neither true nor false"),
+        (["net.weights=a/b"], "slash"),
+        (["net.weights=.."], "begin with a dot"),
+        (["net.weights=--seed"], "begin with a dot or dash"),
+    ],
+)
+def test_bad_input(varied: list[str], message: str):
+    """Claim: what cannot be varied is named, with the remedy."""
+    with pytest.raises(ValueError, match=message):
+        grid.settings(varied)

@@ -1,0 +1,58 @@
+"""Networks of runs side by side that have a device in turn, a few at a time."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import presets
+from csac_jax.training import chunked_vmap
+
+
+@pytest.mark.parametrize(
+    ("members", "size"), [(1, 1), (2, 2), (5, 5), (7, 1), (8, 4), (12, 4), (16, 4), (20, 5)]
+)
+def test_groups_are_of_one_size(members: int, size: int):
+    """Claim: runs of DenseNet-121 are divided into equal groups, as large as they may be; small
+    nets are not."""
+    assert chunked_vmap.at_once(presets.paper(), members) == size
+    assert chunked_vmap.at_once(presets.paper_small(), members) is None
+
+
+@pytest.mark.parametrize("size", [1, 2, 6])
+def test_groups_do_what_each_does(size: int):
+    """Claim: grouped, each of six runs has the value and the shapes that it has alone, what they
+    share included."""
+    runs, shared = jnp.arange(12.0).reshape(6, 2), jnp.arange(6.0).reshape(2, 3)
+    keys = jax.random.split(jax.random.key(0), 6)
+
+    def part(key: jax.Array, run: jax.Array, shared: jax.Array) -> dict[str, jax.Array]:
+        return {"sum": run @ shared, "noise": jax.random.normal(key, (3,)) + run[0]}
+
+    with jax.debug_key_reuse(False):  # keys are used twice, to compare
+        got = jax.jit(jax.vmap(chunked_vmap.grouped(part, size), in_axes=(0, 0, None)))(
+            keys, runs, shared
+        )
+        for i in range(6):
+            for name, leaf in part(keys[i], runs[i], shared).items():
+                np.testing.assert_allclose(got[name][i], leaf, rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(("size", "calls"), [(1, 2), (2, 6), (3, 6)])
+def test_branch_stays_one_in_groups_of_one(size: int, calls: int):
+    """Claim: of six runs, two of which take a costly branch, only these two run it if they come one
+    by one."""
+    ran = []
+
+    def part(costly: jax.Array, x: jax.Array) -> jax.Array:
+        def cost() -> jax.Array:
+            jax.debug.callback(lambda _: ran.append(1), x)
+            return x + 1.0
+
+        return jax.lax.cond(costly, cost, lambda: x)
+
+    taken = jnp.array([0, 1, 0, 0, 1, 0], bool)
+    got = jax.jit(jax.vmap(chunked_vmap.grouped(part, size)))(taken, jnp.arange(6.0))
+    jax.effects_barrier()
+    np.testing.assert_array_equal(got, [0.0, 2.0, 2.0, 3.0, 5.0, 5.0])
+    assert len(ran) == calls

@@ -1,0 +1,172 @@
+"""What is written into one scene stays there: 64 scenes side by side in the compiled training
+step."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import presets
+from csac_jax.config import Config, ReplayConfig, SimConfig
+from csac_jax.training import step
+from csac_jax.training.step import StepMetrics, TrainState
+
+pytestmark = [
+    pytest.mark.mjx,
+    pytest.mark.slow,
+]  # minutes of compilation; tests/test_env.py has the small version
+
+SCENES = 64
+_SMOKE = presets.smoke()
+CFG: Config = dataclasses.replace(
+    _SMOKE,
+    sim=SimConfig(grasp_phases=(4, 3, 4), push_phases=(3, 5, 3), geom_pairs=6, contacts=16),
+    replay=ReplayConfig(capacity=2 * SCENES),
+    train=dataclasses.replace(_SMOKE.train, scenes=SCENES, learning_starts=SCENES),
+)
+BAD = (np.nan, np.inf, 1e6)
+LEAVES = (
+    "position",
+    "quaternion",
+    "velocity",
+    "half_size",
+    "density",
+    "friction",
+    "colour",
+    "target",
+)
+VIEWS = ("height", "colour")
+
+
+class Run(NamedTuple):
+    """One training step."""
+
+    state: TrainState
+    metrics: StepMetrics
+
+
+@pytest.fixture(scope="module")
+def chunk() -> Iterator[Any]:
+    with jax.debug_key_reuse(True):
+        program = step.make(CFG)
+        state = step.init(program)
+        compiled = step.compile_chunk(program, 1).lower(state).compile()
+
+        def run(given: TrainState) -> Run:
+            after, metrics = jax.device_get(compiled(jax.tree.map(jnp.copy, given)))
+            return Run(after, jax.tree.map(lambda leaf: leaf[0], metrics))
+
+        yield state, run, run(state)
+
+
+def _written(
+    state: TrainState, part: str, leaf: str, scene: int, entry: int, value: float
+) -> TrainState:
+    """The state with `value` in one entry of one leaf of one scene; what an integer or a bool makes
+    of it, there."""
+    tree = getattr(state.scenes, part)
+    old = np.array(getattr(tree, leaf))
+    flat = old.reshape(SCENES, -1)
+    with np.errstate(invalid="ignore"):
+        flat[scene, entry] = (
+            ~flat[scene, entry] if old.dtype == bool else np.asarray(value).astype(old.dtype)
+        )
+    changed = dataclasses.replace(tree, **{leaf: jnp.asarray(old)})
+    return dataclasses.replace(state, scenes=dataclasses.replace(state.scenes, **{part: changed}))
+
+
+def _rows(tree: Any, keep: np.ndarray) -> list[np.ndarray]:
+    return [np.asarray(leaf)[keep] for leaf in jax.tree.leaves(tree)]
+
+
+def _stored(run: Run) -> list[np.ndarray]:
+    """Transitions in the ring, oldest first."""
+    return _rows(run.state.replay.items, np.arange(int(run.state.replay.size)))
+
+
+def _assert_isolated(good: Run, bad: Run, scene: int, what: str) -> None:
+    others = np.arange(SCENES) != scene
+    for ours, theirs in zip(
+        _rows(good.state.scenes, others), _rows(bad.state.scenes, others), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs, err_msg=what)
+    np.testing.assert_array_equal(bad.metrics.physics_diverged, ~others, err_msg=what)
+    assert (bad.metrics.truncated[scene], bad.metrics.terminated[scene]) == (True, False), what
+    assert (bad.metrics.cleared[scene], bad.metrics.blocks_lost[scene]) == (0, 0), what
+    for ours, theirs in zip(_stored(good), _stored(bad), strict=True):
+        np.testing.assert_array_equal(ours[others], theirs, err_msg=what)
+    for leaf in jax.tree.leaves(
+        (bad.state.scenes, bad.state.learner, bad.state.replay, bad.metrics)
+    ):
+        leaf = np.asarray(leaf)
+        assert leaf.dtype.kind != "f" or np.isfinite(leaf).all(), what
+
+
+def _entries(state: TrainState, part: str, leaf: str) -> int:
+    return int(np.prod(np.shape(getattr(getattr(state.scenes, part), leaf))[1:]))
+
+
+def test_good_scenes_are_none_of_them_ill(chunk):
+    """Claim: with nothing amiss no scene is physics_diverged and every transition is stored."""
+    _, _, good = chunk
+    assert not good.metrics.physics_diverged.any()
+    assert good.state.replay.size == SCENES
+    assert good.metrics.learned
+
+
+def test_bad_entry_stays_in_its_scene(chunk):
+    """Claim: NaN, infinity or 1e6 in any entry of a scene, or of its view (48 places), leaves the
+    other 63 the same, bit for bit; it is counted and replaced, and no transition of it is
+    stored."""
+    state, run, good = chunk
+    count = 0
+    for part, leaf in [*(("scene", leaf) for leaf in LEAVES), *(("obs", leaf) for leaf in VIEWS)]:
+        entries = _entries(state, part, leaf)
+        for entry in range(0, entries, max(entries // 48, 1)):
+            for value in BAD:
+                scene = count % SCENES
+                what = f"{part}.{leaf}[{scene}, {entry}] = {value}"
+                _assert_isolated(
+                    good, run(_written(state, part, leaf, scene, entry, value)), scene, what
+                )
+                count += 1
+    assert count > 400
+
+
+def test_block_out_of_place_stays_in_its_scene(chunk):
+    """Claim: a block marked as in play where it is parked makes its scene physics_diverged, one
+    marked as parked where it lies is taken away; nothing changes elsewhere."""
+    state, run, good = chunk
+    seen = set()
+    for scene in range(8):
+        for entry in range(_entries(state, "scene", "in_play")):
+            was = bool(state.scenes.scene.in_play[scene, entry])
+            bad = run(_written(state, "scene", "in_play", scene, entry, 1.0))
+            others = np.arange(SCENES) != scene
+            for ours, theirs in zip(
+                _rows(good.state.scenes, others), _rows(bad.state.scenes, others), strict=True
+            ):
+                np.testing.assert_array_equal(ours, theirs)
+            np.testing.assert_array_equal(bad.metrics.physics_diverged, ~others & (not was))
+            seen.add(was)
+    assert seen == {False, True}
+
+
+@pytest.mark.parametrize("leaf", ["actions", "steps_without_change"])
+def test_bad_counter_stays_in_its_scene(chunk, leaf: str):
+    """Claim: a counter gone wild cuts its own episode off, and changes nothing elsewhere."""
+    state, run, good = chunk
+    scene = 5
+    wild = jnp.asarray(getattr(state.scenes, leaf)).at[scene].set(1_000_000)
+    bad = run(dataclasses.replace(state, scenes=dataclasses.replace(state.scenes, **{leaf: wild})))
+    others = np.arange(SCENES) != scene
+    for ours, theirs in zip(
+        _rows(good.state.scenes, others), _rows(bad.state.scenes, others), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    assert not bad.metrics.physics_diverged.any()
+    assert bad.state.scenes.actions[scene] <= 1

@@ -1,0 +1,326 @@
+"""The host loop, with a tiny program in place of the learner."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from csac_jax import presets
+from csac_jax.config import Config, TrainConfig
+from csac_jax.io import checkpoint
+from csac_jax.io.checkpoint import CheckpointError
+from csac_jax.runtime.signals import Stop
+from csac_jax.training import loop
+from csac_jax.training.loop import Record, TrainingError
+
+E = 3
+TRAIN = TrainConfig(scenes=E, actions=72, learning_starts=12, chunk=4, save_every=2)
+CFG = dataclasses.replace(presets.smoke(), train=TRAIN, seed=5)  # 24 steps, 6 chunks
+UNTIMED = ("seconds", "actions_per_second")
+
+
+@struct.dataclass
+class State:
+    key: jax.Array
+    step: jax.Array
+    total: jax.Array
+
+
+class StepMetrics(NamedTuple):
+    primitive: jax.Array
+    outcome: jax.Array
+    push_better: jax.Array
+    cleared: jax.Array
+    blocks_lost: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    reward: jax.Array
+    gap_disagrees: jax.Array
+    contact_overflow: jax.Array
+    physics_diverged: jax.Array
+    learned: jax.Array
+    critic_loss: jax.Array
+    actor_loss: jax.Array
+    td_error: jax.Array
+    q_mean: jax.Array
+
+
+def _init() -> State:
+    return State(jax.random.key(CFG.seed), jnp.int32(0), jnp.zeros(4, jnp.float32))
+
+
+class Fake:
+    """A program that draws its metrics at random, counts compilations, and can lose its loss or its
+    physics."""
+
+    def __init__(self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99) -> None:
+        self.compiled: list[int] = []
+        self._nan_at, self._ill = nan_at, (ill_from, ill_to)
+
+    def compile_chunk(self, num_steps: int):
+        """As `csac_jax.training.step.compile_chunk`, with the program bound."""
+        self.compiled.append(num_steps)
+        return jax.jit(
+            lambda state: jax.lax.scan(self._step, state, length=num_steps), donate_argnums=0
+        )
+
+    def _step(self, state: State, _):
+        keys = jax.random.split(jax.random.fold_in(state.key, state.step), 4)
+        outcome = jax.random.randint(keys[0], (E,), 0, 5)
+        no = jnp.zeros(E, bool)
+        loss = jnp.where(state.step == self._nan_at, jnp.nan, jax.random.uniform(keys[1]))
+        metrics = StepMetrics(
+            primitive=jax.random.bernoulli(keys[2], 0.7, (E,)).astype(jnp.int32),
+            outcome=outcome,
+            push_better=no,
+            cleared=(outcome == 4).astype(jnp.int32),
+            blocks_lost=jnp.zeros(E, jnp.int32),
+            terminated=no,
+            truncated=no,
+            reward=outcome.astype(jnp.float32),
+            gap_disagrees=no,
+            contact_overflow=jnp.zeros(E, jnp.int32),
+            physics_diverged=no.at[0].set(
+                (state.step >= self._ill[0]) & (state.step < self._ill[1])
+            ),
+            learned=state.step >= 4,
+            critic_loss=loss,
+            actor_loss=loss,
+            td_error=loss,
+            q_mean=loss,
+        )
+        total = state.total + jax.random.normal(keys[3], (4,))
+        return State(state.key, state.step + 1, total), metrics
+
+
+class Listener:
+    """Keeps what a run reports; sets the stop flag after `stop_after` chunks."""
+
+    def __init__(self, stop_after: int | None = None, signal: int = 2) -> None:
+        self.stop, self.said, self.records = Stop(), [], []
+        self._stop_after, self._signal = stop_after, signal
+        if stop_after == 0:
+            self.stop.signal = signal
+
+    def say(self, text: str) -> None:
+        """Reporter."""
+        self.said.append(text)
+
+    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+        """Reporter."""
+        assert total_actions == 72
+        assert eta >= 0.0
+        self.records.append(record)
+        if len(self.records) == self._stop_after:
+            self.stop.signal = self._signal
+
+
+def _run(
+    run_dir: Path, listener: Listener, fake: Fake, resume: bool = False, cfg: Config = CFG
+) -> loop.Summary:
+    return loop.run(cfg, run_dir, _init, fake.compile_chunk, listener, listener.stop, resume)
+
+
+def _final(run_dir: Path) -> list[bytes]:
+    state, _ = checkpoint.restore(run_dir, jax.eval_shape(_init))
+    return [
+        np.asarray(leaf).tobytes()
+        for leaf in (jax.random.key_data(state.key), state.step, state.total)
+    ]
+
+
+def _log(run_dir: Path) -> list[dict]:
+    """The log without what depends on the clock."""
+    lines = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in line.items() if name not in UNTIMED} for line in lines]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an uninterrupted run."""
+    run_dir = tmp_path_factory.mktemp("whole") / "run"
+    _run(run_dir, Listener(), Fake())
+    return run_dir
+
+
+def test_run_ends_complete(tmp_path: Path):
+    """Claim: a run takes its actions, compiles once, logs a line per chunk, and saves its end."""
+    listener, fake = Listener(), Fake()
+    summary = _run(tmp_path / "a/run", listener, fake)
+    assert (summary.step, summary.actions, summary.stopped_by) == (24, 72, None)
+    assert fake.compiled == [4]
+    assert [line["step"] for line in _log(tmp_path / "a/run")] == [4, 8, 12, 16, 20, 24]
+    assert checkpoint.latest_step(tmp_path / "a/run") == 24
+    assert json.loads((tmp_path / "a/run/config.json").read_text())["seed"] == 5
+    assert any("compiled in" in text for text in listener.said)
+
+
+def test_steps_are_rounded_up_to_whole_chunks():
+    """Claim: the number of steps is rounded up to whole chunks."""
+    cfg = dataclasses.replace(CFG, train=dataclasses.replace(TRAIN, actions=73))
+    assert cfg.train.steps == 25
+    assert loop.total_steps(cfg) == 28
+    assert loop.total_steps(CFG) == 24
+
+
+def test_saves_on_the_way(tmp_path: Path):
+    """Claim: every `save_every` chunks a checkpoint is written."""
+    saved = []
+    listener = Listener()
+    listener.progress = lambda *_: saved.append(checkpoint.latest_step(tmp_path / "run"))
+    _run(tmp_path / "run", listener, Fake())
+    assert saved == [None, None, 8, 8, 16, 16]  # as seen before the save of the same chunk
+
+
+@pytest.mark.parametrize("stop_after", [0, 1, 3, 5, 6])
+def test_resumed_run_ends_as_the_uninterrupted_one(tmp_path: Path, whole: Path, stop_after: int):
+    """Claim: a run that is stopped and resumed ends bit for bit as one that is not, with the same
+    log but for times."""
+    first = Listener(stop_after, signal=15)
+    summary = _run(tmp_path / "run", first, Fake())
+    assert (summary.step, summary.stopped_by) == (4 * stop_after, 15)
+    assert first.stop.exit_code == 143
+    assert checkpoint.latest_step(tmp_path / "run") == 4 * stop_after
+    assert "stopped and saved" in first.said[-1]
+    second = Listener()
+    summary = _run(tmp_path / "run", second, Fake(), resume=True)
+    assert (summary.step, summary.stopped_by) == (24, None)
+    assert _final(tmp_path / "run") == _final(whole)
+    assert _log(tmp_path / "run") == _log(whole)
+
+
+def test_lines_newer_than_the_checkpoint_are_dropped(tmp_path: Path, whole: Path):
+    """Claim: after a kill, lines of the log newer than the checkpoint, and a half-written one, are
+    written anew."""
+    _run(tmp_path / "run", Listener(2), Fake())
+    log = tmp_path / "run/metrics.jsonl"
+    log.write_text(
+        log.read_text() + json.dumps({"step": 12, "actions": -1}) + '\n{"step": 16, "act'
+    )
+    _run(tmp_path / "run", Listener(), Fake(), resume=True)
+    assert _log(tmp_path / "run") == _log(whole)
+
+
+def test_seconds_go_on_after_resuming(tmp_path: Path):
+    """Claim: `seconds` counts resumed parts too."""
+    before = _run(tmp_path / "run", Listener(2), Fake()).seconds
+    listener = Listener()
+    _run(tmp_path / "run", listener, Fake(), resume=True)
+    seconds = [record.seconds for record in listener.records]
+    assert seconds[0] >= round(before, 3)
+    assert seconds == sorted(seconds)
+
+
+def test_complete_run_resumed_does_nothing(tmp_path: Path):
+    """Claim: resuming a complete run compiles nothing and changes nothing."""
+    _run(tmp_path / "run", Listener(), Fake())
+    before, fake = _final(tmp_path / "run"), Fake()
+    assert _run(tmp_path / "run", Listener(), fake, resume=True).step == 24
+    assert fake.compiled == []
+    assert _final(tmp_path / "run") == before
+
+
+@pytest.mark.parametrize("step", [9, 21])
+def test_loss_that_is_not_finite_stops_the_run(tmp_path: Path, step: int):
+    """Claim: a loss that is not finite ends the run with one line; the last good checkpoint stays
+    the newest."""
+    good = (step // 8) * 8
+    with pytest.raises(
+        TrainingError, match=f"critic_loss is not finite.*step {good} is kept.*learning_rate"
+    ) as caught:
+        _run(tmp_path / "run", Listener(), Fake(nan_at=step))
+    assert "\n" not in str(caught.value)
+    assert checkpoint.latest_step(tmp_path / "run") == good
+    assert all(math.isfinite(line["reward"]) for line in _log(tmp_path / "run"))
+
+
+def test_loss_of_the_warm_up_is_not_looked_at(tmp_path: Path):
+    """Claim: before the first update there is no loss: none is judged, none is logged."""
+    listener = Listener(2)
+    _run(tmp_path / "run", listener, Fake(nan_at=2))
+    assert listener.records[0].critic_loss is None
+    assert listener.records[1].critic_loss is not None
+
+
+def test_physics_that_keeps_failing_is_said_once(tmp_path: Path):
+    """Claim: a run whose physics fails again and again says so, once; a scene that fails alone is
+    no news."""
+    for name, fake, told in (("many", Fake(ill_from=5), 1), ("one", Fake(ill_from=5, ill_to=6), 0)):
+        listener = Listener()
+        _run(tmp_path / name, listener, fake)
+        doubts = [said for said in listener.said if "physics failed" in said]
+        assert len(doubts) == told
+    assert sum(record.physics_diverged for record in listener.records) == 1
+
+
+def test_kernels_of_warp_are_announced(tmp_path: Path):
+    """Claim: before the first step on Warp, during which nothing is shown for minutes, the reason
+    is."""
+    for physics, told in (("mjx", 0), ("warp", 1)):
+        scene = dataclasses.replace(CFG.scene, mesh_size_jitter=0.0)
+        cfg = dataclasses.replace(
+            CFG, scene=scene, sim=dataclasses.replace(CFG.sim, physics=physics)
+        )
+        listener = Listener(1)
+        _run(tmp_path / physics, listener, Fake(), cfg=cfg)
+        assert sum("Warp builds its kernels" in said for said in listener.said) == told
+
+
+def test_existing_folder_is_left_alone(tmp_path: Path):
+    """Claim: a new run never writes into a folder that exists."""
+    with pytest.raises(FileExistsError):
+        _run(tmp_path, Listener(), Fake())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_resume_needs_the_same_config(tmp_path: Path):
+    """Claim: a run is resumed with its own config only; the message names what differs."""
+    _run(tmp_path / "run", Listener(1), Fake())
+    other = dataclasses.replace(CFG, learn=dataclasses.replace(CFG.learn, tau=0.5))
+    with pytest.raises(TrainingError, match=r"learn\.tau"):
+        _run(tmp_path / "run", Listener(), Fake(), resume=True, cfg=other)
+
+
+def test_resume_needs_a_checkpoint(tmp_path: Path):
+    """Claim: a folder without a checkpoint cannot be resumed."""
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        _run(tmp_path, Listener(), Fake(), resume=True)
+
+
+def _metrics(primitive: list[int], outcome: list[int]) -> StepMetrics:
+    """One scene, T steps."""
+    steps = len(primitive)
+    zeros, losses = np.zeros((steps, 1), np.int32), np.ones(steps, np.float32)
+    return StepMetrics(
+        np.array(primitive)[:, None],
+        np.array(outcome)[:, None],
+        *[zeros] * 9,
+        np.ones(steps, bool),
+        *[losses] * 4,
+    )
+
+
+def test_success_is_over_the_last_200_grasps():
+    """Claim: grasp success is over the last 200 grasps, pushes not counted, oldest dropped
+    first."""
+    before = loop.Progress(0.0, [1] * 150 + [0] * 49)  # 199 grasps
+    metrics = _metrics(primitive=[1, 0, 1, 1], outcome=[4, 4, 3, 4])
+    after, record = loop.record_chunk(CFG, 4, metrics, before, 0.5)
+    assert after.grasps == [1] * 148 + [0] * 49 + [1, 0, 1]
+    assert (record.grasp_success, record.grasps_counted) == (150 / 200, 200)
+    assert (record.pushes, record.grasps) == (1, 3)
+    assert record.outcomes == {"nothing": 0, "empty": 0, "touched": 0, "dropped": 1, "lifted": 2}
+    assert (record.seconds, record.actions_per_second) == (0.5, 8.0)
+
+
+def test_fake_has_the_fields_of_the_program():
+    """Claim: the loop is tested with the metrics that the training step gives."""
+    step = pytest.importorskip("csac_jax.training.step")
+    assert set(step.StepMetrics._fields) == set(StepMetrics._fields)

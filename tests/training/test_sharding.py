@@ -1,0 +1,93 @@
+"""Several devices: eight virtual ones of the CPU, in a process of their own."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+
+import csac_jax
+from csac_jax import _guard
+from csac_jax.training import sharding
+
+ROOT = Path(csac_jax.__file__).parents[1]
+
+
+def _eight(module: str, *arguments: str, flags: str = "", timeout: float = 300.0) -> dict[str, Any]:
+    """What a module prints that is run with eight virtual devices."""
+    flags = f"--xla_force_host_platform_device_count=8 {flags}"
+    variables = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    variables.pop(_guard.POOL_VARIABLE, None)  # that of this process is for one device
+    command = [sys.executable, "-m", module, *arguments]
+    done = subprocess.run(
+        command, env=variables, cwd=ROOT, capture_output=True, text=True, timeout=timeout
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _check(found: dict[str, Any], tolerance: float) -> None:
+    assert found["devices"] == 8
+    for shard in found.keys() - {"devices"}:
+        assert found[shard]["metrics"] < tolerance, shard
+        assert found[shard]["state"] < tolerance, shard
+        assert found[shard]["moved"] < tolerance, shard
+        assert found[shard]["resumed"] == 0.0, shard
+
+
+def test_eight_devices_are_one(tmp_path: Path):
+    """Claim: seeds or scenes over eight devices give the metrics and the state of one, to the
+    rounding of sums in another order; each device holds its share; a checkpoint of eight goes on
+    bit for bit, and can be read on one. A small step stands in for the learner's."""
+    found = _eight("tests.sweeps.eight_devices", str(tmp_path))
+    _check(found, 1e-5)
+    assert found["seeds"]["parts"] == [[1, 8], [1, 3]]
+    assert found["scenes"]["parts"] == [[2, 1], [2, 3]]
+
+
+@pytest.mark.slow
+def test_eight_devices_learn_as_one():
+    """Claim: training steps of `smoke`, a scene on each of eight devices, give what one device
+    gives where physics do not round by the batch: scenes and transitions bit for bit, metrics and
+    critic to the rounding of sums in another order. 1e-6 is eight times the last bit of 1; eight
+    steps take it to one."""
+    found = _eight(
+        "tests.sweeps.eight_real", flags="--xla_backend_optimization_level=0", timeout=1200.0
+    )
+    assert found["devices"] == found["learned"] == 8
+    assert found["grasps"] > 0
+    assert found["counts"] == found["scenes"] == found["stored"] == 0
+    assert found["metrics"] < 1e-6
+    assert found["critic"] < 1e-6
+
+
+@pytest.mark.parametrize("devices", [0, -1, 10_000])
+def test_devices_that_are_not_there(devices: int):
+    """Claim: a mesh larger than the devices there are is refused, with their number."""
+    with pytest.raises(
+        ValueError, match=f"--devices: {devices} asked for, there are {len(jax.devices())}"
+    ):
+        sharding.make(devices)
+
+
+def test_what_cannot_be_divided():
+    """Claim: seeds, scenes or a batch that the devices cannot share evenly are refused by name."""
+
+    class Three:
+        size = 3
+
+    sharding.check(Three(), "seeds", 6, 8, 8)
+    sharding.check(Three(), "scenes", 1, 6, 9)
+    sharding.check(None, "scenes", 1, 7, 5)
+    for arguments, name in (
+        (("seeds", 8, 6, 9), "--seeds: 8"),
+        (("scenes", 6, 8, 9), "train.scenes: 8"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            sharding.check(Three(), *arguments)
+    with pytest.raises(ValueError, match=r"learn\.batch: 8"):
+        sharding.check(Three(), "scenes", 6, 6, 8)

@@ -1,0 +1,447 @@
+"""The compiled training step, with the smallest preset."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import presets
+from csac_jax.agent import learner as learning, rewards
+from csac_jax.config import ReplayConfig
+from csac_jax.constants import Primitive
+from csac_jax.env import Env
+from csac_jax.io import checkpoint
+from csac_jax.replay import ring, samplers
+from csac_jax.training import step
+from csac_jax.training.step import Program, StepMetrics, TrainState
+from csac_jax.vision.heightmap import Observation
+
+pytestmark = pytest.mark.mjx
+
+CFG = dataclasses.replace(
+    presets.smoke(), replay=ReplayConfig(capacity=1024)
+)  # a ring larger than all else
+T = CFG.train.chunk
+NUM_SEEN = T * CFG.train.scenes
+HOST = ("callback", "infeed", "outfeed", "device_put", "debug_print")
+
+
+class Run(NamedTuple):
+    """A compiled chunk and what it did."""
+
+    program: Program
+    traced: Any
+    chunk: Callable[[TrainState], tuple[TrainState, StepMetrics]]  # uses up its argument
+    states: list[TrainState]  # at the start and after each chunk
+    metrics: list[StepMetrics]
+    compilations: int  # by the calls after the first
+
+
+def copy(state: TrainState) -> TrainState:
+    return jax.tree.map(jnp.copy, state)
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    """Three chunks of one compiled program; the warm-up ends in the first."""
+    counted: list[str] = []
+
+    def count(event: str, _: float, **__: Any) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            counted.append(event)
+
+    with jax.debug_key_reuse(True):
+        program = step.make(CFG)
+        states = [step.init(program)]
+        traced = step.compile_chunk(program, T).trace(states[0])
+        chunk = traced.lower().compile()
+        metrics = []
+        compilations = 0
+        jax.monitoring.register_event_duration_secs_listener(count)
+        for number in range(3):
+            given = copy(states[-1])
+            before = len(counted)
+            state, seen = jax.block_until_ready(chunk(given))
+            compilations += len(counted) - before if number else 0
+            states.append(state)
+            metrics.append(jax.device_get(seen))
+        jax.monitoring.unregister_event_duration_listener(count)
+    assert counted  # the listener hears: the first copy is compiled
+    return Run(program, traced, chunk, states, metrics, compilations)
+
+
+def leaves(tree: Any) -> list[tuple[str, np.ndarray]]:
+    """Names and values of all leaves; keys as their bits."""
+    named = jax.tree_util.tree_leaves_with_path(tree)
+    is_key = [jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) for _, leaf in named]
+    return [
+        (jax.tree_util.keystr(path), np.asarray(jax.random.key_data(leaf) if key else leaf))
+        for (path, leaf), key in zip(named, is_key, strict=True)
+    ]
+
+
+def assert_same(first: Any, other: Any) -> None:
+    for (name, a), (_, b) in zip(leaves(first), leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def equal(first: Any, other: Any) -> bool:
+    return all(
+        np.array_equal(a, b) for (_, a), (_, b) in zip(leaves(first), leaves(other), strict=True)
+    )
+
+
+def test_state_is_a_fixed_point_of_types(run):
+    """Claim: a step changes no shape, dtype or weak type of the state, so that its output fits its
+    program."""
+    shapes = run.traced.jaxpr
+    num = len(jax.tree.leaves(run.states[0]))
+    before, after = shapes.in_avals[:num], shapes.out_avals[:num]
+    assert len(shapes.in_avals) == num
+    for (name, _), given, got in zip(leaves(run.states[0]), before, after, strict=True):
+        assert (given.shape, given.dtype, given.weak_type) == (
+            got.shape,
+            got.dtype,
+            got.weak_type,
+        ), name
+
+
+def test_chunks_after_the_first_compile_nothing(run):
+    """Claim: one program serves every chunk; nothing is compiled while it runs on."""
+    assert run.compilations == 0
+    assert [int(state.step) for state in run.states] == [0, T, 2 * T, 3 * T]
+
+
+def primitives(jaxpr: Any) -> Iterator[str]:
+    """Names of all primitives, those of nested programs too."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for value in jax.tree.leaves(
+            equation.params, is_leaf=lambda v: hasattr(v, "eqns") or hasattr(v, "jaxpr")
+        ):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                yield from primitives(inner)
+
+
+def test_search_for_host_calls_finds_them():
+    """Claim: the search below sees a callback inside of a scan inside of a branch."""
+
+    def body(carry, _):
+        jax.debug.print("{x}", x=carry)
+        return carry, None
+
+    nested = jax.make_jaxpr(
+        lambda x: jax.lax.cond(x > 0, lambda x: jax.lax.scan(body, x, length=2)[0], lambda x: x, x)
+    )
+    assert any(word in name for name in primitives(nested(1.0).jaxpr) for word in HOST)
+
+
+def test_chunk_does_not_speak_to_the_host(run):
+    """Claim: no callback, no feed and no transfer in the compiled chunk, at any depth."""
+    names = set(primitives(run.traced.jaxpr.jaxpr))
+    assert {"scan", "while", "conv_general_dilated", "sort"} <= names  # it was searched in depth
+    found = {name for name in names if any(word in name for word in HOST)}
+    assert not found
+
+
+def test_replay_is_updated_in_place(run):
+    """Claim: the compiled step copies no replay memory: the whole state is given back in its own
+    memory, and what is needed besides is smaller than half a ring."""
+    memory = run.chunk.memory_analysis()
+    ring = sum(leaf.nbytes for leaf in jax.tree.leaves(run.states[0].replay))
+    state = sum(leaf.nbytes for _, leaf in leaves(run.states[0]))
+    assert memory.alias_size_in_bytes >= state > ring
+    assert memory.temp_size_in_bytes < ring / 2
+
+
+class Still(Env):
+    """The environment without physics: compiles fast."""
+
+    def step(self, state, action):
+        return state.replace(actions=state.actions + 1)
+
+
+class Losing(Env):
+    """The environment without physics, in which every action drives a block out."""
+
+    def step(self, state, action):
+        return state.replace(info=state.info.replace(blocks_lost=jnp.int32(1)))
+
+
+def test_blocks_that_left_reach_the_reward(run):
+    """Claim: a step takes `reward.lost_block_penalty` where a block has left, from grasps of
+    nothing and worthless pushes alike."""
+    reward = dataclasses.replace(CFG.reward, lost_block_penalty=0.75)
+    cfg = dataclasses.replace(CFG, reward=reward)
+    env = Losing(cfg, run.program.env.physics, run.program.env.scenes)
+    program = Program(cfg, env, learning.make(cfg))
+    _, metrics = jax.jit(functools.partial(step.train_step, program))(copy(run.states[0]))
+    grasp, push = (
+        reward.nothing - 0.75,
+        rewards.scale(reward, reward.push_level) * reward.push_worse - 0.75,
+    )
+    np.testing.assert_allclose(
+        metrics.reward, np.where(metrics.primitive == Primitive.GRASP, grasp, push), rtol=1e-6
+    )
+
+
+@pytest.mark.slow
+def test_temporary_memory_does_not_grow_with_the_ring():
+    """Claim: four times the ring needs hardly more temporary memory, a fiftieth of the difference
+    at most."""
+    temporary, rings = [], []
+    for capacity in (512, 2048):
+        program = step.make(dataclasses.replace(CFG, replay=ReplayConfig(capacity=capacity)))
+        env = Still(program.env.cfg, program.env.physics, program.env.scenes)
+        program = dataclasses.replace(program, env=env)
+        state = step.init(program)
+        temporary.append(
+            step.compile_chunk(program, T)
+            .lower(state)
+            .compile()
+            .memory_analysis()
+            .temp_size_in_bytes
+        )
+        rings.append(sum(leaf.nbytes for leaf in jax.tree.leaves(state.replay)))
+    assert temporary[1] - temporary[0] < (rings[1] - rings[0]) / 50
+
+
+def test_same_seed_gives_the_same_run(run):
+    """Claim: two runs of one seed are the same in every bit of state and metrics."""
+    state, metrics = run.chunk(copy(run.states[0]))
+    assert_same(state, run.states[1])
+    assert_same(metrics, run.metrics[0])
+
+
+def test_seeds_differ(run):
+    """Claim: seeds 0 and 1 begin with other scenes and networks, and choose and see other things in
+    every scene."""
+    other_cfg = dataclasses.replace(CFG, seed=1)
+    begun = step.init(dataclasses.replace(run.program, cfg=other_cfg))
+    for name in ("scenes", "learner"):
+        assert not equal(getattr(begun, name), getattr(run.states[0], name)), name
+    state, _ = run.chunk(begun)
+    poses, others = (
+        np.asarray(s.replay.items.action.pose[:NUM_SEEN]) for s in (run.states[1], state)
+    )
+    assert np.all(np.any(poses != others, axis=1))
+
+
+def test_scenes_and_steps_differ(run):
+    """Claim: every scene and every step has randomness of its own: alike scenes, looked at by one
+    and the same network, are acted on in different ways, and at each step in others."""
+    state = run.states[1]
+    alike = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), state.scenes)
+    first = int(state.replay.size)  # where the next actions are stored
+
+    def poses(number: int) -> np.ndarray:
+        after, _ = run.chunk(copy(state.replace(scenes=alike, step=jnp.int32(number))))
+        return np.asarray(after.replay.items.action.pose)[first : first + CFG.train.scenes]
+
+    acted = np.concatenate([poses(number) for number in range(T, T + 4)])
+    assert len(np.unique(acted, axis=0)) == len(acted) == 4 * CFG.train.scenes
+
+
+def test_nothing_is_learned_before_the_warm_up(run):
+    """Claim: until `train.learning_starts` actions are done the networks, targets and optimisers
+    stay as they are; then each training step has its updates."""
+    assert run.metrics[0].learned.tolist() == [False, False, False, True]  # 8 actions, 2 per step
+    late = run.states[0].replace(
+        step=jnp.int32(-T - 1)
+    )  # so far from the warm-up's end that a chunk ends before it
+    state, metrics = run.chunk(copy(late))
+    assert not np.any(metrics.learned)
+    assert_same(state.learner, run.states[0].learner)
+    assert state.learner.updates == 0
+    for name in ("critic", "actor"):
+        before, after = (getattr(s.learner.online, name) for s in (run.states[0], run.states[1]))
+        assert not equal(before, after), name
+    assert [int(s.learner.updates) for s in run.states] == [
+        CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)
+    ]
+    assert all(np.all(np.isfinite(m.critic_loss)) for m in run.metrics)
+
+
+def test_resuming_goes_on_as_if_nothing_had_happened(run, tmp_path):
+    """Claim: a run saved and restored between chunks is the uninterrupted one in every bit of every
+    leaf."""
+    checkpoint.save(tmp_path, T, run.states[1], CFG, {})
+    restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: run.states[0]))
+    assert_same(restored, run.states[1])
+    state, metrics = run.chunk(restored)
+    assert_same(state, run.states[2])
+    assert_same(metrics, run.metrics[1])
+
+
+def test_every_action_is_stored(run):
+    """Claim: the ring holds, in order, what was done and seen; each scene's next view is what it
+    acts on next."""
+    state, metrics = run.states[-1], run.metrics
+    size = int(state.replay.size)
+    assert size == 3 * NUM_SEEN == int(state.replay.head)
+    items = jax.tree.map(
+        lambda leaf: np.asarray(leaf[:size]).reshape(3 * T, CFG.train.scenes, *leaf.shape[1:]),
+        state.replay.items,
+    )
+    for name, stored in (
+        ("reward", items.reward),
+        ("primitive", items.action.primitive),
+        ("terminated", items.terminated),
+    ):
+        np.testing.assert_array_equal(
+            stored, np.concatenate([getattr(m, name) for m in metrics]), err_msg=name
+        )
+    done = np.concatenate([m.terminated | m.truncated for m in metrics])[:-1]
+    assert not np.all(done)
+    np.testing.assert_array_equal(items.next_obs.height[:-1][~done], items.obs.height[1:][~done])
+
+
+def test_finished_scenes_are_replaced(run):
+    """Claim: a scene that is cut off gives way to a fresh one, with no actions taken; its last
+    transition is stored as not terminated, so that it bootstraps. The other scene goes on."""
+    scenes = run.states[0].scenes
+    near_end = scenes.replace(actions=jnp.array([CFG.task.max_actions - T, 0], jnp.int32))
+    state, metrics = run.chunk(copy(run.states[0].replace(scenes=near_end)))
+    ended = np.asarray(metrics.terminated | metrics.truncated)
+    assert ended[:, 0].any()
+    for scene in range(CFG.train.scenes):
+        ends = np.flatnonzero(ended[:, scene])
+        since = T - 1 - ends[-1] if ends.size else T + int(near_end.actions[scene])
+        assert state.scenes.actions[scene] == since
+    assert not np.any(state.scenes.terminated | state.scenes.truncated)
+    if metrics.truncated[-1, 0]:
+        assert not np.asarray(state.replay.items.terminated)[NUM_SEEN - 2]
+        assert np.all(state.scenes.steps_without_change[0] == 0)
+
+
+def test_a_cleared_table_is_a_true_end(run):
+    """Claim: an empty scene terminates, is stored as such and is replaced by one with blocks."""
+    scenes = run.states[0].scenes
+    empty = jax.vmap(lambda scene: Env.begin(run.program.env, scene))(
+        scenes.scene.replace(
+            in_play=jnp.array([[False] * len(CFG.scene.slots), [True] * len(CFG.scene.slots)])
+            & scenes.scene.in_play,
+            position=scenes.scene.position.at[0].set(
+                jnp.asarray([[3.0 + 0.3 * i, 0.0, 1.0] for i in range(3)])
+            ),
+        )
+    )
+    state, metrics = run.chunk(copy(run.states[0].replace(scenes=empty)))
+    assert metrics.terminated[0].tolist() == [True, False]
+    assert state.replay.items.terminated[0]
+    assert np.all(np.any(state.scenes.scene.in_play, axis=1))
+
+
+def test_ill_scenes_leave_no_trace(run):
+    """Claim: a scene whose physics fails is replaced and its transition is not stored; the others'
+    are."""
+    scenes = run.states[0].scenes
+    broken = scenes.scene.replace(velocity=scenes.scene.velocity.at[0].set(jnp.nan))
+    state, metrics = run.chunk(copy(run.states[0].replace(scenes=scenes.replace(scene=broken))))
+    assert metrics.physics_diverged[0].tolist() == [True, False]
+    assert metrics.truncated[0, 0]
+    assert not metrics.terminated[0, 0]
+    assert int(state.replay.size) == NUM_SEEN - int(np.sum(metrics.physics_diverged))
+    for name, leaf in leaves(state):
+        assert np.issubdtype(leaf.dtype, np.integer) or np.all(np.isfinite(leaf)), name
+
+
+@pytest.mark.parametrize("sampler", ["prioritised", "beta"])
+def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
+    """Claim: the sampler's weights are those of the critic's loss, and what a batch's errors make
+    of priorities is stored in the slots that were drawn, and nowhere else. Sampler and networks
+    stand in."""
+    num = CFG.learn.batch
+    weights, error = jnp.linspace(0.5, 1.0, num), jnp.linspace(-1.0, 1.0, num)
+
+    def draw(key, cfg, state, progress, num):
+        return samplers.Sample(2 * jnp.arange(num, dtype=jnp.int32), weights)
+
+    def update(key, learner, state, batch, given):
+        return state, learning.UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
+
+    monkeypatch.setattr(samplers, "sample", draw)
+    monkeypatch.setattr(learning, "update_critic", update)
+    monkeypatch.setattr(
+        learning, "update_actor", lambda learner, state, obs: (state, jnp.float32(0.0))
+    )
+    cfg = dataclasses.replace(
+        CFG, replay=ReplayConfig(capacity=64, sampler=sampler, alpha=0.5, per_epsilon=0.25)
+    )
+    replay = ring.init(cfg.replay, step.example(cfg)).replace(
+        size=jnp.int32(64), priority=jnp.full(64, 7.0)
+    )
+    learner_state = learning.LearnerState(None, None, None, None, jnp.int32(0))
+    _, priority, losses = step._learn(
+        Program(cfg, None, None), jax.random.key(0), learner_state, replay
+    )
+    np.testing.assert_allclose(losses["critic_loss"], np.sum(weights * error), rtol=1e-5)
+    expected = np.full(64, 7.0)
+    expected[: 2 * num : 2] = (
+        np.sqrt(np.abs(error) + 0.25) if sampler == "prioritised" else np.abs(error)
+    )
+    np.testing.assert_allclose(priority, expected, rtol=1e-6)
+
+
+def _opinions() -> tuple[learning.Learner, learning.LearnerState]:
+    """A learner and networks whose critic values every cell differently."""
+    learner = learning.make(CFG)
+    rng = np.random.default_rng(0)
+    blank = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+    state = jax.jit(lambda: learning.init(jax.random.key(0), learner))()
+    noise = jax.tree.map(
+        lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), blank.online
+    )
+    return learner, state.replace(online=noise, target=noise)
+
+
+def _pictures(count: int, seed: int) -> Observation:
+    rng, size = np.random.default_rng(seed), CFG.heightmap.size
+    height = np.where(rng.random((count, size, size)) < 0.2, 0.05, 0.0).astype(np.float32)
+    colour = rng.random((count, size, size, 3)).astype(np.float32)
+    return Observation(
+        colour=jnp.asarray(colour), height=jnp.asarray(height), target=jnp.asarray(height > 0.0)
+    )
+
+
+def test_only_pushes_ask_for_the_best_grasps():
+    """Claim: phi_g before and after an action is the target critic's as soon as one scene was
+    pushed, else 0."""
+    learner, state = _opinions()
+    before, after = _pictures(2, seed=1), _pictures(2, seed=2)
+    around = jax.jit(lambda pushed: step._around(learner, state.target, before, after, pushed))
+    one = jax.jit(lambda obs: step._best_grasps(learner, state.target, obs))
+    wanted = np.stack([one(before), one(after)])
+    assert np.all(np.abs(wanted) > 1e-3)
+    np.testing.assert_allclose(around(jnp.array([False, True])), wanted, rtol=1e-4, atol=1e-5)
+    assert not np.any(around(jnp.array([False, False])))
+
+
+def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the actor's update takes `learn.actor_batch` of the batch's transitions, all if that
+    is 0."""
+    nothing: Any = None
+    taken = []
+
+    def update(learner, state, obs):
+        taken.append(obs.height.shape[0])
+        return state, jnp.zeros(())
+
+    monkeypatch.setattr(learning, "update_actor", update)
+    for actor_batch in (0, 3):
+        cfg = dataclasses.replace(
+            CFG, learn=dataclasses.replace(CFG.learn, actor_batch=actor_batch)
+        )
+        program = Program(cfg, nothing, learning.make(cfg))
+        state = jax.eval_shape(
+            lambda program=program: learning.init(jax.random.key(0), program.learner)
+        )
+        replay = jax.eval_shape(lambda: ring.init(CFG.replay, step.example(CFG)))
+        jax.eval_shape(functools.partial(step._learn, program), jax.random.key(0), state, replay)
+    assert taken == [CFG.learn.batch, 3]

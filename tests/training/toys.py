@@ -1,0 +1,143 @@
+"""A training step that is small, compiles fast and yet calls what every number of a config
+enters."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax import presets
+from csac_jax.agent import cem, explore, learner as learning, losses, rewards, softmax
+from csac_jax.agent.learner import Learner
+from csac_jax.config import Config
+from csac_jax.replay import samplers
+from csac_jax.training.step import Program, StepMetrics, TrainState
+
+SMOKE = presets.smoke()
+SCENES = 8
+CFG = dataclasses.replace(
+    SMOKE, train=dataclasses.replace(SMOKE.train, scenes=SCENES, actions=12 * SCENES)
+)  # 12 steps, 3 chunks
+
+
+def program(cfg: Config = CFG) -> Program:
+    """Without environment and networks."""
+    nothing: Any = None
+    bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
+    learner = Learner(cfg, nothing, nothing, nothing, nothing, nothing, bounds)
+    return Program(cfg, nothing, learning.with_numbers(learner, cfg, bounds))
+
+
+def begin(program: Program, key: jax.Array) -> TrainState:
+    """In place of `step.begin`: scenes [E], networks [3], a ring [4]."""
+    params = jax.random.normal(jax.random.fold_in(key, 1), (3,))
+    learner = {
+        "online": params,
+        "target": params,
+        "optimiser": program.learner.critic_optimiser.init(params),
+        "actor": program.learner.actor_optimiser.init(params),
+    }
+    scenes = jax.random.uniform(jax.random.fold_in(key, 2), (program.cfg.train.scenes,))
+    return TrainState(key, jnp.int32(0), scenes, learner, jnp.zeros(4))
+
+
+def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+    """In place of `step.train_step`: physics, a batch, a gradient, a schedule that is a branch."""
+    cfg, learner = program.cfg, program.learner
+    num = cfg.train.scenes
+    key = jax.random.fold_in(state.key, state.step)
+    noise = jax.random.normal(key, (num,))
+    scenes = program.spread.scenes(lambda scenes, noise: jnp.sin(scenes + noise))(
+        state.scenes, noise
+    )
+    batch = program.spread.batch(scenes)
+
+    def loss(params: jax.Array) -> jax.Array:
+        q = params[0] * batch + params[1] * batch**2 + params[2]
+        target = losses.td_target(
+            batch, cfg.target.gamma, batch > 0.9, jnp.clip(0.5 * q, *learner.bounds)
+        )
+        return jnp.mean(losses.of_error(cfg.learn, target - q))
+
+    critic_loss, gradient = jax.value_and_grad(loss)(state.learner["online"])
+    change, optimiser = learner.critic_optimiser.update(50.0 * gradient, state.learner["optimiser"])
+    slow, actor = learner.actor_optimiser.update(gradient, state.learner["actor"])
+    online = state.learner["online"] + change + slow
+    target = losses.follow(cfg.learn, online, state.learner["target"], state.step + 1)
+    replay = jax.lax.cond(
+        state.step < 2, lambda ring: ring, lambda ring: ring.at[0].add(1.0), state.replay
+    )
+    seen = numbers(program, jax.random.fold_in(key, 1), state.step)
+    primitive = (noise > -1.0).astype(jnp.int32)
+    outcome = jnp.clip(jnp.floor(5.0 * jnp.abs(scenes)), 0.0, 4.0).astype(jnp.int32)
+    no, none = jnp.zeros(num, bool), jnp.zeros(num, jnp.int32)
+    metrics = StepMetrics(
+        primitive=primitive,
+        outcome=outcome,
+        push_better=no,
+        cleared=none,
+        blocks_lost=none,
+        terminated=no,
+        truncated=no,
+        reward=scenes + jnp.mean(seen),
+        gap_disagrees=no,
+        contact_overflow=none,
+        physics_diverged=no,
+        learned=state.step >= 1,
+        critic_loss=critic_loss,
+        actor_loss=jnp.sum(target),
+        td_error=jnp.sum(online),
+        q_mean=seen,
+    )
+    learner_state = {"online": online, "target": target, "optimiser": optimiser, "actor": actor}
+    return TrainState(state.key, state.step + 1, scenes, learner_state, replay), metrics
+
+
+def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
+    """What comes of every number of a config that the losses above do not show, [n]."""
+    cfg, (low, high) = program.cfg, program.learner.bounds
+    keys = [jax.random.fold_in(key, i) for i in range(3)]
+    share = step.astype(jnp.float32) / 10.0
+    found = cem.maximise(
+        keys[0],
+        cfg.cem,
+        lambda u: -jnp.sum((u - 0.3) ** 2),
+        jnp.zeros(2),
+        jnp.zeros((0, 2)),
+        np.zeros(2, bool),
+    )
+    outcomes = jnp.arange(5, dtype=jnp.int32)
+    far, zero, changed = jnp.float32(0.4), jnp.float32(0.0), jnp.array(True)
+    each = jax.vmap(rewards.reward, (None, None, 0, None, None, None, None, None))
+    grasps = each(cfg.reward, jnp.int32(1), outcomes, far, zero, zero, changed, jnp.int32(1))
+    none_lifted, push = jnp.int32(0), jnp.int32(0)
+    gains = (jnp.float32(0.05), jnp.float32(0.5))
+    pushes = [
+        rewards.reward(cfg.reward, push, none_lifted, zero, zero, gain, changed, jnp.int32(0))
+        for gain in gains
+    ]
+    ex = cfg.explore
+    chances = [
+        explore.probability(start, end, ex.decay, 100 * step)
+        for start, end in (
+            (ex.epsilon_primitive_start, ex.epsilon_primitive_end),
+            (ex.epsilon_place_start, ex.epsilon_place_end),
+        )
+    ]
+    noisy = explore.action_noise(keys[1], ex, jnp.zeros(3))
+    pushed = jax.random.bernoulli(keys[2], ex.push_fraction, (32,)).astype(jnp.float32).mean()
+    a, b = samplers.beta_schedule(cfg.replay, share)
+    scalars = [
+        found.value,
+        *pushes,
+        *chances,
+        pushed,
+        a,
+        b,
+        samplers.weight_exponent(cfg.replay, share),
+    ]
+    scalars += [softmax.scaled_inverse_temperature(cfg.target, high - low) * jnp.float32(1.0)]
+    priority = samplers.priority(cfg.replay, jnp.array([0.1, 0.7]))
+    return jnp.concatenate([jnp.stack(scalars), found.action, grasps, noisy, priority])
