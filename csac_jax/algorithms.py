@@ -1,59 +1,49 @@
-"""The CSAC family and its baselines: each a function from a config to a config, for one and the
-same learner.
+"""The CSAC family and its baselines: each a function from a config to a config, for one learner.
 
-A function sets what makes its algorithm; sizes, rates, exploration of places and the run's length
+A function sets what makes its algorithm. Sizes, rates, exploration of places and the run's length
 stay the preset's, so that two algorithms on one preset differ in nothing else. `docs/paper.md` has
-the table of what differs.
+the table of what differs. `register` adds an algorithm of your own.
 """
 
 import dataclasses
+import difflib
 from collections.abc import Callable
-from typing import Any
 
-from csac_jax.config import Algo, Config, RewardConfig
+from csac_jax.config import Config, RewardConfig
+
+Algorithm = Callable[[Config], Config]
 
 VPG_REWARD = RewardConfig(
     success_bonus=0.0,
-    nothing=0.0,
-    empty=0.0,
-    touched=0.0,
-    dropped=0.0,
-    lifted=1.0,
+    grasp_levels=(0.0, 0.0, 0.0, 0.0, 1.0),
     push_effect="change",
-    push_better=1.0,
-    push_worse=0.0,
+    push_levels=(0.0, 1.0),
 )
 """Rewards of VPG (arXiv:1803.09956 sec. IV): 1 for a grasp that lifts, 0.5 = Gamma for a push that
 changes the map."""
 
 
-def _change(cfg: Config, **sections: dict[str, Any]) -> Config:
-    """The config with the given fields of the given sections changed."""
-    changed = {
-        name: dataclasses.replace(getattr(cfg, name), **fields) for name, fields in sections.items()
-    }
-    return dataclasses.replace(cfg, **changed)
-
-
-def csac(cfg: Config) -> Config:
-    """Continuous pose by CEM, softmax target, actor; transitions drawn alike."""
-    return _change(
-        cfg,
+def _csac(cfg: Config) -> Config:
+    return cfg.change(
         policy={"place": "cem", "primitive": "argmax"},
         target={"value": "softmax"},
         learn={"actor": True},
-        replay={"sampler": "uniform"},
     )
+
+
+def csac(cfg: Config) -> Config:
+    """Continuous pose by CEM, softmax target, actor; all transitions are equally likely."""
+    return _csac(cfg).change(replay={"sampler": "uniform"})
 
 
 def csac_per(cfg: Config) -> Config:
     """CSAC with prioritised replay."""
-    return _change(csac(cfg), replay={"sampler": "prioritised"})
+    return _csac(cfg).change(replay={"sampler": "prioritised"})
 
 
 def csac_beta(cfg: Config) -> Config:
     """CSAC with beta-ranked replay, sec. 3.5; the law of the ranks is the preset's."""
-    return _change(csac(cfg), replay={"sampler": "beta"})
+    return _csac(cfg).change(replay={"sampler": "beta"})
 
 
 def vpg(cfg: Config) -> Config:
@@ -63,39 +53,28 @@ def vpg(cfg: Config) -> Config:
     Deviations: Adam for SGD with momentum, batches for single transitions, random places while
     learning as for all.
     """
-    return _change(
-        dataclasses.replace(cfg, reward=VPG_REWARD),
+    return cfg.change(
+        reward=VPG_REWARD,
         policy={"place": "argmax", "primitive": "argmax"},
         target={"value": "max", "gamma": 0.5},
-        explore={
-            "noise_std": 0.0,
-            "epsilon_primitive_start": 0.5,
-            "epsilon_primitive_end": 0.1,
-            "push_fraction": 0.5,
-        },
+        explore={"noise_std": 0.0, "epsilon_primitive": (0.5, 0.1), "push_fraction": 0.5},
         learn={
             "actor": False,
             "critics": 1,
             "loss": "huber",
-            "target_update": "hard",
+            "tau": 1.0,
             "target_update_period": 1,
         },
-        replay={
-            "sampler": "beta",
-            "beta_start": (1.0, 2.0),
-            "beta_middle": (1.0, 2.0),
-            "beta_end": (1.0, 2.0),
-        },
+        replay={"sampler": "beta", "start": (1.0, 2.0), "middle": (1.0, 2.0), "end": (1.0, 2.0)},
     )
 
 
 def reactive(cfg: Config) -> Config:
     """VPG's baseline P+G reactive: no future, gamma = 0.
 
-    Deviation: VPG's classifies outcomes as good or bad by cross-entropy; here their rewards are
-    regressed.
+    Deviation: VPG's classifies outcomes by cross-entropy; here their rewards are regressed.
     """
-    return _change(vpg(cfg), target={"gamma": 0.0})
+    return vpg(cfg).change(target={"gamma": 0.0})
 
 
 def grasp_only(cfg: Config) -> Config:
@@ -104,10 +83,10 @@ def grasp_only(cfg: Config) -> Config:
 
     Deviation: as of `reactive`.
     """
-    return _change(reactive(cfg), policy={"primitive": "grasp"}, explore={"push_fraction": 0.0})
+    return reactive(cfg).change(policy={"primitive": "grasp"}, explore={"push_fraction": 0.0})
 
 
-ALGORITHMS: dict[Algo, Callable[[Config], Config]] = {
+ALGORITHMS: dict[str, Algorithm] = {
     "csac": csac,
     "csac_per": csac_per,
     "csac_beta": csac_beta,
@@ -117,10 +96,25 @@ ALGORITHMS: dict[Algo, Callable[[Config], Config]] = {
 }
 
 
+def register(name: str, algorithm: Algorithm) -> None:
+    """Makes `algorithm`, a function from a config to a config, known as `name` to API and commands.
+
+    Raises ValueError if the name is taken.
+    """
+    if name in ALGORITHMS:
+        raise ValueError(f"algorithm '{name}' exists; choose another name")
+    ALGORITHMS[name] = algorithm
+
+
 def configure(cfg: Config, name: str) -> Config:
-    """The config made one of the algorithm `name`. Raises ValueError if there is none, naming those
-    that there are."""
-    for algo, change in ALGORITHMS.items():
-        if algo == name:
-            return dataclasses.replace(change(cfg), algo=algo)
-    raise ValueError(f"unknown algorithm '{name}'; choose one of: {', '.join(ALGORITHMS)}")
+    """The config made one of the algorithm `name`. Raises ValueError for an unknown name."""
+    if name not in ALGORITHMS:
+        raise ValueError(unknown("algorithm", name, ALGORITHMS))
+    return dataclasses.replace(ALGORITHMS[name](cfg), algo=name)
+
+
+def unknown(what: str, name: str, known: dict[str, Algorithm]) -> str:
+    """The complaint about an unknown name, with the nearest known one."""
+    near = difflib.get_close_matches(name, known, 1)
+    meant = f"; did you mean {near[0]}?" if near else ""
+    return f"unknown {what} '{name}'{meant} choose one of: {', '.join(known)}"

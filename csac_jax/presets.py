@@ -1,19 +1,21 @@
-"""Named configs. A preset is a function, so that reading one builds only that one."""
+"""Named configs. A preset is a function; `register` adds one of your own."""
 
 import dataclasses
 from collections.abc import Callable
 
+from csac_jax.algorithms import unknown
 from csac_jax.config import (
+    BetaReplay,
     CEMConfig,
     Config,
+    DenseNet121,
     ExploreConfig,
     HeightmapConfig,
     LearnConfig,
-    NetConfig,
-    ReplayConfig,
     RewardConfig,
     SceneConfig,
     SimConfig,
+    SmallNet,
     TargetConfig,
     TaskConfig,
     TrainConfig,
@@ -29,17 +31,15 @@ def quick() -> Config:
     passes; the net's features lie 28 mm apart, not 14, for cheaper passes, its maps' cells still
     14, and its layers see as far.
     """
-    alike = SceneConfig(
-        size_jitter=0.0, mesh_size_jitter=0.0, density=(600.0, 600.0), friction=(0.8, 0.8)
-    )
+    alike = SceneConfig(size_jitter=(0.0, 0.0), density=(600.0, 600.0), friction=(0.8, 0.8))
     return Config(
         preset="quick",
         scene=alike,
         sim=SimConfig(physics="auto"),
-        net=NetConfig(stride=4, subcells=2, dilations=(1, 2, 1), stem=32, growth=32, head=48),
+        net=SmallNet(stride=4, subcells=2, dilations=(1, 2, 1), stem=32, growth=32, head=48),
         target=TargetConfig(gamma=0.2),
         learn=LearnConfig(actor_batch=8),
-        replay=ReplayConfig(beta_end=(1.0, 4.0)),
+        replay=BetaReplay(end=(1.0, 4.0)),
     )
 
 
@@ -71,18 +71,16 @@ def fast() -> Config:
             pool=4096,
             arranged=0.75,
             drop_extent=(0.1, 0.25),
-            mesh_size_jitter=0.0,
+            size_jitter=(0.1, 0.0),
         ),
         task=TaskConfig(max_actions=25),
         sim=SimConfig(physics="auto", geom_pairs=24, contacts=80),
-        net=NetConfig(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
+        net=SmallNet(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         target=TargetConfig(gamma=0.2),
-        reward=RewardConfig(
-            nothing=-1.5, empty=-1.5, touched=-1.5, dropped=-1.0, lost_block_penalty=3.0
-        ),
-        explore=ExploreConfig(epsilon_primitive_end=0.2, push_fraction=0.5, decay=0.9999),
+        reward=RewardConfig(grasp_levels=(-1.5, -1.5, -1.5, -1.0, 1.0), lost_block_penalty=3.0),
+        explore=ExploreConfig(epsilon_primitive=(0.5, 0.2), push_fraction=0.5, decay=0.9999),
         learn=LearnConfig(batch=64, updates=64, augment_shift=8, critics=2, loss="squared"),
-        replay=ReplayConfig(capacity=65536, beta_end=(1.0, 4.0)),
+        replay=BetaReplay(capacity=65536, end=(1.0, 4.0)),
         train=TrainConfig(
             scenes=2048, actions=163840, learning_starts=4096, chunk=2, save_every=20
         ),
@@ -120,9 +118,9 @@ def paper() -> Config:
         task=TaskConfig(max_actions=25),
         sim=SimConfig(physics="c", geom_pairs=24, contacts=80),
         heightmap=HeightmapConfig(size=224),
-        net=NetConfig(kind="densenet121", norm="batch", head=64, margin=0.4286, zoom=2),
+        net=DenseNet121(norm="batch", head=64, margin=0.4286, zoom=2),
         target=TargetConfig(gamma=0.5),
-        explore=ExploreConfig(epsilon_place_start=0.0, decay=0.9998, push_fraction=0.5),
+        explore=ExploreConfig(epsilon_place=(0.0, 0.0), decay=0.9998, push_fraction=0.5),
         learn=LearnConfig(
             learning_rate=1e-4,
             actor_learning_rate=1e-4,
@@ -133,7 +131,7 @@ def paper() -> Config:
             augment=False,
             tau=0.005,
         ),
-        replay=ReplayConfig(capacity=2500),
+        replay=BetaReplay(capacity=2500),
         train=TrainConfig(scenes=1, actions=2500, learning_starts=8, chunk=50, save_every=10),
     )
 
@@ -153,9 +151,9 @@ def paper_small() -> Config:
     return dataclasses.replace(
         whole,
         preset="paper_small",
-        scene=dataclasses.replace(whole.scene, mesh_size_jitter=0.0),
+        scene=dataclasses.replace(whole.scene, size_jitter=(0.1, 0.0)),
         heightmap=HeightmapConfig(),
-        net=NetConfig(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
+        net=SmallNet(stride=4, subcells=4, dilations=(1, 2, 1), stem=48, growth=64, head=96),
         target=TargetConfig(gamma=0.2),
         explore=ExploreConfig(),
         learn=LearnConfig(batch=32, updates=1, augment_shift=8, critics=2, loss="squared"),
@@ -169,20 +167,20 @@ def smoke() -> Config:
     return Config(
         preset="smoke",
         scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=8, settle_time=1.0),
-        sim=SimConfig(
-            grasp_phases=(20, 15, 20), push_phases=(15, 25, 15), geom_pairs=6, contacts=16
-        ),
+        sim=SimConfig(grasp_phases=(20, 15, 20), geom_pairs=6, contacts=16),
         heightmap=HeightmapConfig(size=32),
-        net=NetConfig(rotations=4, growth=4, dilations=(1, 2), stem=4, head=4),
+        net=SmallNet(rotations=4, growth=4, dilations=(1, 2), stem=4, head=4),
         cem=CEMConfig(candidates=16, elites=4, rounds=2),
         target=TargetConfig(samples=8),
         learn=LearnConfig(batch=8, updates=1),
-        replay=ReplayConfig(capacity=64),
+        replay=BetaReplay(capacity=64),
         train=TrainConfig(scenes=2, actions=64, learning_starts=8, chunk=4, save_every=2),
     )
 
 
-PRESETS: dict[str, Callable[[], Config]] = {
+Preset = Callable[[], Config]
+
+PRESETS: dict[str, Preset] = {
     "smoke": smoke,
     "quick": quick,
     "fast": fast,
@@ -191,8 +189,18 @@ PRESETS: dict[str, Callable[[], Config]] = {
 }
 
 
+def register(name: str, preset: Preset) -> None:
+    """Makes `preset`, a function that returns a config, known as `name` to API and commands.
+
+    Raises ValueError if the name is taken.
+    """
+    if name in PRESETS:
+        raise ValueError(f"preset '{name}' exists; choose another name")
+    PRESETS[name] = preset
+
+
 def get(name: str) -> Config:
-    """The preset `name`. Raises ValueError if there is none, naming those that there are."""
+    """The preset `name`. Raises ValueError for an unknown name."""
     if name not in PRESETS:
-        raise ValueError(f"unknown preset '{name}'; choose one of: {', '.join(PRESETS)}")
+        raise ValueError(unknown("preset", name, PRESETS))
     return dataclasses.replace(PRESETS[name](), preset=name)

@@ -15,9 +15,10 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.agent import box
-from csac_jax.config import Config, NetConfig, PolicyConfig
+from csac_jax.config import Config, PolicyConfig
 from csac_jax.constants import Primitive
-from csac_jax.nets import dense, networks
+from csac_jax.nets import dense
+from csac_jax.nets.networks import Networks
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation
@@ -38,7 +39,7 @@ class Frames:
         rotate.RotationTables
     )  # of the first K / 2 frames: the others are the same pictures upside down
     yaws: np.ndarray  # [K] rad
-    net: NetConfig
+    networks: Networks
     stride: int  # cells of a canvas per cell of a map, along each axis
     side: int  # h = w, cells
     cell: float  # side of a cell, m
@@ -49,11 +50,11 @@ class Frames:
     inside: np.ndarray  # [K, h, w] bool, above the workspace
 
 
-def frames(cfg: Config) -> Frames:
+def frames(cfg: Config, networks: Networks) -> Frames:
     """Frames of a config's heightmap and net."""
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
     tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
-    stride = networks.stride(cfg.net)
+    stride = networks.stride
     side, cell = tables.canvas // stride, tables.cell * stride
     yaws = 2.0 * np.pi * np.arange(rotations) / rotations
     along = (np.arange(side) - 0.5 * (side - 1)) * cell
@@ -66,7 +67,7 @@ def frames(cfg: Config) -> Frames:
     return Frames(
         tables,
         yaws.astype(np.float32),
-        cfg.net,
+        networks,
         stride,
         side,
         cell,
@@ -89,9 +90,8 @@ class DenseMaps:
 
 def seen(frames: Frames, obs: Observation) -> jax.Array:
     """What the net is to see of an observation, [..., H, W, I]; see `inputs` of the net."""
-    return networks.inputs(
-        frames.net, obs.colour, obs.height, obs.target if frames.marked else None
-    )
+    target = obs.target if frames.marked else None
+    return frames.networks.inputs(obs.colour, obs.height, target)
 
 
 def net_inputs(frames: Frames, obs: Observation) -> jax.Array:

@@ -6,11 +6,11 @@ from typing import Any
 import safetensors
 import safetensors.numpy
 
-from csac_jax.config import NetConfig
+from csac_jax.config import DenseNet121
 from csac_jax.nets import torchvision
 
 
-def read(cfg: NetConfig) -> Any:
+def read(cfg: DenseNet121) -> Any:
     """Variables of a trunk from the file `net.weights`. Nothing in the file is executed.
 
     Raises ValueError in one line, naming the tensor if one is missing, extra or misshapen.

@@ -16,7 +16,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from csac_jax.config import NetConfig
+from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets.convolution import conv2d
 
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
@@ -34,7 +34,7 @@ def compute_dtype(cfg: NetConfig) -> Any:
 
 
 def inputs(
-    colour: jax.Array | None, height: jax.Array, target: jax.Array | None, border: bool
+    colour: jax.Array | None, height: jax.Array, target: jax.Array | None, border: bool = False
 ) -> jax.Array:
     """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [...,
     H, W] m.
@@ -75,7 +75,7 @@ class Trunk(nn.Module):
     """Dense features of turned maps: [B, C, C, I] -> [B, C / stride, C / stride, stem + layers *
     growth]."""
 
-    cfg: NetConfig
+    cfg: SmallNet
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
@@ -96,7 +96,7 @@ class Head(nn.Module):
     """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS], s = subcells; two 1 x 1
     convolutions."""
 
-    cfg: NetConfig
+    cfg: SmallNet
 
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
@@ -151,7 +151,7 @@ class GroupNorm(nn.Module):
 class Critic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads."""
 
-    cfg: NetConfig
+    cfg: SmallNet
 
     def setup(self) -> None:
         self.trunk = Trunk(self.cfg)

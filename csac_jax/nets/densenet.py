@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
-from csac_jax.config import DENSENET_STRIDE, NetConfig
+from csac_jax.config import DenseNet121
 from csac_jax.nets.dense import OUTPUTS, TABLE_HEIGHT, compute_dtype
 from csac_jax.nets.products import Convolution, Stem, average_pool, max_pool
 
@@ -107,7 +107,7 @@ class BatchNorm(nn.Module):
         return (maps.astype(jnp.float32) * factor + shift).astype(self.dtype)
 
 
-def _norm(cfg: NetConfig, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
+def _norm(cfg: DenseNet121, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
     """Pieces joined and normed [..., F]; `train`: batch norm takes the batch's statistics, which
     are followed."""
     dtype = compute_dtype(cfg)
@@ -120,14 +120,14 @@ def _norm(cfg: NetConfig, pieces: Sequence[Piece], train: bool, name: str) -> ja
     )(maps)
 
 
-def _convolution(cfg: NetConfig, features: int, size: int, name: str) -> Convolution:
+def _convolution(cfg: DenseNet121, features: int, size: int, name: str) -> Convolution:
     return Convolution(features, size, compute_dtype(cfg), name=name)
 
 
 class DenseLayer(nn.Module):
     """What a layer adds to the pieces before it: [B, H, W, .] -> [B, H, W, block_growth]."""
 
-    cfg: NetConfig
+    cfg: DenseNet121
 
     @nn.compact
     def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
@@ -145,7 +145,7 @@ class DenseBlock(nn.Module):
     paper draws it, all channels would be written once more per layer.
     """
 
-    cfg: NetConfig
+    cfg: DenseNet121
     layers: int
 
     @nn.compact
@@ -159,7 +159,7 @@ class DenseBlock(nn.Module):
 class Transition(nn.Module):
     """Half of the channels at half of the resolution."""
 
-    cfg: NetConfig
+    cfg: DenseNet121
 
     @nn.compact
     def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
@@ -175,7 +175,7 @@ class Trunk(nn.Module):
     W / 16, 1024].
     """
 
-    cfg: NetConfig
+    cfg: DenseNet121
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> jax.Array:
@@ -198,7 +198,7 @@ class Head(nn.Module):
     (ours).
     """
 
-    cfg: NetConfig
+    cfg: DenseNet121
 
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
@@ -208,7 +208,7 @@ class Head(nn.Module):
         hidden = nn.relu(_norm(cfg, [_piece(hidden)], train, "norm1")).astype(jnp.float32)
         small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
         maps = nn.Dense(OUTPUTS, kernel_init=small, name="conv1")(hidden)
-        return _upsample(maps, DENSENET_STRIDE // (cfg.zoom * cfg.output_stride))
+        return _upsample(maps, DenseNet121.STRIDE // (cfg.zoom * cfg.output_stride))
 
 
 def _upsample(maps: jax.Array, factor: int) -> jax.Array:
@@ -224,7 +224,7 @@ class Critic(nn.Module):
     anew.
     """
 
-    cfg: NetConfig
+    cfg: DenseNet121
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
@@ -243,7 +243,7 @@ class Critic(nn.Module):
         return Head(self.cfg, name="head")(features, train), features
 
 
-def _trunk_inputs(cfg: NetConfig, maps: jax.Array) -> jax.Array:
+def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
     """What each trunk sees [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map
     three times.
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.config import NetConfig
+from csac_jax.config import DenseNet121
 from csac_jax.nets import densenet
 
 _LEAVES = {
@@ -29,7 +29,7 @@ def _needed(name: str) -> bool:
     return not name.startswith("classifier.") and not name.endswith(".num_batches_tracked")
 
 
-def variables(cfg: NetConfig, tensors: Mapping[str, np.ndarray]) -> Any:
+def variables(cfg: DenseNet121, tensors: Mapping[str, np.ndarray]) -> Any:
     """Variables of one trunk, float32 leaves [...], from `tensors` by name.
 
     Raises ValueError naming the first tensor that is missing, misshapen or not known.

@@ -1,5 +1,4 @@
-"""The ring of transitions: R1 of CSAC Algorithm 1 line 14. R2, its ranked view, is the
-sampler's."""
+"""The ring of transitions: R1 of CSAC Algorithm 1 line 14. R2, its ranked view, is a sampler's."""
 
 import dataclasses
 import math
@@ -9,8 +8,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from csac_jax.config import ReplayConfig
-
 LARGEST = 1e28  # larger priorities are cut off here, so that the sum over any ring is finite
 
 
@@ -18,20 +15,17 @@ LARGEST = 1e28  # larger priorities are cut off here, so that the sum over any r
 class ReplayState:
     """Ring of transitions. C = capacity. Slot `(head - 1) % C` is the newest."""
 
-    items: Any  # pytree, leaves [C, ...]; it has a field `reward` [C] if that is what the sampler ranks by
+    items: Any  # pytree, leaves [C, ...]
     head: jax.Array  # [] int32, next slot written
     size: jax.Array  # [] int32, filled slots, <= C
-    priority: (
-        jax.Array
-    )  # [C] float32, what `samplers.priority` made of the last TD error; 0 beyond `size`
+    priority: jax.Array  # [C] float32, the sampler's; of the built-in ones 0 beyond `size`
 
 
-def init(cfg: ReplayConfig, example_item: Any) -> ReplayState:
-    """An empty ring for items of the types and shapes of `example_item`."""
-    items = jax.tree.map(
-        lambda leaf: jnp.zeros((cfg.capacity, *leaf.shape), leaf.dtype), example_item
-    )
-    return ReplayState(items, jnp.int32(0), jnp.int32(0), jnp.zeros(cfg.capacity, jnp.float32))
+def init(priority: jax.Array, example_item: Any) -> ReplayState:
+    """An empty ring with a slot for each entry of `priority` [C], for items like `example_item`."""
+    rows = priority.shape
+    items = jax.tree.map(lambda leaf: jnp.zeros((*rows, *leaf.shape), leaf.dtype), example_item)
+    return ReplayState(items, jnp.int32(0), jnp.int32(0), priority)
 
 
 def bytes_needed(capacity: int, example_item: Any) -> int:
