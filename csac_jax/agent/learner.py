@@ -76,6 +76,11 @@ class Learner:
     actor_optimiser: optax.GradientTransformation
     bounds: tuple[float, float]  # smallest and largest possible return
 
+    @property
+    def return_range(self) -> float:
+        """Distance between the bounds."""
+        return self.bounds[1] - self.bounds[0]
+
 
 def make(cfg: Config) -> Learner:
     """The learner of a config."""
@@ -132,7 +137,7 @@ def init(key: jax.Array, learner: Learner) -> LearnerState:
     blank_obs = Observation(
         jnp.zeros((size, size, 3)), jnp.zeros((size, size)), jnp.zeros((size, size), bool)
     )
-    blank = jnp.zeros((1, side, side, maps.seen(learner.frames, blank_obs).shape[-1]))
+    blank = jnp.zeros((1, side, side, maps.input_maps(learner.frames, blank_obs).shape[-1]))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(
         key_critic, jnp.arange(learner.cfg.learn.critics)
     )
@@ -180,7 +185,7 @@ def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[ja
     Q is the lower of both critics in each cell, before anything is read between cells; features are
     the first one's.
     """
-    fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
+    fed = jax.vmap(maps.rotated_inputs, (None, 0))(learner.frames, obs)
     q, features = _of_each_critic(
         lambda variables: networks.look(learner.critic, variables, fed), params.critic
     )
@@ -204,7 +209,7 @@ def _dense_maps(
     """The maps of all yaws from those of the passes; `correction` [B, K / 2, h, w, OUTPUTS] is the
     actor's."""
     unfold = jax.vmap(maps.unfold)
-    find = maps.actionable if learner.cfg.policy.mask else maps.everywhere
+    find = maps.actionable_cells if learner.cfg.policy.mask else maps.all_cells
     return DenseMaps(
         q=unfold(q),
         logits=unfold(actor.logits(q, correction)),
@@ -235,7 +240,7 @@ def _max_value(learner: Learner, state: DenseMaps) -> jax.Array:
     The limit of the softmax over the map: samples would miss the highest cell, and a trilinear map
     is highest in one.
     """
-    chosen = np.array(maps.allowed(learner.cfg.policy))
+    chosen = np.array(maps.allowed_primitives(learner.cfg.policy))
     valid = state.valid[chosen]
     return jnp.max(jnp.where(valid | ~jnp.any(valid), state.q[chosen], -jnp.inf))
 
@@ -261,7 +266,7 @@ def _softmax_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Ar
             jax.vmap(maps.is_valid, (None, None, None, 0))(frames, state.valid, which, poses),
         )
 
-    sampled = map(of, maps.allowed(learner.cfg.policy))
+    sampled = map(of, maps.allowed_primitives(learner.cfg.policy))
     q, log_density, valid = (jnp.concatenate(leaves) for leaves in zip(*sampled, strict=True))
     low, high = learner.bounds
     shown = valid | ~jnp.any(valid)
@@ -285,7 +290,7 @@ def _value(
     lower = jnp.floor(turns)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
-    fed = maps.seen(frames, obs)
+    fed = maps.input_maps(frames, obs)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(
         frames.tables, fed, half
     )
@@ -329,7 +334,7 @@ def update_critic(
 
     def loss(learned: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
         q, statistics = _value(learner, {**critic, **learned}, obs, batch.action)  # [M, B]
-        each = jnp.sum(losses.of_error(cfg.learn, target[None] - q), axis=0)
+        each = jnp.sum(losses.td_loss(cfg.learn, target[None] - q), axis=0)
         return jnp.mean(weights * each), (jnp.mean(q, axis=0), statistics)
 
     before = networks.learned(critic)
@@ -338,7 +343,7 @@ def update_critic(
     online = state.online.replace(critic={**optax.apply_updates(before, step), **statistics})
     state = state.replace(
         online=online,
-        target=losses.follow(cfg.learn, online, state.target, state.updates + 1),
+        target=losses.update_target(cfg.learn, online, state.target, state.updates + 1),
         critic_optimiser=optimiser,
         updates=state.updates + 1,
     )
@@ -357,7 +362,7 @@ def update_actor(
     """
     if not learner.cfg.learn.actor:
         return state, jnp.zeros(())
-    chosen = maps.allowed(learner.cfg.policy)
+    chosen = maps.allowed_primitives(learner.cfg.policy)
     q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online, obs))
 
     def value(dense_maps: DenseMaps, primitive: Primitive) -> jax.Array:

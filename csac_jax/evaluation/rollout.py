@@ -141,12 +141,10 @@ def episode(cfg: Config, env: Env, name: str, params: Params | None, seed: int) 
 def _think(learner: Learner, keys: jax.Array, params: Params, states: State) -> Thought:
     """What the policy `learned`, given the same keys, looks at; leaves [E, ...]."""
     cfg, frames = learner.cfg, learner.frames
-    seen, span = learning.look(learner, params, states.obs), learner.bounds[1] - learner.bounds[0]
+    seen = learning.look(learner, params, states.obs)
     places = geometry.cell_centres(cfg.heightmap)
     q, _ = jax.vmap(maps.best_over_yaws, (None, 0, None))(frames, seen, places)
-    candidates = jax.vmap(policy.candidates, (0, None, None, 0, None))(
-        keys, cfg, frames, seen, span
-    )
+    candidates = jax.vmap(policy.candidates, (0, None, 0))(keys, learner, seen)
     return Thought(q, candidates, jax.vmap(learning.best_grasp)(seen))
 
 
@@ -157,18 +155,16 @@ def _rewards(
     target critic."""
     info, cfg = after.info, learner.cfg.reward
     phi = jax.vmap(learning.best_grasp)(learning.look(learner, params, after.obs))
-    pay = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
-    changed = info.moved > CHANGE_AREA
-    return pay(
-        cfg,
-        action.primitive,
-        info.outcome,
-        info.distance,
-        thought.best_grasp,
-        phi,
-        changed,
-        info.blocks_lost,
+    result = rewards.ActionResult(
+        primitive=action.primitive,
+        outcome=info.outcome,
+        distance=info.distance,
+        phi_before=thought.best_grasp,
+        phi_after=phi,
+        changed=info.moved > CHANGE_AREA,
+        blocks_lost=info.blocks_lost,
     )
+    return jax.vmap(rewards.reward, (None, 0))(cfg, result)
 
 
 def _run(
@@ -264,15 +260,15 @@ def _step(
 def _policy(cfg: Config, env: Env, name: str) -> Policy:
     """The policy of that name. Raises ValueError for an unknown one."""
     learner = learning.make(cfg)
-    frames, span = learner.frames, learner.bounds[1] - learner.bounds[0]
+    frames = learner.frames
 
     def learned(keys: jax.Array, params: Params, states: State) -> Action:
         dense_maps = learning.look(learner, params, states.obs)
-        act = jax.vmap(policy.best_action, (0, None, None, 0, None, 0))
-        return act(keys, cfg, frames, dense_maps, span, states.steps_without_change)
+        act = jax.vmap(policy.best_action, (0, None, 0, 0))
+        return act(keys, learner, dense_maps, states.steps_without_change)
 
     def random(keys: jax.Array, params: Params, states: State) -> Action:
-        valid = jax.vmap(maps.actionable, (None, 0))(frames, states.obs)
+        valid = jax.vmap(maps.actionable_cells, (None, 0))(frames, states.obs)
         return jax.vmap(policy.random_grasp, (0, None, 0))(keys, frames, valid)
 
     def planned(keys: jax.Array, params: Params, states: State) -> Action:

@@ -90,18 +90,10 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     # 8-13).
     look = _apart(program, lambda online, obs: learning.look(learner, online, obs))
     maps = look(state.learner.online, scenes.obs)
-    act = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
+    act = jax.vmap(policy.act, (0, None, 0, 0, None))
     taken = state.step * cfg.train.scenes
-    span = learner.bounds[1] - learner.bounds[0]
-    action = act(
-        _keys(key_act, cfg.train.scenes),
-        cfg,
-        learner.frames,
-        maps,
-        span,
-        scenes.steps_without_change,
-        taken,
-    )
+    keys = _keys(key_act, cfg.train.scenes)
+    action = act(keys, learner, maps, scenes.steps_without_change, taken)
 
     # Simulate.
     after = program.spread.scenes(jax.vmap(env.step))(scenes, action)
@@ -111,17 +103,16 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     around = _apart(program, lambda *given: _around(learner, *given), one_by_one=True)
     phi_before, phi_after = around(state.learner.target, scenes.obs, after.obs, pushed)
     info = after.info
-    changed = info.moved > CHANGE_AREA
-    reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))(
-        cfg.reward,
-        action.primitive,
-        info.outcome,
-        info.distance,
-        phi_before,
-        phi_after,
-        changed,
-        info.blocks_lost,
+    result = rewards.ActionResult(
+        primitive=action.primitive,
+        outcome=info.outcome,
+        distance=info.distance,
+        phi_before=phi_before,
+        phi_after=phi_after,
+        changed=info.moved > CHANGE_AREA,
+        blocks_lost=info.blocks_lost,
     )
+    reward = jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
     seen = Transition(
         obs=heightmap.pack(scenes.obs),
         action=action,
@@ -220,8 +211,8 @@ def _draw(
     cfg, (key_sample, key_augment) = program.cfg, keys
     slots, weights = samplers.sample(key_sample, cfg.replay, replay, progress, cfg.learn.batch)
     batch = program.spread.batch(ring.gather(replay, slots))
-    vary = jax.vmap(augment.vary, (0, None, 0))
-    return slots, weights, vary(_keys(key_augment, cfg.learn.batch), cfg, batch)
+    augmented = jax.vmap(augment.augment, (0, None, 0))
+    return slots, weights, augmented(_keys(key_augment, cfg.learn.batch), cfg, batch)
 
 
 def _best_grasps(learner: Learner, target: Params, obs: Observation) -> jax.Array:

@@ -108,26 +108,19 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     cfg, env, learner = program.cfg, program.env, program.learner
     scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
     keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
-    span = learner.bounds[1] - learner.bounds[0]
-    choose = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
+    choose = jax.vmap(policy.act, (0, None, 0, 0, None))
 
     def act(keys: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
-        return choose(keys, cfg, learner.frames, maps, span, steps_without_change, jnp.int32(0))
+        return choose(keys, learner, maps, steps_without_change, jnp.int32(0))
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         pushed = action.primitive == Primitive.PUSH
         phi = step._around(learner, nets.target, before.obs, after.obs, pushed)
-        changed = after.info.moved > CHANGE_AREA
-        info, of_one = after.info, jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
-        return of_one(
-            cfg.reward,
-            action.primitive,
-            info.outcome,
-            info.distance,
-            *phi,
-            changed,
-            info.blocks_lost,
+        info, changed = after.info, after.info.moved > CHANGE_AREA
+        result = rewards.ActionResult(
+            action.primitive, info.outcome, info.distance, *phi, changed, info.blocks_lost
         )
+        return jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)

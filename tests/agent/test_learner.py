@@ -158,8 +158,11 @@ def test_critic_gradient_is_that_of_its_loss(learner, state, batch):
     )
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.critic, after.online.critic)
-    _check_slope(lambda critic: run(state.replace(online=state.online.replace(critic=critic)))[1].critic_loss,
-                 state.online.critic, gradient)  # fmt: skip
+
+    def loss(critic):
+        return run(state.replace(online=state.online.replace(critic=critic)))[1].critic_loss
+
+    _check_slope(loss, state.online.critic, gradient)
 
 
 def _check_slope(loss, params, gradient, relative: float = 1e-2, step: float = 2e-3) -> None:
