@@ -345,11 +345,10 @@ def test_both_levels_of_a_push_are_reached(lab: Lab):
     zero, push = jnp.zeros(()), jnp.int32(Primitive.PUSH)
     level, reward = [], []
     for low, high, moved in zip(*phi, after.info.moved[:4], strict=True):
-        seen = (jnp.float32(low), jnp.float32(high), moved > CHANGE_AREA)
-        level.append(float(rewards.push_effect(cfg, *seen)))
-        reward.append(
-            float(rewards.reward(cfg, push, jnp.int32(Outcome.NOTHING), zero, *seen, jnp.int32(0)))
-        )
+        phis, nothing = (jnp.float32(low), jnp.float32(high)), jnp.int32(Outcome.NOTHING)
+        result = rewards.ActionResult(push, nothing, zero, *phis, moved > CHANGE_AREA, jnp.int32(0))
+        level.append(float(rewards.push_effect(cfg, result)))
+        reward.append(float(rewards.reward(cfg, result)))
     assert level == [1.0, -1.0, -1.0, -1.0]
     assert reward == [0.5, -0.5, -0.5, -0.5]  # Gamma = 0.5, eq. 13
     np.testing.assert_array_equal(

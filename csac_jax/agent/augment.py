@@ -1,10 +1,8 @@
-"""Augmentation of transitions: the eight symmetries of the square workspace, shifts by whole cells,
-turns.
+"""Augmentation of transitions: symmetries of the square workspace, shifts by cells, rotations.
 
-Symmetries, shifts and quarter turns are exact, cell by cell. Any other turn is exact in place and
-yaw of the action; the maps are turned to the nearest cell, so that what a cell shows lies up to
-half a cell a side beside it. In each of them the light stays where it is: sloping faces keep their
-brightness.
+Symmetries, shifts and quarter turns are exact, cell by cell. Any other rotation is exact for the
+action; maps take the nearest cell, at most half a cell a side away. The light does not move along:
+sloping faces keep their brightness.
 """
 
 import jax
@@ -12,23 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.agent.learner import Transition
+from csac_jax.agent.actor_critic import Transition
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import PackedObservation
 
-CLEAR = (
-    0.05  # m from a side that what stands must keep where the border is shown and that side is none
-)
+CLEARANCE = 0.05  # m, of blocks to a side that a shown border moves out of sight
 
 
-def turn_over(
+def apply_symmetry(
     transition: Transition, mirror_x: jax.Array, mirror_y: jax.Array, swap: jax.Array
 ) -> Transition:
-    """The transition seen with x mirrored, then y mirrored, then x and y swapped, where the flags
-    [] bool say so."""
+    """The transition with x mirrored, then y mirrored, then x and y swapped; flags [] bool."""
 
     def view(field: jax.Array) -> jax.Array:  # rows are y, columns x
         field = jnp.where(mirror_x, field[:, ::-1], field)
@@ -38,12 +33,8 @@ def turn_over(
     x, y, yaw = transition.action.pose
     x, yaw = jnp.where(mirror_x, -x, x), jnp.where(mirror_x, np.float32(np.pi) - yaw, yaw)
     y, yaw = jnp.where(mirror_y, -y, y), jnp.where(mirror_y, -yaw, yaw)
-    x, y, yaw = (
-        jnp.where(swap, y, x),
-        jnp.where(swap, x, y),
-        jnp.where(swap, np.float32(0.5 * np.pi) - yaw, yaw),
-    )
-    pose = jnp.stack([x, y, geometry.wrap_angle(yaw)])
+    yaw = jnp.where(swap, np.float32(0.5 * np.pi) - yaw, yaw)
+    pose = jnp.stack([jnp.where(swap, y, x), jnp.where(swap, x, y), geometry.wrap_angle(yaw)])
     return transition.replace(
         obs=jax.tree.map(view, transition.obs),
         next_obs=jax.tree.map(view, transition.next_obs),
@@ -51,36 +42,36 @@ def turn_over(
     )
 
 
-def randomly(key: jax.Array, transition: Transition) -> Transition:
+def random_symmetry(key: jax.Array, transition: Transition) -> Transition:
     """The transition under one of the eight symmetries, each equally likely."""
-    return turn_over(transition, *jax.random.bernoulli(key, shape=(3,)))
+    return apply_symmetry(transition, *jax.random.bernoulli(key, shape=(3,)))
 
 
-def move(cfg: Config, transition: Transition, yaw: jax.Array, cells: jax.Array) -> Transition:
-    """The transition turned about the workspace centre by `yaw` [] rad, then shifted by `cells` [2]
-    int32 (row, col).
+def shift_and_rotate(
+    cfg: Config, transition: Transition, yaw: jax.Array, cells: jax.Array
+) -> Transition:
+    """The transition rotated by `yaw` [] rad about the workspace centre, then shifted.
 
-    As it was where that would cut something off: something higher than BARE in either map, the
-    place of the action, or the end of a push, which the workspace must not have cut off before
-    either. What comes in from beside the workspace is bare table; or, where the net is shown the
-    border, beyond it: the border moves along. Sides that the move pushes out of sight are where it
-    is not: what stands keeps CLEAR of them.
+    `cells` [2] int32 are (row, col). The transition stays as it is where that would cut something
+    off: a surface higher than BARE in either map, the place of the action or the end of a push. It
+    also stays if the workspace already cut off the push. Cells that come in are bare table; where
+    the net is shown the border they lie beyond it, and the border moves along. A side that moves
+    out of sight is still there: blocks keep CLEARANCE to it.
     """
     pose = transition.action.pose
     step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
     xy = geometry.rotate2d(yaw, pose[:2]) + step
-    turned = jnp.append(xy, geometry.wrap_angle(pose[2] + yaw))
-    whole = _reaches(cfg, transition.action.primitive, pose) & _reaches(
-        cfg, transition.action.primitive, turned
-    )
+    new_pose = jnp.append(xy, geometry.wrap_angle(pose[2] + yaw))
+    primitive = transition.action.primitive
+    fits = _reaches(cfg, primitive, pose) & _reaches(cfg, primitive, new_pose)
     for obs in (transition.obs, transition.next_obs):
-        whole &= _stays(cfg, heightmap.unpack(obs).height, yaw, step)
+        fits &= _stays(cfg, heightmap.unpack(obs).height, yaw, step)
     moved = transition.replace(
-        obs=_moved_map(cfg, transition.obs, yaw, cells),
-        next_obs=_moved_map(cfg, transition.next_obs, yaw, cells),
-        action=transition.action.replace(pose=turned),
+        obs=_move_maps(cfg, transition.obs, yaw, cells),
+        next_obs=_move_maps(cfg, transition.next_obs, yaw, cells),
+        action=transition.action.replace(pose=new_pose),
     )
-    return jax.tree.map(lambda new, old: jnp.where(whole, new, old), moved, transition)
+    return jax.tree.map(lambda new, old: jnp.where(fits, new, old), moved, transition)
 
 
 def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
@@ -91,24 +82,24 @@ def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
 
 
 def _stays(cfg: Config, height: jax.Array, yaw: jax.Array, step: jax.Array) -> jax.Array:
-    """Whether all that stands on the map [H, W] m stays above the workspace, turned and shifted by
-    `step` [2] m."""
+    """Whether all blocks of a map [H, W] m stay above the workspace, rotated, then shifted by
+    `step` [2] m; [] bool."""
     place = geometry.rotate2d(yaw, geometry.cell_centres(cfg.heightmap)) + step[None, None]
     half = 0.5 * cfg.heightmap.extent
-    low, high = jnp.full(2, half), jnp.full(2, half)  # room towards -x, -y and +x, +y
+    low, high = jnp.full(2, half), jnp.full(2, half)  # m, room towards -x, -y and +x, +y
     if cfg.net.border:
-        turned = jnp.broadcast_to(yaw != 0.0, (2,))
-        low = jnp.where((step < 0.0) | turned, half - CLEAR, half)
-        high = jnp.where((step > 0.0) | turned, half - CLEAR, half)
+        rotated = jnp.broadcast_to(yaw != 0.0, (2,))
+        low = jnp.where((step < 0.0) | rotated, half - CLEARANCE, half)
+        high = jnp.where((step > 0.0) | rotated, half - CLEARANCE, half)
     stays = jnp.all((-place <= low[None, None]) & (place <= high[None, None]), axis=-1)
     return jnp.all((height <= BARE) | stays)
 
 
-def _moved_map(
+def _move_maps(
     cfg: Config, obs: PackedObservation, yaw: jax.Array, cells: jax.Array
 ) -> PackedObservation:
-    """Maps turned and then shifted, from the nearest cell; what comes in from beside looks like the
-    lowest cell."""
+    """Maps rotated, then shifted, from the nearest cell; cells that come in look like the lowest
+    one."""
     size = obs.height.shape[0]
     along = jnp.arange(size, dtype=jnp.float32) + 0.5 - 0.5 * size  # cells from the centre
     y, x = (along - shift.astype(jnp.float32) for shift in cells)
@@ -121,23 +112,22 @@ def _moved_map(
     def take(field: jax.Array) -> jax.Array:
         return field.reshape(size * size, *field.shape[2:]).at[source].get(mode="promise_in_bounds")
 
+    beyond = jnp.uint16(heightmap.BEYOND_COUNT if cfg.net.border else 0)
     return PackedObservation(
         colour=take(obs.colour),
-        height=jnp.where(
-            inside, take(obs.height), jnp.uint16(heightmap.BEYOND_COUNT if cfg.net.border else 0)
-        ),
+        height=jnp.where(inside, take(obs.height), beyond),
         target=jnp.where(inside, take(obs.target), jnp.all(obs.target)),
     )
 
 
-def vary(key: jax.Array, cfg: Config, transition: Transition) -> Transition:
-    """The transition as the learner is shown it: augmented as the config says."""
+def augment(key: jax.Array, cfg: Config, transition: Transition) -> Transition:
+    """The transition augmented as the config says."""
     learn, key_move = cfg.learn, jax.random.fold_in(key, 1)
     if learn.augment:
-        transition = randomly(key, transition)
+        transition = random_symmetry(key, transition)
     if learn.augment_shift == 0 and learn.augment_turn == 0.0:
         return transition
     key_yaw, key_cells = jax.random.split(key_move)
     yaw = learn.augment_turn * jax.random.uniform(key_yaw, (), minval=-1.0)
     cells = jax.random.randint(key_cells, (2,), -learn.augment_shift, learn.augment_shift + 1)
-    return move(cfg, transition, yaw, cells)
+    return shift_and_rotate(cfg, transition, yaw, cells)

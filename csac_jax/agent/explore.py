@@ -1,4 +1,4 @@
-"""Exploration: action noise, now and then a random primitive, now and then a random place."""
+"""Exploration: action noise, sometimes a random primitive, sometimes a random place."""
 
 from typing import NamedTuple
 
@@ -10,10 +10,10 @@ from csac_jax.config import ExploreConfig
 
 
 class Greedy(NamedTuple):
-    """What the policy would do; poses are normalised (x, y, yaw)."""
+    """What the policy would do. P = primitives."""
 
-    primitive: jax.Array  # [] int32, 0 push, 1 grasp
-    poses: jax.Array  # [2, 3], the best pose of each primitive
+    primitive: jax.Array  # [] int32, Primitive
+    poses: jax.Array  # [P, 3] normalised (x, y, yaw), the best pose of each primitive
 
 
 def probability(start: float, end: float, decay: float, actions: jax.Array) -> jax.Array:
@@ -22,11 +22,7 @@ def probability(start: float, end: float, decay: float, actions: jax.Array) -> j
 
 
 def action_noise(key: jax.Array, cfg: ExploreConfig, action: jax.Array) -> jax.Array:
-    """`action` [3], a normalised pose, plus clip(N(0, delta), -c, c) in each dimension, Algorithm 1
-    line 13.
-
-    Yaw wraps, x and y stop at the walls of the box.
-    """
+    """`action` [3], a normalised pose, plus clip(N(0, delta), -c, c), Algorithm 1 line 13."""
     noise = cfg.noise_std * jax.random.normal(key, action.shape, action.dtype)
     return box.project(action + jnp.clip(noise, -cfg.noise_clip, cfg.noise_clip), box.POSE_WRAPS)
 
@@ -40,36 +36,33 @@ def choose(
 ) -> tuple[jax.Array, jax.Array]:
     """Primitive [] int32 and normalised pose [3] to try.
 
-    The primitive is random with a probability that decays (VPG), and then a push with
-    `push_fraction`. The pose is, with another decaying probability, the random place of the
-    primitive so chosen, as it is, else that primitive's own greedy pose plus noise: a primitive
-    that was forced still acts where it is best.
+    With a decaying probability the primitive is random, a push with `push_fraction` (VPG). With
+    another one the pose is the random place of that primitive. Else it is that primitive's greedy
+    pose plus noise: a forced primitive still acts where it is best.
 
-    Args: actions_taken [] int32 by the whole run; random_places [2, 3], one normalised pose per
-    primitive.
+    Args: actions_taken [] int32 by the whole run; random_places [P, 3] normalised poses.
     """
     key_explore, key_push, key_place, key_noise = jax.random.split(key, 4)
-    explore = jax.random.bernoulli(
+    primitive_is_random = jax.random.bernoulli(
         key_explore,
         probability(
             cfg.epsilon_primitive_start, cfg.epsilon_primitive_end, cfg.decay, actions_taken
         ),
     )
-    grasp = jnp.where(jax.random.bernoulli(key_push, cfg.push_fraction), 0, 1)
-    primitive = jnp.where(explore, grasp, greedy.primitive).astype(jnp.int32)
-    elsewhere = jax.random.bernoulli(
+    random_primitive = jnp.where(jax.random.bernoulli(key_push, cfg.push_fraction), 0, 1)
+    primitive = jnp.where(primitive_is_random, random_primitive, greedy.primitive).astype(jnp.int32)
+    place_is_random = jax.random.bernoulli(
         key_place,
         probability(cfg.epsilon_place_start, cfg.epsilon_place_end, cfg.decay, actions_taken),
     )
     noisy = action_noise(key_noise, cfg, greedy.poses[primitive])
-    return primitive, jnp.where(elsewhere, random_places[primitive], noisy)
+    return primitive, jnp.where(place_is_random, random_places[primitive], noisy)
 
 
 def random_cell(key: jax.Array, valid: jax.Array) -> jax.Array:
     """Index [] int32, uniform over the True entries of `valid` [n]; 0 if there is none.
 
-    One random rank among the valid ones, and not the largest of n noises, whose ties would favour
-    low indices.
+    One random rank among the valid ones: ties of n noises would favour low indices.
     """
     count = jnp.cumsum(valid, dtype=jnp.int32)  # [n]
     rank = jax.random.randint(key, (), 0, jnp.maximum(count[-1], 1))

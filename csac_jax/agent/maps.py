@@ -1,9 +1,8 @@
-"""Dense maps of one state: Q and actor logits for every primitive, yaw and cell, and reading them
-at an action.
+"""Dense maps of one state: Q and actor logits for every primitive, yaw and cell.
 
-Map k lies in frame k, the workspace turned so that yaw_k points along +column; it stays there,
-since turning it back would blur it once more. Q at a continuous action is trilinear: bilinear in
-the two frames next to its yaw, linear between them.
+Map k lies in frame k, the workspace turned so that yaw_k points along +column. It stays there:
+turning it back would blur it. Q at a continuous action is trilinear: bilinear in the two frames
+next to its yaw, linear between them.
 """
 
 import dataclasses
@@ -26,8 +25,8 @@ from csac_jax.vision.heightmap import Observation
 NUM_PRIMITIVES = len(Primitive)
 
 
-def allowed(cfg: PolicyConfig) -> tuple[Primitive, ...]:
-    """Primitives that a policy ever takes: its values and its actor concern no others."""
+def allowed_primitives(cfg: PolicyConfig) -> tuple[Primitive, ...]:
+    """Primitives that a policy ever takes; V(s) and the actor's loss range over them."""
     return (Primitive.GRASP,) if cfg.primitive == "grasp" else tuple(Primitive)
 
 
@@ -35,9 +34,7 @@ def allowed(cfg: PolicyConfig) -> tuple[Primitive, ...]:
 class Frames:
     """Where the cells of the dense maps lie. K = yaws, h = w = rows and columns of a map."""
 
-    tables: (
-        rotate.RotationTables
-    )  # of the first K / 2 frames: the others are the same pictures upside down
+    tables: rotate.RotationTables  # of the first K / 2 frames; the others are these upside down
     yaws: np.ndarray  # [K] rad
     networks: Networks
     stride: int  # cells of a canvas per cell of a map, along each axis
@@ -45,7 +42,7 @@ class Frames:
     cell: float  # side of a cell, m
     extent: float  # side of the workspace, m
     push_length: float  # m
-    marked: bool  # one block is the target: the net sees its mask
+    shows_target: bool  # the target task: the net sees the target's mask
     xy: np.ndarray  # [K, h, w, 2] m, workspace position of every cell
     inside: np.ndarray  # [K, h, w] bool, above the workspace
 
@@ -62,20 +59,18 @@ def frames(cfg: Config, networks: Networks) -> Frames:
     cos, sin = np.cos(yaws)[:, None, None], np.sin(yaws)[:, None, None]
     xy = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1).astype(np.float32)
     inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
-    marked = cfg.task.kind == "target"
-    length = cfg.sim.push_length
     return Frames(
-        tables,
-        yaws.astype(np.float32),
-        networks,
-        stride,
-        side,
-        cell,
-        extent,
-        length,
-        marked,
-        xy,
-        inside,
+        tables=tables,
+        yaws=yaws.astype(np.float32),
+        networks=networks,
+        stride=stride,
+        side=side,
+        cell=cell,
+        extent=extent,
+        push_length=cfg.sim.push_length,
+        shows_target=cfg.task.kind == "target",
+        xy=xy,
+        inside=inside,
     )
 
 
@@ -88,19 +83,19 @@ class DenseMaps:
     valid: jax.Array  # [P, K, h, w] bool, there is something to act on
 
 
-def seen(frames: Frames, obs: Observation) -> jax.Array:
-    """What the net is to see of an observation, [..., H, W, I]; see `inputs` of the net."""
-    target = obs.target if frames.marked else None
+def input_maps(frames: Frames, obs: Observation) -> jax.Array:
+    """The net's input maps [..., H, W, I] of an observation, in the workspace's own frame."""
+    target = obs.target if frames.shows_target else None
     return frames.networks.inputs(obs.colour, obs.height, target)
 
 
-def net_inputs(frames: Frames, obs: Observation) -> jax.Array:
-    """The observation in the first K / 2 frames, as the net is fed: [K / 2, C, C, I]."""
-    return rotate.rotate(frames.tables, seen(frames, obs))
+def rotated_inputs(frames: Frames, obs: Observation) -> jax.Array:
+    """The net's input in the first K / 2 frames, [K / 2, C, C, I]."""
+    return rotate.rotate(frames.tables, input_maps(frames, obs))
 
 
 def unfold(halves: jax.Array) -> jax.Array:
-    """Net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] to the maps of all K, [P, K, h, w]."""
+    """Net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] as maps of all K, [P, K, h, w]."""
     ahead, back, grasp = (halves[..., output] for output in range(dense.OUTPUTS))
     return jnp.stack(
         [jnp.concatenate([ahead, _half_turn(back)]), jnp.concatenate([grasp, _half_turn(grasp)])]
@@ -112,42 +107,49 @@ def _half_turn(maps: jax.Array) -> jax.Array:
     return maps[..., ::-1, ::-1]
 
 
-def actionable(frames: Frames, obs: Observation) -> jax.Array:
+def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Cells where an action can have an effect, [P, K, h, w] bool.
 
-    Grasp: something to get, higher than 1 cm, lies under the cell. Push: something does within the
-    push's length ahead, whatever it is. Masking what is bare is SPOT's dynamic action space
+    Grasp: a surface higher than BARE lies under the cell, of the target in the target task. Push:
+    any such surface lies within the push's length ahead. This is SPOT's dynamic action space
     (arXiv:1909.04730).
     """
-    under = _under(frames, obs.height)
-    wanted = _under(frames, jnp.where(obs.target, obs.height, 0.0)) if frames.marked else under
+    under = _cells_above_bare(frames, obs.height)
+    graspable = _target_cells(frames, obs) if frames.shows_target else under
     reach = int(np.ceil(frames.push_length / frames.cell))
     ahead = jax.lax.reduce_window(
         under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
     )
-    return jnp.stack([ahead & frames.inside, wanted & frames.inside])
+    return jnp.stack([ahead & frames.inside, graspable & frames.inside])
 
 
-def _under(frames: Frames, height: jax.Array) -> jax.Array:
-    """Cells [K, h, w] bool under which the height map [H, W] m shows something."""
+def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:
+    """Cells [K, h, w] bool under which the height map [H, W] m is higher than BARE."""
     side, stride = frames.side, frames.stride
-    turned = rotate.rotate(frames.tables, height[..., None])[..., 0]
-    cells = turned.reshape(-1, side, stride, side, stride).max(axis=(2, 4)) > BARE  # [K / 2, h, w]
+    rotated = rotate.rotate(frames.tables, height[..., None])[..., 0]
+    blocks = rotated.reshape(-1, side, stride, side, stride)
+    cells = blocks.max(axis=(2, 4)) > BARE  # [K / 2, h, w]
     return jnp.concatenate([cells, _half_turn(cells)])
 
 
-def everywhere(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells above the workspace for each primitive, [P, K, h, w] bool, whatever is seen: no
-    masking.
+def _target_cells(frames: Frames, obs: Observation) -> jax.Array:
+    """Cells [K, h, w] bool above the target."""
+    return _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
 
-    In the target task, grasps only where the target lies under the cell: phi_g of eq. 16 is that of
-    the target.
+
+def all_cells(frames: Frames, obs: Observation) -> jax.Array:
+    """Cells above the workspace, [P, K, h, w] bool: no masking.
+
+    In the target task grasps have only those above the target: phi_g of eq. 16 is the target's.
     """
     inside = jnp.asarray(frames.inside)
-    grasp = (
-        inside & _under(frames, jnp.where(obs.target, obs.height, 0.0)) if frames.marked else inside
-    )
+    grasp = inside & _target_cells(frames, obs) if frames.shows_target else inside
     return jnp.stack([inside, grasp])
+
+
+def _yaw_index(frames: Frames, yaw: jax.Array) -> jax.Array:
+    """Index of a yaw [] rad among the frames', [] float32, whole at each of theirs."""
+    return yaw * (frames.yaws.shape[0] / (2.0 * np.pi))
 
 
 def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
@@ -156,9 +158,9 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
     Differentiable in the maps and in the pose.
     """
     num, side = frames.yaws.shape[0], frames.side
-    turns = pose[2] * (num / (2.0 * np.pi))
-    lower = jnp.floor(turns)
-    share = turns - lower
+    yaw_index = _yaw_index(frames, pose[2])
+    lower = jnp.floor(yaw_index)
+    upper_weight = yaw_index - lower
 
     def at(k: jax.Array) -> jax.Array:
         k = jnp.mod(k, num)
@@ -170,29 +172,27 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
         )
 
     k = lower.astype(jnp.int32)
-    return (1.0 - share) * at(k) + share * at(k + 1)
+    return (1.0 - upper_weight) * at(k) + upper_weight * at(k + 1)
 
 
 def best_over_yaws(
     frames: Frames, state: DenseMaps, places: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The largest valid value over the yaws at `places` [..., 2] m, and whether any is valid, both
-    [P, ...].
+    """The largest valid value over the yaws at `places` [..., 2] m, and whether any is valid.
 
-    To be looked at: a picture of what the maps say, without their turned frames.
+    Both [P, ...]; for pictures.
     """
     flat = places.reshape(-1, 2)
 
     def at(primitive: jax.Array, place: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
         pose = jnp.append(place, yaw)
-        return read(frames, state.q, primitive, pose), is_valid(
-            frames, state.valid, primitive, pose
-        )
+        valid = is_valid(frames, state.valid, primitive, pose)
+        return read(frames, state.q, primitive, pose), valid
 
-    every = jax.vmap(jax.vmap(jax.vmap(at, (None, None, 0)), (None, 0, None)), (0, None, None))
-    values, valid = every(
-        jnp.arange(NUM_PRIMITIVES), flat, jnp.asarray(frames.yaws)
-    )  # [P, places, K]
+    over_yaws = jax.vmap(at, (None, None, 0))
+    over_all = jax.vmap(jax.vmap(over_yaws, (None, 0, None)), (0, None, None))
+    primitives, yaws = jnp.arange(NUM_PRIMITIVES), jnp.asarray(frames.yaws)
+    values, valid = over_all(primitives, flat, yaws)  # [P, places, K]
     best = jnp.max(jnp.where(valid, values, -jnp.inf), axis=-1)
     shape = (NUM_PRIMITIVES, *places.shape[:-1])
     return best.reshape(shape), jnp.any(valid, axis=-1).reshape(shape)
@@ -201,17 +201,18 @@ def best_over_yaws(
 def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
     """Whether the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
     num, side = frames.yaws.shape[0], frames.side
-    k = jnp.mod(jnp.round(pose[2] * (num / (2.0 * np.pi))).astype(jnp.int32), num)
+    k = jnp.mod(jnp.round(_yaw_index(frames, pose[2])).astype(jnp.int32), num)
     position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
-    row, col = jnp.clip(
-        jnp.round(rotate.to_cell(side, frames.cell, position)), 0.0, side - 1.0
-    ).astype(jnp.int32)
+    cell = jnp.round(rotate.to_cell(side, frames.cell, position))
+    row, col = jnp.clip(cell, 0.0, side - 1.0).astype(jnp.int32)
     return valid[primitive, k, row, col]
 
 
 def best_cells(values: jax.Array, valid: jax.Array, num: int) -> jax.Array:
-    """Flat indices [num] int32 into [K, h, w] of the largest valid values; of the largest at all if
-    none is valid."""
+    """Flat indices [num] int32 into [K, h, w] of the largest valid values.
+
+    All cells count if none is valid.
+    """
     masked = jnp.where(valid | ~jnp.any(valid), values, -jnp.inf)
     return jax.lax.top_k(masked.reshape(-1), num)[1].astype(jnp.int32)
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.agent import learner as learning, maps, policy, rewards
-from csac_jax.agent.learner import Learner, Params
+from csac_jax.agent import actor_critic, maps, policy, rewards
+from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA
 from csac_jax.env import Env, State
@@ -105,7 +105,7 @@ class Moment(NamedTuple):
 def episode(cfg: Config, env: Env, name: str, params: Params | None, seed: int) -> Iterator[Moment]:
     """One episode of a policy in the first scene of the environment's pool, action by action."""
     act, numbers = _policy(cfg, env, name), jnp.zeros(1, jnp.int32)
-    learner = learning.make(cfg) if name == "learned" else None
+    learner = actor_critic.make(cfg) if name == "learned" else None
 
     @jax.jit
     def step(key: jax.Array, params: Params, states: State):
@@ -138,37 +138,33 @@ def episode(cfg: Config, env: Env, name: str, params: Params | None, seed: int) 
             return
 
 
-def _think(learner: Learner, keys: jax.Array, params: Params, states: State) -> Thought:
+def _think(learner: ActorCritic, keys: jax.Array, params: Params, states: State) -> Thought:
     """What the policy `learned`, given the same keys, looks at; leaves [E, ...]."""
     cfg, frames = learner.cfg, learner.frames
-    seen, span = learning.look(learner, params, states.obs), learner.bounds[1] - learner.bounds[0]
+    seen = actor_critic.look(learner, params, states.obs)
     places = geometry.cell_centres(cfg.heightmap)
     q, _ = jax.vmap(maps.best_over_yaws, (None, 0, None))(frames, seen, places)
-    candidates = jax.vmap(policy.candidates, (0, None, None, 0, None))(
-        keys, cfg, frames, seen, span
-    )
-    return Thought(q, candidates, jax.vmap(learning.best_grasp)(seen))
+    candidates = jax.vmap(policy.candidates, (0, None, 0))(keys, learner, seen)
+    return Thought(q, candidates, jax.vmap(actor_critic.best_grasp)(seen))
 
 
 def _rewards(
-    learner: Learner, params: Params, thought: Thought, action: Action, after: State
+    learner: ActorCritic, params: Params, thought: Thought, action: Action, after: State
 ) -> jax.Array:
     """What training would have paid [E]; phi by the critic that acts, where training takes the
     target critic."""
     info, cfg = after.info, learner.cfg.reward
-    phi = jax.vmap(learning.best_grasp)(learning.look(learner, params, after.obs))
-    pay = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
-    changed = info.moved > CHANGE_AREA
-    return pay(
-        cfg,
-        action.primitive,
-        info.outcome,
-        info.distance,
-        thought.best_grasp,
-        phi,
-        changed,
-        info.blocks_lost,
+    phi = jax.vmap(actor_critic.best_grasp)(actor_critic.look(learner, params, after.obs))
+    result = rewards.ActionResult(
+        primitive=action.primitive,
+        outcome=info.outcome,
+        distance=info.distance,
+        phi_before=thought.best_grasp,
+        phi_after=phi,
+        changed=info.moved > CHANGE_AREA,
+        blocks_lost=info.blocks_lost,
     )
+    return jax.vmap(rewards.reward, (None, 0))(cfg, result)
 
 
 def _run(
@@ -263,16 +259,16 @@ def _step(
 
 def _policy(cfg: Config, env: Env, name: str) -> Policy:
     """The policy of that name. Raises ValueError for an unknown one."""
-    learner = learning.make(cfg)
-    frames, span = learner.frames, learner.bounds[1] - learner.bounds[0]
+    learner = actor_critic.make(cfg)
+    frames = learner.frames
 
     def learned(keys: jax.Array, params: Params, states: State) -> Action:
-        dense_maps = learning.look(learner, params, states.obs)
-        act = jax.vmap(policy.best_action, (0, None, None, 0, None, 0))
-        return act(keys, cfg, frames, dense_maps, span, states.steps_without_change)
+        dense_maps = actor_critic.look(learner, params, states.obs)
+        act = jax.vmap(policy.best_action, (0, None, 0, 0))
+        return act(keys, learner, dense_maps, states.steps_without_change)
 
     def random(keys: jax.Array, params: Params, states: State) -> Action:
-        valid = jax.vmap(maps.actionable, (None, 0))(frames, states.obs)
+        valid = jax.vmap(maps.actionable_cells, (None, 0))(frames, states.obs)
         return jax.vmap(policy.random_grasp, (0, None, 0))(keys, frames, valid)
 
     def planned(keys: jax.Array, params: Params, states: State) -> Action:

@@ -15,8 +15,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from csac_jax.agent import learner as learning
-from csac_jax.agent.learner import Params
+from csac_jax.agent import actor_critic
+from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
 from csac_jax.io import config_json, files
 
@@ -64,7 +64,7 @@ def load(path: Path) -> tuple[Config, Params]:
         raise PolicyFileError(
             f"{path} was made by another version of csac_jax ({error}); use that version"
         ) from None
-    return cfg, _filled(path, learning.abstract_params(cfg), tensors)
+    return cfg, _filled(path, actor_critic.abstract_params(cfg), tensors)
 
 
 def _filled(path: Path, blank: Params, tensors: dict[str, np.ndarray]) -> Params:

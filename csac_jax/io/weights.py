@@ -18,11 +18,8 @@ def read(cfg: DenseNet121) -> Any:
     path = Path(cfg.weights)
     try:
         tensors = safetensors.numpy.load_file(path)
-    except (
-        OSError,
-        KeyError,
-        safetensors.SafetensorError,
-    ) as error:  # KeyError: a type that NumPy lacks
+    # KeyError: a type that NumPy lacks
+    except (OSError, KeyError, safetensors.SafetensorError) as error:
         raise ValueError(
             f"net.weights: {path} cannot be read as .safetensors ({error}); give another file"
         ) from error
@@ -30,5 +27,6 @@ def read(cfg: DenseNet121) -> Any:
         return torchvision.variables(cfg, tensors)
     except ValueError as error:
         raise ValueError(
-            f"net.weights: in {path}, {error}; bring torchvision's densenet121 with the layers of net.block_layers"
+            f"net.weights: in {path}, {error}; "
+            "bring torchvision's densenet121 with the layers of net.block_layers"
         ) from error

@@ -1,13 +1,11 @@
-"""The small dense net: densely connected convolutions with group norm, at 1/`net.stride` of its
-input's resolution.
+"""The small dense net: densely connected convolutions with group norm on rotated maps.
 
-Its maps may be finer: the last 1 x 1 convolution then gives `net.subcells`^2 values per cell of the
-features, laid out beside each other (Shi et al., arXiv:1609.05158), at next to no cost.
+Features have 1/`net.stride` of the input's resolution. The last 1 x 1 convolution gives
+`net.subcells`^2 values per cell of them, as sub-pixel convolution (arXiv:1609.05158).
 
-It sees maps already turned to a frame, so that what it must know of a push is "ahead" and of a
-grasp "across". The frame of yaw + pi shows the same picture upside down: each pass gives three
-maps, push ahead, push back and grasp (a parallel gripper is symmetric), and K / 2 passes give all K
-yaws of both primitives.
+The net sees maps in an action's own frame: a push goes ahead, a grasp closes across. The frame of
+yaw + pi shows the same picture upside down. So each pass gives three maps, push ahead, push back
+and grasp (a parallel gripper is symmetric); K / 2 passes give all K yaws of both primitives.
 """
 
 from typing import Any
@@ -20,14 +18,15 @@ from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets.convolution import conv2d
 
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
-TABLE_HEIGHT = 0.002  # m: what is lower is bare table
+COLOUR_MIN_HEIGHT = 0.002  # m: lower cells are bare table, of which no net sees the colour
+OUTPUT_INIT = nn.initializers.variance_scaling(0.01, "fan_in", "normal")  # maps begin near 0
 _HEIGHT_SCALE = 0.05  # m, a block's height: brings heights near 1
-_GROUP = 8  # channels per group of the norm
+_GROUP_SIZE = 8  # channels per group of the norm
 _EPSILON = 1e-6  # of the norm, Flax's
 
 
 def compute_dtype(cfg: NetConfig) -> Any:
-    """What a net computes in on this machine; its parameters and its maps are float32."""
+    """A net's type for computing on this machine; its parameters and its Q maps are float32."""
     if cfg.dtype == "auto":
         return jnp.float32 if jax.default_backend() == "cpu" else jnp.bfloat16
     return jnp.dtype(cfg.dtype)
@@ -36,16 +35,16 @@ def compute_dtype(cfg: NetConfig) -> Any:
 def inputs(
     colour: jax.Array | None, height: jax.Array, target: jax.Array | None, border: bool = False
 ) -> jax.Array:
-    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [...,
-    H, W] m.
+    """The net's input maps [..., H, W, I].
 
-    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool, + 1 with the border: 1 on the
-    workspace. Bare table is 0 in the others, like what lies outside of a turned map, where all are
-    0; heights below 0 are outside too.
+    Bare table is 0, like cells outside of a rotated map, but for the border: 1 on the workspace.
+
+    Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m, below 0 beyond the workspace;
+    target [..., H, W] bool or None; border, whether the net sees it. I = 1, + 3, + 1, + 1.
     """
     maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
     if colour is not None:
-        maps.insert(0, jnp.where(height[..., None] > TABLE_HEIGHT, colour - 0.5, 0.0))
+        maps.insert(0, jnp.where(height[..., None] > COLOUR_MIN_HEIGHT, colour - 0.5, 0.0))
     if target is not None:
         maps.append(target[..., None].astype(height.dtype))
     if border:
@@ -72,58 +71,51 @@ class Convolution(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Dense features of turned maps: [B, C, C, I] -> [B, C / stride, C / stride, stem + layers *
-    growth]."""
+    """Features of rotated maps: [B, C, C, I] -> [B, C / stride, C / stride, F].
+
+    F = stem + layers * growth.
+    """
 
     cfg: SmallNet
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
         cfg, stride, dtype = self.cfg, self.cfg.stride, compute_dtype(self.cfg)
-        features = Convolution(
-            cfg.stem, 2 * stride, stride=stride, padding=stride // 2, dtype=dtype
-        )(maps)
-        features = nn.relu(GroupNorm(dtype)(features))
+        stem = Convolution(cfg.stem, 2 * stride, stride // 2, stride, dtype=dtype)
+        features = nn.relu(GroupNorm(dtype)(stem(maps)))
         for dilation in cfg.dilations:
-            new = Convolution(cfg.growth, size=3, dilation=dilation, padding=dilation, dtype=dtype)(
-                features
-            )
+            layer = Convolution(cfg.growth, 3, dilation, dilation=dilation, dtype=dtype)
+            new = layer(features)
             features = jnp.concatenate([features, nn.relu(GroupNorm(dtype)(new))], axis=-1)
         return features
 
 
 class Head(nn.Module):
-    """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS], s = subcells; two 1 x 1
-    convolutions."""
+    """Two 1 x 1 convolutions: [..., h, w, F] -> [..., s h, s w, OUTPUTS], s = subcells."""
 
     cfg: SmallNet
 
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
         del train  # group norm is the same in both
-        hidden = nn.relu(nn.Dense(self.cfg.head, dtype=compute_dtype(self.cfg))(features)).astype(
-            jnp.float32
-        )
-        small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
-        return _spread(
-            nn.Dense(OUTPUTS * self.cfg.subcells**2, kernel_init=small)(hidden), self.cfg.subcells
-        )
+        cfg = self.cfg
+        hidden = nn.relu(nn.Dense(cfg.head, dtype=compute_dtype(cfg))(features))
+        output = nn.Dense(OUTPUTS * cfg.subcells**2, kernel_init=OUTPUT_INIT)
+        return pixel_shuffle(output(hidden.astype(jnp.float32)), cfg.subcells)
 
 
-def _spread(maps: jax.Array, factor: int) -> jax.Array:
-    """Channels laid out as cells: [..., h, w, s s O] -> [..., s h, s w, O], s = factor; row,
-    column, output."""
+def pixel_shuffle(maps: jax.Array, factor: int) -> jax.Array:
+    """Channels laid out as cells: [..., h, w, s s O] -> [..., s h, s w, O], s = factor."""
     *batch, rows, cols, channels = maps.shape
     parts = maps.reshape(*batch, rows, cols, factor, factor, channels // factor**2)
     return jnp.swapaxes(parts, -4, -3).reshape(*batch, factor * rows, factor * cols, -1)
 
 
 class GroupNorm(nn.Module):
-    """Group norm of maps [B, H, W, F], `_GROUP` channels a group: Flax's, in 0.6 to 0.7 of its time
-    on a CPU.
+    """Group norm of maps [B, H, W, F], `_GROUP_SIZE` channels a group.
 
-    Sums run over cells first and over a group's channels then, which XLA computes a whole row of
-    channels at a time.
+    It takes 0.6 to 0.7 of the time of Flax's on a CPU: sums run over cells first, for which XLA
+    takes all channels at a time, then over a group's channels.
     """
 
     dtype: Any
@@ -133,19 +125,18 @@ class GroupNorm(nn.Module):
         channels = maps.shape[-1]
         scale = self.param("scale", nn.initializers.ones, (channels,))
         bias = self.param("bias", nn.initializers.zeros, (channels,))
-        groups = max(channels // _GROUP, 1)
-        wide = maps.astype(jnp.float32)
+        groups = max(channels // _GROUP_SIZE, 1)
+        exact = maps.astype(jnp.float32)
 
-        def mean(
-            values: jax.Array,
-        ) -> jax.Array:  # [B, H, W, F] -> [B, 1, 1, F], the same within a group
+        def group_mean(values: jax.Array) -> jax.Array:
+            """[B, H, W, F] -> [B, 1, 1, F], the same within a group."""
             each = jnp.mean(values, axis=(1, 2)).reshape(-1, groups, channels // groups)
             return jnp.repeat(jnp.mean(each, axis=2), channels // groups, axis=1)[:, None, None]
 
-        middle = mean(wide)
-        variance = jnp.maximum(mean(wide**2) - middle**2, 0.0)
+        mean = group_mean(exact)
+        variance = jnp.maximum(group_mean(exact**2) - mean**2, 0.0)
         factor = jax.lax.rsqrt(variance + _EPSILON) * scale[None, None, None]
-        return ((wide - middle) * factor + bias[None, None, None]).astype(self.dtype)
+        return ((exact - mean) * factor + bias[None, None, None]).astype(self.dtype)
 
 
 class Critic(nn.Module):
@@ -158,8 +149,10 @@ class Critic(nn.Module):
         self.head = Head(self.cfg)
 
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s =
-        subcells."""
+        """[B, C, C, I] -> Q [B, s h, s h, OUTPUTS] and features [B, h, h, F].
+
+        h = C / stride, s = subcells.
+        """
         del train  # group norm is the same in both
         features = self.trunk(maps)
         return self.head(features), features

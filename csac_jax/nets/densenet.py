@@ -1,12 +1,9 @@
-"""DenseNet-121 (Huang et al., arXiv:1608.06993, table 1) as the paper's network over turned maps,
-CSAC sec. 3.4.
+"""DenseNet-121 (arXiv:1608.06993, table 1) as the paper's network over rotated maps, CSAC sec. 3.4.
 
-One trunk each for colour, height and, in the target task, the mask; what they see is joined, two 1
-x 1 convolutions turn it into maps, and these are brought up to a finer grid. Push and grasp come
-from one network. Modules are named as in torchvision, so that its weights fit.
-
-The trunks are the same program with other weights: stacked along an axis T, leaves [T, ...], they
-run side by side.
+Colour, height and, in the target task, the mask have a trunk each. Trunks are the same program
+with other weights, stacked along an axis T: leaves [T, ...]. Two 1 x 1 convolutions turn their
+joined features into maps, which are upsampled. One network serves push and grasp. Modules have
+torchvision's names: its weights fit.
 """
 
 import math
@@ -20,67 +17,63 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
 from csac_jax.config import DenseNet121
-from csac_jax.nets.dense import OUTPUTS, TABLE_HEIGHT, compute_dtype
-from csac_jax.nets.products import Convolution, Stem, average_pool, max_pool
+from csac_jax.nets.dense import COLOUR_MIN_HEIGHT, OUTPUT_INIT, OUTPUTS, compute_dtype
+from csac_jax.nets.products import Stem, TapConvolution, average_pool, max_pool
 
-_COLOUR_MEAN = np.array(
-    [0.485, 0.456, 0.406], np.float32
-)  # of ImageNet, as torchvision's weights want it
+# Of ImageNet: torchvision's weights want colours normalised by these.
+_COLOUR_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _COLOUR_STD = np.array([0.229, 0.224, 0.225], np.float32)
 _HEIGHT_SCALE = 0.03  # m (VPG)
 _BOTTLENECK = 4  # channels of a layer's 1 x 1 convolution per channel that the layer adds
 _EPSILON = 1e-5  # of both norms, torchvision's
-_MOMENTUM = (
-    0.9  # share that running statistics keep in an update, torchvision's (there written 0.1)
-)
-_GROUPS = 32
-_KEPT = "kept"  # name of what the gradient does not make once more
+_MOMENTUM = 0.9  # share that running statistics keep in an update; torchvision writes 0.1
+_MAX_GROUPS = 32  # of group norm
+_SAVED = "saved"  # name of values that the backward pass does not compute again
 
 
 def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
-    """Maps that the net is fed [..., H, W, I] from colour [..., H, W, 3] in 0..1 and height [...,
-    H, W] m.
+    """The net's input maps [..., H, W, I], I = 1, + 3 with colour, + 1 with target.
 
-    I = 3 with colour, + 1, + 1 with a target mask [..., H, W] bool. Bare table is 0, like what lies
-    outside of a turned map; VPG takes a mean off the heights too.
+    Bare table is 0, like cells outside of a rotated map; VPG subtracts a mean from heights too.
+
+    Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m; target [..., H, W] bool or
+    None.
     """
     maps = [height[..., None] / _HEIGHT_SCALE]
     if colour is not None:
         mean, std = (jnp.broadcast_to(v, colour.shape) for v in (_COLOUR_MEAN, _COLOUR_STD))
-        normal = (colour - mean) / std
-        maps.insert(0, jnp.where(height[..., None] > TABLE_HEIGHT, normal, 0.0))
+        normalised = (colour - mean) / std
+        maps.insert(0, jnp.where(height[..., None] > COLOUR_MIN_HEIGHT, normalised, 0.0))
     if target is not None:
         maps.append(target[..., None].astype(height.dtype))
     return jnp.concatenate(maps, axis=-1)
 
 
 class Piece(NamedTuple):
-    """Maps [..., F] that one layer made, and the mean and the variance of each channel over them,
-    [F] float32."""
+    """Output of one layer, with the statistics of each channel."""
 
-    maps: jax.Array
-    mean: jax.Array
-    variance: jax.Array
+    maps: jax.Array  # [..., F]
+    mean: jax.Array  # [F] float32
+    variance: jax.Array  # [F] float32
 
 
 def _piece(maps: jax.Array) -> Piece:
-    """Maps with their statistics; both are kept for the gradient, see `Critic`.
+    """Maps with their statistics; both are saved for the gradient, see `Critic`.
 
-    The variance is taken about the mean: E x^2 - (E x)^2 would cost a decimal in the last block.
+    The variance is E (x - E x)^2: E x^2 - (E x)^2 would cost a decimal in the last block.
     """
     axes = tuple(range(maps.ndim - 1))
     exact = maps.astype(jnp.float32)
     mean = jnp.mean(exact, axes, keepdims=True)
     variance = jnp.mean(jnp.square(exact - mean), axes)
-    return Piece(*(checkpoint_name(leaf, _KEPT) for leaf in (maps, mean.reshape(-1), variance)))
+    return Piece(*(checkpoint_name(leaf, _SAVED) for leaf in (maps, mean.reshape(-1), variance)))
 
 
 class BatchNorm(nn.Module):
-    """Batch norm of maps [..., F] by given statistics of the batch (mean and variance, [F]), or by
-    the running ones.
+    """Batch norm of maps [..., F] by the batch's mean and variance [F], or by the running ones.
 
-    They are given, because every layer of a block norms what all before it made: so they are taken
-    once. Variables are those of `flax.linen.BatchNorm`.
+    The caller gives the batch's: every layer of a block norms the same maps, whose statistics are
+    computed once. Variables are those of `flax.linen.BatchNorm`.
     """
 
     dtype: Any
@@ -92,14 +85,12 @@ class BatchNorm(nn.Module):
         shape = maps.shape[-1:]
         running = [self.variable("batch_stats", "mean", jnp.zeros, shape)]
         running += [self.variable("batch_stats", "var", jnp.ones, shape)]
-        scale, bias = (
-            self.param("scale", nn.initializers.ones, shape),
-            self.param("bias", nn.initializers.zeros, shape),
-        )
+        scale = self.param("scale", nn.initializers.ones, shape)
+        bias = self.param("bias", nn.initializers.zeros, shape)
         mean, variance = statistics or [variable.value for variable in running]
         if statistics and not self.is_initializing():
-            for variable, now in zip(running, statistics, strict=True):
-                variable.value = _MOMENTUM * variable.value + (1.0 - _MOMENTUM) * now
+            for variable, value in zip(running, statistics, strict=True):
+                variable.value = _MOMENTUM * variable.value + (1.0 - _MOMENTUM) * value
         factor = scale * jax.lax.rsqrt(variance + _EPSILON)
         factor, shift = (
             leaf.reshape((1,) * (maps.ndim - 1) + shape) for leaf in (factor, bias - mean * factor)
@@ -108,24 +99,23 @@ class BatchNorm(nn.Module):
 
 
 def _norm(cfg: DenseNet121, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
-    """Pieces joined and normed [..., F]; `train`: batch norm takes the batch's statistics, which
-    are followed."""
+    """Pieces joined and normed [..., F]; with `train` batch norm takes the batch's statistics."""
     dtype = compute_dtype(cfg)
     maps, *statistics = (jnp.concatenate(leaves, axis=-1) for leaves in zip(*pieces, strict=True))
     if cfg.norm == "batch":
         return BatchNorm(dtype, name=name)(maps, (statistics[0], statistics[1]) if train else None)
-    groups = math.gcd(_GROUPS, maps.shape[-1])
+    groups = math.gcd(_MAX_GROUPS, maps.shape[-1])
     return nn.GroupNorm(
         groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name
     )(maps)
 
 
-def _convolution(cfg: DenseNet121, features: int, size: int, name: str) -> Convolution:
-    return Convolution(features, size, compute_dtype(cfg), name=name)
+def _convolution(cfg: DenseNet121, features: int, size: int, name: str) -> TapConvolution:
+    return TapConvolution(features, size, compute_dtype(cfg), name=name)
 
 
 class DenseLayer(nn.Module):
-    """What a layer adds to the pieces before it: [B, H, W, .] -> [B, H, W, block_growth]."""
+    """The piece [B, H, W, block_growth] that a layer adds to those before it."""
 
     cfg: DenseNet121
 
@@ -139,10 +129,10 @@ class DenseLayer(nn.Module):
 
 
 class DenseBlock(nn.Module):
-    """Dense layers one after the other, each on the pieces of all before it.
+    """Dense layers, each on the pieces of all before it.
 
-    They are joined where they are read, on the way into a norm: joined after every layer, as the
-    paper draws it, all channels would be written once more per layer.
+    A norm joins the pieces that it reads. Joined after every layer, as the paper draws it, all
+    channels would be written once more per layer.
     """
 
     cfg: DenseNet121
@@ -156,7 +146,7 @@ class DenseBlock(nn.Module):
         return pieces
 
 
-class Transition(nn.Module):
+class TransitionLayer(nn.Module):
     """Half of the channels at half of the resolution."""
 
     cfg: DenseNet121
@@ -171,8 +161,7 @@ class Transition(nn.Module):
 class Trunk(nn.Module):
     """DenseNet-121 without its top: [B, H, W, 3] -> [B, H / 32, W / 32, 1024], after the last norm.
 
-    With `cfg.zoom` above 1 each cell of the maps stands for 2 x 2 pixels: features are [B, H / 16,
-    W / 16, 1024].
+    With `cfg.zoom` above 1 each cell stands for 2 x 2 pixels: [B, H / 16, W / 16, 1024].
     """
 
     cfg: DenseNet121
@@ -186,16 +175,14 @@ class Trunk(nn.Module):
         for i, layers in enumerate(self.cfg.block_layers, start=1):
             pieces = DenseBlock(self.cfg, layers, name=f"denseblock{i}")(piece, train)
             if i < len(self.cfg.block_layers):
-                piece = Transition(self.cfg, name=f"transition{i}")(pieces, train)
+                piece = TransitionLayer(self.cfg, name=f"transition{i}")(pieces, train)
         return _norm(self.cfg, pieces, train, "norm5")
 
 
 class Head(nn.Module):
-    """Dense maps from features: [..., h, w, F] -> [..., s h, s w, OUTPUTS] float32, s = 32 / (zoom
-    * output_stride).
+    """Twice norm, ReLU and a 1 x 1 convolution, then upsampling (VPG); the last bias is ours.
 
-    Twice norm, ReLU and a 1 x 1 convolution, then upsampling (VPG). The last convolution has a bias
-    (ours).
+    [..., h, w, F] -> [..., s h, s w, OUTPUTS] float32, s = 32 / (zoom * output_stride).
     """
 
     cfg: DenseNet121
@@ -206,8 +193,7 @@ class Head(nn.Module):
         hidden = nn.relu(_norm(cfg, [_piece(features)], train, "norm0"))
         hidden = nn.Dense(cfg.head, use_bias=False, dtype=compute_dtype(cfg), name="conv0")(hidden)
         hidden = nn.relu(_norm(cfg, [_piece(hidden)], train, "norm1")).astype(jnp.float32)
-        small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
-        maps = nn.Dense(OUTPUTS, kernel_init=small, name="conv1")(hidden)
+        maps = nn.Dense(OUTPUTS, kernel_init=OUTPUT_INIT, name="conv1")(hidden)
         return _upsample(maps, DenseNet121.STRIDE // (cfg.zoom * cfg.output_stride))
 
 
@@ -220,39 +206,37 @@ def _upsample(maps: jax.Array, factor: int) -> jax.Array:
 class Critic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads.
 
-    For the gradient only what convolutions made is kept, not what norms make of it for each layer
-    anew.
+    The backward pass keeps outputs of convolutions and computes those of norms again.
     """
 
     cfg: DenseNet121
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS], features [B, h, w,
-        F]."""
-        kept = jax.checkpoint_policies.save_only_these_names(_KEPT)
-        see = nn.vmap(
-            nn.remat(lambda trunk, seen: trunk(seen, train), policy=kept),
+        """[B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS] and features
+        [B, h, w, F]."""
+        policy = jax.checkpoint_policies.save_only_these_names(_SAVED)
+        apply = nn.vmap(
+            nn.remat(lambda trunk, inputs: trunk(inputs, train), policy=policy),
             variable_axes={"params": 0, "batch_stats": 0},
             split_rngs={"params": True},
         )
-        features = see(
-            Trunk(self.cfg, name="trunk"), _trunk_inputs(self.cfg, maps)
-        )  # [T, B, h, w, f]
+        inputs = _trunk_inputs(self.cfg, maps)
+        features = apply(Trunk(self.cfg, name="trunk"), inputs)  # [T, B, h, w, f]
         features = jnp.concatenate(list(features), axis=-1)
         return Head(self.cfg, name="head")(features, train), features
 
 
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
-    """What each trunk sees [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map
+    """Each trunk's input [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map
     three times.
 
-    z = zoom / 2, at least 1: a trunk doubles its cells itself. Turned maps are held, not turned for
-    each window anew.
+    z = zoom / 2, at least 1: a trunk doubles its cells itself. The barrier keeps XLA from rotating
+    the maps once per window.
     """
     colour, rest = (maps[..., :3], maps[..., 3:]) if cfg.colour else (maps[..., :0], maps)
-    seen = [colour] if cfg.colour else []
-    seen += [jnp.repeat(rest[..., i : i + 1], 3, axis=-1) for i in range(rest.shape[-1])]
-    stacked = jax.lax.optimization_barrier(jnp.stack(seen).astype(compute_dtype(cfg)))
+    inputs = [colour] if cfg.colour else []
+    inputs += [jnp.repeat(rest[..., i : i + 1], 3, axis=-1) for i in range(rest.shape[-1])]
+    stacked = jax.lax.optimization_barrier(jnp.stack(inputs).astype(compute_dtype(cfg)))
     zoom = max(cfg.zoom // 2, 1)
     return jnp.repeat(jnp.repeat(stacked, zoom, axis=2), zoom, axis=3)

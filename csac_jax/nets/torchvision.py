@@ -25,7 +25,7 @@ _LEAVES = {
 
 
 def _needed(name: str) -> bool:
-    """False for the classifier and for the counters of batch norm."""
+    """False for the classifier and the counters of batch norm."""
     return not name.startswith("classifier.") and not name.endswith(".num_batches_tracked")
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from csac_jax.agent import learner as learning, rewards
+from csac_jax.agent import actor_critic, rewards
 from csac_jax.config import Config
 from csac_jax.runtime import compiler
 from csac_jax.sweeps import pipelined
@@ -169,7 +169,7 @@ def _lifted(program: Program, member: Members) -> Program:
         return program
     cfg = with_numbers(program.cfg, member.numbers)
     return dataclasses.replace(
-        program, cfg=cfg, learner=learning.with_numbers(program.learner, cfg, member.bounds)
+        program, cfg=cfg, learner=actor_critic.with_numbers(program.learner, cfg, member.bounds)
     )
 
 
@@ -324,7 +324,7 @@ def engine(
         state = init(program, each, mesh, shard)
         if trunk is None:
             return state
-        state = state.replace(learner=learning.with_trunk(state.learner, trunk))
+        state = state.replace(learner=actor_critic.with_trunk(state.learner, trunk))
         return state if mesh is None else jax.device_put(state, shardings(mesh, shard))
 
     return Engine(

@@ -14,8 +14,8 @@ import numpy as np
 from flax import struct
 
 from csac_jax import env as environment
-from csac_jax.agent import augment, learner as learning, policy, rewards
-from csac_jax.agent.learner import Learner, LearnerState, Params, Transition
+from csac_jax.agent import augment, actor_critic, policy, rewards
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params, Transition
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Primitive
 from csac_jax.env import Env
@@ -68,7 +68,7 @@ class Program:
 
     cfg: Config
     env: Env
-    learner: Learner
+    learner: ActorCritic
     spread: Spread = ALONE  # of scenes and batches over devices
     at_once: int | None = (
         None  # of several runs side by side, the networks of so many at a time; None for all
@@ -77,7 +77,7 @@ class Program:
 
 def make(cfg: Config) -> Program:
     """Environment and learner of a config."""
-    return Program(cfg, environment.make(cfg), learning.make(cfg))
+    return Program(cfg, environment.make(cfg), actor_critic.make(cfg))
 
 
 def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
@@ -88,20 +88,12 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
     # Look and act: by default CEM on the critic's maps from the actor's mean, plus noise (lines
     # 8-13).
-    look = _apart(program, lambda online, obs: learning.look(learner, online, obs))
+    look = _apart(program, lambda online, obs: actor_critic.look(learner, online, obs))
     maps = look(state.learner.online, scenes.obs)
-    act = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
+    act = jax.vmap(policy.act, (0, None, 0, 0, None))
     taken = state.step * cfg.train.scenes
-    span = learner.bounds[1] - learner.bounds[0]
-    action = act(
-        _keys(key_act, cfg.train.scenes),
-        cfg,
-        learner.frames,
-        maps,
-        span,
-        scenes.steps_without_change,
-        taken,
-    )
+    keys = _keys(key_act, cfg.train.scenes)
+    action = act(keys, learner, maps, scenes.steps_without_change, taken)
 
     # Simulate.
     after = program.spread.scenes(jax.vmap(env.step))(scenes, action)
@@ -111,17 +103,16 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     around = _apart(program, lambda *given: _around(learner, *given), one_by_one=True)
     phi_before, phi_after = around(state.learner.target, scenes.obs, after.obs, pushed)
     info = after.info
-    changed = info.moved > CHANGE_AREA
-    reward = jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))(
-        cfg.reward,
-        action.primitive,
-        info.outcome,
-        info.distance,
-        phi_before,
-        phi_after,
-        changed,
-        info.blocks_lost,
+    result = rewards.ActionResult(
+        primitive=action.primitive,
+        outcome=info.outcome,
+        distance=info.distance,
+        phi_before=phi_before,
+        phi_after=phi_after,
+        changed=info.moved > CHANGE_AREA,
+        blocks_lost=info.blocks_lost,
     )
+    reward = jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
     seen = Transition(
         obs=heightmap.pack(scenes.obs),
         action=action,
@@ -181,9 +172,9 @@ def _learn(
     cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
     update_critic = _apart(
-        program, lambda key, *given: learning.update_critic(key, learner, *given)
+        program, lambda key, *given: actor_critic.update_critic(key, learner, *given)
     )
-    update_actor = _apart(program, lambda *given: learning.update_actor(learner, *given))
+    update_actor = _apart(program, lambda *given: actor_critic.update_actor(learner, *given))
 
     def update(carry, i):
         state, priority = carry
@@ -220,17 +211,17 @@ def _draw(
     cfg, (key_sample, key_augment) = program.cfg, keys
     slots, weights = samplers.sample(key_sample, cfg.replay, replay, progress, cfg.learn.batch)
     batch = program.spread.batch(ring.gather(replay, slots))
-    vary = jax.vmap(augment.vary, (0, None, 0))
-    return slots, weights, vary(_keys(key_augment, cfg.learn.batch), cfg, batch)
+    augmented = jax.vmap(augment.augment, (0, None, 0))
+    return slots, weights, augmented(_keys(key_augment, cfg.learn.batch), cfg, batch)
 
 
-def _best_grasps(learner: Learner, target: Params, obs: Observation) -> jax.Array:
+def _best_grasps(learner: ActorCritic, target: Params, obs: Observation) -> jax.Array:
     """phi_g of E states [E] by the target critic, eq. 16."""
-    return jax.vmap(learning.best_grasp)(learning.look(learner, target, obs))
+    return jax.vmap(actor_critic.best_grasp)(actor_critic.look(learner, target, obs))
 
 
 def _around(
-    learner: Learner, target: Params, before: Observation, after: Observation, pushed: jax.Array
+    learner: ActorCritic, target: Params, before: Observation, after: Observation, pushed: jax.Array
 ) -> jax.Array:
     """phi_g before and after the action [2, E]; zeros if no scene was `pushed` [E] bool, since
     grasps need none.
@@ -258,7 +249,7 @@ def init(program: Program, trunk: Any = None) -> TrainState:
     """
     state = jax.jit(lambda: begin(program, jax.random.key(program.cfg.seed)))()
     return (
-        state if trunk is None else state.replace(learner=learning.with_trunk(state.learner, trunk))
+        state if trunk is None else state.replace(learner=actor_critic.with_trunk(state.learner, trunk))
     )
 
 
@@ -270,7 +261,7 @@ def begin(program: Program, key: jax.Array) -> TrainState:
         key=key,
         step=jnp.int32(0),
         scenes=jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes)),
-        learner=learning.init(key_nets, program.learner),
+        learner=actor_critic.init(key_nets, program.learner),
         replay=ring.init(cfg.replay, example(cfg)),
     )
 
@@ -295,7 +286,7 @@ def abstract_state(cfg: Config) -> Any:
     nothing is compiled."""
     nothing: Any = None
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
-    program = Program(cfg, Env(cfg, nothing, blank), learning.make(cfg))
+    program = Program(cfg, Env(cfg, nothing, blank), actor_critic.make(cfg))
     return jax.eval_shape(lambda: init(program))
 
 

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.agent import learner as learning
-from csac_jax.agent.learner import Learner
+from csac_jax.agent import actor_critic
+from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import DENSENET_STRIDE, Config, HeightmapConfig, NetConfig
 from csac_jax.runtime import compiler, provenance
@@ -75,12 +75,12 @@ def _observations(size: int, num: int) -> Observation:
 
 def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     """Time of the Q maps of `states` states at once."""
-    learner = learning.make(cfg)
-    abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+    learner = actor_critic.make(cfg)
+    abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     params, obs = _random(abstract.online), _observations(cfg.heightmap.size, states)
     begun = time.perf_counter()
     jitted = jax.jit(
-        lambda params, obs: learning.look(learner, params, obs).q,
+        lambda params, obs: actor_critic.look(learner, params, obs).q,
         compiler_options=compiler.options(cfg),
     )
     look = jitted.lower(params, obs).compile()
@@ -97,15 +97,15 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     }
 
 
-def _update_memory(learner: Learner) -> int:
+def _update_memory(learner: ActorCritic) -> int:
     """Bytes that one update of the critic needs beside the networks and the batch."""
-    state = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+    state = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     size = learner.cfg.learn.batch
     batch = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype),
         step.example(learner.cfg),
     )
-    update = jax.jit(lambda *given: learning.update_critic(jax.random.key(0), learner, *given))
+    update = jax.jit(lambda *given: actor_critic.update_critic(jax.random.key(0), learner, *given))
     compiled = update.lower(state, batch, jax.ShapeDtypeStruct((size,), jnp.float32)).compile()
     return compiled.memory_analysis().temp_size_in_bytes
 
@@ -113,8 +113,8 @@ def _update_memory(learner: Learner) -> int:
 def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
     """A small net with the map and the batch of `quick`."""
     cfg = dataclasses.replace(presets.quick(), net=net)
-    learner = learning.make(cfg)
-    abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner)).online
+    learner = actor_critic.make(cfg)
+    abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner)).online
     return {
         "pixels": cfg.heightmap.size,
         "parameters": {

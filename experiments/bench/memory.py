@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.agent import learner as learning
+from csac_jax.agent import actor_critic
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.env import Env
@@ -86,7 +86,7 @@ def _program(cfg: Config) -> step.Program:
     """The program of a config with a single scene in its pool: nothing needs to settle."""
     world = model.build(cfg.scene, cfg.sim)
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
-    return step.Program(cfg, Env(cfg, physics.make(world, cfg.sim), blank), learning.make(cfg))
+    return step.Program(cfg, Env(cfg, physics.make(world, cfg.sim), blank), actor_critic.make(cfg))
 
 
 def measure(cfg: Config) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def _random(key: jax.Array, frames: maps.Frames, state: State) -> Action:
     """A random primitive at a random place with something to act on."""
     key_primitive, key_place = jax.random.split(key)
     primitive = jax.random.bernoulli(key_primitive).astype(jnp.int32)
-    places = policy.random_places(key_place, frames, maps.actionable(frames, state.obs))
+    places = policy.random_places(key_place, frames, maps.actionable_cells(frames, state.obs))
     return Action(primitive=primitive, pose=maps.denormalise(frames, places[primitive]))
 
 

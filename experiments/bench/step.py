@@ -31,8 +31,8 @@ import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 from csac_jax import presets
-from csac_jax.agent import learner as learning, policy, rewards
-from csac_jax.agent.learner import Transition
+from csac_jax.agent import actor_critic, policy, rewards
+from csac_jax.agent.actor_critic import Transition
 from csac_jax.cli import parsing
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config, PhysicsKind
@@ -108,26 +108,19 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     cfg, env, learner = program.cfg, program.env, program.learner
     scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
     keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
-    span = learner.bounds[1] - learner.bounds[0]
-    choose = jax.vmap(policy.act, (0, None, None, 0, None, 0, None))
+    choose = jax.vmap(policy.act, (0, None, 0, 0, None))
 
     def act(keys: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
-        return choose(keys, cfg, learner.frames, maps, span, steps_without_change, jnp.int32(0))
+        return choose(keys, learner, maps, steps_without_change, jnp.int32(0))
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         pushed = action.primitive == Primitive.PUSH
         phi = step._around(learner, nets.target, before.obs, after.obs, pushed)
-        changed = after.info.moved > CHANGE_AREA
-        info, of_one = after.info, jax.vmap(rewards.reward, (None, 0, 0, 0, 0, 0, 0, 0))
-        return of_one(
-            cfg.reward,
-            action.primitive,
-            info.outcome,
-            info.distance,
-            *phi,
-            changed,
-            info.blocks_lost,
+        info, changed = after.info, after.info.moved > CHANGE_AREA
+        result = rewards.ActionResult(
+            action.primitive, info.outcome, info.distance, *phi, changed, info.blocks_lost
         )
+        return jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
@@ -142,7 +135,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
-        "look": jit(lambda params, obs: learning.look(learner, params, obs)),
+        "look": jit(lambda params, obs: actor_critic.look(learner, params, obs)),
         "act": jax.jit(act),
         "simulate": jax.jit(jax.vmap(env.step)),
         "reward": jit(reward),
@@ -199,17 +192,17 @@ def _learning(program: step.Program, nets: Any, replay: Any) -> dict[str, Callab
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
 
     def next_value(nets: Any, batch: Transition) -> jax.Array:
-        maps = learning.look(learner, nets.target, heightmap.unpack(batch.next_obs))
-        return jax.vmap(learning.next_value, (None, 0, 0))(learner, keys, maps)
+        maps = actor_critic.look(learner, nets.target, heightmap.unpack(batch.next_obs))
+        return jax.vmap(actor_critic.next_value, (None, 0, 0))(learner, keys, maps)
 
     draw = jit(
         lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
     )
     value = jit(next_value)
     critic = jit(
-        lambda nets, batch, weights: learning.update_critic(key, learner, nets, batch, weights)
+        lambda nets, batch, weights: actor_critic.update_critic(key, learner, nets, batch, weights)
     )
-    actor = jit(lambda nets, obs: learning.update_actor(learner, nets, heightmap.unpack(obs)))
+    actor = jit(lambda nets, obs: actor_critic.update_actor(learner, nets, heightmap.unpack(obs)))
     _, weights, batch = draw(replay)
     part = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
     return {

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import learner as learning, maps
-from csac_jax.agent.learner import Learner, LearnerState
+from csac_jax.agent import actor_critic, maps
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.maps import Frames
 from csac_jax.config import Config, NetConfig
 from csac_jax.vision.heightmap import Observation
@@ -32,8 +32,8 @@ def frames(cfg: Config) -> Frames:
 
 
 @pytest.fixture(scope="session")
-def learner(cfg: Config) -> Learner:
-    return learning.make(cfg)
+def learner(cfg: Config) -> ActorCritic:
+    return actor_critic.make(cfg)
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from scipy.stats import chisquare, kstest
 
 from csac_jax import geometry, presets
 from csac_jax.agent import augment, maps
-from csac_jax.agent.learner import Transition
+from csac_jax.agent.actor_critic import Transition
 from csac_jax.constants import Primitive
 from csac_jax.env import Env
 from csac_jax.scene import blocks, layout
@@ -24,7 +24,7 @@ FLAGS = list(itertools.product((False, True), repeat=3))
 CFG = presets.smoke()  # four yaws: turning to the nearest cell is exact
 FRAMES = maps.frames(CFG)
 
-turn_over = jax.jit(augment.turn_over)
+apply_symmetry = jax.jit(augment.apply_symmetry)
 
 
 def _matrix(flags: tuple[bool, bool, bool]) -> np.ndarray:
@@ -35,7 +35,7 @@ def _matrix(flags: tuple[bool, bool, bool]) -> np.ndarray:
 
 
 def _turn(flags, transition: Transition) -> Transition:
-    return turn_over(transition, *(jnp.array(flag) for flag in flags))
+    return apply_symmetry(transition, *(jnp.array(flag) for flag in flags))
 
 
 def _scene(rotation: Rotation, position: np.ndarray) -> Scene:
@@ -144,7 +144,7 @@ def test_reading_under_the_action_stays(transition, flags):
 
     def valid(transition: Transition) -> jax.Array:
         """Validity [n] of an action of the transition's primitive at every cell of every yaw."""
-        return maps.actionable(FRAMES, heightmap.unpack(transition.obs))
+        return maps.actionable_cells(FRAMES, heightmap.unpack(transition.obs))
 
     turned = _turn(flags, transition)
     np.testing.assert_allclose(height(turned), height(transition), atol=1e-6)
@@ -152,7 +152,7 @@ def test_reading_under_the_action_stays(transition, flags):
     poses = jax.vmap(lambda cell: maps.cell_pose(FRAMES, cell))(jnp.arange(before[0].size))
     move = jax.vmap(
         lambda pose: (
-            augment.turn_over(
+            augment.apply_symmetry(
                 transition.replace(action=transition.action.replace(pose=pose)),
                 *(jnp.array(flag) for flag in flags),
             ).action.pose
@@ -184,7 +184,7 @@ def test_they_form_a_group(transition):
         np.testing.assert_allclose(both.action.pose, same.action.pose, atol=1e-6)
 
 
-def test_randomly_draws_all_eight_alike(transition):
+def test_random_symmetry_draws_all_eight_alike(transition):
     """Claim: each symmetry is equally likely (chi-square)."""
     heights = transition.obs.height
     small = transition.replace(
@@ -197,13 +197,13 @@ def test_randomly_draws_all_eight_alike(transition):
         next_obs=jax.tree.map(lambda leaf: leaf[:2, :2], transition.next_obs),
     )
     keys = jax.random.split(jax.random.key(0), 4000)
-    drawn = jax.jit(jax.vmap(lambda key: augment.randomly(key, small).obs.height))(keys)
+    drawn = jax.jit(jax.vmap(lambda key: augment.random_symmetry(key, small).obs.height))(keys)
     _, counts = np.unique(np.asarray(drawn).reshape(-1, 4), axis=0, return_counts=True)
     assert counts.size == 8
     assert chisquare(counts).pvalue > 1e-4
 
 
-move = jax.jit(lambda transition, yaw, cells: augment.move(CFG, transition, yaw, cells))
+move = jax.jit(lambda transition, yaw, cells: augment.shift_and_rotate(CFG, transition, yaw, cells))
 CELL = CFG.heightmap.cell
 
 
@@ -302,7 +302,9 @@ def test_what_would_be_cut_off_stays(transition):
 
 BORDERED = dataclasses.replace(CFG, net=dataclasses.replace(CFG.net, border=True))
 move_border = jax.jit(
-    lambda transition, cells: augment.move(BORDERED, transition, jnp.float32(0.0), cells)
+    lambda transition, cells: augment.shift_and_rotate(
+        BORDERED, transition, jnp.float32(0.0), cells
+    )
 )
 
 
@@ -318,12 +320,12 @@ def test_the_border_moves_along(transition):
         np.testing.assert_array_equal(
             seen.height, np.where(beyond, heightmap.BEYOND, heightmap.unpack(wanted).height)
         )
-        fed = np.asarray(maps.net_inputs(maps.frames(BORDERED), seen))[
+        fed = np.asarray(maps.rotated_inputs(maps.frames(BORDERED), seen))[
             0
         ]  # the frame that is not turned
         np.testing.assert_array_equal(fed[..., -1], np.pad(~beyond, 2))
         np.testing.assert_array_equal(
-            fed[..., :-1], maps.net_inputs(FRAMES, heightmap.unpack(wanted))[0]
+            fed[..., :-1], maps.rotated_inputs(FRAMES, heightmap.unpack(wanted))[0]
         )
     assert not np.array_equal(moved.obs.height, transition.obs.height)
 
@@ -351,26 +353,28 @@ def test_nothing_comes_near_a_border_that_is_none(
     assert (not np.array_equal(move_border(lone, cells).obs.height, height)) == goes
 
 
-def test_vary_is_what_the_config_says(transition):
-    """Claim: by default `vary` draws the same symmetry as `randomly`; shifts and turns stay in
-    their bounds and reach them; with everything off it changes nothing."""
-    same = jax.jit(augment.vary, static_argnums=1)
+def test_augment_is_what_the_config_says(transition):
+    """Claim: by default `augment` draws the same symmetry as `random_symmetry`; shifts and
+    rotations stay in their bounds and reach them; with everything off it changes nothing."""
+    same = jax.jit(augment.augment, static_argnums=1)
     for seed in range(3):
-        default, randomly = (
+        default, drawn = (
             same(jax.random.key(seed), CFG, transition),
-            augment.randomly(jax.random.key(seed), transition),
+            augment.random_symmetry(jax.random.key(seed), transition),
         )
-        jax.tree.map(np.testing.assert_array_equal, default, randomly)
+        jax.tree.map(np.testing.assert_array_equal, default, drawn)
     off = dataclasses.replace(CFG, learn=dataclasses.replace(CFG.learn, augment=False))
     jax.tree.map(
         np.testing.assert_array_equal, same(jax.random.key(0), off, transition), transition
     )
     wide = dataclasses.replace(off, learn=dataclasses.replace(off.learn, augment_shift=2))
     keys = jax.random.split(jax.random.key(1), 300)
-    poses = jax.jit(jax.vmap(lambda key: augment.vary(key, wide, transition).action.pose))(keys)
+    poses = jax.jit(jax.vmap(lambda key: augment.augment(key, wide, transition).action.pose))(keys)
     shifts = (np.asarray(poses) - POSE)[:, :2] / CELL
     np.testing.assert_allclose(shifts, shifts.round(), atol=1e-4)
     assert len(np.unique(shifts.round(), axis=0)) == 25
     turning = dataclasses.replace(off, learn=dataclasses.replace(off.learn, augment_turn=0.2))
-    poses = jax.jit(jax.vmap(lambda key: augment.vary(key, turning, transition).action.pose))(keys)
+    poses = jax.jit(jax.vmap(lambda key: augment.augment(key, turning, transition).action.pose))(
+        keys
+    )
     assert kstest((np.asarray(poses)[:, 2] - POSE[2]) / 0.2, "uniform", args=(-1, 2)).pvalue > 1e-3

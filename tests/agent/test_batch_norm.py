@@ -10,8 +10,8 @@ import numpy as np
 import optax
 import pytest
 
-from csac_jax.agent import learner as learning
-from csac_jax.agent.learner import Learner, LearnerState, Transition
+from csac_jax.agent import actor_critic
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Transition
 from csac_jax.config import NetConfig
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
@@ -31,10 +31,10 @@ NET = NetConfig(
 
 
 @pytest.fixture(scope="module")
-def learner(cfg) -> Learner:
+def learner(cfg) -> ActorCritic:
     """Its steps are plain gradients; its target, the largest value, compiles fast."""
     quick = dataclasses.replace(cfg, net=NET, target=dataclasses.replace(cfg.target, value="max"))
-    plain = dataclasses.replace(learning.make(quick), critic_optimiser=optax.sgd(0.1))
+    plain = dataclasses.replace(actor_critic.make(quick), critic_optimiser=optax.sgd(0.1))
     return dataclasses.replace(plain, actor_optimiser=optax.sgd(0.1))
 
 
@@ -50,7 +50,7 @@ def state(learner) -> LearnerState:
         return jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype)
 
     with jax.numpy_dtype_promotion("standard"):
-        abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+        abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     return jax.tree_util.tree_map_with_path(draw, abstract)
 
 
@@ -72,7 +72,7 @@ def batch(observations) -> Transition:
 def update(learner):
     """(state, batch) -> state, info of one update of the critic."""
     return jax.jit(
-        lambda state, batch: learning.update_critic(
+        lambda state, batch: actor_critic.update_critic(
             jax.random.key(3), learner, state, batch, jnp.ones(B)
         )
     )
@@ -104,7 +104,7 @@ def _same(first: Any, other: Any) -> None:
 def test_acting_uses_running_statistics(learner, state, observations):
     """Claim: a state's maps do not depend on what else is looked at, but on the running statistics
     of both nets."""
-    look = jax.jit(lambda params, obs: learning.look(learner, params, obs))
+    look = jax.jit(lambda params, obs: actor_critic.look(learner, params, obs))
     obs = observations(2, 4)
     others = jax.tree.map(lambda leaf: leaf.at[1].set(jnp.zeros((), leaf.dtype)), obs)
     both, one = look(state.online, obs), look(state.online, others)
@@ -153,9 +153,9 @@ def test_gradients_change_parameters_only(learner, state, batch, update, updated
     )
     assert _differ(before["batch_stats"], after["batch_stats"])
     assert _differ(again["params"]["head"]["conv1"], after["params"]["head"]["conv1"])
-    adam = learning.make(learner.cfg)
+    adam = actor_critic.make(learner.cfg)
     with jax.numpy_dtype_promotion("standard"):
-        fresh = jax.eval_shape(lambda: learning.init(jax.random.key(0), adam))
+        fresh = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), adam))
     for variables, optimiser in (
         (fresh.online.critic, fresh.critic_optimiser),
         (fresh.online.actor, fresh.actor_optimiser),
@@ -184,7 +184,7 @@ def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
     """Claim: an update of the actor moves its parameters and statistics, and none of the
     critic's."""
     obs = heightmap.unpack(batch.obs)
-    after, _ = jax.jit(lambda state: learning.update_actor(learner, state, obs))(state)
+    after, _ = jax.jit(lambda state: actor_critic.update_actor(learner, state, obs))(state)
     assert _differ(state.online.actor["batch_stats"], after.online.actor["batch_stats"])
     assert np.any(
         state.online.actor["params"]["conv1"]["kernel"]

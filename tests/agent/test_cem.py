@@ -100,15 +100,15 @@ def test_yaw_is_searched_across_the_seam(mean_yaw, peak_yaw):
     assert np.mean(found.value > 0.98) >= 0.98
 
 
-@pytest.mark.parametrize("spread", ["std", "mad"])
-def test_more_rounds_come_nearer(spread):
-    """Claim: elites' mean and spread carry the search to a peak outside the first round's reach."""
+@pytest.mark.parametrize("estimator", ["std", "mad"])
+def test_more_rounds_come_nearer(estimator):
+    """Claim: elites' mean and std carry the search to a peak outside the first round's reach."""
     peak = jnp.array([0.35, -0.35, 0.2])
     score = functools.partial(peaks, peak[None], jnp.ones(1), jnp.ones(1))
 
     def median_miss(rounds):
         found = search(
-            CEMConfig(std=0.2, rounds=rounds, std_estimator=spread), score, jnp.zeros(3), num=100
+            CEMConfig(std=0.2, rounds=rounds, std_estimator=estimator), score, jnp.zeros(3), num=100
         )
         return np.median(np.linalg.norm(found.action - peak[None], axis=-1))
 
@@ -130,9 +130,7 @@ def test_best_sample_is_kept():
 
 def test_samples_stay_in_the_box():
     """Claim: no sample leaves the box: a score that pays only outside it is never paid."""
-    outside = lambda action: jnp.where(
-        jnp.any(jnp.abs(action) > 1.0) | (action[2] == 1.0), 1.0, 0.0
-    )  # noqa: E731
+    outside = lambda u: jnp.where(jnp.any(jnp.abs(u) > 1.0) | (u[2] == 1.0), 1.0, 0.0)  # noqa: E731
     cfg, mean, start = CEMConfig(std=2.0), jnp.array([1.5, -1.0, 0.99]), jnp.full((2, 3), 1.0)
     assert search(cfg, outside, mean, start).value[0] == 0.0
 
@@ -154,7 +152,7 @@ def test_no_score_at_all():
 
 
 def test_search_goes_on_where_no_score_was_found():
-    """Claim: a round without any value leaves mean and spread as they are, so that later rounds may
+    """Claim: a round without any value leaves mean and std as they are, so that later rounds may
     still find one."""
     score = lambda action: jnp.where(jnp.max(jnp.abs(action - 0.25)) < 0.06, 1.0, -jnp.inf)  # noqa: E731
     found = search(
@@ -206,12 +204,12 @@ def test_fit_across_the_seam():
 
 
 def test_fit_leaves_out_invalid_elites():
-    """Claim: elites without a value do not count, and a single one has the least spread."""
+    """Claim: elites without a value do not count, and a single one has the least std."""
     elites = jnp.array([[0.1], [0.3], [0.9]])
     mean, _ = cem.fit(CEMConfig(), elites, jnp.array([True, True, False]), jnp.zeros(1, bool))
     np.testing.assert_allclose(mean, [0.2], atol=1e-6)
-    for spread in ("std", "mad"):
-        cfg = CEMConfig(std_estimator=spread)
+    for estimator in ("std", "mad"):
+        cfg = CEMConfig(std_estimator=estimator)
         np.testing.assert_allclose(
             cem.fit(cfg, elites, jnp.arange(3) < 1, jnp.zeros(1, bool))[1], [cfg.std_min]
         )

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.agent import learner as learning, maps
-from csac_jax.agent.learner import Learner
+from csac_jax.agent import actor_critic, maps
+from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import HeightmapConfig, NetConfig
 from csac_jax.nets import dense
@@ -36,7 +36,7 @@ NETS = {
 class Fixed(NamedTuple):
     """A net with random weights."""
 
-    learner: Learner
+    learner: ActorCritic
     params: Any
     look: Callable[[Any, Observation], DenseMaps]
 
@@ -44,16 +44,16 @@ class Fixed(NamedTuple):
 @pytest.fixture(scope="module", params=list(NETS))
 def net(request, cfg) -> Fixed:
     """Either net, random in every parameter; nothing but `look` is compiled."""
-    learner = learning.make(
+    learner = actor_critic.make(
         dataclasses.replace(cfg, net=NETS[request.param], heightmap=HeightmapConfig(size=SIZE))
     )
     rng = np.random.default_rng(0)
     with jax.numpy_dtype_promotion("standard"):
-        abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner)).online
+        abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner)).online
     params = jax.tree.map(
         lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), abstract
     )
-    return Fixed(learner, params, jax.jit(lambda params, obs: learning.look(learner, params, obs)))
+    return Fixed(learner, params, jax.jit(lambda params, obs: actor_critic.look(learner, params, obs)))
 
 
 def _hills(seed: int, yaw: float) -> Observation:

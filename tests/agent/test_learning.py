@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.agent import learner as learning, maps, policy
-from csac_jax.agent.learner import Learner, Params
+from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.training import step
@@ -40,7 +40,7 @@ def learn(
     """Trains an algorithm on a problem for a number of actions and plays EPISODES fresh
     episodes."""
     cfg = toys.config(algo, actions, cap, push)
-    toy, learner = problem(cfg), learning.make(cfg)
+    toy, learner = problem(cfg), actor_critic.make(cfg)
     state = step.init(step.Program(cfg, toy, learner))
     state, metrics = step.compile_chunk(step.Program(cfg, toy, learner), cfg.train.steps)(state)
     assert np.all(np.isfinite(metrics.critic_loss))
@@ -48,7 +48,7 @@ def learn(
         jax.random.key(99), state.learner.online
     )
     chosen = np.array(
-        maps.allowed(cfg.policy)
+        maps.allowed_primitives(cfg.policy)
     )  # an output of a primitive never taken is never trained
     value = jnp.max(jnp.where(begun.valid, begun.q, -jnp.inf)[:, chosen], axis=(1, 2, 3, 4))
     return Learned(
@@ -59,31 +59,24 @@ def learn(
     )
 
 
-def _play(toy: Toy, learner: Learner, key: jax.Array, params: Params):
+def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
     """Dense maps of the first states, last states and primitives [T, E]."""
-    cfg, span = toy.cfg, learner.bounds[1] - learner.bounds[0]
 
     def act(state: State, i: jax.Array) -> tuple[State, jax.Array]:
         keys = jax.vmap(jax.random.fold_in, (None, 0))(
             jax.random.fold_in(key, i), jnp.arange(EPISODES)
         )
-        best = jax.vmap(policy.best_action, (0, None, None, 0, None, 0))
-        action = best(
-            keys,
-            cfg,
-            learner.frames,
-            learning.look(learner, params, state.obs),
-            span,
-            state.steps_without_change,
-        )
+        dense_maps = actor_critic.look(learner, params, state.obs)
+        best = jax.vmap(policy.best_action, (0, None, 0, 0))
+        action = best(keys, learner, dense_maps, state.steps_without_change)
         after = jax.vmap(toy.step)(state, action)
         return jax.tree.map(
             lambda old, new: jax.vmap(jnp.where)(state.done, old, new), state, after
         ), action.primitive
 
     first = jax.vmap(lambda i: toy.reset(jax.random.fold_in(key, i)))(1000 + jnp.arange(EPISODES))
-    last, primitives = jax.lax.scan(act, first, jnp.arange(cfg.task.max_actions))
-    return learning.look(learner, params, first.obs), last, primitives
+    last, primitives = jax.lax.scan(act, first, jnp.arange(toy.cfg.task.max_actions))
+    return actor_critic.look(learner, params, first.obs), last, primitives
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from csac_jax.agent import losses
@@ -11,30 +10,13 @@ from csac_jax.config import LearnConfig
 
 
 @pytest.mark.parametrize("width", [0.5, 1.0])
-def test_huber_is_optax_huber(width):
-    """Claim: the Huber loss and its gradient are Optax's."""
-    error = jnp.array([-1e6, -3.0, -0.5, -0.1, 0.0, 0.2, 0.999, 2.0, 1e6])
-    np.testing.assert_allclose(
-        losses.huber(error, width), optax.huber_loss(error, delta=width), rtol=1e-6
-    )
-    ours, theirs = (
-        jax.grad(lambda e, f=f: jnp.sum(f(e)))(error)
-        for f in (lambda e: losses.huber(e, width), lambda e: optax.huber_loss(e, delta=width))
-    )
-    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
-
-
-def test_huber_by_hand():
-    """Claim: e^2 / 2 inside the width, width (|e| - width / 2) beyond."""
-    np.testing.assert_allclose(losses.huber(jnp.array([0.5, -3.0]), 2.0), [0.125, 4.0])
-
-
-def test_huber_gradient_is_bounded():
+def test_huber_gradient_is_bounded(width):
     """Claim: the gradient is finite, at most the width, for every finite error."""
-    gradient = jax.vmap(jax.grad(lambda e: losses.huber(e, 1.0)))(
-        jnp.array([1e30, -3e38, 1.0, 0.0])
+    cfg = LearnConfig(loss="huber", huber=width)
+    gradient = jax.vmap(jax.grad(lambda e: losses.td_loss(cfg, e)))(
+        jnp.array([1e30, -3e38, width, 0.0])
     )
-    np.testing.assert_allclose(gradient, [1.0, -1.0, 1.0, 0.0])
+    np.testing.assert_allclose(gradient, [width, -width, width, 0.0])
 
 
 def test_td_target_by_hand():
@@ -54,23 +36,24 @@ def test_td_target_has_no_gradient():
     assert gradient == 0.0
 
 
-def test_polyak_by_hand():
+def test_soft_target_by_hand():
     """Claim: each leaf moves by tau of the way; tau = 1 copies bit for bit; the structure stays."""
-    online, target = (
-        {"a": jnp.array([1.0, 0.1]), "b": jnp.float32(3.0)},
-        {"a": jnp.array([0.0, 7.3]), "b": jnp.float32(5.0)},
+    online = {"a": jnp.array([1.0, 0.1]), "b": jnp.float32(3.0)}
+    target = {"a": jnp.array([0.0, 7.3]), "b": jnp.float32(5.0)}
+    moved, copied = (
+        losses.update_target(LearnConfig(tau=tau), online, target, jnp.int32(1))
+        for tau in (0.25, 1.0)
     )
-    moved = losses.polyak(online, target, 0.25)
     np.testing.assert_allclose(moved["a"], [0.25, 5.5], rtol=1e-6)
     np.testing.assert_allclose(moved["b"], 4.5)
-    jax.tree.map(np.testing.assert_array_equal, losses.polyak(online, target, 1.0), online)
+    jax.tree.map(np.testing.assert_array_equal, copied, online)
 
 
 @pytest.mark.parametrize(("loss", "expected"), [("huber", [0.125, 4.0]), ("squared", [0.25, 9.0])])
-def test_loss_of_error_by_hand(loss, expected):
+def test_td_loss_by_hand(loss, expected):
     """Claim: errors 0.5 and -3 cost 0.125 and 4 by Huber of width 2, and their squares by line
     21."""
-    got = losses.of_error(LearnConfig(loss=loss, huber=2.0), jnp.array([0.5, -3.0]))
+    got = losses.td_loss(LearnConfig(loss=loss, huber=2.0), jnp.array([0.5, -3.0]))
     np.testing.assert_array_equal(got, expected)
 
 
@@ -80,7 +63,7 @@ def test_hard_targets_are_copied_every_c_updates(updates):
     untouched otherwise."""
     online, target = {"a": jnp.array([0.1, 7.0])}, {"a": jnp.array([3.0, -1.0])}
     cfg = LearnConfig(target_update="hard", target_update_period=3, tau=0.5)
-    got = losses.follow(cfg, online, target, jnp.int32(updates))
+    got = losses.update_target(cfg, online, target, jnp.int32(updates))
     np.testing.assert_array_equal(got["a"], (online if updates % 3 == 0 else target)["a"])
 
 
@@ -88,6 +71,6 @@ def test_soft_targets_follow_each_update():
     """Claim: soft targets move by tau at every update, whatever C is."""
     online, target = {"a": jnp.array([1.0])}, {"a": jnp.array([0.0])}
     cfg = LearnConfig(target_update="soft", target_update_period=3, tau=0.25)
-    assert [float(losses.follow(cfg, online, target, jnp.int32(n))["a"][0]) for n in (1, 2, 3)] == [
-        0.25
-    ] * 3
+    assert [
+        float(losses.update_target(cfg, online, target, jnp.int32(n))["a"][0]) for n in (1, 2, 3)
+    ] == [0.25] * 3

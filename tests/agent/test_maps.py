@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.agent import learner as learning, maps
+from csac_jax.agent import actor_critic, maps
 from csac_jax.config import NetConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
@@ -208,7 +208,7 @@ def test_grasps_are_valid_above_blocks(cfg, frames):
     A cell's corners are 0.71 of its side from its centre; turning to the nearest cell moves by that
     of an input cell.
     """
-    valid = np.asarray(maps.actionable(frames, _one_block(cfg)))[GRASP]
+    valid = np.asarray(maps.actionable_cells(frames, _one_block(cfg)))[GRASP]
     distance = _beside(frames.xy)
     slack = 0.71 * frames.cell + 0.71 * cfg.heightmap.cell
     assert np.all(valid[distance < 0.0])
@@ -222,7 +222,7 @@ def test_grasps_are_valid_above_blocks(cfg, frames):
 def test_pushes_are_valid_ahead_of_which_a_block_lies(cfg, frames):
     """Claim: a push is valid where a block lies within its length ahead along the yaw, not behind,
     not beside."""
-    valid = np.asarray(maps.actionable(frames, _one_block(cfg)))[PUSH]
+    valid = np.asarray(maps.actionable_cells(frames, _one_block(cfg)))[PUSH]
     length, slack = cfg.sim.push_length, 1.5 * frames.cell
     seen = {"ahead": 0, "behind": 0, "beside": 0, "far": 0}
     for k, yaw in enumerate(frames.yaws):
@@ -251,12 +251,12 @@ def test_nothing_is_valid_outside_of_the_workspace(cfg, frames):
     """Claim: no action starts outside of the square, and on a bare table none is valid."""
     size = cfg.heightmap.size
     full = _one_block(cfg).replace(height=jnp.full((size, size), 0.05))
-    valid = np.asarray(maps.actionable(frames, full))
+    valid = np.asarray(maps.actionable_cells(frames, full))
     assert not np.any(valid[:, np.max(np.abs(frames.xy), axis=-1) > 0.5 * cfg.heightmap.extent])
     assert np.all(
         valid[GRASP] == (np.max(np.abs(frames.xy), axis=-1) <= 0.5 * cfg.heightmap.extent)
     )
-    assert not np.any(maps.actionable(frames, full.replace(height=jnp.zeros((size, size)))))
+    assert not np.any(maps.actionable_cells(frames, full.replace(height=jnp.zeros((size, size)))))
 
 
 def test_without_mask_every_cell_counts(cfg, frames):
@@ -266,11 +266,11 @@ def test_without_mask_every_cell_counts(cfg, frames):
     obs = obs.replace(
         target=obs.height > 0.01, height=jnp.maximum(obs.height, 0.02)
     )  # the target amid another block
-    np.testing.assert_array_equal(maps.everywhere(frames, obs), np.stack([frames.inside] * 2))
-    marked = dataclasses.replace(frames, marked=True)
-    valid = np.asarray(maps.everywhere(marked, obs))
+    np.testing.assert_array_equal(maps.all_cells(frames, obs), np.stack([frames.inside] * 2))
+    with_target = dataclasses.replace(frames, shows_target=True)
+    valid = np.asarray(maps.all_cells(with_target, obs))
     np.testing.assert_array_equal(valid[PUSH], frames.inside)
-    np.testing.assert_array_equal(valid[GRASP], maps.actionable(marked, obs)[GRASP])
+    np.testing.assert_array_equal(valid[GRASP], maps.actionable_cells(with_target, obs)[GRASP])
     assert 0 < valid[GRASP].sum() < frames.inside.sum() / 4
 
 
@@ -306,17 +306,17 @@ def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
     ahead and push back come from other outputs of the net, and frames K / 2 - 1 and K - 1 have no
     such successor.
     """
-    four = learning.make(
+    four = actor_critic.make(
         dataclasses.replace(
             cfg, net=NetConfig(rotations=4, growth=4, dilations=(1, 2), stem=4, head=8)
         )
     )
-    params = randomised(learning.init(jax.random.key(0), four)).online
+    params = randomised(actor_critic.init(jax.random.key(0), four)).online
     scenes = observations(2, 0)
     turned = jax.tree.map(
         lambda field: jnp.rot90(field, -1, axes=(1, 2)), scenes
     )  # rows are y: this is +90 degrees
-    look = jax.jit(lambda obs: learning.look(four, params, obs))
+    look = jax.jit(lambda obs: actor_critic.look(four, params, obs))
     before, after = look(scenes), look(turned)
     for k in (0, 2):
         np.testing.assert_array_equal(after.valid[:, :, k + 1], before.valid[:, :, k])

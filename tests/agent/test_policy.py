@@ -14,17 +14,19 @@ from csac_jax.config import CEMConfig, ExploreConfig, PolicyConfig
 from csac_jax.constants import Primitive
 from csac_jax.sim.outcome import BARE
 
-PENALTY = 6.0
 KEYS = 20
 
 
+def _learner(learner, cfg):
+    """The learner of a config that differs in the policy only; its returns span 6."""
+    return dataclasses.replace(learner, cfg=cfg, bounds=(-2.0, 4.0))
+
+
 @pytest.fixture(scope="module")
-def best(cfg, frames):
+def best(cfg, learner):
     """Actions of DenseMaps for KEYS keys."""
-    run = jax.vmap(
-        lambda key, state: policy.best_action(key, cfg, frames, state, PENALTY, jnp.int32(0)),
-        (0, None),
-    )
+    six = _learner(learner, cfg)
+    run = jax.vmap(lambda key, state: policy.best_action(key, six, state, jnp.int32(0)), (0, None))
     return jax.jit(lambda state: run(jax.random.split(jax.random.key(0), KEYS), state))
 
 
@@ -77,7 +79,7 @@ def test_greedy_picks_the_better_primitive(frames, best, primitive):
 def test_random_grasps_land_on_blocks(cfg, frames, observations):
     """Claim: a random grasp is above a block, and takes every yaw."""
     obs = jax.tree.map(lambda leaf: leaf[0], observations(1, 3))
-    valid = maps.actionable(frames, obs)
+    valid = maps.actionable_cells(frames, obs)
     keys = jax.random.split(jax.random.key(1), 400)
     action = jax.jit(jax.vmap(lambda key: policy.random_grasp(key, frames, valid)))(keys)
     assert np.all(action.primitive == Primitive.GRASP)
@@ -96,7 +98,7 @@ def test_random_grasps_land_on_blocks(cfg, frames, observations):
 
 
 @pytest.mark.slow
-def test_without_exploration_it_acts_greedily(cfg, frames):
+def test_without_exploration_it_acts_greedily(cfg, frames, learner):
     """Claim: with no noise, random primitive nor random place, what is tried is valid and worth the
     best value."""
     state = _state(frames, 7)
@@ -110,7 +112,7 @@ def test_without_exploration_it_acts_greedily(cfg, frames):
     own = dataclasses.replace(cfg, explore=calm)
     act = jax.jit(
         jax.vmap(
-            lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(0), jnp.int32(0))
+            lambda key: policy.act(key, _learner(learner, own), state, jnp.int32(0), jnp.int32(0))
         )
     )
     action = act(jax.random.split(jax.random.key(2), KEYS))
@@ -131,12 +133,12 @@ def _with(cfg, section: str, **settings):
     )
 
 
-def test_best_pixel(cfg, frames):
+def test_best_pixel(cfg, frames, learner):
     """Claim: with `argmax` a primitive's pose is that of NumPy's largest valid cell, exactly,
     whatever the key."""
     own, state = _with(cfg, "policy", place="argmax"), _state(frames, 4)
     run = jax.jit(
-        jax.vmap(lambda key: policy.greedy(key, own, frames, state, PENALTY, jnp.int32(0)))
+        jax.vmap(lambda key: policy.greedy(key, _learner(learner, own), state, jnp.int32(0)))
     )
     choice = run(jax.random.split(jax.random.key(0), 3))
     masked = np.where(state.valid, state.q, -np.inf)
@@ -171,7 +173,7 @@ def test_choice_of_primitive(rule, values, steps_without_change, expected):
 
 @pytest.mark.parametrize("steps_without_change", [0, 1])
 @pytest.mark.slow
-def test_rule_reaches_the_action(cfg, frames, steps_without_change):
+def test_rule_reaches_the_action(cfg, frames, learner, steps_without_change):
     """Claim: what is done follows the rule with and without exploration, where values say the
     opposite."""
     own = _with(cfg, "policy", primitive="rule")
@@ -182,24 +184,24 @@ def test_rule_reaches_the_action(cfg, frames, steps_without_change):
     key, count = jax.random.key(0), jnp.int32(steps_without_change)
     best = jax.jit(
         lambda steps_without_change: policy.best_action(
-            key, own, frames, state, PENALTY, steps_without_change
+            key, _learner(learner, own), state, steps_without_change
         )
     )
     act = jax.jit(
         lambda steps_without_change: policy.act(
-            key, own, frames, state, PENALTY, steps_without_change, jnp.int32(0)
+            key, _learner(learner, own), state, steps_without_change, jnp.int32(0)
         )
     )
     assert best(count).primitive == act(count).primitive == 1 - wrong
 
 
-def test_grasp_only_never_pushes(cfg, frames):
+def test_grasp_only_never_pushes(cfg, frames, learner):
     """Claim: grasp_only grasps while it explores too, where pushes are worth more."""
     own, state = algorithms.configure(cfg, "grasp_only"), _state(frames, 6)
     state = state.replace(q=state.q.at[Primitive.PUSH].add(5.0))
     act = jax.jit(
         jax.vmap(
-            lambda key: policy.act(key, own, frames, state, PENALTY, jnp.int32(3), jnp.int32(0))
+            lambda key: policy.act(key, _learner(learner, own), state, jnp.int32(3), jnp.int32(0))
         )
     )
     assert np.all(act(jax.random.split(jax.random.key(2), 200)).primitive == Primitive.GRASP)
@@ -236,7 +238,7 @@ def _peaked(key: jax.Array, frames) -> DenseMaps:
         pytest.param("actor", 0.0, 0.1, marks=pytest.mark.slow),
     ],
 )
-def test_search_finds_the_highest_of_several_peaks(cfg, frames, start, least, most):
+def test_search_finds_the_highest_of_several_peaks(cfg, frames, learner, start, least, most):
     """Claim: with the default settings, of 1,000 searches on maps of one to five peaks at least 98
     % reach the highest value within 1 %, whatever the actor proposes; from an actor alone that
     knows nothing of it, hardly one does."""
@@ -245,7 +247,7 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, start, least, mo
     def reached(i: jax.Array) -> jax.Array:
         state = _peaked(jax.random.fold_in(jax.random.key(3), i), frames)
         choice = policy.greedy(
-            jax.random.fold_in(jax.random.key(4), i), own, frames, state, PENALTY, jnp.int32(0)
+            jax.random.fold_in(jax.random.key(4), i), _learner(learner, own), state, jnp.int32(0)
         )
         best = jnp.max(jnp.where(frames.inside, state.q[Primitive.GRASP], -jnp.inf))
         return choice.values[Primitive.GRASP] >= 0.99 * best
@@ -264,15 +266,15 @@ def test_random_places_without_the_mask(cfg, frames):
     assert np.all(np.abs(u[..., :2]).max(axis=0) > 0.9)
 
 
-def test_candidates_are_those_of_the_search(cfg, frames):
+def test_candidates_are_those_of_the_search(cfg, frames, learner):
     """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
     key."""
     one = dataclasses.replace(cfg, cem=dataclasses.replace(cfg.cem, rounds=1, start="actor"))
     state, key = _state(frames, 0), jax.random.key(3)
-    tried = jax.jit(lambda key: policy.candidates(key, one, frames, state, PENALTY))(key)
+    tried = jax.jit(lambda key: policy.candidates(key, _learner(learner, one), state))(key)
     assert tried.shape == (2, cfg.cem.candidates, 3)
     greedy = jax.jit(
-        lambda key: policy.greedy(key, one, frames, state, PENALTY, jnp.int32(0)).greedy.poses
+        lambda key: policy.greedy(key, _learner(learner, one), state, jnp.int32(0)).greedy.poses
     )
     for primitive, u in zip(Primitive, greedy(key), strict=True):
         pose = maps.denormalise(frames, u)
@@ -281,11 +283,11 @@ def test_candidates_are_those_of_the_search(cfg, frames):
         )
 
 
-def test_without_a_search_there_is_one_candidate(cfg, frames):
+def test_without_a_search_there_is_one_candidate(cfg, frames, learner):
     """Claim: VPG's only candidate is the best pixel."""
     vpg = algorithms.configure(cfg, "vpg")
     state, key = _state(frames, 0), jax.random.key(3)
-    tried = policy.candidates(key, vpg, frames, state, PENALTY)
-    action = policy.best_action(key, vpg, frames, state, PENALTY, jnp.int32(0))
+    tried = policy.candidates(key, _learner(learner, vpg), state)
+    action = policy.best_action(key, _learner(learner, vpg), state, jnp.int32(0))
     assert tried.shape == (2, 1, 3)
     np.testing.assert_allclose(tried[action.primitive, 0], action.pose, atol=1e-5)

@@ -18,9 +18,16 @@ CFG = RewardConfig()
 def reward(
     cfg, primitive, outcome=0, distance=0.0, before=0.0, after=0.0, changed=False, blocks_lost=0
 ):
-    values = (jnp.float32(v) for v in (distance, before, after))
-    seen = jnp.asarray(changed), jnp.int32(blocks_lost)
-    return float(rewards.reward(cfg, jnp.int32(primitive), jnp.int32(outcome), *values, *seen))
+    result = rewards.ActionResult(
+        primitive=jnp.int32(primitive),
+        outcome=jnp.int32(outcome),
+        distance=jnp.float32(distance),
+        phi_before=jnp.float32(before),
+        phi_after=jnp.float32(after),
+        changed=jnp.asarray(changed),
+        blocks_lost=jnp.int32(blocks_lost),
+    )
+    return float(rewards.reward(cfg, result))
 
 
 @pytest.mark.parametrize(
@@ -69,8 +76,8 @@ def test_distance_is_a_loss():
 
 @pytest.mark.parametrize("primitive", [Primitive.PUSH, Primitive.GRASP])
 def test_blocks_that_left_cost_once(primitive):
-    """Claim: with `left` 0.75 an action pays 0.75 less when one block has left, or three, and
-    nothing by default."""
+    """Claim: with a penalty of 0.75 an action that loses one block, or three, pays 0.75 less; by
+    default it pays nothing less."""
     strict = RewardConfig(lost_block_penalty=0.75)
     whole = reward(CFG, primitive, Outcome.LIFTED, after=1.0)
     assert [

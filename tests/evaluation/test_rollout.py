@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.agent import learner as learning
+from csac_jax.agent import actor_critic
 from csac_jax.config import TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
@@ -174,8 +174,8 @@ def test_more_episodes_than_run_at_once(magnet, monkeypatch):
 @pytest.mark.slow
 def test_learned_needs_its_networks_only(magnet):
     """Claim: the learned policy runs from parameters alone and gives consistent records."""
-    learner = learning.make(CFG)
-    params = jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)).online
+    learner = actor_critic.make(CFG)
+    params = jax.jit(lambda key: actor_critic.init(key, learner))(jax.random.key(0)).online
     assert_consistent(
         rollout.rollout(CFG, magnet, "learned", params, EPISODES, 0), CFG.task.max_actions
     )

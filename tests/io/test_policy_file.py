@@ -11,7 +11,7 @@ import pytest
 import safetensors.numpy
 
 from csac_jax import presets
-from csac_jax.agent.learner import Params
+from csac_jax.agent.actor_critic import Params
 from csac_jax.io import config_json, policy_file
 from csac_jax.training import step
 

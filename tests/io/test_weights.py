@@ -12,7 +12,7 @@ import pytest
 import safetensors.numpy
 
 from csac_jax import cli, presets
-from csac_jax.agent import learner as learning
+from csac_jax.agent import actor_critic
 from csac_jax.config import NetConfig
 from csac_jax.io import weights
 from csac_jax.nets import torchvision
@@ -175,12 +175,12 @@ def test_networks_begin_with_the_weights(tmp_path, tensors):
     statistics; heads and optimisers are as without."""
     smoke = presets.smoke()
     cfg = dataclasses.replace(smoke, net=NET, learn=dataclasses.replace(smoke.learn, critics=2))
-    learner = learning.make(cfg)
+    learner = actor_critic.make(cfg)
     with jax.numpy_dtype_promotion("standard"):
-        abstract = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+        abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, 7, leaf.dtype), abstract)
     trunk = weights.read(_config(tmp_path / "w.safetensors", tensors))
-    state = learning.with_trunk(blank, trunk)
+    state = actor_critic.with_trunk(blank, trunk)
     for params in (state.online, state.target):
         for kind in ("params", "batch_stats"):
             for leaf, one in zip(

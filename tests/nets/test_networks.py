@@ -142,7 +142,7 @@ def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: boo
     frames = maps.frames(cfg)
     seen = jax.eval_shape(
         lambda colour, height, mask: networks.inputs(
-            cfg.net, colour, height, mask if frames.marked else None
+            cfg.net, colour, height, mask if frames.shows_target else None
         ),
         jnp.zeros((1, 96, 96, 3)),
         jnp.zeros((1, 96, 96)),

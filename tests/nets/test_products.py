@@ -13,8 +13,8 @@ from csac_jax.nets import products
 @pytest.mark.parametrize(
     ("module", "stride", "size"),
     [
-        (products.Convolution(5, 1, jnp.float32), 1, 1),
-        (products.Convolution(5, 3, jnp.float32), 1, 3),
+        (products.TapConvolution(5, 1, jnp.float32), 1, 1),
+        (products.TapConvolution(5, 3, jnp.float32), 1, 3),
         (products.Stem(5, False, jnp.float32), 2, 7),
     ],
 )

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import learner as learning
+from csac_jax.agent import actor_critic
 from csac_jax.config import Config
 from csac_jax.env import Env
 from csac_jax.replay import ring
@@ -62,8 +62,8 @@ def test_state_is_exact():
 )
 def test_looking_takes_what_is_predicted(cfg: Config):
     """Claim: what looking at all scenes needs is predicted within 15 % of what XLA reserves."""
-    learner = learning.make(cfg)
-    state = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
+    learner = actor_critic.make(cfg)
+    state = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     obs = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct((cfg.train.scenes, *leaf.shape[1:]), leaf.dtype),
         step.abstract_state(cfg).scenes.obs,
@@ -83,7 +83,7 @@ def test_learning_at_stride_4_takes_what_is_predicted():
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
     nothing: Any = None
     program, state = (
-        step.Program(cfg, Env(cfg, nothing, blank), learning.make(cfg)),
+        step.Program(cfg, Env(cfg, nothing, blank), actor_critic.make(cfg)),
         step.abstract_state(cfg),
     )
     learn = jax.jit(

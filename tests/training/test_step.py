@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import learner as learning, rewards
+from csac_jax.agent import actor_critic, rewards
 from csac_jax.config import ReplayConfig
 from csac_jax.constants import Primitive
 from csac_jax.env import Env
@@ -180,7 +180,7 @@ def test_blocks_that_left_reach_the_reward(run):
     reward = dataclasses.replace(CFG.reward, lost_block_penalty=0.75)
     cfg = dataclasses.replace(CFG, reward=reward)
     env = Losing(cfg, run.program.env.physics, run.program.env.scenes)
-    program = Program(cfg, env, learning.make(cfg))
+    program = Program(cfg, env, actor_critic.make(cfg))
     _, metrics = jax.jit(functools.partial(step.train_step, program))(copy(run.states[0]))
     grasp, push = (
         reward.nothing - 0.75,
@@ -389,12 +389,12 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     np.testing.assert_allclose(priority, expected, rtol=1e-6)
 
 
-def _opinions() -> tuple[learning.Learner, learning.LearnerState]:
+def _opinions() -> tuple[learning.ActorCritic, learning.LearnerState]:
     """A learner and networks whose critic values every cell differently."""
-    learner = learning.make(CFG)
+    learner = actor_critic.make(CFG)
     rng = np.random.default_rng(0)
-    blank = jax.eval_shape(lambda: learning.init(jax.random.key(0), learner))
-    state = jax.jit(lambda: learning.init(jax.random.key(0), learner))()
+    blank = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
+    state = jax.jit(lambda: actor_critic.init(jax.random.key(0), learner))()
     noise = jax.tree.map(
         lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), blank.online
     )
@@ -438,9 +438,9 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
         cfg = dataclasses.replace(
             CFG, learn=dataclasses.replace(CFG.learn, actor_batch=actor_batch)
         )
-        program = Program(cfg, nothing, learning.make(cfg))
+        program = Program(cfg, nothing, actor_critic.make(cfg))
         state = jax.eval_shape(
-            lambda program=program: learning.init(jax.random.key(0), program.learner)
+            lambda program=program: actor_critic.init(jax.random.key(0), program.learner)
         )
         replay = jax.eval_shape(lambda: ring.init(CFG.replay, step.example(CFG)))
         jax.eval_shape(functools.partial(step._learn, program), jax.random.key(0), state, replay)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.agent import cem, explore, learner as learning, losses, rewards, softmax
-from csac_jax.agent.learner import Learner
+from csac_jax.agent import cem, explore, actor_critic, losses, rewards, softmax
+from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.config import Config
 from csac_jax.replay import samplers
 from csac_jax.training.step import Program, StepMetrics, TrainState
@@ -26,8 +26,8 @@ def program(cfg: Config = CFG) -> Program:
     """Without environment and networks."""
     nothing: Any = None
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
-    learner = Learner(cfg, nothing, nothing, nothing, nothing, nothing, bounds)
-    return Program(cfg, nothing, learning.with_numbers(learner, cfg, bounds))
+    learner = ActorCritic(cfg, nothing, nothing, nothing, nothing, nothing, bounds)
+    return Program(cfg, nothing, actor_critic.with_numbers(learner, cfg, bounds))
 
 
 def begin(program: Program, key: jax.Array) -> TrainState:
@@ -59,13 +59,13 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
         target = losses.td_target(
             batch, cfg.target.gamma, batch > 0.9, jnp.clip(0.5 * q, *learner.bounds)
         )
-        return jnp.mean(losses.of_error(cfg.learn, target - q))
+        return jnp.mean(losses.td_loss(cfg.learn, target - q))
 
     critic_loss, gradient = jax.value_and_grad(loss)(state.learner["online"])
     change, optimiser = learner.critic_optimiser.update(50.0 * gradient, state.learner["optimiser"])
     slow, actor = learner.actor_optimiser.update(gradient, state.learner["actor"])
     online = state.learner["online"] + change + slow
-    target = losses.follow(cfg.learn, online, state.learner["target"], state.step + 1)
+    target = losses.update_target(cfg.learn, online, state.learner["target"], state.step + 1)
     replay = jax.lax.cond(
         state.step < 2, lambda ring: ring, lambda ring: ring.at[0].add(1.0), state.replay
     )
@@ -110,12 +110,16 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     )
     outcomes = jnp.arange(5, dtype=jnp.int32)
     far, zero, changed = jnp.float32(0.4), jnp.float32(0.0), jnp.array(True)
-    each = jax.vmap(rewards.reward, (None, None, 0, None, None, None, None, None))
-    grasps = each(cfg.reward, jnp.int32(1), outcomes, far, zero, zero, changed, jnp.int32(1))
+    grasp = rewards.ActionResult(jnp.int32(1), outcomes, far, zero, zero, changed, jnp.int32(1))
+    axes = rewards.ActionResult(None, 0, None, None, None, None, None)
+    grasps = jax.vmap(rewards.reward, (None, axes))(cfg.reward, grasp)
     none_lifted, push = jnp.int32(0), jnp.int32(0)
     gains = (jnp.float32(0.05), jnp.float32(0.5))
     pushes = [
-        rewards.reward(cfg.reward, push, none_lifted, zero, zero, gain, changed, jnp.int32(0))
+        rewards.reward(
+            cfg.reward,
+            rewards.ActionResult(push, none_lifted, zero, zero, gain, changed, jnp.int32(0)),
+        )
         for gain in gains
     ]
     ex = cfg.explore

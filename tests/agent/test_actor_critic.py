@@ -8,8 +8,8 @@ import numpy as np
 import optax
 import pytest
 
-from csac_jax.agent import actor, learner as learning, maps, softmax
-from csac_jax.agent.learner import Learner, LearnerState, Params, Transition
+from csac_jax.agent import actor, actor_critic, maps, softmax
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params, Transition
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import TargetConfig
 from csac_jax.constants import Primitive
@@ -25,7 +25,7 @@ B = 6
 def state(learner, randomised) -> LearnerState:
     """Random online networks, and others as targets."""
     with jax.numpy_dtype_promotion("standard"):
-        return randomised(jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)))
+        return randomised(jax.jit(lambda key: actor_critic.init(key, learner))(jax.random.key(0)))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def update(learner):
 
     @jax.jit
     def one(state, batch, weights):
-        return learning.update_critic(jax.random.key(3), learner, state, batch, weights)
+        return actor_critic.update_critic(jax.random.key(3), learner, state, batch, weights)
 
     return lambda state, batch, weights=None: one(
         state, batch, jnp.ones(B) if weights is None else weights
@@ -81,7 +81,7 @@ def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
     Where everything ends the target is the reward, so that the error tells Q. Both primitives,
     poses all over.
     """
-    look = jax.jit(lambda params, obs: learning.look(learner, params, heightmap.unpack(obs)).q)
+    look = jax.jit(lambda params, obs: actor_critic.look(learner, params, heightmap.unpack(obs)).q)
     read = jax.jit(jax.vmap(lambda q, p, pose: maps.read(learner.frames, q, p, pose)))
     q = look(state.online, batch.obs)
     rng = np.random.default_rng(0)
@@ -136,7 +136,7 @@ def test_target_carries_no_gradient(learner, state, batch):
     def loss(online, target, reward):
         before = state.replace(online=online, target=target)
         seen = batch.replace(reward=reward)
-        return learning.update_critic(jax.random.key(3), learner, before, seen, jnp.ones(B))[
+        return actor_critic.update_critic(jax.random.key(3), learner, before, seen, jnp.ones(B))[
             1
         ].critic_loss
 
@@ -152,14 +152,17 @@ def test_critic_gradient_is_that_of_its_loss(learner, state, batch):
     plain = dataclasses.replace(learner, critic_optimiser=optax.sgd(1.0))
     weights = jnp.linspace(0.2, 1.0, B)
     run = jax.jit(
-        lambda state: learning.update_critic(
+        lambda state: actor_critic.update_critic(
             jax.random.key(3), plain, state, _ended(batch), weights
         )
     )
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.critic, after.online.critic)
-    _check_slope(lambda critic: run(state.replace(online=state.online.replace(critic=critic)))[1].critic_loss,
-                 state.online.critic, gradient)  # fmt: skip
+
+    def loss(critic):
+        return run(state.replace(online=state.online.replace(critic=critic)))[1].critic_loss
+
+    _check_slope(loss, state.online.critic, gradient)
 
 
 def _check_slope(loss, params, gradient, relative: float = 1e-2, step: float = 2e-3) -> None:
@@ -181,7 +184,7 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
     pose jumps. The step is so long that float32's rounding of the loss, 1e-8, is 1e-5 of the slope.
     """
     plain = dataclasses.replace(learner, actor_optimiser=optax.sgd(1.0))
-    run = jax.jit(lambda state: learning.update_actor(plain, state, observations(B, 4)))
+    run = jax.jit(lambda state: actor_critic.update_actor(plain, state, observations(B, 4)))
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.actor, after.online.actor)
     _check_slope(
@@ -196,12 +199,12 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
 def test_actor_climbs_the_critic(learner, state, batch):
     """Claim: updates of the actor raise Q(s, mu(s)) and leave the critic and both targets as they
     are."""
-    run = jax.jit(lambda state: learning.update_actor(learner, state, heightmap.unpack(batch.obs)))
+    run = jax.jit(lambda state: actor_critic.update_actor(learner, state, heightmap.unpack(batch.obs)))
 
     @jax.jit
     def value(online: Params) -> jax.Array:
         """Mean of Q(s, mu(s)) over states and primitives."""
-        seen = learning.look(learner, online, heightmap.unpack(batch.obs))
+        seen = actor_critic.look(learner, online, heightmap.unpack(batch.obs))
         poses = [
             jax.vmap(lambda one, p=p: actor.pose(learner.frames, one, p))(seen) for p in Primitive
         ]
@@ -274,7 +277,7 @@ def _smooth(frames) -> DenseMaps:
     return DenseMaps(q=q, logits=10.0 * q, valid=jnp.ones(q.shape, bool))
 
 
-def _with_target(learner: Learner, **settings) -> Learner:
+def _with_target(learner: ActorCritic, **settings) -> ActorCritic:
     cfg = dataclasses.replace(learner.cfg, target=dataclasses.replace(TargetConfig(), **settings))
     return dataclasses.replace(learner, cfg=cfg)
 
@@ -288,7 +291,7 @@ def test_next_value_lies_within_the_map(learner):
     means = []
     for beta in (0.0, 1e5):
         own = _with_target(learner, inverse_temperature=beta, samples=256)
-        run = jax.jit(jax.vmap(lambda key, own=own: learning.next_value(own, key, state)))
+        run = jax.jit(jax.vmap(lambda key, own=own: actor_critic.next_value(own, key, state)))
         values = np.asarray(run(jax.random.split(jax.random.key(1), 16)))
         assert np.all((values >= low) & (values <= high))
         means.append(values.mean())
@@ -302,7 +305,7 @@ def test_next_value_ignores_what_is_bare(learner):
     q = jnp.stack([jnp.full((8, 18, 18), 3.0), jnp.full((8, 18, 18), 1.0)])
     assert q.shape[1:] == learner.frames.xy.shape[:3]
     value = jax.jit(
-        lambda valid: learning.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
+        lambda valid: actor_critic.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
     )
     grasps = jnp.zeros(q.shape, bool).at[Primitive.GRASP].set(True)
     np.testing.assert_allclose(value(grasps), 1.0, rtol=1e-5)
@@ -318,11 +321,11 @@ def test_best_grasp():
     q[Primitive.PUSH] += 9.0
     best = max(q[Primitive.GRASP][valid[Primitive.GRASP]])
     state = DenseMaps(jnp.asarray(q), jnp.asarray(q), jnp.asarray(valid))
-    assert learning.best_grasp(state) == best < 0.0
-    assert learning.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0
+    assert actor_critic.best_grasp(state) == best < 0.0
+    assert actor_critic.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0
 
 
-def _changed(learner: Learner, section: str, **settings) -> Learner:
+def _changed(learner: ActorCritic, section: str, **settings) -> ActorCritic:
     """The same learner with other settings of one section."""
     cfg = learner.cfg
     cfg = dataclasses.replace(
@@ -331,9 +334,9 @@ def _changed(learner: Learner, section: str, **settings) -> Learner:
     return dataclasses.replace(learner, cfg=cfg)
 
 
-def _run(learner: Learner):
+def _run(learner: ActorCritic):
     return jax.jit(
-        lambda state, batch: learning.update_critic(
+        lambda state, batch: actor_critic.update_critic(
             jax.random.key(3), learner, state, batch, jnp.ones(B)
         )
     )
@@ -352,10 +355,10 @@ def test_max_target_is_the_best_valid_cell(learner):
     of the softmax over the map; without a valid cell, over all."""
     own, state = _with_target(learner, value="max"), _random_maps((2, 4, 6, 6))
     best = np.asarray(state.q)[np.asarray(state.valid)].max()
-    assert learning.next_value(own, jax.random.key(0), state) == best
+    assert actor_critic.next_value(own, jax.random.key(0), state) == best
     np.testing.assert_allclose(softmax.exact(state.q, 1e6, state.valid), best, rtol=1e-6)
     assert (
-        learning.next_value(
+        actor_critic.next_value(
             own, jax.random.key(0), state.replace(valid=jnp.zeros(state.q.shape, bool))
         )
         == 5.0
@@ -369,14 +372,14 @@ def test_a_policy_that_never_pushes_expects_nothing_of_pushes(learner, value):
     own = _changed(own, "policy", primitive="grasp")
     state = _smooth(learner.frames)
     high = state.replace(q=state.q.at[Primitive.PUSH].add(3.0))
-    run = jax.jit(lambda s: learning.next_value(own, jax.random.key(0), s))
+    run = jax.jit(lambda s: actor_critic.next_value(own, jax.random.key(0), s))
     assert run(state) == run(high) <= float(state.q[Primitive.GRASP].max())
 
 
 def test_max_target_reaches_the_update(learner, state, batch, update):
     """Claim: y = r + gamma max Q'(s', .), by NumPy from the target critic's maps."""
     own = _with_target(learner, value="max", gamma=0.5)
-    seen = jax.jit(lambda params, obs: learning.look(learner, params, heightmap.unpack(obs)))(
+    seen = jax.jit(lambda params, obs: actor_critic.look(learner, params, heightmap.unpack(obs)))(
         state.target, batch.next_obs
     )
     best = np.where(seen.valid, seen.q, -np.inf).reshape(B, -1).max(axis=1)
@@ -412,13 +415,13 @@ def test_twin_critics(learner, batch, randomised):
     """Claim: of two critics the maps are the lower value in each cell; each is trained on its own
     loss, towards one target from the lower maps, and they differ from the start."""
     twin = _changed(_with_target(learner, value="max"), "learn", critics=2)
-    begun = jax.jit(lambda key: learning.init(key, twin))(jax.random.key(0))
+    begun = jax.jit(lambda key: actor_critic.init(key, twin))(jax.random.key(0))
     assert all(
         np.any(leaf[0] != leaf[1]) for leaf in jax.tree.leaves(begun.online.critic) if leaf.ndim > 3
     )
     with jax.numpy_dtype_promotion("standard"):
         state = randomised(begun)
-    look = jax.jit(lambda params: learning.look(learner, params, heightmap.unpack(batch.next_obs)))
+    look = jax.jit(lambda params: actor_critic.look(learner, params, heightmap.unpack(batch.next_obs)))
     both, single = look(state.target), [look(_one(state.target, m)) for m in (0, 1)]
     np.testing.assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
     assert 0.1 < np.mean(single[0].q < single[1].q) < 0.9
@@ -439,7 +442,7 @@ def test_twin_critics(learner, batch, randomised):
     )
 
 
-def _alone(learner: Learner, state: LearnerState, m: int) -> LearnerState:
+def _alone(learner: ActorCritic, state: LearnerState, m: int) -> LearnerState:
     """The state of a learner with critic `m` alone; its optimiser is fresh."""
     online, target = _one(state.online, m), _one(state.target, m)
     return state.replace(
@@ -451,9 +454,9 @@ def test_without_an_actor(learner, state, observations):
     """Claim: without an actor the logits are the critic's map, ten to one, and an update of the
     actor is none."""
     own = _changed(learner, "learn", actor=False)
-    seen = jax.jit(lambda obs: learning.look(own, state.online, obs))(observations(2, 4))
+    seen = jax.jit(lambda obs: actor_critic.look(own, state.online, obs))(observations(2, 4))
     np.testing.assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
-    after, loss = learning.update_actor(own, state, observations(2, 4))
+    after, loss = actor_critic.update_actor(own, state, observations(2, 4))
     jax.tree.map(np.testing.assert_array_equal, after, state)
     assert loss == 0.0
 
@@ -462,9 +465,9 @@ def test_without_the_mask(learner, state, observations):
     """Claim: without masking every cell above the workspace is valid, whatever lies there; with it,
     far fewer are."""
     own = _changed(learner, "policy", mask=False)
-    valid = jax.jit(lambda obs: learning.look(own, state.online, obs))(observations(2, 4)).valid
+    valid = jax.jit(lambda obs: actor_critic.look(own, state.online, obs))(observations(2, 4)).valid
     np.testing.assert_array_equal(valid, np.broadcast_to(learner.frames.inside, valid.shape))
-    masked = jax.jit(lambda obs: learning.look(learner, state.online, obs))(
+    masked = jax.jit(lambda obs: actor_critic.look(learner, state.online, obs))(
         observations(2, 4)
     ).valid
     assert np.mean(masked) < 0.7 * np.mean(valid)

@@ -65,7 +65,7 @@ class UpdateInfo(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Learner:
+class ActorCritic:
     """Static part: closed over by the compiled step."""
 
     cfg: Config
@@ -76,11 +76,16 @@ class Learner:
     actor_optimiser: optax.GradientTransformation
     bounds: tuple[float, float]  # smallest and largest possible return
 
+    @property
+    def return_range(self) -> float:
+        """Distance between the bounds."""
+        return self.bounds[1] - self.bounds[0]
 
-def make(cfg: Config) -> Learner:
+
+def make(cfg: Config) -> ActorCritic:
     """The learner of a config."""
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
-    return Learner(
+    return ActorCritic(
         cfg,
         maps.frames(cfg),
         networks.critic(cfg.net),
@@ -90,7 +95,7 @@ def make(cfg: Config) -> Learner:
     )
 
 
-def with_numbers(learner: Learner, cfg: Config, bounds: tuple[Any, Any]) -> Learner:
+def with_numbers(learner: ActorCritic, cfg: Config, bounds: tuple[Any, Any]) -> ActorCritic:
     """The learner of a config that differs in numbers only, which may be traced, and with them the
     `bounds`."""
     critic_optimiser, actor_optimiser = _optimisers(cfg)
@@ -124,7 +129,7 @@ def _optimiser(cfg: Config, rate: float, updates: int) -> optax.GradientTransfor
     return optax.flatten(optimiser) if cfg.net.kind == "densenet121" else optimiser
 
 
-def init(key: jax.Array, learner: Learner) -> LearnerState:
+def init(key: jax.Array, learner: ActorCritic) -> LearnerState:
     """Fresh networks; targets are copies (Algorithm 1 lines 1-2)."""
     key_critic, key_actor = jax.random.split(key)
     side = learner.frames.tables.canvas
@@ -132,7 +137,7 @@ def init(key: jax.Array, learner: Learner) -> LearnerState:
     blank_obs = Observation(
         jnp.zeros((size, size, 3)), jnp.zeros((size, size)), jnp.zeros((size, size), bool)
     )
-    blank = jnp.zeros((1, side, side, maps.seen(learner.frames, blank_obs).shape[-1]))
+    blank = jnp.zeros((1, side, side, maps.input_maps(learner.frames, blank_obs).shape[-1]))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(
         key_critic, jnp.arange(learner.cfg.learn.critics)
     )
@@ -162,7 +167,7 @@ def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
     return state.replace(online=online, target=target)
 
 
-def look(learner: Learner, params: Params, obs: Observation) -> DenseMaps:
+def look(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
     """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
     q, features = _critic_maps(learner, params, obs)
     correction: Any = (
@@ -173,14 +178,14 @@ def look(learner: Learner, params: Params, obs: Observation) -> DenseMaps:
     return _dense_maps(learner, obs, q, correction)
 
 
-def _critic_maps(learner: Learner, params: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
+def _critic_maps(learner: ActorCritic, params: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
     """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, ., ., F] of a batch, in the frames of the
     passes.
 
     Q is the lower of both critics in each cell, before anything is read between cells; features are
     the first one's.
     """
-    fed = jax.vmap(maps.net_inputs, (None, 0))(learner.frames, obs)
+    fed = jax.vmap(maps.rotated_inputs, (None, 0))(learner.frames, obs)
     q, features = _of_each_critic(
         lambda variables: networks.look(learner.critic, variables, fed), params.critic
     )
@@ -199,12 +204,12 @@ def _of_each_critic(call: Callable[[Any], Any], variables: Any) -> Any:
 
 
 def _dense_maps(
-    learner: Learner, obs: Observation, q: jax.Array, correction: jax.Array
+    learner: ActorCritic, obs: Observation, q: jax.Array, correction: jax.Array
 ) -> DenseMaps:
     """The maps of all yaws from those of the passes; `correction` [B, K / 2, h, w, OUTPUTS] is the
     actor's."""
     unfold = jax.vmap(maps.unfold)
-    find = maps.actionable if learner.cfg.policy.mask else maps.everywhere
+    find = maps.actionable_cells if learner.cfg.policy.mask else maps.all_cells
     return DenseMaps(
         q=unfold(q),
         logits=unfold(actor.logits(q, correction)),
@@ -219,7 +224,7 @@ def best_grasp(state: DenseMaps) -> jax.Array:
     return jnp.where(jnp.any(valid), best, 0.0)
 
 
-def next_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
+def next_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """V(s') [] over the primitives that the policy takes, as `target.value` says."""
     value = learner.cfg.target.value
     if value == "softmax":
@@ -229,18 +234,18 @@ def next_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
     raise ValueError(f"target.value: {value!r} is neither 'softmax' nor 'max'")
 
 
-def _max_value(learner: Learner, state: DenseMaps) -> jax.Array:
+def _max_value(learner: ActorCritic, state: DenseMaps) -> jax.Array:
     """max Q'(s', .) [] over the dense map's valid cells, eq. 9 and VPG; over all if none is valid.
 
     The limit of the softmax over the map: samples would miss the highest cell, and a trilinear map
     is highest in one.
     """
-    chosen = np.array(maps.allowed(learner.cfg.policy))
+    chosen = np.array(maps.allowed_primitives(learner.cfg.policy))
     valid = state.valid[chosen]
     return jnp.max(jnp.where(valid | ~jnp.any(valid), state.q[chosen], -jnp.inf))
 
 
-def _softmax_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Array:
+def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """softmax_beta(Q'(s', .)) [] over noisy target actions, Algorithm 1 line 17.
 
     Samples above nothing do not count, unless all are; a state's two primitives count alike.
@@ -261,7 +266,7 @@ def _softmax_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Ar
             jax.vmap(maps.is_valid, (None, None, None, 0))(frames, state.valid, which, poses),
         )
 
-    sampled = map(of, maps.allowed(learner.cfg.policy))
+    sampled = map(of, maps.allowed_primitives(learner.cfg.policy))
     q, log_density, valid = (jnp.concatenate(leaves) for leaves in zip(*sampled, strict=True))
     low, high = learner.bounds
     shown = valid | ~jnp.any(valid)
@@ -272,7 +277,7 @@ def _softmax_value(learner: Learner, key: jax.Array, state: DenseMaps) -> jax.Ar
 
 
 def _value(
-    learner: Learner, critic: Any, obs: Observation, action: Action
+    learner: ActorCritic, critic: Any, obs: Observation, action: Action
 ) -> tuple[jax.Array, Any]:
     """Q(s, a) of a batch by each critic [M, B], from two passes per state: the frames next to the
     action's yaw.
@@ -285,7 +290,7 @@ def _value(
     lower = jnp.floor(turns)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
-    fed = maps.seen(frames, obs)
+    fed = maps.input_maps(frames, obs)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(
         frames.tables, fed, half
     )
@@ -310,7 +315,7 @@ def _value(
 
 
 def update_critic(
-    key: jax.Array, learner: Learner, state: LearnerState, batch: Transition, weights: jax.Array
+    key: jax.Array, learner: ActorCritic, state: LearnerState, batch: Transition, weights: jax.Array
 ) -> tuple[LearnerState, UpdateInfo]:
     """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines
     17-26.
@@ -329,7 +334,7 @@ def update_critic(
 
     def loss(learned: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
         q, statistics = _value(learner, {**critic, **learned}, obs, batch.action)  # [M, B]
-        each = jnp.sum(losses.of_error(cfg.learn, target[None] - q), axis=0)
+        each = jnp.sum(losses.td_loss(cfg.learn, target[None] - q), axis=0)
         return jnp.mean(weights * each), (jnp.mean(q, axis=0), statistics)
 
     before = networks.learned(critic)
@@ -338,7 +343,7 @@ def update_critic(
     online = state.online.replace(critic={**optax.apply_updates(before, step), **statistics})
     state = state.replace(
         online=online,
-        target=losses.follow(cfg.learn, online, state.target, state.updates + 1),
+        target=losses.update_target(cfg.learn, online, state.target, state.updates + 1),
         critic_optimiser=optimiser,
         updates=state.updates + 1,
     )
@@ -346,7 +351,7 @@ def update_critic(
 
 
 def update_actor(
-    learner: Learner, state: LearnerState, obs: Observation
+    learner: ActorCritic, state: LearnerState, obs: Observation
 ) -> tuple[LearnerState, jax.Array]:
     """One step of theta^mu up the critic, Algorithm 1 lines 22-23; returns the loss [], minus the
     mean of Q(s, mu(s)).
@@ -357,7 +362,7 @@ def update_actor(
     """
     if not learner.cfg.learn.actor:
         return state, jnp.zeros(())
-    chosen = maps.allowed(learner.cfg.policy)
+    chosen = maps.allowed_primitives(learner.cfg.policy)
     q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online, obs))
 
     def value(dense_maps: DenseMaps, primitive: Primitive) -> jax.Array:
