@@ -116,5 +116,5 @@ def configure(cfg: Config, name: str) -> Config:
 def unknown(what: str, name: str, known: dict[str, Algorithm]) -> str:
     """The complaint about an unknown name, with the nearest known one."""
     near = difflib.get_close_matches(name, known, 1)
-    meant = f"; did you mean {near[0]}?" if near else ""
-    return f"unknown {what} '{name}'{meant} choose one of: {', '.join(known)}"
+    meant = f"did you mean {near[0]}? " if near else ""
+    return f"unknown {what} '{name}'; {meant}choose one of: {', '.join(known)}"

@@ -64,9 +64,12 @@ class Section:
 
 
 def _is_plain(value: Any) -> bool:
+    """Whether a value can be checked: a sweep's numbers may be traced."""
     if isinstance(value, tuple):
         return all(map(_is_plain, value))
-    return isinstance(value, int | float | str | Section)
+    if isinstance(value, Section):
+        return all(_is_plain(getattr(value, name)) for name in _names(value))
+    return isinstance(value, int | float | str)
 
 
 def _check_choice(name: str, kind: Any, value: Any) -> None:
@@ -303,6 +306,7 @@ class SmallNet(Section):
     """What a net computes in: bfloat16 on accelerators, float32 on a CPU. Parameters are float32."""
 
     kind: Literal["small"] = "small"
+    """`small`, or `densenet121`: the paper's, 100 times the work."""
     rotations: int = _count(16, 4)
     """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
     colour: bool = True
@@ -351,6 +355,7 @@ class DenseNet121(Section):
     the memory: what is upsampled is bilinear, and so is reading it)."""
 
     kind: Literal["densenet121"] = "densenet121"
+    """The paper's network; `small` is ours."""
     rotations: int = _count(16, 4)
     """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
     colour: bool = True
@@ -566,6 +571,7 @@ class UniformReplay(Section):
     SECTION: ClassVar[str] = "replay"
 
     sampler: Literal["uniform"] = "uniform"
+    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
     capacity: int = _bounded(4096, 2, 2**30)
     """C, transitions kept."""
 
@@ -584,6 +590,7 @@ class PrioritisedReplay(Section):
     """Added to abs(TD error), so that no transition is out of reach (ours)."""
 
     sampler: Literal["prioritised"] = "prioritised"
+    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
     capacity: int = _bounded(4096, 2, 2**30)
     """C, transitions kept."""
 
@@ -600,6 +607,7 @@ class BetaReplay(Section):
     """Share of all updates after which (a, b) is `middle` (ours)."""
 
     sampler: Literal["beta"] = "beta"
+    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
     capacity: int = _bounded(4096, 2, 2**30)
     """C, transitions kept."""
     rank_by: Literal["error", "reward"] = "error"

@@ -1,5 +1,4 @@
-"""Networks and their updates: the critic towards the TD target, the actor up the critic, targets
-after both.
+"""Networks and their updates: the critic towards the TD target, the actor up the critic.
 
 M = critics, one or two of the same shape, their parameters stacked. Everything but the loss sees
 the lower of their values in each cell.
@@ -7,7 +6,7 @@ the lower of their values in each cell.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,24 +15,15 @@ import optax
 from flax import struct
 
 from csac_jax.agent import actor, losses, maps, rewards, softmax
+from csac_jax.agent.learner import Transition, UpdateInfo
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
+from csac_jax.nets.networks import Networks
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, rotate
-from csac_jax.vision.heightmap import Observation, PackedObservation
-
-
-@struct.dataclass
-class Transition:
-    """What one action showed. All leaves of one transition; a batch has a leading axis B."""
-
-    obs: PackedObservation
-    action: Action
-    reward: jax.Array  # [] float32, R of eq. 12
-    next_obs: PackedObservation
-    terminated: jax.Array  # [] bool, a true end: nothing follows
+from csac_jax.vision.heightmap import Observation
 
 
 @struct.dataclass
@@ -56,25 +46,25 @@ class LearnerState:
     updates: jax.Array  # [] int32, critic updates so far
 
 
-class UpdateInfo(NamedTuple):
-    """What one update saw."""
-
-    critic_loss: jax.Array  # []
-    q: jax.Array  # [] mean of Q(s, a)
-    error: jax.Array  # [B] y - Q(s, a), mean over critics
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class ActorCritic:
     """Static part: closed over by the compiled step."""
 
     cfg: Config
     frames: Frames
-    critic: networks.Critic
-    actor: networks.Head
     critic_optimiser: optax.GradientTransformation
     actor_optimiser: optax.GradientTransformation
     bounds: tuple[float, float]  # smallest and largest possible return
+
+    @property
+    def critic(self) -> Any:
+        """The critic, a Flax module."""
+        return self.frames.networks.critic
+
+    @property
+    def actor(self) -> Any:
+        """The actor's head, a Flax module."""
+        return self.frames.networks.head
 
     @property
     def return_range(self) -> float:
@@ -82,23 +72,16 @@ class ActorCritic:
         return self.bounds[1] - self.bounds[0]
 
 
-def make(cfg: Config) -> ActorCritic:
-    """The learner of a config."""
+def make(cfg: Config, network: Any = None) -> ActorCritic:
+    """Networks and optimisers of a config; `network` is a critic of your own, see `networks`."""
+    nets = networks.make(cfg.net, network)
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
-    return ActorCritic(
-        cfg,
-        maps.frames(cfg),
-        networks.critic(cfg.net),
-        networks.head(cfg.net),
-        *_optimisers(cfg),
-        bounds,
-    )
+    return ActorCritic(cfg, maps.frames(cfg, nets), *_optimisers(cfg, nets), bounds)
 
 
-def with_numbers(learner: ActorCritic, cfg: Config, bounds: tuple[Any, Any]) -> ActorCritic:
-    """The learner of a config that differs in numbers only, which may be traced, and with them the
-    `bounds`."""
-    critic_optimiser, actor_optimiser = _optimisers(cfg)
+def replace_hyperparams(learner: ActorCritic, cfg: Config, bounds: tuple[Any, Any]) -> ActorCritic:
+    """The same networks with hyper-parameters and bounds of returns that may be traced."""
+    critic_optimiser, actor_optimiser = _optimisers(cfg, learner.frames.networks)
     return dataclasses.replace(
         learner,
         cfg=cfg,
@@ -108,25 +91,25 @@ def with_numbers(learner: ActorCritic, cfg: Config, bounds: tuple[Any, Any]) -> 
     )
 
 
-def _optimisers(cfg: Config) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+def _optimisers(
+    cfg: Config, nets: Networks
+) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     """Of the critic and of the actor."""
     return (
-        _optimiser(cfg, cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates),
-        _optimiser(cfg, cfg.learn.actor_learning_rate, cfg.train.steps),
+        _optimiser(cfg, nets, cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates),
+        _optimiser(cfg, nets, cfg.learn.actor_learning_rate, cfg.train.steps),
     )
 
 
-def _optimiser(cfg: Config, rate: float, updates: int) -> optax.GradientTransformation:
-    """Adam on clipped gradients, its step size falling linearly over the run's `updates`.
-
-    The many small arrays of DenseNet-121 are one vector to it: a GPU takes longer to begin with
-    each than to change it.
-    """
+def _optimiser(
+    cfg: Config, nets: Networks, rate: float, updates: int
+) -> optax.GradientTransformation:
+    """Adam on clipped gradients, its step size falling linearly over the run's `updates`."""
     schedule = optax.linear_schedule(rate, rate * cfg.learn.lr_final_fraction, updates)
     optimiser = optax.chain(
         optax.clip_by_global_norm(cfg.learn.gradient_clip), optax.adam(schedule)
     )
-    return optax.flatten(optimiser) if cfg.net.kind == "densenet121" else optimiser
+    return optax.flatten(optimiser) if nets.one_vector else optimiser
 
 
 def init(key: jax.Array, learner: ActorCritic) -> LearnerState:
@@ -152,9 +135,9 @@ def init(key: jax.Array, learner: ActorCritic) -> LearnerState:
     )
 
 
-def abstract_params(cfg: Config) -> Params:
+def abstract_params(cfg: Config, network: Any = None) -> Params:
     """Shapes and types of a config's networks; no arrays."""
-    return jax.eval_shape(lambda: init(jax.random.key(0), make(cfg))).online
+    return jax.eval_shape(lambda: init(jax.random.key(0), make(cfg, network))).online
 
 
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
@@ -167,7 +150,7 @@ def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
     return state.replace(online=online, target=target)
 
 
-def look(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
+def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
     """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
     q, features = _critic_maps(learner, params, obs)
     correction: Any = (
@@ -178,16 +161,18 @@ def look(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
     return _dense_maps(learner, obs, q, correction)
 
 
-def _critic_maps(learner: ActorCritic, params: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
+def _critic_maps(
+    learner: ActorCritic, params: Params, obs: Observation
+) -> tuple[jax.Array, jax.Array]:
     """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, ., ., F] of a batch, in the frames of the
     passes.
 
     Q is the lower of both critics in each cell, before anything is read between cells; features are
     the first one's.
     """
-    fed = jax.vmap(maps.rotated_inputs, (None, 0))(learner.frames, obs)
+    rotated = jax.vmap(maps.rotated_inputs, (None, 0))(learner.frames, obs)
     q, features = _of_each_critic(
-        lambda variables: networks.look(learner.critic, variables, fed), params.critic
+        lambda variables: networks.apply(learner.frames.networks, variables, rotated), params.critic
     )
     return jnp.min(q, axis=0), features[0]
 
@@ -209,11 +194,10 @@ def _dense_maps(
     """The maps of all yaws from those of the passes; `correction` [B, K / 2, h, w, OUTPUTS] is the
     actor's."""
     unfold = jax.vmap(maps.unfold)
-    find = maps.actionable_cells if learner.cfg.policy.mask else maps.all_cells
     return DenseMaps(
         q=unfold(q),
         logits=unfold(actor.logits(q, correction)),
-        valid=jax.vmap(find, (None, 0))(learner.frames, obs),
+        valid=jax.vmap(maps.actionable_cells, (None, 0))(learner.frames, obs),
     )
 
 
@@ -226,20 +210,16 @@ def best_grasp(state: DenseMaps) -> jax.Array:
 
 def next_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """V(s') [] over the primitives that the policy takes, as `target.value` says."""
-    value = learner.cfg.target.value
-    if value == "softmax":
-        return _softmax_value(learner, key, state)
-    if value == "max":
-        return _max_value(learner, state)
-    raise ValueError(f"target.value: {value!r} is neither 'softmax' nor 'max'")
+    return NEXT_VALUES[learner.cfg.target.value](learner, key, state)
 
 
-def _max_value(learner: ActorCritic, state: DenseMaps) -> jax.Array:
+def _max_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """max Q'(s', .) [] over the dense map's valid cells, eq. 9 and VPG; over all if none is valid.
 
     The limit of the softmax over the map: samples would miss the highest cell, and a trilinear map
     is highest in one.
     """
+    del key
     chosen = np.array(maps.allowed_primitives(learner.cfg.policy))
     valid = state.valid[chosen]
     return jnp.max(jnp.where(valid | ~jnp.any(valid), state.q[chosen], -jnp.inf))
@@ -276,6 +256,9 @@ def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> ja
     )
 
 
+NEXT_VALUES = {"softmax": _softmax_value, "max": _max_value}
+
+
 def _value(
     learner: ActorCritic, critic: Any, obs: Observation, action: Action
 ) -> tuple[jax.Array, Any]:
@@ -290,9 +273,9 @@ def _value(
     lower = jnp.floor(turns)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
-    fed = maps.input_maps(frames, obs)
+    inputs = maps.input_maps(frames, obs)
     one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(
-        frames.tables, fed, half
+        frames.tables, inputs, half
     )
     flat = one.reshape(-1, *one.shape[2:])
     (q, _), statistics = _of_each_critic(
@@ -323,7 +306,7 @@ def update_critic(
     L = mean_i w_i huber(y_i - Q(s_i, a_i)) with `weights` w [B], 1 but for a prioritised replay.
     """
     cfg = learner.cfg
-    next_maps = look(learner, state.target, heightmap.unpack(batch.next_obs))
+    next_maps = dense_maps(learner, state.target, heightmap.unpack(batch.next_obs))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(batch.reward.shape[0]))
     values = jax.vmap(next_value, (None, 0, 0))(learner, keys, next_maps)
     low, high = learner.bounds
@@ -365,16 +348,16 @@ def update_actor(
     chosen = maps.allowed_primitives(learner.cfg.policy)
     q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online, obs))
 
-    def value(dense_maps: DenseMaps, primitive: Primitive) -> jax.Array:
-        pose = actor.pose(learner.frames, dense_maps, primitive)
-        return maps.read(learner.frames, dense_maps.q, jnp.int32(primitive), pose)
+    def value(state_maps: DenseMaps, primitive: Primitive) -> jax.Array:
+        pose = actor.pose(learner.frames, state_maps, primitive)
+        return maps.read(learner.frames, state_maps.q, jnp.int32(primitive), pose)
 
     def loss(learned: Any) -> tuple[jax.Array, Any]:
         correction, statistics = networks.train(
             learner.actor, {**state.online.actor, **learned}, features
         )
-        dense_maps = _dense_maps(learner, obs, q, correction)
-        values = [jax.vmap(lambda one, p=p: value(one, p))(dense_maps) for p in chosen]
+        batch_maps = _dense_maps(learner, obs, q, correction)
+        values = [jax.vmap(lambda one, p=p: value(one, p))(batch_maps) for p in chosen]
         return -jnp.mean(jnp.stack(values)), statistics
 
     before = networks.learned(state.online.actor)

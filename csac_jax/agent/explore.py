@@ -22,9 +22,13 @@ def probability(start: float, end: float, decay: float, actions: jax.Array) -> j
 
 
 def action_noise(key: jax.Array, cfg: ExploreConfig, action: jax.Array) -> jax.Array:
-    """`action` [3], a normalised pose, plus clip(N(0, delta), -c, c), Algorithm 1 line 13."""
+    """`action` [3], a normalised pose, plus clip(N(0, delta), -c, c), Algorithm 1 line 13.
+
+    c is three delta (ours).
+    """
+    bound = 3.0 * cfg.noise_std
     noise = cfg.noise_std * jax.random.normal(key, action.shape, action.dtype)
-    return box.project(action + jnp.clip(noise, -cfg.noise_clip, cfg.noise_clip), box.POSE_WRAPS)
+    return box.project(action + jnp.clip(noise, -bound, bound), box.POSE_WRAPS)
 
 
 def choose(
@@ -44,16 +48,12 @@ def choose(
     """
     key_explore, key_push, key_place, key_noise = jax.random.split(key, 4)
     primitive_is_random = jax.random.bernoulli(
-        key_explore,
-        probability(
-            cfg.epsilon_primitive_start, cfg.epsilon_primitive_end, cfg.decay, actions_taken
-        ),
+        key_explore, probability(*cfg.epsilon_primitive, cfg.decay, actions_taken)
     )
     random_primitive = jnp.where(jax.random.bernoulli(key_push, cfg.push_fraction), 0, 1)
     primitive = jnp.where(primitive_is_random, random_primitive, greedy.primitive).astype(jnp.int32)
     place_is_random = jax.random.bernoulli(
-        key_place,
-        probability(cfg.epsilon_place_start, cfg.epsilon_place_end, cfg.decay, actions_taken),
+        key_place, probability(*cfg.epsilon_place, cfg.decay, actions_taken)
     )
     noisy = action_noise(key_noise, cfg, greedy.poses[primitive])
     return primitive, jnp.where(place_is_random, random_places[primitive], noisy)

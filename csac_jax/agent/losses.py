@@ -13,14 +13,6 @@ TD_LOSSES: dict[str, Callable[[LearnConfig, jax.Array], jax.Array]] = {
     "huber": lambda cfg, error: optax.losses.huber_loss(error, delta=cfg.huber),  # CSAC sec. 4
     "squared": lambda cfg, error: optax.losses.squared_error(error),  # Algorithm 1 line 21
 }
-TARGET_UPDATES: dict[str, Callable[[LearnConfig, Any, Any, jax.Array], Any]] = {
-    # Algorithm 1 lines 24-26
-    "soft": lambda cfg, online, target, _: optax.incremental_update(online, target, cfg.tau),
-    # CSAC sec. 3.4
-    "hard": lambda cfg, online, target, updates: optax.periodic_update(
-        online, target, updates, cfg.target_update_period
-    ),
-}
 
 
 def td_loss(cfg: LearnConfig, error: jax.Array) -> jax.Array:
@@ -41,4 +33,7 @@ def td_target(
 
 def update_target(cfg: LearnConfig, online: Any, target: Any, updates: jax.Array) -> Any:
     """Target networks after the critic's update number `updates` [] int32, counted from 1."""
-    return TARGET_UPDATES[cfg.target_update](cfg, online, target, updates)
+    followed = optax.incremental_update(online, target, cfg.tau)  # Algorithm 1 lines 24-26
+    if cfg.target_update_period == 1:
+        return followed
+    return optax.periodic_update(followed, target, updates, cfg.target_update_period)  # sec. 3.4

@@ -137,16 +137,6 @@ def _target_cells(frames: Frames, obs: Observation) -> jax.Array:
     return _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
 
 
-def all_cells(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells above the workspace, [P, K, h, w] bool: no masking.
-
-    In the target task grasps have only those above the target: phi_g of eq. 16 is the target's.
-    """
-    inside = jnp.asarray(frames.inside)
-    grasp = inside & _target_cells(frames, obs) if frames.shows_target else inside
-    return jnp.stack([inside, grasp])
-
-
 def _yaw_index(frames: Frames, yaw: jax.Array) -> jax.Array:
     """Index of a yaw [] rad among the frames', [] float32, whole at each of theirs."""
     return yaw * (frames.yaws.shape[0] / (2.0 * np.pi))

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.agent import actor, box, cem, explore, maps
-from csac_jax.agent.explore import Greedy
 from csac_jax.agent.actor_critic import ActorCritic
+from csac_jax.agent.explore import Greedy
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.config import PolicyConfig
 from csac_jax.constants import Primitive
@@ -52,7 +52,9 @@ def candidates(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> jax.Ar
     return jax.vmap(jax.vmap(maps.denormalise, (None, 0)), (None, 0))(learner.frames, tried)
 
 
-def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps, primitive: Primitive) -> cem.CEMResult:
+def _cem(
+    key: jax.Array, learner: ActorCritic, state: DenseMaps, primitive: Primitive
+) -> cem.CEMResult:
     """Maximises Q over the pose by the cross-entropy method, Algorithm 1 lines 8-13."""
     key = jax.random.fold_in(key, primitive)
     return cem.maximise(key, learner.cfg.cem, *_problem(learner, state, primitive), box.POSE_WRAPS)

@@ -30,7 +30,8 @@ GOOD_PUSH: dict[str, Callable[[RewardConfig, ActionResult], jax.Array]] = {
 
 def scale(cfg: RewardConfig, level: float) -> float:
     """Gamma = eta0 + eta1 2^(s - s_max), eq. 13; a grasp's level is s_max."""
-    return cfg.eta0 + cfg.eta1 * 2.0 ** (level - cfg.grasp_level)
+    eta0, eta1 = cfg.eta
+    return eta0 + eta1 * 2.0 ** (level - cfg.grasp_level)
 
 
 def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array:
@@ -45,17 +46,18 @@ def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array
 
 def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
     """I_g [] of `outcome` [] int32, eq. 15."""
-    levels = jnp.asarray(_grasp_levels(cfg), jnp.float32)
+    levels = jnp.asarray(cfg.grasp_levels, jnp.float32)
     return levels.at[outcome].get(mode="clip")
 
 
 def push_effect(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """I_c []: `push_better` after a good push, else `push_worse`.
+    """I_c []: the second of `push_levels` after a good push, else the first.
 
     Good by `value`: phi(s') > phi(s) + dead band, eq. 16. Good by `change`: the map moved (VPG).
     """
     good = GOOD_PUSH[cfg.push_effect](cfg, result)
-    return jnp.where(good, cfg.push_better, cfg.push_worse)
+    worse, better = cfg.push_levels
+    return jnp.where(good, better, worse)
 
 
 def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
@@ -77,19 +79,22 @@ def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
     )
 
 
+def rewards_of(cfg: RewardConfig, results: ActionResult) -> tuple[jax.Array, jax.Array]:
+    """Rewards [E] and which pushes were good [E] bool, of results with leaves [E]."""
+    each = jax.vmap(reward, (None, 0))(cfg, results)
+    gained = results.phi_after > results.phi_before + cfg.dead_band
+    return each, (results.primitive == Primitive.PUSH) & gained
+
+
 def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:
     """Smallest and largest discounted return of an episode of any length.
 
     The smallest is r_min / (1 - gamma) if r_min is a loss, else r_min of an episode that ends at
     once. The largest likewise.
     """
-    grasp = [scale(cfg, cfg.grasp_level) * level for level in _grasp_levels(cfg)]
+    grasp = [scale(cfg, cfg.grasp_level) * level for level in cfg.grasp_levels]
     grasp[Outcome.LIFTED] += cfg.success_bonus
-    push = [scale(cfg, cfg.push_level) * effect for effect in (cfg.push_better, cfg.push_worse)]
+    push = [scale(cfg, cfg.push_level) * effect for effect in cfg.push_levels]
     lowest = min(grasp + push) - cfg.distance_weight * cfg.distance_cap - cfg.lost_block_penalty
     highest = max(grasp + push)
     return min(lowest, lowest / (1.0 - gamma)), max(highest, highest / (1.0 - gamma))
-
-
-def _grasp_levels(cfg: RewardConfig) -> tuple[float, ...]:
-    return (cfg.nothing, cfg.empty, cfg.touched, cfg.dropped, cfg.lifted)

@@ -22,10 +22,10 @@ def write_result(path: Path | None, result: dict[str, Any], cfg: Config | None) 
     """Writes a result with its config and provenance, if there is a path."""
     if path is None:
         return
-    from csac_jax.io import config_json
+    from csac_jax.io import configs
     from csac_jax.runtime import provenance
 
-    config = {} if cfg is None else {"config": config_json.to_dict(cfg)}
+    config = {} if cfg is None else {"config": configs.to_dict(cfg)}
     files.write_json(path, {**result, **config, **provenance.record()})
 
 

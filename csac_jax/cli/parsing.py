@@ -37,7 +37,12 @@ def parse(
 
 def asks_help(arguments: Sequence[str]) -> bool:
     """Whether help is asked for, which comes before all else."""
-    return bool({"-h", "--help"} & set(arguments))
+    return bool({"-h", "--help", "--help-all"} & set(arguments))
+
+
+def asks_short_help(arguments: Sequence[str]) -> bool:
+    """Whether the short help of a command with many settings is asked for."""
+    return asks_help(arguments) and "--help-all" not in arguments
 
 
 def value_of(flags: Sequence[str], name: str) -> str | None:

@@ -23,7 +23,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import LatestN
 
 from csac_jax.config import Config
-from csac_jax.io import config_json
+from csac_jax.io import configs, renames
 from csac_jax.runtime import cluster
 
 FOLDER = "checkpoints"
@@ -51,7 +51,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
             step,
             args=ocp.args.Composite(
                 state=ocp.args.StandardSave(leaves),
-                config=ocp.args.JsonSave(config_json.to_dict(cfg)),
+                config=ocp.args.JsonSave(configs.to_dict(cfg)),
                 extra=ocp.args.JsonSave(record),
             ),
         )
@@ -76,10 +76,11 @@ def load_config(run_dir: Path) -> Config:
             int(folder.name), args=ocp.args.Composite(config=ocp.args.JsonRestore())
         )
     try:
-        return config_json.from_dict(stored["config"])
+        return configs.from_dict(stored["config"])
     except ValueError as error:
         raise CheckpointError(
-            f"checkpoint {folder} was made by another version of csac_jax ({error}); use that version or train anew"
+            f"checkpoint {folder} was made by another version of csac_jax ({error}); "
+            "use that version or train again"
         ) from error
 
 
@@ -98,10 +99,13 @@ def restore(
         record = manager.restore(number, args=ocp.args.Composite(extra=ocp.args.JsonRestore()))[
             "extra"
         ]
-        _compare(folder, record["layout"], _layout(abstract_state))
-        wanted = ocp.args.StandardRestore(_raw_abstract(abstract_state))
+        stored = _stored_names(abstract_state, record["layout"])
+        _compare(folder, record["layout"], _layout(abstract_state, stored))
+        raw = {stored[name]: leaf for name, leaf in _raw_abstract(abstract_state).items()}
+        wanted = ocp.args.StandardRestore(raw)
         leaves = manager.restore(number, args=ocp.args.Composite(state=wanted))["state"]
-    return _with_leaves(abstract_state, leaves), record["extra"]
+    named = {name: leaves[old] for name, old in stored.items()}
+    return _with_leaves(abstract_state, named), record["extra"]
 
 
 def _root(run_dir: Path) -> Path:
@@ -171,17 +175,24 @@ def _key_impl(abstract_key: Any) -> Any:
     return found[0]
 
 
-def _layout(tree: Any) -> dict[str, str]:
-    """Name of each leaf -> its dtype and shape, as in `float32[8, 3]`."""
-    return {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in _named(tree)}
+def _layout(tree: Any, names: dict[str, str] | None = None) -> dict[str, str]:
+    """Name of each leaf, or what `names` has for it -> dtype and shape, as in `float32[8, 3]`."""
+    layout = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in _named(tree)}
+    return layout if names is None else {names[name]: kind for name, kind in layout.items()}
+
+
+def _stored_names(tree: Any, layout: dict[str, str]) -> dict[str, str]:
+    """Name of each leaf -> its name in a checkpoint, which may be an older one."""
+    older = {new: old for old, new in renames.STATE.items()}
+    return {name: name if name in layout else older.get(name, name) for name, _ in _named(tree)}
 
 
 def _compare(folder: Path, stored: dict[str, str], wanted: dict[str, str]) -> None:
     for name in dict.fromkeys([*wanted, *stored]):
         if stored.get(name) != wanted.get(name):
             raise CheckpointError(
-                f"checkpoint {folder} holds {name} as {stored.get(name, 'nothing')}, the program needs "
-                f"{wanted.get(name, 'nothing')}; use the version of csac_jax that saved it or train anew"
+                f"checkpoint {folder} holds {name} as {stored.get(name, 'nothing')}, the program "
+                f"needs {wanted.get(name, 'nothing')}; use the version of csac_jax that saved it"
             )
 
 
@@ -249,6 +260,6 @@ def _verified(run_dir: Path, step: int | None) -> Path:
     remedy = (
         f"to go on from step {older[-1]}, the newest sound one, delete that folder"
         if older
-        else "train anew"
+        else "train again"
     )
     raise CheckpointError(f"checkpoint {folder} {fault}; {remedy}")

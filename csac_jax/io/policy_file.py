@@ -18,7 +18,7 @@ import safetensors.numpy
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
-from csac_jax.io import config_json, files
+from csac_jax.io import configs, files
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
 SHIPPED_SHA256 = "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c"
@@ -32,7 +32,7 @@ class PolicyFileError(Exception):
 def save(path: Path, params: Params, cfg: Config) -> None:
     """Writes a policy; the file appears all at once, its folder is made. Raises OSError where it
     cannot be written."""
-    remarks = {_CONFIG: json.dumps(config_json.to_dict(cfg))}
+    remarks = {_CONFIG: json.dumps(configs.to_dict(cfg))}
     content = safetensors.numpy.save(
         {name: np.asarray(leaf) for name, leaf in _named(params)}, remarks
     )
@@ -59,7 +59,7 @@ def load(path: Path) -> tuple[Config, Params]:
             f"{path} holds no config: it is no policy; csac-jax export writes one"
         )
     try:
-        cfg = config_json.from_dict(json.loads(remarks[_CONFIG]))
+        cfg = configs.from_dict(json.loads(remarks[_CONFIG]))
     except ValueError as error:
         raise PolicyFileError(
             f"{path} was made by another version of csac_jax ({error}); use that version"

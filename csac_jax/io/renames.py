@@ -64,9 +64,5 @@ SETTINGS = {
 }
 """Settings of format 1; a number at the end is a place in a tuple."""
 
-GONE = {
-    "learn.augment_turn": 0.0,
-    "net.border": False,
-    "policy.mask": True,
-}
+GONE = {"learn.augment_turn": 0.0, "net.border": False, "policy.mask": True}
 """Settings of format 1 whose part is gone: a file must hold this value."""

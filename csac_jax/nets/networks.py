@@ -32,11 +32,9 @@ class Networks:
     colour: bool  # the critic sees colours
     stack: Callable[..., jax.Array]  # colour or None, height, target or None -> maps [..., H, W, I]
     zoom: int = 0  # pixels of the input per cell of the map; 0: any number of states at a time
-    many_arrays: bool = False  # the optimiser sees one vector: a GPU starts slowly on each array
+    one_vector: bool = False  # the optimiser sees one vector: a GPU is slow with many small arrays
 
-    def inputs(
-        self, colour: jax.Array, height: jax.Array, target: jax.Array | None
-    ) -> jax.Array:
+    def inputs(self, colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:
         """What the critic is fed [..., H, W, I], from colour [..., H, W, 3], height [..., H, W] m
         and target [..., H, W] bool."""
         return self.stack(colour if self.colour else None, height, target)
@@ -63,7 +61,7 @@ def _densenet(cfg: DenseNet121) -> Networks:
         cfg.colour,
         densenet.inputs,
         zoom=cfg.zoom,
-        many_arrays=True,
+        one_vector=True,
     )
 
 
@@ -96,7 +94,9 @@ def apply(networks: Networks, variables: Any, maps: jax.Array) -> tuple[jax.Arra
     critic, group = networks.critic, networks.states_at_once(maps.shape[2])
     if group is not None:
         at_once = group if group > 1 else None
-        return jax.lax.map(lambda one: _traced_once(critic, variables, one), maps, batch_size=at_once)
+        return jax.lax.map(
+            lambda one: _traced_once(critic, variables, one), maps, batch_size=at_once
+        )
     flat: Any = critic.apply(variables, maps.reshape(-1, *maps.shape[2:]))
     return jax.tree.map(lambda leaf: leaf.reshape(*maps.shape[:2], *leaf.shape[1:]), flat)
 

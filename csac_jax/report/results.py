@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax import algorithms, presets
-from csac_jax.io import config_json, files
+from csac_jax.io import configs, files
 
 RECORD = "train.json"  # with device, versions and commit, in the folder of a run or of a sweep
 SKIPPED = ("checkpoints", "tensorboard")
@@ -255,7 +255,7 @@ def variant(config: Json) -> Variant:
         config.get("algo", "csac_beta"),
     )  # the first records name no algorithm
     try:
-        base = flat(config_json.to_dict(algorithms.configure(presets.get(preset), algo)))
+        base = flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
     except ValueError:  # a name that is no more
         base = {}
     own = flat(config)

@@ -26,7 +26,7 @@ import numpy as np
 
 from csac_jax.config import WARP_WORLDS, Config
 from csac_jax.evaluation import statistics
-from csac_jax.io import checkpoint, config_json, files
+from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import Engine, Group, group
@@ -113,7 +113,7 @@ def read_plan(folder: Path) -> Plan:
     try:
         stored = json.loads((folder / PLAN).read_text())
         settings = [
-            Setting(one["name"], one["values"], config_json.from_dict(one["config"]))
+            Setting(one["name"], one["values"], configs.from_dict(one["config"]))
             for one in stored["settings"]
         ]
         return Plan(stored["seeds"], settings)
@@ -126,7 +126,7 @@ def read_plan(folder: Path) -> Plan:
 def plan_text(plan: Plan) -> str:
     """What `read_plan` reads, as JSON."""
     settings = [
-        {"name": one.name, "values": one.values, "config": config_json.to_dict(one.cfg)}
+        {"name": one.name, "values": one.values, "config": configs.to_dict(one.cfg)}
         for one in plan.settings
     ]
     return json.dumps({"seeds": plan.seeds, "settings": settings}, indent=2) + "\n"
@@ -249,7 +249,7 @@ class _Sweep:
             for one in each:
                 path = member_folder(self.folder, one)
                 path.mkdir(parents=True, exist_ok=True)
-                files.write_json(path / files.CONFIG, config_json.to_dict(one.cfg))
+                files.write_json(path / files.CONFIG, configs.to_dict(one.cfg))
                 files.truncate_log(path / files.METRICS, step)
         return state, progress, step
 

@@ -14,12 +14,14 @@ import numpy as np
 
 from csac_jax.config import Config
 from csac_jax.constants import GRASP_WINDOW, OUTCOMES, Outcome, Primitive
-from csac_jax.io import checkpoint, config_json, files
+from csac_jax.errors import SettingsError
+from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
 
 LOSSES = ("critic_loss", "actor_loss")
-DIVERGED_SHARE = 1e-3  # share of a chunk's actions whose physics failed beyond which physics is to be doubted; 1e-5 is common
+# Share of a chunk's actions beyond which diverged physics is reported; 1e-5 is common.
+DIVERGED_SHARE = 1e-3
 
 
 class TrainingError(Exception):
@@ -153,17 +155,20 @@ def run(
 
 def _begin(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
     run_dir.mkdir(parents=True)
-    files.write_json(run_dir / files.CONFIG, config_json.to_dict(cfg))
+    files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
     return init(), Progress(0.0, []), 0
 
 
 def _resume(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
     """State of the newest checkpoint; lines of the log that are newer than it are dropped."""
     stored = checkpoint.load_config(run_dir)
-    if names := config_json.differences(stored, cfg):
-        raise TrainingError(
-            f"{run_dir} was trained with other values of {', '.join(names)}; resume it with its own"
+    longer = stored.change(train={"actions": max(stored.train.actions, cfg.train.actions)})
+    if names := configs.differences(longer, cfg):
+        raise SettingsError(
+            f"{run_dir} was trained with other values of {', '.join(names)}; leave them out, or "
+            "begin a new run; only train.actions may grow"
         )
+    files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
     state, extra = checkpoint.restore(run_dir, jax.eval_shape(init))
     step = int(state.step)
     files.truncate_log(run_dir / files.METRICS, step)
@@ -192,8 +197,10 @@ def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress)
 
 def _doubt(cfg: Config, record: Record) -> str:
     return (
-        f"physics failed in {record.physics_diverged} of the last {record.pushes + record.grasps} actions, whose scenes were "
-        f"dropped: see `physics_diverged` in {files.METRICS}; try another --sim.physics than {cfg.sim.physics} before you trust this run"
+        f"physics failed in {record.physics_diverged} of the last "
+        f"{record.pushes + record.grasps} actions, whose scenes were dropped: see "
+        f"`physics_diverged` in {files.METRICS}; try another --sim.physics than "
+        f"{cfg.sim.physics} before you trust this run"
     )
 
 

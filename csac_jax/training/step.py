@@ -1,11 +1,10 @@
 """The algorithm: one training step of all scenes, CSAC Algorithm 1, compiled as a chunk of many.
 
-Look, act, simulate, remember, learn, replace finished scenes. E = scenes, B = batch, P =
-primitives.
+Observe, act, simulate, remember, learn, replace finished scenes. E = scenes, B = batch.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,17 +13,18 @@ import numpy as np
 from flax import struct
 
 from csac_jax import env as environment
-from csac_jax.agent import augment, actor_critic, policy, rewards
-from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params, Transition
+from csac_jax.agent import augment, csac
+from csac_jax.agent.learner import Learner, Transition
+from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Primitive
 from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
+from csac_jax.replay.samplers import Sampler
 from csac_jax.runtime import compiler
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action
-from csac_jax.training import chunked_vmap
 from csac_jax.training.sharding import ALONE, Spread
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
@@ -37,7 +37,7 @@ class TrainState:
     key: jax.Array  # [] typed key, root of all randomness, never consumed
     step: jax.Array  # [] int32, training steps done
     scenes: environment.State  # leaves [E, ...]
-    learner: LearnerState
+    learner: Any  # the learner's state
     replay: ReplayState
 
 
@@ -62,68 +62,85 @@ class StepMetrics(NamedTuple):
     q_mean: jax.Array  # [] float32
 
 
+class Hyperparams(NamedTuple):
+    """Settings that enter the program as arguments, in place of constants of its config."""
+
+    values: dict[str, Any]  # value [...] of each setting by its dotted name, such as `learn.tau`
+    return_bounds: tuple[Any, Any]  # smallest and largest possible return, []
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Program:
     """The static parts of a run, closed over by what is compiled."""
 
     cfg: Config
     env: Env
-    learner: ActorCritic
-    spread: Spread = ALONE  # of scenes and batches over devices
-    at_once: int | None = (
-        None  # of several runs side by side, the networks of so many at a time; None for all
+    learner: Learner
+    sampler: Sampler
+    sharding: Spread = ALONE  # of scenes and batches over devices
+
+
+def make(
+    cfg: Config,
+    env: Env | None = None,
+    learner: Learner | None = None,
+    sampler: Sampler | None = None,
+    network: Any = None,
+) -> Program:
+    """The program of a config, with parts of your own in place of the config's."""
+    return Program(
+        cfg=cfg,
+        env=environment.make(cfg) if env is None else env,
+        learner=csac.make(cfg, network) if learner is None else learner,
+        sampler=samplers.make(cfg.replay) if sampler is None else sampler,
     )
 
 
-def make(cfg: Config) -> Program:
-    """Environment and learner of a config."""
-    return Program(cfg, environment.make(cfg), actor_critic.make(cfg))
+def replace_hyperparams(program: Program, hyperparams: Hyperparams | None) -> Program:
+    """The program with these hyper-parameters, if there are any, in place of its config's."""
+    if hyperparams is None:
+        return program
+    sections: dict[str, dict[str, Any]] = {}
+    for name, value in hyperparams.values.items():
+        section, field = name.split(".")
+        sections.setdefault(section, {})[field] = value
+    cfg = program.cfg.change(**sections)
+    learner = program.learner.replace_hyperparams(cfg, hyperparams.return_bounds)
+    sampler = program.sampler.replace_hyperparams(cfg.replay)
+    return dataclasses.replace(program, cfg=cfg, learner=learner, sampler=sampler)
 
 
-def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+def train_step(
+    program: Program, state: TrainState, hyperparams: Hyperparams | None = None
+) -> tuple[TrainState, StepMetrics]:
     """One action in each of the E scenes and the updates that belong to it."""
+    program = replace_hyperparams(program, hyperparams)
     cfg, env, learner = program.cfg, program.env, program.learner
     key_act, key_learn, key_reset = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
     scenes = state.scenes
 
-    # Look and act: by default CEM on the critic's maps from the actor's mean, plus noise (lines
-    # 8-13).
-    look = _apart(program, lambda online, obs: actor_critic.look(learner, online, obs))
-    maps = look(state.learner.online, scenes.obs)
-    act = jax.vmap(policy.act, (0, None, 0, 0, None))
+    # Observe and act (lines 8-13).
     taken = state.step * cfg.train.scenes
-    keys = _keys(key_act, cfg.train.scenes)
-    action = act(keys, learner, maps, scenes.steps_without_change, taken)
+    action = learner.act(key_act, state.learner, scenes.obs, scenes.steps_without_change, taken)
 
     # Simulate.
-    after = program.spread.scenes(jax.vmap(env.step))(scenes, action)
+    after = program.sharding.scenes(jax.vmap(env.step))(scenes, action)
 
     # Reward and remember (lines 14-15).
-    pushed = action.primitive == Primitive.PUSH
-    around = _apart(program, lambda *given: _around(learner, *given), one_by_one=True)
-    phi_before, phi_after = around(state.learner.target, scenes.obs, after.obs, pushed)
     info = after.info
-    result = rewards.ActionResult(
-        primitive=action.primitive,
-        outcome=info.outcome,
-        distance=info.distance,
-        phi_before=phi_before,
-        phi_after=phi_after,
-        changed=info.moved > CHANGE_AREA,
-        blocks_lost=info.blocks_lost,
-    )
-    reward = jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
-    seen = Transition(
+    result = _result(action, info)
+    reward, push_better = learner.reward(cfg.reward, state.learner, scenes.obs, after.obs, result)
+    transition = Transition(
         obs=heightmap.pack(scenes.obs),
         action=action,
         reward=reward,
         next_obs=heightmap.pack(after.obs),
         terminated=after.terminated,
     )
-    replay = ring.add(state.replay, seen, ~info.physics_diverged)
+    replay = ring.add(state.replay, transition, ~info.physics_diverged)
 
-    # Learn (lines 16-26). During the warm-up the result is dropped: a branch would cost more than
-    # those few updates.
+    # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch would cost more
+    # than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.learning_starts
     learned, priority, losses = _learn(program, key_learn, state.learner, replay)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
@@ -136,13 +153,13 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     metrics = StepMetrics(
         primitive=action.primitive,
         outcome=info.outcome,
-        push_better=pushed & (phi_after > phi_before + cfg.reward.dead_band),
+        push_better=push_better,
         cleared=info.cleared,
         blocks_lost=info.blocks_lost,
         terminated=after.terminated,
         truncated=after.truncated,
         reward=reward,
-        gap_disagrees=~pushed & (info.outcome != info.outcome_by_gap),
+        gap_disagrees=(action.primitive == Primitive.GRASP) & (info.outcome != info.outcome_by_gap),
         contact_overflow=info.contact_overflow,
         physics_diverged=info.physics_diverged,
         learned=ready,
@@ -154,46 +171,43 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     return state, metrics
 
 
-def _apart(
-    program: Program, part: Callable[..., Any], one_by_one: bool = False
-) -> Callable[..., Any]:
-    """`part`, what the networks of one run do; of several side by side only so many at a time as
-    the program says."""
-    if program.at_once is None:
-        return part
-    return chunked_vmap.grouped(part, 1 if one_by_one else program.at_once)
+def _result(action: Action, info: environment.Info) -> ActionResult:
+    """What the actions did, leaves [E]; phi is the learner's to fill in."""
+    unknown = jnp.zeros_like(info.distance)
+    return ActionResult(
+        primitive=action.primitive,
+        outcome=info.outcome,
+        distance=info.distance,
+        phi_before=unknown,
+        phi_after=unknown,
+        changed=info.moved > CHANGE_AREA,
+        blocks_lost=info.blocks_lost,
+    )
 
 
 def _learn(
-    program: Program, key: jax.Array, state: LearnerState, replay: ReplayState
-) -> tuple[LearnerState, jax.Array, dict[str, jax.Array]]:
-    """The critic's updates, each on a batch drawn anew, then one of the actor on the last batch, or
-    a part of it."""
+    program: Program, key: jax.Array, state: Any, replay: ReplayState
+) -> tuple[Any, jax.Array, dict[str, jax.Array]]:
+    """The updates, each on a batch of its own, then the end of the step on (part of) the last."""
     cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
-    update_critic = _apart(
-        program, lambda key, *given: actor_critic.update_critic(key, learner, *given)
-    )
-    update_actor = _apart(program, lambda *given: actor_critic.update_actor(learner, *given))
 
     def update(carry, i):
         state, priority = carry
-        *keys_draw, key_target = jax.random.split(jax.random.fold_in(key, i), 3)
+        *keys_draw, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
         progress = state.updates.astype(jnp.float32) / total
         current = replay.replace(priority=priority)
         slots, weights, batch = _draw(program, keys_draw, current, progress)
-        state, info = update_critic(key_target, state, batch, weights)
-        current = ring.set_priorities(current, slots, samplers.priority(cfg.replay, info.error))
+        state, info = learner.update(key_update, state, batch, weights)
+        current = program.sampler.update(current, slots, info.error)
         return (state, current.priority), (info, batch.obs)
 
     numbers = jnp.arange(cfg.learn.updates)
     (state, priority), (info, observations) = jax.lax.scan(
         update, (state, replay.priority), numbers
     )
-    last = heightmap.unpack(
-        jax.tree.map(lambda leaf: leaf[-1, : cfg.learn.actor_batch or None], observations)
-    )
-    state, actor_loss = update_actor(state, last)
+    last = jax.tree.map(lambda leaf: leaf[-1, : cfg.learn.actor_batch or None], observations)
+    state, actor_loss = learner.end_step(state, heightmap.unpack(last))
     losses = {
         "critic_loss": jnp.mean(info.critic_loss),
         "actor_loss": actor_loss,
@@ -206,63 +220,36 @@ def _learn(
 def _draw(
     program: Program, keys: Sequence[jax.Array], replay: ReplayState, progress: jax.Array
 ) -> tuple[jax.Array, jax.Array, Transition]:
-    """A batch as the sampler has it, augmented: slots [B], weights [B], leaves [B, ...]; two
-    keys."""
+    """A batch as the sampler has it, augmented: slots [B], weights [B], leaves [B, ...]."""
     cfg, (key_sample, key_augment) = program.cfg, keys
-    slots, weights = samplers.sample(key_sample, cfg.replay, replay, progress, cfg.learn.batch)
-    batch = program.spread.batch(ring.gather(replay, slots))
+    slots, weights = program.sampler.sample(key_sample, replay, progress, cfg.learn.batch)
+    batch = program.sharding.batch(ring.gather(replay, slots))
     augmented = jax.vmap(augment.augment, (0, None, 0))
     return slots, weights, augmented(_keys(key_augment, cfg.learn.batch), cfg, batch)
-
-
-def _best_grasps(learner: ActorCritic, target: Params, obs: Observation) -> jax.Array:
-    """phi_g of E states [E] by the target critic, eq. 16."""
-    return jax.vmap(actor_critic.best_grasp)(actor_critic.look(learner, target, obs))
-
-
-def _around(
-    learner: ActorCritic, target: Params, before: Observation, after: Observation, pushed: jax.Array
-) -> jax.Array:
-    """phi_g before and after the action [2, E]; zeros if no scene was `pushed` [E] bool, since
-    grasps need none.
-
-    With seeds side by side the branch turns into a selection, both sides run; one by one it stays a
-    branch.
-    """
-    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, after)
-
-    def look() -> jax.Array:
-        return jax.lax.map(lambda obs: _best_grasps(learner, target, obs), views)
-
-    return jax.lax.cond(jnp.any(pushed), look, lambda: jnp.zeros((2, *pushed.shape)))
 
 
 def _keys(key: jax.Array, num: int) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
 
 
-def init(program: Program, trunk: Any = None) -> TrainState:
-    """The state before the first step: fresh scenes and networks, an empty ring (lines 1-4). A
-    fixed point of types.
-
-    trunk: variables that the networks' trunks begin with, see `weights.read`; None for random ones.
-    """
-    state = jax.jit(lambda: begin(program, jax.random.key(program.cfg.seed)))()
-    return (
-        state if trunk is None else state.replace(learner=actor_critic.with_trunk(state.learner, trunk))
-    )
+def init(program: Program) -> TrainState:
+    """The state before the first step; a fixed point of types."""
+    return jax.jit(lambda: init_state(program, jax.random.key(program.cfg.seed)))()
 
 
-def begin(program: Program, key: jax.Array) -> TrainState:
-    """The state before the first step of the run whose root key is `key`; pure."""
-    cfg = program.cfg
+def init_state(
+    program: Program, key: jax.Array, hyperparams: Hyperparams | None = None
+) -> TrainState:
+    """Fresh scenes and networks, an empty ring (lines 1-4), from the run's root key; pure."""
+    program = replace_hyperparams(program, hyperparams)
+    cfg, sampler = program.cfg, program.sampler
     key_scenes, key_nets = jax.random.split(jax.random.fold_in(key, np.uint32(2**32 - 1)))
     return TrainState(
         key=key,
         step=jnp.int32(0),
         scenes=jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes)),
-        learner=actor_critic.init(key_nets, program.learner),
-        replay=ring.init(cfg.replay, example(cfg)),
+        learner=program.learner.init(key_nets),
+        replay=ring.init(sampler.init(cfg.replay.capacity), example(cfg)),
     )
 
 
@@ -271,23 +258,26 @@ def example(cfg: Config) -> Transition:
 
     def build() -> Transition:
         rows = (cfg.heightmap.size, cfg.heightmap.size)
-        seen = Observation(
+        obs = Observation(
             colour=jnp.zeros((*rows, 3)), height=jnp.zeros(rows), target=jnp.zeros(rows, bool)
         )
         action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
-        packed = heightmap.pack(seen)
+        packed = heightmap.pack(obs)
         return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool))
 
     return jax.eval_shape(build)
 
 
-def abstract_state(cfg: Config) -> Any:
-    """Shapes and types of a run's state, as `jax.eval_shape` gives them: no scene is settled,
-    nothing is compiled."""
+def abstract_state(program: Program) -> Any:
+    """Shapes and types of a run's state: no scene is settled, nothing is compiled."""
+    return jax.eval_shape(lambda: init(program))
+
+
+def without_physics(cfg: Config) -> Env:
+    """An environment for shapes alone."""
     nothing: Any = None
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
-    program = Program(cfg, Env(cfg, nothing, blank), actor_critic.make(cfg))
-    return jax.eval_shape(lambda: init(program))
+    return Env(cfg, nothing, blank)
 
 
 def compile_chunk(program: Program, num_steps: int):

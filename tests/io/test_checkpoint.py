@@ -222,8 +222,8 @@ def test_other_dtype_or_shape_is_refused(run_dir: Path):
 
 def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: a config with a setting that this version does not know is an error that names it."""
-    good = checkpoint.config_json.to_dict
-    monkeypatch.setattr(checkpoint.config_json, "to_dict", lambda cfg: {**good(cfg), "sweep": 1})
+    good = checkpoint.configs.to_dict
+    monkeypatch.setattr(checkpoint.configs, "to_dict", lambda cfg: {**good(cfg), "sweep": 1})
     folder = checkpoint.save(tmp_path, 4, _state(), CFG, {})
     assert json.loads((folder / checkpoint.MANIFEST).read_text())
     with pytest.raises(CheckpointError, match=r"another version.*sweep: unknown setting"):

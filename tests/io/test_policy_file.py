@@ -12,7 +12,7 @@ import safetensors.numpy
 
 from csac_jax import presets
 from csac_jax.agent.actor_critic import Params
-from csac_jax.io import config_json, policy_file
+from csac_jax.io import configs, policy_file
 from csac_jax.training import step
 
 CFG = presets.get("smoke")
@@ -32,7 +32,7 @@ def params() -> Params:
 def _rewrite(path: Path, change: Callable[[dict[str, Any], dict[str, str]], None]) -> None:
     """The file with its tensors and remarks changed."""
     tensors = safetensors.numpy.load_file(path)
-    remarks = {"config": json.dumps(config_json.to_dict(CFG))}
+    remarks = {"config": json.dumps(configs.to_dict(CFG))}
     change(tensors, remarks)
     safetensors.numpy.save_file(tensors, path, remarks)
 

@@ -14,14 +14,14 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import train
 from csac_jax.config import Algo
 from csac_jax.evaluation import metrics, statistics
-from csac_jax.io import config_json
+from csac_jax.io import configs
 from csac_jax.report import charts, report, results
 
 CASES = ("hole", "row")
 
 
 def _config(algo: Algo, seed: int, **changed: Any) -> dict[str, Any]:
-    config = config_json.to_dict(algorithms.configure(presets.get("paper"), algo))
+    config = configs.to_dict(algorithms.configure(presets.get("paper"), algo))
     config["seed"] = seed
     for name, value in changed.items():
         section, _, field = name.partition("__")
@@ -296,7 +296,7 @@ def test_command_gives_the_config_back():
     run = results.Run(Path("x"), config, *[np.zeros(1)] * 4, record={})
     program, command, *flags = results.command(run).split()
     assert (program, command) == ("csac-jax", "train")
-    assert config_json.to_dict(train.read(flags)[1]) == config
+    assert configs.to_dict(train.read(flags)[1]) == config
 
 
 def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):

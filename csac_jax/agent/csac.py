@@ -1,0 +1,111 @@
+"""CSAC and its baselines as a learner: dense maps, search, rewards, updates of critic and actor."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from csac_jax.agent import actor_critic, policy, rewards
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
+from csac_jax.agent.learner import Learner, Transition, UpdateInfo
+from csac_jax.agent.rewards import ActionResult
+from csac_jax.config import Config, RewardConfig
+from csac_jax.constants import Primitive
+from csac_jax.nets import chunked_vmap
+from csac_jax.sim.primitives import Action
+from csac_jax.vision.heightmap import Observation
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CSAC(Learner):
+    """The algorithms of `algorithms`, by the config of `parts`."""
+
+    parts: ActorCritic
+    networks_at_once: int | None = None  # of runs that are vmapped, see `chunked_vmap`; None: all
+
+    def init(self, key: jax.Array) -> LearnerState:
+        return actor_critic.init(key, self.parts)
+
+    def act(
+        self,
+        key: jax.Array,
+        state: LearnerState,
+        obs: Observation,
+        steps_without_change: jax.Array,
+        actions_taken: jax.Array | None = None,
+    ) -> Action:
+        """By default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13)."""
+        dense_maps = self._chunked(
+            lambda online, obs: actor_critic.dense_maps(self.parts, online, obs)
+        )
+        maps = dense_maps(state.online, obs)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(steps_without_change)))
+        if actions_taken is None:
+            best = jax.vmap(policy.best_action, (0, None, 0, 0))
+            return best(keys, self.parts, maps, steps_without_change)
+        act = jax.vmap(policy.act, (0, None, 0, 0, None))
+        return act(keys, self.parts, maps, steps_without_change, actions_taken)
+
+    def reward(
+        self,
+        cfg: RewardConfig,
+        state: LearnerState,
+        obs: Observation,
+        next_obs: Observation,
+        result: ActionResult,
+    ) -> tuple[jax.Array, jax.Array]:
+        """Eqs. 10-16, phi by the target critic."""
+        best_grasps = self._chunked(lambda *args: _best_grasps(self.parts, *args), at_once=1)
+        pushed = result.primitive == Primitive.PUSH
+        before, after = best_grasps(state.target, obs, next_obs, pushed)
+        return rewards.rewards_of(cfg, result._replace(phi_before=before, phi_after=after))
+
+    def update(
+        self, key: jax.Array, state: LearnerState, batch: Transition, weights: jax.Array
+    ) -> tuple[LearnerState, UpdateInfo]:
+        update = self._chunked(
+            lambda key, *args: actor_critic.update_critic(key, self.parts, *args)
+        )
+        return update(key, state, batch, weights)
+
+    def end_step(self, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
+        """The actor's update (lines 22-23)."""
+        update = self._chunked(lambda *args: actor_critic.update_actor(self.parts, *args))
+        return update(state, obs)
+
+    def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "CSAC":
+        parts = actor_critic.replace_hyperparams(self.parts, cfg, return_bounds)
+        return dataclasses.replace(self, parts=parts)
+
+    def in_chunks(self, networks_at_once: int | None) -> "CSAC":
+        return dataclasses.replace(self, networks_at_once=networks_at_once)
+
+    def _chunked(self, part: Callable[..., Any], at_once: int | None = None) -> Callable[..., Any]:
+        if self.networks_at_once is None:
+            return part
+        return chunked_vmap.grouped(part, at_once or self.networks_at_once)
+
+
+def make(cfg: Config, network: Any = None) -> CSAC:
+    """The learner of a config; `network` is a critic of your own, see `networks`."""
+    return CSAC(actor_critic.make(cfg, network))
+
+
+def _best_grasps(
+    parts: ActorCritic, target: Params, before: Observation, after: Observation, pushed: jax.Array
+) -> jax.Array:
+    """phi_g before and after the action [2, E], eq. 16; zeros if no scene was `pushed` [E] bool.
+
+    Vmapped over runs, both sides of the branch are computed; in chunks of one it stays a branch.
+    """
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, after)
+
+    def phi(obs: Observation) -> jax.Array:
+        maps = actor_critic.dense_maps(parts, target, obs)
+        return jax.vmap(actor_critic.best_grasp)(maps)
+
+    return jax.lax.cond(
+        jnp.any(pushed), lambda: jax.lax.map(phi, views), lambda: jnp.zeros((2, *pushed.shape))
+    )

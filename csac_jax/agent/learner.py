@@ -1,0 +1,98 @@
+"""What learns from replayed transitions: the interface that a training step knows.
+
+A learner of your own derives from `Learner`. `csac.CSAC` is the one that the package comes with.
+"""
+
+import abc
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from csac_jax.agent import rewards
+from csac_jax.agent.rewards import ActionResult
+from csac_jax.config import Config, RewardConfig
+from csac_jax.sim.primitives import Action
+from csac_jax.vision.heightmap import Observation, PackedObservation
+
+
+@struct.dataclass
+class Transition:
+    """What one action showed; a batch has a leading axis B."""
+
+    obs: PackedObservation
+    action: Action
+    reward: jax.Array  # [] float32, R of CSAC eq. 12
+    next_obs: PackedObservation
+    terminated: jax.Array  # [] bool, a true end: nothing follows
+
+
+class UpdateInfo(NamedTuple):
+    """What one update saw."""
+
+    critic_loss: jax.Array  # []
+    q: jax.Array  # [] mean of Q(s, a)
+    error: jax.Array  # [B] TD errors y - Q(s, a), for the sampler
+
+
+class Learner(abc.ABC):
+    """Pure functions of a state, any pytree of arrays; E scenes side by side, B transitions."""
+
+    @abc.abstractmethod
+    def init(self, key: jax.Array) -> Any:
+        """The state before the first update."""
+
+    @abc.abstractmethod
+    def act(
+        self,
+        key: jax.Array,
+        state: Any,
+        obs: Observation,
+        steps_without_change: jax.Array,
+        actions_taken: jax.Array | None = None,
+    ) -> Action:
+        """An action for every observation, leaves [E, ...].
+
+        Args: steps_without_change [E] int32; actions_taken [] int32 by the whole run, which
+        exploration decays with, or None for the policy without exploration.
+        """
+
+    @abc.abstractmethod
+    def update(
+        self, key: jax.Array, state: Any, batch: Transition, weights: jax.Array
+    ) -> tuple[Any, UpdateInfo]:
+        """One update on a batch, leaves [B, ...], whose losses count by `weights` [B]."""
+
+    def end_step(self, state: Any, obs: Observation) -> tuple[Any, jax.Array]:
+        """What is done once after a step's updates, and its loss []; by default nothing.
+
+        Args: obs, of the last batch, leaves [B, ...].
+        """
+        del obs
+        return state, jnp.zeros(())
+
+    def reward(
+        self,
+        cfg: RewardConfig,
+        state: Any,
+        obs: Observation,
+        next_obs: Observation,
+        result: ActionResult,
+    ) -> tuple[jax.Array, jax.Array]:
+        """Rewards [E] float32 and which pushes were good [E] bool; `result` has no phi yet.
+
+        By default phi is 0: take `push_effect` "change" with it.
+        """
+        del state, obs, next_obs
+        return rewards.rewards_of(cfg, result)
+
+    def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "Learner":
+        """The learner of a config whose hyper-parameters may be traced; by default itself."""
+        del cfg, return_bounds
+        return self
+
+    def in_chunks(self, networks_at_once: int | None) -> "Learner":
+        """The learner where several runs are vmapped, for so many networks at a time."""
+        del networks_at_once
+        return self

@@ -1,0 +1,33 @@
+"""The environment by itself: random grasps in a batch of scenes, with automatic reset.
+
+python examples/random_agent.py [PRESET] [STEPS]
+"""
+
+import sys
+
+import csac_jax as csac
+import jax
+import jax.numpy as jnp
+
+SCENES = 8
+
+
+def main(preset="quick", steps="20"):
+    env = csac.auto_reset(csac.make_env(csac.presets.get(preset)))
+    low, high = env.action_spec.pose.minimum, env.action_spec.pose.maximum
+
+    def step(state, key):
+        key_act, key_reset = jax.random.split(key)
+        pose = jax.random.uniform(key_act, (SCENES, 3), minval=low, maxval=high)
+        action = jax.vmap(csac.Action.grasp)(*pose.T)
+        state = jax.vmap(env.step)(jax.random.split(key_reset, SCENES), state, action)
+        return state, state.info.cleared
+
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), SCENES))
+    keys = jax.random.split(jax.random.key(1), int(steps))
+    _, cleared = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys))(state, keys)
+    return jnp.sum(cleared) / cleared.size
+
+
+if __name__ == "__main__":
+    print(f"blocks cleared per random grasp: {main(*sys.argv[1:]):.3f}")
