@@ -1,39 +1,116 @@
-"""A robot learns to push and grasp in clutter: physics, vision, networks and learner in one JAX
-program.
+"""A robot learns to push and grasp in clutter: physics, vision, networks and learner in one program.
+
+    import csac_jax as csac
+
+    env = csac.make_env(csac.presets.quick())          # reset(key), step(state, action): pure JAX
+    run = csac.train(csac.presets.quick(), "runs/a")
+    policy = csac.load_policy("shipped")               # action = policy(obs, key)
+    table = csac.evaluate(policy, suite="random10", episodes=50)
+
+The names in `__all__` are the public API; everything else may move without notice.
 
 Map, in the direction of data; imports point only backwards along it:
 
+    constants   numbers that several stages share
     config      every setting, as frozen dataclasses
-    presets     named configs
+    presets     named configs; algorithms: the CSAC family and its baselines
     geometry    poses, pixels <-> metres
     scene       MJCF -> model and index of ids; block layouts; the pool of settled scenes
     sim         physics, push and grasp primitives, their outcomes
     vision      raycaster, height and colour maps, rotations of maps
     nets        dense Q maps and action proposals
-    agent       cross-entropy method, targets, losses, rewards, exploration, update
+    agent       learner: cross-entropy method, targets, losses, rewards, exploration, update
     replay      ring of transitions and its samplers
     env         reset and step of one scene
-    train       the training step, host loop, checkpoints, evaluation
-    show        progress and pictures
-    cli         the command `csac-jax`, a file per subcommand
+    runtime     compile cache, devices, signals, provenance
+    io          checkpoints, policy files, configs
+    training    the training step and its host loop
+    evaluation  policies, suites, metrics, statistics
+    sweeps      many runs in one program, over devices and hosts
+    render      pictures and videos; report: tables, charts, pages
+    api         the functions of the public API; cli: the command `csac-jax`
 
-Axis letters: E scenes in the batch, B learner batch, N block slots, G geoms, R rays, K rotations, H
-W heightmap rows and columns, J CEM candidates, A action dimensions, C replay capacity, S seeds, T
-scan time.
+Axis letters: E scenes in the batch, B learner batch, N block slots, G geoms, R rays, K rotations,
+H W heightmap rows and columns, J CEM candidates, A action dimensions, C replay capacity, S seeds,
+T scan time.
 
 Units are SI, angles rad; a name carries its unit only where it is not SI (`_mm`, `_deg`, `_px`).
 The frame is the robot base's, moved so that the centre of the workspace on the table is (0, 0, 0),
 z up. `T_a_b` maps b to a. Masks say what is true: `valid`, never `mask`.
 
 Importing this package sets environment variables that JAX reads as it starts, see `_guard`: import
-it first.
+it first. JAX itself is loaded with the first name that needs it.
 """
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from csac_jax import _guard
 
+if TYPE_CHECKING:
+    from csac_jax import algorithms, presets
+    from csac_jax.agent.learner import Learner, Transition, UpdateInfo
+    from csac_jax.api import Run, evaluate, load_policy, sweep, train
+    from csac_jax.config import Config
+    from csac_jax.env import Env, State, auto_reset, make_env
+    from csac_jax.evaluation.policies import Policy
+    from csac_jax.replay.samplers import Sample, Sampler
+    from csac_jax.sim.primitives import Action
+    from csac_jax.vision.heightmap import Observation, unpack
+
 __version__ = "0.1.0"
+
+_HOMES = {
+    "csac_jax": ("algorithms", "presets"),
+    "csac_jax.agent.learner": ("Learner", "Transition", "UpdateInfo"),
+    "csac_jax.api": ("Run", "evaluate", "load_policy", "sweep", "train"),
+    "csac_jax.config": ("Config",),
+    "csac_jax.env": ("Env", "State", "auto_reset", "make_env"),
+    "csac_jax.evaluation.policies": ("Policy",),
+    "csac_jax.replay.samplers": ("Sample", "Sampler"),
+    "csac_jax.sim.primitives": ("Action",),
+    "csac_jax.vision.heightmap": ("Observation", "unpack"),
+}
+
+__all__ = [
+    "Action",
+    "Config",
+    "Env",
+    "Learner",
+    "Observation",
+    "Policy",
+    "Run",
+    "Sample",
+    "Sampler",
+    "State",
+    "Transition",
+    "UpdateInfo",
+    "algorithms",
+    "auto_reset",
+    "evaluate",
+    "load_policy",
+    "make_env",
+    "presets",
+    "sweep",
+    "train",
+    "unpack",
+]
 
 _guard.refuse_broken_jax()
 _guard.switch_off_broken_fusion()
 _guard.switch_off_broken_partitioner()
 _guard.widen_thread_pool()
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is first asked for."""
+    for home, names in _HOMES.items():
+        if name in names:
+            if home == "csac_jax":
+                return importlib.import_module(f"csac_jax.{name}")
+            return getattr(importlib.import_module(home), name)
+    raise AttributeError(f"module 'csac_jax' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -5,13 +5,24 @@ A file per command, whose `run` takes its arguments and returns the exit code. J
 once the arguments are known to be good, so that help and complaints come at once.
 """
 
+import difflib
 import os
 import sys
 from collections.abc import Callable, Sequence
 
 import csac_jax
 from csac_jax import algorithms, presets
-from csac_jax.cli import bench, doctor, evaluation, export, play, report, sweep, train
+from csac_jax.cli import (
+    bench,
+    doctor,
+    evaluation,
+    export,
+    parsing,
+    play,
+    report,
+    sweep,
+    train,
+)
 from csac_jax.cli.errors import PROGRAM, BadArgumentsError, FailedError, complain
 from csac_jax.errors import SceneError
 
@@ -69,8 +80,23 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments[0] == "--version":
         print(csac_jax.__version__)
         return 0
-    if arguments[0] not in COMMANDS:
-        raise BadArgumentsError(
-            f"unknown command '{arguments[0]}'; choose one of: {', '.join(COMMANDS)}"
-        )
-    return COMMANDS[arguments[0]](arguments[1:])
+    name, *rest = arguments
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        meant = f"did you mean {near[0]}? " if near else ""
+        listed = ", ".join(COMMANDS)
+        raise BadArgumentsError(f"unknown command '{name}'; {meant}choose one of: {listed}")
+    return COMMANDS[name](_on_device(rest))
+
+
+def _on_device(arguments: list[str]) -> list[str]:
+    """The arguments without --device, which decides where JAX computes."""
+    device = parsing.value_of(arguments, "--device")
+    if device is None:
+        return arguments
+    if device not in ("cpu", "gpu"):
+        raise BadArgumentsError(f"--device: '{device}' is not one of: cpu, gpu")
+    from csac_jax.runtime import devices
+
+    devices.select(device)
+    return parsing.without(arguments, "--device")

@@ -57,6 +57,16 @@ def value_of(flags: Sequence[str], name: str) -> str | None:
     return found  # the last one, as the parser takes it
 
 
+def without(arguments: Sequence[str], name: str) -> list[str]:
+    """The arguments without the option `name` and its value."""
+    kept, skip = [], False
+    for word in arguments:
+        if not skip and word != name and not word.startswith(f"{name}="):
+            kept.append(word)
+        skip = word == name
+    return kept
+
+
 @contextlib.contextmanager
 def _wide_terminal() -> Iterator[None]:
     """Keeps tyro from breaking its messages into lines."""

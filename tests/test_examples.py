@@ -1,0 +1,50 @@
+"""Every file of examples/ runs, and is short."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import csac_jax
+
+FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
+TRAINERS = ("own_sampler", "own_network", "own_learner")
+
+
+def _module(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_example_is_tested():
+    """Claim: the tests below run all of them."""
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*TRAINERS, "random_agent"}
+
+
+@pytest.mark.parametrize("path", FOLDER.glob("*.py"), ids=lambda path: path.stem)
+def test_examples_are_short(path: Path):
+    """Claim: an example has at most 60 lines."""
+    assert len(path.read_text().splitlines()) <= 60
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+@pytest.mark.parametrize("name", TRAINERS)
+def test_own_parts_train(name: str, tmp_path: Path):
+    """Claim: a part of one's own trains a run to its end, and the run's policy acts with it."""
+    run = _module(name).main("smoke", tmp_path / "run")
+    assert run.summary.actions == 64
+    assert run.summary.stopped_by is None
+    table = csac_jax.evaluate(run.policy, suite="in_distribution", episodes=2)
+    assert table["counts"]["episodes"] == 2
+
+
+@pytest.mark.mjx
+def test_random_agent_runs():
+    """Claim: the environment runs in a scan of a vmap, with finished scenes replaced."""
+    assert 0.0 <= _module("random_agent").main("smoke", "6") <= 1.0
