@@ -52,6 +52,6 @@ def resolve(cfg: Config, devices: int = 1, members: int = 1) -> Config:
     side."""
     if cfg.sim.physics != "auto":
         return cfg  # no need of JAX
-    from csac_jax.sim import auto
+    from csac_jax.sim import backend
 
-    return auto.resolve(cfg, devices, members)
+    return backend.resolve(cfg, devices, members)
