@@ -93,7 +93,7 @@ class Env:
         scene = self._fresh(key_fresh)
         if self.cfg.task.kind == "target":
             goes_on = (state.reward > 0.0) & jnp.any(state.scene.in_play)
-            again = layout.mark(key_target, state.scene)
+            again = layout.choose_target(key_target, state.scene)
             scene = jax.tree.map(lambda new, old: jnp.where(goes_on, old, new), scene, again)
         return self.begin(scene, key)
 
@@ -111,14 +111,14 @@ class Env:
         yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
         near = jnp.linalg.norm(scene.position[:, :2], axis=1) <= 0.5 * self.cfg.heightmap.extent
         anyhow = self.any_yaw & jnp.all(near | ~scene.in_play)
-        turned = layout.turn(
+        turned = layout.rotate(
             scene, jnp.where(anyhow, yaw, jnp.round(yaw / (0.5 * np.pi)) * (0.5 * np.pi))
         )
         if self.cfg.task.kind != "target":
             return turned.replace(target=jnp.full_like(scene.target, layout.ANY))
         own = scene.target != layout.ANY
         return jax.tree.map(
-            lambda a, b: jnp.where(own, a, b), turned, layout.mark(key_target, turned)
+            lambda a, b: jnp.where(own, a, b), turned, layout.choose_target(key_target, turned)
         )
 
     def begin(self, scene: Scene, key: jax.Array | None = None) -> State:

@@ -1,7 +1,7 @@
 """Poses, angles, and the map from heightmap cells to metres and back.
 
-Quaternions are (w, x, y, z), of unit length. Heightmap rows run along y and columns along x; row 0
-and column 0 lie at the lowest y and x; a whole-numbered (row, col) is the centre of a cell. Shapes
+Quaternions are (w, x, y, z), of unit length. Heightmap rows run along y and columns along x. Row 0
+and column 0 lie at the lowest y and x. A whole-numbered (row, col) is the centre of a cell. Shapes
 `[..., n]` may have any leading axes.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from csac_jax.config import HeightmapConfig
 
-_TURN = 2.0 * np.pi
+FULL_TURN = 2.0 * np.pi  # rad
 
 
 def quat_to_matrix(quat: jax.Array) -> jax.Array:
@@ -37,14 +37,13 @@ def quat_multiply(left: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def quat_from_yaw(yaw: jax.Array) -> jax.Array:
-    """Quaternion [4] of a turn by `yaw` [] rad about z, counter-clockwise seen from above."""
+    """Quaternion [4] of a rotation by `yaw` [] rad about z, counter-clockwise from above."""
     zero = jnp.zeros_like(yaw)
     return jnp.stack([jnp.cos(0.5 * yaw), zero, zero, jnp.sin(0.5 * yaw)])
 
 
 def rotate2d(yaw: jax.Array, xy: jax.Array) -> jax.Array:
-    """Points `xy` [..., 2] m turned by `yaw` [] rad about the origin, counter-clockwise seen from
-    above."""
+    """Points `xy` [..., 2] m rotated by `yaw` [] rad about the origin, counter-clockwise."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = xy[..., 0], xy[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
@@ -53,22 +52,20 @@ def rotate2d(yaw: jax.Array, xy: jax.Array) -> jax.Array:
 def wrap_angle(angle: jax.Array) -> jax.Array:
     """The same direction in [0, 2 pi) rad, any shape.
 
-    The remainder of a tiny negative angle rounds to 2 pi itself in float32, and that of a denormal
-    stays negative: both are turned into 0.
+    In float32 the remainder of a tiny negative angle is 2 pi itself, and that of a denormal stays
+    negative. Both become 0.
     """
-    wrapped = jnp.mod(angle, _TURN)
-    return jnp.where((wrapped >= _TURN) | (wrapped <= 0.0), 0.0, wrapped)
+    wrapped = jnp.mod(angle, FULL_TURN)
+    return jnp.where((wrapped >= FULL_TURN) | (wrapped <= 0.0), 0.0, wrapped)
 
 
 def to_pixel(cfg: HeightmapConfig, xy: jax.Array) -> jax.Array:
-    """Heightmap position (row, col) [..., 2] of the points `xy` [..., 2] m; cell centres are whole
-    numbers."""
+    """Heightmap position (row, col) [..., 2] of the points `xy` [..., 2] m."""
     return xy[..., ::-1] / cfg.cell + 0.5 * (cfg.size - 1)
 
 
 def from_pixel(cfg: HeightmapConfig, row_col: jax.Array) -> jax.Array:
-    """Points xy [..., 2] m of the heightmap positions `row_col` [..., 2]: x = (col + 0.5) cell -
-    extent / 2."""
+    """Points xy [..., 2] m of heightmap positions: x = (col + 0.5) cell - extent / 2."""
     return (row_col[..., ::-1] - 0.5 * (cfg.size - 1)) * cfg.cell
 
 

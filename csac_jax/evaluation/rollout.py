@@ -18,7 +18,7 @@ from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, primitives, robot
 from csac_jax.sim.primitives import Action
-from csac_jax.sim.robot import Drive
+from csac_jax.sim.robot import JointTrajectory
 
 POLICIES = ("learned", "random", "oracle")
 SIDE_BY_SIDE = 64  # most episodes that run at once
@@ -94,7 +94,7 @@ class Moment(NamedTuple):
 
     before: State
     action: Action
-    drive: Drive  # how the robot moved
+    joints: JointTrajectory  # how the robot moved
     after: State
     reward: (
         np.ndarray
@@ -114,12 +114,12 @@ def episode(cfg: Config, env: Env, name: str, params: Params | None, seed: int) 
         plan = jax.vmap(lambda obs, one: primitives.plan(cfg.sim, cfg.heightmap, obs.height, one))(
             states.obs, action
         )
-        drive = jax.vmap(lambda one: robot.drive(cfg.sim.robot, one))(plan)
+        joints = jax.vmap(lambda one: robot.joint_trajectory(cfg.sim.robot, one))(plan)
         after = jax.vmap(env.step)(states, action)
         if learner is None:
-            return action, drive, after, after.reward, None
+            return action, joints, after, after.reward, None
         thought = _think(learner, keys, params, states)
-        return action, drive, after, _rewards(learner, params, thought, action, after), thought
+        return action, joints, after, _rewards(learner, params, thought, action, after), thought
 
     key = jax.random.key(seed)
     first = jax.tree.map(lambda leaf: leaf[:1], env.scenes)
@@ -127,11 +127,11 @@ def episode(cfg: Config, env: Env, name: str, params: Params | None, seed: int) 
         jax.random.fold_in(key, 0)
     )
     for number in range(1, cfg.task.max_actions + 1):
-        action, drive, after, reward, thought = step(
+        action, joints, after, reward, thought = step(
             jax.random.fold_in(key, number), params, states
         )
         yield jax.tree.map(
-            lambda leaf: np.asarray(leaf)[0], Moment(states, action, drive, after, reward, thought)
+            lambda leaf: np.asarray(leaf)[0], Moment(states, action, joints, after, reward, thought)
         )
         states = after
         if bool(after.done[0]):

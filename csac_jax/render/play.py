@@ -50,7 +50,7 @@ class Stage:
 
     def _still(self, moment: Moment) -> np.ndarray:
         scene, pose = moment.before.scene, self._data.qpos
-        pose[self._world.robot_qpos] = moment.drive.start
+        pose[self._world.robot_qpos] = moment.joints.start
         pose[self._world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
         return self._picture()
 
@@ -63,8 +63,9 @@ class Stage:
         """
         shown = self._still(moment)
         yield self._beside(shown, moment, text.split(":")[0])
-        film = c_physics.film(self._world, self._fields, moment.before.scene, moment.drive)
-        for pose in film.qpos[:: self._every]:
+        scene, joints = moment.before.scene, moment.joints
+        recorded = c_physics.trajectory(self._world, self._fields, scene, joints)
+        for pose in recorded.qpos[:: self._every]:
             self._data.qpos[:] = pose
             shown = self._picture()
             yield self._beside(shown, moment, text.split(":")[0])
@@ -91,7 +92,7 @@ def line(number: int, moment: Moment) -> str:
         done = f"push  {where}: moved {info.moved:.0f} cm2"
     else:
         done = f"grasp {where}: {Outcome(int(info.outcome)).name.lower()}"
-    if not moment.drive.reachable:
+    if not moment.joints.reachable:
         done += ", out of the robot's reach"
     gone = np.flatnonzero(before.scene.in_play & ~after.scene.in_play)
     names = [blocks.COLOUR_NAMES[before.scene.colour[slot]] for slot in gone]

@@ -1,8 +1,7 @@
-"""Ordered arrangements drawn inside the compiled program: some blocks packed together, a few more
-lying loose beside.
+"""Ordered arrangements drawn inside the compiled program: packed blocks and a few loose ones.
 
-What is packed how stands in `families`; here slots are given sizes, packed, put down somewhere on
-the table, and joined by loose ones. N = block slots, R = roles of a family.
+`families` says how blocks are packed. Here slots take sizes, are packed, placed on the table and
+joined by loose blocks. N = block slots, R = roles of a family.
 """
 
 from typing import NamedTuple
@@ -18,16 +17,12 @@ from csac_jax.scene.families import ROLES, Draws, Family, Role
 from csac_jax.scene.layout import Scene
 
 GAPS = (0.001, 0.030)  # m between packed neighbours: at level 1, and the widest at level 0
-BESIDE = 0.015  # m, least distance of a loose block from any other
-REACH = 0.205  # m, no packed block of any size reaches farther from the middle of the arrangement
+LOOSE_GAP = 0.015  # m, least distance of a loose block from any other
+REACH = 0.205  # m, most that a packed block extends from the middle of the arrangement
 _MARGIN = 0.001  # m kept free along the border of the square
 _TRIES = 64  # random places tried for every loose block
-_LOOSE = (
-    1,
-    3,
-)  # most loose blocks at level 0 and at level 1, unless more are needed for `min_blocks`
-_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
-_ON_SIDE = np.sqrt(np.array([0.5, 0.5, 0.0, 0.0], np.float32))  # a quarter turn about x
+_LOOSE = (1, 3)  # most loose blocks at level 0 and at level 1, if enough for `min_blocks`
+_ON_SIDE = np.sqrt(np.array([0.5, 0.5, 0.0, 0.0], np.float32))  # 90 deg about x
 
 
 class Blocks(NamedTuple):
@@ -35,42 +30,41 @@ class Blocks(NamedTuple):
 
     centre: jax.Array  # [N, 3] m
     yaw: jax.Array  # [N] rad
-    on_side: jax.Array  # [N] bool, a quarter turn about x before the yaw
+    on_side: jax.Array  # [N] bool, tipped by 90 deg about x before the yaw
     half_size: jax.Array  # [N, 3] m, in the block's frame
     placed: jax.Array  # [N] bool, False where the rest means nothing
 
 
 class Sizes(NamedTuple):
-    """Half sizes that slots would take: of any shape of their kind, and of a long one where the
-    kind has several."""
+    """Half sizes drawn for the slots."""
 
-    any: jax.Array  # [N, 3] m
-    long: jax.Array  # [N, 3] m
+    any: jax.Array  # [N, 3] m, of any shape of the slot's kind
+    long: jax.Array  # [N, 3] m, of one of the kind's longest shapes
 
 
 def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -> Scene:
-    """A random arrangement at rest inside the square of side `extent` m; vmap over keys and levels
-    for a batch.
+    """A random arrangement at rest inside the square of side `extent` m; callers vmap.
 
-    `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 30 mm to 1 mm,
-    and adds loose ones. Sizes, densities and frictions spread as in the pool. The target is the
-    block that the others enclose. Fewer than `cfg.min_blocks` are in play only where the square has
-    no room left for loose ones.
+    A higher `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 30 mm
+    to 1 mm, and adds loose blocks. Sizes, densities and frictions vary as in the pool. The target
+    is the block that the others enclose. Fewer than `cfg.min_blocks` are in play only where the
+    square has no room left for loose blocks.
 
     Raises ValueError while tracing where the slots or the square are too small.
     """
-    if extent < 2.0 * (REACH + _MARGIN):
+    least = 2.0 * (REACH + _MARGIN)
+    if extent < least:
         raise ValueError(
-            f"heightmap.extent: arrangements need a square of at least {2.0 * (REACH + _MARGIN):g} m, not {extent:g} m"
+            "heightmap.extent: arrangements need a square of at least "
+            f"{least:g} m, not {extent:g} m"
         )
     possible = families.available(cfg.slots).values()
     key_sizes, key_family, key_pack, key_place, key_loose, key_looks = jax.random.split(key, 6)
     sizes = _draw_sizes(key_sizes, cfg)
     draws = families.draw(key_pack, len(cfg.slots))
     each = [_pack(family, cfg.slots, draws, sizes, level) for family in possible]
-    chosen = jax.random.randint(
-        key_family, (), 0, len(each)
-    )  # a batch needs them all: no lax.switch
+    # A batch needs all families: no lax.switch.
+    chosen = jax.random.randint(key_family, (), 0, len(each))
     packed, target = jax.tree.map(lambda *leaves: jnp.stack(leaves)[chosen], *each)
     border = 0.5 * extent - _MARGIN
     together = _add_loose(key_loose, cfg, border, level, _put_down(key_place, border, packed))
@@ -78,19 +72,17 @@ def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -
 
 
 def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> Sizes:
-    """A shape of each slot's kind, larger or smaller; mesh blocks of one kind alike, as in the
-    pool."""
+    """A shape of each slot's kind, larger or smaller; one size for all mesh blocks of a kind."""
     key_any, key_long, key_scale = jax.random.split(key, 3)
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
     number = np.array([len(choice) for choice in choices])
-    table = np.stack(
-        [np.resize(choice, (number.max(), 3)) for choice in choices]
-    )  # [N, choices, 3]
-    long = np.array(
-        [np.resize(choice[choice[:, 0] == choice[:, 0].max()], (2, 3)) for choice in choices]
-    )  # [N, 2, 3]
+    table = np.stack([np.resize(choice, (number.max(), 3)) for choice in choices])
+    longest = [choice[choice[:, 0] == choice[:, 0].max()] for choice in choices]
+    long = np.stack([np.resize(choice, (2, 3)) for choice in longest])  # [N, 2, 3]
     num = len(cfg.slots)
-    scale = 1.0 + blocks.spread(cfg) * jax.random.uniform(key_scale, (num,), jnp.float32, -1.0, 1.0)
+    scale = 1.0 + blocks.size_jitter(cfg) * jax.random.uniform(
+        key_scale, (num,), jnp.float32, -1.0, 1.0
+    )
     shared = blocks.size_leader(cfg.slots)
 
     def choose(table: np.ndarray, index: jax.Array) -> jax.Array:
@@ -118,19 +110,16 @@ def _pack(
     lying = lying & ~jnp.asarray([kind in MESH_KINDS for kind in slots])[slot]
     feet = jnp.where(used[:, None], _feet(half, lying), 0.0)
     gap = GAPS[0] + (GAPS[1] - GAPS[0]) * (1.0 - level) * (0.5 + 0.5 * draws.gap)
-    centre, turned, target = family.place(draws, feet, used, gap)
+    centre, rotated, target = family.place(draws, feet, used, gap)
     out = jnp.where(used, slot, len(slots))  # dropped where not used
 
     def by_slot(values: jax.Array) -> jax.Array:
-        return (
-            jnp.zeros((len(slots), *values.shape[1:]), values.dtype)
-            .at[out]
-            .set(values, mode="drop")
-        )
+        empty = jnp.zeros((len(slots), *values.shape[1:]), values.dtype)
+        return empty.at[out].set(values, mode="drop")
 
     packed = Blocks(
         centre=by_slot(centre.at[:, 2].add(feet[:, 2])),
-        yaw=by_slot(jnp.where(turned, np.float32(0.5 * np.pi), 0.0)),
+        yaw=by_slot(jnp.where(rotated, np.float32(0.5 * np.pi), 0.0)),
         on_side=by_slot(lying),
         half_size=jnp.asarray(sizes.any).at[out].set(half, mode="drop"),
         placed=by_slot(used),
@@ -141,16 +130,16 @@ def _pack(
 def _assign(
     preference: jax.Array, slots: tuple[SlotKind, ...], roles: tuple[Role, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """A different slot for every role in turn [R] int32, by `preference` [N] among its kinds; False
-    [R]: none left."""
+    """A different slot [R] int32 for every role, by `preference` [N] among its kinds, and whether
+    one was left [R] bool."""
     free = jnp.ones(len(slots), bool)
-    chosen, found = [], []
+    chosen, assigned = [], []
     for role in roles:
         fits = free & np.array([kind in role.kinds for kind in slots])
         chosen.append(jnp.argmax(jnp.where(fits, preference, -1.0)).astype(jnp.int32))
-        found.append(jnp.any(fits))
+        assigned.append(jnp.any(fits))
         free = free & ~(fits & (np.arange(len(slots)) == chosen[-1]))
-    return jnp.stack(chosen), jnp.stack(found)
+    return jnp.stack(chosen), jnp.stack(assigned)
 
 
 def _feet(half: jax.Array, on_side: jax.Array) -> jax.Array:
@@ -162,35 +151,34 @@ def _feet(half: jax.Array, on_side: jax.Array) -> jax.Array:
 
 
 def _put_down(key: jax.Array, border: float, packed: Blocks) -> Blocks:
-    """The packed blocks turned as one by a random yaw and shifted to a random place within `border`
-    m of the centre."""
+    """The packed blocks, rotated and shifted as one at random within `border` m of the centre."""
     key_yaw, key_shift = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (), jnp.float32, 0.0, 2.0 * np.pi)
-    turned = packed._replace(
+    rotated = packed._replace(
         centre=packed.centre.at[:, :2].set(geometry.rotate2d(yaw, packed.centre[:, :2])),
         yaw=packed.yaw + yaw,
     )
-    xy, reach = turned.centre[:, :2], _reach(turned.yaw, _feet(turned.half_size, turned.on_side))
+    xy, reach = (
+        rotated.centre[:, :2],
+        _reach(rotated.yaw, _feet(rotated.half_size, rotated.on_side)),
+    )
     low = jnp.min(jnp.where(packed.placed[:, None], xy - reach, jnp.inf), axis=0)
     high = jnp.max(jnp.where(packed.placed[:, None], xy + reach, -jnp.inf), axis=0)
     shift = jax.random.uniform(key_shift, (2,), jnp.float32, -border - low, border - high)
-    return turned._replace(centre=turned.centre.at[:, :2].add(shift[None]))
+    return rotated._replace(centre=rotated.centre.at[:, :2].add(shift[None]))
 
 
 def _reach(yaw: jax.Array, feet: jax.Array) -> jax.Array:
-    """Half extents [N, 2] m along the world's x and y of blocks with the half extents `feet` [N,
-    3], turned by [N]."""
+    """Half extents [N, 2] m along the world's x and y of blocks `feet` [N, 3] m at `yaw` [N]."""
     cos, sin = jnp.abs(jnp.cos(yaw)), jnp.abs(jnp.sin(yaw))
-    return jnp.stack(
-        [cos * feet[:, 0] + sin * feet[:, 1], sin * feet[:, 0] + cos * feet[:, 1]], axis=1
-    )
+    x, y = cos * feet[:, 0] + sin * feet[:, 1], sin * feet[:, 0] + cos * feet[:, 1]
+    return jnp.stack([x, y], axis=1)
 
 
 def _add_loose(
     key: jax.Array, cfg: SceneConfig, border: float, level: jax.Array, packed: Blocks
 ) -> Blocks:
-    """The arrangement and loose blocks beside it, in random free places; a block that finds none is
-    left out."""
+    """The arrangement and loose blocks in random free places; a block without one is left out."""
     key_order, key_number, key_tries = jax.random.split(key, 3)
     num = len(cfg.slots)
     order = jax.random.permutation(key_order, num)
@@ -199,14 +187,14 @@ def _add_loose(
     wanted = jnp.maximum(jnp.sum(packed.placed) + extra, cfg.min_blocks)
 
     def add(i: jax.Array, now: Blocks) -> Blocks:
-        found, xy, yaw = _free_place(
-            jax.random.fold_in(key_tries, i), border, now, now.half_size[order[i]]
-        )
-        joins = found & ~now.placed[order[i]] & (jnp.sum(now.placed) < wanted)
-        here = joins & (np.arange(num) == order[i])
-        there = jnp.concatenate([xy, now.half_size[order[i], 2:]])
+        slot = order[i]
+        half, key_place = now.half_size[slot], jax.random.fold_in(key_tries, i)
+        is_free, xy, yaw = _free_place(key_place, border, now, half)
+        joins = is_free & ~now.placed[slot] & (jnp.sum(now.placed) < wanted)
+        here = joins & (np.arange(num) == slot)
+        centre = jnp.concatenate([xy, half[2:]])
         return now._replace(
-            centre=jnp.where(here[:, None], there[None], now.centre),
+            centre=jnp.where(here[:, None], centre[None], now.centre),
             yaw=jnp.where(here, yaw, now.yaw),
             placed=now.placed | here,
         )
@@ -217,8 +205,7 @@ def _add_loose(
 def _free_place(
     key: jax.Array, border: float, now: Blocks, half: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Whether there is room for a block of half size [3] m, and where: found [], xy [2] m, yaw []
-    rad."""
+    """Whether a block of half size [3] m finds room, [] bool; its xy [2] m and yaw [] rad."""
     key_xy, key_yaw = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (_TRIES,), jnp.float32, 0.0, 2.0 * np.pi)
     room = border - _reach(yaw, jnp.broadcast_to(half, (_TRIES, 3)))
@@ -228,9 +215,9 @@ def _free_place(
     gap = jax.vmap(to_each, (0, 0, None, None, None, None))(
         xy, yaw, half[:2], now.centre[:, :2], now.yaw, feet
     )
-    free = jnp.all((gap >= BESIDE) | ~now.placed[None], axis=1)  # [tries]
-    first = jnp.argmax(free)
-    return jnp.any(free), xy[first], yaw[first]
+    is_free = jnp.all((gap >= LOOSE_GAP) | ~now.placed[None], axis=1)  # [tries]
+    first = jnp.argmax(is_free)
+    return jnp.any(is_free), xy[first], yaw[first]
 
 
 def rectangle_gap(
@@ -241,32 +228,28 @@ def rectangle_gap(
     other_yaw: jax.Array,
     other_half: jax.Array,
 ) -> jax.Array:
-    """Gap [] m between two rectangles along the axis that parts them widest, at most their
-    distance; < 0: they overlap.
+    """Gap [] m between two rectangles along their best separating axis; < 0 where they overlap.
 
-    Args: centres [2] m, yaws [] rad, half sides [2] m.
+    It is at most their distance. Args: centres [2] m, yaws [] rad, half sides [2] m.
     """
-    angle = jnp.stack(
-        [yaw, yaw + 0.5 * np.pi, other_yaw, other_yaw + 0.5 * np.pi]
-    )  # the sides' normals
-    apart = jnp.abs(jnp.cos(angle) * (other_xy - xy)[0] + jnp.sin(angle) * (other_xy - xy)[1])
+    # The sides' normals.
+    angle = jnp.stack([yaw, yaw + 0.5 * np.pi, other_yaw, other_yaw + 0.5 * np.pi])
+    distance = jnp.abs(jnp.cos(angle) * (other_xy - xy)[0] + jnp.sin(angle) * (other_xy - xy)[1])
 
     def width(side_yaw: jax.Array, side: jax.Array) -> jax.Array:
-        return side[0] * jnp.abs(jnp.cos(angle - side_yaw)) + side[1] * jnp.abs(
-            jnp.sin(angle - side_yaw)
-        )
+        cos, sin = jnp.abs(jnp.cos(angle - side_yaw)), jnp.abs(jnp.sin(angle - side_yaw))
+        return side[0] * cos + side[1] * sin
 
-    return jnp.max(apart - width(yaw, half) - width(other_yaw, other_half))
+    return jnp.max(distance - width(yaw, half) - width(other_yaw, other_half))
 
 
 def _scene(key: jax.Array, cfg: SceneConfig, together: Blocks, target: jax.Array) -> Scene:
     """The blocks with random colours, densities and frictions; what is not placed is parked."""
     key_colour, key_density, key_friction = jax.random.split(key, 3)
     num = len(cfg.slots)
-    colours = jax.random.permutation(key_colour, max(num, len(blocks.COLOURS)))[:num] % len(
-        blocks.COLOURS
-    )
-    tipped = jnp.where(together.on_side[:, None], _ON_SIDE[None], _UPRIGHT[None])
+    palette = len(blocks.COLOURS)
+    colours = jax.random.permutation(key_colour, max(num, palette))[:num] % palette
+    tipped = jnp.where(together.on_side[:, None], _ON_SIDE[None], layout.UPRIGHT[None])
     yaws = jax.vmap(geometry.quat_from_yaw)(together.yaw)
     loose = Scene(
         position=together.centre,

@@ -1,9 +1,9 @@
 """The block set of VPG (arXiv:1803.09956): eight shapes in ten colours.
 
 A slot of kind `box` may hold cube, cuboid, plank or tile; every other kind is one shape. A block's
-frame has its origin at the centre of the bounding box; what differs between scenes is `half_size`,
-half of that box. Boxes and arches scale along each axis, the other shapes as a whole. An arch is
-three convex parts, every other shape one.
+frame has its origin at the centre of the bounding box, whose half, `half_size`, differs between
+scenes. Boxes and arches scale along each axis, the other shapes as a whole. An arch is three convex
+parts, every other shape one.
 """
 
 from typing import NamedTuple
@@ -35,33 +35,20 @@ SHAPES = {
 MAX_FACES = 10
 PADDING_OFFSET = 1e3  # m, offset of a face that is not there: every point lies inside it
 
-COLOURS = np.array(
-    [
-        [78, 121, 167],
-        [89, 161, 79],
-        [156, 117, 95],
-        [242, 142, 43],
-        [237, 201, 72],
-        [186, 176, 172],
-        [255, 87, 89],
-        [176, 122, 161],
-        [118, 183, 178],
-        [255, 157, 167],
-    ],
-    np.float32,
-) / np.float32(255)  # [10, 3] sRGB in 0..1 (Tableau's ten, as in VPG)
-COLOUR_NAMES = (
-    "blue",
-    "green",
-    "brown",
-    "orange",
-    "yellow",
-    "grey",
-    "red",
-    "purple",
-    "cyan",
-    "pink",
-)
+_COLOURS = {  # sRGB (Tableau's ten, as in VPG)
+    "blue": (78, 121, 167),
+    "green": (89, 161, 79),
+    "brown": (156, 117, 95),
+    "orange": (242, 142, 43),
+    "yellow": (237, 201, 72),
+    "grey": (186, 176, 172),
+    "red": (255, 87, 89),
+    "purple": (176, 122, 161),
+    "cyan": (118, 183, 178),
+    "pink": (255, 157, 167),
+}
+COLOURS = np.array([*_COLOURS.values()], np.float32) / np.float32(255)  # [10, 3] sRGB in 0..1
+COLOUR_NAMES = tuple(_COLOURS)
 TABLE_COLOUR = np.array([0.35, 0.33, 0.31], np.float32)
 
 
@@ -75,7 +62,7 @@ def half_size_choices(kind: SlotKind) -> np.ndarray:
 # Parts: centre and half size of every convex part, in units of the block's half size.
 
 _WHOLE = (((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),)
-_ARCH = (  # two posts and a lintel: the half-round tunnel of radius 25 mm as a square one, 50 x 25 mm
+_ARCH = (  # two posts and a lintel: a square tunnel, 50 x 25 mm, for the half-round of VPG
     ((-0.75, 0.0, 0.0), (0.25, 1.0, 1.0)),
     ((0.75, 0.0, 0.0), (0.25, 1.0, 1.0)),
     ((0.0, 0.0, 0.5), (0.5, 1.0, 0.5)),
@@ -158,33 +145,34 @@ def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.
     Args: half_size [N, 3] m. Returns: normals [G, F, 3], outward unit vectors, 0 where there is no
     face; offsets [G, F] m. G as in `parts`.
     """
-    every = parts(slots)
-    normals = np.zeros((len(every.slot), MAX_FACES, 3), np.float32)
-    nominal = np.full((len(every.slot), MAX_FACES), PADDING_OFFSET, np.float32)
-    for part, slot in enumerate(every.slot):
+    all_parts = parts(slots)
+    normals = np.zeros((len(all_parts.slot), MAX_FACES, 3), np.float32)
+    nominal = np.full((len(all_parts.slot), MAX_FACES), PADDING_OFFSET, np.float32)
+    for part, slot in enumerate(all_parts.slot):
         normal, offset = _FACES[slots[slot]]()
         normals[part, : len(normal)], nominal[part, : len(offset)] = normal, offset
     present = nominal < PADDING_OFFSET
-    is_mesh = np.array([slots[slot] in MESH_KINDS for slot in every.slot])[:, None]
-    size = half_size[every.slot]  # [G, 3]
-    reach = jnp.sum(
-        np.abs(normals) * (every.half * size)[:, None] + normals * (every.centre * size)[:, None],
-        axis=-1,
-    )
-    offsets = jnp.where(is_mesh, nominal * mesh_scale(slots, half_size)[every.slot][:, None], reach)
-    return jnp.asarray(normals), jnp.where(present, offsets, PADDING_OFFSET)
+    is_mesh = np.array([slots[slot] in MESH_KINDS for slot in all_parts.slot])[:, None]
+    size = half_size[all_parts.slot]  # [G, 3]
+    from_centre = np.abs(normals) * (all_parts.half * size)[:, None]
+    reach = jnp.sum(from_centre + normals * (all_parts.centre * size)[:, None], axis=-1)
+    scaled = nominal * mesh_scale(slots, half_size)[all_parts.slot][:, None]
+    offsets = jnp.where(present, jnp.where(is_mesh, scaled, reach), PADDING_OFFSET)
+    return jnp.asarray(normals), offsets
 
 
 def size_leader(slots: tuple[SlotKind, ...]) -> np.ndarray:
-    """Slot [N] whose scale each slot takes: its own, but one for all slots of a mesh kind, as MJX
-    shares their mesh."""
+    """Slot [N] whose scale each slot takes: its own, or the first of its mesh kind.
+
+    MJX shares a mesh between all slots of a kind.
+    """
     return np.array(
         [slots.index(kind) if kind in MESH_KINDS else slot for slot, kind in enumerate(slots)]
     )
 
 
-def spread(cfg: SceneConfig) -> np.ndarray:
-    """By what share the size of each slot's block may differ from nominal, [N]."""
+def size_jitter(cfg: SceneConfig) -> np.ndarray:
+    """Largest deviation [N] of each slot's block from its nominal size, as a share of it."""
     return np.array(
         [cfg.mesh_size_jitter if kind in MESH_KINDS else cfg.size_jitter for kind in cfg.slots],
         np.float32,
@@ -192,7 +180,6 @@ def spread(cfg: SceneConfig) -> np.ndarray:
 
 
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:
-    """How much larger than nominal every slot's block is [N], by its height; of use for kinds that
-    scale as a whole."""
+    """Size of every slot's block relative to nominal [N], by its height; for mesh kinds."""
     nominal = np.array([half_size_choices(kind)[0][2] for kind in slots], np.float32)
     return half_size[:, 2] / nominal

@@ -1,13 +1,14 @@
-"""Case files: arrangements of blocks written by hand, shipped in `scenes/cases/` or brought by the
-user.
+"""Case files: arrangements written by hand, shipped in `scenes/cases/` or brought by the user.
 
     {"name": "pair", "blocks": [
-        {"shape": "cube", "colour": "red", "position": [0.03, 0, 0.025], "quaternion": [1, 0, 0, 0], "target": true},
-        {"shape": "tile", "colour": "blue", "position": [-0.03, 0, 0.0125], "quaternion": [1, 0, 0, 0]}]}
+        {"shape": "cube", "colour": "red", "position": [0.03, 0, 0.025],
+         "quaternion": [1, 0, 0, 0], "target": true},
+        {"shape": "tile", "colour": "blue", "position": [-0.03, 0, 0.0125],
+         "quaternion": [1, 0, 0, 0]}]}
 
-Shapes and colours are the names in `blocks`; a position, in metres, is that of the centre of the
-bounding box; a quaternion (w, x, y, z) is brought to unit length; `target` may be left out. Sizes,
-densities and frictions are nominal.
+Shapes and colours are the names in `blocks`. A position, in metres, is that of the centre of the
+bounding box. A quaternion (w, x, y, z) is normalised. `target` is optional. Sizes, densities and
+frictions are nominal.
 """
 
 import copy
@@ -17,6 +18,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import mujoco
 import numpy as np
 
@@ -34,8 +36,7 @@ _REQUIRED = ("shape", "colour", "position", "quaternion")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """An arrangement read from a file: as many slots as blocks, all in play, in the file's order. N
-    = blocks."""
+    """An arrangement read from a file. Its N slots are the file's blocks in order, all in play."""
 
     name: str
     slots: tuple[SlotKind, ...]
@@ -48,8 +49,7 @@ def names() -> tuple[str, ...]:
 
 
 def shipped(name: str) -> Path:
-    """File of the shipped case `name`. Raises ValueError if there is none, naming those that there
-    are."""
+    """File of the shipped case `name`. Raises ValueError with all names if there is none."""
     if name not in names():
         raise ValueError(f"unknown case '{name}'; choose one of: {', '.join(names())}")
     return model.assets() / "cases" / f"{name}.json"
@@ -58,8 +58,7 @@ def shipped(name: str) -> Path:
 def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
     """The case in the file `path`, its blocks inside the square of side `extent` m.
 
-    Raises ValueError, in one line that names the file, the block (the first is 1) and what to
-    change.
+    Raises ValueError, one line with the file, the block (the first is 1) and what to change.
     """
     try:
         case = _parse(_read(path))
@@ -78,24 +77,22 @@ def require_target(case: Case) -> None:
 
 
 def seat(case: Case, slots: tuple[SlotKind, ...]) -> Scene:
-    """The case's scene in other slots, each block in the first free one of its kind; slots left
-    over are parked."""
-    free = list(range(len(slots)))
-    place = []
+    """The case's scene in other slots: each block in the first free one of its kind, the rest
+    parked."""
+    free, seats = list(range(len(slots))), []
     for kind in case.slots:
-        place.append(next(slot for slot in free if slots[slot] == kind))
-        free.remove(place[-1])
-    given, scene = case.scene, layout.parked(slots)
-    leaves: dict[str, Any] = {}
-    for field in dataclasses.fields(scene):
-        if field.name == "target":
-            continue
-        leaf = getattr(scene, field.name).copy()
-        leaf[place] = getattr(given, field.name)
-        leaves[field.name] = leaf
-    target = int(given.target)
-    leaves["target"] = np.int32(target if target == layout.ANY else place[target])
-    return dataclasses.replace(scene, **leaves)
+        seats.append(next(slot for slot in free if slots[slot] == kind))
+        free.remove(seats[-1])
+
+    def put(parked: np.ndarray, placed: np.ndarray) -> np.ndarray:
+        leaf = parked.copy()
+        if leaf.ndim:  # all but the target
+            leaf[seats] = placed
+        return leaf
+
+    scene = jax.tree.map(put, layout.parked(slots), case.scene)
+    target = int(case.scene.target)
+    return scene.replace(target=np.int32(target if target == layout.ANY else seats[target]))
 
 
 # From text to a scene.
@@ -119,8 +116,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """The object of these keys and values; a key given twice is an error, as one of the two would
-    be lost."""
+    """The object of these keys and values. Raises ValueError for a key given twice."""
     keys = [key for key, _ in pairs]
     for key in keys:
         if keys.count(key) > 1:
@@ -129,7 +125,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _parse(content: dict[str, Any]) -> Case:
-    """The case of a file's content, its blocks not yet checked against one another."""
+    """The case of a file's content; places are not checked yet."""
     _check_keys(content, ("name", "blocks"), ())
     name, entries = content["name"], content["blocks"]
     if not (isinstance(name, str) and name.isprintable() and 1 <= len(name) <= 100):
@@ -183,9 +179,8 @@ def _check_keys(
             raise ValueError(f'key "{key}" is missing')
     for key in content:
         if key not in required + optional:
-            raise ValueError(
-                f"unknown key {_short(key)}; known are: {', '.join(required + optional)}"
-            )
+            known = ", ".join(required + optional)
+            raise ValueError(f"unknown key {_short(key)}; known are: {known}")
 
 
 def _choice(entry: dict[str, Any], key: str, choices: tuple[str, ...]) -> str:
@@ -196,23 +191,22 @@ def _choice(entry: dict[str, Any], key: str, choices: tuple[str, ...]) -> str:
 
 
 def _numbers(entry: dict[str, Any], key: str, count: int) -> list[float]:
-    """`count` finite numbers; true and false are none, and nothing sensible is larger than 10."""
+    """`count` numbers up to 10, more than any place needs."""
     values = entry[key]
-    if isinstance(values, list) and len(values) == count:
-        # the comparison keeps out NaN, and integers too large for a float
-        good = [
-            isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= 10 for v in values
-        ]
-        if all(good):
-            return [float(value) for value in values]
+    if isinstance(values, list) and len(values) == count and all(map(_is_number, values)):
+        return [float(value) for value in values]
     unit = " in metres" if key == "position" else ""
-    raise ValueError(
-        f'"{key}" must be a list of {count} numbers{unit}, each from -10 to 10, not {_short(values)}'
-    )
+    wanted = f"a list of {count} numbers{unit}, each from -10 to 10"
+    raise ValueError(f'"{key}" must be {wanted}, not {_short(values)}')
+
+
+def _is_number(value: Any) -> bool:
+    """Whether the value lies in -10 .. 10; false for NaN, and for true and false themselves."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= 10
 
 
 def _short(value: Any) -> str:
-    """A value of the file, to be shown on one line."""
+    """A value of the file on one line."""
     text = json.dumps(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -221,9 +215,8 @@ def _assemble(name: str, parsed: list[_Block]) -> Case:
     """The case of these blocks."""
     targets = [slot for slot, block in enumerate(parsed) if block.target]
     if len(targets) > 1:
-        raise ValueError(
-            f"block {targets[1] + 1}: block {targets[0] + 1} is the target already; mark only one"
-        )
+        first, second = targets[0] + 1, targets[1] + 1
+        raise ValueError(f"block {second}: block {first} is the target already; mark only one")
     slots = tuple(block.shape.kind for block in parsed)
     leaves: dict[str, Any] = {
         "position": np.array([block.position for block in parsed], np.float32),
@@ -244,9 +237,8 @@ def _check_places(case: Case, extent: float) -> None:
     world = model.build(SceneConfig(slots=case.slots, min_blocks=1), SimConfig())
     exact = _nominal(world, np.asarray(case.scene.half_size))
     data = mujoco.MjData(exact)
-    data.qpos[world.block_qpos] = np.concatenate(
-        [case.scene.position, case.scene.quaternion], axis=1
-    )
+    poses = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
+    data.qpos[world.block_qpos] = poses
     mujoco.mj_kinematics(exact, data)
     placed: list[list[_Part]] = []  # of the blocks so far
     for slot, kind in enumerate(case.slots):
@@ -269,10 +261,9 @@ class _Part(NamedTuple):
 
 
 def _nominal(world: World, half_size: np.ndarray) -> mujoco.MjModel:
-    """A copy of the world's model with the surfaces of blocks of nominal half sizes [N, 3] m,
-    masses left as they are.
+    """A copy of the world's model with block surfaces of half sizes [N, 3] m, masses unchanged.
 
-    `model.with_blocks` with its masses would do, but first compiles what takes seconds.
+    `model.with_blocks` would do too, but compiles for seconds first.
     """
     exact = copy.copy(world.model)
     size = half_size[world.parts.slot]  # [G, 3]
@@ -289,15 +280,12 @@ def _check_corners(corners: np.ndarray, extent: float) -> None:
     beyond = np.abs(corners[:, :2]).max() - 0.5 * extent
     below, top = -corners[:, 2].min(), corners[:, 2].max()
     if beyond > _ROUNDING:
-        raise ValueError(
-            f"reaches {1e3 * beyond:.1f} mm beyond the square of {extent:g} m; move it inwards"
-        )
+        where = f"beyond the square of {extent:g} m"
+        raise ValueError(f"reaches {1e3 * beyond:.1f} mm {where}; move it inwards")
     if below > MAX_OVERLAP:
         raise ValueError(f"reaches {1e3 * below:.1f} mm below the table; raise its z by as much")
     if top > _HIGHEST:
-        raise ValueError(
-            f"reaches {top:.3f} m above the table; lower its z so that it stays below {_HIGHEST:g} m"
-        )
+        raise ValueError(f"reaches {top:.3f} m above the table; keep it below {_HIGHEST:g} m")
 
 
 def _corners(exact: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
@@ -318,6 +306,6 @@ def _check_overlaps(own: list[_Part], placed: list[list[_Part]]) -> None:
         depth = max(overlap.depth((a.corners, b.corners), (a.normals, b.normals)) for a, b in pairs)
         if depth > MAX_OVERLAP:
             raise ValueError(
-                f"overlaps block {number} by {1e3 * depth:.1f} mm, more than the {1e3 * MAX_OVERLAP:g} mm allowed; "
-                "move them apart"
+                f"overlaps block {number} by {1e3 * depth:.1f} mm, more than the "
+                f"{1e3 * MAX_OVERLAP:g} mm allowed; increase their distance"
             )

@@ -1,9 +1,8 @@
-"""A linter of models for MJX: what its JAX implementation lacks, or carries along and never reads,
-is refused.
+"""A linter of models for MJX: refuses what its JAX implementation lacks, or stores and never reads.
 
-Read off mujoco-mjx 3.17: `put_model`, `step`, and the fields of a model that no other code of MJX
-mentions. Where MJX would raise by itself, now or as it steps, the line here also says what to write
-instead; where it would not, blocks would move otherwise than in C MuJoCo without a word.
+Derived from mujoco-mjx 3.17: `put_model`, `step`, and the fields of a model that no other code of
+MJX mentions. MJX raises for some of it, without a remedy. The rest it ignores silently, and blocks
+would move otherwise than in C MuJoCo.
 """
 
 import itertools
@@ -27,9 +26,8 @@ IGNORED_OPTIONS = (
 )
 INTEGRATORS = {mjtIntegrator.mjINT_EULER, mjtIntegrator.mjINT_RK4, mjtIntegrator.mjINT_IMPLICITFAST}
 SOLVERS = {mjtSolver.mjSOL_NEWTON, mjtSolver.mjSOL_CG}
-ENABLE_FLAGS = {
-    mjtEnableBit.mjENBL_INVDISCRETE
-}  # sleep and ipc pass `put_model`, then nothing reads them
+# Sleep and ipc pass `put_model`, then nothing reads them.
+ENABLE_FLAGS = {mjtEnableBit.mjENBL_INVDISCRETE}
 DISABLE_FLAGS_IGNORED = {
     mjtDisableBit.mjDSBL_MIDPHASE,
     mjtDisableBit.mjDSBL_AUTORESET,
@@ -67,35 +65,23 @@ IGNORED_FIELDS = {  # field of the model, zero unless its attribute of MJCF is u
     "sensor_delay": "sensor delay",
     "sensor_interval": "sensor interval",
 }
-KINDS_LACKING = {  # field of the model: (what it is of, enumeration, values that MJX has no code for)
+_SENSORS_LACKING = (
+    *("E_KINETIC", "E_POTENTIAL", "GEOMDIST", "GEOMFROMTO", "GEOMNORMAL"),
+    *("INSIDESITE", "PLUGIN", "USER"),
+    *(f"{of}LIMIT{what}" for of in ("JOINT", "TENDON") for what in ("FRC", "POS", "VEL")),
+)
+KINDS_LACKING = {  # field of the model: (its element, enumeration, values without code in MJX)
     "actuator_biastype": ("actuator", mujoco.mjtBias, ("DCMOTOR", "SO3", "USER")),
     "actuator_dyntype": ("actuator", mujoco.mjtDyn, ("DCMOTOR", "PID", "USER")),
     "actuator_gaintype": ("actuator", mujoco.mjtGain, ("DCMOTOR", "PID", "SO3", "USER")),
     "actuator_trntype": ("actuator", mujoco.mjtTrn, ("BODY", "SLIDERCRANK", "SO3", "UNDEFINED")),
     "eq_type": ("equality", mujoco.mjtEq, ("DISTANCE", "FLEX", "FLEXSTRAIN", "FLEXVERT")),
-    "sensor_type": (
-        "sensor",
-        mujoco.mjtSensor,
-        (
-            *(
-                "E_KINETIC",
-                "E_POTENTIAL",
-                "GEOMDIST",
-                "GEOMFROMTO",
-                "GEOMNORMAL",
-                "INSIDESITE",
-                "PLUGIN",
-                "USER",
-            ),
-            *(f"{of}LIMIT{what}" for of in ("JOINT", "TENDON") for what in ("FRC", "POS", "VEL")),
-        ),
-    ),
+    "sensor_type": ("sensor", mujoco.mjtSensor, _SENSORS_LACKING),
 }
 
 
 def check(model: mujoco.MjModel) -> None:
-    """Raises SceneError, one line, for the first thing in the model that MJX lacks or would
-    ignore."""
+    """Raises SceneError, one line, for the first fault of the model."""
     for fault in faults(model):
         raise SceneError(f"MJX {fault}")
 
@@ -126,7 +112,10 @@ def _options(option: mujoco.MjOption) -> Iterator[str]:
             yield f"ignores flag {_name(mjtDisableBit, flag)}; do not disable it"
     fluid = option.density > 0.0 or option.viscosity > 0.0 or np.any(option.wind)
     if fluid and option.integrator == mjtIntegrator.mjINT_IMPLICITFAST:
-        yield "lacks fluid drag with implicitfast; set density, viscosity and wind to 0, or integrator to Euler"
+        yield (
+            "lacks fluid drag with implicitfast; "
+            "set density, viscosity and wind to 0, or integrator to Euler"
+        )
 
 
 def _bits(kind: Any, flags: int) -> list[Any]:
@@ -152,13 +141,15 @@ def _kinds(model: mujoco.MjModel) -> Iterator[str]:
         for index, value in enumerate(getattr(model, field)):
             word = kind(value).name.split("_", 1)[1]
             if word in lacking:
-                yield f"lacks {field} {word.lower()} of {_label(model, what, index)}; choose another, or take it out"
+                named = f"{field} {word.lower()} of {_label(model, what, index)}"
+                yield f"lacks {named}; choose another, or take it out"
     reduction, netforce = 1, 3  # column of sensor_intprm, its value
     for index in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).tolist():
         ends = {mjtObj(int(end[index])) for end in (model.sensor_objtype, model.sensor_reftype)}
         if ends & CONTACT_ENDS_LACKING or model.sensor_intprm[index, reduction] == netforce:
+            sensor = _label(model, "sensor", index)
             yield (
-                f"lacks contact by site, body or subtree and netforce of {_label(model, 'sensor', index)}; "
+                f"lacks contact by site, body or subtree and netforce of {sensor}; "
                 "name geoms and another reduction"
             )
 
@@ -175,7 +166,10 @@ def _collisions(model: mujoco.MjModel) -> Iterator[str]:
         pair = " and ".join(_label(model, "geom", geom) for geom in (one, two))
         words = " x ".join(_name(mjtGeom, kind) for kind in kinds)
         if kinds in COLLISIONS_LACKING:
-            yield f"lacks collisions {words} ({pair}); make the round one a mesh of few corners, or let them not meet"
+            yield (
+                f"lacks collisions {words} ({pair}); "
+                "make the round one a mesh of few corners, or let them not meet"
+            )
         elif margin and set(kinds) & NO_MARGIN:
             yield f"lacks margins in collisions {words} ({pair}); set the margin to 0"
 
@@ -191,20 +185,12 @@ def _meeting(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
     filtered = not model.opt.disableflags & mjtDisableBit.mjDSBL_FILTERPARENT
     excluded = set(model.exclude_signature.tolist())
     for one, two in itertools.combinations(np.flatnonzero(kind | affinity).tolist(), 2):
-        apart = weld[one] != weld[two]
-        related = (
-            weld[one] != 0
-            and weld[two] != 0
-            and (weld[one] == parent[two] or weld[two] == parent[one])
-        )
         mask = kind[one] & affinity[two] | kind[two] & affinity[one]
-        bodies = sorted(model.geom_bodyid[[one, two]].tolist())
-        if (
-            apart
-            and mask
-            and not (filtered and related)
-            and (bodies[0] << 16) + bodies[1] not in excluded
-        ):
+        low, high = sorted(model.geom_bodyid[[one, two]].tolist())
+        if not mask or weld[one] == weld[two] or (low << 16) + high in excluded:
+            continue
+        related = weld[one] == parent[two] or weld[two] == parent[one]
+        if not (filtered and related and weld[one] != 0 and weld[two] != 0):
             yield *_by_type(model, one, two), model.geom_margin[one] + model.geom_margin[two]
 
 

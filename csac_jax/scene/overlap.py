@@ -9,14 +9,12 @@ _PARALLEL = 1e-6  # sine of the angle below which two directions count as one
 
 
 def depth(corners: tuple[np.ndarray, np.ndarray], normals: tuple[np.ndarray, np.ndarray]) -> float:
-    """Length in m of the shortest shift that parts two convex bodies; not above 0 where they are
-    apart.
+    """Length in m of the shortest shift that separates two convex bodies; <= 0 without overlap.
 
-    Separating axis theorem: that shift runs along a face normal of either, or square to an edge of
+    Separating axis theorem: the shift runs along a face normal of either, or square to an edge of
     each.
 
-    Args: corners [V, 3] m and face normals [F, 3] of both, in one frame; the numbers of corners and
-    faces may differ.
+    Args: corners [V, 3] m and face normals [F, 3] of both, in one frame; V and F may differ.
     """
     axes = np.concatenate([*normals, _crosses(_edges(normals[0]), _edges(normals[1]))])
     one, two = (corner @ axes.T for corner in corners)  # [V, axes]
@@ -27,21 +25,16 @@ def depth(corners: tuple[np.ndarray, np.ndarray], normals: tuple[np.ndarray, np.
 def _edges(normals: np.ndarray) -> np.ndarray:
     """Directions [D, 3] of a body's edges: an edge is square to the normals of its two faces.
 
-    Faces that do not meet add directions that no edge has; they cannot make the shortest shift
-    shorter than it is.
+    Faces that do not meet add directions that no edge has. They cannot make the shift shorter.
     """
     crosses = _crosses(normals, normals)
-    leading = np.take_along_axis(
-        crosses, np.argmax(np.abs(crosses) > _PARALLEL, axis=1)[:, None], axis=1
-    )
-    return np.unique(
-        np.round(crosses * np.sign(leading), 6), axis=0
-    )  # a direction and its opposite are one
+    first = np.argmax(np.abs(crosses) > _PARALLEL, axis=1)[:, None]
+    sign = np.sign(np.take_along_axis(crosses, first, axis=1))  # opposite directions are one
+    return np.unique(np.round(crosses * sign, 6), axis=0)
 
 
 def _crosses(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Unit vectors [D, 3] square to every pair of the directions [A, 3] and [B, 3] that are not
-    parallel."""
+    """Unit vectors [D, 3] square to both directions, of all pairs that are not parallel."""
     crosses = np.cross(one[:, None], two[None]).reshape(-1, 3)
     length = np.linalg.norm(crosses, axis=1)
     crossed = length > _PARALLEL

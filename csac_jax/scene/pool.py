@@ -1,8 +1,7 @@
-"""A pool of settled scenes: blocks dropped one above the other and left to come to rest, once per
-configuration.
+"""A pool of settled scenes: blocks dropped one above the other, which then come to rest.
 
-Settling runs in C MuJoCo on all cores, bit-identical for any number of threads, and is cached by
-content.
+Settling runs in C MuJoCo on all cores. It gives the same bits for any number of threads, and the
+result is cached by content.
 """
 
 import concurrent.futures
@@ -38,25 +37,24 @@ _STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
-_MOST_DROPS = 3  # times the number of blocks: pauses that pouring a scene may take
+_MOST_DROPS = 3  # pauses that pouring a scene may take, per block
+_EFFORT = 20  # solver and line-search iterations: quality over speed, this runs once
 
 
 def settled(
     world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool = False
 ) -> Scene:
-    """`count` distinct settled scenes per number of blocks, leaves [P, N, ...], from the cache or
-    settled now.
+    """`count` distinct settled scenes per number of blocks, fewest first; leaves [P, N, ...].
 
-    P = count for each number from `min_blocks` to N, fewest first.
+    P = count for each number from `min_blocks` to N. Every block in play lies still, its centre
+    within extent / 2 of the workspace centre, so that a scene can be rotated by any yaw.
 
-    Every block in play lies still, its centre within extent / 2 of the workspace centre, so that a
-    scene can be turned by any yaw. `world` is one with the floating hand, which waits high above.
-    The same arguments give the same scenes on every machine of one kind. Raises SceneError where
-    hardly any scene comes to rest.
+    Blocks start all at once, stacked up in the air. With `poured` they drop one after another
+    from `drop_height` above the pile, and again if they roll off: for piles of more blocks than
+    fit side by side.
 
-    Blocks are dropped all at once, stacked up in the air; `poured` drops one after another from
-    `drop_height` above what lies there already, and those that roll off anew, for piles of more
-    blocks than fit beside one another.
+    `world` has the floating hand, which waits high above. The same arguments give the same scenes
+    on every machine of one kind. Raises SceneError where hardly any scene comes to rest.
     """
     path = _cache_folder() / f"{_digest(world, cfg, extent, stream, count, poured)}.npz"
     cached = _read(path)
@@ -82,54 +80,46 @@ def _settle(
     """`count` settled scenes of `in_play` blocks."""
     fall = pour if poured else rest
     fields_of = jax.vmap(functools.partial(scene_fields, world))
-    found: list[Scene] = []
-    kept = dropped = 0
+    settled_scenes: list[Scene] = []
+    dropped = 0
     with concurrent.futures.ThreadPoolExecutor() as threads:
-        while kept < count:
-            # a round of piles takes minutes: no more of them than are wanted
-            num = min(_ROUND, count - kept) if poured else _ROUND
+        while len(settled_scenes) < count:
+            # A round of piles takes minutes: no more of them than are wanted.
+            num = min(_ROUND, count - len(settled_scenes)) if poured else _ROUND
             drops = [_drop(cfg, rng, in_play) for _ in range(num)]
-            fields = jax.device_get(
-                fields_of(jax.tree.map(lambda *leaves: np.stack(leaves), *drops))
-            )
+            batch = jax.tree.map(lambda *leaves: np.stack(leaves), *drops)
+            fields = jax.device_get(fields_of(batch))
             rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
-            ended = threads.map(
-                lambda scene, row: fall(world, cfg, extent, scene, row), drops, rows
-            )
-            good = [scene for scene in ended if scene is not None]
-            found, kept, dropped = found + good, kept + len(good), dropped + num
-            if dropped >= 20 * _ROUND and kept < dropped / 50:
+            ends = threads.map(functools.partial(fall, world, cfg, extent), drops, rows)
+            settled_scenes += [scene for scene in ends if scene is not None]
+            dropped += num
+            if dropped >= 20 * _ROUND and len(settled_scenes) < dropped / 50:
                 raise SceneError(
-                    f"only {kept} of {dropped} dropped scenes came to rest inside the workspace; "
-                    "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
+                    f"only {len(settled_scenes)} of {dropped} dropped scenes came to rest inside "
+                    "the workspace; lower scene.min_blocks or scene.drop_extent, or raise "
+                    "scene.settle_time"
                 )
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *found[:count])
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *settled_scenes[:count])
 
 
 def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
     """A random scene of `count` blocks before they fall: dropped as in VPG, one above the other."""
-    num = len(cfg.slots)
+    num, palette = len(cfg.slots), len(blocks.COLOURS)
     in_play = rng.permutation(num) < count
     quaternion = rng.normal(size=(num, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     half = 0.5 * rng.uniform(*cfg.drop_extent)
-    position = np.concatenate(
-        [
-            rng.uniform(-half, half, (num, 2)),
-            cfg.drop_height + _SPACING * rng.permutation(num)[:, None],
-        ],
-        axis=1,
-    )
+    xy = rng.uniform(-half, half, (num, 2))
+    z = cfg.drop_height + _SPACING * rng.permutation(num)[:, None]
+    position = np.concatenate([xy, z], axis=1)
     leaves: dict[str, Any] = {
         "position": np.where(in_play[:, None], position, layout.parking(num)).astype(np.float32),
-        "quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).astype(
-            np.float32
-        ),
+        "quaternion": quaternion.astype(np.float32),
         "velocity": np.zeros((num, 6), np.float32),
         "half_size": _half_sizes(cfg, rng),
         "density": rng.uniform(*cfg.density, num).astype(np.float32),
         "friction": rng.uniform(*cfg.friction, num).astype(np.float32),
-        "colour": rng.permutation(max(num, len(blocks.COLOURS)))[:num].astype(np.int32)
-        % len(blocks.COLOURS),
+        "colour": rng.permutation(max(num, palette))[:num].astype(np.int32) % palette,
         "in_play": in_play,
         "target": np.int32(layout.ANY),
     }
@@ -137,10 +127,10 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 
 
 def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
-    """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; mesh blocks of one kind
-    alike."""
+    """Half sizes [N, 3] m: a shape of each slot's kind, larger or smaller; one size for all mesh
+    blocks of a kind."""
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
-    scales = 1.0 + blocks.spread(cfg) * rng.uniform(-1.0, 1.0, len(cfg.slots))
+    scales = 1.0 + blocks.size_jitter(cfg) * rng.uniform(-1.0, 1.0, len(cfg.slots))
     sizes = np.stack([kind[rng.integers(len(kind))] for kind in choices])
     return (sizes * scales[blocks.size_leader(cfg.slots)][:, None]).astype(np.float32)
 
@@ -150,7 +140,7 @@ def _falling(
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The scene's blocks where they are, the hand high above."""
     model = with_blocks(world, fields)
-    model.opt.iterations, model.opt.ls_iterations = 20, 20  # quality over speed: this runs once
+    model.opt.iterations = model.opt.ls_iterations = _EFFORT
     model.opt.timestep = 0.5 * world.model.opt.timestep
     data = mujoco.MjData(model)
     data.qpos[world.robot_qpos] = [0.0, 0.0, HAND_PARK_HEIGHT, 0.0, 0.0, 0.0]
@@ -162,7 +152,7 @@ def _falling(
 def rest(
     world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields
 ) -> Scene | None:
-    """The scene after its blocks fell, None where a block is not at rest or left the workspace."""
+    """The scene after its blocks fell; None where one is not at rest or left the workspace."""
     model, data = _falling(world, scene, fields)
     model.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
     mujoco.mj_step(model, data, nstep=round(cfg.settle_time / model.opt.timestep))
@@ -172,8 +162,10 @@ def rest(
 def pour(
     world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields
 ) -> Scene | None:
-    """As `rest`, the blocks dropped one after another, lowest first; one that leaves the workspace
-    is dropped anew."""
+    """As `rest`, with the blocks dropped one after another, lowest first.
+
+    A block that leaves the workspace is dropped again.
+    """
     model, data = _falling(world, scene, fields)
     num, still = len(scene.in_play), round(_PAUSE / model.opt.timestep)
     waiting = [int(slot) for slot in np.argsort(scene.position[:, 2]) if scene.in_play[slot]]
@@ -184,10 +176,8 @@ def pour(
 
     def run() -> None:
         for _ in range(0, still, _PIN_EVERY):
-            data.qpos[world.block_qpos[aloft, :3]], data.qvel[world.block_dofs[aloft]] = (
-                pinned[aloft],
-                0.0,
-            )
+            data.qpos[world.block_qpos[aloft, :3]] = pinned[aloft]
+            data.qvel[world.block_dofs[aloft]] = 0.0
             mujoco.mj_step(model, data, nstep=_PIN_EVERY)
 
     for _ in range(_MOST_DROPS * len(waiting)):
@@ -195,10 +185,8 @@ def pour(
             slot = waiting.pop(0)
             high = data.qpos[world.block_qpos[~aloft, 2]].max(initial=0.0)
             aloft[slot], quiet = False, 0.0
-            data.qpos[world.block_qpos[slot, :3]] = [
-                *rng.uniform(-half, half, 2),
-                high + cfg.drop_height,
-            ]
+            place = [*rng.uniform(-half, half, 2), high + cfg.drop_height]
+            data.qpos[world.block_qpos[slot, :3]] = place
             data.qvel[world.block_dofs[slot]] = 0.0
         run()
         quiet += _PAUSE
@@ -211,7 +199,7 @@ def pour(
 
 
 def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> Scene | None:
-    """The scene as its blocks lie now, None where a block is not at rest or left the workspace."""
+    """The scene as its blocks lie now; None where one is not at rest or left the workspace."""
     parked = ~scene.in_play
     pose = data.qpos[world.block_qpos].astype(np.float32)
     position, quaternion = pose[:, :3], pose[:, 3:]
@@ -220,10 +208,9 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
     ok &= (speed.max(axis=1) < _STILL) & (position[:, 2] > 0.0) & np.isfinite(pose).all(axis=1)
     if not np.all(ok | parked):
         return None
-    upright = np.array([1, 0, 0, 0], np.float32)
     rest: dict[str, Any] = {
         "position": np.where(parked[:, None], scene.position, position),
-        "quaternion": np.where(parked[:, None], upright, quaternion),
+        "quaternion": np.where(parked[:, None], layout.UPRIGHT, quaternion),
     }
     return dataclasses.replace(scene, **rest)
 
@@ -236,15 +223,8 @@ def _digest(
     world: World, cfg: SceneConfig, extent: float, stream: int, count: int, poured: bool
 ) -> str:
     """Name of a pool: hash of everything that decides its content."""
-    relevant = (
-        _VERSION,
-        mujoco.__version__,
-        repr(cfg),
-        float(extent),
-        stream,
-        count,
-        world.model.opt.timestep,
-    )
+    versions = (_VERSION, mujoco.__version__)
+    relevant = (*versions, repr(cfg), float(extent), stream, count, world.model.opt.timestep)
     content = hashlib.sha256(repr((*relevant, "poured") if poured else relevant).encode())
     for name in ("table.xml", "hand.xml", "blocks.xml"):
         content.update((assets() / name).read_bytes())
@@ -252,21 +232,19 @@ def _digest(
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
-    return hashlib.sha256(
-        b"".join(np.ascontiguousarray(arrays[name]).tobytes() for name in sorted(arrays))
-    ).hexdigest()
+    content = (np.ascontiguousarray(arrays[name]).tobytes() for name in sorted(arrays))
+    return hashlib.sha256(b"".join(content)).hexdigest()
 
 
 def _read(path: Path) -> Scene | None:
-    """The cached scenes, None where there are none or they are damaged (they are then settled
-    anew)."""
+    """The cached scenes; None where there are none or the file is damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         if str(arrays.pop("sha256")) != _checksum(arrays):
             return None
         return Scene(**arrays)
-    except Exception:  # a damaged archive raises nearly anything: BadZipFile, NotImplementedError, ValueError, KeyError
+    except Exception:  # a damaged archive raises nearly anything, BadZipFile to KeyError
         return None
 
 

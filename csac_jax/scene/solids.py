@@ -1,5 +1,4 @@
-"""Any MuJoCo model as groups of geoms of one kind: what the raycaster takes where blocks are not
-all there is to see.
+"""Any MuJoCo model as groups of geoms of one kind, for rays that meet more than blocks.
 
 scene = solids.read(model)  # on the host, once
 scene = solids.place(scene, data.geom_xpos, data.geom_xmat)  # also inside compiled functions
@@ -39,7 +38,7 @@ _KIND_OF_TYPE = {
 
 
 @struct.dataclass
-class Group:
+class GeomGroup:
     """The geoms of one kind in one scene. G = geoms, F = faces of the polytope with most."""
 
     kind: Kind = struct.field(pytree_node=False)
@@ -51,32 +50,26 @@ class Group:
 
 @struct.dataclass
 class Solids:
-    """All that is to be seen of one scene."""
+    """All visible geoms of one scene."""
 
-    groups: tuple[Group, ...]  # one per kind
+    groups: tuple[GeomGroup, ...]  # one per kind
     colour: jax.Array  # [geoms, 3] red, green, blue in 0 .. 1, by the geom's number
 
 
 def read(
     model: mujoco.MjModel, xpos: np.ndarray | None = None, xmat: np.ndarray | None = None
 ) -> Solids:
-    """The visible geoms of a model, NumPy leaves, numbered as there; in the model's rest pose if no
-    other is given.
+    """The visible geoms of a model, NumPy leaves, numbered as there.
 
-    Left out are geoms whose opacity is 0. A mesh is its convex hull. Args: as in `place`.
-    Raises ValueError for a geom of a type that the raycaster cannot meet, with its name.
+    Geoms of opacity 0 are left out. A mesh is its convex hull. Args: poses as in `place`, those of
+    the model's rest state by default. Raises ValueError with the name of a geom of another type.
     """
-    opacity = np.where(model.geom_matid >= 0, _material(model)[:, 3], model.geom_rgba[:, 3])
-    members: dict[Kind, list[int]] = {}
-    for geom in map(int, np.flatnonzero(opacity > 0.0)):
-        members.setdefault(_kind(model, geom), []).append(geom)
-    groups = tuple(
-        _group(model, kind, np.array(geoms, np.int32)) for kind, geoms in members.items()
-    )
-    colours: Any = np.where(model.geom_matid[:, None] >= 0, _material(model), model.geom_rgba)[
-        :, :3
-    ]
-    solids = Solids(groups, colours.astype(np.float32))
+    rgba: Any = np.where(model.geom_matid[:, None] >= 0, _material(model), model.geom_rgba)
+    geoms_of: dict[Kind, list[int]] = {}
+    for geom in map(int, np.flatnonzero(rgba[:, 3] > 0.0)):
+        geoms_of.setdefault(_kind(model, geom), []).append(geom)
+    groups = [_group(model, kind, np.array(geoms, np.int32)) for kind, geoms in geoms_of.items()]
+    solids = Solids(tuple(groups), rgba[:, :3].astype(np.float32))
     if xpos is None or xmat is None:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -85,38 +78,38 @@ def read(
 
 
 def _kind(model: mujoco.MjModel, geom: int) -> Kind:
-    kind = _KIND_OF_TYPE.get(mujoco.mjtGeom(model.geom_type[geom]))
-    if kind is None:
-        name, given = model.geom(geom).name or geom, mujoco.mjtGeom(model.geom_type[geom]).name
-        known = ", ".join(each.name.removeprefix("mjGEOM_").lower() for each in _KIND_OF_TYPE)
+    geom_type = mujoco.mjtGeom(model.geom_type[geom])
+    if geom_type not in _KIND_OF_TYPE:
+        name = model.geom(geom).name or geom
+        known = ", ".join(map(_type_name, _KIND_OF_TYPE))
         raise ValueError(
-            f"geom {name}: rays do not meet type {given.removeprefix('mjGEOM_').lower()}; use: {known}"
+            f"geom {name}: rays do not meet type {_type_name(geom_type)}; use: {known}"
         )
-    return kind
+    return _KIND_OF_TYPE[geom_type]
 
 
-def _group(model: mujoco.MjModel, kind: Kind, geoms: np.ndarray) -> Group:
+def _type_name(geom_type: mujoco.mjtGeom) -> str:
+    return geom_type.name.removeprefix("mjGEOM_").lower()
+
+
+def _group(model: mujoco.MjModel, kind: Kind, geoms: np.ndarray) -> GeomGroup:
+    is_mesh = kind is Kind.POLYTOPE
     leaves: dict[str, Any] = {
-        "shape": _half_spaces(model, geoms)
-        if kind is Kind.POLYTOPE
-        else model.geom_size[geoms].astype(np.float32),
+        "shape": _half_spaces(model, geoms) if is_mesh else np.float32(model.geom_size[geoms]),
         "position": np.zeros((len(geoms), 3), np.float32),
         "rotation": np.zeros((len(geoms), 3, 3), np.float32),
         "geom": geoms,
     }
-    return Group(kind=kind, **leaves)
+    return GeomGroup(kind=kind, **leaves)
 
 
 def _half_spaces(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
-    """Faces [G, F, 4] of the convex hulls of mesh geoms; what is not there has a zero normal and
-    bounds nothing."""
+    """Faces [G, F, 4] of the convex hulls of mesh geoms; padding faces have a zero normal."""
     hulls = []
     for mesh in model.geom_dataid[geoms]:
         start = model.mesh_vertadr[mesh]
         equations = ConvexHull(model.mesh_vert[start : start + model.mesh_vertnum[mesh]]).equations
-        _, kept = np.unique(
-            equations.round(5), axis=0, return_index=True
-        )  # the hull is triangulated
+        _, kept = np.unique(equations.round(5), axis=0, return_index=True)  # of the triangles
         hulls.append(equations[kept] * [1.0, 1.0, 1.0, -1.0])
     faces = np.zeros((len(hulls), max(map(len, hulls)), 4), np.float32)
     faces[:, :, 3] = blocks.PADDING_OFFSET
@@ -127,16 +120,15 @@ def _half_spaces(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
 
 def _material(model: mujoco.MjModel) -> np.ndarray:
     """Colour and opacity [geoms, 4] of every geom's material; zero where it has none."""
-    every = np.concatenate([model.mat_rgba, np.zeros((1, 4), np.float32)])
-    return every[model.geom_matid]  # -1 is the last row
+    rows = np.concatenate([model.mat_rgba, np.zeros((1, 4), np.float32)])
+    return rows[model.geom_matid]  # -1 is the last row
 
 
 def place(solids: Solids, xpos: jax.Array | np.ndarray, xmat: jax.Array | np.ndarray) -> Solids:
-    """The same geoms at other poses: xpos [geoms, 3] m, xmat [geoms, 9] or [geoms, 3, 3] geom to
-    world."""
+    """The same geoms at other poses: xpos [geoms, 3] m; xmat [geoms, 9 or 3, 3], geom to world."""
     rotation = xmat.reshape(-1, 3, 3)
-    moved = (
+    moved = [
         group.replace(position=xpos[group.geom], rotation=rotation[group.geom])
         for group in solids.groups
-    )
+    ]
     return solids.replace(groups=tuple(moved))

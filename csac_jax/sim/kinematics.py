@@ -1,10 +1,9 @@
-"""UR5 kinematics in closed form: where the finger tips are, and the joint angles that bring them to
-a pose.
+"""UR5 kinematics in closed form: the pose of the finger tips, and joint angles for a pose.
 
-Frames: the arm's base frame has the world's axes; the tip frame is that of `scenes/rg2.xml`,
-between the finger tips, z back to the flange, fingers closing along x. Joint angles [6] rad in the
-maker's order and sense: shoulder pan, shoulder lift, elbow, wrist 1, 2, 3. Sums are written out
-instead of matrix products, which a GPU may round to ten bits.
+The arm's base frame has the world's axes. The tip frame is that of `scenes/rg2.xml`: between the
+finger tips, z back to the flange, fingers closing along x. Joint angles [6] rad have the maker's
+order and sense: shoulder pan, shoulder lift, elbow, wrist 1, 2, 3. Sums are written out, since a
+GPU may round matrix products to ten bits.
 """
 
 import itertools
@@ -14,27 +13,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from csac_jax.geometry import FULL_TURN
+
 # The maker's Denavit-Hartenberg parameters, m (Universal Robots, UR5 of series 3).
 D1, A2, A3, D4, D5, D6 = 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823
 BASE = (0.6, 0.0, 0.35)  # m, ours: see scenes/README.md
-TOOL = (
-    0.213  # m, flange to finger tips: mean of the RG2 open and closed, from its maker's description
-)
+TOOL = 0.213  # m, flange to finger tips: mean of the RG2 open and closed, see scenes/README.md
 LIMITS = np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0], np.float32)  # rad, either way
 MAX_SPEED = np.pi  # rad/s of every joint, the maker's
-HOME = np.array(
-    [-0.183, -0.976, 1.832, -2.426, -1.571, 1.388], np.float32
-)  # rad, tips 0.2 m above the centre: ours
+# rad, ours: tips 0.2 m above the centre
+HOME = np.array([-0.183, -0.976, 1.832, -2.426, -1.571, 1.388], np.float32)
 
-SINGULAR = (
-    0.01  # sine of an angle (shoulder, elbow, wrist) below which a branch does not count: ours
-)
-_ON_TABLE = 0.02  # m, least room between a link and the table
-_APART = 0.01  # m, least room between two links
+SINGULAR = 0.01  # least sine of shoulder, elbow and wrist angle for a branch to count: ours
+_TABLE_CLEARANCE = 0.02  # m, least distance between a link and the table
+_LINK_CLEARANCE = 0.01  # m, least distance between two links
 _FAR = 10.0  # m, positions beyond are out of reach whatever the arm does
-_TURN = 2.0 * np.pi
 
-# Signs of shoulder, elbow and wrist: the eight ways to a pose.
+# Signs of shoulder, elbow and wrist: the eight solutions for a pose.
 BRANCHES = np.array(list(itertools.product((1.0, -1.0), repeat=3)), np.float32)
 
 
@@ -45,7 +40,7 @@ class Pose(NamedTuple):
     rotation: jax.Array  # [3, 3], tip to world
 
 
-class Trajectory(NamedTuple):
+class JointTargets(NamedTuple):
     """What the actuators are told. T = set-points."""
 
     target: jax.Array  # [T, 7] six joint angles rad, half the opening m
@@ -77,11 +72,8 @@ def _frames(q: jax.Array) -> _Frames:
     """Frames of the joint angles `q` [6], by the maker's parameters."""
     cos, sin = jnp.cos(q), jnp.sin(q)
     zero, one = jnp.zeros_like(q[0]), jnp.ones_like(q[0])
-    ahead, side, up = (
-        _vector(cos[0], sin[0], zero),
-        _vector(sin[0], -cos[0], zero),
-        _vector(zero, zero, one),
-    )
+    ahead, side = _vector(cos[0], sin[0], zero), _vector(sin[0], -cos[0], zero)
+    up = _vector(zero, zero, one)
 
     def along(angle):
         return jnp.cos(angle) * ahead + jnp.sin(angle) * up
@@ -112,8 +104,7 @@ def forward(q: jax.Array) -> Pose:
 
 
 def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
-    """Pose of a hand that points straight down with its tips at `xyz` [3] m, fingers closing along
-    `yaw` [] rad."""
+    """Pose of a hand that points down, tips at `xyz` [3] m, fingers closing along `yaw` [] rad."""
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     rows = (_vector(cos, -sin, zero), _vector(sin, cos, zero), _vector(zero, zero, zero + 1.0))
     return Pose(xyz, jnp.stack(rows))
@@ -122,19 +113,18 @@ def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
 def inverse(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Joint angles of all eight branches to a pose of the tips, in closed form.
 
-    After Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013),
-    with every arc cosine in its `atan2` form: near 1, one rounding of a cosine in float32 is an
-    angle of 3e-4. Every step takes the angles found before as they are, so that what one lost to
-    rounding the next makes up for: no refinement is needed.
+    After Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
+    Arc cosines take their `atan2` form: near 1, one rounding of a float32 cosine is an angle of
+    3e-4. Every step uses the rounded angles found before, so that later steps correct them.
 
-    Args: position [3] m; rotation [3, 3], tip to world. Returns: [8, 6] rad in [-pi, pi], order of
-    BRANCHES; [8] bool, False where the pose is out of the branch's reach or within SINGULAR of
-    where two branches meet. Angles are finite, and mean nothing, where it is False.
+    Args: position [3] m; rotation [3, 3], tip to world.
+    Returns: [8, 6] rad in [-pi, pi], order of BRANCHES; [8] bool, False where the pose is out of
+    the branch's reach or within SINGULAR of where two branches meet. Angles are finite but
+    meaningless where it is False.
     """
     columns = jnp.sum(rotation**2, axis=0)
-    sane = jnp.all(jnp.abs(position) < _FAR) & jnp.all(
-        jnp.abs(columns - 1.0) < 0.01
-    )  # False for NaN
+    unit = jnp.all(jnp.abs(columns - 1.0) < 0.01)
+    sane = jnp.all(jnp.abs(position) < _FAR) & unit  # False for NaN
     position, rotation = jnp.where(sane, position, 0.0), jnp.where(sane, rotation, jnp.eye(3))
     joints, valid = jax.vmap(_branch, (None, None, 0))(position, rotation, jnp.asarray(BRANCHES))
     return joints, valid & sane
@@ -143,16 +133,13 @@ def inverse(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Ar
 def _branch(
     position: jax.Array, rotation: jax.Array, signs: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Joint angles [6] of one branch, and if they count [] bool. Args: signs [3] of shoulder,
-    elbow, wrist."""
+    """Joint angles [6] of the branch of these `signs` [3], and whether they count [] bool."""
     x6, y6, down = rotation[:, 0], -rotation[:, 1], -rotation[:, 2]
     from_base = position - jnp.array(BASE) - (D6 + TOOL) * down  # wrist 3
     pan, shoulder_ok = _shoulder(from_base[:2], signs[0])
     zero = jnp.zeros_like(pan)
-    ahead, side = (
-        _vector(jnp.cos(pan), jnp.sin(pan), zero),
-        _vector(jnp.sin(pan), -jnp.cos(pan), zero),
-    )
+    ahead = _vector(jnp.cos(pan), jnp.sin(pan), zero)
+    side = _vector(jnp.sin(pan), -jnp.cos(pan), zero)
 
     wrist2, wrist3, wrist_ok = _wrist(_dot(side, x6), _dot(side, y6), _dot(side, down), signs[2])
     x5 = jnp.cos(wrist3) * x6 - jnp.sin(wrist3) * y6
@@ -167,21 +154,18 @@ def _branch(
 
 
 def _shoulder(xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Shoulder pan [] that puts wrist 3 at `xy` [2] m from the base, D4 to the side of the arm's
-    plane."""
+    """Shoulder pan [] that puts wrist 3 at `xy` [2] m from the base, D4 beside the arm's plane."""
     square = _dot(xy, xy)
     ok = square - D4**2 > SINGULAR**2 * square
     xy, square = jnp.where(ok, xy, jnp.array([1.0, 0.0])), jnp.where(ok, square, 1.0)
-    return jnp.arctan2(xy[1], xy[0]) + 0.5 * np.pi + sign * jnp.arctan2(
-        jnp.sqrt(square - D4**2), D4
-    ), ok
+    towards, offset = jnp.arctan2(xy[1], xy[0]), jnp.arctan2(jnp.sqrt(square - D4**2), D4)
+    return towards + 0.5 * np.pi + sign * offset, ok
 
 
 def _wrist(
     x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Wrist 2 and 3 [] from the components [] along the flange's axes of the axis that joints 2, 3
-    and 4 share."""
+    """Wrist 2 and 3 [] from the axis of joints 2, 3 and 4, `x` `y` `z` [] in the flange's frame."""
     square = x**2 + y**2
     ok = square > SINGULAR**2
     x, y, square = jnp.where(ok, x, 1.0), jnp.where(ok, y, 0.0), jnp.where(ok, square, 1.0)
@@ -191,17 +175,14 @@ def _wrist(
 def _elbow(
     ahead: jax.Array, up: jax.Array, sign: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Shoulder lift and elbow [] that put wrist 1 `ahead` [] and `up` [] m from the shoulder, in
-    the arm's plane.
+    """Shoulder lift and elbow [] that put wrist 1 `ahead` and `up` [] m from the shoulder.
 
-    With r the distance, sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3), and cos^2 = (r^2 - (a2 -
-    a3)^2) / (4 a2 a3).
+    With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3),
+    cos^2(q3 / 2) = (r^2 - (a2 - a3)^2) / (4 a2 a3).
     """
     square = ahead**2 + up**2
-    sin2, cos2 = (
-        ((A2 + A3) ** 2 - square) / (4.0 * A2 * A3),
-        (square - (A2 - A3) ** 2) / (4.0 * A2 * A3),
-    )
+    sin2 = ((A2 + A3) ** 2 - square) / (4.0 * A2 * A3)
+    cos2 = (square - (A2 - A3) ** 2) / (4.0 * A2 * A3)
     ok = jnp.minimum(sin2, cos2) > (0.5 * SINGULAR) ** 2
     ahead, up, sin2, cos2 = (
         jnp.where(ok, v, w) for v, w in ((ahead, 0.5), (up, 0.0), (sin2, 0.5), (cos2, 0.5))
@@ -213,57 +194,43 @@ def _elbow(
 
 def _wrap(angle: jax.Array) -> jax.Array:
     """The same directions in [-pi, pi] rad, any shape."""
-    return angle - _TURN * jnp.round(angle / _TURN)
+    return angle - FULL_TURN * jnp.round(angle / FULL_TURN)
 
 
-_SHOULDER_OFFSET, _FOREARM_OFFSET = (
-    0.13585,
-    0.0165,
-)  # m, of the links' middles along `side`: ur_description
-_RADII = np.array(
-    [0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045, 0.045, 0.07], np.float32
-)  # m, of _capsules
-# Pairs of capsules that could meet; the links' shape keeps all others apart or together.
+# m along `side`, of the links' middles (ur_description).
+_SHOULDER_OFFSET, _FOREARM_OFFSET = 0.13585, 0.0165
+_PALM, _FINGERS = 0.115, 0.07  # m from the tips back to the ends of the gripper's two capsules
+# m, of _capsules
+_RADII = np.array([0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045, 0.045, 0.07], np.float32)
+# Pairs of capsules that could meet; the shape of the links rules out all others.
 _PAIRS = np.array([
     *itertools.product((0,), (3, 4, 5, 6, 7, 8)),
     *itertools.product((1,), (4, 5, 6, 7, 8)),
     *itertools.product((2,), (5, 6, 7, 8)),
     *itertools.product((3, 4), (7, 8)),
 ])  # fmt: skip
-_ABOVE_TABLE = np.array([2, 3, 4, 5, 6, 7])  # not the hand, whose place is the planner's to choose
+_ABOVE_TABLE = np.array([2, 3, 4, 5, 6, 7])  # not the hand, whose height is the planner's choice
 
 
 def _capsules(q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends [9, 3] and [9, 3] m of the capsules about pedestal, shoulder, upper arm, elbow, forearm,
-    wrist 1, wrist 2, wrist 3 with the gripper's body, and open fingers; all but the last two are
-    geoms of `scenes/ur5.xml`."""
+    """Ends [9, 3] and [9, 3] m of the capsules about the arm.
+
+    Pedestal, shoulder, upper arm, elbow, forearm, wrist 1, wrist 2, wrist 3 with the gripper's
+    body, and open fingers. All but the last two are geoms of `scenes/ur5.xml`.
+    """
     f = _frames(q)
     foot = jnp.array([BASE[0], BASE[1], 0.0])
-    palm, tips = f.wrist3 + (D6 + TOOL - 0.115) * f.down, f.wrist3 + (D6 + TOOL - 0.07) * f.down
+    palm, tips = (f.wrist3 + (D6 + TOOL - back) * f.down for back in (_PALM, _FINGERS))
     outer, inner = _SHOULDER_OFFSET * f.side, _FOREARM_OFFSET * f.side
-    start = (
-        foot,
-        f.shoulder,
-        f.shoulder + outer,
-        f.elbow + outer,
-        f.elbow + inner,
-        f.wrist1 + inner,
-    )
-    end = (
-        f.shoulder,
-        f.shoulder + outer,
-        f.elbow + outer,
-        f.elbow + inner,
-        f.wrist1 + inner,
-        f.wrist2,
-    )
-    return jnp.stack([*start, f.wrist2, f.wrist3, palm]), jnp.stack([*end, f.wrist3, palm, tips])
+    arm = [foot, f.shoulder, f.shoulder + outer, f.elbow + outer, f.elbow + inner]
+    arm += [f.wrist1 + inner, f.wrist2]
+    return jnp.stack([*arm, f.wrist3, palm]), jnp.stack([*arm[1:], f.wrist3, palm, tips])
 
 
 def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array) -> jax.Array:
     """Distance [] m between the segments `p0` `p1` and `q0` `q1` [3] m, neither of them a point.
 
-    The nearest points of the lines, clipped to one segment, then to the other, and back (Ericson,
+    The nearest points of the lines are clipped to one segment, to the other, and back (Ericson,
     Real-Time Collision Detection, 5.1.9).
     """
     u, v, w = p1 - p0, q1 - q0, p0 - q0
@@ -278,52 +245,30 @@ def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array
 
 
 def clearance(q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Room [] m between the table and the arm at the joint angles `q` [6] rad, and between links
-    that could meet.
+    """Least distance [] m at the joint angles `q` [6] rad from arm to table, and between links.
 
-    The links are capsules; the fingers may touch the table. Negative: they overlap.
+    The links are capsules, the fingers may touch the table. Negative: they overlap.
     """
     start, end = _capsules(q)
     above = jnp.minimum(start[:, 2], end[:, 2]) - jnp.asarray(_RADII)
     first, second = _PAIRS.T
-    apart = jax.vmap(_segment_distance)(start[first], end[first], start[second], end[second])
-    return jnp.min(above[_ABOVE_TABLE]), jnp.min(
-        apart - jnp.asarray(_RADII[first] + _RADII[second])
-    )
+    axes = jax.vmap(_segment_distance)(start[first], end[first], start[second], end[second])
+    between = axes - jnp.asarray(_RADII[first] + _RADII[second])
+    return jnp.min(above[_ABOVE_TABLE]), jnp.min(between)
 
 
 def clear(q: jax.Array) -> jax.Array:
-    """True where the arm at the joint angles `q` [6] rad keeps off the table and itself, []
-    bool."""
-    above, apart = clearance(q)
-    return (above > _ON_TABLE) & (apart > _APART)
+    """True where the arm at the joint angles `q` [6] rad avoids the table and itself, [] bool."""
+    to_table, between_links = clearance(q)
+    return (to_table > _TABLE_CLEARANCE) & (between_links > _LINK_CLEARANCE)
 
 
-def nearest(
-    q_from: jax.Array, solutions: jax.Array, valid: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The valid solution that is the least turn away from `q_from` [6] rad, each joint by the turn
-    that suits best.
+def joint_targets(q_start: jax.Array, control: jax.Array) -> JointTargets:
+    """Joint targets that lead the tips through set-points, all on one branch.
 
-    Args: solutions [8, 6] rad in [-pi, pi], valid [8] bool, as of `inverse`.
-    Returns: [6] rad within LIMITS, `q_from` where nothing is valid; [] bool, if anything is.
-    """
-    turned = solutions + _TURN * jnp.round((q_from[None] - solutions) / _TURN)
-    limit = jnp.asarray(LIMITS)[None]
-    turned = turned + _TURN * jnp.where(turned > limit, -1.0, jnp.where(turned < -limit, 1.0, 0.0))
-    turn = jnp.where(valid, jnp.sum((turned - q_from[None]) ** 2, axis=1), jnp.inf)
-    reachable = jnp.any(valid)
-    return jnp.where(reachable, turned[jnp.argmin(turn)], q_from), reachable
-
-
-def trajectory(q_start: jax.Array, control: jax.Array) -> Trajectory:
-    """Joint targets that lead the tips through set-points, on the one branch that reaches all of
-    them, or the most.
-
-    Among branches that reach as many, the one with the least motion, from `q_start` on. No branch
-    is left on the way, so there is no jump but the one from `q_start`: a set-point that the branch
-    does not reach, or reaches only through the table or itself, stops the arm where it is, for
-    good.
+    It is the branch that reaches the most set-points; of several, the one with the least motion
+    from `q_start` on. The only jump is the one from `q_start`. The arm stops for good at the first
+    set-point that the branch does not reach, or reaches only through the table or itself.
 
     Args: q_start [6] rad; control [T, 5] as in `primitives.Plan`: x, y, z m of the tips, yaw rad,
     half the opening m.
@@ -331,13 +276,11 @@ def trajectory(q_start: jax.Array, control: jax.Array) -> Trajectory:
     poses = jax.vmap(top_down)(control[:, :3], control[:, 3])
     solutions, valid = jax.vmap(inverse)(*poses)  # [T, 8, 6], [T, 8]
     valid = valid & jax.vmap(jax.vmap(clear))(solutions)
-    joints, good, motion = jax.vmap(_follow, (None, 1, 1))(
-        q_start, solutions, valid
-    )  # branch first
+    joints, good, motion = jax.vmap(_follow, (None, 1, 1))(q_start, solutions, valid)  # by branch
     reached = jnp.sum(good, axis=1)
     branch = jnp.argmin(jnp.where(reached == jnp.max(reached), motion, jnp.inf))
     target = jnp.concatenate([joints[branch], control[:, 4:]], axis=1)
-    return Trajectory(target, jnp.all(good[branch]))
+    return JointTargets(target, jnp.all(good[branch]))
 
 
 def _follow(
@@ -346,12 +289,12 @@ def _follow(
     """One branch [T, 6] rad as far as it is valid [T] bool, without jumps, and within LIMITS.
 
     Returns: [T, 6] rad, held from the first set-point that fails; [T] bool, good until then; []
-    rad, sum of all turns.
+    rad, the sum of all motion.
     """
     step = jnp.diff(solutions, axis=0)
-    turns = jnp.cumsum(jnp.round(-step / _TURN), axis=0)  # whole, so that no rounding adds up
-    path = solutions + _TURN * jnp.concatenate([jnp.zeros_like(q_start)[None], turns])
-    path = path + _TURN * _offset(q_start, path, valid)[None]
+    turns = jnp.cumsum(jnp.round(-step / FULL_TURN), axis=0)  # whole, so that no rounding adds up
+    path = solutions + FULL_TURN * jnp.concatenate([jnp.zeros_like(q_start)[None], turns])
+    path = path + FULL_TURN * _offset(q_start, path, valid)[None]
     allowed = valid & jnp.all(jnp.abs(path) <= jnp.asarray(LIMITS)[None], axis=1)
     good = jnp.cumprod(allowed.astype(jnp.int32)).astype(bool)
     last = jnp.maximum(jnp.sum(good) - 1, 0)
@@ -361,12 +304,11 @@ def _follow(
 
 
 def _offset(q_start: jax.Array, path: jax.Array, valid: jax.Array) -> jax.Array:
-    """Whole turns [6] that bring a path [T, 6] rad within LIMITS, as near to `q_start` [6] as may
-    be."""
+    """Whole turns [6] that bring a path [T, 6] rad within LIMITS and near to `q_start` [6]."""
     turns = jnp.arange(-2.0, 3.0)[:, None]
-    low = jnp.min(jnp.where(valid[:, None], path, jnp.inf), axis=0)[None] + _TURN * turns
-    high = jnp.max(jnp.where(valid[:, None], path, -jnp.inf), axis=0)[None] + _TURN * turns
+    low = jnp.min(jnp.where(valid[:, None], path, jnp.inf), axis=0)[None] + FULL_TURN * turns
+    high = jnp.max(jnp.where(valid[:, None], path, -jnp.inf), axis=0)[None] + FULL_TURN * turns
     limit = jnp.asarray(LIMITS)[None]
     excess = jnp.maximum(jnp.maximum(-limit - low, high - limit), 0.0)
-    away = jnp.abs(path[:1] + _TURN * turns - q_start[None])
+    away = jnp.abs(path[:1] + FULL_TURN * turns - q_start[None])
     return turns[jnp.argmin(away + 100.0 * excess, axis=0), 0]

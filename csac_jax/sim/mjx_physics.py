@@ -6,15 +6,15 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from csac_jax.config import SimConfig
 from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World, scene_fields
 from csac_jax.sim import mjx_step, outcome
-from csac_jax.sim.outcome import Trace
-from csac_jax.sim.robot import Drive
+from csac_jax.sim.outcome import Substep, Trace
+from csac_jax.sim.quiet_mjx import mjx
+from csac_jax.sim.robot import JointTrajectory
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -26,21 +26,20 @@ class MjxPhysics:
     model: mjx.Model
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
     touch: Callable[[World, mjx.Data], tuple[jax.Array, jax.Array]]
-    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing, []
-    bool."""
+    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing,
+    [] bool."""
     step: Callable[[mjx.Model, mjx.Data], mjx.Data] = mjx.step
 
-    def run(self, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
-        """See `physics.Physics`. Products of matrices keep float32's precision: a GPU would cut
-        them to 10 bits."""
+    def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+        """See `physics.Physics`. Matrix products keep float32: a GPU would cut them to 10 bits."""
         with jax.default_matmul_precision("highest"):
-            return _run(self, scene, drive)
+            return _run(self, scene, joints)
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
     """Physics of a world, MJX with its JAX implementation."""
     mjx_model, data = mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax")
-    return MjxPhysics(world, cfg, mjx_model, data, _pad_contacts, mjx_step.step)
+    return MjxPhysics(world, cfg, mjx_model, data, _contact_touch, mjx_step.step)
 
 
 def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
@@ -48,11 +47,10 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
     geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
-    subtree = model.body_subtreemass.at[0].add(
-        jnp.sum(fields.mass - model.body_mass[bodies])
-    )  # all; then each block
+    added_mass = jnp.sum(fields.mass - model.body_mass[bodies])
+    subtree = model.body_subtreemass.at[0].add(added_mass)
     if model.impl == mjx.Impl.JAX:
-        meshes = [  # None for a mesh that no slot uses; `face` holds the corners of the faces once more
+        meshes = [  # None for a mesh that no slot uses; `face` repeats the corners of the faces
             mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
             for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
         ]
@@ -71,14 +69,14 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     )
 
 
-def initial_data(physics: MjxPhysics, scene: Scene, drive: Drive) -> mjx.Data:
-    """Data with the scene's blocks and the robot where the drive starts, at rest."""
+def initial_data(physics: MjxPhysics, scene: Scene, joints: JointTrajectory) -> mjx.Data:
+    """Data with the scene's blocks, and the robot at rest at its first set-point."""
     world = physics.world
     poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
-    qpos = physics.data.qpos.at[world.robot_qpos].set(drive.start)
+    qpos = physics.data.qpos.at[world.robot_qpos].set(joints.start)
     qpos = qpos.at[world.block_qpos].set(poses)
     qvel = physics.data.qvel.at[world.block_dofs].set(scene.velocity)
-    return physics.data.replace(qpos=qpos, qvel=qvel, ctrl=drive.control[0])
+    return physics.data.replace(qpos=qpos, qvel=qvel, ctrl=joints.control[0])
 
 
 def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data) -> mjx.Data:
@@ -90,55 +88,39 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
     return data.replace(qpos=data.qpos.at[address].set(qpos), qvel=data.qvel.at[dofs].set(qvel))
 
 
-def _pad_contacts(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """See `MjxPhysics.touch`; contacts may be missing once all slots are full."""
+def _contact_touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
+    """See `MjxPhysics.touch`; contacts may be missing once all slots are in use."""
     contact = data._impl.contact
     active = contact.dist < 0.0  # [C]
     pair = contact.geom  # [C, 2]
-    is_hand = (
-        jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1) & active[None]
-    )  # [3, C]
+    is_pad = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1)
+    is_hand = is_pad & active[None]  # [3, C]
     slots = jnp.asarray(world.slot_of_geom)[pair]  # [C, 2]
     is_block = jnp.any(slots[None] == np.arange(len(world.slots))[:, None, None], axis=-1)  # [N, C]
     return jnp.any(is_hand[:, None] & is_block[None], axis=-1), jnp.all(active)
 
 
-def _run(physics: MjxPhysics, scene: Scene, drive: Drive) -> tuple[Scene, Trace]:
-    """The primitive's substeps; blocks that end up in the hand are still in play, hanging where the
-    hand is."""
+def _run(physics: MjxPhysics, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+    """The substeps of a primitive."""
     world, cfg = physics.world, physics.cfg
     model = scene_model(physics, scene)
-    initial = initial_data(physics, scene, drive)
-    z_address = world.block_qpos[:, 2]
-    finger = world.robot_qpos[-2]
-    close_end = sum(cfg.grasp_phases[:2])
+    initial = initial_data(physics, scene, joints)
 
-    def substep(carry, x):
+    def substep(carry, indexed_control):
         data, trace = carry
-        index, control = x
-        data = _restrain(
-            world, ~scene.in_play, initial, physics.step(model, data.replace(ctrl=control))
-        )
-        touching, full = physics.touch(world, data)
-        held = touching[1] & touching[2]
-        rise = data.qpos[z_address] - scene.position[:, 2]
-        gap = 2.0 * data.qpos[finger]
-        trace = Trace(
-            touched=trace.touched | jnp.any(touching),
-            held_rise=jnp.maximum(trace.held_rise, jnp.where(held, rise, 0.0)),
-            held=held,
-            rise=rise,
-            gap_closed=jnp.where(index == close_end - 1, gap, trace.gap_closed),
-            gap_end=gap,
-            contact_overflow=trace.contact_overflow + full.astype(jnp.int32),
-        )
-        return (data, trace), None
+        index, control = indexed_control
+        parked = ~scene.in_play
+        data = physics.step(model, data.replace(ctrl=control))
+        data = _restrain(world, parked, initial, data)
+        touching, overflow = physics.touch(world, data)
+        rise = data.qpos[world.block_qpos[:, 2]] - scene.position[:, 2]
+        gap = 2.0 * data.qpos[world.robot_qpos[-2]]
+        observed = Substep(touching, rise, gap, overflow)
+        return (data, outcome.extend(cfg, trace, index, observed)), None
 
-    (data, trace), _ = jax.lax.scan(
-        substep,
-        (initial, outcome.blank(len(world.slots))),
-        (jnp.arange(cfg.substeps), drive.control),
-    )
+    before = (initial, outcome.blank(len(world.slots)))
+    inputs = (jnp.arange(cfg.substeps), joints.control)
+    (data, trace), _ = jax.lax.scan(substep, before, inputs)
     pose = data.qpos[world.block_qpos]
     moved = scene.replace(
         position=pose[:, :3], quaternion=pose[:, 3:], velocity=data.qvel[world.block_dofs]

@@ -1,25 +1,27 @@
-"""One step of MJX (its JAX implementation) with two departures from `mjx.step`, each towards what C
-MuJoCo does."""
+"""One step of MJX (its JAX implementation) with two departures from `mjx.step`.
+
+Each brings it nearer to C MuJoCo.
+"""
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
 
-SAME_PLACE = (
-    1e-5  # m; copies lie within 1e-7 m of each other, other points of a pair seldom under 1e-4
-)
+from csac_jax.sim.quiet_mjx import mjx
+
+SAME_PLACE = 1e-5  # m; copies lie within 1e-7 m, other points of a pair seldom within 1e-4 m
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """The state one timestep later; for `implicitfast`, without sensors and tendons. One scene;
-    callers vmap."""
+    """The state one timestep later. One scene; callers vmap.
+
+    For `implicitfast`, without sensors and tendons.
+    """
     data = mjx.fwd_position(model, data)
     contact = data._impl.contact
-    # MJX leaves a contact out where its distance is beyond its margin; the distance is kept for who
-    # reads contacts.
+    # A contact beyond its margin is inactive. The distance stays, since others read it.
     margin = jnp.where(repeated(contact), contact.dist - 1.0, contact.includemargin)
     data = data.tree_replace({"_impl.contact": contact.replace(includemargin=margin)})
-    data = mjx.make_constraint(model, data)  # that of `fwd_position` is not used, so XLA drops it
+    data = mjx.make_constraint(model, data)  # XLA drops the one of `fwd_position`
     data = mjx.fwd_velocity(model, data)
     data = mjx.fwd_actuation(model, data)
     data = mjx.fwd_acceleration(model, data)
@@ -28,20 +30,20 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def repeated(contact: mjx.Contact) -> jax.Array:
-    """Which contacts [C] are at the place of an earlier one of the same two geoms, [C] bool.
+    """Which contacts [C] repeat the place of an earlier one of the same two geoms, [C] bool.
 
-    MJX always gives four points for two boxes or meshes and fills up with copies, each of which
-    would be one more soft constraint: a touch at one point would be four times as stiff.
+    MJX always gives four points for two boxes or meshes and fills up with copies. Each copy would
+    be one more soft constraint: a touch at one point would be four times as stiff.
     """
-    apart = contact.pos[:, None] - contact.pos[None]  # [C, C, 3]
-    same = jnp.all(jnp.abs(apart) < SAME_PLACE, axis=-1)
+    offset = contact.pos[:, None] - contact.pos[None]  # [C, C, 3]
+    same = jnp.all(jnp.abs(offset) < SAME_PLACE, axis=-1)
     same &= jnp.all(contact.geom[:, None] == contact.geom[None], axis=-1)
     return jnp.any(jnp.tril(same, -1), axis=1)
 
 
 def _undamped_at_limits(model: mjx.Model, data: mjx.Data) -> mjx.Model:
-    """The model whose actuators lose their damping where their force is limited: more speed changes
-    no force there."""
+    """The model without the damping of actuators at their force limit, where speed changes no
+    force."""
     force, (low, high) = data.actuator_force, model.actuator_forcerange.T
     limited = model.actuator_forcelimited & ((force <= low) | (force >= high))
     damping = jnp.where(limited, 0.0, model.actuator_biasprm[:, 2])

@@ -1,5 +1,4 @@
-"""A grasp planner that reads block poses: the ceiling that physics allows, and the scripted hand of
-the tests."""
+"""A grasp planner that reads block poses: the ceiling that physics allows."""
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +13,8 @@ from csac_jax.scene.model import MAX_OPENING
 from csac_jax.sim.primitives import Action, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric
-FINGER_HALF = (
-    0.008,
-    0.012,
-)  # m, half footprint of a finger tip across and along its pad, with a little room
+PAD_HALF_WIDTH = 0.006  # m, across the pad: scenes/hand.xml
+FINGER_HALF = (0.008, 0.012)  # m, half footprint of a finger tip across and along its pad: roomy
 EXACT = jax.lax.Precision.HIGHEST  # a GPU would cut products of matrices to 10 bits
 ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
@@ -25,8 +22,7 @@ ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as paral
 def _support(
     normals: jax.Array, offsets: jax.Array, axis: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """How well the best faces on both sides are square to `axis` [3] (cosine), and the block's
-    width between them, m.
+    """Of the two faces most square to `axis` [3]: the lesser cosine, and the width between, m.
 
     Args: normals [F, 3] world frame, offsets [F] m from the block's centre.
     """
@@ -42,17 +38,16 @@ def grasp(
     scene: Scene,
     height: jax.Array,
 ) -> Action:
-    """The grasp of the block and yaw with room for both fingers, faces square to the pads, high and
-    narrow.
+    """The best grasp: room for both fingers, faces square to the pads, a high and narrow block.
 
-    With a target, of the target if it can be had so, else of the block nearest to it that can.
+    With a target, the best grasp is the target's, else that of the block nearest to it.
 
     Args: slots, kinds of the block slots; height [H, W] m.
     """
     hulls: tuple[SlotKind, ...] = tuple("box" if kind == "arch" else kind for kind in slots)
     normals, offsets = blocks.half_spaces(hulls, scene.half_size)
-    turn = jax.vmap(quat_to_matrix)(scene.quaternion)
-    world_normals = jnp.einsum("nij,nfj->nfi", turn, normals, precision=EXACT)
+    rotation = jax.vmap(quat_to_matrix)(scene.quaternion)
+    world_normals = jnp.einsum("nij,nfj->nfi", rotation, normals, precision=EXACT)
     yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
     cells = cell_centres(heightmap)
 
@@ -63,26 +58,20 @@ def grasp(
         top = local_top(heightmap, height, centre, cfg.window)
         tip = jnp.maximum(top - cfg.grasp_depth, cfg.clearance)
         local = jnp.abs(rotate2d(-yaw, cells - centre))
-        finger = (jnp.abs(local[..., 0] - 0.5 * MAX_OPENING - 0.006) < FINGER_HALF[0]) & (
-            local[..., 1] < FINGER_HALF[1]
-        )
+        across = jnp.abs(local[..., 0] - 0.5 * MAX_OPENING - PAD_HALF_WIDTH) < FINGER_HALF[0]
+        finger = across & (local[..., 1] < FINGER_HALF[1])
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
         fits = width < MAX_OPENING - 0.02
-        cost = (
-            4.0 * blocked
-            + 4.0 * ~fits
-            + 20.0 * jnp.maximum(1.0 - square - ALIGNED, 0.0)
-            + 10.0 * width
-        )
-        away = jnp.linalg.norm(
-            centre - scene.position[scene.target, :2]
-        )  # of the last slot where there is no target
+        askew = jnp.maximum(1.0 - square - ALIGNED, 0.0)
+        cost = 4.0 * blocked + 4.0 * ~fits + 20.0 * askew + 10.0 * width
+        # ANY indexes the last slot, whose distance is then unused.
+        away = jnp.linalg.norm(centre - scene.position[scene.target, :2])
         asked = jnp.where(scene.target == slot, 3.0, -4.0 * away)
         wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[slot, 2], asked)
         return jnp.where(scene.in_play[slot], wanted - cost, -jnp.inf)
 
-    every = jax.vmap(jax.vmap(score, (None, 0)), (0, None))
-    scores = every(jnp.arange(len(slots)), yaws)  # [N, YAWS]
+    each_pair = jax.vmap(jax.vmap(score, (None, 0)), (0, None))
+    scores = each_pair(jnp.arange(len(slots)), yaws)  # [N, YAWS]
     slot, yaw = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     pose = jnp.append(scene.position[slot, :2], yaws[yaw])
     return Action(primitive=jnp.int32(Primitive.GRASP), pose=pose)

@@ -1,5 +1,4 @@
-"""Push and grasp as one fixed-length sequence of hand set-points, so that both run in the same
-scan."""
+"""Push and grasp as one fixed-length sequence of hand set-points: both run in the same scan."""
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +11,7 @@ from csac_jax.constants import Primitive
 from csac_jax.scene.model import MAX_OPENING
 
 HAND_RADIUS = 0.09  # m, circle about the tool axis that holds the open hand
-START_GAP = (
-    0.01  # m, between the open hand's tips and whatever lies under it when a primitive starts
-)
+START_GAP = 0.01  # m, between the open hand's tips and what lies under them at the start
 
 
 @struct.dataclass
@@ -35,18 +32,17 @@ class Plan:
 
 
 def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: float) -> jax.Array:
-    """Highest surface [] m in a square window of `side` m about `xy` [2] m of the height map [H, W]
-    m."""
+    """Highest surface [] m of the map [H, W] m in a square window of `side` m about `xy` [2] m."""
     distance = jnp.max(jnp.abs(geometry.cell_centres(cfg) - xy[None, None]), axis=-1)
     return jnp.max(jnp.where(distance <= 0.5 * max(side, cfg.cell), height, 0.0))
 
 
 def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: Action) -> Plan:
-    """Set-points of a primitive (VPG's two, arXiv:1803.09956, with the depths of the config).
+    """Set-points of a primitive, one of VPG's two (arXiv:1803.09956).
 
     Grasp: straight down with open fingers to `grasp_depth` below the surface, close, lift. Push:
-    down with closed fingers to `push_depth` below the local top, `push_length` along the yaw (end
-    clipped to the workspace), lift.
+    down with closed fingers to `push_depth` below the surface, then `push_length` along the yaw,
+    the end clipped to the workspace, then lift.
     """
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
@@ -59,9 +55,8 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
     end = jnp.where(is_grasp, xy, jnp.clip(xy + cfg.push_length * direction, -limit, limit))
     opening = jnp.where(is_grasp, 0.5 * MAX_OPENING, 0.0)
 
-    descend, act, lift = jnp.where(
-        is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases)
-    )  # [T] each
+    phases = jnp.where(is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases))
+    descend, act, lift = phases  # [T] each
     z = high + (low - high) * descend + (high - low) * lift
     place = xy[None] + act[:, None] * (end - xy)[None]
     fingers = opening * (1.0 - jnp.minimum(1.3 * act, 1.0))  # closed before the lift begins
@@ -73,15 +68,12 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
 
 
 def _progress(phases: tuple[int, int, int]) -> np.ndarray:
-    """How far each phase has come, 0 to 1, at every substep: [3, T]. The last is smooth: a jerk
-    shakes blocks loose."""
-    times = np.arange(1, sum(phases) + 1)
-    ends = np.cumsum(phases)
-    linear = np.stack(
-        [
-            np.clip((times - end + length) / length, 0, 1)
-            for end, length in zip(ends, phases, strict=True)
-        ]
-    )
+    """How far each phase has come, 0 to 1, at every substep: [3, T].
+
+    The last phase, the lift, is smooth: a jerk shakes blocks loose.
+    """
+    times, lengths = np.arange(1, sum(phases) + 1), np.array(phases)[:, None]
+    starts = np.cumsum(lengths, axis=0) - lengths
+    linear = np.clip((times - starts) / lengths, 0, 1)
     linear[2] = linear[2] ** 2 * (3.0 - 2.0 * linear[2])
     return linear.astype(np.float32)

@@ -1,5 +1,7 @@
 """From set-points of the hand to those of a robot's joints."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -10,7 +12,7 @@ from csac_jax.sim.primitives import Plan
 
 
 @struct.dataclass
-class Drive:
+class JointTrajectory:
     """A plan as the robot's joints follow it. Q = joints, U = actuators, T = substeps."""
 
     start: jax.Array  # [Q] joint positions at rest, order of `World.robot_qpos`
@@ -18,13 +20,21 @@ class Drive:
     reachable: jax.Array  # [] bool, False where the robot cannot follow the whole plan
 
 
-def drive(kind: RobotKind, plan: Plan) -> Drive:
-    """How a robot follows a plan: the floating hand as it is, the arm by its inverse kinematics."""
-    if kind == "hand":
-        return Drive(jnp.append(plan.start, plan.start[4]), plan.control, jnp.ones((), bool))
-    if kind == "ur5":
-        way = kinematics.trajectory(
-            jnp.asarray(kinematics.HOME), jnp.concatenate([plan.start[None], plan.control])
-        )
-        return Drive(jnp.append(way.target[0], way.target[0, 6]), way.target[1:], way.reachable)
-    raise ValueError(f"sim.robot: {kind!r} is neither 'hand' nor 'ur5'")
+def _hand(plan: Plan) -> JointTrajectory:
+    """The floating hand follows the plan as it is."""
+    return JointTrajectory(jnp.append(plan.start, plan.start[4]), plan.control, jnp.ones((), bool))
+
+
+def _ur5(plan: Plan) -> JointTrajectory:
+    """The arm follows by its inverse kinematics."""
+    control = jnp.concatenate([plan.start[None], plan.control])
+    target, reachable = kinematics.joint_targets(jnp.asarray(kinematics.HOME), control)
+    return JointTrajectory(jnp.append(target[0], target[0, 6]), target[1:], reachable)
+
+
+ROBOTS: dict[RobotKind, Callable[[Plan], JointTrajectory]] = {"hand": _hand, "ur5": _ur5}
+
+
+def joint_trajectory(kind: RobotKind, plan: Plan) -> JointTrajectory:
+    """How the joints of a robot follow a plan."""
+    return ROBOTS[kind](plan)

@@ -1,9 +1,7 @@
-"""Primitives in MJX with its Warp implementation: the scan of `mjx_physics`, the contacts of
-another engine.
+"""Primitives in MJX with its Warp implementation: the scan of `mjx_physics`, other contacts.
 
-Contacts of all scenes share one array here, so that a scene cannot look its own up: sensors in the
-model tell which block the hand touches. Meshes have one size in all scenes. Not repeatable bit for
-bit.
+All scenes share one array of contacts, which a scene cannot read: touch sensors tell which block
+the hand touches. Meshes have one size in all scenes. Results are not repeatable bit for bit.
 """
 
 import functools
@@ -11,12 +9,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
 
 from csac_jax.config import WARP_WORLDS, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene.model import HAND_GEOMS, World
 from csac_jax.sim.mjx_physics import MjxPhysics
+from csac_jax.sim.quiet_mjx import mjx
 
 _ROWS = 4  # constraint rows of a contact: the edges of its friction pyramid
 _OTHER_ROWS = 32  # of joints and limits
@@ -41,18 +39,17 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
         naconmax=WARP_WORLDS * cfg.contacts,
         njmax=_ROWS * cfg.contacts + _OTHER_ROWS,
     )
-    lost = OverflowType.ALL & ~(
-        OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
-    )  # the solver stops early by design
-    return MjxPhysics(world, cfg, model, data, functools.partial(_sensed, int(lost)))
+    stopped_early = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS  # the solver, by design
+    lost_contacts = int(OverflowType.ALL & ~stopped_early)
+    return MjxPhysics(world, cfg, model, data, functools.partial(_sensor_touch, lost_contacts))
 
 
 def _graph_mode() -> Any:
     """How a step becomes a CUDA graph; None, MJX's choice, on a CPU.
 
-    MJX's choice on CUDA records a graph anew for every set of buffers that XLA hands over, of which
-    a training step has many: 1,024 scenes took 3.7 s an action so, 0.52 s with one graph and its
-    own buffers (H200, `experiments/bench`).
+    On CUDA, MJX's choice records a new graph for every set of buffers from XLA. A training step
+    has many: 1,024 scenes took 3.7 s an action. One graph with its own buffers takes 0.52 s
+    (H200, `experiments/bench`).
     """
     if jax.default_backend() != "gpu":
         return None
@@ -61,8 +58,7 @@ def _graph_mode() -> Any:
     return types.GraphMode.WARP_STAGED
 
 
-def _sensed(lost: int, world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """See `MjxPhysics.touch`; contacts may be missing once one of the arrays ran over that `lost`
-    has a bit for."""
+def _sensor_touch(lost_contacts: int, world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
+    """See `MjxPhysics.touch`; the bits `lost_contacts` tell that an array of contacts ran over."""
     touching = data.sensordata.reshape(len(HAND_GEOMS), len(world.slots)) > 0.0
-    return touching, jnp.any((data._impl.overflow & lost) != 0)
+    return touching, jnp.any((data._impl.overflow & lost_contacts) != 0)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from csac_jax.scene.solids import Group, Solids
+from csac_jax.scene.solids import GeomGroup, Solids
 from csac_jax.vision import shapes
 
 TABLE = -1
@@ -140,7 +140,9 @@ Nearest = tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array], jax.Array]
 int32 or -1."""
 
 
-def _fold_group(group: Group, origin: jax.Array, direction: jax.Array, nearest: Nearest) -> Nearest:
+def _fold_group(
+    group: GeomGroup, origin: jax.Array, direction: jax.Array, nearest: Nearest
+) -> Nearest:
     ray = shapes.RAY[group.kind]
 
     def fold(nearest: Nearest, geom: tuple[jax.Array, ...]) -> tuple[Nearest, None]:

@@ -191,5 +191,5 @@ RAY: dict[Kind, Callable[[jax.Array, Vector, Vector], Entry]] = {
     Kind.CYLINDER: ray_cylinder,
     Kind.POLYTOPE: ray_polytope,
 }
-"""Of every kind, the function of its shape (a row of `Group.shape`), the ray's origin [3] m and
+"""Of every kind, the function of its shape (a row of `GeomGroup.shape`), the ray's origin [3] m and
 direction [3]."""

@@ -16,59 +16,61 @@ from csac_jax.sim import mjx_physics, primitives, robot
 from csac_jax.sim.c_physics import CPhysics
 from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.primitives import Action
-from csac_jax.sim.robot import Drive
+from csac_jax.sim.quiet_mjx import mjx
+from csac_jax.sim.robot import JointTrajectory
 
-from mujoco import mjx  # isort: skip  (after csac_jax.sim, which imports it quietly)
 
-
-def drives(cfg: Config, height: jax.Array, actions: Action) -> Drive:
+def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:
     """How the robot moves in actions chosen from the height maps [E, H, W] m; leaves [E, ...]."""
 
-    def drive(height: jax.Array, action: Action) -> Drive:
-        return robot.drive(cfg.sim.robot, primitives.plan(cfg.sim, cfg.heightmap, height, action))
+    def joints(height: jax.Array, action: Action) -> JointTrajectory:
+        plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+        return robot.joint_trajectory(cfg.sim.robot, plan)
 
-    return jax.jit(jax.vmap(drive))(height, actions)
+    return jax.jit(jax.vmap(joints))(height, actions)
 
 
-def loop(physics: MjxPhysics | CPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
-    """As many plain steps as an action has, of scenes and drives with leaves [E, ...]; a call runs
+def loop(
+    physics: MjxPhysics | CPhysics, scenes: Scene, joints: JointTrajectory
+) -> Callable[[], Any]:
+    """As many plain steps as an action has, of scenes and joints with leaves [E, ...]; a call runs
     them all."""
     return (
-        _mjx(physics, scenes, drives)
+        _mjx(physics, scenes, joints)
         if isinstance(physics, MjxPhysics)
-        else _c(physics, scenes, drives)
+        else _c(physics, scenes, joints)
     )
 
 
-def _mjx(physics: MjxPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
-    def one(scene: Scene, drive: Drive) -> jax.Array:
+def _mjx(physics: MjxPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
+    def one(scene: Scene, joints: JointTrajectory) -> jax.Array:
         its, data = (
             mjx_physics.scene_model(physics, scene),
-            mjx_physics.initial_data(physics, scene, drive),
+            mjx_physics.initial_data(physics, scene, joints),
         )
 
         def step(data: mjx.Data, control: jax.Array) -> tuple[mjx.Data, None]:
             return mjx.step(its, data.replace(ctrl=control)), None
 
-        return jax.lax.scan(step, data, drive.control)[0].qpos
+        return jax.lax.scan(step, data, joints.control)[0].qpos
 
     compiled = jax.jit(jax.vmap(one))
-    return lambda: compiled(scenes, drives)
+    return lambda: compiled(scenes, joints)
 
 
-def _c(physics: CPhysics, scenes: Scene, drives: Drive) -> Callable[[], Any]:
+def _c(physics: CPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
     world = physics.world
     fields = jax.device_get(jax.vmap(lambda scene: model.scene_fields(world, scene))(scenes))
-    rows = jax.device_get((scenes, fields, drives))
+    rows = jax.device_get((scenes, fields, joints))
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], rows) for i in range(len(rows[2].reachable))]
     models = [model.with_blocks(world, field) for _, field, _ in each]
 
     def one(exact: mujoco.MjModel, row: tuple[Any, Any, Any]) -> None:
-        scene, _, drive = row
+        scene, _, joints = row
         data = mujoco.MjData(exact)
-        data.qpos[world.robot_qpos] = drive.start
+        data.qpos[world.robot_qpos] = joints.start
         data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-        for control in drive.control:
+        for control in joints.control:
             data.ctrl[:] = control
             mujoco.mj_step(exact, data)
 

@@ -1,10 +1,9 @@
-"""One physics step of MJX beside one of C MuJoCo, as JSON: `csac-jax bench one_step [--states N]`.
+"""One physics step of MJX against one of C MuJoCo, as JSON: `csac-jax bench one_step [--states N]`.
 
-States are recorded in C MuJoCo at a random substep of random pushes and planned grasps in settled
-piles of ten blocks. From each, both engines compute where every body is (kinematics), take one step
-without contacts, and one with them, the solver started cold. What differs after a step with
-contacts is measured once more with a solver that converges: what is left then is not the solver's.
-NOTES.md says what it is.
+States are recorded in C MuJoCo, each at a random substep of a random push or a planned grasp in
+settled piles of ten blocks. From each state both engines compute where every body is (kinematics),
+then take one step without contacts and one with contacts, the solver started cold. The step with
+contacts is repeated with a solver that converges: what then differs is not the solver's.
 """
 
 import dataclasses
@@ -21,17 +20,16 @@ from csac_jax.runtime import provenance
 from csac_jax.scene import model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import c_physics, mjx_physics, primitives, robot
+from csac_jax.sim.quiet_mjx import mjx
 from experiments.bench._options import read
 from experiments.bench.parity import STREAM, TEN, Bench, pile_config
 
-from mujoco import mjx  # isort: skip  (after csac_jax.sim, which imports it quietly)
-
 BATCH = 50
 SCENES = 128  # settled piles; each is acted on again and again
-EFFORT = {
+EFFORT = {  # iterations, line search
     "as_configured": (TEN.sim.iterations, TEN.sim.line_search),
     "converged": (100, 50),
-}  # iterations, line search
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,28 +57,25 @@ def record(bench: Bench, count: int) -> list[State]:
     plan = jax.jit(jax.vmap(lambda h, a: primitives.plan(cfg.sim, cfg.heightmap, h, a)))(
         height, action
     )
-    drives = jax.device_get(jax.vmap(lambda one: robot.drive(cfg.sim.robot, one))(plan))
+    joints = jax.device_get(jax.vmap(lambda one: robot.joint_trajectory(cfg.sim.robot, one))(plan))
     fields = jax.device_get(
         jax.jit(jax.vmap(lambda scene: model.scene_fields(world, scene)))(scenes)
     )
     rng = np.random.default_rng(STREAM)
     states = []
     for i in range(count):
-        scene, field, drive = jax.tree.map(lambda leaf, i=i: leaf[i], (scenes, fields, drives))
-        film, at = (
-            c_physics.film(world, field, scene, drive),
-            int(rng.integers(cfg.sim.substeps - 1)),
-        )
-        qpos, qvel = (leaf[at].astype(np.float32) for leaf in (film.qpos, film.qvel))
-        states.append(State(scene, qpos, qvel, drive.control[at + 1]))
+        scene, own_fields, own = jax.tree.map(lambda leaf, i=i: leaf[i], (scenes, fields, joints))
+        recorded = c_physics.trajectory(world, own_fields, scene, own)
+        at = int(rng.integers(cfg.sim.substeps - 1))
+        qpos, qvel = (leaf[at].astype(np.float32) for leaf in (recorded.qpos, recorded.qvel))
+        states.append(State(scene, qpos, qvel, own.control[at + 1]))
     return states
 
 
 def _by_mjx(
     bench: Bench, states: list[State], contacts: bool, effort: tuple[int, int]
 ) -> np.ndarray:
-    """Positions [S, bodies, 3] m of all bodies before and after a step, stacked: [2, S, bodies,
-    3]."""
+    """Positions [2, S, bodies, 3] m of all bodies, before and after a step."""
     sim = dataclasses.replace(bench.cfg.sim, iterations=effort[0], line_search=effort[1])
     world = model.build(bench.cfg.scene, sim)
     if not contacts:
@@ -125,13 +120,12 @@ def _by_c(
 
 
 def _errors(bench: Bench, ours: np.ndarray, theirs: np.ndarray) -> dict[str, dict[str, float]]:
-    """Distances between bodies of both engines, m; the largest of each state, among blocks and
-    among the robot's."""
-    apart = np.linalg.norm(ours - theirs, axis=-1)  # [S, bodies]
-    is_block = np.isin(np.arange(apart.shape[1]), bench.world.block_bodies)
+    """Largest distance of a body between the engines, m, of the blocks and of the robot."""
+    distance = np.linalg.norm(ours - theirs, axis=-1)  # [S, bodies]
+    is_block = np.isin(np.arange(distance.shape[1]), bench.world.block_bodies)
     levels = (("median", 50), ("p99", 99), ("largest", 100))
     return {
-        who: {name: float(np.percentile(apart[:, these].max(axis=1), q)) for name, q in levels}
+        who: {name: float(np.percentile(distance[:, these].max(axis=1), q)) for name, q in levels}
         for who, these in (("blocks", is_block), ("robot", ~is_block))
     }
 
@@ -145,10 +139,8 @@ def measure(count: int) -> dict[str, Any]:
     result["kinematics_m"] = _errors(bench, free[0], free_c[0][0])
     result["step_without_contacts_m"] = _errors(bench, free[1], free_c[0][1])
     for name, effort in EFFORT.items():
-        after, (after_c, touching) = (
-            _by_mjx(bench, states, True, effort),
-            _by_c(bench, states, True, effort),
-        )
+        after = _by_mjx(bench, states, True, effort)
+        after_c, touching = _by_c(bench, states, True, effort)
         result[f"step_with_contacts_{name}_m"] = _errors(bench, after[1], after_c[1])
     result["contacts_median"] = float(np.median(touching))
     return result

@@ -1,14 +1,15 @@
-"""Does MJX move blocks as C MuJoCo does? As JSON: `csac-jax bench parity [--primitives N] [--poses
-N] [--warp]`, N grasps and N pushes in piles of 6 and of 10, and N poses of each shape alone. With
---warp MJX on Warp, on CUDA, is measured in place of MJX on JAX, and meshes have their nominal size.
+"""Does MJX move blocks as C MuJoCo does? Prints JSON.
 
-The same settled scenes and the same actions go through both. Grasps are the planner's, which reads
-poses: its share of lifts is the ceiling that physics allows. Pushes start before a random block and
-go through it.
+`csac-jax bench parity [--primitives N] [--poses N] [--warp]`: N grasps and N pushes in piles of 6
+and of 10, and N poses of each shape alone. --warp measures MJX on Warp, on CUDA, instead of MJX on
+JAX; meshes then have their nominal size.
 
-How near two engines can come is measured beside it: C MuJoCo against itself, with every block a
-micrometre aside, and with the solver of MJX, which takes a scene as one problem where C takes each
-heap of touching blocks by itself.
+Both engines get the same settled scenes and actions. The planner that reads poses makes the grasps:
+its share of lifts is the ceiling that physics allows. Pushes go through a random block.
+
+Two references show how near two engines can come. In one, C MuJoCo runs against itself with every
+block a micrometre aside. In the other it solves a scene as one problem, as MJX does, instead of
+each heap of touching blocks by itself.
 """
 
 import dataclasses
@@ -39,15 +40,15 @@ BATCH = 64
 STREAM = 9001  # of drops: neither training's nor an evaluation's
 PUSH_RUN_UP = 0.07  # m from the place of a push to the block's centre
 REFERENCE = "c"
-ASIDE = 1e-6  # m
+NUDGE = 1e-6  # m
 TEN = presets.get("fast")
 Engine = Callable[[Scene, jax.Array, Action], Any]  # scenes, heights [E, H, W] m, actions
 
 
 def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind = "mjx") -> Config:
     """Scenes of `in_play` blocks in these slots, with contacts enough for ten."""
-    spread = 0.0 if physics == "warp" else SceneConfig().mesh_size_jitter
-    scene = SceneConfig(slots=slots, min_blocks=in_play, mesh_size_jitter=spread)
+    jitter = 0.0 if physics == "warp" else SceneConfig().mesh_size_jitter
+    scene = SceneConfig(slots=slots, min_blocks=in_play, mesh_size_jitter=jitter)
     sim = dataclasses.replace(TEN.sim, physics=physics)
     return dataclasses.replace(presets.get("quick"), scene=scene, sim=sim)
 
@@ -74,13 +75,13 @@ class Bench:
         solved_whole = self._engine(REFERENCE, mujoco.mjtDisableBit.mjDSBL_ISLAND)
         self.references = {
             "c_against_itself_1um": lambda scenes, *rest: self.engines[REFERENCE](
-                _aside(scenes), *rest
+                _nudged(scenes), *rest
             ),
             "c_against_itself_solved_whole": solved_whole,
         }
 
     def _engine(self, name: Any, disabled: int = 0) -> Engine:
-        """A physics, with MuJoCo's `disabled` flags set beside its own, in a world of its own."""
+        """A physics with these MuJoCo features disabled, in a world of its own."""
         sim = dataclasses.replace(self.cfg.sim, physics=name)
         world = model.build(self.cfg.scene, sim)
         world.model.opt.disableflags |= disabled
@@ -90,8 +91,7 @@ class Bench:
         )
 
     def run(self, engines: dict[str, Engine], scenes: Scene, actions: Action) -> dict[str, Any]:
-        """What engines make of the actions: ends [E, N, 3], outcomes [E], contact_overflow [E],
-        physics_diverged [E]."""
+        """Results of each engine: ends [E, N, 3], outcomes, overflows and failures [E]."""
         height = self.look(scenes)
         result = {}
         for name, engine in engines.items():
@@ -105,12 +105,12 @@ class Bench:
         return result
 
 
-def _aside(scenes: Scene) -> Scene:
-    """The same with each block in play a micrometre aside, each another way."""
-    way = np.random.default_rng(STREAM).uniform(0.0, 2.0 * np.pi, scenes.position.shape[:2])
+def _nudged(scenes: Scene) -> Scene:
+    """The same scenes with each block in play a micrometre aside, in its own direction."""
+    angle = np.random.default_rng(STREAM).uniform(0.0, 2.0 * np.pi, scenes.position.shape[:2])
     step = (
-        ASIDE
-        * np.stack([np.cos(way), np.sin(way), np.zeros_like(way)], axis=-1)
+        NUDGE
+        * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
         * scenes.in_play[..., None]
     )
     return scenes.replace(position=scenes.position + step.astype(np.float32))
@@ -136,12 +136,8 @@ def piles(
     for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))
         grasps = bench.oracle(scenes, bench.look(scenes))
-        rows.append(
-            (
-                scenes,
-                *(bench.run(engines, scenes, act) for act in (grasps, bench.push(keys, scenes))),
-            )
-        )
+        pushes = bench.push(keys, scenes)
+        rows.append((scenes, *(bench.run(engines, scenes, act) for act in (grasps, pushes))))
     starts = np.concatenate([row[0].position for row in rows])
     grasped, pushed = (
         {
@@ -162,7 +158,7 @@ def piles(
             name: _agreement(starts, *((runs[name], runs[REFERENCE]) for runs in (grasped, pushed)))
             for name in bench.references
         },
-        "saturated_substeps_share": _saturated(cfg, grasped[physics], pushed[physics]),
+        "saturated_substeps_share": _overflow_share(cfg, grasped[physics], pushed[physics]),
         "physics_diverged": int(grasped[physics][3].sum() + pushed[physics][3].sum()),
     }
 
@@ -170,37 +166,35 @@ def piles(
 def _agreement(
     starts: np.ndarray, grasped: tuple[list, list], pushed: tuple[list, list]
 ) -> dict[str, Any]:
-    """How well an engine agrees with the reference in grasps and in pushes, each (the engine's
-    runs, the other's)."""
+    """Agreement in grasps and in pushes, each a pair: runs of an engine and of the reference."""
     return {
         "grasp_outcome_equal": float(np.mean(grasped[0][1] == grasped[1][1])),
-        "pushed_block_apart_mm": _apart(starts, *pushed),
+        "pushed_block_apart_mm": _distances(starts, *pushed),
     }
 
 
-def _apart(
+def _distances(
     starts: np.ndarray, pushed: list[np.ndarray], reference: list[np.ndarray]
 ) -> dict[str, float]:
-    """How far apart the two engines leave the block that the reference moved most, mm."""
+    """Distance between the engines' ends of the block that the reference moved most, mm."""
     moved = np.linalg.norm(reference[0] - starts, axis=2)
     slot = moved.argmax(axis=1)
     rows = np.arange(len(slot))
-    apart = 1e3 * np.linalg.norm(pushed[0][rows, slot] - reference[0][rows, slot], axis=1)
+    distance = 1e3 * np.linalg.norm(pushed[0][rows, slot] - reference[0][rows, slot], axis=1)
     return {
-        "median": float(np.median(apart)),
-        "p95": float(np.percentile(apart, 95)),
+        "median": float(np.median(distance)),
+        "p95": float(np.percentile(distance, 95)),
         "median_moved": float(1e3 * np.median(moved[rows, slot])),
         "pushes": len(rows),
     }
 
 
-def _saturated(cfg: Config, *runs: list[np.ndarray]) -> float:
+def _overflow_share(cfg: Config, *runs: list[np.ndarray]) -> float:
     return float(np.mean([run[2].mean() for run in runs]) / cfg.sim.substeps)
 
 
 def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
-    """Grasps of a single block of every shape, as it came to rest after a fall in any
-    orientation."""
+    """Grasps of a single block of every shape, at rest after a fall in a random orientation."""
     slots: tuple[SlotKind, ...] = ("box", "arch", "prism", "half_cylinder", "cylinder")
     cfg = pile_config(slots, 1, physics)
     bench = Bench(cfg)
@@ -231,18 +225,15 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
     """`count` scenes of one block of this shape at rest."""
     rng = np.random.default_rng([STREAM, list(blocks.SHAPES).index(shape)])
     slot = cfg.scene.slots.index(blocks.SHAPES[shape].kind)
-    found: list[Scene] = []
-    while len(found) < count:
+    at_rest: list[Scene] = []
+    while len(at_rest) < count:
         scene = layout.parked(cfg.scene.slots)
-        half, position, quaternion = (
-            scene.half_size.copy(),
-            scene.position.copy(),
-            scene.quaternion.copy(),
-        )
+        half = scene.half_size.copy()
+        position, quaternion = scene.position.copy(), scene.quaternion.copy()
         half[slot] = blocks.SHAPES[shape].half_size
         position[slot] = [*rng.uniform(-0.12, 0.12, 2), cfg.scene.drop_height]
-        turn = rng.normal(size=4)
-        quaternion[slot] = turn / np.linalg.norm(turn)
+        rotation = rng.normal(size=4)
+        quaternion[slot] = rotation / np.linalg.norm(rotation)
         dropped = scene.replace(
             half_size=half,
             position=position,
@@ -251,8 +242,8 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
         )
         fields = jax.device_get(model.scene_fields(bench.world, dropped))
         scene = pool.rest(bench.world, cfg.scene, cfg.heightmap.extent, dropped, fields)
-        found += [scene] if scene is not None else []
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+        at_rest += [scene] if scene is not None else []
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *at_rest)
 
 
 def main(arguments: list[str]) -> None:

@@ -1,11 +1,11 @@
-"""Speed of every physics, as JSON: `csac-jax bench physics [--smallest E0] [--scenes E] [--warp]`,
-from a batch of E0 (1) scenes to one of E (64), each eight times the last; with --warp MJX on Warp
-too, on CUDA.
+"""Speed of every physics, as JSON: `csac-jax bench physics [--smallest E0] [--scenes E] [--warp]`.
 
-Each is timed as an action of the environment, heights and outcomes included, beside a bare loop of
-the engine's own steps: same model, same settled scenes with their block sizes, same set-points,
-same batch, same process, turn by turn. `share` is (actions/s x substeps) / (bare steps/s): what is
-left of the engine's speed. Blocks are those of the preset `quick`; every action is a planned grasp.
+Batches grow from E0 (1) to E (64) scenes by factors of eight. --warp adds MJX on Warp, on CUDA.
+
+Actions of the environment, with heights and outcomes, alternate with a bare loop of the engine's
+own steps: same model, settled scenes, set-points, batch and process. `share` is (actions/s x
+substeps) / (bare steps/s), what is left of the engine's speed. Blocks are those of the preset
+`quick`; every action is a planned grasp.
 """
 
 import dataclasses
@@ -33,7 +33,9 @@ def measure(cfg: Config, name: PhysicsKind, scenes: int) -> dict[str, Any]:
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
     plan_grasp = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
     actions = jax.jit(jax.vmap(plan_grasp))(states.scene, states.obs.height)
-    bare = _bare.loop(env.physics, states.scene, _bare.drives(cfg, states.obs.height, actions))
+    bare = _bare.loop(
+        env.physics, states.scene, _bare.joint_trajectories(cfg, states.obs.height, actions)
+    )
     step = jax.jit(jax.vmap(env.step))
     seconds = medians({"action": lambda: step(states, actions), "bare": bare}, REPEATS)
     return {

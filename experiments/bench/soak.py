@@ -1,8 +1,8 @@
-"""Random actions without end: is every block accounted for, how often does physics fail? JSON.
+"""Random actions: is every block accounted for, how often does physics fail? Prints JSON.
 
-`csac-jax bench soak [--actions N] [--scenes E]`. Half of the actions are pushes; scenes hold ten
-blocks of all shapes and are replaced as in training. Then random grasps run once more with twice as
-many contacts, and once from scenes a micrometre away: what that alone changes is chaos.
+`csac-jax bench soak [--actions N] [--scenes E]`. Half of the actions are pushes. Scenes hold ten
+blocks of all shapes and are replaced as in training. At the end random grasps run again with twice
+as many contacts, and again with all blocks a micrometre away, which shows what chaos changes.
 """
 
 import dataclasses
@@ -131,8 +131,8 @@ def soak(actions: int, scenes: int) -> dict[str, Any]:
 
 
 def _caps(cfg: Config, env: Env, frames: maps.Frames, state: State) -> dict[str, Any]:
-    """Share of random grasps that end alike with the caps of the config and with twice as many;
-    and, as the floor that chaos sets, with the caps of the config and every block NUDGE away."""
+    """Share of random grasps that end as with the config's caps: with caps twice as wide, and, as
+    the floor that chaos sets, with every block NUDGE away."""
     count = state.actions.shape[0]
     keys = jax.random.split(jax.random.key(1), count)
     action = jax.jit(jax.vmap(_random, (0, None, 0)), static_argnums=1)(keys, frames, state)

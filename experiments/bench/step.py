@@ -40,7 +40,7 @@ from csac_jax.constants import CHANGE_AREA, Primitive
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
 from csac_jax.runtime import cache, compiler, provenance
-from csac_jax.sim import auto
+from csac_jax.sim import backend
 from csac_jax.sim.primitives import Action
 from csac_jax.training import step
 from csac_jax.vision import heightmap
@@ -179,7 +179,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     }
     calls |= _learning(program, nets, filled)
     calls["bare_loop"] = _bare.loop(
-        env.physics, scenes.scene, _bare.drives(cfg, scenes.obs.height, action)
+        env.physics, scenes.scene, _bare.joint_trajectories(cfg, scenes.obs.height, action)
     )
     return calls
 
@@ -373,7 +373,9 @@ def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Confi
         physics = cfg.sim.physics if parsing.value_of(flags, "--sim.physics") else "auto"
     if physics == "warp":
         cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, mesh_size_jitter=0.0))
-    return auto.resolve(dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=physics)))
+    return backend.resolve(
+        dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=physics))
+    )
 
 
 def _values(smallest: int, largest: int) -> list[int]:

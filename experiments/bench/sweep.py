@@ -22,7 +22,7 @@ import jax
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.runtime import compiler, provenance
-from csac_jax.sim import auto
+from csac_jax.sim import backend
 from csac_jax.sweeps import grid, pipelined, replicas, sweep as sweeping
 from csac_jax.training import sharding, step
 from experiments.bench._options import Parser, config, split
@@ -72,7 +72,9 @@ def measure(
 def _config(preset: str, flags: list[str], options: Any) -> Config:
     cfg = config("sweep", preset, flags)
     sim = dataclasses.replace(cfg.sim, physics=options.physics or cfg.sim.physics)
-    return auto.resolve(dataclasses.replace(cfg, sim=sim), max(options.devices), max(options.seeds))
+    return backend.resolve(
+        dataclasses.replace(cfg, sim=sim), max(options.devices), max(options.seeds)
+    )
 
 
 def main(arguments: list[str]) -> None:

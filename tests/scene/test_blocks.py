@@ -36,7 +36,7 @@ def test_half_spaces_are_those_of_the_hull(shape: str, scale: float):
     normals, offsets = map(np.asarray, blocks.half_spaces((kind,), jnp.asarray(half[None])))
     points = np.random.default_rng(0).uniform(-0.08, 0.08, (4000, 3))
     hull = ConvexHull(_corners(kind, half) * (1.0 if kind == "box" else scale)).equations
-    depth = (points @ normals[0].T - offsets[0]).max(axis=1)  # of the distance_cap face: < 0 inside
+    depth = (points @ normals[0].T - offsets[0]).max(axis=1)  # of the farthest face: < 0 inside
     np.testing.assert_allclose(depth, (points @ hull[:, :3].T + hull[:, 3]).max(axis=1), atol=2e-6)
     present = offsets[0] < blocks.PADDING_OFFSET
     np.testing.assert_allclose(np.linalg.norm(normals[0], axis=1), present, atol=1e-6)

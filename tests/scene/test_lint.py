@@ -7,12 +7,11 @@ from typing import Any
 import mujoco
 import pytest
 
-import csac_jax.sim  # noqa: F401  (before MJX, which it imports quietly)
 from csac_jax.config import Config, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import lint, model
+from csac_jax.sim.quiet_mjx import mjx
 
-from mujoco import mjx  # isort: skip
 from mujoco.mjx._src import (  # isort: skip
     collision_driver,
     constraint,
@@ -33,8 +32,12 @@ SCENE = """
   <option timestep="0.004" integrator="{integrator}" {option}><flag {flag}/></option>
   <worldbody>
     <geom name="table" type="plane" size="1 1 0.1"/>
-    <body name="box" pos="0 0 0.1"><freejoint/><geom name="box" type="box" size="0.02 0.02 0.02" {geom}/></body>
-    <body name="arm" pos="1 0 0.5"><joint name="hinge" axis="0 1 0" {joint}/><geom name="arm" size="0.05"/></body>
+    <body name="box" pos="0 0 0.1">
+      <freejoint/><geom name="box" type="box" size="0.02 0.02 0.02" {geom}/>
+    </body>
+    <body name="arm" pos="1 0 0.5">
+      <joint name="hinge" axis="0 1 0" {joint}/><geom name="arm" size="0.05"/>
+    </body>
     {body}
   </worldbody>
   <tendon><fixed name="string" {tendon}><joint joint="hinge" coef="1"/></fixed></tendon>
@@ -56,8 +59,10 @@ ROUND = (
 )
 MOTOR = '<general name="motor" joint="hinge" {}/>'
 NESTED = (
-    '<body pos="0 2 1"><joint/><geom type="box" size="0.02 0.02 0.02" contype="0" conaffinity="4"/>'
-    '<body><joint/><geom type="cylinder" size="0.02 0.02" contype="4" conaffinity="0"/></body></body>'
+    '<body pos="0 2 1"><joint/>'
+    '<geom type="box" size="0.02 0.02 0.02" contype="0" conaffinity="4"/>'
+    "<body><joint/>"
+    '<geom type="cylinder" size="0.02 0.02" contype="4" conaffinity="0"/></body></body>'
 )
 CORNERS = '<asset><mesh name="wedge" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset>'
 WEDGE = '<body pos="0 0 0.3"><freejoint/><geom name="wedge" type="mesh" mesh="wedge" {}/></body>'

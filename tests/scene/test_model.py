@@ -1,11 +1,16 @@
 """The model against MuJoCo's own compiler."""
 
+import re
+import shutil
+from pathlib import Path
+
 import jax
 import mujoco
 import numpy as np
 import pytest
 
-from csac_jax.config import SceneConfig, SimConfig
+from csac_jax.config import RobotKind, SceneConfig, SimConfig
+from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, layout, model
 from csac_jax.scene.layout import Scene
 from tests.scene import placed
@@ -146,10 +151,63 @@ def test_addresses_name_what_they_say(world: model.World):
     )
     np.testing.assert_array_equal(world.slot_of_geom[world.block_geoms], world.parts.slot)
     assert np.all(np.delete(world.slot_of_geom, world.block_geoms) == -1)
-    for name, qpos in zip(model.ROBOT_JOINTS["hand"], world.robot_qpos, strict=True):
-        assert world.model.joint(name).qposadr[0] == qpos
+    (hand,) = model.ROBOTS["hand"]
+    for name, qpos in zip(hand.joints, world.robot_qpos, strict=True):
+        assert world.model.joint(f"hand/{name}").qposadr[0] == qpos
     assert [world.model.geom(i).name for i in world.hand_geoms] == [
         "hand/palm",
         "hand/pad_low",
         "hand/pad_high",
     ]
+
+
+HAND_ORDER = "actuators must be x, y, z, yaw, finger, not "
+
+
+@pytest.mark.parametrize(
+    ("robot", "file", "old", "new", "says"),
+    [
+        ("hand", "hand.xml", '<joint name="yaw"', '<joint name="turn"', "joint 'yaw' is missing"),
+        ("hand", "hand.xml", 'name="pad_low"', 'name="left"', "geom 'pad_low' is missing; it has"),
+        ("hand", "hand.xml", '"palm"', '"Palm"', "geom 'palm' is missing; it has: Palm, pad_low"),
+        ("hand", "hand.xml", '<position name="x"', '<position name="a"', HAND_ORDER),
+        ("hand", "hand.xml", "</actuator>", '<motor name="m" joint="x"/></actuator>', HAND_ORDER),
+        ("ur5", "ur5.xml", '<joint name="elbow"', '<joint name="e"', "joint 'elbow' is missing"),
+        ("ur5", "ur5.xml", '<site name="tip"', '<site name="t"', "site 'tip' is missing; it has"),
+        ("ur5", "rg2.xml", '"pad_high"', '"right"', "geom 'pad_high' is missing"),
+        (
+            "ur5",
+            "rg2.xml",
+            '<position name="finger"',
+            '<position name="f"',
+            "actuators must be finger, not f",
+        ),
+        ("hand", "blocks.xml", '<mesh name="prism"', '<mesh name="p"', "mesh 'prism' is missing"),
+        ("hand", "blocks.xml", 'class="block"', 'class="b"', "default class 'block' is missing"),
+        ("hand", "table.xml", "<worldbody>", '<worldbody><body name="block0"/>', "repeated name"),
+        ("hand", "table.xml", "<mujoco", "<mujocoo", "XML Error"),
+        ("hand", "hand.xml", 'joint1="finger_low"', 'joint1="thumb"', "thumb"),
+        ("hand", "hand.xml", 'joint="finger_low"', 'joint="thumb"', "thumb"),
+    ],
+)
+def test_names_of_other_mjcf_are_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    robot: RobotKind,
+    file: str,
+    old: str,
+    new: str,
+    says: str,
+):
+    """Claim: MJCF files of the user's own that lack a name, or do not compile, give one line with
+    the file and what is missing."""
+    folder = Path(shutil.copytree(model.assets(), tmp_path / "scenes"))
+    text = (folder / file).read_text()
+    assert old in text
+    (folder / file).write_text(text.replace(old, new))
+    monkeypatch.setattr(model, "assets", lambda: folder)
+    for physics in ("c", "mjx"):
+        with pytest.raises(SceneError, match=re.escape(says)) as error:
+            model.build(CONFIG, SimConfig(robot=robot, physics=physics))
+        assert str(error.value).startswith(str(folder))
+        assert "\n" not in str(error.value)

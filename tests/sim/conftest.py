@@ -177,7 +177,11 @@ def grasped(executed: Run) -> Run:
 def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]:
     """The settled scenes' grasps in C MuJoCo, by the same plans: ends [E, N, 3] m and traces."""
     engine = c_physics.CPhysics(c_world, CONFIG.sim)
-    run = jax.jit(jax.vmap(lambda scene, plan: engine.run(scene, robot.drive("hand", plan))))
+
+    def one(scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
+        return engine.run(scene, robot.joint_trajectory("hand", plan))
+
+    run = jax.jit(jax.vmap(one))
     after, trace = jax.tree.map(np.asarray, run(grasped.scene, grasped.plan))
     return after.position, trace
 

@@ -1,4 +1,4 @@
-"""C MuJoCo as the reference: what is filmed of it is what it does."""
+"""C MuJoCo as the reference: its fast loop against a slow one, and the threads that share it."""
 
 import concurrent.futures
 import dataclasses
@@ -11,158 +11,146 @@ import pytest
 
 from csac_jax.scene import layout, model
 from csac_jax.sim import c_physics, primitives, robot
-from csac_jax.sim.robot import Drive
+from csac_jax.sim.c_physics import SimulatorPool, Trajectory
+from csac_jax.sim.robot import JointTrajectory
 from tests.scene import placed
-from tests.sim import conftest
+from tests.sim import conftest, slow_loop
 
 pytestmark = pytest.mark.mjx
 
 
 @pytest.fixture(scope="module")
 def pushed(c_world: model.World) -> tuple:
-    """A scene of a cube in the way of a push, and the drive of that push."""
+    """A scene of a cube in the way of a push, and the joints' way through that push."""
     cfg = conftest.CONFIG
     scene = conftest.place(cube=(0.06, 0.0, 0.0))
     action = jax.tree.map(jnp.asarray, conftest.push(0.0, 0.0))
     plan = primitives.plan(cfg.sim, cfg.heightmap, jnp.zeros((cfg.heightmap.size,) * 2), action)
     fields = jax.device_get(model.scene_fields(c_world, scene))
-    return scene, fields, jax.device_get(robot.drive("hand", plan))
+    return scene, fields, jax.device_get(robot.joint_trajectory("hand", plan))
 
 
-def test_film_goes_the_way_of_the_run(c_world: model.World, pushed: tuple):
-    """Claim: a film has every substep, and its last is where a run leaves the blocks, bit for
-    bit."""
-    scene, fields, drive = pushed
-    film = c_physics.film(c_world, fields, scene, drive)
-    after, trace = jax.jit(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run)(scene, drive)
-    assert film.qpos.shape == (len(drive.control), c_world.model.nq)
+def _assert_equal(ours: Trajectory, theirs: Trajectory) -> None:
+    for mine, reference in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(mine, reference)
+
+
+def test_trajectory_goes_the_way_of_the_run(c_world: model.World, pushed: tuple):
+    """Claim: a trajectory has every substep, and its last is where a run leaves the blocks, bit
+    for bit."""
+    scene, fields, joints = pushed
+    recorded = c_physics.trajectory(c_world, fields, scene, joints)
+    after, trace = jax.jit(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run)(scene, joints)
+    assert recorded.qpos.shape == (len(joints.control), c_world.model.nq)
     np.testing.assert_array_equal(
-        film.qpos[-1][c_world.block_qpos[:, :3]].astype(np.float32)[0], after.position[0]
+        recorded.qpos[-1][c_world.block_qpos[:, :3]].astype(np.float32)[0], after.position[0]
     )
-    moved = film.qpos[:, c_world.block_qpos[0, 0]]
+    moved = recorded.qpos[:, c_world.block_qpos[0, 0]]
     assert trace.touched
     assert moved[0] < 0.061 < moved[-1] - 0.04
     assert (np.diff(moved) > -1e-4).all()  # never back
 
 
-def test_film_of_what_the_robot_cannot_follow_is_empty(c_world: model.World, pushed: tuple):
-    """Claim: where the robot cannot follow, nothing moves: the film has no substep."""
-    scene, fields, drive = pushed
-    still: Drive = dataclasses.replace(drive, reachable=np.array(False))
-    film = c_physics.film(c_world, fields, scene, still)
-    assert (film.qpos.shape, film.qvel.shape) == ((0, c_world.model.nq), (0, c_world.model.nv))
+def test_trajectory_that_the_robot_cannot_follow_is_empty(c_world: model.World, pushed: tuple):
+    """Claim: where the robot cannot follow, nothing moves: the trajectory has no substep."""
+    scene, fields, joints = pushed
+    unreachable: JointTrajectory = dataclasses.replace(joints, reachable=np.array(False))
+    recorded = c_physics.trajectory(c_world, fields, scene, unreachable)
+    assert recorded.qpos.shape == (0, c_world.model.nq)
+    assert recorded.qvel.shape == (0, c_world.model.nv)
+
+
+def test_trajectory_needs_no_touch_sensors(world: model.World, c_world: model.World, pushed: tuple):
+    """Claim: a world that was built for MJX moves in C as one that was built for C."""
+    ours = c_physics.trajectory(world, *(pushed[i] for i in (1, 0, 2)))
+    np.testing.assert_array_equal(
+        ours.qpos, c_physics.trajectory(c_world, *(pushed[i] for i in (1, 0, 2))).qpos
+    )
+
+
+def test_trajectory_keeps_parked_blocks_where_they_are(c_world: model.World, pushed: tuple):
+    """Claim: blocks out of play neither fall nor meet anything: the slow loop holds them, this
+    one lets them fall alone and puts them back."""
+    scene, fields, joints = pushed
+    recorded = c_physics.trajectory(c_world, fields, scene, joints)
+    parked = c_world.block_qpos[1:, :3]
+    wanted = np.broadcast_to(layout.parking(3)[1:], (len(joints.control), 2, 3))
+    np.testing.assert_array_equal(recorded.qpos[:, parked].astype(np.float32), wanted)
+    assert not recorded.qvel[:, c_world.block_dofs[1:]].any()
+    _assert_equal(recorded, slow_loop.trajectory(c_world, fields, scene, joints))
 
 
 def test_touches_are_those_of_every_contact(c_world: model.World, pushed: tuple):
     """Claim: a hand geom touches a block where any contact of the two is deeper than 0, in either
     order."""
-    scene, fields, drive = pushed
-    exact, seen = model.with_blocks(c_world, fields), 0
-    for data in c_physics._substeps(c_world, exact, scene, drive):
+    scene, fields, joints = pushed
+    substeps_with_touch = 0
+    for data in slow_loop.substeps(c_world, fields, scene, joints):
         wanted = np.zeros((3, len(c_world.slots)), bool)
         for i in range(data.ncon):
             contact = data.contact[i]
             for hand, other in (contact.geom, contact.geom[::-1]):
-                if (
-                    hand in c_world.hand_geoms
-                    and c_world.slot_of_geom[other] >= 0
-                    and contact.dist < 0.0
-                ):
+                is_touch = c_world.slot_of_geom[other] >= 0 and contact.dist < 0.0
+                if hand in c_world.hand_geoms and is_touch:
                     wanted[list(c_world.hand_geoms).index(hand), c_world.slot_of_geom[other]] = True
         np.testing.assert_array_equal(data.sensordata.reshape(wanted.shape) > 0.0, wanted)
-        seen += wanted.any()
-    assert seen > 20
-
-
-def test_trace_by_hand(c_world: model.World, pushed: tuple):
-    """Claim: held is what both pads touch, its rise the highest while they do; parked blocks, which
-    fall, rise by 0."""
-    scene, _, _ = pushed
-    steps, num = 4, len(c_world.slots)
-    qpos = np.zeros((steps, c_world.model.nq))
-    qpos[:, c_world.block_qpos[:, 2]] = scene.position[:, 2] - 1.0
-    qpos[:, c_world.block_qpos[0, 2]] = scene.position[0, 2] + [0.0, 0.02, 0.03, 0.01]
-    qpos[:, c_world.robot_qpos[-2]] = [0.05, 0.04, 0.03, 0.02]
-    sensed = np.zeros((steps, 3, num))
-    sensed[1:3, 1, 0], sensed[0:2, 2, 0] = 2.0, 1.0  # both pads in step 1 alone
-    film = c_physics.Film(qpos, np.zeros((steps, c_world.model.nv)), sensed.reshape(steps, -1))
-    _, _, trace = c_physics._judge(c_world, 1, scene, film)
-    assert trace.touched
-    assert not trace.held.any()
-    np.testing.assert_allclose(trace.held_rise[0], 0.02, atol=1e-6)
-    np.testing.assert_allclose(trace.rise[0], 0.01, atol=1e-6)
-    np.testing.assert_array_equal(trace.held_rise[1:], 0.0)
-    np.testing.assert_array_equal(trace.rise[1:], 0.0)
-    np.testing.assert_allclose([trace.gap_closed, trace.gap_end], [0.08, 0.04], atol=1e-6)
+        substeps_with_touch += wanted.any()
+    assert substeps_with_touch > 20
 
 
 def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
-    """Claim: in a batch each scene ends as its own film does, one that spins too fast too; the
-    physics_diverged stay as they are."""
-    scene, _, drive = pushed
+    """Claim: in a batch each scene ends as its own slow loop does, one that spins too fast too; a
+    scene with NaN stays as it is."""
+    scene, _, joints = pushed
     large = dataclasses.replace(scene, half_size=1.1 * np.asarray(scene.half_size))
     spun = dataclasses.replace(scene, velocity=np.array(scene.velocity))
     spun.velocity[0, 3:] = [0.0, 0.0, 250.0]
-    physics_diverged = dataclasses.replace(
+    broken = dataclasses.replace(
         scene, position=np.where(np.arange(3) == 2, np.nan, scene.position).astype(np.float32)
     )
-    scenes = jax.tree.map(
-        lambda *leaves: np.stack(leaves), scene, large, spun, physics_diverged, scene
-    )
-    drives = jax.tree.map(lambda leaf: np.stack([leaf] * 5), drive)
-    after, _ = jax.jit(jax.vmap(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run))(
-        scenes, drives
-    )
+    scenes = jax.tree.map(lambda *leaves: np.stack(leaves), scene, large, spun, broken, scene)
+    batch = jax.tree.map(lambda leaf: np.stack([leaf] * 5), joints)
+    run = jax.jit(jax.vmap(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run))
+    after, _ = run(scenes, batch)
     ends = []
     for i, one in {0: scene, 1: large, 2: spun, 4: scene}.items():
-        film = c_physics.film(c_world, jax.device_get(model.scene_fields(c_world, one)), one, drive)
-        ends.append(film.qpos[-1][c_world.block_qpos[0]].astype(np.float32))
+        fields = jax.device_get(model.scene_fields(c_world, one))
+        end = slow_loop.trajectory(c_world, fields, one, joints).qpos[-1]
+        ends.append(end[c_world.block_qpos[0]].astype(np.float32))
         np.testing.assert_array_equal(
             np.concatenate([after.position[i, 0], after.quaternion[i, 0]]), ends[-1]
         )
     assert len({tuple(end) for end in ends}) == 3
-    np.testing.assert_array_equal(after.position[3, 0], physics_diverged.position[0])
+    np.testing.assert_array_equal(after.position[3, 0], broken.position[0])
 
 
 @pytest.mark.parametrize("metres", [0.02, 0.1, 0.3])
 def test_limit_of_speed_is_held_after_every_substep(
     c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch, metres: float
 ):
-    """Claim: MuJoCo's own loop, stopped and gone on with, gives the bits of one that limits the
-    speed as it goes."""
-    scene, fields, drive = pushed
+    """Claim: MuJoCo's own loop, stopped and continued, gives the bits of one that limits the
+    speed after every substep."""
+    scene, fields, joints = pushed
     limit = np.array([metres] * 3 + [10.0 * metres] * 3, np.float32)
     monkeypatch.setattr(layout, "SPEED_LIMIT", limit)
-    wanted = c_physics.film(c_world, fields, scene, drive)
-    (seen,) = _roll(c_world, c_physics.Workers(c_world.model), [(scene, fields, drive)])
-    places, dofs = (
-        c_world.block_qpos[0],
-        c_world.block_dofs[0],
-    )  # the cube's: parked blocks fall in one alone
-    at_limit = (np.abs(wanted.qvel[:, dofs]) == limit).any(axis=1)
+    wanted = slow_loop.trajectory(c_world, fields, scene, joints)
+    at_limit = (np.abs(wanted.qvel[:, c_world.block_dofs[0]]) == limit).any(axis=1)
     assert at_limit.any()
     assert (at_limit[:-1] & ~at_limit[1:]).any()  # and below it again
-    np.testing.assert_array_equal(seen.qpos[:, places], wanted.qpos[:, places])
-    np.testing.assert_array_equal(seen.qvel[:, dofs], wanted.qvel[:, dofs])
-    np.testing.assert_array_equal(
-        seen.qpos[:, c_world.robot_qpos], wanted.qpos[:, c_world.robot_qpos]
-    )
-    np.testing.assert_array_equal(seen.sensed, wanted.sensed)
+    _assert_equal(c_physics.trajectory(c_world, fields, scene, joints), wanted)
 
 
-def _roll(
-    world: model.World, workers: c_physics.Workers, rows: list[tuple]
-) -> list[c_physics.Film]:
-    """The films of scenes, each in a room that a thread finds."""
+def _rollouts(world: model.World, pool: SimulatorPool, rows: list[tuple]) -> list[Trajectory]:
+    """The trajectories of scenes, each in a simulator of the pool."""
 
-    def film(row: tuple) -> c_physics.Film:
-        with workers.room() as room:
-            return c_physics._roll(world, room, *row)
+    def one(row: tuple) -> Trajectory:
+        with pool.simulator() as simulator:
+            return c_physics._rollout(world, simulator, *row)
 
-    return workers.each(film, rows)
+    return pool.map(one, rows)
 
 
-def test_workers_are_used_again(
+def test_simulators_are_used_again(
     c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch
 ):
     """Claim: calls leave nothing behind: small ones after large ones, and two at the same time,
@@ -170,49 +158,47 @@ def test_workers_are_used_again(
 
     Nor does a scene in which the cube is out of play, and meets nothing.
     """
-    scene, _, drive = pushed
+    scene, _, joints = pushed
     larger = [
         dataclasses.replace(scene, half_size=k * np.asarray(scene.half_size))
         for k in (1.0, 1.1, 1.2)
     ]
-    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), drive) for one in larger]
-    place = c_world.block_qpos[0]
-    wanted = [c_physics.film(c_world, its, one, drive).qpos[:, place] for one, its, _ in rows]
+    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in larger]
+    wanted = [slow_loop.trajectory(c_world, fields, one, joints) for one, fields, _ in rows]
     monkeypatch.setattr(c_physics.os, "sched_getaffinity", lambda _: range(3))
-    roll = functools.partial(_roll, c_world, c_physics.Workers(c_world.model))
+    rollouts = functools.partial(_rollouts, c_world, SimulatorPool(c_world.model))
 
     def check(chosen: list[int]) -> None:
-        for i, film in zip(chosen, roll([rows[i] for i in chosen]), strict=True):
-            np.testing.assert_array_equal(film.qpos[:, place], wanted[i])
+        for i, recorded in zip(chosen, rollouts([rows[i] for i in chosen]), strict=True):
+            _assert_equal(recorded, wanted[i])
 
     for chosen in ([0], [2, 1, 0], [1], [0, 2]):
         check(chosen)
-    roll([(conftest.place(prism=(-0.1, 0.1, 0.0)), rows[0][1], drive)] * 3)
+    rollouts([(conftest.place(prism=(-0.1, 0.1, 0.0)), rows[0][1], joints)] * 3)
     check([0])
     with concurrent.futures.ThreadPoolExecutor() as threads:
         list(threads.map(check, [[0, 1, 2], [2, 0], [1]] * 4))
 
 
-def test_scenes_leave_nothing_behind_in_a_room(c_world: model.World, pushed: tuple):
-    """Claim: after any scene a room's model is, byte for byte, that of a room that never saw
-    another."""
-    _, _, drive = pushed
+def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed: tuple):
+    """Claim: after any scene a simulator's model is, byte for byte, that of a fresh simulator."""
+    _, _, joints = pushed
     scenes = [
         conftest.place(cube=(0.06, 0.0, 0.0)),
         conftest.place(prism=(-0.1, 0.1, 0.4)),
         conftest.place(cube=(0.06, 0.0, 0.0), other=(-0.1, 0.0, 0.0), prism=(0.0, 0.1, 0.0)),
     ]
     scenes.append(dataclasses.replace(scenes[2], half_size=1.1 * np.asarray(scenes[2].half_size)))
-    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), drive) for one in scenes]
+    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in scenes]
 
-    def after(workers: c_physics.Workers, row: tuple) -> bytes:
-        with workers.room() as room:
-            c_physics._roll(c_world, room, *row)
-            return placed.model_bytes(room.exact)
+    def after(pool: SimulatorPool, row: tuple) -> bytes:
+        with pool.simulator() as simulator:
+            c_physics._rollout(c_world, simulator, *row)
+            return placed.model_bytes(simulator.model)
 
-    wanted = [after(c_physics.Workers(c_world.model), row) for row in rows]
+    wanted = [after(SimulatorPool(c_world.model), row) for row in rows]
     assert len(set(wanted)) == len(rows)
-    used = c_physics.Workers(c_world.model)
+    used = SimulatorPool(c_world.model)
     for i in (0, 1, 2, 3, 2, 1, 3, 0, 2, 0):
         assert after(used, rows[i]) == wanted[i]
 
@@ -224,20 +210,19 @@ def test_world_of_mjx_is_refused(world: model.World):
 
 
 def test_nothing_to_move(c_world: model.World, pushed: tuple):
-    """Claim: an empty table and a drive that the robot cannot follow leave the scene as it is, with
+    """Claim: an empty table and a plan that the robot cannot follow leave the scene as it is, with
     a blank trace."""
-    scene, fields, drive = pushed
-    workers = c_physics.Workers(c_world.model)
+    scene, fields, joints = pushed
     cleared = dataclasses.replace(scene, in_play=np.zeros(len(c_world.slots), bool))
-    still = dataclasses.replace(drive, reachable=np.array(False))
-    for its, his in ((cleared, drive), (scene, still)):
-        one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (its, fields, his))
-        pose, velocity, trace = jax.tree.map(
-            lambda leaf: leaf[0], c_physics._run_batch(c_world, workers, 109, *one)
-        )
+    unreachable = dataclasses.replace(joints, reachable=np.array(False))
+    for its, way in ((cleared, joints), (scene, unreachable)):
+        row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (its, fields, way))
+        pool = SimulatorPool(c_world.model)
+        pose, velocity, *seen = c_physics._run_batch(c_world, pool, *row)
         np.testing.assert_array_equal(
-            pose, np.concatenate([scene.position, scene.quaternion], axis=1)
+            pose[0], np.concatenate([scene.position, scene.quaternion], axis=1)
         )
-        np.testing.assert_array_equal(velocity, scene.velocity)
-        assert not trace.touched
-        assert trace.gap_end == 0.0
+        np.testing.assert_array_equal(velocity[0], scene.velocity)
+        assert not any(leaf.any() for leaf in seen)
+        _, trace = jax.jit(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run)(its, way)
+        assert not any(np.any(leaf) for leaf in jax.tree.leaves(trace))

@@ -24,9 +24,9 @@ inverse = jax.jit(jax.vmap(kinematics.inverse))
 top_down = jax.jit(jax.vmap(kinematics.top_down))
 clearance = jax.jit(jax.vmap(kinematics.clearance))
 clear = jax.jit(jax.vmap(jax.vmap(kinematics.clear)))
-trajectory = jax.jit(kinematics.trajectory)
+targets_of = jax.jit(kinematics.joint_targets)
 gradients = jax.jit(jax.grad(lambda *pose: jnp.sum(kinematics.inverse(*pose)[0]), argnums=(0, 1)))
-trajectories = jax.jit(jax.vmap(kinematics.trajectory, (None, 0)))
+targets_of_batch = jax.jit(jax.vmap(kinematics.joint_targets, (None, 0)))
 
 
 def _random_joints(num: int, seed: int = 0) -> np.ndarray:
@@ -85,12 +85,12 @@ def _plans(num: int, seed: int = 0) -> primitives.Plan:
 
 
 @functools.cache
-def _moves(num: int = 64) -> tuple[np.ndarray, kinematics.Trajectory]:
-    """Set-points [num, 1 + T, 5] of plans, from their start on, and the trajectories through
+def _moves(num: int = 64) -> tuple[np.ndarray, kinematics.JointTargets]:
+    """Set-points [num, 1 + T, 5] of plans, from their start on, and the joint targets through
     them."""
     plan = _plans(num)
     control = jnp.concatenate([plan.start[:, None], plan.control], axis=1)
-    return np.asarray(control), trajectories(jnp.asarray(kinematics.HOME), control)
+    return np.asarray(control), targets_of_batch(jnp.asarray(kinematics.HOME), control)
 
 
 def test_forward_agrees_with_c():
@@ -319,44 +319,7 @@ def test_links_left_out_never_change():
     assert changes.sum() > 20
 
 
-@pytest.mark.parametrize("turns", [(0, 0, 0, 0, 0, 0), (-1, 1, 0, 1, 1, -1)])
-def test_nearest_turns_least(turns: tuple[int, ...]):
-    """Claim: the nearest solution is the branch that the arm is in, each joint by the turn that it
-    is in."""
-    q = jnp.array([0.4, -1.0, 1.7, -2.2, -1.5, 1.2]) + 2 * np.pi * jnp.array(turns, jnp.float32)
-    found, reachable = kinematics.nearest(q + 0.05, *kinematics.inverse(*kinematics.forward(q)))
-    assert reachable
-    np.testing.assert_allclose(found, q, atol=1e-4)
-
-
-@pytest.mark.parametrize(("joint", "limit"), [(0, 2 * np.pi), (2, np.pi), (5, -2 * np.pi)])
-def test_nearest_keeps_the_limits(joint: int, limit: float):
-    """Claim: where the nearest turn lies beyond a joint's limit, the one before it is taken."""
-    q = jnp.array([0.4, -1.0, 1.7, -2.2, -1.5, 1.2])
-    solution = q.at[joint].set(limit + 0.1 * np.sign(limit))
-    solution = solution - 2 * np.pi * jnp.round(solution / (2 * np.pi))
-    solutions, valid = jnp.tile(solution, (8, 1)), jnp.arange(8) == 3
-    found, reachable = kinematics.nearest(q.at[joint].set(0.99 * limit), solutions, valid)
-    assert reachable
-    np.testing.assert_allclose(
-        found[joint], limit + 0.1 * np.sign(limit) - np.sign(limit) * 2 * np.pi, atol=1e-5
-    )
-
-
-def test_nearest_without_a_choice_stays():
-    """Claim: without a valid solution the arm stays; with one, it is taken however far it is."""
-    q = jnp.asarray(kinematics.HOME)
-    solutions, valid = kinematics.inverse(*kinematics.forward(q))
-    found, reachable = kinematics.nearest(q, solutions, jnp.zeros_like(valid))
-    np.testing.assert_array_equal(found, q)
-    assert not reachable
-    for branch in np.flatnonzero(valid):
-        found, reachable = kinematics.nearest(q, solutions, jnp.arange(8) == branch)
-        assert reachable
-        assert _angles_apart(found, solutions[branch]) < 1e-5
-
-
-def test_trajectory_hits_the_set_points():
+def test_targets_hits_the_set_points():
     """Claim: the joint targets put the tips on every set-point of a plan, and hand on the
     fingers."""
     control, (target, reachable) = _moves()
@@ -369,7 +332,7 @@ def test_trajectory_hits_the_set_points():
     np.testing.assert_array_equal(target[..., 6], control[..., 4])
 
 
-def test_trajectory_is_continuous():
+def test_targets_is_continuous():
     """Claim: over flat surfaces no joint turns faster between set-points than the maker's 180
     degrees per second, none leaves its limits, and the arm is clear all the way."""
     joints = np.asarray(_moves()[1].target[..., :6])
@@ -383,7 +346,7 @@ def _line(start: tuple[float, ...], end: tuple[float, ...], num: int = 50) -> ja
     return jnp.asarray(np.linspace(start, end, num), jnp.float32)
 
 
-def test_trajectory_keeps_to_one_branch():
+def test_targets_keeps_to_one_branch():
     """Claim: the branch is one that reaches every set-point, even if the arm starts in one that
     does not."""
     control = _line((0.2, 0.0, 0.1, 0.0, 0.0), (-0.2, 0.2, 0.1, 0.0, 0.0))
@@ -392,14 +355,14 @@ def test_trajectory_keeps_to_one_branch():
     partly = np.flatnonzero(valid[0] & ~valid.all(axis=0))
     assert partly.size
     for branch in partly:
-        target, reachable = trajectory(solutions[0, branch], control)
+        target, reachable = targets_of(solutions[0, branch], control)
         assert reachable
         apart = _angles_apart(np.asarray(solutions), np.asarray(target)[:, None, :6]).max(axis=0)
         assert (apart < 1e-4).sum() == 1
         assert valid.all(axis=0)[apart.argmin()]
 
 
-def test_trajectory_takes_the_branch_it_is_in():
+def test_targets_takes_the_branch_it_is_in():
     """Claim: of branches that reach every set-point, the one with the least motion is taken: the
     one the arm is in."""
     control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
@@ -407,11 +370,11 @@ def test_trajectory_takes_the_branch_it_is_in():
     whole = np.flatnonzero(np.asarray(valid & clear(solutions)).all(axis=0))
     assert whole.size >= 2
     for branch in whole:
-        target, _ = trajectory(solutions[0, branch], control)
+        target, _ = targets_of(solutions[0, branch], control)
         np.testing.assert_allclose(target[0, :6], solutions[0, branch], atol=1e-5)
 
 
-def test_trajectory_leaves_a_branch_that_is_not_clear():
+def test_targets_leaves_a_branch_that_is_not_clear():
     """Claim: a branch that reaches every set-point, but through the table or the arm itself, is not
     taken."""
     control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
@@ -421,37 +384,37 @@ def test_trajectory_leaves_a_branch_that_is_not_clear():
     )
     assert blocked.size
     for branch in blocked:
-        target, reachable = trajectory(solutions[0, branch], control)
+        target, reachable = targets_of(solutions[0, branch], control)
         assert reachable
         assert clear(target[None, :, :6]).all()
 
 
 @pytest.mark.parametrize("turn", [1.0, -1.0])
-def test_trajectory_stays_within_limits_as_the_hand_turns(turn: float):
+def test_targets_stays_within_limits_as_the_hand_turns(turn: float):
     """Claim: a hand that turns a full circle is followed without a jump, and without passing a
     joint's limit."""
     start = (0.0, 0.0, 0.1, 0.0, 0.0)
     control = _line(start, (0.0, 0.0, 0.1, 2 * np.pi * turn, 0.0), 400)
     for wrist3 in (-5.0, 0.0, 5.0):
-        target, reachable = trajectory(jnp.asarray(kinematics.HOME).at[5].set(wrist3), control)
+        target, reachable = targets_of(jnp.asarray(kinematics.HOME).at[5].set(wrist3), control)
         assert reachable
         assert np.abs(np.diff(target[:, :6], axis=0)).max() < 0.02
         assert (np.abs(target[:, :6]) <= kinematics.LIMITS).all()
 
 
 @pytest.mark.parametrize("lost", [(-0.6, 0.0, 0.1, 0.0, 0.0), (np.nan, 0.0, 0.1, 0.0, 0.0)])
-def test_trajectory_stops_where_reach_ends(lost: tuple[float, ...]):
+def test_targets_stops_where_reach_ends(lost: tuple[float, ...]):
     """Claim: from the first set-point out of reach the arm holds the last good target, and this is
     flagged."""
     control = _line((0.0, 0.0, 0.1, 0.0, 0.05), (-0.1, 0.0, 0.1, 0.0, 0.05))
-    target, reachable = trajectory(
+    target, reachable = targets_of(
         jnp.asarray(kinematics.HOME), control.at[30:40].set(jnp.array(lost))
     )
-    whole, _ = trajectory(jnp.asarray(kinematics.HOME), control)
+    whole, _ = targets_of(jnp.asarray(kinematics.HOME), control)
     assert not reachable
     np.testing.assert_array_equal(target[:30], whole[:30])
     np.testing.assert_array_equal(target[30:, :6], np.broadcast_to(whole[29, :6], (20, 6)))
-    nowhere, reachable = trajectory(
+    nowhere, reachable = targets_of(
         jnp.asarray(kinematics.HOME), control.at[0].set(jnp.array(lost))
     )
     assert not reachable
@@ -463,8 +426,8 @@ def test_one_scene_is_not_the_others_matter():
     alone."""
     control, expected = _moves()
     control = jnp.asarray(control[:32]).at[7, :, 0].set(-5.0)
-    batch = trajectories(jnp.asarray(kinematics.HOME), control)
+    batch = targets_of_batch(jnp.asarray(kinematics.HOME), control)
     np.testing.assert_array_equal(batch.reachable, np.arange(32) != 7)
-    alone = trajectory(jnp.asarray(kinematics.HOME), control[3])
+    alone = targets_of(jnp.asarray(kinematics.HOME), control[3])
     np.testing.assert_allclose(batch.target[3], alone.target, atol=1e-5)
     np.testing.assert_allclose(batch.target[3], expected.target[3], atol=1e-5)

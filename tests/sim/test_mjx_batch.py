@@ -17,21 +17,21 @@ SCENES = 8
 
 
 def _pushes(program: env.Env):
-    """Scenes [E], drives [E] that push low through a block of each, and data [E] before the first
-    substep."""
+    """Scenes [E], joints [E] of a low push through a block of each, data [E] before substep 0."""
     cfg = program.cfg
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf[:SCENES]), program.scenes)
     place = scenes.position[:, 0, :2] - jnp.array([[0.05, 0.0]])
     pose = jnp.concatenate([place, jnp.zeros((SCENES, 1))], axis=1)
     bare = jnp.zeros((cfg.heightmap.size, cfg.heightmap.size))
 
-    def drive(pose: jax.Array):
+    def push(pose: jax.Array):
         action = Action(primitive=jnp.int32(Primitive.PUSH), pose=pose)
-        return robot.drive(cfg.sim.robot, primitives.plan(cfg.sim, cfg.heightmap, bare, action))
+        plan = primitives.plan(cfg.sim, cfg.heightmap, bare, action)
+        return robot.joint_trajectory(cfg.sim.robot, plan)
 
-    drives = jax.vmap(drive)(pose)
-    begin = jax.vmap(lambda scene, drive: mjx_physics.initial_data(program.physics, scene, drive))
-    return scenes, drives, begin(scenes, drives)
+    joints = jax.vmap(push)(pose)
+    begin = jax.vmap(lambda scene, one: mjx_physics.initial_data(program.physics, scene, one))
+    return scenes, joints, begin(scenes, joints)
 
 
 def _each(tree):
@@ -47,10 +47,10 @@ def test_batches_round_otherwise_and_contacts_amplify_it():
     physics = program.physics
     given = jax.jit(lambda: _pushes(program))()
 
-    def substep(scene, drive, initial, data, index):
+    def substep(scene, joints, initial, data, index):
         model = mjx_physics.scene_model(physics, scene)
         with jax.default_matmul_precision("highest"):
-            after = mjx.step(model, data.replace(ctrl=drive.control[index]))
+            after = mjx.step(model, data.replace(ctrl=joints.control[index]))
         return mjx_physics._restrain(physics.world, ~scene.in_play, initial, after)
 
     run = jax.jit(jax.vmap(substep, (0, 0, 0, 0, None)))

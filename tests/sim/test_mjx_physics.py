@@ -125,7 +125,8 @@ def test_fast_spin_does_not_blow_up(executed, c_world):
     """Claim: a thin block that comes in spinning at 250 rad/s is held to the speed limit, in MJX
     and in C."""
     run = executed.case("spinning")
-    end, _ = c_physics.CPhysics(c_world, CONFIG.sim).run(run.scene, robot.drive("hand", run.plan))
+    joints = robot.joint_trajectory("hand", run.plan)
+    end, _ = c_physics.CPhysics(c_world, CONFIG.sim).run(run.scene, joints)
     for after in (run.after, end):
         assert simulation.healthy(after)
         assert (np.abs(after.velocity) <= layout.SPEED_LIMIT).all()

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.scene import layout, model
 from csac_jax.sim import mjx_physics
-
-from mujoco import mjx  # isort: skip  (after csac_jax.sim, which imports it quietly)
+from csac_jax.sim.quiet_mjx import mjx
 
 pytestmark = pytest.mark.mjx
 
@@ -23,7 +22,8 @@ CONFIG = Config(
         iterations=50, line_search=50
     ),  # both solvers converge: what differs is not theirs
 )
-PAD = 0.012  # m, front of the closed fingers from the hand's axis; the axis stands at the origin, tips 12 mm high
+# m, front of the closed fingers from the hand's axis at the origin; tips are 12 mm high
+PAD = 0.012
 HALF, DEEP = 0.025, 3e-4  # m, half a cube and how deep it is in what it touches
 DIAGONAL = np.sqrt(2.0) * HALF
 TILT = 0.2  # rad

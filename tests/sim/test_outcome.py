@@ -1,11 +1,16 @@
 """Outcomes of hand-made traces."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from csac_jax.config import SimConfig
 from csac_jax.constants import Outcome
 from csac_jax.sim import outcome
-from csac_jax.sim.outcome import Trace
+from csac_jax.sim.outcome import Substep, Trace
 
 RISE = 0.10  # m, of the hand
 
@@ -23,6 +28,42 @@ def _trace(
         gap_end=jnp.array(gap_end),
         contact_overflow=jnp.int32(0),
     )
+
+
+def _substeps() -> Substep:
+    """Four substeps over three blocks, of which both pads touch block 0 in the second alone."""
+    touching = np.zeros((4, 3, 3), bool)
+    touching[1:3, 1, 0] = touching[0:2, 2, 0] = True
+    rise = np.zeros((4, 3), np.float32)
+    rise[:, 0] = [0.0, 0.02, 0.03, 0.01]
+    gap = np.float32([0.10, 0.08, 0.06, 0.04])
+    return Substep(touching, rise, gap, np.array([False, True, True, False]))
+
+
+CLOSES_AT_1 = dataclasses.replace(SimConfig(), grasp_phases=(1, 1, 2), push_phases=(1, 1, 2))
+
+
+def test_trace_by_hand():
+    """Claim: held is what both pads touch, its rise the highest while they do; the gap is read as
+    the hand has closed and in the end; overflows are counted."""
+    trace = jax.device_get(outcome.trace_of(CLOSES_AT_1, _substeps()))
+    assert trace.touched
+    assert not trace.held.any()
+    np.testing.assert_array_equal(trace.held_rise, np.float32([0.02, 0.0, 0.0]))
+    np.testing.assert_array_equal(trace.rise, np.float32([0.01, 0.0, 0.0]))
+    np.testing.assert_array_equal([trace.gap_closed, trace.gap_end], np.float32([0.08, 0.04]))
+    assert trace.contact_overflow == 2
+
+
+def test_trace_is_the_same_substep_by_substep():
+    """Claim: a trace extended one substep at a time, as in MJX, is that of all at once, as in C."""
+    seen = jax.tree.map(jnp.asarray, _substeps())
+    trace = outcome.blank(3)
+    for index in range(4):
+        one = jax.tree.map(lambda leaf, index=index: leaf[index], seen)
+        trace = outcome.extend(CLOSES_AT_1, trace, jnp.int32(index), one)
+    whole = outcome.trace_of(CLOSES_AT_1, seen)
+    jax.tree.map(np.testing.assert_array_equal, trace, whole)
 
 
 @pytest.mark.parametrize(

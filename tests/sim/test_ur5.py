@@ -21,7 +21,7 @@ CUBE = 0.025  # m, half its side
 FINGER = 6  # address in qpos of the first finger, after the six joints
 BLOCK = 8  # address in qpos of the block
 
-_target = jax.jit(functools.partial(kinematics.trajectory, kinematics.HOME))
+_target = jax.jit(functools.partial(kinematics.joint_targets, kinematics.HOME))
 
 
 def _part(name: str) -> mujoco.MjSpec:

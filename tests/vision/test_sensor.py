@@ -74,7 +74,7 @@ def test_no_errors_change_nothing():
 class Still:
     """Physics in which nothing moves."""
 
-    def run(self, scene, drive):
+    def run(self, scene, joints):
         return layout.park(scene, scene.in_play), outcome.blank(len(scene.colour))
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from csac_jax.scene import solids
-from csac_jax.scene.solids import Group, Kind, Solids
+from csac_jax.scene.solids import GeomGroup, Kind, Solids
 from csac_jax.vision import raycast, shapes
 from tests.vision import mujoco_rays
 
@@ -91,7 +91,7 @@ def _solid(
     3]."""
     size, position = rng.uniform(0.01, 0.08, 3), rng.uniform(-0.2, 0.2, 3)
     rotation = Rotation.random(random_state=rng).as_matrix()
-    group = Group(
+    group = GeomGroup(
         kind,
         jnp.asarray(size[None], jnp.float32),
         jnp.asarray(position[None], jnp.float32),

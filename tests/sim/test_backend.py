@@ -1,12 +1,16 @@
 """`sim.physics auto`: what it stands for, whatever this machine has."""
 
 import dataclasses
+import subprocess
+import sys
+import typing
 
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import Config, PhysicsKind
-from csac_jax.sim import auto, physics
+from csac_jax.config import Config, PhysicsKind, RobotKind
+from csac_jax.scene import model
+from csac_jax.sim import backend, physics, robot
 
 
 def _config(kind: PhysicsKind, mesh_size_jitter: float = 0.0, scenes: int = 256) -> Config:
@@ -21,14 +25,14 @@ def _config(kind: PhysicsKind, mesh_size_jitter: float = 0.0, scenes: int = 256)
 
 def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
     """Claim: where Warp is installed, `fast` runs on it on a GPU, else in MJX's own physics."""
-    monkeypatch.setattr(auto.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(backend.jax, "default_backend", lambda: "gpu")
     for installed, chosen in ((True, "warp"), (False, "mjx")):
         monkeypatch.setattr(
-            auto.importlib.util,
+            backend.importlib.util,
             "find_spec",
             lambda name, there=installed: object() if there else None,
         )
-        assert auto.resolve(presets.fast()).sim.physics == chosen
+        assert backend.resolve(presets.fast()).sim.physics == chosen
 
 
 @pytest.mark.parametrize(
@@ -48,29 +52,42 @@ def test_choice(
 ):
     """Claim: `auto` is `c` on a CPU, `warp` where measured to be faster, on CUDA, installed, able
     to do the scene; else `mjx`, also on several devices."""
-    monkeypatch.setattr(auto.jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(backend.jax, "default_backend", lambda: backend)
     monkeypatch.setattr(
-        auto.importlib.util, "find_spec", lambda name: object() if installed else None
+        backend.importlib.util, "find_spec", lambda name: object() if installed else None
     )
-    monkeypatch.setattr(auto, "WARP_SCENES", measured)
+    monkeypatch.setattr(backend, "WARP_SCENES", measured)
     cfg = _config("auto", mesh_size_jitter, scenes)
-    assert auto.resolve(cfg) == dataclasses.replace(
+    assert backend.resolve(cfg) == dataclasses.replace(
         cfg, sim=dataclasses.replace(cfg.sim, physics=chosen)
     )
-    assert auto.resolve(cfg, 2).sim.physics == "mjx"
+    assert backend.resolve(cfg, 2).sim.physics == "mjx"
     if chosen == "warp":
-        assert auto.resolve(cfg, 1, 5000 // scenes).sim.physics == "warp"
-        assert auto.resolve(cfg, 1, 5001 // scenes + 1).sim.physics == "mjx"
+        assert backend.resolve(cfg, 1, 5000 // scenes).sim.physics == "warp"
+        assert backend.resolve(cfg, 1, 5001 // scenes + 1).sim.physics == "mjx"
 
 
 def test_other_choices_stay():
     """Claim: what the user has chosen stays."""
     for kind in ("mjx", "warp", "c"):
-        assert auto.resolve(_config(kind)) == _config(kind)
+        assert backend.resolve(_config(kind)) == _config(kind)
 
 
 def test_auto_is_no_engine():
     """Claim: `auto` that nobody resolved is an error that says what to do, not the physics of some
     engine."""
-    with pytest.raises(ValueError, match=r"sim\.physics: 'auto' .* mjx, warp or c"):
+    with pytest.raises(ValueError, match=r"sim\.physics: 'auto' .* one of: mjx, warp, c"):
         physics.make(None, _config("auto").sim)
+
+
+def test_tables_are_those_of_the_config():
+    """Claim: every physics and robot that the config allows has its entry, and there are no
+    others."""
+    assert {*physics.PHYSICS, "auto"} == {*typing.get_args(PhysicsKind)}
+    assert {*robot.ROBOTS} == {*model.ROBOTS} == {*typing.get_args(RobotKind)}
+
+
+def test_choice_needs_no_mujoco():
+    """Claim: `auto` is resolved without loading MuJoCo, which takes longer than JAX itself."""
+    code = "import sys, csac_jax.sim.backend; assert 'mujoco' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
