@@ -77,7 +77,7 @@ class Program:
 
 def make(cfg: Config) -> Program:
     """Environment and learner of a config."""
-    return Program(cfg, environment.make(cfg), learning.make(cfg))
+    return Program(cfg, environment.make_env(cfg), learning.make(cfg))
 
 
 def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
@@ -139,7 +139,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     priority = jnp.where(ready, priority, replay.priority)
 
     # Replace finished scenes.
-    fresh = jax.vmap(env.restart)(_keys(key_reset, cfg.train.scenes), after)
+    fresh = jax.vmap(env.auto_reset)(_keys(key_reset, cfg.train.scenes), after)
     scenes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
     metrics = StepMetrics(

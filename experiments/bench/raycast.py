@@ -69,7 +69,7 @@ def _ours(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -
     def look(position: jax.Array, quaternion: jax.Array) -> Any:
         turn = jax.vmap(geometry.quat_to_matrix)(quaternion)
         shapes = Polytopes(normal, offset, position[slot], turn[slot], jnp.zeros((len(slot), 3)))
-        return jax.vmap(raycast.meet, (None, 0, None))(shapes, origin, jnp.asarray(DOWN))
+        return jax.vmap(raycast.cast_polytopes, (None, 0, None))(shapes, origin, jnp.asarray(DOWN))
 
     compiled = jax.jit(jax.vmap(look))
     return lambda: compiled(*poses)

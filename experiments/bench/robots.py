@@ -19,12 +19,12 @@ import numpy as np
 
 from csac_jax.config import Config, RobotKind
 from csac_jax.constants import Outcome
-from csac_jax.env import Env
 from csac_jax.runtime import provenance
 from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.primitives import Action
+from csac_jax.vision import observe
 from experiments.bench._options import read
 from experiments.bench.parity import STREAM, TEN, pile_config
 
@@ -65,8 +65,8 @@ def measure(grasps: int) -> dict[str, Any]:
     rng = np.random.default_rng(STREAM)
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(grasps) % SCENES], settled)
     yaws = rng.uniform(0.0, 2.0 * np.pi, grasps).astype(np.float32)
-    scenes = jax.jit(jax.vmap(layout.turn))(scenes, yaws)
-    height = jax.jit(jax.vmap(lambda scene: Env(cfg, None, None).look(scene).height))(scenes)
+    scenes = jax.jit(jax.vmap(layout.rotate))(scenes, yaws)
+    height = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))(scenes)
     plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
     actions = jax.jit(jax.vmap(plan))(scenes, height)
     noise = rng.normal(size=(grasps, 3)) * NOISE * (np.arange(grasps) % 4 == 0)[:, None]

@@ -49,7 +49,7 @@ def test_park_touches_only_what_leaves(scene: Scene):
 
 def test_turn_keeps_parked_blocks_parked(scene: Scene):
     """Claim: turning a scene leaves what is parked where it is."""
-    turned = layout.turn(scene, jnp.float32(2.0))
+    turned = layout.rotate(scene, jnp.float32(2.0))
     for leaf in ("position", "quaternion", "velocity", "in_play"):
         np.testing.assert_array_equal(getattr(turned, leaf)[PARKED], getattr(scene, leaf)[PARKED])
 
@@ -57,7 +57,7 @@ def test_turn_keeps_parked_blocks_parked(scene: Scene):
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 3.0, 6.0])
 def test_turn_is_a_rotation_about_z(scene: Scene, yaw: float):
     """Claim: turning keeps heights and distances, and turns places and blocks by the same angle."""
-    turned = layout.turn(scene, jnp.float32(yaw))
+    turned = layout.rotate(scene, jnp.float32(yaw))
     play = np.flatnonzero(scene.in_play)
     about_z = Rotation.from_rotvec([0.0, 0.0, yaw])
     before, after = np.asarray(scene.position)[play], np.asarray(turned.position)[play]
