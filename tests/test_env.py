@@ -28,7 +28,7 @@ CONFIG = Config(
     task=TaskConfig(max_actions=6, max_steps_without_change=3),
 )
 SCENES = 8
-BARE = (0.15, 0.15, 0.0)  # a place where nothing lies
+BARE = (0.15, 0.15, 0.0)  # x, y and yaw of a place where nothing lies
 
 
 class Lab(NamedTuple):
@@ -55,12 +55,12 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     keys = jax.random.split(jax.random.key(0), SCENES)
     plan_grasp = functools.partial(oracle.grasp, CONFIG.sim, CONFIG.heightmap, CONFIG.scene.slots)
 
-    def look_and_plan(state: State) -> Action:
+    def plan_from_state(state: State) -> Action:
         return plan_grasp(state.scene, state.obs.height)
 
     reset = jax.jit(jax.vmap(env.reset)).trace(keys)
     state = reset.lower().compile()(keys)
-    plan = jax.jit(jax.vmap(look_and_plan)).lower(state).compile()
+    plan = jax.jit(jax.vmap(plan_from_state)).lower(state).compile()
     reset_to = jax.jit(jax.vmap(env.reset_to)).lower(state.scene).compile()
     step = jax.jit(jax.vmap(env.step)).trace(state, plan(state))
     into, out = (
@@ -141,23 +141,23 @@ def _at(tree, index: int):
 
 @pytest.fixture(scope="module")
 def stepped(lab: Lab) -> State:
-    """One step of the scenes of `_LANES`."""
+    """One step of the scenes of `_CASES`."""
     first = lab.reset_to(
         _stack(
-            *(_cube(*place, _TARGETS.get(name, layout.ANY)) for name, (place, *_) in _LANES.items())
+            *(_cube(*place, _TARGETS.get(name, layout.ANY)) for name, (place, *_) in _CASES.items())
         )
     )
     actions, steps_without_change = (
-        jnp.array([lane[i] for lane in _LANES.values()], jnp.int32) for i in (1, 2)
+        jnp.array([case[i] for case in _CASES.values()], jnp.int32) for i in (1, 2)
     )
-    action = _actions(*((kind, pose) for *_, kind, pose in _LANES.values()))
+    action = _actions(*((kind, pose) for *_, kind, pose in _CASES.values()))
     return lab.step(
         dataclasses.replace(first, actions=actions, steps_without_change=steps_without_change),
         action,
     )
 
 
-_LANES = {  # the cube's place, actions and steps_without_change actions so far, the action
+_CASES = {  # the cube's place, actions and steps_without_change actions so far, the action
     "last chance": ((0.0, 0.0), 5, 2, Primitive.GRASP, (0.01, 0.0, 0.0)),
     "cap": ((0.0, 0.0), 5, 0, Primitive.GRASP, BARE),
     "steps_without_change": ((0.0, 0.0), 2, 2, Primitive.GRASP, BARE),
@@ -171,33 +171,33 @@ _TARGETS = {"got": 0, "wrong": 1}  # slots
 
 
 @pytest.fixture
-def lane(stepped: State) -> Callable[[str], State]:
-    return lambda name: _at(stepped, list(_LANES).index(name))
+def state_of(stepped: State) -> Callable[[str], State]:
+    return lambda name: _at(stepped, list(_CASES).index(name))
 
 
-def test_last_block_terminates(lane):
+def test_last_block_terminates(state_of):
     """Claim: taking the last block terminates the episode, is worth 1, and is no truncation even at
     the cap."""
-    state = lane("last chance")
+    state = state_of("last chance")
     assert (state.terminated, state.truncated, state.done) == (True, False, True)
     assert (state.reward, state.info.cleared, state.info.blocks_lost) == (1.0, 1, 0)
     assert state.info.outcome == state.info.outcome_by_gap == Outcome.LIFTED
-    assert abs(state.info.distance - 0.01) < 1e-6  # the place aimed at lay 1 cm beside the cube
+    assert abs(state.info.distance - 0.01) < 1e-6  # the place aimed at lay 1 cm off the cube
     assert state.obs.height.max() < 0.001
 
 
-def test_target_ends_the_episode(lane):
+def test_target_ends_the_episode(state_of):
     """Claim: in the target task the episode ends when the target is got, though another block is
     left."""
-    state = lane("got")
+    state = state_of("got")
     assert (state.terminated, state.reward, state.info.outcome) == (True, 1.0, Outcome.LIFTED)
     np.testing.assert_array_equal(state.scene.in_play, [False, True, False])
 
 
-def test_wrong_block_is_no_success(lane):
+def test_wrong_block_is_no_success(state_of):
     """Claim: lifting another block than the target takes it away, counts as `touched` and is worth
     nothing."""
-    state = lane("wrong")
+    state = state_of("wrong")
     assert (state.done, state.reward, state.info.cleared, state.info.outcome) == (
         False,
         0.0,
@@ -256,7 +256,7 @@ def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
     )
     fresh = jax.jit(jax.vmap(env.auto_reset))(jax.random.split(jax.random.key(0), SCENES), stepped)
     for name, stays in (("got", True), ("wrong", False), ("last chance", False)):
-        new, old = (_at(state, list(_LANES).index(name)) for state in (fresh, stepped))
+        new, old = (_at(state, list(_CASES).index(name)) for state in (fresh, stepped))
         assert np.array_equal(new.scene.position, old.scene.position) == stays, name
         assert new.scene.in_play[new.scene.target], name
         assert (new.done, new.reward, new.actions) == (False, 0.0, 0)
@@ -264,9 +264,9 @@ def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
         assert not new.obs.target.all()
 
 
-def test_action_cap_truncates(lane):
+def test_action_cap_truncates(state_of):
     """Claim: an episode is cut off after max_actions actions; that does not terminate it."""
-    state = lane("cap")
+    state = state_of("cap")
     assert (state.terminated, state.truncated, state.reward) == (False, True, 0.0)
     assert (state.actions, state.steps_without_change, state.info.outcome) == (
         6,
@@ -275,10 +275,10 @@ def test_action_cap_truncates(lane):
     )
 
 
-def test_idle_cap_truncates(lane):
+def test_no_change_cap_truncates(state_of):
     """Claim: an episode is cut off after max_steps_without_change actions in a row without visible
     change."""
-    state = lane("steps_without_change")
+    state = state_of("steps_without_change")
     assert (state.terminated, state.truncated, state.actions, state.steps_without_change) == (
         False,
         True,
@@ -287,26 +287,26 @@ def test_idle_cap_truncates(lane):
     )
 
 
-def test_episode_goes_on(lane):
+def test_episode_goes_on(state_of):
     """Claim: below both caps the episode goes on, and an action without visible change counts as
     steps_without_change."""
-    state = lane("on")
+    state = state_of("on")
     assert (state.done, state.actions, state.steps_without_change) == (False, 1, 2)
 
 
-def test_visible_change_ends_idleness(lane):
-    """Claim: an action that moves a block more than CHANGE_AREA starts the steps_without_change
-    count anew."""
-    state = lane("moved")
+def test_visible_change_ends_the_count_without_change(state_of):
+    """Claim: an action that moves a block more than CHANGE_AREA resets the count of
+    steps_without_change."""
+    state = state_of("moved")
     assert state.info.moved > CHANGE_AREA
     assert (state.done, state.steps_without_change, state.reward) == (False, 0, 0.0)
     assert 0.05 < state.scene.position[0, 0] - 0.06 < 0.1
 
 
-def test_block_pushed_out_leaves(lane):
-    """Claim: a block pushed out of the square is counted as left, not as cleared, and is out of
+def test_block_pushed_out_leaves(state_of):
+    """Claim: a block pushed out of the square counts as lost, not as cleared, and is out of
     play and of sight."""
-    state = lane("out")
+    state = state_of("out")
     assert (state.info.blocks_lost, state.info.cleared, state.reward) == (1, 0, 0.0)
     np.testing.assert_array_equal(state.scene.position, layout.parking(3))
     assert not state.scene.in_play.any()
@@ -340,8 +340,8 @@ def test_oracle_clears_scenes(lab: Lab):
 
 
 def _graspable(height: np.ndarray) -> float:
-    """phi_g of a fixed critic: 1 if somewhere something stands with room for both fingers beside
-    it, else 0.
+    """phi_g of a fixed critic: 1 if somewhere something stands with room for a finger on either
+    side, else 0.
 
     Room: nothing 36 to 64 mm to either side, along x or along y.
     """
@@ -463,7 +463,7 @@ def test_failed_physics_stays_in_its_scene(lab: Lab, where: str, value: float):
     jax.tree.map(np.testing.assert_array_equal, physics_diverged.scene, expected)
 
 
-def test_target_that_is_no_slot_is_ill(lab: Lab):
+def test_target_that_is_no_slot_counts_as_divergence(lab: Lab):
     """Claim: a target beyond the slots makes a scene physics_diverged; it does not pass for a table
     cleared of its target."""
     scene = _stack(*[_cube(0.0, 0.0)] * SCENES)

@@ -1,4 +1,4 @@
-"""Parked blocks and turned scenes."""
+"""Parked blocks and rotated scenes."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,26 +47,26 @@ def test_park_touches_only_what_leaves(scene: Scene):
         np.testing.assert_array_equal(getattr(again, leaf)[kept], getattr(scene, leaf)[kept])
 
 
-def test_turn_keeps_parked_blocks_parked(scene: Scene):
-    """Claim: turning a scene leaves what is parked where it is."""
-    turned = layout.rotate(scene, jnp.float32(2.0))
+def test_rotate_keeps_parked_blocks_parked(scene: Scene):
+    """Claim: rotating a scene leaves what is parked where it is."""
+    rotated = layout.rotate(scene, jnp.float32(2.0))
     for leaf in ("position", "quaternion", "velocity", "in_play"):
-        np.testing.assert_array_equal(getattr(turned, leaf)[PARKED], getattr(scene, leaf)[PARKED])
+        np.testing.assert_array_equal(getattr(rotated, leaf)[PARKED], getattr(scene, leaf)[PARKED])
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 3.0, 6.0])
-def test_turn_is_a_rotation_about_z(scene: Scene, yaw: float):
-    """Claim: turning keeps heights and distances, and turns places and blocks by the same angle."""
-    turned = layout.rotate(scene, jnp.float32(yaw))
+def test_rotate_is_a_rotation_about_z(scene: Scene, yaw: float):
+    """Claim: rotating keeps heights and distances, and rotates places and blocks alike."""
+    rotated = layout.rotate(scene, jnp.float32(yaw))
     play = np.flatnonzero(scene.in_play)
     about_z = Rotation.from_rotvec([0.0, 0.0, yaw])
-    before, after = np.asarray(scene.position)[play], np.asarray(turned.position)[play]
+    before, after = np.asarray(scene.position)[play], np.asarray(rotated.position)[play]
     np.testing.assert_array_equal(after[:, 2], before[:, 2])
     distances = [np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (before, after)]
     np.testing.assert_allclose(*distances, atol=1e-6)
     np.testing.assert_allclose(after, about_z.apply(before), atol=1e-6)
     expected = (about_z * _rotations(scene)).as_matrix()
-    np.testing.assert_allclose(_rotations(turned).as_matrix()[play], expected[play], atol=1e-5)
+    np.testing.assert_allclose(_rotations(rotated).as_matrix()[play], expected[play], atol=1e-5)
 
 
 def test_parking_is_out_of_reach_and_out_of_view():
