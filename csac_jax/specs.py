@@ -51,6 +51,6 @@ def action_spec(cfg: HeightmapConfig) -> Action:
     low = np.array([-0.5 * cfg.extent, -0.5 * cfg.extent, 0.0], np.float32)
     high = np.array([0.5 * cfg.extent, 0.5 * cfg.extent, 2.0 * np.pi], np.float32)
     return Action(
-        primitive=_Spec((), np.int32, min(Primitive), max(Primitive)),
+        primitive=_Spec((), np.int32, int(min(Primitive)), int(max(Primitive))),
         pose=_Spec((3,), np.float32, low, high),
     )
