@@ -1,47 +1,42 @@
-"""The environment by itself: one scene, pure `reset` and `step`; the caller vmaps and jits.
+"""The environment: a Markov decision process over one scene.
 
-env = make(Config())
-state = env.reset(jax.random.key(0))
-state = env.step(state, Action(primitive=jnp.int32(1), pose=jnp.array([0.0, 0.0, 0.5])))
+    env = make_env(presets.quick())
+    state = env.reset(jax.random.key(0))
+    state = env.step(state, Action.grasp(x=0.02, y=-0.05, yaw=0.3))
+
+`reset` and `step` are pure and take one scene: vmap, jit or scan them. An episode terminates when
+no block to get is left: any block in the task `clear`, one in the task `target`. It is truncated at
+a cap of the config's section `task`, or when physics diverges.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
-from csac_jax import geometry
-from csac_jax.config import Config, SceneConfig
+from csac_jax import specs
+from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
-from csac_jax.errors import SceneError
-from csac_jax.scene import arrange, blocks, families, layout, model, pool
+from csac_jax.scene import layout, model, pool, sources
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import outcome, physics as simulation
+from csac_jax.sim import auto, outcome, physics as simulation
 from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action
-from csac_jax.vision import camera, heightmap
+from csac_jax.vision import heightmap, observe, sensor
 from csac_jax.vision.heightmap import Observation
-from csac_jax.vision.raycast import Polytopes
-
-_NOISE = np.uint32(2**31)  # folded into an episode's key: beside its children from `split`
-LEAST_ARRANGED = 4  # blocks in an arrangement
 
 
 @struct.dataclass
 class Info:
-    """What the last action did."""
+    """What the last action did. A block lifted that is not the target counts as TOUCHED."""
 
-    outcome: jax.Array  # [] int32, Outcome of a grasp by ground truth; NOTHING after a push; of a wrong block TOUCHED
-    outcome_by_gap: (
-        jax.Array
-    )  # [] int32, as finger gap and height map suggest; a wrong block is seen to be one
+    outcome: jax.Array  # [] int32, Outcome of a grasp by ground truth; NOTHING after a push
+    outcome_by_gap: jax.Array  # [] int32, the same judged by finger gap and height map
     moved: jax.Array  # [] cm^2 of the height map that moved
-    distance: (
-        jax.Array
-    )  # [] m, between the place aimed at and the nearest block lifted; 0 if none was
-    cleared: jax.Array  # [] int32, blocks taken from the table
+    distance: jax.Array  # [] m, from the place aimed at to the nearest block lifted; 0 without one
+    cleared: jax.Array  # [] int32, blocks lifted off the table
     blocks_lost: jax.Array  # [] int32, blocks that left the workspace
     contact_overflow: jax.Array  # [] int32, substeps in which contacts may have been dropped
     physics_diverged: jax.Array  # [] bool, physics failed: the transition is void
@@ -53,19 +48,13 @@ class State:
 
     scene: Scene
     obs: Observation
-    reward: (
-        jax.Array
-    )  # [] 1 if the last action took a block that was asked for, else 0 (r2 of CSAC eq. 11)
-    terminated: jax.Array  # [] bool, nothing is left to get
-    truncated: (
-        jax.Array
-    )  # [] bool, action cap or no-change cap reached, or the scene is physics_diverged
-    actions: jax.Array  # [] int32, taken in this episode
+    reward: jax.Array  # [] float32, 1 if the last action lifted a block to get (r2, CSAC eq. 11)
+    terminated: jax.Array  # [] bool, no block to get is left
+    truncated: jax.Array  # [] bool, a cap was reached or physics diverged
+    actions: jax.Array  # [] int32, actions in this episode
     steps_without_change: jax.Array  # [] int32, actions in a row without visible change
     info: Info
-    noise: jax.Array | None = (
-        None  # [] typed key, root of the episode's sensor errors; None without any
-    )
+    noise_key: jax.Array | None = None  # [] root of the episode's sensor noise; None without noise
 
     @property
     def done(self) -> jax.Array:
@@ -75,207 +64,162 @@ class State:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Env:
-    """Physics, eyes and the pool of settled scenes; closed over by whoever compiles."""
+    """Physics and a pool of scenes; static, so compiled functions close over it."""
 
     cfg: Config
     physics: Physics
     scenes: Scene  # NumPy leaves [P, N, ...], at rest
-    any_yaw: bool = True  # scenes are turned by any yaw that keeps them in the workspace; else only by quarter turns
+    any_yaw: bool = True  # False: `reset` rotates scenes by quarter turns only
+
+    @property
+    def observation_spec(self) -> Observation:
+        """The ArraySpec of each leaf of an observation."""
+        return specs.observation_spec(self.cfg.heightmap)
+
+    @property
+    def action_spec(self) -> Action:
+        """The ArraySpec of each leaf of an action."""
+        return specs.action_spec(self.cfg.heightmap)
 
     def reset(self, key: jax.Array) -> State:
-        """A fresh settled scene of the pool, turned by a random yaw."""
-        return self.begin(self._fresh(key), key)
+        """The first state of an episode: a random scene of the pool, rotated by a random yaw."""
+        return self.reset_to(self._sample_scene(key), key)
 
-    def restart(self, key: jax.Array, state: State) -> State:
-        """What follows an episode: a fresh scene; or, after a target was got, the same one with the
-        next target."""
-        key_fresh, key_target = jax.random.split(key)
-        scene = self._fresh(key_fresh)
-        if self.cfg.task.kind == "target":
-            goes_on = (state.reward > 0.0) & jnp.any(state.scene.in_play)
-            again = layout.choose_target(key_target, state.scene)
-            scene = jax.tree.map(lambda new, old: jnp.where(goes_on, old, new), scene, again)
-        return self.begin(scene, key)
+    def reset_to(self, scene: Scene, key: jax.Array | None = None) -> State:
+        """The first state of an episode that starts with this scene.
 
-    def _fresh(self, key: jax.Array) -> Scene:
-        key_scene, key_enter = jax.random.split(key)
-        index = jax.random.randint(key_scene, (), 0, self.scenes.position.shape[0])
-        return self.vary(
-            key_enter, jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes)
-        )
-
-    def vary(self, key: jax.Array, scene: Scene) -> Scene:
-        """A scene as an episode meets it: turned at random; with a target, its own or any, if the
-        task has one."""
-        key_yaw, key_target = jax.random.split(key)
-        yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
-        near = jnp.linalg.norm(scene.position[:, :2], axis=1) <= 0.5 * self.cfg.heightmap.extent
-        anyhow = self.any_yaw & jnp.all(near | ~scene.in_play)
-        turned = layout.rotate(
-            scene, jnp.where(anyhow, yaw, jnp.round(yaw / (0.5 * np.pi)) * (0.5 * np.pi))
-        )
-        if self.cfg.task.kind != "target":
-            return turned.replace(target=jnp.full_like(scene.target, layout.ANY))
-        own = scene.target != layout.ANY
-        return jax.tree.map(
-            lambda a, b: jnp.where(own, a, b), turned, layout.choose_target(key_target, turned)
-        )
-
-    def begin(self, scene: Scene, key: jax.Array | None = None) -> State:
-        """The first state of an episode that starts with this scene; the key is needed with a
-        sensor model only."""
+        Only sensor noise needs the key. Raises ValueError where it is missing.
+        """
         no, none = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         zero = jnp.zeros((), jnp.float32)
         info = Info(none, none, zero, zero, none, none, none, no)
-        noise = self._noise(key)
-        return State(scene, self._see(scene, noise, none), zero, no, no, none, none, info, noise)
+        noise_key = sensor.episode_key(key, self.cfg.sensor)
+        obs = self._observe(scene, noise_key, none)
+        return State(scene, obs, zero, no, no, none, none, info, noise_key)
 
-    def _noise(self, key: jax.Array | None) -> jax.Array | None:
-        """The root of the sensor's errors in the episode that begins with this key."""
-        if not self.cfg.sensor.active:
-            return None
-        if key is None:
-            raise ValueError(
-                "begin: with a sensor model (config section `sensor`) an episode needs a key"
-            )
-        return jax.random.fold_in(key, _NOISE)
+    def auto_reset(self, key: jax.Array, state: State) -> State:
+        """The first state after the episode that ended in `state`.
 
-    def _see(self, scene: Scene, noise: jax.Array | None, actions: jax.Array) -> Observation:
-        """What the sensor makes of a scene after so many actions."""
-        return self.look(scene, noise if noise is None else jax.random.fold_in(noise, actions))
-
-    def look(self, scene: Scene, key: jax.Array | None = None) -> Observation:
-        """The view of a scene: as it is, or with the errors of the config's sensor if a key is
-        given."""
-        cfg = self.cfg
-        slots = cfg.scene.slots
-        normals, offsets = blocks.half_spaces(slots, scene.half_size)
-        slot = blocks.parts(slots).slot
-        shapes = Polytopes(
-            normal=normals,
-            offset=offsets,
-            position=scene.position[slot],
-            rotation=jax.vmap(geometry.quat_to_matrix)(scene.quaternion)[slot],
-            colour=jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
-        )
-        wanted = (slot == scene.target) | (scene.target == layout.ANY)
-        seen = (shapes, jnp.asarray(blocks.TABLE_COLOUR), wanted)
-        if cfg.heightmap.view == "oblique":
-            eye = camera.make(cfg.camera)
-            if key is None:
-                return heightmap.oblique(cfg.heightmap, *seen, eye)
-            return heightmap.oblique_measured(key, cfg.heightmap, cfg.sensor, *seen, eye)
-        true = heightmap.orthographic(cfg.heightmap, *seen)
-        return true if key is None else heightmap.measured(key, cfg.sensor, true, wanted)
+        A fresh scene; but in the task `target`, after a success, the same scene with a new target.
+        """
+        key_scene, key_target = jax.random.split(key)
+        scene = self._sample_scene(key_scene)
+        if self.cfg.task.kind == "target":
+            goes_on = (state.reward > 0.0) & jnp.any(state.scene.in_play)
+            scene = _select(goes_on, layout.mark_target(key_target, state.scene), scene)
+        return self.reset_to(scene, key)
 
     def step(self, state: State, action: Action) -> State:
-        """Runs one primitive; blocks lifted or out of the workspace leave the scene.
+        """The state after one action; blocks lifted or pushed out of the workspace are removed.
 
-        Where physics failed, the scene is as it was before; where it was no scene to begin with,
-        empty.
+        Nothing moves for an action that the robot cannot follow. Where physics diverges, the scene
+        stays as it was; a scene that was invalid before becomes empty. `state.done` is not read.
         """
-        cfg = self.cfg
-        sound = simulation.healthy(state.scene) & plausible(state.obs)
-        empty = layout.parked(cfg.scene.slots)
-        before = jax.tree.map(lambda given, none: jnp.where(sound, given, none), state.scene, empty)
+        cfg, task = self.cfg, self.cfg.task
+        valid = simulation.healthy(state.scene) & specs.is_valid(cfg.heightmap, state.obs)
+        before = _select(valid, state.scene, layout.parked(cfg.scene.slots))
         after, trace, plan = simulation.execute(
             self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action
         )
-        physics_diverged = ~(sound & simulation.healthy(after))
-        after = jax.tree.map(
-            lambda good, bad: jnp.where(physics_diverged, good, bad), before, after
-        )
+        diverged = ~(valid & simulation.healthy(after))
+        after = _select(diverged, before, after)
 
-        grasped = action.primitive == Primitive.GRASP
+        # Remove the blocks that were lifted or lost.
+        is_grasp = action.primitive == Primitive.GRASP
         hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
-        lifted = outcome.lifted_blocks(trace, hand_rise) & grasped & ~physics_diverged
-        gone = after.in_play & ~layout.inside(after.position, cfg.heightmap.extent) & ~lifted
-        got = lifted & self._wanted(before)
-        after = layout.park(after, ~lifted & ~gone)
+        lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & ~diverged
+        lost = after.in_play & ~layout.inside(after.position, cfg.heightmap.extent) & ~lifted
+        success = lifted & layout.is_target(before)
+        after = layout.park(after, ~lifted & ~lost)
         actions = state.actions + 1
-        obs = self._see(after, state.noise, actions)
+        obs = self._observe(after, state.noise_key, actions)
 
+        # Judge the action and the episode.
         moved = heightmap.moved_area(cfg.heightmap, state.obs.height, obs.height)
         changed = moved > CHANGE_AREA
-        steps_without_change = jnp.where(changed, 0, state.steps_without_change + 1)
-        terminated = ~jnp.any(after.in_play & self._wanted(after))
-        capped = (actions >= cfg.task.max_actions) | (
-            steps_without_change >= cfg.task.max_steps_without_change
-        )
-        off = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
-        nothing = jnp.int32(Outcome.NOTHING)
-        judged = outcome.grasp_outcome(trace, plan.surface, hand_rise)
+        unchanged_steps = jnp.where(changed, 0, state.steps_without_change + 1)
+        terminated = ~jnp.any(after.in_play & layout.is_target(after))
+        capped = (actions >= task.max_actions) | (unchanged_steps >= task.max_steps_without_change)
+        distance = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
+        by_truth = outcome.grasp_outcome(trace, plan.surface, hand_rise)
         by_gap = outcome.grasp_outcome_by_gap(trace, plan.surface, changed)
-        wrong, touched = jnp.any(lifted) & ~jnp.any(got), jnp.int32(Outcome.TOUCHED)
+        wrong = jnp.any(lifted) & ~jnp.any(success)
+        nothing, touched = jnp.int32(Outcome.NOTHING), jnp.int32(Outcome.TOUCHED)
+        by_truth = jnp.where(is_grasp, jnp.where(wrong, touched, by_truth), nothing)
+        by_gap = jnp.where(wrong, jnp.minimum(by_gap, touched), by_gap)
         info = Info(
-            outcome=jnp.where(grasped, jnp.where(wrong, touched, judged), nothing),
-            outcome_by_gap=jnp.where(
-                grasped, jnp.where(wrong, jnp.minimum(by_gap, touched), by_gap), nothing
-            ),
+            outcome=by_truth,
+            outcome_by_gap=jnp.where(is_grasp, by_gap, nothing),
             moved=moved,
-            distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, off, jnp.inf)), 0.0),
+            distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, distance, jnp.inf)), 0.0),
             cleared=jnp.sum(lifted, dtype=jnp.int32),
-            blocks_lost=jnp.sum(gone, dtype=jnp.int32),
+            blocks_lost=jnp.sum(lost, dtype=jnp.int32),
             contact_overflow=trace.contact_overflow,
-            physics_diverged=physics_diverged,
+            physics_diverged=diverged,
         )
         return State(
             scene=after,
             obs=obs,
-            reward=jnp.any(got).astype(jnp.float32),
-            terminated=terminated & ~physics_diverged,
-            truncated=(capped & ~terminated) | physics_diverged,
+            reward=jnp.any(success).astype(jnp.float32),
+            terminated=terminated & ~diverged,
+            truncated=(capped & ~terminated) | diverged,
             actions=actions,
-            steps_without_change=steps_without_change,
+            steps_without_change=unchanged_steps,
             info=info,
-            noise=state.noise,
+            noise_key=state.noise_key,
         )
 
-    def _wanted(self, scene: Scene) -> jax.Array:
-        """Slots [N] bool of the blocks that the task asks for."""
-        return (scene.target == layout.ANY) | (np.arange(len(self.cfg.scene.slots)) == scene.target)
+    def randomise_pose(self, key: jax.Array, scene: Scene) -> Scene:
+        """The scene as episodes start with it: at a random yaw, with a target or none."""
+        extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
+        return sources.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+
+    def _sample_scene(self, key: jax.Array) -> Scene:
+        key_index, key_pose = jax.random.split(key)
+        index = jax.random.randint(key_index, (), 0, self.scenes.position.shape[0])
+        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes)
+        return self.randomise_pose(key_pose, scene)
+
+    def _observe(
+        self, scene: Scene, noise_key: jax.Array | None, actions: jax.Array
+    ) -> Observation:
+        key = noise_key if noise_key is None else jax.random.fold_in(noise_key, actions)
+        return observe.observe(self.cfg, scene, key)
 
 
-def plausible(obs: Observation) -> jax.Array:
-    """True where every entry of a top view is one that a view can have, [] bool; NaN is none."""
-    height = (obs.height >= 0.0) & (obs.height <= heightmap.VIEW_HEIGHT)
-    return jnp.all(height) & jnp.all((obs.colour >= 0.0) & (obs.colour <= 1.0))
+@dataclasses.dataclass(frozen=True, eq=False)
+class AutoResetEnv:
+    """An environment whose `step` replaces a finished scene by a fresh one."""
+
+    env: Env
+
+    def reset(self, key: jax.Array) -> State:
+        """As `Env.reset`."""
+        return self.env.reset(key)
+
+    def step(self, key: jax.Array, state: State, action: Action) -> tuple[State, State]:
+        """The state to act in next, and the state that the action led to; carry and output of scan.
+
+        The second has reward, done, info and, where done, the terminal observation. The first is
+        the second, or where done `Env.auto_reset` of it: the next episode's first observation.
+        """
+        after = self.env.step(state, action)
+        return _select(after.done, self.env.auto_reset(key, after), after), after
 
 
-def make(cfg: Config, stream: int = pool.TRAIN_STREAM, scenes: int | None = None) -> Env:
-    """The environment of a config; settles (or reads from the cache) the scenes that resets draw
-    from.
+def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | None = None) -> Env:
+    """The environment of a config; physics `auto` is resolved for this machine.
 
-    Args: stream, the stream of random numbers that drops follow: training takes 0, evaluation
-    others; scenes, size of the pool at least, as many with each number of blocks; `cfg.scene.pool`
-    of each if None. Of these `cfg.scene.arranged` are arrangements, behind the others.
+    Settles its pool of scenes once and caches it on disk. Evaluation draws from another `stream` of
+    random numbers, and needs a pool of `num_scenes` or more; None is the config's `scene.pool`.
+    Raises SceneError for blocks that do not come to rest, and for physics that is not installed.
     """
+    cfg = auto.resolve(cfg)
     world = model.build(cfg.scene, cfg.sim)
-    floating = model.build(cfg.scene, dataclasses.replace(cfg.sim, robot="hand"))
-    numbers = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
-    count = cfg.scene.pool if scenes is None else -(-scenes // numbers)
-    packed, extent = round(cfg.scene.arranged * count), cfg.heightmap.extent
-    parts = []
-    if packed < count:
-        dropped = dataclasses.replace(cfg.scene, arranged=0.0)
-        parts.append(pool.settled(floating, dropped, extent, stream, count - packed))
-    if packed:
-        parts.append(arrangements(cfg.scene, extent, stream, packed * numbers))
-    scenes_at_rest = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return Env(cfg, simulation.make(world, cfg.sim), scenes_at_rest)
+    scenes = sources.scenes(cfg, stream, num_scenes)
+    return Env(cfg, simulation.make(world, cfg.sim), scenes)
 
 
-def arrangements(cfg: SceneConfig, extent: float, stream: int, count: int) -> Scene:
-    """`count` packed arrangements, NumPy leaves [P, N, ...], easy ones first; streams as in `make`.
-
-    Each has at least LEAST_ARRANGED blocks or `cfg.min_blocks`, whichever is less, as far as there
-    is room. Raises SceneError where the slots allow no arrangement.
-    """
-    try:
-        families.available(cfg.slots)
-    except ValueError as error:
-        raise SceneError(f"scene.arranged: {error}") from None
-    few = dataclasses.replace(cfg, min_blocks=min(cfg.min_blocks, LEAST_ARRANGED))
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(stream), jnp.arange(count))
-    draw = jax.vmap(lambda key, level: arrange.arrange(key, few, extent, level))
-    return jax.device_get(jax.jit(draw)(keys, jnp.linspace(0.0, 1.0, count)))
+def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """Leaf by leaf, `yes` where the condition [] holds, else `no`."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import env as environment
+from csac_jax import specs
 from csac_jax.agent import rewards
 from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
-from csac_jax.env import Env, State
+from csac_jax.env import AutoResetEnv, Env, State, make_env
 from csac_jax.errors import SceneError
-from csac_jax.scene import blocks, layout
+from csac_jax.scene import blocks, layout, sources
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import oracle
+from csac_jax.sim import auto, oracle
 from csac_jax.sim.primitives import Action
 
 pytestmark = pytest.mark.mjx
@@ -29,7 +29,7 @@ CONFIG = Config(
     task=TaskConfig(max_actions=6, max_steps_without_change=3),
 )
 SCENES = 8
-BARE = (0.15, 0.15, 0.0)  # a place where nothing lies
+BARE = (0.15, 0.15, 0.0)  # x, y and yaw of a place where nothing lies
 
 
 class Lab(NamedTuple):
@@ -37,7 +37,7 @@ class Lab(NamedTuple):
 
     env: Env
     reset: Callable[[jax.Array], State]
-    begin: Callable[[Scene], State]
+    reset_to: Callable[[Scene], State]
     step: Callable[[State, Action], State]
     oracle: Callable[[State], Action]
     into_step: State  # shapes and dtypes that go into step,
@@ -52,24 +52,30 @@ def _types(tree: State) -> State:
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        env = environment.make(CONFIG)
+        env = make_env(CONFIG)
     keys = jax.random.split(jax.random.key(0), SCENES)
     plan_grasp = functools.partial(oracle.grasp, CONFIG.sim, CONFIG.heightmap, CONFIG.scene.slots)
 
-    def look_and_plan(state: State) -> Action:
+    def plan_from_state(state: State) -> Action:
         return plan_grasp(state.scene, state.obs.height)
 
     reset = jax.jit(jax.vmap(env.reset)).trace(keys)
     state = reset.lower().compile()(keys)
-    plan = jax.jit(jax.vmap(look_and_plan)).lower(state).compile()
-    begin = jax.jit(jax.vmap(env.begin)).lower(state.scene).compile()
+    plan = jax.jit(jax.vmap(plan_from_state)).lower(state).compile()
+    reset_to = jax.jit(jax.vmap(env.reset_to)).lower(state.scene).compile()
     step = jax.jit(jax.vmap(env.step)).trace(state, plan(state))
     into, out = (
         jax.tree.unflatten(jax.tree.structure(state), traced.jaxpr.out_avals)
         for traced in (reset, step)
     )
     return Lab(
-        env, reset.lower().compile(), begin, step.lower().compile(), plan, _types(into), _types(out)
+        env,
+        reset.lower().compile(),
+        reset_to,
+        step.lower().compile(),
+        plan,
+        _types(into),
+        _types(out),
     )
 
 
@@ -89,13 +95,13 @@ def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     scene = dataclasses.replace(CONFIG.scene, slots=("box",) * 3, min_blocks=3, pool=8)
     dropped, mixed = (
-        environment.make(
+        make_env(
             dataclasses.replace(CONFIG, scene=dataclasses.replace(scene, arranged=share, pool=pool))
         ).scenes
         for share, pool in ((0.0, 6), (0.25, 8))
     )
     np.testing.assert_array_equal(mixed.position[:6], dropped.position)
-    packed = environment.arrangements(scene, CONFIG.heightmap.extent, 0, 2)
+    packed = sources.arrangements(scene, CONFIG.heightmap.extent, 0, 2)
     np.testing.assert_array_equal(mixed.position[6:], packed.position)
     assert mixed.in_play.all()
 
@@ -107,7 +113,7 @@ def test_arrangement_without_blocks_for_it():
     with pytest.raises(
         SceneError, match=r"scene\.arranged: scene\.slots: too few for an arrangement"
     ):
-        environment.arrangements(two, CONFIG.heightmap.extent, 0, 2)
+        sources.arrangements(two, CONFIG.heightmap.extent, 0, 2)
 
 
 def test_scenes_stay_inside_however_turned(lab: Lab):
@@ -115,7 +121,7 @@ def test_scenes_stay_inside_however_turned(lab: Lab):
     any yaw."""
     for seed, (x, quarters) in enumerate(((0.21, True), (0.15, False))):
         scene, keys = _cube(x, x), jax.random.split(jax.random.key(seed), 64)
-        places = jax.vmap(lab.env.vary, (0, None))(keys, scene).position[:, 0, :2]
+        places = jax.vmap(lab.env.randomise_pose, (0, None))(keys, scene).position[:, 0, :2]
         assert np.abs(places).max() <= 0.5 * CONFIG.heightmap.extent
         whole = np.isclose(np.abs(places), x, atol=1e-5).all(axis=1)
         assert whole.all() if quarters else whole.mean() < 0.2
@@ -136,23 +142,23 @@ def _at(tree, index: int):
 
 @pytest.fixture(scope="module")
 def stepped(lab: Lab) -> State:
-    """One step of the scenes of `_LANES`."""
-    first = lab.begin(
+    """One step of the scenes of `_CASES`."""
+    first = lab.reset_to(
         _stack(
-            *(_cube(*place, _TARGETS.get(name, layout.ANY)) for name, (place, *_) in _LANES.items())
+            *(_cube(*place, _TARGETS.get(name, layout.ANY)) for name, (place, *_) in _CASES.items())
         )
     )
     actions, steps_without_change = (
-        jnp.array([lane[i] for lane in _LANES.values()], jnp.int32) for i in (1, 2)
+        jnp.array([case[i] for case in _CASES.values()], jnp.int32) for i in (1, 2)
     )
-    action = _actions(*((kind, pose) for *_, kind, pose in _LANES.values()))
+    action = _actions(*((kind, pose) for *_, kind, pose in _CASES.values()))
     return lab.step(
         dataclasses.replace(first, actions=actions, steps_without_change=steps_without_change),
         action,
     )
 
 
-_LANES = {  # the cube's place, actions and steps_without_change actions so far, the action
+_CASES = {  # the cube's place, actions and steps_without_change actions so far, the action
     "last chance": ((0.0, 0.0), 5, 2, Primitive.GRASP, (0.01, 0.0, 0.0)),
     "cap": ((0.0, 0.0), 5, 0, Primitive.GRASP, BARE),
     "steps_without_change": ((0.0, 0.0), 2, 2, Primitive.GRASP, BARE),
@@ -166,33 +172,33 @@ _TARGETS = {"got": 0, "wrong": 1}  # slots
 
 
 @pytest.fixture
-def lane(stepped: State) -> Callable[[str], State]:
-    return lambda name: _at(stepped, list(_LANES).index(name))
+def state_of(stepped: State) -> Callable[[str], State]:
+    return lambda name: _at(stepped, list(_CASES).index(name))
 
 
-def test_last_block_terminates(lane):
+def test_last_block_terminates(state_of):
     """Claim: taking the last block terminates the episode, is worth 1, and is no truncation even at
     the cap."""
-    state = lane("last chance")
+    state = state_of("last chance")
     assert (state.terminated, state.truncated, state.done) == (True, False, True)
     assert (state.reward, state.info.cleared, state.info.blocks_lost) == (1.0, 1, 0)
     assert state.info.outcome == state.info.outcome_by_gap == Outcome.LIFTED
-    assert abs(state.info.distance - 0.01) < 1e-6  # the place aimed at lay 1 cm beside the cube
+    assert abs(state.info.distance - 0.01) < 1e-6  # the place aimed at lay 1 cm off the cube
     assert state.obs.height.max() < 0.001
 
 
-def test_target_ends_the_episode(lane):
+def test_target_ends_the_episode(state_of):
     """Claim: in the target task the episode ends when the target is got, though another block is
     left."""
-    state = lane("got")
+    state = state_of("got")
     assert (state.terminated, state.reward, state.info.outcome) == (True, 1.0, Outcome.LIFTED)
     np.testing.assert_array_equal(state.scene.in_play, [False, True, False])
 
 
-def test_wrong_block_is_no_success(lane):
+def test_wrong_block_is_no_success(state_of):
     """Claim: lifting another block than the target takes it away, counts as `touched` and is worth
     nothing."""
-    state = lane("wrong")
+    state = state_of("wrong")
     assert (state.done, state.reward, state.info.cleared, state.info.outcome) == (
         False,
         0.0,
@@ -208,15 +214,50 @@ def test_wrong_block_is_no_success(lane):
     )  # the target alone is left
 
 
+def test_auto_reset_replaces_finished_scenes_alone(lab: Lab, stepped: State):
+    """Claim: AutoResetEnv goes on where an episode does; where one is done, a fresh one is next and
+    the output keeps reward, end and terminal observation. It can be scanned."""
+
+    class Replay(Env):
+        """Whatever the action, the next state is the one given."""
+
+        def step(self, state: State, action: Action) -> State:
+            return state
+
+    auto = AutoResetEnv(Replay(lab.env.cfg, lab.env.physics, lab.env.scenes))
+    keys = jax.random.split(jax.random.key(1), SCENES)
+    state, after = jax.jit(jax.vmap(auto.step))(keys, stepped, _action_of(stepped))
+    jax.tree.map(np.testing.assert_array_equal, after, stepped)
+    fresh = jax.jit(jax.vmap(lab.env.auto_reset))(keys, stepped)
+    done = np.asarray(stepped.done)
+    assert done.any()
+    assert not done.all()
+    for index in range(SCENES):
+        expected = _at(fresh if done[index] else stepped, index)
+        assert _leaves(_at(state, index)) == _leaves(expected)
+    assert not state.done.any()
+    one = jax.tree.map(lambda leaf: leaf[0], stepped)
+    action = jax.tree.map(lambda leaf: leaf[0], _action_of(stepped))
+    _, ends = jax.jit(lambda s: jax.lax.scan(lambda s, key: auto.step(key, s, action), s, keys))(
+        one
+    )
+    np.testing.assert_array_equal(ends.done, np.arange(SCENES) == 0)
+
+
+def _action_of(state: State) -> Action:
+    zero = jnp.zeros(state.actions.shape)
+    return Action.push(zero, zero, zero)
+
+
 def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
     """Claim: after a target was got the scene goes on with another target; after any other end
     comes a fresh scene."""
     env = dataclasses.replace(
         lab.env, cfg=dataclasses.replace(CONFIG, task=TaskConfig(kind="target"))
     )
-    restart = jax.jit(jax.vmap(env.restart))(jax.random.split(jax.random.key(0), SCENES), stepped)
+    fresh = jax.jit(jax.vmap(env.auto_reset))(jax.random.split(jax.random.key(0), SCENES), stepped)
     for name, stays in (("got", True), ("wrong", False), ("last chance", False)):
-        new, old = (_at(state, list(_LANES).index(name)) for state in (restart, stepped))
+        new, old = (_at(state, list(_CASES).index(name)) for state in (fresh, stepped))
         assert np.array_equal(new.scene.position, old.scene.position) == stays, name
         assert new.scene.in_play[new.scene.target], name
         assert (new.done, new.reward, new.actions) == (False, 0.0, 0)
@@ -224,9 +265,9 @@ def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
         assert not new.obs.target.all()
 
 
-def test_action_cap_truncates(lane):
+def test_action_cap_truncates(state_of):
     """Claim: an episode is cut off after max_actions actions; that does not terminate it."""
-    state = lane("cap")
+    state = state_of("cap")
     assert (state.terminated, state.truncated, state.reward) == (False, True, 0.0)
     assert (state.actions, state.steps_without_change, state.info.outcome) == (
         6,
@@ -235,10 +276,10 @@ def test_action_cap_truncates(lane):
     )
 
 
-def test_idle_cap_truncates(lane):
+def test_no_change_cap_truncates(state_of):
     """Claim: an episode is cut off after max_steps_without_change actions in a row without visible
     change."""
-    state = lane("steps_without_change")
+    state = state_of("steps_without_change")
     assert (state.terminated, state.truncated, state.actions, state.steps_without_change) == (
         False,
         True,
@@ -247,26 +288,26 @@ def test_idle_cap_truncates(lane):
     )
 
 
-def test_episode_goes_on(lane):
+def test_episode_goes_on(state_of):
     """Claim: below both caps the episode goes on, and an action without visible change counts as
     steps_without_change."""
-    state = lane("on")
+    state = state_of("on")
     assert (state.done, state.actions, state.steps_without_change) == (False, 1, 2)
 
 
-def test_visible_change_ends_idleness(lane):
-    """Claim: an action that moves a block more than CHANGE_AREA starts the steps_without_change
-    count anew."""
-    state = lane("moved")
+def test_visible_change_ends_the_count_without_change(state_of):
+    """Claim: an action that moves a block more than CHANGE_AREA resets the count of
+    steps_without_change."""
+    state = state_of("moved")
     assert state.info.moved > CHANGE_AREA
     assert (state.done, state.steps_without_change, state.reward) == (False, 0, 0.0)
     assert 0.05 < state.scene.position[0, 0] - 0.06 < 0.1
 
 
-def test_block_pushed_out_leaves(lane):
-    """Claim: a block pushed out of the square is counted as left, not as cleared, and is out of
+def test_block_pushed_out_leaves(state_of):
+    """Claim: a block pushed out of the square counts as lost, not as cleared, and is out of
     play and of sight."""
-    state = lane("out")
+    state = state_of("out")
     assert (state.info.blocks_lost, state.info.cleared, state.reward) == (1, 0, 0.0)
     np.testing.assert_array_equal(state.scene.position, layout.parking(3))
     assert not state.scene.in_play.any()
@@ -300,8 +341,8 @@ def test_oracle_clears_scenes(lab: Lab):
 
 
 def _graspable(height: np.ndarray) -> float:
-    """phi_g of a fixed critic: 1 if somewhere something stands with room for both fingers beside
-    it, else 0.
+    """phi_g of a fixed critic: 1 if somewhere something stands with room for a finger on either
+    side, else 0.
 
     Room: nothing 36 to 64 mm to either side, along x or along y.
     """
@@ -333,7 +374,7 @@ def test_both_levels_of_a_push_are_reached(lab: Lab):
     raft, alone = _raft(0.0006), _cube(0.0, 0.0)
     cases = [(raft, (-0.12, 0.025, 0.0)), (raft, BARE), (alone, (-0.07, 0.0, 0.0)), (alone, BARE)]
     scenes, places = zip(*(cases * 2), strict=True)
-    before = lab.begin(_stack(*scenes))
+    before = lab.reset_to(_stack(*scenes))
     after = lab.step(before, _actions(*((Primitive.PUSH, place) for place in places)))
     assert not after.info.physics_diverged.any()
     phi = [
@@ -422,7 +463,7 @@ def test_failed_physics_stays_in_its_scene(lab: Lab, where: str, value: float):
     jax.tree.map(np.testing.assert_array_equal, physics_diverged.scene, expected)
 
 
-def test_target_that_is_no_slot_is_ill(lab: Lab):
+def test_target_that_is_no_slot_counts_as_divergence(lab: Lab):
     """Claim: a target beyond the slots makes a scene physics_diverged; it does not pass for a table
     cleared of its target."""
     scene = _stack(*[_cube(0.0, 0.0)] * SCENES)
@@ -430,7 +471,7 @@ def test_target_that_is_no_slot_is_ill(lab: Lab):
         scene, target=jnp.array([-1, 3, 1_000_000, -2, -(2**31), 0, -1, -1], jnp.int32)
     )
     action = _actions(*[(Primitive.PUSH, BARE)] * SCENES)
-    state = lab.step(dataclasses.replace(lab.begin(scene), scene=wild), action)
+    state = lab.step(dataclasses.replace(lab.reset_to(scene), scene=wild), action)
     expected = np.array([False, True, True, True, True, False, False, False])
     np.testing.assert_array_equal(state.info.physics_diverged, expected)
     np.testing.assert_array_equal(state.truncated, expected)
@@ -488,3 +529,67 @@ def test_same_key_same_scene(lab: Lab):
     assert not np.any(first.actions)
     assert not np.any(first.done)
     assert np.asarray(first.obs.height).max(axis=(1, 2)).min() > 0.02
+
+
+def test_observations_lie_within_their_spec(lab: Lab, stepped: State):
+    """Claim: what reset and step show has the shapes, dtypes and bounds of `observation_spec`."""
+    spec = lab.env.observation_spec
+    for state in (lab.reset(jax.random.split(jax.random.key(6), SCENES)), stepped):
+        assert jax.tree.structure(spec) == jax.tree.structure(state.obs)
+        for leaf, values in zip(*map(jax.tree.leaves, (spec, state.obs)), strict=True):
+            assert (values.shape, values.dtype) == ((SCENES, *leaf.shape), leaf.dtype)
+            assert jax.vmap(leaf.contains)(values).all()
+
+
+def test_actions_of_the_spec_are_accepted(lab: Lab):
+    """Claim: random actions in the shapes, dtypes and bounds of `action_spec` can be taken."""
+    spec, state = lab.env.action_spec, lab.reset(jax.random.split(jax.random.key(7), SCENES))
+    rng = np.random.default_rng(0)
+
+    def draw(leaf) -> jax.Array:
+        values = rng.uniform(leaf.minimum, leaf.maximum, (SCENES, *leaf.shape))
+        return jnp.asarray(values.round() if leaf.dtype == np.int32 else values, leaf.dtype)
+
+    action = jax.tree.map(draw, spec)
+    assert set(np.asarray(action.primitive)) == set(Primitive)
+    assert not lab.step(state, action).info.physics_diverged.any()
+
+
+@pytest.mark.parametrize(("change", "inside"), [(0.0, True), (0.1, False), (np.nan, False)])
+def test_spec_tells_what_is_out_of_bounds(change: float, inside: bool):
+    """Claim: a spec contains its bounds, and neither what lies beyond them nor NaN."""
+    cfg = CONFIG.heightmap
+    for spec in (specs.action_spec(cfg).pose, specs.observation_spec(cfg).height):
+        for bound, sign in ((spec.minimum, -1.0), (spec.maximum, 1.0)):
+            values = jnp.broadcast_to(jnp.asarray(bound, spec.dtype), spec.shape) + sign * change
+            assert spec.contains(values) == inside
+
+
+def test_actions_are_built_from_numbers_or_arrays():
+    """Claim: `Action.grasp` and `Action.push` build [] or batched actions, also in jit and vmap."""
+    one = Action.grasp(0.02, -0.05, 0.3)
+    assert (one.primitive.dtype, one.primitive, one.pose.dtype) == (
+        jnp.int32,
+        Primitive.GRASP,
+        jnp.float32,
+    )
+    np.testing.assert_array_equal(one.pose, np.float32([0.02, -0.05, 0.3]))
+    xs = jnp.array([0.0, 0.1, 0.2])
+    pushes = (
+        Action.push(xs, 0.1, xs[::-1]),
+        jax.jit(jax.vmap(lambda x, yaw: Action.push(x, 0.1, yaw)))(xs, xs[::-1]),
+    )
+    for many in pushes:
+        np.testing.assert_array_equal(many.primitive, np.full(3, Primitive.PUSH))
+        np.testing.assert_array_equal(
+            many.pose, np.stack([xs, np.full(3, np.float32(0.1)), xs[::-1]], 1)
+        )
+
+
+def test_make_env_chooses_physics(monkeypatch: pytest.MonkeyPatch):
+    """Claim: `make_env` resolves physics `auto`: its config names the physics that it runs."""
+    monkeypatch.setattr(sources, "scenes", lambda *_: None)
+    sim = dataclasses.replace(CONFIG.sim, physics="auto")
+    env = make_env(dataclasses.replace(CONFIG, sim=sim))
+    assert env.cfg.sim == auto.resolve(dataclasses.replace(CONFIG, sim=sim)).sim
+    assert env.cfg.sim.physics != "auto"

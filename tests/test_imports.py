@@ -24,6 +24,7 @@ ORDER = (
     ("io",),
     ("runtime",),
     ("env",),
+    ("specs",),
     ("replay", "agent"),
     ("nets",),
     ("vision",),
@@ -50,11 +51,12 @@ ONLY_IN = {
     "safetensors": ("io",),
 }
 JIT_IN = (
-    *("training", "sweeps", "evaluation", "env.py"),
+    *("training", "sweeps", "evaluation"),
     *(
         "runtime/compiler.py",
         "runtime/selftest.py",
     ),  # small programs that show what this machine does
+    "scene/sources.py",
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
     "render/picture.py",  # draws on machines without OpenGL
 )

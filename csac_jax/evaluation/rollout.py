@@ -231,7 +231,7 @@ class _Record(NamedTuple):
 
 def _begin(env: Env, keys: jax.Array, scenes: Scene) -> State:
     scenes = jax.tree.map(jnp.asarray, scenes)
-    return jax.vmap(env.begin)(jax.vmap(env.vary)(keys, scenes), keys)
+    return jax.vmap(env.reset_to)(jax.vmap(env.randomise_pose)(keys, scenes), keys)
 
 
 def _step(

@@ -26,7 +26,7 @@ import numpy as np
 from csac_jax import env as environment, presets
 from csac_jax.config import Config, SceneConfig, SimConfig, SlotKind
 from csac_jax.env import Env
-from csac_jax.scene import cases, model, pool
+from csac_jax.scene import cases, model, sources
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation
 
@@ -48,7 +48,7 @@ def environments(
     """
     stream = 1 + seed
     if suite == "own":
-        return {suite: environment.make(cfg, stream, episodes)}
+        return {suite: environment.make_env(cfg, stream, episodes)}
     if suite == "random10":
         return {suite: _ten(cfg, episodes, stream)}
     if suite == "random30":
@@ -98,13 +98,12 @@ def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config
 
 
 def _ten(cfg: Config, episodes: int, stream: int) -> Env:
-    return environment.make(_dropped(cfg, TEN.scene.slots, TEN.sim), stream, episodes)
+    return environment.make_env(_dropped(cfg, TEN.scene.slots, TEN.sim), stream, episodes)
 
 
 def _thirty(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _dropped(cfg, TEN.scene.slots * 3, THIRTY)
-    floating = model.build(cfg.scene, dataclasses.replace(cfg.sim, robot="hand"))
-    scenes = pool.settled(floating, cfg.scene, cfg.heightmap.extent, stream, episodes, poured=True)
+    scenes = sources.settled(cfg, stream, episodes, poured=True)
     return Env(cfg, simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim), scenes)
 
 
@@ -142,6 +141,6 @@ def _cases(cfg: Config) -> dict[str, Env]:
 
 
 def _generated(cfg: Config, episodes: int, stream: int) -> Env:
-    scene = SceneConfig(slots=PACKED, min_blocks=environment.LEAST_ARRANGED)
-    scenes = environment.arrangements(scene, cfg.heightmap.extent, stream, episodes)
+    scene = SceneConfig(slots=PACKED, min_blocks=sources.MIN_ARRANGED)
+    scenes = sources.arrangements(scene, cfg.heightmap.extent, stream, episodes)
     return _placed(cfg, scene, scenes)

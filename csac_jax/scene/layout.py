@@ -1,4 +1,4 @@
-"""The state of the blocks of one scene, and where blocks that are not in play wait."""
+"""The state of the blocks of one scene; blocks out of play are parked."""
 
 from typing import Any
 
@@ -14,43 +14,41 @@ from csac_jax.scene import blocks
 NOMINAL_DENSITY = 600.0  # kg/m^3, wood
 NOMINAL_FRICTION = 0.8
 SPEED_LIMIT = np.array([5, 5, 5, 50, 50, 50], np.float32)
-"""Fastest that a block may be after a substep, m/s and rad/s (ours).
-
-A thin block squeezed from under the hand spins faster. The integrator takes its gyroscopic torque
-explicitly, so the spin would grow until it is NaN."""
+"""Fastest block after a substep, m/s and rad/s (ours). A thin block squeezed from under the hand
+spins faster; the explicit gyroscopic torque would then drive it to NaN."""
 ANY = -1
 """`Scene.target` in the clearing task."""
-UPRIGHT = np.array([1, 0, 0, 0], np.float32)
-"""Quaternion of a block that is not rotated."""
 
 
 @struct.dataclass
 class Scene:
-    """Blocks of one scene. N = block slots; one that is not in play is parked, out of view."""
+    """Blocks of one scene. N = block slots; slots out of play are parked out of view."""
 
     position: jax.Array  # [N, 3] float32 m, centre of the bounding box
     quaternion: jax.Array  # [N, 4] float32 (w, x, y, z), body -> world
     velocity: jax.Array  # [N, 6] float32 linear m/s (world), angular rad/s (body)
     half_size: jax.Array  # [N, 3] float32 m, half of the bounding box
     density: jax.Array  # [N] float32 kg/m^3
-    friction: jax.Array  # [N] float32, sliding friction; against the pads theirs counts
+    friction: jax.Array  # [N] float32, sliding, against table and blocks; pads have their own
     colour: jax.Array  # [N] int32, row of blocks.COLOURS
     in_play: jax.Array  # [N] bool
     target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
 
 
 def parking(num_slots: int) -> np.ndarray:
-    """Parking places [N, 3] m, in the air and 0.3 m from each other: no contacts."""
-    x, zeros = 3.0 + 0.3 * np.arange(num_slots), np.zeros(num_slots)
-    return np.stack([x, zeros, zeros + 1.0], axis=1).astype(np.float32)
+    """Parking places [N, 3] m, in the air and far apart, so that nothing touches."""
+    x = 3.0 + 0.3 * np.arange(num_slots)
+    return np.stack([x, np.zeros(num_slots), np.ones(num_slots)], 1).astype(np.float32)
 
 
 def parked(slots: tuple[SlotKind, ...]) -> Scene:
-    """A scene of NumPy arrays with every slot parked, its block nominal in size and material."""
+    """A scene of NumPy arrays: every slot parked, every block nominal."""
     num = len(slots)
+    quaternion = np.zeros((num, 4), np.float32)
+    quaternion[:, 0] = 1.0
     leaves: dict[str, Any] = {
         "position": parking(num),
-        "quaternion": np.tile(UPRIGHT, (num, 1)),
+        "quaternion": quaternion,
         "velocity": np.zeros((num, 6), np.float32),
         "half_size": np.stack([blocks.half_size_choices(kind)[0] for kind in slots]),
         "density": np.full(num, NOMINAL_DENSITY, np.float32),
@@ -63,7 +61,7 @@ def parked(slots: tuple[SlotKind, ...]) -> Scene:
 
 
 def park(scene: Scene, keep: jax.Array) -> Scene:
-    """The scene with every block outside `keep` [N] bool taken out of play and parked."""
+    """The scene with all blocks but those in `keep` [N] bool parked."""
     keep = scene.in_play & keep
     upright = jnp.zeros_like(scene.quaternion).at[:, 0].set(1.0)
     return scene.replace(
@@ -75,20 +73,26 @@ def park(scene: Scene, keep: jax.Array) -> Scene:
 
 
 def rotate(scene: Scene, yaw: jax.Array) -> Scene:
-    """The scene's blocks in play, at rest, rotated about the workspace centre by `yaw` [] rad."""
-    xy = geometry.rotate2d(yaw, scene.position[:, :2])
+    """The scene at rest, its blocks in play rotated about the workspace centre by `yaw` [] rad."""
     multiply = jax.vmap(geometry.quat_multiply, (None, 0))
-    quaternion = multiply(geometry.quat_from_yaw(yaw), scene.quaternion)
-    rotated = scene.replace(position=scene.position.at[:, :2].set(xy), quaternion=quaternion)
+    rotated = scene.replace(
+        position=scene.position.at[:, :2].set(geometry.rotate2d(yaw, scene.position[:, :2])),
+        quaternion=multiply(geometry.quat_from_yaw(yaw), scene.quaternion),
+    )
     return park(rotated, scene.in_play)
 
 
-def choose_target(key: jax.Array, scene: Scene) -> Scene:
-    """The scene with a random block in play as the target; ANY if none is in play."""
+def mark_target(key: jax.Array, scene: Scene) -> Scene:
+    """The scene with a random block in play as its target; ANY if none is in play."""
     slot = jax.random.categorical(key, jnp.where(scene.in_play, 0.0, -jnp.inf)).astype(jnp.int32)
     return scene.replace(target=jnp.where(jnp.any(scene.in_play), slot, ANY))
 
 
+def is_target(scene: Scene) -> jax.Array:
+    """[N] bool, slots of the blocks that the task asks for."""
+    return (scene.target == ANY) | (np.arange(len(scene.in_play)) == scene.target)
+
+
 def inside(position: jax.Array, extent: float) -> jax.Array:
-    """True where a block's centre [N, 3] lies above the workspace square, [N] bool."""
+    """[N] bool, the block's centre [N, 3] m lies above the workspace square."""
     return jnp.all(jnp.abs(position[:, :2]) <= 0.5 * extent, axis=1)

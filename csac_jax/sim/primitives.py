@@ -21,6 +21,21 @@ class Action:
     primitive: jax.Array  # [] int32, Primitive
     pose: jax.Array  # [3] x m, y m, yaw rad: a push goes along the yaw, fingers close along it
 
+    @classmethod
+    def grasp(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
+        """A grasp at (x, y) m whose fingers close along `yaw` rad; numbers or arrays [...]."""
+        return cls(*_primitive_and_pose(Primitive.GRASP, x, y, yaw))
+
+    @classmethod
+    def push(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
+        """A push from (x, y) m along `yaw` rad; numbers or arrays [...]."""
+        return cls(*_primitive_and_pose(Primitive.PUSH, x, y, yaw))
+
+
+def _primitive_and_pose(kind: Primitive, *pose: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+    parts = jnp.broadcast_arrays(*(jnp.asarray(value, jnp.float32) for value in pose))
+    return jnp.full(parts[0].shape, kind, jnp.int32), jnp.stack(parts, axis=-1)
+
 
 @struct.dataclass
 class Plan:

@@ -90,7 +90,7 @@ def make(
     """The program of a config, with parts of your own in place of the config's."""
     return Program(
         cfg=cfg,
-        env=environment.make(cfg) if env is None else env,
+        env=environment.make_env(cfg) if env is None else env,
         learner=csac.make(cfg, network) if learner is None else learner,
         sampler=samplers.make(cfg.replay) if sampler is None else sampler,
     )
@@ -147,7 +147,7 @@ def train_step(
     priority = jnp.where(ready, priority, replay.priority)
 
     # Replace finished scenes.
-    fresh = jax.vmap(env.restart)(_keys(key_reset, cfg.train.scenes), after)
+    fresh = jax.vmap(env.auto_reset)(_keys(key_reset, cfg.train.scenes), after)
     scenes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
     metrics = StepMetrics(

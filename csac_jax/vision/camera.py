@@ -1,12 +1,10 @@
-"""A pinhole camera: what it sees of a scene, as depth and colour, and its pixels as points in
-space.
+"""A pinhole camera: the depth and colour that it sees, and its pixels as points in space.
 
-The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depths are
-along z, not along the ray: the ray of a pixel is not of unit length, but advances by 1 m in depth
-per unit of the caster's distance.
+The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depth is
+along z. A pixel's ray has no unit length: it advances by 1 m in depth per unit of distance.
 
     eye = camera.make(CameraConfig(scale=0.5))
-    picture = camera.render(eye, solids.read(model, data.geom_xpos, data.geom_xmat))  # .colour [H, W, 3] in 0 .. 1
+    picture = camera.render(eye, solids.read(model, data.geom_xpos, data.geom_xmat))
 """
 
 from collections.abc import Callable
@@ -47,22 +45,20 @@ class Picture:
 def make(cfg: CameraConfig) -> Camera:
     """The camera of a config."""
     width, height = cfg.pixels
-    share = np.array([width, height]) / np.array(cfg.size)
+    scale = np.array([width, height]) / np.array(cfg.size)
+    rotation = level_rotation(np.array(cfg.position), np.array(cfg.look_at))
     return Camera(
-        focal=jnp.asarray(np.array(cfg.focal) * share, jnp.float32),
-        centre=jnp.asarray((np.array(cfg.centre) + 0.5) * share - 0.5, jnp.float32),
+        focal=jnp.asarray(np.array(cfg.focal) * scale, jnp.float32),
+        centre=jnp.asarray((np.array(cfg.centre) + 0.5) * scale - 0.5, jnp.float32),
         position=jnp.asarray(cfg.position, jnp.float32),
-        rotation=jnp.asarray(
-            level_rotation(np.array(cfg.position), np.array(cfg.look_at)), jnp.float32
-        ),
+        rotation=jnp.asarray(rotation, jnp.float32),
         width=width,
         height=height,
     )
 
 
 def level_rotation(position: np.ndarray, look_at: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3], camera to world, of a camera at `position` [3] that looks at a point, its x
-    horizontal."""
+    """Rotation [3, 3], camera to world, of a camera that looks at a point, its x horizontal."""
     forward = (look_at - position) / np.linalg.norm(look_at - position)
     right = np.array([forward[1], -forward[0], 0.0]) / np.hypot(forward[0], forward[1])
     return np.stack([right, np.cross(forward, right), forward], axis=1)
@@ -73,11 +69,8 @@ def directions(camera: Camera) -> jax.Array:
     x = (jnp.arange(camera.width, dtype=jnp.float32) - camera.centre[0]) / camera.focal[0]
     y = (jnp.arange(camera.height, dtype=jnp.float32) - camera.centre[1]) / camera.focal[1]
     right, down, forward = (camera.rotation[:, axis] for axis in range(3))
-    return (
-        x[None, :, None] * right[None, None]
-        + y[:, None, None] * down[None, None]
-        + forward[None, None]
-    )
+    across = x[None, :, None] * right[None, None] + y[:, None, None] * down[None, None]
+    return across + forward[None, None]
 
 
 def points(camera: Camera, depth: jax.Array) -> jax.Array:
@@ -85,19 +78,16 @@ def points(camera: Camera, depth: jax.Array) -> jax.Array:
     return depth[..., None] * directions(camera) + camera.position[None, None]
 
 
-def look(camera: Camera, cast: Callable[[jax.Array, jax.Array], Any]) -> Any:
-    """What `cast`, a function of one ray (origin [3] m, direction [3]), makes of every pixel:
-    leaves [H, W, ...]."""
-    one = jax.vmap(cast, in_axes=(None, 0))
-    seen = one(camera.position, directions(camera).reshape(-1, 3))
-    return jax.tree.map(
-        lambda leaf: leaf.reshape(camera.height, camera.width, *leaf.shape[1:]), seen
-    )
+def cast_rays(camera: Camera, cast: Callable[[jax.Array, jax.Array], Any]) -> Any:
+    """`cast`, a function of one ray (origin [3] m, direction [3]), for every pixel: [H, W, ...]."""
+    hits = jax.vmap(cast, in_axes=(None, 0))(camera.position, directions(camera).reshape(-1, 3))
+    rows = (camera.height, camera.width)
+    return jax.tree.map(lambda leaf: leaf.reshape(*rows, *leaf.shape[1:]), hits)
 
 
 def render(camera: Camera, solids: Solids) -> Picture:
     """The picture of a scene of any geoms, flat shaded."""
-    hit = look(camera, lambda origin, direction: raycast.cast_solids(solids, origin, direction))
+    hit = cast_rays(camera, lambda *ray: raycast.cast_solids(solids, *ray))
     own = jnp.asarray(solids.colour).at[jnp.maximum(hit.geom, 0)].get(mode="promise_in_bounds")
     lit = shade.flat(own.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(own.shape)
     return Picture(

@@ -1,44 +1,60 @@
-"""What a real depth camera gets wrong, drawn from a key; what has a spread of 0 is left out of the
-program."""
+"""Noise of a real depth camera; noise of standard deviation 0 is left out of the program."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from csac_jax import geometry
 from csac_jax.config import SensorConfig
 from csac_jax.vision.camera import Camera
 
+_NOISE = np.uint32(2**31)  # folded into a reset's key: distinct from its children by `split`
 
-def depth(key: jax.Array, cfg: SensorConfig, true: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Measured depths m, normal about the true ones with sigma = depth_floor + depth_square d^2,
-    and which pixels have one, bool; any shape. See SensorConfig for the source."""
+
+def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
+    """Root key of the noise of an episode that is reset with `key`; None without noise.
+
+    Raises ValueError where there is noise but no key.
+    """
+    if not cfg.active:
+        return None
+    if key is None:
+        raise ValueError("a reset with sensor noise (config section `sensor`) needs a key")
+    return jax.random.fold_in(key, _NOISE)
+
+
+def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Measured depths m of the exact ones, any shape, and which pixels have one, bool.
+
+    Normal with standard deviation depth_floor + depth_square d^2; source: SensorConfig.
+    """
     key_noise, key_drop = jax.random.split(key)
-    measured, kept = true, jnp.ones(true.shape, bool)
+    measured, valid = exact, jnp.ones(exact.shape, bool)
     if cfg.depth_floor > 0.0 or cfg.depth_square > 0.0:
-        sigma = cfg.depth_floor + cfg.depth_square * true**2
-        measured = true + sigma * jax.random.normal(key_noise, true.shape)
+        std = cfg.depth_floor + cfg.depth_square * exact**2
+        measured = exact + std * jax.random.normal(key_noise, exact.shape)
     if cfg.dropped > 0.0:
-        kept = jax.random.bernoulli(key_drop, 1.0 - cfg.dropped, true.shape)
-    return measured, kept
+        valid = jax.random.bernoulli(key_drop, 1.0 - cfg.dropped, exact.shape)
+    return measured, valid
 
 
 def pose(key: jax.Array, cfg: SensorConfig, believed: Camera) -> Camera:
-    """Where the camera really stands: moved and turned a little."""
+    """The real camera: the believed one, moved and rotated a little."""
     key_position, key_rotation = jax.random.split(key)
     position, rotation = believed.position, believed.rotation
     if cfg.position > 0.0:
         position = position + cfg.position * jax.random.normal(key_position, (3,))
     if cfg.rotation > 0.0:
-        half_turn = 0.5 * cfg.rotation * jax.random.normal(key_rotation, (3,))
-        quat = jnp.concatenate([jnp.ones(1), half_turn])  # small angles
-        turn = geometry.quat_to_matrix(quat / jnp.sqrt(jnp.sum(quat**2)))
-        rotation = (turn[:, :, None] * rotation[None]).sum(1)
+        half_angle = 0.5 * cfg.rotation * jax.random.normal(key_rotation, (3,))
+        quat = jnp.concatenate([jnp.ones(1), half_angle])  # small angles
+        jitter = geometry.quat_to_matrix(quat / jnp.sqrt(jnp.sum(quat**2)))
+        rotation = (jitter[:, :, None] * rotation[None]).sum(1)
     return believed.replace(position=position, rotation=rotation)
 
 
-def colour(key: jax.Array, cfg: SensorConfig, true: jax.Array) -> jax.Array:
-    """Colours [H, W, 3] under another white balance, 0 .. 1."""
+def colour(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> jax.Array:
+    """Colours [H, W, 3] in 0 .. 1 under another white balance: one random gain per channel."""
     if cfg.colour == 0.0:
-        return true
+        return exact
     gain = 1.0 + cfg.colour * jax.random.normal(key, (3,))
-    return jnp.clip(gain[None, None] * true, 0.0, 1.0)
+    return jnp.clip(gain[None, None] * exact, 0.0, 1.0)

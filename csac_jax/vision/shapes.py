@@ -1,11 +1,9 @@
-"""One ray against one geom of each kind, in the geom's own frame: callers vmap over rays and fold
-over geoms.
+"""One ray against one geom of each kind, in the geom's own frame; callers vmap and fold.
 
-A geom is seen from outside only: a ray that starts inside does not meet it. Distances are in
-lengths of the ray's direction, which may have any. Scalars throughout: under vmap every step is one
-fused loop over rays, 20 times faster than carrying vectors. Where the ray's line passes a round
-surface is told from the point of the line that lies nearest to the axis: the textbook b^2 - 4ac
-loses all digits from afar (Haines et al., Ray Tracing Gems, 2019, chapter 7).
+A ray that starts inside a geom does not hit it. Distances are in lengths of the ray's direction.
+All values are scalars: under vmap every step is one fused loop over rays, 20 times faster than with
+vectors. Round surfaces are solved from the line's point nearest to the axis, since the textbook
+b^2 - 4ac loses all digits from afar (Haines et al., Ray Tracing Gems, 2019, chapter 7).
 """
 
 from collections.abc import Callable, Sequence
@@ -17,8 +15,8 @@ import numpy as np
 
 from csac_jax.scene.solids import Kind
 
-_ALONG = np.float32(1e-30)  # taken for the speed towards a plane that the ray runs along
-_ON_PLANE = np.float32(1e-12)  # m, room of an origin that lies on a plane
+_PARALLEL = np.float32(1e-30)  # n . d of a plane along the ray, in place of 0
+_ON_PLANE = np.float32(1e-12)  # m, depth of an origin that lies on a plane
 
 Vector = jax.Array | Sequence[jax.Array]
 """[3], or its three scalars []."""
@@ -28,15 +26,12 @@ class Entry(NamedTuple):
     """Where one ray enters one geom; all but `valid` are meaningless where not valid."""
 
     distance: jax.Array  # [] in lengths of the ray's direction, not negative
-    normal: tuple[
-        jax.Array, jax.Array, jax.Array
-    ]  # x, y, z [] of the outward unit normal, in the geom's frame
+    normal: tuple[jax.Array, jax.Array, jax.Array]  # outward, of unit length, in the geom's frame
     valid: jax.Array  # [] bool, True if it enters
 
 
-class Crossing(NamedTuple):
-    """Where one ray enters an intersection of half-spaces; all but `valid` are meaningless where
-    not valid."""
+class FaceEntry(NamedTuple):
+    """As `Entry`, of an intersection of half-spaces, with the face in place of its normal."""
 
     distance: jax.Array  # [] in lengths of the ray's direction, not negative
     face: jax.Array  # [] int32, face through which it enters
@@ -50,50 +45,45 @@ def dot(a: Vector, b: Vector) -> jax.Array:
 
 def enter_half_spaces(
     normal: jax.Array, offset: jax.Array, origin: Vector, direction: Vector
-) -> Crossing:
+) -> FaceEntry:
     """One ray against one intersection of half-spaces (slab method, Kay and Kajiya 1986).
 
-    t = (offset - n . o) / (n . d) at each plane; the ray enters at the largest t with n . d < 0 and
-    leaves at the smallest with n . d > 0. A plane along the ray is left at t = +-1e30 (offset - n .
-    o): never if the origin lies inside of it or on it, at once if outside. Times the reciprocal of
-    n . d: where all rays share a direction, the division is done once per plane.
+    t = (offset - n . o) / (n . d) at each plane. The ray enters at the largest t with n . d < 0 and
+    leaves at the smallest with n . d > 0. A parallel plane is left at t = +-1e30 (offset - n . o):
+    never if the origin is inside or on it, at once if outside. 1 / (n . d) is computed first: rays
+    that share a direction share the division.
 
     Args: normal [F, 3] and offset [F] m; origin [3] m, direction [3].
     """
-    enter, leave, face = (
-        jnp.array(-jnp.inf, jnp.float32),
-        jnp.array(jnp.inf, jnp.float32),
-        jnp.array(0, jnp.int32),
-    )
+    enter, leave = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32)
+    face = jnp.array(0, jnp.int32)
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
-        inverse = 1.0 / jnp.where(speed == 0.0, _ALONG, speed)
-        room = (offset[f] - dot(normal[f], origin)) + _ON_PLANE  # m, not negative inside
-        crossing = room * inverse
+        inverse = 1.0 / jnp.where(speed == 0.0, _PARALLEL, speed)
+        depth = (offset[f] - dot(normal[f], origin)) + _ON_PLANE  # m, not negative inside
+        crossing = depth * inverse
         inwards = jnp.where(speed < 0.0, crossing, -jnp.inf)
         face = jnp.where(inwards > enter, f, face)
         enter = jnp.maximum(enter, inwards)
         leave = jnp.minimum(leave, jnp.where(speed < 0.0, jnp.inf, crossing))
-    return Crossing(enter, face, (enter >= 0.0) & (enter <= leave))
+    return FaceEntry(enter, face, (enter >= 0.0) & (enter <= leave))
 
 
 def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The plane z = 0, seen from above, within +-size[0] in x and +-size[1] in y; a size of 0 has
-    no end."""
+    """The upper side of the plane z = 0, |x| <= size[0] and |y| <= size[1]; 0 means no end."""
     falling = direction[2] < 0.0
     distance = -origin[2] / jnp.where(falling, direction[2], -1.0)
     inside = falling & (distance >= 0.0)
     for axis in range(2):
-        inside &= (size[axis] <= 0.0) | (
-            jnp.abs(origin[axis] + distance * direction[axis]) <= size[axis]
-        )
+        endless = size[axis] <= 0.0
+        place = jnp.abs(origin[axis] + distance * direction[axis])
+        inside &= endless | (place <= size[axis])
     zero = jnp.zeros_like(distance)
     return Entry(distance, (zero, zero, zero + 1.0), inside)
 
 
 def ray_box(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The box of half sizes `size` [3]: three slabs; it is entered through that which is entered
-    last."""
+    """The box of half sizes `size` [3]: the ray enters through the slab that it enters last."""
     enter, leave = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32)
     side, excluded = jnp.array(0, jnp.int32), jnp.array(False)
     for axis in range(3):
@@ -105,9 +95,8 @@ def ray_box(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
         leave = jnp.where(parallel, leave, jnp.minimum(leave, middle + half))
         excluded |= parallel & (jnp.abs(origin[axis]) > size[axis])
     normal = [jnp.where(side == axis, -jnp.sign(direction[axis]), 0.0) for axis in range(3)]
-    return Entry(
-        enter, (normal[0], normal[1], normal[2]), ~excluded & (enter >= 0.0) & (enter <= leave)
-    )
+    valid = ~excluded & (enter >= 0.0) & (enter <= leave)
+    return Entry(enter, (normal[0], normal[1], normal[2]), valid)
 
 
 def ray_sphere(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
@@ -115,9 +104,9 @@ def ray_sphere(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     square = dot(direction, direction)
     nearest = -dot(origin, direction) / square  # t at which the line passes the centre
     miss = [origin[axis] + nearest * direction[axis] for axis in range(3)]
-    left = size[0] * size[0] - dot(miss, miss)  # m^2, half the chord, squared
-    hits = left >= 0.0
-    distance = nearest - jnp.sqrt(jnp.where(hits, left, 0.0) / square)
+    half_chord_sq = size[0] * size[0] - dot(miss, miss)  # m^2
+    hits = half_chord_sq >= 0.0
+    distance = nearest - jnp.sqrt(jnp.where(hits, half_chord_sq, 0.0) / square)
     x, y, z = ((origin[axis] + distance * direction[axis]) / size[0] for axis in range(3))
     return Entry(distance, (x, y, z), hits & (distance >= 0.0))
 
@@ -125,22 +114,24 @@ def ray_sphere(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
 def _tube(
     radius: jax.Array, origin: Vector, direction: Vector
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Where the ray's line enters and leaves the endless cylinder about z ([], -inf and inf for a
-    line along it that lies inside), and whether it does."""
+    """Where the ray's line enters and leaves the endless cylinder about z, and whether it does.
+
+    -inf and inf for a parallel line inside.
+    """
     square = direction[0] * direction[0] + direction[1] * direction[1]
-    along = ~(square > 0.0)
-    safe = jnp.where(along, 1.0, square)
+    parallel = ~(square > 0.0)
+    safe = jnp.where(parallel, 1.0, square)
     nearest = -(origin[0] * direction[0] + origin[1] * direction[1]) / safe
     x, y = (origin[axis] + nearest * direction[axis] for axis in range(2))
-    left = radius * radius - (x * x + y * y)
-    hits = left >= 0.0
-    half = jnp.where(along, jnp.inf, jnp.sqrt(jnp.where(hits, left, 0.0) / safe))
+    half_chord_sq = radius * radius - (x * x + y * y)
+    hits = half_chord_sq >= 0.0
+    half = jnp.sqrt(jnp.where(hits, half_chord_sq, 0.0) / safe)
+    half = jnp.where(parallel, jnp.inf, half)
     return nearest - half, nearest + half, hits
 
 
 def ray_cylinder(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The cylinder about z of radius size[0] and half length size[1]: the common part of a tube and
-    a slab."""
+    """The cylinder about z of radius size[0] and half length size[1]: tube and slab."""
     enter_side, leave_side, hits = _tube(size[0], origin, direction)
     parallel = ~(jnp.abs(direction[2]) > 0.0)
     inverse = 1.0 / jnp.where(parallel, 1.0, direction[2])
@@ -159,9 +150,9 @@ def ray_cylinder(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
 def ray_capsule(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     """The capsule about z of radius size[0], half length size[1] without its caps.
 
-    A line that enters the endless tube between the caps enters the capsule there; one that enters
-    it beyond an end can meet only the sphere at that end, and a ray along the tube only the sphere
-    at the end beyond which it starts.
+    A line that enters the endless tube between the caps enters the capsule there. One that enters
+    it beyond an end can hit only the sphere at that end. A parallel ray can hit only the sphere at
+    the end beyond which it starts.
     """
     enter, _, hits = _tube(size[0], origin, direction)
     z = origin[2] + jnp.where(jnp.isinf(enter), 0.0, enter) * direction[2]
@@ -176,8 +167,7 @@ def ray_capsule(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
 
 
 def ray_polytope(faces: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The convex polytope of the half-spaces `faces` [F, 4]: outward unit normal and offset m of
-    each."""
+    """The polytope of the half-spaces `faces` [F, 4]: outward unit normal and offset m."""
     entry = enter_half_spaces(faces[:, :3], faces[:, 3], origin, direction)
     x, y, z = (faces[:, axis].at[entry.face].get(mode="promise_in_bounds") for axis in range(3))
     return Entry(entry.distance, (x, y, z), entry.valid)
@@ -191,5 +181,5 @@ RAY: dict[Kind, Callable[[jax.Array, Vector, Vector], Entry]] = {
     Kind.CYLINDER: ray_cylinder,
     Kind.POLYTOPE: ray_polytope,
 }
-"""Of every kind, the function of its shape (a row of `GeomGroup.shape`), the ray's origin [3] m and
-direction [3]."""
+"""Per kind, a function of the shape (a row of `Group.shape`), the ray's origin [3] m and direction
+[3]."""

@@ -28,12 +28,12 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.config import Config, PhysicsKind, SceneConfig, SlotKind
 from csac_jax.constants import Outcome, Primitive
-from csac_jax.env import Env
 from csac_jax.runtime import provenance
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.primitives import Action
+from csac_jax.vision import observe
 from experiments.bench._options import read
 
 BATCH = 64
@@ -67,7 +67,7 @@ class Bench:
     def __init__(self, cfg: Config) -> None:
         self.cfg = cfg
         self.world = model.build(cfg.scene, cfg.sim)
-        self.look = jax.jit(jax.vmap(lambda scene: Env(cfg, None, None).look(scene).height))
+        self.look = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))
         plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
         self.oracle = jax.jit(jax.vmap(plan))
         self.push = jax.jit(jax.vmap(_push))

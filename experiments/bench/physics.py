@@ -29,7 +29,7 @@ REPEATS = 5
 def measure(cfg: Config, name: PhysicsKind, scenes: int) -> dict[str, Any]:
     """One physics and one batch."""
     cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=name))
-    env = environment.make(cfg)
+    env = environment.make_env(cfg)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
     plan_grasp = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
     actions = jax.jit(jax.vmap(plan_grasp))(states.scene, states.obs.height)

@@ -1,19 +1,17 @@
 """Speed of the raycaster, as JSON: `csac-jax bench raycast [--size N] [--scenes N] [--repeats N]`.
 
-Rays straight down through every cell of the map, at random poses of the ten blocks of the preset
-`fast`, and the table: ours gives distance and surface, `mjx.ray` distance and geom, of the same
-model (without the hand), vmapped over rays and scenes, in parts of PEER_ROWS rows a scene, since it
-keeps every triangle of every ray in memory. It passes through cylinders, of which there are none:
-round blocks are meshes; and it fails on models without a material, so it gets one. Calls take turns
-and the median counts.
+One ray straight down per cell of the map, at random poses of the ten blocks of the preset `fast` on
+the table. Ours gives distance and surface; `mjx.ray` gives distance and geom on the same model
+without the hand. `mjx.ray` keeps every triangle of every ray in memory, so it runs on PEER_ROWS
+rows of a scene at a time. It fails on models without a material, so it gets one. It ignores
+cylinders; there are none, since round blocks are meshes. Calls alternate and the median counts.
 
-Arithmetic limit: the rate of a float32 matrix product at full precision, 2 SIDE^3 operations, timed
-in the same run. Operations of a ray are counted from the code: every sum, product, comparison,
-selection, minimum, maximum and logical operation is one. Per plane (`enter_half_spaces` for a
-direction that all rays share: what depends on the direction alone has no ray axis): room 7 (3
-products, 3 sums, a difference), crossing 1, inwards 1, face 2, enter 1, leave 2: 14. Per geom:
-valid 3, closer 2, number and selection of the surface 3, distance 1: 9. Planes that a geom lacks
-are computed as well, and counted.
+The arithmetic limit is the rate of a float32 matrix product at full precision, 2 SIDE^3 operations,
+timed in the same run. Operations per ray are counted from the code: each sum, product, comparison,
+selection, minimum, maximum and logical operation is one. What depends on the direction alone has no
+ray axis and does not count. Per plane (`enter_half_spaces`): depth 7 (3 products, 3 sums, a
+difference), crossing 1, inwards 1, face 2, enter 1, leave 2: 14. Per geom: valid 3, closer 2,
+number and selection of the surface 3, distance 1: 9. Padding planes count: they are computed.
 """
 
 import json
@@ -66,12 +64,12 @@ def _ours(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -
     normal, offset = blocks.half_spaces(world.slots, jnp.asarray(half_size))
     slot = world.parts.slot
 
-    def look(position: jax.Array, quaternion: jax.Array) -> Any:
-        turn = jax.vmap(geometry.quat_to_matrix)(quaternion)
-        shapes = Polytopes(normal, offset, position[slot], turn[slot], jnp.zeros((len(slot), 3)))
-        return jax.vmap(raycast.meet, (None, 0, None))(shapes, origin, jnp.asarray(DOWN))
+    def cast(position: jax.Array, quaternion: jax.Array) -> Any:
+        rotation = jax.vmap(geometry.quat_to_matrix)(quaternion)[slot]
+        shapes = Polytopes(normal, offset, position[slot], rotation, jnp.zeros((len(slot), 3)))
+        return jax.vmap(raycast.cast_polytopes, (None, 0, None))(shapes, origin, jnp.asarray(DOWN))
 
-    compiled = jax.jit(jax.vmap(look))
+    compiled = jax.jit(jax.vmap(cast))
     return lambda: compiled(*poses)
 
 
@@ -84,18 +82,18 @@ def _peer(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -
     hand = sorted(set(range(1, world.model.nbody)) - set(world.block_bodies.tolist()))
     part = PEER_ROWS * round(len(origin) ** 0.5)
 
-    def look(position: jax.Array, quaternion: jax.Array) -> Any:
-        qpos = physics.data.qpos.at[world.block_qpos].set(
-            jnp.concatenate([position, quaternion], axis=1)
-        )
+    def cast(position: jax.Array, quaternion: jax.Array) -> Any:
+        pose = jnp.concatenate([position, quaternion], axis=1)
+        qpos = physics.data.qpos.at[world.block_qpos].set(pose)
         data = mjx.kinematics(model, physics.data.replace(qpos=qpos))
-        cast = jax.vmap(
-            lambda start: mjx.ray(model, data, start, jnp.asarray(DOWN), bodyexclude=hand)
-        )
-        found = jax.lax.map(cast, origin.reshape(-1, part, 3))
-        return jax.tree.map(jnp.ravel, found)
 
-    compiled = jax.jit(jax.vmap(look))
+        def ray(start: jax.Array) -> Any:
+            return mjx.ray(model, data, start, jnp.asarray(DOWN), bodyexclude=hand)
+
+        hits = jax.lax.map(jax.vmap(ray), origin.reshape(-1, part, 3))
+        return jax.tree.map(jnp.ravel, hits)
+
+    compiled = jax.jit(jax.vmap(cast))
     return lambda: compiled(*poses)
 
 

@@ -1,8 +1,9 @@
-"""Does the arm grasp as the floating hand does? As JSON: `csac-jax bench robots [--grasps N]`.
+"""Does the arm grasp as the floating hand does? As JSON: `csac-jax bench robots [--grasps N]`, in C
+MuJoCo.
 
-Both make the same grasps in the same settled piles of six, in C MuJoCo. A pile is rotated each time
-it is used, so that the arm takes another posture. One grasp in four is moved and rotated away from
-the planned one, so that outcomes differ.
+The same grasps in the same settled piles of six, each pile turned by another yaw every time it is
+used, so that the arm stands otherwise. One grasp in four is beside the planned place, and turned,
+so that outcomes differ.
 """
 
 import collections
@@ -18,12 +19,12 @@ import numpy as np
 
 from csac_jax.config import Config, RobotKind
 from csac_jax.constants import Outcome
-from csac_jax.env import Env
 from csac_jax.runtime import provenance
 from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.primitives import Action
+from csac_jax.vision import observe
 from experiments.bench._options import read
 from experiments.bench.parity import STREAM, TEN, pile_config
 
@@ -65,16 +66,16 @@ def measure(grasps: int) -> dict[str, Any]:
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(grasps) % SCENES], settled)
     yaws = rng.uniform(0.0, 2.0 * np.pi, grasps).astype(np.float32)
     scenes = jax.jit(jax.vmap(layout.rotate))(scenes, yaws)
-    height = jax.jit(jax.vmap(lambda scene: Env(cfg, None, None).look(scene).height))(scenes)
+    height = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))(scenes)
     plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
     actions = jax.jit(jax.vmap(plan))(scenes, height)
     noise = rng.normal(size=(grasps, 3)) * NOISE * (np.arange(grasps) % 4 == 0)[:, None]
     actions = actions.replace(pose=jnp.asarray(actions.pose + noise.astype(np.float32)))
-    outcomes = {kind: _outcomes(cfg, kind, scenes, height, actions) for kind in ROBOTS}
-    equal = outcomes["hand"] == outcomes["ur5"]
+    found = {kind: _outcomes(cfg, kind, scenes, height, actions) for kind in ROBOTS}
+    equal = found["hand"] == found["ur5"]
     counts = {
         kind: {level.name.lower(): collections.Counter(rows.tolist())[level] for level in Outcome}
-        for kind, rows in outcomes.items()
+        for kind, rows in found.items()
     }
     return {
         "grasps": grasps,

@@ -97,7 +97,7 @@ def _doubled(cfg: Config) -> Config:
 def soak(actions: int, scenes: int) -> dict[str, Any]:
     """At least `actions` random actions in `scenes` scenes side by side."""
     cfg = pile_config(TEN.scene.slots, len(TEN.scene.slots))
-    env, frames = environment.make(cfg), maps.frames(cfg)
+    env, frames = environment.make_env(cfg), maps.frames(cfg)
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, scenes))
 
@@ -139,7 +139,7 @@ def _caps(cfg: Config, env: Env, frames: maps.Frames, state: State) -> dict[str,
     action = action.replace(primitive=jnp.full_like(action.primitive, Primitive.GRASP))
     step = jax.jit(jax.vmap(env.step))
     moved = state.replace(scene=state.scene.replace(position=state.scene.position + NUDGE))
-    doubled = jax.jit(jax.vmap(environment.make(_doubled(cfg)).step))
+    doubled = jax.jit(jax.vmap(environment.make_env(_doubled(cfg)).step))
     ends = {
         "as_it_is": step(state, action),
         "nudged": step(moved, action),

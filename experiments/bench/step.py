@@ -128,7 +128,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         return ring.add(replay, seen, ~after.info.physics_diverged)
 
     def replace(keys: jax.Array, after: Any) -> Any:
-        fresh = jax.vmap(env.restart)(keys, after)
+        fresh = jax.vmap(env.auto_reset)(keys, after)
         return jax.tree.map(
             lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after
         )

@@ -14,11 +14,10 @@ from csac_jax import geometry, presets
 from csac_jax.agent import augment, maps
 from csac_jax.agent.actor_critic import Transition
 from csac_jax.constants import Primitive
-from csac_jax.env import Env
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.sim.primitives import Action
-from csac_jax.vision import heightmap, rotate
+from csac_jax.vision import heightmap, observe, rotate
 
 FLAGS = list(itertools.product((False, True), repeat=3))
 CFG = presets.smoke()  # four yaws: turning to the nearest cell is exact
@@ -54,7 +53,7 @@ ROTATION = Rotation.from_euler("zyx", [[0.4, 0.3, 0.0], [1.1, -0.2, 0.35], [2.0,
 POSITION = np.array([[0.06, 0.05, 0.05], [-0.12, 0.02, 0.04], [0.03, -0.14, 0.0243]])
 POSE = np.array([0.071, -0.033, 0.6])
 
-look = jax.jit(Env(CFG, None, None).look)
+_observe = jax.jit(lambda scene: observe.observe(CFG, scene))
 
 
 def _transition(
@@ -68,7 +67,7 @@ def _transition(
 @pytest.fixture(scope="module")
 def transition() -> Transition:
     """A transition of a scene without any symmetry."""
-    return _transition(look(_scene(ROTATION, POSITION)))
+    return _transition(_observe(_scene(ROTATION, POSITION)))
 
 
 def _turned_scene(matrix: np.ndarray) -> Scene:
@@ -86,7 +85,7 @@ def test_view_is_that_of_the_mirrored_scene(transition, flags):
     Heights everywhere, colours of the table: the light does not turn, so that sloping faces differ
     in brightness.
     """
-    seen = heightmap.pack(look(_turned_scene(_matrix(flags))))
+    seen = heightmap.pack(_observe(_turned_scene(_matrix(flags))))
     turned = _turn(flags, transition)
     for obs in (turned.obs, turned.next_obs):
         off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
@@ -102,13 +101,13 @@ def test_colours_turn_too():
     flat = Rotation.from_euler("z", [[0.4], [1.1], [2.0]])
     scene = _scene(flat, POSITION).replace(in_play=jnp.array([True, True, False]))
     away = scene.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))
-    transition = _transition(look(scene.replace(position=away)))
+    transition = _transition(_observe(scene.replace(position=away)))
     for flags in FLAGS:
         matrix = _matrix(flags)
         body = np.diag([np.linalg.det(matrix), 1.0, 1.0])
         turned = _scene(Rotation.from_matrix(matrix @ flat.as_matrix() @ body), POSITION @ matrix.T)
         seen = heightmap.pack(
-            look(turned.replace(position=turned.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))))
+            _observe(turned.replace(position=turned.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))))
         )
         off = np.abs(
             np.asarray(seen.colour, int) - np.asarray(_turn(flags, transition).obs.colour, int)
@@ -218,7 +217,7 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
     table that comes in included, and moves the action as far; another shift takes it back, cell by
     cell."""
     moved = move(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
-    seen = heightmap.pack(look(_shifted(cells)))
+    seen = heightmap.pack(_observe(_shifted(cells)))
     for obs in (moved.obs, moved.next_obs):
         off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
         assert np.mean(off > 1) < 0.005  # a ray along an edge

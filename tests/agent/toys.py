@@ -62,9 +62,9 @@ class Toy:
         layout = Layout(place.astype(jnp.int32), jnp.asarray(self.kinds, jnp.int32))
         no, none, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros(())
         info = Info(none, none, zero, zero, none, none, none, no)
-        return State(layout, self.look(layout), zero, no, no, none, none, info)
+        return State(layout, self.observe(layout), zero, no, no, none, none, info)
 
-    def look(self, layout: Layout) -> Observation:
+    def observe(self, layout: Layout) -> Observation:
         """The picture of a scene."""
         size = self.cfg.heightmap.size
         cell = jnp.arange(size, dtype=jnp.int32) // (size // GRID)
@@ -81,7 +81,7 @@ class Toy:
             target=jnp.ones((size, size), bool),
         )
 
-    def restart(self, key: jax.Array, state: State) -> State:
+    def auto_reset(self, key: jax.Array, state: State) -> State:
         """A new problem, whatever came of the last one."""
         return self.reset(key)
 
@@ -104,7 +104,7 @@ class Toy:
         )
         return state.replace(
             scene=layout,
-            obs=self.look(layout),
+            obs=self.observe(layout),
             terminated=lifted,
             truncated=(actions >= self.cfg.task.max_actions) & ~lifted,
             actions=actions,

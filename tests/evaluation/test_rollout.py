@@ -16,6 +16,7 @@ from csac_jax.evaluation import rollout
 from csac_jax.evaluation.metrics import Episodes
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action
+from csac_jax.vision import observe
 
 pytestmark = pytest.mark.mjx
 
@@ -44,7 +45,7 @@ class Magnet(Env):
         outcome = jnp.where(jnp.any(taken), jnp.int32(Outcome.LIFTED), jnp.int32(Outcome.EMPTY))
         return state.replace(
             scene=scene,
-            obs=self.look(scene),
+            obs=observe.observe(self.cfg, scene),
             terminated=terminated,
             truncated=capped & ~terminated,
             actions=actions,
@@ -60,7 +61,7 @@ class Magnet(Env):
 
 @pytest.fixture(scope="module")
 def magnet() -> Magnet:
-    made = environment.make(CFG, stream=1, scenes=EPISODES)
+    made = environment.make_env(CFG, stream=1, num_scenes=EPISODES)
     return Magnet(made.cfg, made.physics, made.scenes)
 
 
@@ -192,7 +193,7 @@ def test_oracle_beats_random_in_physics():
     """Claim: in physics too the oracle clears more blocks per action than random grasps above
     blocks."""
     cfg = presets.smoke()
-    env = environment.make(cfg, stream=1, scenes=12)
+    env = environment.make_env(cfg, stream=1, num_scenes=12)
     oracle, random = (rollout.rollout(cfg, env, name, None, 12, 0) for name in ("oracle", "random"))
     for episodes in (oracle, random):
         assert_consistent(episodes, cfg.task.max_actions)

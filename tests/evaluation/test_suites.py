@@ -26,7 +26,7 @@ def _varied(cfg: Config, name: str, count: int = 40):
     env = suites.environments(cfg, "cases", EPISODES, 0)[name]
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
     return scene, jax.device_get(
-        jax.vmap(env.vary, (0, None))(jax.random.split(jax.random.key(0), count), scene)
+        jax.vmap(env.randomise_pose, (0, None))(jax.random.split(jax.random.key(0), count), scene)
     )
 
 
@@ -170,7 +170,7 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
         for env in parts.values():
             assert (env.cfg.task.kind, env.cfg.task.max_actions) == ("target", 5)
             scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
-            varied = env.vary(jax.random.key(0), scene)
+            varied = env.randomise_pose(jax.random.key(0), scene)
             assert scene.in_play[varied.target]
     with pytest.raises(
         ValueError, match=r"^--suite: target needs a policy trained with --task.kind target"

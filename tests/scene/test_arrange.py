@@ -38,7 +38,7 @@ MANY = SceneConfig(
 BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_jitter=0.25)
 EXTENT = {
     MANY: HeightmapConfig().extent,
-    BOXES: 2.0 * (arrange.REACH + 0.001),
+    BOXES: 2.0 * (arrange.RADIUS + 0.001),
 }  # the usual square, the smallest
 FAR = 0.05  # m, distances are measured up to here
 TOGETHER = 0.012  # m, blocks closer than this make a cluster; loose ones keep 15 mm

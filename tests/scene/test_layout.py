@@ -56,7 +56,7 @@ def test_rotate_keeps_parked_blocks_parked(scene: Scene):
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 3.0, 6.0])
 def test_rotate_is_a_rotation_about_z(scene: Scene, yaw: float):
-    """Claim: rotating keeps heights and distances; places and blocks rotate by the same angle."""
+    """Claim: rotating keeps heights and distances, and rotates places and blocks alike."""
     rotated = layout.rotate(scene, jnp.float32(yaw))
     play = np.flatnonzero(scene.in_play)
     about_z = Rotation.from_rotvec([0.0, 0.0, yaw])

@@ -11,12 +11,12 @@ import pytest
 
 from csac_jax.config import Config, SceneConfig
 from csac_jax.constants import Primitive
-from csac_jax.env import Env
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, robot
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, Plan
+from csac_jax.vision import observe
 
 CONFIG = Config(scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, settle_time=1.5))
 SETTLED = 40
@@ -124,7 +124,7 @@ def execute_settled(config: Config, count: int, scripted: dict[str, tuple[Scene,
     settled = pool.settled(
         world, config.scene, config.heightmap.extent, pool.TRAIN_STREAM, per_number
     )
-    look = jax.jit(jax.vmap(lambda scene: Env(config, None, None).look(scene).height))
+    look = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))
     plan_grasp = functools.partial(oracle.grasp, config.sim, config.heightmap, config.scene.slots)
     grasps = _noisy(jax.jit(jax.vmap(plan_grasp))(settled, look(settled)))
     scenes, actions = settled, grasps

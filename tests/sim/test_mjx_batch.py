@@ -43,7 +43,7 @@ def test_batches_round_otherwise_and_contacts_amplify_it():
     """Claim: on one device, a scene in a batch of eight and the same by itself are apart by
     rounding after a physics step, less than 1e-6 m, and by more than 1e-4 m after a push in one of
     eight scenes: two layouts are two runs."""
-    program = env.make(presets.smoke())
+    program = env.make_env(presets.smoke())
     physics = program.physics
     given = jax.jit(lambda: _pushes(program))()
 

@@ -16,11 +16,11 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.constants import Outcome
-from csac_jax.env import Env
 from csac_jax.errors import SceneError
 from csac_jax.scene import layout, model, pool
 from csac_jax.sim import mjx_physics, oracle, physics as simulation, warp_physics
 from csac_jax.sim.outcome import Trace, grasp_outcome
+from csac_jax.vision import observe
 
 SCENES = 4
 SLOTS = ("box", "arch", "prism", "cylinder")
@@ -116,7 +116,7 @@ def _end(cfg: Config, physics: Any) -> tuple[np.ndarray, np.ndarray, Trace]:
     sim = dataclasses.replace(cfg.sim, physics=physics)
     world = model.build(cfg.scene, sim)
     scenes = pool.settled(world, cfg.scene, cfg.heightmap.extent, 77, SCENES)
-    height = jax.vmap(lambda scene: Env(cfg, None, None).look(scene).height)(scenes)
+    height = jax.vmap(lambda scene: observe.observe(cfg, scene).height)(scenes)
     action = jax.vmap(functools.partial(oracle.grasp, sim, cfg.heightmap, cfg.scene.slots))(
         scenes, height
     )

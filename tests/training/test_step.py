@@ -323,7 +323,7 @@ def test_finished_scenes_are_replaced(run):
 def test_a_cleared_table_is_a_true_end(run):
     """Claim: an empty scene terminates, is stored as such and is replaced by one with blocks."""
     scenes = run.states[0].scenes
-    empty = jax.vmap(lambda scene: Env.begin(run.program.env, scene))(
+    empty = jax.vmap(lambda scene: Env.reset_to(run.program.env, scene))(
         scenes.scene.replace(
             in_play=jnp.array([[False] * len(CFG.scene.slots), [True] * len(CFG.scene.slots)])
             & scenes.scene.in_play,

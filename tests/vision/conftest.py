@@ -93,7 +93,8 @@ def reference() -> Reference:
     )
     geoms = "".join(f'<geom {kind} pos="{pos}" euler="{euler}"/>' for kind, pos, euler in _GEOMS)
     model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><asset>{meshes}</asset><worldbody><geom type="plane" size="0 0 1"/>{geoms}</worldbody></mujoco>'
+        f"<mujoco><asset>{meshes}</asset><worldbody>"
+        f'<geom type="plane" size="0 0 1"/>{geoms}</worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -58,7 +58,10 @@ def blocks_and_arm(rng: np.random.Generator) -> Placed:
 def every_type(rng: np.random.Generator) -> Placed:
     """Two of each type that the raycaster knows, of random sizes and poses; one plane has an
     end."""
-    geoms = '<geom type="plane" size="0 0 1" pos="0 0 -0.3"/><geom type="plane" size="0.3 0.2 1" euler="10 20 30"/>'
+    geoms = (
+        '<geom type="plane" size="0 0 1" pos="0 0 -0.3"/>'
+        '<geom type="plane" size="0.3 0.2 1" euler="10 20 30"/>'
+    )
     meshes = ""
     for number, kind in enumerate(("box", "sphere", "capsule", "cylinder", "mesh") * 2):
         size, place, turn = (

@@ -105,7 +105,8 @@ def test_colours_are_flat_shaded():
     """Claim: a pixel shows its geom's colour times a brightness that follows the normal, and SKY
     where nothing is."""
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1" rgba="0.2 0.4 0.8 1"/></worldbody></mujoco>'
+        '<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1" rgba="0.2 0.4 0.8 1"/>'
+        "</worldbody></mujoco>"
     )
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

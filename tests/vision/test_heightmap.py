@@ -10,22 +10,19 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from csac_jax import geometry, presets
-from csac_jax.config import HeightmapConfig
-from csac_jax.env import Env
-from csac_jax.scene import model, pool
+from csac_jax.config import Config, HeightmapConfig
+from csac_jax.scene import blocks, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.vision import heightmap, raycast, shade
+from csac_jax.vision import heightmap, observe, raycast, shade
 from tests.vision import mujoco_rays
 from tests.vision.mujoco_rays import Placed
 
-_TABLE = np.array([0.5, 0.4, 0.3], np.float32)
+_TABLE = blocks.TABLE_COLOUR
 
 
-def _look(cfg: HeightmapConfig, polytopes: raycast.Polytopes, wanted: jax.Array | None = None):
+def _look(cfg: HeightmapConfig, polytopes: raycast.Polytopes, is_target: jax.Array | None = None):
     every = jnp.ones(polytopes.offset.shape[0], bool)
-    return heightmap.orthographic(
-        cfg, polytopes, jnp.asarray(_TABLE), every if wanted is None else wanted
-    )
+    return observe.ortho(cfg, polytopes, every if is_target is None else is_target)
 
 
 def test_heights_agree_with_mujoco(reference):
@@ -42,7 +39,7 @@ def test_heights_agree_with_mujoco(reference):
     assert set(geom[clear]) == {-1, 0, 1, 2, 3, 4, 5}
     height = np.asarray(obs.height).reshape(-1)
     np.testing.assert_allclose(height[clear], 0.5 - distance[clear], rtol=0, atol=1e-4)
-    assert np.all(height[clear & (geom == raycast.TABLE)] == 0.0)
+    assert np.all(height[clear & (geom == -1)] == 0.0)
     albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[
         geom
     ]  # -1 is the last row
@@ -53,7 +50,7 @@ def test_heights_agree_with_mujoco(reference):
     assert obs.target.dtype == jnp.bool_
 
 
-def _settled_pile(rng: np.random.Generator) -> tuple[Env, Scene, Placed]:
+def _settled_pile(rng: np.random.Generator) -> tuple[Config, Scene, Placed]:
     """Ten settled blocks of all eight shapes of nominal size, for both: geom 0 of C is the
     table."""
     cfg = dataclasses.replace(presets.get("fast"), heightmap=HeightmapConfig(224))
@@ -74,7 +71,7 @@ def _settled_pile(rng: np.random.Generator) -> tuple[Env, Scene, Placed]:
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
     data.qpos[world.robot_qpos[2]] = 2.0
     mujoco.mj_kinematics(exact, data)
-    return Env(cfg, None, None), scene, Placed(exact, data)
+    return cfg, scene, Placed(exact, data)
 
 
 @pytest.mark.slow
@@ -85,10 +82,11 @@ def test_a_settled_pile_agrees_with_mujoco():
 
     An edge is a cell that sees another height 0.1 mm beside its centre.
     """
-    env, scene, pile = _settled_pile(np.random.default_rng(0))
-    cfg = env.cfg.heightmap
-    height = np.asarray(jax.jit(env.look)(jax.tree.map(jnp.asarray, scene)).height)
-    centres = np.asarray(geometry.cell_centres(cfg), np.float64).reshape(-1, 2)
+    cfg, scene, pile = _settled_pile(np.random.default_rng(0))
+    height = np.asarray(
+        jax.jit(lambda scene: observe.observe(cfg, scene))(jax.tree.map(jnp.asarray, scene)).height
+    )
+    centres = np.asarray(geometry.cell_centres(cfg.heightmap), np.float64).reshape(-1, 2)
     down, expected = np.array([[0.0, 0.0, -1.0]]), []
     for shift in ((0.0, 0.0), (1e-4, 0.0), (-1e-4, 0.0), (0.0, 1e-4), (0.0, -1e-4)):
         rays = [mujoco_rays.cast(*pile, np.append(xy + shift, 0.5), down) for xy in centres]

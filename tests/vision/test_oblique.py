@@ -8,10 +8,9 @@ from hypothesis import given, settings, strategies as st
 
 from csac_jax import geometry
 from csac_jax.config import CameraConfig, HeightmapConfig
-from csac_jax.vision import camera, heightmap, raycast
+from csac_jax.vision import camera, heightmap, observe, raycast
 
 CFG = HeightmapConfig(64, view="oblique")
-_TABLE = np.array([0.5, 0.4, 0.3], np.float32)
 _EYE, _FINE = camera.make(CameraConfig(scale=0.25)), camera.make(CameraConfig(scale=0.5))
 
 
@@ -59,10 +58,10 @@ def test_the_view_agrees_with_numpy(reference):
 
     Not compiled as a whole: a fused multiply-add may move a point across the border of a cell.
     """
-    seen = heightmap.sight(reference.polytopes, _EYE)
-    wanted = jnp.arange(6) == 4
-    tables = heightmap.surface_tables(reference.polytopes, jnp.asarray(_TABLE), wanted)
-    obs = heightmap.from_depth(CFG, _EYE, seen.distance, seen.valid, seen.surface, tables)
+    seen = observe.pixel_hits(reference.polytopes, _EYE)
+    is_target = jnp.arange(6) == 4
+    tables = observe.surface_tables(reference.polytopes, is_target)
+    obs = observe.from_depth(CFG, _EYE, seen.distance, seen.valid, seen.surface, tables)
     depth, valid, surface = (np.asarray(leaf) for leaf in (seen.distance, seen.valid, seen.surface))
     points = depth[..., None] * np.asarray(camera.directions(_EYE)) + np.asarray(_EYE.position)
     height, source = _by_hand(CFG, points.reshape(-1, 3), valid.reshape(-1))
@@ -79,8 +78,8 @@ def test_the_view_agrees_with_numpy(reference):
 
 _views = jax.jit(
     lambda polytopes: (
-        heightmap.orthographic(CFG, polytopes, jnp.asarray(_TABLE), jnp.ones(6, bool)),
-        heightmap.oblique(CFG, polytopes, jnp.asarray(_TABLE), jnp.ones(6, bool), _EYE),
+        observe.ortho(CFG, polytopes, jnp.ones(6, bool)),
+        observe.oblique(CFG, polytopes, jnp.ones(6, bool), _EYE),
     )
 )
 
@@ -113,9 +112,7 @@ def test_a_block_casts_a_shadow():
         rotation=jnp.eye(3)[None],
         colour=jnp.ones((1, 3)),
     )
-    obs = jax.jit(
-        lambda: heightmap.oblique(CFG, cube, jnp.asarray(_TABLE), jnp.ones(1, bool), _FINE)
-    )()
+    obs = jax.jit(lambda: observe.oblique(CFG, cube, jnp.ones(1, bool), _FINE))()
     height, filled = np.asarray(obs.height), np.asarray(obs.colour).sum(-1) > 0.0
     x = np.asarray(geometry.cell_centres(CFG))[0, :, 0]
     middle = slice(30, 34)  # rows at y = 0

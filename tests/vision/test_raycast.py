@@ -8,7 +8,17 @@ from hypothesis import given, settings, strategies as st
 from csac_jax import geometry
 from csac_jax.vision import raycast
 
-_cast_all = jax.jit(jax.vmap(raycast.cast, in_axes=(None, 0, 0)))
+_TABLE = -1  # geom
+
+
+def _cast_one(polytopes: raycast.Polytopes, origin: jax.Array, direction: jax.Array) -> raycast.Hit:
+    """`raycast.cast_polytopes` with the normal and the geom of the surface."""
+    distance, surface, valid = raycast.cast_polytopes(polytopes, origin, direction)
+    normal = raycast.surface_normals(polytopes)[surface]
+    return raycast.Hit(distance, normal, (surface - 1) // polytopes.offset.shape[1], valid)
+
+
+_cast_all = jax.jit(jax.vmap(_cast_one, in_axes=(None, 0, 0)))
 _seeds = st.integers(0, 2**32 - 1)
 
 
@@ -104,7 +114,7 @@ def test_hits_lie_on_the_surface(seed):
     origin, direction = _random_rays(rng, 64)
     hit = jax.tree.map(np.asarray, _cast(polytopes, origin, direction))
     normal, offset = map(np.asarray, raycast.world_half_spaces(polytopes))
-    for r in np.flatnonzero(hit.valid & (hit.geom != raycast.TABLE)):
+    for r in np.flatnonzero(hit.valid & (hit.geom != _TABLE)):
         point = origin[r] + hit.distance[r] * direction[r]
         room = offset[hit.geom[r]] - normal[hit.geom[r]] @ point  # [F] m
         face = np.argmin(np.abs(normal[hit.geom[r]] - hit.normal[r]).sum(-1))
@@ -165,7 +175,7 @@ def test_unused_geoms_are_never_hit():
     empty = polytopes.replace(normal=jnp.zeros((4, 8, 3)), offset=jnp.full((4, 8), 1e3))
     origin, direction = _random_rays(rng, 500)
     hit = _cast(empty, origin, direction)
-    np.testing.assert_array_equal(hit.geom, raycast.TABLE)
+    np.testing.assert_array_equal(hit.geom, _TABLE)
     np.testing.assert_array_equal(hit.valid, direction[:, 2] < 0)
     assert not np.isnan(np.asarray(hit.distance)).any()
 
@@ -173,9 +183,9 @@ def test_unused_geoms_are_never_hit():
 def test_no_geoms_at_all():
     """Claim: a scene without geoms is the table alone."""
     empty = jax.tree.map(lambda x: x[:0], _random_scene(np.random.default_rng(3)))
-    hit = raycast.cast(empty, jnp.array([0.0, 0.0, 0.5]), jnp.array([0.0, 0.0, -1.0]))
+    hit = _cast_one(empty, jnp.array([0.0, 0.0, 0.5]), jnp.array([0.0, 0.0, -1.0]))
     assert hit.valid
-    assert hit.geom == raycast.TABLE
+    assert hit.geom == _TABLE
     assert hit.distance == 0.5
 
 
@@ -184,11 +194,11 @@ def test_seen_from_outside_only(reference):
     points away misses."""
     down, up = jnp.array([0.0, 0.0, -1.0]), jnp.array([0.0, 0.0, 1.0])
     inside = jnp.array([0.02, 0.01, 0.025])
-    hit = raycast.cast(reference.polytopes, inside, down)
+    hit = _cast_one(reference.polytopes, inside, down)
     assert hit.valid
-    assert hit.geom == raycast.TABLE
-    assert not raycast.cast(reference.polytopes, jnp.array([0.02, 0.01, 0.3]), up).valid
-    assert not raycast.cast(reference.polytopes, jnp.array([0.02, 0.01, -0.1]), down).valid
+    assert hit.geom == _TABLE
+    assert not _cast_one(reference.polytopes, jnp.array([0.02, 0.01, 0.3]), up).valid
+    assert not _cast_one(reference.polytopes, jnp.array([0.02, 0.01, -0.1]), down).valid
 
 
 def test_a_broken_scene_spoils_no_other():

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 from csac_jax import geometry
 from csac_jax.config import HeightmapConfig
-from csac_jax.vision import heightmap, raycast, rotate
+from csac_jax.vision import observe, raycast, rotate
 
 _K = 16
 
@@ -120,9 +120,7 @@ def test_a_block_appears_where_frame_position_says(k, x, y):
 
 @jax.jit
 def _look(block):
-    return heightmap.orthographic(
-        HeightmapConfig(64), block, jnp.zeros(3), jnp.ones(1, bool)
-    ).height
+    return observe.ortho(HeightmapConfig(64), block, jnp.ones(1, bool)).height
 
 
 def test_an_action_points_along_the_columns():

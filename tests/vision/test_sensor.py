@@ -16,7 +16,7 @@ from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import outcome
 from csac_jax.sim.primitives import Action
-from csac_jax.vision import camera, heightmap, sensor
+from csac_jax.vision import camera, heightmap, observe, sensor
 
 ERRORS = SensorConfig(depth_floor=0.001, depth_square=0.0014, dropped=0.1, colour=0.05)
 SMALL = HeightmapConfig(32)
@@ -34,8 +34,8 @@ def test_depth_errors_grow_with_the_square(distance):
 
 
 def test_the_camera_is_jittered():
-    """Claim: place and orientation scatter about the believed ones with the stated spreads, as
-    rotations."""
+    """Claim: place and orientation scatter about the believed ones with the stated standard
+    deviations, as rotations."""
     errors, eye = SensorConfig(position=0.01, rotation=0.02), camera.make(CameraConfig())
     keys = jax.random.split(jax.random.key(1), 3000)
     real = jax.jit(jax.vmap(lambda key: sensor.pose(key, errors, eye)))(keys)
@@ -61,7 +61,7 @@ def test_colours_change_together():
 
 
 def test_no_errors_change_nothing():
-    """Claim: with every spread 0 each part gives back what it was given."""
+    """Claim: with every standard deviation 0 each part gives back what it was given."""
     none, eye = SensorConfig(), camera.make(CameraConfig())
     true = jnp.linspace(0.0, 1.0, 12).reshape(2, 2, 3)
     measured, kept = sensor.depth(jax.random.key(0), none, true)
@@ -81,6 +81,10 @@ class Still:
 def _env(**changes) -> Env:
     cfg = dataclasses.replace(presets.smoke(), heightmap=SMALL, camera=CameraConfig(scale=0.1))
     return Env(dataclasses.replace(cfg, **changes), Still(), _scenes(cfg))
+
+
+def _look(env: Env, scene: Scene) -> heightmap.Observation:
+    return jax.jit(lambda scene: observe.observe(env.cfg, scene))(scene)
 
 
 def _scenes(cfg: Config) -> Scene:
@@ -119,7 +123,7 @@ def test_views_differ_from_step_to_step(view, errors):
     states = (first, second, third, other)
     assert len({np.asarray(state.obs.height).tobytes() for state in states}) == 4
     jax.tree.map(np.testing.assert_array_equal, second.obs, step(again, _PUSH).obs)
-    true = jax.jit(env.look)(first.scene)
+    true = _look(env, first.scene)
     off = np.abs(np.asarray(first.obs.height) - np.asarray(true.height))
     assert 0.0 < np.mean(off) < 0.01
 
@@ -128,10 +132,9 @@ def test_views_differ_from_step_to_step(view, errors):
 def test_orthographic_errors():
     """Claim: from above, heights err as depths do from VIEW_HEIGHT, and a dropped cell is empty."""
     env = _env(sensor=dataclasses.replace(ERRORS, depth_square=0.01))
-    views = jax.jit(jax.vmap(env.look, (None, 0)))(
-        env._fresh(jax.random.key(0)), jax.random.split(jax.random.key(3), 500)
-    )
-    true = jax.jit(env.look)(env._fresh(jax.random.key(0)))
+    scene = env._sample_scene(jax.random.key(0))
+    noisy = jax.jit(jax.vmap(lambda key: observe.observe(env.cfg, scene, key)))
+    views, true = noisy(jax.random.split(jax.random.key(3), 500)), _look(env, scene)
     height, empty = np.asarray(views.height), np.asarray(views.colour).sum(-1) == 0.0
     assert abs(empty.mean() - 0.1) < 0.005
     assert np.all(height[empty] == 0.0)
@@ -147,7 +150,7 @@ def test_without_errors_there_is_no_randomness():
     """Claim: by default a state carries no key and the compiled view draws no random numbers."""
     env = _env()
     state = jax.eval_shape(env.reset, jax.random.key(0))
-    assert state.noise is None
+    assert state.noise_key is None
     stepped = str(
         jax.make_jaxpr(env.step)(
             jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state), _PUSH
@@ -155,10 +158,12 @@ def test_without_errors_there_is_no_randomness():
     )
     assert "random" not in stepped
     noisy = _env(sensor=ERRORS)
-    begin = jax.make_jaxpr(
-        lambda key: noisy.begin(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), noisy.scenes), key)
+    reset_to = jax.make_jaxpr(
+        lambda key: noisy.reset_to(
+            jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), noisy.scenes), key
+        )
     )
-    assert "random" in str(begin(jax.random.key(0)))
+    assert "random" in str(reset_to(jax.random.key(0)))
 
 
 def test_the_config_chooses_the_view():
@@ -166,18 +171,18 @@ def test_the_config_chooses_the_view():
     view is oblique."""
     env = _env(heightmap=OBLIQUE)
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
-    above, beside = (jax.jit(each.look)(scene) for each in (_env(), env))
+    above, beside = (_look(each, scene) for each in (_env(), env))
     hidden = np.asarray(beside.colour).sum(-1) == 0.0
     assert 0.01 < hidden.mean() < 0.9
     assert np.asarray(above.colour).sum(-1).min() > 0.0
 
 
 def test_an_episode_with_errors_needs_a_key():
-    """Claim: beginning an episode without a key says so, instead of showing every episode the same
+    """Claim: a reset without a key says so, instead of showing every episode the same
     errors."""
     env = _env(sensor=ERRORS)
     with pytest.raises(ValueError, match=r"sensor.*key"):
-        env.begin(jax.tree.map(lambda leaf: leaf[0], env.scenes))
+        env.reset_to(jax.tree.map(lambda leaf: leaf[0], env.scenes))
 
 
 @pytest.mark.parametrize(

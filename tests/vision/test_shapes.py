@@ -185,7 +185,8 @@ def test_unknown_type_is_refused_by_name():
     """Claim: a geom of a type that rays do not meet is an error when the scene is read, with its
     name and the type."""
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom name="egg" type="ellipsoid" size="0.1 0.2 0.3"/></worldbody></mujoco>'
+        '<mujoco><worldbody><geom name="egg" type="ellipsoid" size="0.1 0.2 0.3"/>'
+        "</worldbody></mujoco>"
     )
     with pytest.raises(ValueError, match=r"geom egg: .*ellipsoid.*cylinder"):
         solids.read(model)
