@@ -109,7 +109,7 @@ def test_unknown_algorithm_names_the_known():
         (lambda: RewardConfig(push_effect="depth"), "reward.push_effect"),
         (lambda: RewardConfig(distance_cap=0.0), "reward.distance_cap"),
         (lambda: RewardConfig(push_level=2.0), "reward.push_level"),
-        (lambda: RewardConfig(distance=-1.0), "reward.distance_weight"),
+        (lambda: RewardConfig(distance_weight=-1.0), "reward.distance_weight"),
         (lambda: ExploreConfig(push_fraction=1.5), "explore.push_fraction"),
         (lambda: LearnConfig(loss="mse"), "learn.loss"),
         (lambda: LearnConfig(critics=0), "learn.critics"),

@@ -1,4 +1,4 @@
-"""The eight symmetries of the square."""
+"""Augmentation of transitions."""
 
 import dataclasses
 import itertools
@@ -203,7 +203,9 @@ def test_random_symmetry_draws_all_eight_alike(transition):
     assert chisquare(counts).pvalue > 1e-4
 
 
-move = jax.jit(lambda transition, yaw, cells: augment.shift_and_rotate(CFG, transition, yaw, cells))
+shift_and_rotate = jax.jit(
+    lambda transition, yaw, cells: augment.shift_and_rotate(CFG, transition, yaw, cells)
+)
 CELL = CFG.heightmap.cell
 
 
@@ -217,7 +219,7 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
     """Claim: a shift by whole cells gives height, colour and target mask of the shifted scene,
     table that comes in included, and moves the action as far; another shift takes it back, cell by
     cell."""
-    moved = move(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
+    moved = shift_and_rotate(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
     seen = heightmap.pack(look(_shifted(cells)))
     for obs in (moved.obs, moved.next_obs):
         off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
@@ -228,14 +230,14 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
     np.testing.assert_allclose(
         moved.action.pose, np.add(POSE, [cells[1] * CELL, cells[0] * CELL, 0.0]), atol=1e-6
     )
-    back = move(moved, jnp.float32(0.0), -jnp.array(cells, jnp.int32))
+    back = shift_and_rotate(moved, jnp.float32(0.0), -jnp.array(cells, jnp.int32))
     assert _signature(back) == _signature(transition)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_quarter_turns_are_exact(transition, turns):
     """Claim: a quarter turn only permutes cells."""
-    moved = move(transition, jnp.float32(turns * np.pi / 2), jnp.zeros(2, jnp.int32))
+    moved = shift_and_rotate(transition, jnp.float32(turns * np.pi / 2), jnp.zeros(2, jnp.int32))
     np.testing.assert_array_equal(
         moved.obs.height, np.rot90(transition.obs.height, -turns)
     )  # rows point up
@@ -254,7 +256,7 @@ def test_a_turn_is_exact_in_the_action_and_nearest_in_the_map(transition, yaw):
         (np.tile(index, (32, 1)), np.tile(index[:, None], (1, 32)))
     ):  # x, y in low counts
         flat = transition.obs.replace(height=jnp.asarray(ramp))
-        moved = move(
+        moved = shift_and_rotate(
             transition.replace(obs=flat, next_obs=flat), jnp.float32(yaw), jnp.zeros(2, jnp.int32)
         )
         shown = (np.asarray(moved.obs.height) + 0.5) * CELL - 0.5 * CFG.heightmap.extent
@@ -294,14 +296,14 @@ def test_what_would_be_cut_off_stays(transition):
     )
     for before, cells, primitive, pose, goes in cases:
         action = Action(primitive=jnp.int32(primitive), pose=jnp.asarray(pose, jnp.float32))
-        after = move(before.replace(action=action), still, jnp.array(cells, jnp.int32))
+        after = shift_and_rotate(before.replace(action=action), still, jnp.array(cells, jnp.int32))
         assert (not np.array_equal(after.action.pose, action.pose)) == goes
         if not goes:
             assert _signature(after) == _signature(before)
 
 
 BORDERED = dataclasses.replace(CFG, net=dataclasses.replace(CFG.net, border=True))
-move_border = jax.jit(
+shift_bordered = jax.jit(
     lambda transition, cells: augment.shift_and_rotate(
         BORDERED, transition, jnp.float32(0.0), cells
     )
@@ -309,10 +311,13 @@ move_border = jax.jit(
 
 
 def test_the_border_moves_along(transition):
-    """Claim: with `net.border` what comes in beside the workspace is marked, all else as without;
-    the net is fed the border where it would be, had the workspace moved with its blocks."""
+    """Claim: with `net.border` cells that come in are marked, all else as without;
+    the net sees the border where it would be, had the workspace moved with its blocks."""
     cells = jnp.array([2, 1], jnp.int32)
-    moved, plain = move_border(transition, cells), move(transition, jnp.float32(0.0), cells)
+    moved, plain = (
+        shift_bordered(transition, cells),
+        shift_and_rotate(transition, jnp.float32(0.0), cells),
+    )
     beyond = np.zeros((32, 32), bool)
     beyond[:2] = beyond[:, :1] = True
     for obs, wanted in zip((moved.obs, moved.next_obs), (plain.obs, plain.next_obs), strict=True):
@@ -320,12 +325,12 @@ def test_the_border_moves_along(transition):
         np.testing.assert_array_equal(
             seen.height, np.where(beyond, heightmap.BEYOND, heightmap.unpack(wanted).height)
         )
-        fed = np.asarray(maps.rotated_inputs(maps.frames(BORDERED), seen))[
+        net_input = np.asarray(maps.rotated_inputs(maps.frames(BORDERED), seen))[
             0
         ]  # the frame that is not turned
-        np.testing.assert_array_equal(fed[..., -1], np.pad(~beyond, 2))
+        np.testing.assert_array_equal(net_input[..., -1], np.pad(~beyond, 2))
         np.testing.assert_array_equal(
-            fed[..., :-1], maps.rotated_inputs(FRAMES, heightmap.unpack(wanted))[0]
+            net_input[..., :-1], maps.rotated_inputs(FRAMES, heightmap.unpack(wanted))[0]
         )
     assert not np.array_equal(moved.obs.height, transition.obs.height)
 
@@ -350,7 +355,7 @@ def test_nothing_comes_near_a_border_that_is_none(
     lone = transition.replace(
         obs=lone, next_obs=lone, action=transition.action.replace(primitive=jnp.int32(1))
     )
-    assert (not np.array_equal(move_border(lone, cells).obs.height, height)) == goes
+    assert (not np.array_equal(shift_bordered(lone, cells).obs.height, height)) == goes
 
 
 def test_augment_is_what_the_config_says(transition):
