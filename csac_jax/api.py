@@ -1,22 +1,18 @@
 """What the commands do, as functions; the package root exports them."""
 
-import datetime
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from csac_jax.agent import actor_critic
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
-from csac_jax.evaluation import policies
 from csac_jax.evaluation.policies import Policy
-from csac_jax.io import checkpoint, files, weights
 from csac_jax.replay.samplers import Sampler
 from csac_jax.runtime import cache, signals
 from csac_jax.sim import auto
 from csac_jax.training import loop, memory, step
 from csac_jax.training.loop import Record, Reporter, Summary
-from csac_jax.training.step import Program, TrainState
+from csac_jax.training.step import TrainState
 
 RUNS = Path("runs")
 Callback = Callable[[Record], None]

@@ -33,8 +33,9 @@ def apply_symmetry(
     x, y, yaw = transition.action.pose
     x, yaw = jnp.where(mirror_x, -x, x), jnp.where(mirror_x, np.float32(np.pi) - yaw, yaw)
     y, yaw = jnp.where(mirror_y, -y, y), jnp.where(mirror_y, -yaw, yaw)
+    x, y = jnp.where(swap, y, x), jnp.where(swap, x, y)
     yaw = jnp.where(swap, np.float32(0.5 * np.pi) - yaw, yaw)
-    pose = jnp.stack([jnp.where(swap, y, x), jnp.where(swap, x, y), geometry.wrap_angle(yaw)])
+    pose = jnp.stack([x, y, geometry.wrap_angle(yaw)])
     return transition.replace(
         obs=jax.tree.map(view, transition.obs),
         next_obs=jax.tree.map(view, transition.next_obs),

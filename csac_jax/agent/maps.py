@@ -110,9 +110,9 @@ def _half_turn(maps: jax.Array) -> jax.Array:
 def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Cells where an action can have an effect, [P, K, h, w] bool.
 
-    Grasp: a surface higher than BARE lies under the cell, of the target in the target task. Push:
-    any such surface lies within the push's length ahead. This is SPOT's dynamic action space
-    (arXiv:1909.04730).
+    Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
+    such a surface, of any block, lies within the push's length ahead. This is SPOT's dynamic action
+    space (arXiv:1909.04730).
     """
     under = _cells_above_bare(frames, obs.height)
     graspable = _target_cells(frames, obs) if frames.shows_target else under

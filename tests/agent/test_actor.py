@@ -80,7 +80,7 @@ def test_sharp_peaks_are_reproduced(frames, pose):
 
 
 def test_invalid_cells_do_not_attract(frames, pose):
-    """Claim: the mean is at the highest valid cell, and no invalid cell beside it draws its
+    """Claim: the mean is at the highest valid cell, and no invalid cell next to it draws its
     place."""
     logits, valid = _flat(frames), np.ones((frames.yaws.size, frames.side, frames.side), bool)
     logits[1, 3, 3], valid[1, 3, 3] = 50.0, False
@@ -140,28 +140,28 @@ def test_critic_gets_no_gradient_through_the_actor():
     )
 
 
-@pytest.mark.parametrize("beside", [1, -1])
-def test_yaw_does_not_turn_to_what_is_not_valid(frames, pose, beside):
+@pytest.mark.parametrize("side", [1, -1])
+def test_yaw_does_not_turn_to_what_is_not_valid(frames, pose, side):
     """Claim: the next yaw draws the mean's yaw by its valid cells only, however high the others
     are."""
     best = (2, 8, 9)
     logits, valid = _flat(frames), np.ones((frames.yaws.size, frames.side, frames.side), bool)
     logits[best] = 1.0
     plain = pose(jnp.asarray(logits), jnp.asarray(valid))
-    near = np.linalg.norm(frames.xy[2 + beside] - frames.xy[best], axis=-1) < 2.0 * frames.cell
-    logits[2 + beside][near] = 30.0
+    near = np.linalg.norm(frames.xy[2 + side] - frames.xy[best], axis=-1) < 2.0 * frames.cell
+    logits[2 + side][near] = 30.0
     assert (
         abs(pose(jnp.asarray(logits), jnp.asarray(valid))[2] - plain[2]) > 0.3
     )  # valid, it would draw
-    valid[2 + beside][near] = False
+    valid[2 + side][near] = False
     got = pose(jnp.asarray(logits), jnp.asarray(valid))
     away = valid.copy()
-    away[2 + beside] = False
+    away[2 + side] = False
     np.testing.assert_allclose(got, pose(jnp.asarray(logits), jnp.asarray(away)), atol=1e-5)
-    assert (got[2] - frames.yaws[2]) * beside < 0.0  # the only other yaw is on the other side
+    assert (got[2] - frames.yaws[2]) * side < 0.0  # the only other yaw is on the other side
 
 
-def test_cells_beside_do_not_leak_into_the_yaw(frames, pose):
+def test_neighbours_do_not_leak_into_the_yaw(frames, pose):
     """Claim: an invalid cell next to the one read in the neighbouring yaw does not count, however
     high it is."""
     best = (2, 8, 9)

@@ -1,4 +1,4 @@
-"""The eight symmetries of the square."""
+"""Augmentation of transitions."""
 
 import dataclasses
 import itertools
@@ -12,12 +12,13 @@ from scipy.stats import chisquare, kstest
 
 from csac_jax import geometry, presets
 from csac_jax.agent import augment, maps
-from csac_jax.agent.actor_critic import Transition
+from csac_jax.agent.learner import Transition
 from csac_jax.constants import Primitive
+from csac_jax.env import Env
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.sim.primitives import Action
-from csac_jax.vision import heightmap, observe, rotate
+from csac_jax.vision import heightmap, rotate
 
 FLAGS = list(itertools.product((False, True), repeat=3))
 CFG = presets.smoke()  # four yaws: turning to the nearest cell is exact
@@ -53,7 +54,7 @@ ROTATION = Rotation.from_euler("zyx", [[0.4, 0.3, 0.0], [1.1, -0.2, 0.35], [2.0,
 POSITION = np.array([[0.06, 0.05, 0.05], [-0.12, 0.02, 0.04], [0.03, -0.14, 0.0243]])
 POSE = np.array([0.071, -0.033, 0.6])
 
-_observe = jax.jit(lambda scene: observe.observe(CFG, scene))
+look = jax.jit(Env(CFG, None, None).look)
 
 
 def _transition(
@@ -67,7 +68,7 @@ def _transition(
 @pytest.fixture(scope="module")
 def transition() -> Transition:
     """A transition of a scene without any symmetry."""
-    return _transition(_observe(_scene(ROTATION, POSITION)))
+    return _transition(look(_scene(ROTATION, POSITION)))
 
 
 def _turned_scene(matrix: np.ndarray) -> Scene:
@@ -85,7 +86,7 @@ def test_view_is_that_of_the_mirrored_scene(transition, flags):
     Heights everywhere, colours of the table: the light does not turn, so that sloping faces differ
     in brightness.
     """
-    seen = heightmap.pack(_observe(_turned_scene(_matrix(flags))))
+    seen = heightmap.pack(look(_turned_scene(_matrix(flags))))
     turned = _turn(flags, transition)
     for obs in (turned.obs, turned.next_obs):
         off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
@@ -101,13 +102,13 @@ def test_colours_turn_too():
     flat = Rotation.from_euler("z", [[0.4], [1.1], [2.0]])
     scene = _scene(flat, POSITION).replace(in_play=jnp.array([True, True, False]))
     away = scene.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))
-    transition = _transition(_observe(scene.replace(position=away)))
+    transition = _transition(look(scene.replace(position=away)))
     for flags in FLAGS:
         matrix = _matrix(flags)
         body = np.diag([np.linalg.det(matrix), 1.0, 1.0])
         turned = _scene(Rotation.from_matrix(matrix @ flat.as_matrix() @ body), POSITION @ matrix.T)
         seen = heightmap.pack(
-            _observe(turned.replace(position=turned.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))))
+            look(turned.replace(position=turned.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))))
         )
         off = np.abs(
             np.asarray(seen.colour, int) - np.asarray(_turn(flags, transition).obs.colour, int)
@@ -202,7 +203,9 @@ def test_random_symmetry_draws_all_eight_alike(transition):
     assert chisquare(counts).pvalue > 1e-4
 
 
-move = jax.jit(lambda transition, yaw, cells: augment.shift_and_rotate(CFG, transition, yaw, cells))
+shift_and_rotate = jax.jit(
+    lambda transition, yaw, cells: augment.shift_and_rotate(CFG, transition, yaw, cells)
+)
 CELL = CFG.heightmap.cell
 
 
@@ -216,7 +219,7 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
     """Claim: a shift by whole cells gives height, colour and target mask of the shifted scene,
     table that comes in included, and moves the action as far; another shift takes it back, cell by
     cell."""
-    moved = move(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
+    moved = shift_and_rotate(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
     seen = heightmap.pack(_observe(_shifted(cells)))
     for obs in (moved.obs, moved.next_obs):
         off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
@@ -227,14 +230,14 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
     np.testing.assert_allclose(
         moved.action.pose, np.add(POSE, [cells[1] * CELL, cells[0] * CELL, 0.0]), atol=1e-6
     )
-    back = move(moved, jnp.float32(0.0), -jnp.array(cells, jnp.int32))
+    back = shift_and_rotate(moved, jnp.float32(0.0), -jnp.array(cells, jnp.int32))
     assert _signature(back) == _signature(transition)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_quarter_turns_are_exact(transition, turns):
     """Claim: a quarter turn only permutes cells."""
-    moved = move(transition, jnp.float32(turns * np.pi / 2), jnp.zeros(2, jnp.int32))
+    moved = shift_and_rotate(transition, jnp.float32(turns * np.pi / 2), jnp.zeros(2, jnp.int32))
     np.testing.assert_array_equal(
         moved.obs.height, np.rot90(transition.obs.height, -turns)
     )  # rows point up
@@ -253,7 +256,7 @@ def test_a_turn_is_exact_in_the_action_and_nearest_in_the_map(transition, yaw):
         (np.tile(index, (32, 1)), np.tile(index[:, None], (1, 32)))
     ):  # x, y in low counts
         flat = transition.obs.replace(height=jnp.asarray(ramp))
-        moved = move(
+        moved = shift_and_rotate(
             transition.replace(obs=flat, next_obs=flat), jnp.float32(yaw), jnp.zeros(2, jnp.int32)
         )
         shown = (np.asarray(moved.obs.height) + 0.5) * CELL - 0.5 * CFG.heightmap.extent
@@ -293,14 +296,14 @@ def test_what_would_be_cut_off_stays(transition):
     )
     for before, cells, primitive, pose, goes in cases:
         action = Action(primitive=jnp.int32(primitive), pose=jnp.asarray(pose, jnp.float32))
-        after = move(before.replace(action=action), still, jnp.array(cells, jnp.int32))
+        after = shift_and_rotate(before.replace(action=action), still, jnp.array(cells, jnp.int32))
         assert (not np.array_equal(after.action.pose, action.pose)) == goes
         if not goes:
             assert _signature(after) == _signature(before)
 
 
 BORDERED = dataclasses.replace(CFG, net=dataclasses.replace(CFG.net, border=True))
-move_border = jax.jit(
+shift_bordered = jax.jit(
     lambda transition, cells: augment.shift_and_rotate(
         BORDERED, transition, jnp.float32(0.0), cells
     )
@@ -308,10 +311,13 @@ move_border = jax.jit(
 
 
 def test_the_border_moves_along(transition):
-    """Claim: with `net.border` what comes in beside the workspace is marked, all else as without;
-    the net is fed the border where it would be, had the workspace moved with its blocks."""
+    """Claim: with `net.border` cells that come in are marked, all else as without;
+    the net sees the border where it would be, had the workspace moved with its blocks."""
     cells = jnp.array([2, 1], jnp.int32)
-    moved, plain = move_border(transition, cells), move(transition, jnp.float32(0.0), cells)
+    moved, plain = (
+        shift_bordered(transition, cells),
+        shift_and_rotate(transition, jnp.float32(0.0), cells),
+    )
     beyond = np.zeros((32, 32), bool)
     beyond[:2] = beyond[:, :1] = True
     for obs, wanted in zip((moved.obs, moved.next_obs), (plain.obs, plain.next_obs), strict=True):
@@ -319,12 +325,12 @@ def test_the_border_moves_along(transition):
         np.testing.assert_array_equal(
             seen.height, np.where(beyond, heightmap.BEYOND, heightmap.unpack(wanted).height)
         )
-        fed = np.asarray(maps.rotated_inputs(maps.frames(BORDERED), seen))[
+        net_input = np.asarray(maps.rotated_inputs(maps.frames(BORDERED), seen))[
             0
         ]  # the frame that is not turned
-        np.testing.assert_array_equal(fed[..., -1], np.pad(~beyond, 2))
+        np.testing.assert_array_equal(net_input[..., -1], np.pad(~beyond, 2))
         np.testing.assert_array_equal(
-            fed[..., :-1], maps.rotated_inputs(FRAMES, heightmap.unpack(wanted))[0]
+            net_input[..., :-1], maps.rotated_inputs(FRAMES, heightmap.unpack(wanted))[0]
         )
     assert not np.array_equal(moved.obs.height, transition.obs.height)
 
@@ -349,7 +355,7 @@ def test_nothing_comes_near_a_border_that_is_none(
     lone = transition.replace(
         obs=lone, next_obs=lone, action=transition.action.replace(primitive=jnp.int32(1))
     )
-    assert (not np.array_equal(move_border(lone, cells).obs.height, height)) == goes
+    assert (not np.array_equal(shift_bordered(lone, cells).obs.height, height)) == goes
 
 
 def test_augment_is_what_the_config_says(transition):

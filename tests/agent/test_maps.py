@@ -193,7 +193,7 @@ def _one_block(cfg) -> Observation:
     )
 
 
-def _beside(xy: np.ndarray) -> np.ndarray:
+def _distance_to_block(xy: np.ndarray) -> np.ndarray:
     """Distance [...] m of points [..., 2] from the block; below 0 inside."""
     off = np.abs(xy - CENTRE) - HALF
     return np.where(
@@ -209,11 +209,13 @@ def test_grasps_are_valid_above_blocks(cfg, frames):
     of an input cell.
     """
     valid = np.asarray(maps.actionable_cells(frames, _one_block(cfg)))[GRASP]
-    distance = _beside(frames.xy)
+    distance = _distance_to_block(frames.xy)
     slack = 0.71 * frames.cell + 0.71 * cfg.heightmap.cell
     assert np.all(valid[distance < 0.0])
     assert not np.any(valid[distance > slack])
-    axis_parallel = _beside(frames.xy[0]) < 0.5 * frames.cell  # exact where nothing is turned
+    axis_parallel = (
+        _distance_to_block(frames.xy[0]) < 0.5 * frames.cell
+    )  # exact where nothing is turned
     covered = np.max(np.abs(frames.xy[0] - CENTRE) - HALF - 0.5 * frames.cell, axis=-1) < -1e-6
     np.testing.assert_array_equal(valid[0], covered)
     assert covered.sum() >= axis_parallel.sum() / 2 > 0

@@ -151,22 +151,22 @@ def test_finer_maps_lie_where_their_cells_do(stride: int, finer: int):
 
 
 def test_bare_table_is_zero():
-    """Claim: where nothing lies the net is fed 0, whatever the table's colour; a block's height
+    """Claim: where nothing lies the input is 0, whatever the table's colour; a block's height
     comes out near 1."""
     height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
-    fed = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, None, border=False))
-    np.testing.assert_array_equal(fed[0, 0], 0.0)
-    np.testing.assert_array_equal(fed[0, 1, :3], 0.0)
-    np.testing.assert_allclose(fed[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)
+    net_input = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, None, border=False))
+    np.testing.assert_array_equal(net_input[0, 0], 0.0)
+    np.testing.assert_array_equal(net_input[0, 1, :3], 0.0)
+    np.testing.assert_allclose(net_input[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)
 
 
 def test_border_is_a_map_of_its_own():
-    """Claim: with the border the net is fed 1 on the workspace, bare or not, and 0 in every map
+    """Claim: with the border the input is 1 on the workspace, bare or not, and 0 in every map
     beyond it."""
     height = jnp.array([[0.0, 0.05], [heightmap.BEYOND, 0.001]])
-    fed = np.asarray(
+    net_input = np.asarray(
         dense.inputs(jnp.full((2, 2, 3), 0.9), height, jnp.ones((2, 2), bool), border=True)
     )
-    np.testing.assert_array_equal(fed[..., -1], [[1.0, 1.0], [0.0, 1.0]])
-    np.testing.assert_array_equal(fed[1, 0, :4], 0.0)
-    np.testing.assert_allclose(fed[0, 1, 3], 1.0, rtol=1e-6)
+    np.testing.assert_array_equal(net_input[..., -1], [[1.0, 1.0], [0.0, 1.0]])
+    np.testing.assert_array_equal(net_input[1, 0, :4], 0.0)
+    np.testing.assert_allclose(net_input[0, 1, 3], 1.0, rtol=1e-6)

@@ -231,10 +231,10 @@ def test_inputs():
     """Claim: bare table is 0; on blocks colours are normalised as ImageNet's and 3 cm of height are
     1; without colour only the height is left."""
     height, colour = jnp.array([[0.0, 0.03]]), jnp.full((1, 2, 3), 0.5)
-    fed = np.asarray(densenet.inputs(colour, height, jnp.array([[True, False]])))
-    np.testing.assert_array_equal(fed[0, 0], [0.0, 0.0, 0.0, 0.0, 1.0])
+    net_input = np.asarray(densenet.inputs(colour, height, jnp.array([[True, False]])))
+    np.testing.assert_array_equal(net_input[0, 0], [0.0, 0.0, 0.0, 0.0, 1.0])
     np.testing.assert_allclose(
-        fed[0, 1], [0.015 / 0.229, 0.044 / 0.224, 0.094 / 0.225, 1.0, 0.0], rtol=1e-4
+        net_input[0, 1], [0.015 / 0.229, 0.044 / 0.224, 0.094 / 0.225, 1.0, 0.0], rtol=1e-4
     )
     np.testing.assert_allclose(densenet.inputs(None, height, None), [[[0.0], [1.0]]], rtol=1e-6)
 

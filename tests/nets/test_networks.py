@@ -168,14 +168,14 @@ def test_states_of_densenet_are_seen_in_groups():
     assert networks.states_at_once(NetConfig(), 72) is None
     net = NetConfig(kind="densenet121", block_layers=(1, 1, 1, 1), block_growth=4, head=8)
     critic = networks.critic(net)
-    fed = jax.random.normal(jax.random.key(0), (3, 2, 32, 32, 4))
-    variables = critic.init(jax.random.key(1), fed[0])
+    net_input = jax.random.normal(jax.random.key(0), (3, 2, 32, 32, 4))
+    variables = critic.init(jax.random.key(1), net_input[0])
     for group in (1, 2, 3):
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(networks, "_FULL", 32 * group**0.5)
             assert networks.states_at_once(net, 32) == group
-            got = networks.look(critic, variables, fed)
-        apart = [critic.apply(variables, one) for one in fed]
+            got = networks.look(critic, variables, net_input)
+        apart = [critic.apply(variables, one) for one in net_input]
         for leaf, *wanted in zip(got, *apart, strict=True):
             np.testing.assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
 
@@ -190,10 +190,10 @@ def test_looks_at_any_number_of_states_share_products(kind: str):
     variables = jax.eval_shape(critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
 
     def products(states: int) -> set[str]:
-        fed = jax.ShapeDtypeStruct((states, 2, 640, 640, 4), jnp.float32)
+        net_input = jax.ShapeDtypeStruct((states, 2, 640, 640, 4), jnp.float32)
         text = (
-            jax.jit(lambda variables, fed: networks.look(critic, variables, fed))
-            .lower(variables, fed)
+            jax.jit(lambda variables, net_input: networks.look(critic, variables, net_input))
+            .lower(variables, net_input)
             .as_text()
         )
         named = ("stablehlo.convolution", "stablehlo.dot_general")
