@@ -15,7 +15,7 @@ import csac_jax
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import bench, evaluation, play, stored, sweep, train
 from csac_jax.config import Config, SceneConfig
-from csac_jax.evaluation import rollout
+from csac_jax.evaluation import policies, rollout
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
 from csac_jax.scene import pool
@@ -113,7 +113,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --seed 2147483647", "--seed: must lie in"),
         (
             "eval shipped --suite nowhere",
-            "--suite: 'nowhere' is neither a case file nor one of: own, random10",
+            "--suite: 'nowhere' is neither a case file nor one of: in_distribution, random10",
         ),
         ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
         ("doctor --fix", "Unrecognized options: --fix"),
@@ -613,11 +613,10 @@ def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str,
     scene by any yaw."""
     turned = []
 
-    def episode(_, env, *__):
+    def episode(env, *_):
         turned.append(env.any_yaw)
         yield from ()
 
     monkeypatch.setattr(rollout, "episode", episode)
-    physics = dataclasses.replace(SMOKE.sim, physics="c")
-    play._play(play.PlayOptions(scene=scene), dataclasses.replace(SMOKE, sim=physics), None)
+    play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE))
     assert turned == [any_yaw]
