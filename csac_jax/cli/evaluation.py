@@ -103,7 +103,8 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
 
     from csac_jax.evaluation.metrics import PER_ACTION
 
-    table = Table("metric", "value", "95 % interval", "n", title=title)
+    unit = "action_efficiency: blocks per action"
+    table = Table("metric", "value", "95 % interval", "n", title=title, caption=unit)
     for name, entry in {**summary, **summary.get("failures", {})}.items():
         if "value" not in entry:
             continue
@@ -112,8 +113,7 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
             cells = (f"{entry['value']:.3f}", f"{entry['low']:.3f} .. {entry['high']:.3f}")
         elif entry["n"]:
             cells = (output.percent(entry["value"]), output.interval(entry))
-        label = f"{name} (blocks per action)" if name in PER_ACTION else name
-        table.add_row(label, *cells, str(entry["n"]))
+        table.add_row(name, *cells, str(entry["n"]))
     console = Console()
     console.print(table)
     for name in ("outcomes", "counts"):

@@ -62,7 +62,7 @@ def run(arguments: list[str]) -> int:
         "actions": len(steps),
         "cleared": playing.taken(steps),
         "blocks_lost": playing.lost(steps),
-        "completed": bool(steps[-1].after.terminated),
+        "completed": playing.completed(steps),
         "seconds": round(time.time() - begun, 1),
     }
     output.write_result(options.json, result, env.cfg)

@@ -1,5 +1,6 @@
 """What acts: a policy is an object that takes one scene and a key, and returns an action."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -11,7 +12,6 @@ from flax import struct
 from csac_jax import geometry
 from csac_jax.agent import learner as learning, maps, policy
 from csac_jax.agent.learner import Learner, Params
-from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
 from csac_jax.env import State
 from csac_jax.io import checkpoint, policy_file
@@ -72,23 +72,16 @@ class LearnedPolicy:
     @jax.jit
     def debug(self, scene: Observation | State, key: jax.Array) -> PolicyDebug:
         """What the action in this scene with this key follows from."""
-        learner, dense_maps = learning.make(self.cfg), self._dense_maps(scene)
+        learner = learning.make(self.cfg)
+        obs = jax.tree.map(lambda leaf: leaf[None], _observation(scene))
+        batch = learning.look(learner, self.params, obs)
+        dense_maps = jax.tree.map(lambda leaf: leaf[0], batch)
         places = geometry.cell_centres(self.cfg.heightmap)
         q, _ = maps.best_over_yaws(learner.frames, dense_maps, places)
         candidates = policy.candidates(
             key, self.cfg, learner.frames, dense_maps, _return_range(learner)
         )
         return PolicyDebug(q, candidates, learning.best_grasp(dense_maps))
-
-    @jax.jit
-    def best_grasp(self, scene: Observation | State) -> jax.Array:
-        """phi_g [] of CSAC eq. 16: the largest value of a grasp in this scene."""
-        return learning.best_grasp(self._dense_maps(scene))
-
-    def _dense_maps(self, scene: Observation | State) -> DenseMaps:
-        obs = jax.tree.map(lambda leaf: leaf[None], _observation(scene))
-        dense_maps = learning.look(learning.make(self.cfg), self.params, obs)
-        return jax.tree.map(lambda leaf: leaf[0], dense_maps)
 
 
 @struct.dataclass
@@ -129,6 +122,13 @@ def _observation(scene: Observation | State) -> Observation:
 def _return_range(learner: Learner) -> float:
     low, high = learner.bounds
     return high - low
+
+
+def in_world(policy: Policy, cfg: Config) -> Policy:
+    """The policy for an environment of this config; a policy of the user's own as it is."""
+    if isinstance(policy, LearnedPolicy | RandomPolicy | OraclePolicy):
+        return dataclasses.replace(policy, cfg=cfg)
+    return policy
 
 
 def act(policy: Policy, states: State, keys: jax.Array) -> Action:

@@ -15,7 +15,7 @@ from csac_jax.constants import CHANGE_AREA
 from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
-from csac_jax.evaluation.policies import LearnedPolicy, OraclePolicy, Policy, PolicyDebug
+from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import auto, primitives, robot as robots
 from csac_jax.sim.primitives import Action
@@ -58,7 +58,7 @@ def measure(
     """The result of `evaluate` in the parts of a suite."""
     found = {}
     for name, env in parts.items():
-        actor = OraclePolicy(env.cfg) if isinstance(policy, OraclePolicy) else policy
+        actor = policies.in_world(policy, env.cfg)
         report = functools.partial(progress, name) if progress else None
         found[name] = metrics.summarise(rollout(env, actor, episodes, seed, report))
     return next(iter(found.values())) if len(found) == 1 else {"parts": found}
@@ -161,7 +161,7 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
         info.outcome,
         info.distance,
         debug.best_grasp,
-        policy.best_grasp(after),
+        policy.debug(after, key).best_grasp,
         info.moved > CHANGE_AREA,
         info.blocks_lost,
     )

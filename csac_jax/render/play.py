@@ -119,11 +119,18 @@ def summary(cfg: Config, steps: list[StepRecord]) -> str:
 
 def _ending(cfg: Config, steps: list[StepRecord]) -> str:
     last = steps[-1].after
-    if last.terminated and last.scene.target != layout.ANY:
-        return "the target is taken" if last.reward > 0 else "the target is lost"
-    if last.terminated:
-        return "no block is left within reach" if lost(steps) else "the table is clear"
-    return STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
+    if not last.terminated:
+        return STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
+    if last.scene.target != layout.ANY:
+        return "the target is taken" if completed(steps) else "the target is lost"
+    return "the table is clear" if completed(steps) else "no block is left within reach"
+
+
+def completed(steps: list[StepRecord]) -> bool:
+    """Whether the hand took what the task asks for."""
+    last = steps[-1].after
+    got = last.reward > 0 if last.scene.target != layout.ANY else lost(steps) == 0
+    return bool(last.terminated and got)
 
 
 def taken(steps: list[StepRecord]) -> int:

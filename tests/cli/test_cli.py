@@ -591,12 +591,14 @@ def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyP
 
 
 def test_summary_is_printed(capsys: pytest.CaptureFixture):
-    """Claim: `eval` prints every metric, and a dash for one without cases."""
+    """Claim: `eval` prints every metric, shares in per cent, efficiencies in blocks per action, and a
+    dash for one without cases."""
     from csac_jax.evaluation import metrics
 
     summary = {
         "grasp_success": metrics.wilson(9, 10),
         "completion": metrics.wilson(0, 0),
+        "action_efficiency": {"value": 1.25, "low": 1.0, "high": 1.5, "n": 10},
         "outcomes": {"lifted": 9},
         "counts": {"grasps": 10},
     }
@@ -604,7 +606,21 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
     shown = capsys.readouterr().out
     assert "90.0 %" in shown
     assert "lifted 9" in shown
+    assert "1.250" in shown
+    assert "125" not in shown  # blocks per action are no share
     assert "-" in next(line for line in shown.splitlines() if "completion" in line)
+
+
+def test_progress_is_for_terminals(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `eval` says how many episodes are over on a terminal, and nothing elsewhere."""
+    for terminal in ("", "1"):
+        monkeypatch.setenv("FORCE_COLOR", terminal)  # Rich takes this for a terminal
+        with evaluation._progress_bar() as show:
+            show("row", 3, 50)
+        shown = capsys.readouterr()
+        assert shown.out == ""
+        assert ("row" in shown.err and "3/50" in shown.err) == bool(terminal)
+        assert bool(shown.err) == bool(terminal)
 
 
 @pytest.mark.parametrize(("scene", "any_yaw"), [("row", False), ("random", True)])

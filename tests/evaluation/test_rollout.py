@@ -229,8 +229,8 @@ def test_progress_counts_finished_episodes(magnet, monkeypatch):
 
 
 def test_evaluate_gives_metrics(magnet, monkeypatch):
-    """Claim: the metrics of one part come as they are, of several by their names; the oracle plans
-    with the blocks of each part's environment, whatever its own config's are."""
+    """Claim: the metrics of one part come as they are, of several by their names; our policies act
+    in the world of each part's environment, whatever their own config's is."""
     elsewhere = OraclePolicy(presets.quick())
     monkeypatch.setitem(suites.SUITES, "one", suites.Suite(lambda *_: {"a": magnet}))
     monkeypatch.setitem(suites.SUITES, "two", suites.Suite(lambda *_: {"a": magnet, "b": magnet}))
@@ -240,6 +240,8 @@ def test_evaluate_gives_metrics(magnet, monkeypatch):
     assert two == {"parts": {"a": one, "b": one}}
     assert one["completion"]["value"] == one["action_efficiency"]["value"] == 1.0
     assert told[-1] == ("a", EPISODES, EPISODES)
+    random = rollout.evaluate(RandomPolicy(presets.quick()), "one", EPISODES)
+    assert random == rollout.evaluate(RANDOM, "one", EPISODES)
 
 
 @pytest.mark.parametrize("physics", ["c", "mjx"])

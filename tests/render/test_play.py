@@ -121,6 +121,7 @@ def test_summary_says_what_became_of_the_blocks(steps: list[Any], said: str):
     cfg = presets.smoke()
     task = dataclasses.replace(cfg.task, max_actions=30)
     assert play.summary(dataclasses.replace(cfg, task=task), steps) == said
+    assert play.completed(steps) == said.startswith(("the table is clear", "the target is taken"))
 
 
 def _is_red(image: np.ndarray) -> np.ndarray:
