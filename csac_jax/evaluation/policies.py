@@ -138,13 +138,13 @@ def act(policy: Policy, states: State, keys: jax.Array) -> Action:
     return jax.vmap(policy)(states, keys)
 
 
-def load_config(source: str) -> Config:
+def load_config(source: str | Path) -> Config:
     """The config of a policy, see `load`."""
     path = _path(source)
     return policy_file.load(path)[0] if path.is_file() else checkpoint.load_config(path)
 
 
-def load(source: str) -> LearnedPolicy:
+def load(source: str | Path) -> LearnedPolicy:
     """The policy `shipped`, of a policy file, or of the newest checkpoint in a run's folder.
 
     Raises FileNotFoundError, PolicyFileError or CheckpointError, with the remedy.
@@ -157,7 +157,7 @@ def load(source: str) -> LearnedPolicy:
     return LearnedPolicy(cfg, state.learner.online)
 
 
-def _path(source: str) -> Path:
+def _path(source: str | Path) -> Path:
     path = policy_file.SHIPPED if source == "shipped" else Path(source)
     if not path.exists():
         raise FileNotFoundError(

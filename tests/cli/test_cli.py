@@ -613,6 +613,7 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
 
 def test_progress_is_for_terminals(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: `eval` says how many episodes are over on a terminal, and nothing elsewhere."""
+    monkeypatch.setenv("TERM", "xterm")
     for terminal in ("", "1"):
         monkeypatch.setenv("FORCE_COLOR", terminal)  # Rich takes this for a terminal
         with evaluation._progress_bar() as show:
