@@ -7,7 +7,7 @@ the table of what differs. `register` adds an algorithm of your own.
 
 import dataclasses
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from csac_jax.config import Config, RewardConfig
 
@@ -113,7 +113,7 @@ def configure(cfg: Config, name: str) -> Config:
     return dataclasses.replace(ALGORITHMS[name](cfg), algo=name)
 
 
-def unknown(what: str, name: str, known: dict[str, Algorithm]) -> str:
+def unknown(what: str, name: str, known: Iterable[str]) -> str:
     """The complaint about an unknown name, with the nearest known one."""
     near = difflib.get_close_matches(name, known, 1)
     meant = f"did you mean {near[0]}? " if near else ""

@@ -15,10 +15,17 @@ from csac_jax.config import (
     RewardConfig,
     SceneConfig,
     SimConfig,
+    SlotKind,
     SmallNet,
     TargetConfig,
     TaskConfig,
     TrainConfig,
+)
+
+BOX: SlotKind = "box"
+TEN_BLOCKS: tuple[SlotKind, ...] = (
+    *(BOX, BOX, "arch", "prism", BOX),
+    *("cylinder", "half_cylinder", BOX, BOX, BOX),
 )
 
 
@@ -55,18 +62,7 @@ def fast() -> Config:
     return Config(
         preset="fast",
         scene=SceneConfig(
-            slots=(
-                "box",
-                "box",
-                "arch",
-                "prism",
-                "box",
-                "cylinder",
-                "half_cylinder",
-                "box",
-                "box",
-                "box",
-            ),
+            slots=TEN_BLOCKS,
             min_blocks=10,
             pool=4096,
             arranged=0.75,
@@ -94,27 +90,12 @@ def paper() -> Config:
     Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per
     action; places are explored by action noise alone, and nothing is augmented. Where the paper is
     silent: tau of SD3, two pixels per cell and two transitions per update, as many as in VPG, one
-    of them for the actor, and, ours, `policy.mask`. Physics is C's, the fastest for one scene.
-    Result: experiments/results/paper-h200.
+    of them for the actor. Ours is that cells with nothing to act on are left out. Physics is
+    C's, the fastest for one scene. Result: experiments/results/paper-h200.
     """
     return Config(
         preset="paper",
-        scene=SceneConfig(
-            slots=(
-                "box",
-                "box",
-                "arch",
-                "prism",
-                "box",
-                "cylinder",
-                "half_cylinder",
-                "box",
-                "box",
-                "box",
-            ),
-            min_blocks=10,
-            pool=256,
-        ),
+        scene=SceneConfig(slots=TEN_BLOCKS, min_blocks=10, pool=256),
         task=TaskConfig(max_actions=25),
         sim=SimConfig(physics="c", geom_pairs=24, contacts=80),
         heightmap=HeightmapConfig(size=224),

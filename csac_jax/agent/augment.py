@@ -1,8 +1,7 @@
-"""Augmentation of transitions: symmetries of the square workspace, shifts by cells, rotations.
+"""Augmentation of transitions: symmetries of the square workspace and shifts by whole cells.
 
-Symmetries, shifts and quarter turns are exact, cell by cell. Any other rotation is exact for the
-action; maps take the nearest cell, at most half a cell a side away. The light does not move along:
-sloping faces keep their brightness.
+Both are exact, cell by cell, but for the light, which does not move along: sloping faces keep their
+brightness.
 """
 
 import jax
@@ -10,14 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.agent.actor_critic import Transition
+from csac_jax.agent.learner import Transition
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import PackedObservation
-
-CLEARANCE = 0.05  # m, of blocks to a side that a shown border moves out of sight
 
 
 def apply_symmetry(
@@ -48,28 +45,23 @@ def random_symmetry(key: jax.Array, transition: Transition) -> Transition:
     return apply_symmetry(transition, *jax.random.bernoulli(key, shape=(3,)))
 
 
-def shift_and_rotate(
-    cfg: Config, transition: Transition, yaw: jax.Array, cells: jax.Array
-) -> Transition:
-    """The transition rotated by `yaw` [] rad about the workspace centre, then shifted.
+def shift(cfg: Config, transition: Transition, cells: jax.Array) -> Transition:
+    """The transition shifted by `cells` [2] int32 (row, col); cells that come in are bare table.
 
-    `cells` [2] int32 are (row, col). The transition stays as it is where that would cut something
-    off: a surface higher than BARE in either map, the place of the action or the end of a push. It
-    also stays if the workspace already cut off the push. Cells that come in are bare table; where
-    the net is shown the border they lie beyond it, and the border moves along. A side that moves
-    out of sight is still there: blocks keep CLEARANCE to it.
+    The transition stays as it is where that would cut something off: a surface higher than BARE in
+    either map, the place of the action or the end of a push. It also stays if the workspace already
+    cut off the push.
     """
     pose = transition.action.pose
     step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
-    xy = geometry.rotate2d(yaw, pose[:2]) + step
-    new_pose = jnp.append(xy, geometry.wrap_angle(pose[2] + yaw))
+    new_pose = jnp.append(pose[:2] + step, pose[2])
     primitive = transition.action.primitive
     fits = _reaches(cfg, primitive, pose) & _reaches(cfg, primitive, new_pose)
     for obs in (transition.obs, transition.next_obs):
-        fits &= _stays(cfg, heightmap.unpack(obs).height, yaw, step)
+        fits &= _stays(cfg, heightmap.unpack(obs).height, step)
     moved = transition.replace(
-        obs=_move_maps(cfg, transition.obs, yaw, cells),
-        next_obs=_move_maps(cfg, transition.next_obs, yaw, cells),
+        obs=_shift_maps(transition.obs, cells),
+        next_obs=_shift_maps(transition.next_obs, cells),
         action=transition.action.replace(pose=new_pose),
     )
     return jax.tree.map(lambda new, old: jnp.where(fits, new, old), moved, transition)
@@ -82,53 +74,37 @@ def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
     return jnp.all(jnp.maximum(jnp.abs(pose[:2]), jnp.abs(end)) <= 0.5 * cfg.heightmap.extent)
 
 
-def _stays(cfg: Config, height: jax.Array, yaw: jax.Array, step: jax.Array) -> jax.Array:
-    """Whether all blocks of a map [H, W] m stay above the workspace, rotated, then shifted by
-    `step` [2] m; [] bool."""
-    place = geometry.rotate2d(yaw, geometry.cell_centres(cfg.heightmap)) + step[None, None]
-    half = 0.5 * cfg.heightmap.extent
-    low, high = jnp.full(2, half), jnp.full(2, half)  # m, room towards -x, -y and +x, +y
-    if cfg.net.border:
-        rotated = jnp.broadcast_to(yaw != 0.0, (2,))
-        low = jnp.where((step < 0.0) | rotated, half - CLEARANCE, half)
-        high = jnp.where((step > 0.0) | rotated, half - CLEARANCE, half)
-    stays = jnp.all((-place <= low[None, None]) & (place <= high[None, None]), axis=-1)
+def _stays(cfg: Config, height: jax.Array, step: jax.Array) -> jax.Array:
+    """Whether all blocks of a map [H, W] m, shifted by `step` [2] m, stay above the workspace, []."""
+    place = geometry.cell_centres(cfg.heightmap) + step[None, None]
+    stays = jnp.all(jnp.abs(place) <= 0.5 * cfg.heightmap.extent, axis=-1)
     return jnp.all((height <= BARE) | stays)
 
 
-def _move_maps(
-    cfg: Config, obs: PackedObservation, yaw: jax.Array, cells: jax.Array
-) -> PackedObservation:
-    """Maps rotated, then shifted, from the nearest cell; cells that come in look like the lowest
-    one."""
+def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
+    """Maps shifted by `cells` [2] int32; cells that come in look like the lowest one."""
     size = obs.height.shape[0]
-    along = jnp.arange(size, dtype=jnp.float32) + 0.5 - 0.5 * size  # cells from the centre
-    y, x = (along - shift.astype(jnp.float32) for shift in cells)
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    col = jnp.floor(cos * x[None] + sin * y[:, None] + 0.5 * size).astype(jnp.int32)
-    row = jnp.floor(-sin * x[None] + cos * y[:, None] + 0.5 * size).astype(jnp.int32)
+    row, col = (jnp.arange(size, dtype=jnp.int32) - count for count in cells)
+    row, col = row[:, None], col[None]
     inside = (row >= 0) & (row < size) & (col >= 0) & (col < size)
     source = jnp.where(inside, row * size + col, jnp.argmin(obs.height).astype(jnp.int32))
 
     def take(field: jax.Array) -> jax.Array:
         return field.reshape(size * size, *field.shape[2:]).at[source].get(mode="promise_in_bounds")
 
-    beyond = jnp.uint16(heightmap.BEYOND_COUNT if cfg.net.border else 0)
     return PackedObservation(
         colour=take(obs.colour),
-        height=jnp.where(inside, take(obs.height), beyond),
+        height=jnp.where(inside, take(obs.height), jnp.uint16(0)),
         target=jnp.where(inside, take(obs.target), jnp.all(obs.target)),
     )
 
 
 def augment(key: jax.Array, cfg: Config, transition: Transition) -> Transition:
     """The transition augmented as the config says."""
-    learn, key_move = cfg.learn, jax.random.fold_in(key, 1)
-    if learn.augment:
+    most, key_shift = cfg.learn.augment_shift, jax.random.fold_in(key, 1)
+    if cfg.learn.augment:
         transition = random_symmetry(key, transition)
-    if learn.augment_shift == 0 and learn.augment_turn == 0.0:
+    if most == 0:
         return transition
-    key_yaw, key_cells = jax.random.split(key_move)
-    yaw = learn.augment_turn * jax.random.uniform(key_yaw, (), minval=-1.0)
-    cells = jax.random.randint(key_cells, (2,), -learn.augment_shift, learn.augment_shift + 1)
-    return shift_and_rotate(cfg, transition, yaw, cells)
+    _, key_cells = jax.random.split(key_shift)
+    return shift(cfg, transition, jax.random.randint(key_cells, (2,), -most, most + 1))

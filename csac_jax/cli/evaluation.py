@@ -1,8 +1,9 @@
 """`csac-jax eval`: a policy, measured."""
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,22 +19,21 @@ class EvalOptions:
     """Measures a policy in scenes that training never saw."""
 
     source: tyro.conf.Positional[str]
-    """Folder of the run, a policy file, or shipped for the policy that comes with the package."""
+    """A run's folder, a policy file, or shipped for the policy that comes with the package."""
     policy: Literal["learned", "random", "oracle"] = "learned"
-    """What acts: the networks; a random place with a block under it; or one that reads the blocks'
-    poses."""
-    suite: str = "own"
-    """Scenes: own (dropped like the training's), random10, random30 (with --physics c on a CPU),
-    cases, target (needs a policy of that task), generated, or a case file."""
-    physics: Literal["mjx", "c"] = "mjx"
-    """What moves the blocks: MJX as in training, or C MuJoCo, the reference."""
+    """What acts: the networks; grasps at random places above blocks; or a planner that reads the
+    blocks' poses."""
+    suite: str = "in_distribution"
+    """Scenes: in_distribution (like the training's), random10, random30, cases, target (needs a
+    policy of that task), generated, or a case file."""
+    physics: Literal["auto", "mjx", "c"] = "auto"
+    """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5"] = "hand"
     """What moves the gripper: nothing, it floats as in training; or the arm."""
     episodes: int = 50
     """Episodes of every part of the suite, each with a fresh scene where the part has several."""
     seed: int = 0
-    """Number that scenes and noise follow from; whatever it is, the scenes are none that training
-    draws from."""
+    """Number that scenes and noise follow from. No seed gives scenes of the training."""
     json: Path | None = None
     """File to write the result to, as JSON."""
 
@@ -44,22 +44,56 @@ def run(arguments: list[str]) -> int:
     if options.episodes < 1:
         raise BadArgumentsError("--episodes: at least 1")
     guards.check_seed(options.seed)
-    cfg, networks = stored.policy(options.source)
-    cfg = dataclasses.replace(
-        cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot)
-    )
+    policy = stored.policy(options.source, options.policy)
     begun = time.time()
-    parts = _evaluate(options, cfg, networks)
+    cfg, result = _evaluate(options, policy)
     seconds = round(time.time() - begun, 1)
-    for part, summary in parts.items():
+    for part, summary in result.get("parts", {Path(options.suite).stem: result}).items():
         print_summary(
-            f"{options.policy} in {options.episodes} episodes of {part}, seed {options.seed}",
+            f"{options.policy} policy, {part}: {options.episodes} episodes, seed {options.seed}",
             summary,
         )
     asked = {name: getattr(options, name) for name in ("policy", "suite", "seed")}
-    one = next(iter(parts.values())) if len(parts) == 1 else {"parts": parts}
-    output.write_result(options.json, {**asked, "seconds": seconds, **one}, cfg)
+    output.write_result(options.json, {**asked, "seconds": seconds, **result}, cfg)
     return 0
+
+
+def _evaluate(options: EvalOptions, policy: Any) -> tuple[Config, dict[str, Any]]:
+    """The config that was measured in and the result, see `rollout.evaluate`; shows progress."""
+    from csac_jax.evaluation import rollout, suites
+    from csac_jax.runtime import cache
+
+    cache.enable()
+    cfg = rollout.configured(policy.cfg, options.physics, options.robot)
+    count, seed, learned = options.episodes, options.seed, options.policy == "learned"
+    with _progress_bar() as show:
+        with as_bad_arguments(ValueError):
+            parts = suites.environments(cfg, options.suite, count, seed, learned)
+        return cfg, rollout.measure(policy, parts, count, seed, show)
+
+
+@contextlib.contextmanager
+def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A line on the terminal with the part and its finished episodes; nothing elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn())
+    bar = Progress(
+        *columns,
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    task = bar.add_task("preparing scenes", total=None)
+
+    def show(part: str, finished: int, episodes: int) -> None:
+        bar.update(task, description=f"{part}, episodes", completed=finished, total=episodes)
+
+    with bar:
+        yield show
 
 
 def print_summary(title: str, summary: dict[str, Any]) -> None:
@@ -67,15 +101,19 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("metric", "value", "95 % interval", "n", title=title)
+    from csac_jax.evaluation.metrics import PER_ACTION
+
+    unit = "action_efficiency: blocks per action"
+    table = Table("metric", "value", "95 % interval", "n", title=title, caption=unit)
     for name, entry in {**summary, **summary.get("failures", {})}.items():
-        if "value" in entry:
-            shown = (
-                ("-", "-")
-                if entry["n"] == 0
-                else (output.percent(entry["value"]), output.interval(entry))
-            )
-            table.add_row(name, *shown, str(entry["n"]))
+        if "value" not in entry:
+            continue
+        cells = ("-", "-")
+        if entry["n"] and name in PER_ACTION:
+            cells = (f"{entry['value']:.3f}", f"{entry['low']:.3f} .. {entry['high']:.3f}")
+        elif entry["n"]:
+            cells = (output.percent(entry["value"]), output.interval(entry))
+        table.add_row(name, *cells, str(entry["n"]))
     console = Console()
     console.print(table)
     for name in ("outcomes", "counts"):
@@ -83,24 +121,3 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
             f"{name}: " + ", ".join(f"{key} {count}" for key, count in summary[name].items()),
             highlight=False,
         )
-
-
-def _evaluate(
-    options: EvalOptions, cfg: Config, networks: Callable[[], Any]
-) -> dict[str, dict[str, Any]]:
-    """Metrics of every part of the suite."""
-    from csac_jax.evaluation import metrics, rollout, suites
-    from csac_jax.runtime import cache
-
-    cache.enable()
-    with as_bad_arguments(ValueError):
-        parts = suites.environments(
-            cfg, options.suite, options.episodes, options.seed, options.policy
-        )
-    params = networks() if options.policy == "learned" else None
-    return {
-        name: metrics.summarise(
-            rollout.rollout(env.cfg, env, options.policy, params, options.episodes, options.seed)
-        )
-        for name, env in parts.items()
-    }

@@ -11,8 +11,7 @@ from csac_jax.cli.errors import BadArgumentsError
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """Writes the policy that a run has learned, networks and config, into one file for `eval` and
-    `play`."""
+    """Writes a run's policy, networks and config, into one file for `eval` and `play`."""
 
     run_dir: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -29,7 +28,7 @@ def run(arguments: list[str]) -> int:
         raise BadArgumentsError(f"{options.file} exists; give another name")
     from csac_jax.io import policy_file
 
-    cfg, networks = stored.policy(str(options.run_dir))
-    policy_file.save(options.file, networks(), cfg)
+    policy = stored.policy(str(options.run_dir))
+    policy_file.save(options.file, policy.params, policy.cfg)
     print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
     return 0

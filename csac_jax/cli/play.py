@@ -2,31 +2,27 @@
 
 import dataclasses
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 from csac_jax import presets
 from csac_jax.cli import guards, output, parsing, stored
 from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments
-from csac_jax.config import Config
 
 
 @dataclasses.dataclass(frozen=True)
 class PlayOptions:
-    """Runs one episode and says what every action did; draws it, if asked to, with no display."""
+    """Runs one episode and says what every action did. Draws it if asked to, with no display."""
 
     scene: str = "random"
-    """What lies on the table: random (blocks dropped anew), the name of a shipped case, or a case
-    file."""
+    """What lies on the table: random (dropped blocks), a shipped case by name, or a case file."""
     robot: Literal["hand", "ur5"] = "hand"
     """What moves the gripper: nothing, it floats; or the arm."""
     policy: str = "oracle"
     """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped
     (learned, comes with the package), the folder of a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
-    """What moves the blocks; with mjx, the motion between two states that a video shows is still C
-    MuJoCo's."""
+    """What moves the blocks: C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None
     """File to write a video to, such as out.mp4."""
     png: Path | None = None
@@ -34,7 +30,7 @@ class PlayOptions:
     size: tuple[int, int] = (640, 480)
     """Width and height of picture and video, px, even numbers."""
     views: bool = True
-    """Show height map and action beside the scene; of a learned policy also Q of both primitives,
+    """Show height map and action next to the scene; of a learned policy also Q of both primitives,
     best over yaws, and the candidates of its search."""
     seed: int = 0
     """Number that the scene and the policy's noise follow from."""
@@ -51,29 +47,25 @@ def run(arguments: list[str]) -> int:
         from csac_jax.render import gl
 
         opengl = gl.choose()  # before MuJoCo is imported
-    learned = options.policy not in ("oracle", "random")
-    cfg, networks = stored.policy(options.policy) if learned else (presets.quick(), None)
-    cfg = dataclasses.replace(
-        cfg, sim=dataclasses.replace(cfg.sim, physics=options.physics, robot=options.robot)
-    )
     begun = time.time()
-    cfg, moments = _play(options, cfg, networks)
+    env, steps = _play(options, _policy(options))
     from csac_jax.render import play as playing
 
-    print(playing.summary(moments))
+    print(playing.summary(env.cfg, steps))
     if drawn:
-        stage = playing.Stage(cfg, moments[0].before, options.size, opengl, options.views)
-        playing.record(stage, moments, options.png, options.video)
+        stage = playing.Stage(env.cfg, steps[0].before, options.size, opengl, options.views)
+        playing.record(stage, steps, options.png, options.video)
     result = {
         "scene": options.scene,
         "policy": options.policy,
         "renderer": (opengl or "rays") if drawn else None,
-        "actions": len(moments),
-        "cleared": sum(int(moment.after.info.cleared) for moment in moments),
-        "completed": bool(moments[-1].after.terminated),
+        "actions": len(steps),
+        "cleared": playing.taken(steps),
+        "blocks_lost": playing.lost(steps),
+        "completed": playing.completed(steps),
         "seconds": round(time.time() - begun, 1),
     }
-    output.write_result(options.json, result, cfg)
+    output.write_result(options.json, result, env.cfg)
     return 0
 
 
@@ -85,26 +77,36 @@ def _check(options: PlayOptions) -> None:
         guards.check_extra("--video", "imageio_ffmpeg", "video")
 
 
-def _play(
-    options: PlayOptions, cfg: Config, networks: Callable[[], Any] | None
-) -> tuple[Config, list[Any]]:
-    """The scene's config and the moments of the episode, each printed as it happens."""
+def _policy(options: PlayOptions) -> Any:
+    """The policy; without networks it has the config of `quick`."""
+    from csac_jax.evaluation import policies
+
+    without_networks = {"oracle": policies.OraclePolicy, "random": policies.RandomPolicy}
+    if options.policy in without_networks:
+        return without_networks[options.policy](presets.quick())
+    return stored.policy(options.policy)
+
+
+def _play(options: PlayOptions, policy: Any) -> tuple[Any, list[Any]]:
+    """The environment and the records of the episode's steps, each printed as it happens."""
     from csac_jax.evaluation import rollout, suites
     from csac_jax.render import play as playing
     from csac_jax.runtime import cache
 
     cache.enable()
+    cfg = rollout.configured(policy.cfg, options.physics, options.robot)
     with as_bad_arguments(ValueError):
-        suite = "own" if options.scene == "random" else str(_case_file(options.scene))
+        suite = (
+            suites.IN_DISTRIBUTION if options.scene == "random" else str(_case_file(options.scene))
+        )
         (env,) = suites.environments(cfg, suite, 1, options.seed).values()
-    env = dataclasses.replace(env, any_yaw=options.scene == "random")  # a case is to be known again
-    params = None if networks is None else networks()
-    moments: list[Any] = []
-    name = options.policy if networks is None else "learned"
-    for moment in rollout.episode(env.cfg, env, name, params, options.seed):
-        moments.append(moment)
-        print(playing.line(len(moments), moment), flush=True)
-    return env.cfg, moments
+    # Quarter turns only, so that a case is recognised.
+    env = dataclasses.replace(env, any_yaw=options.scene == "random")
+    steps: list[Any] = []
+    for step in rollout.episode(env, policy.replace(cfg=env.cfg), options.seed):
+        steps.append(step)
+        print(playing.line(len(steps), step), flush=True)
+    return env, steps
 
 
 def _case_file(scene: str) -> Path:

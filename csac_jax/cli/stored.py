@@ -1,6 +1,5 @@
 """What commands read from files: the config of a run, a policy, weights."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +17,13 @@ def config(run_dir: Path) -> Config:
         return checkpoint.load_config(run_dir)
 
 
-def policy(source: str) -> tuple[Config, Callable[[], Any]]:
-    """Config of the policy in a run's folder, in a policy file or `shipped`, and what reads its
-    networks."""
+def policy(source: str, kind: str = "learned") -> Any:
+    """The policy of a kind, see `evaluation.policies.POLICIES`, with the config of a source."""
+    from csac_jax.evaluation import policies
     from csac_jax.io import checkpoint, policy_file
-    from csac_jax.training import step
 
-    path = policy_file.SHIPPED if source == "shipped" else Path(source)
-    if path.is_file():
-        with as_failure(policy_file.PolicyFileError):
-            cfg, params = policy_file.load(path)
-            return cfg, lambda: params
-    cfg = config(path)
-
-    def read() -> Any:
-        with as_failure(checkpoint.CheckpointError):
-            return checkpoint.restore(path, step.abstract_state(cfg))[0].learner.online
-
-    return cfg, read
+    with as_failure(policy_file.PolicyFileError, checkpoint.CheckpointError, FileNotFoundError):
+        return policies.POLICIES[kind](source)
 
 
 def weights(cfg: Config) -> Any:

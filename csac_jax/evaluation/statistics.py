@@ -1,20 +1,16 @@
-"""What several seeds say together: interquartile mean and stratified bootstrap (Agarwal et al.,
-arXiv:2108.13264).
+"""Means over seeds with bootstrap bands, after Agarwal et al. (arXiv:2108.13264); no JAX."""
 
-NumPy only.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.stats
 
 RESAMPLES = 10_000
-CUT = 0.25  # share of the values left out at either end
 
 
 class Band(NamedTuple):
-    """A value and its 95 % band; no band (None) where one seed is all there is."""
+    """A value and its 95 % band; None for the band of a single seed."""
 
     value: float
     low: float | None
@@ -23,65 +19,61 @@ class Band(NamedTuple):
 
 
 def iqm(values: np.ndarray) -> np.ndarray:
-    """Mean of the middle half of `values` [..., n]: a quarter of them, rounded down, is left out at
-    either end."""
-    ordered = np.sort(values, axis=-1)
-    cut = int(CUT * ordered.shape[-1])
-    return ordered[..., cut : ordered.shape[-1] - cut].mean(axis=-1)
+    """Interquartile mean of `values` [..., n]: without a quarter, rounded down, at either end."""
+    return scipy.stats.trim_mean(values, 0.25, axis=-1)
 
 
 def band(strata: Sequence[np.ndarray], seed: int = 0) -> Band:
-    """Mean over strata (tasks) of the IQM over seeds in each [seeds]; seeds are drawn anew in each
-    for the band.
+    """Mean over strata (tasks) of the IQM over each one's seeds [seeds].
 
-    Unlike Agarwal et al., no IQM over all strata at once: of four cases that would leave out the
-    hardest. Raises ValueError where a stratum has no value.
+    The bootstrap draws seeds within each stratum. Unlike Agarwal et al. there is no IQM over all
+    strata at once: of four cases it would leave out the hardest. Raises ValueError where a stratum
+    is empty.
     """
-    every = [np.asarray(stratum, float) for stratum in strata]
-    fewest = min((len(stratum) for stratum in every), default=0)
+    fewest = min(map(len, strata), default=0)
     if fewest == 0:
         raise ValueError("no values to take a mean of")
-    value = float(np.mean([iqm(stratum) for stratum in every]))
-    if fewest < 2:
-        return Band(value, None, None, fewest)
-    rng = np.random.default_rng(seed)
-    drawn = [
-        iqm(stratum[rng.integers(0, len(stratum), (RESAMPLES, len(stratum)))]) for stratum in every
-    ]
-    low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
-    return Band(value, float(low), float(high), fewest)
+    if fewest == 1:
+        return Band(float(_mean_iqm(*strata)), None, None, 1)
+    return _bootstrapped(strata, _mean_iqm, seed)
 
 
 def difference(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], seed: int = 0) -> Band:
-    """`band` of ours less `band` of theirs, whose seeds are drawn independently of ours; strata in
-    the same order.
+    """`band` of ours less `band` of theirs, seeds drawn independently; strata in the same order.
 
-    Raises ValueError where a stratum has fewer than two values: one seed tells nothing of the
-    spread.
+    Raises ValueError where a stratum has fewer than two values.
     """
-    if min((len(stratum) for stratum in (*ours, *theirs)), default=0) < 2:
+    if min(map(len, (*ours, *theirs)), default=0) < 2:
         raise ValueError("a difference needs two values of each")
-    rng = np.random.default_rng(seed)
 
-    def drawn(strata: Sequence[np.ndarray]) -> np.ndarray:
-        draws = (
-            np.asarray(one, float)[rng.integers(0, len(one), (RESAMPLES, len(one)))]
-            for one in strata
-        )
-        return np.mean([iqm(each) for each in draws], axis=0)
+    def gap(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+        return _mean_iqm(*strata[: len(ours)]) - _mean_iqm(*strata[len(ours) :])
 
-    low, high = np.percentile(drawn(ours) - drawn(theirs), [2.5, 97.5])
-    value = band(ours).value - band(theirs).value
-    return Band(value, float(low), float(high), min(len(stratum) for stratum in (*ours, *theirs)))
+    return _bootstrapped((*ours, *theirs), gap, seed)
+
+
+def _mean_iqm(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Mean over strata of the IQM over the last axis; SciPy passes that axis by name."""
+    return np.mean([iqm(np.asarray(stratum, float)) for stratum in strata], axis=0)
+
+
+def _bootstrapped(
+    strata: Sequence[np.ndarray], statistic: Callable[..., np.ndarray], seed: int
+) -> Band:
+    """The statistic of strata [seeds], with its 95 % percentile bootstrap band."""
+    samples = [np.asarray(stratum, float) for stratum in strata]
+    low, high = scipy.stats.bootstrap(
+        samples, statistic, n_resamples=RESAMPLES, method="percentile", rng=seed
+    ).confidence_interval
+    return Band(float(statistic(*samples)), float(low), float(high), min(map(len, samples)))
 
 
 def curves(points: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, list[Band]]:
-    """IQM and band of curves, one a seed, at the places x that the first one has, up to where the
-    shortest ends.
+    """IQM and band of curves, one per seed, at the first one's places x up to the shortest's end.
 
-    Args: points, for each seed x [n], rising, and y [n]; between its points a curve is a straight
-    line. Returns: x [m] and a band for each. A seed whose curve begins later holds its first value
-    until then.
+    A curve is linear between its points, and holds its first value before them.
+
+    Args: points, for each seed x [n], rising, and y [n]. Returns: x [m] and a band for each.
     """
     end = min(x[-1] for x, _ in points)
     places = points[0][0][points[0][0] <= end]

@@ -10,23 +10,22 @@ from csac_jax.config import DenseNet121
 from csac_jax.nets import torchvision
 
 
-def read(cfg: DenseNet121) -> Any:
-    """Variables of a trunk from the file `net.weights`. Nothing in the file is executed.
+def read(cfg: DenseNet121, path: Path) -> Any:
+    """Variables of a trunk from a file with torchvision's names; nothing in it is executed.
 
     Raises ValueError in one line, naming the tensor if one is missing, extra or misshapen.
     """
-    path = Path(cfg.weights)
     try:
         tensors = safetensors.numpy.load_file(path)
     # KeyError: a type that NumPy lacks
     except (OSError, KeyError, safetensors.SafetensorError) as error:
         raise ValueError(
-            f"net.weights: {path} cannot be read as .safetensors ({error}); give another file"
+            f"{path} cannot be read as .safetensors ({error}); give another file"
         ) from error
     try:
         return torchvision.variables(cfg, tensors)
     except ValueError as error:
         raise ValueError(
-            f"net.weights: in {path}, {error}; "
+            f"in {path}, {error}; "
             "bring torchvision's densenet121 with the layers of net.block_layers"
         ) from error

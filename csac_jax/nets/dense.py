@@ -32,23 +32,17 @@ def compute_dtype(cfg: NetConfig) -> Any:
     return jnp.dtype(cfg.dtype)
 
 
-def inputs(
-    colour: jax.Array | None, height: jax.Array, target: jax.Array | None, border: bool = False
-) -> jax.Array:
-    """The net's input maps [..., H, W, I].
+def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
+    """The net's input maps [..., H, W, I]; bare table is 0, like cells outside of a rotated map.
 
-    Bare table is 0, like cells outside of a rotated map, but for the border: 1 on the workspace.
-
-    Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m, below 0 beyond the workspace;
-    target [..., H, W] bool or None; border, whether the net sees it. I = 1, + 3, + 1, + 1.
+    Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m; target [..., H, W] bool or
+    None. I = 1, + 3, + 1.
     """
-    maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
+    maps = [height[..., None] / _HEIGHT_SCALE]
     if colour is not None:
         maps.insert(0, jnp.where(height[..., None] > COLOUR_MIN_HEIGHT, colour - 0.5, 0.0))
     if target is not None:
         maps.append(target[..., None].astype(height.dtype))
-    if border:
-        maps.append((height >= 0.0)[..., None].astype(height.dtype))
     return jnp.concatenate(maps, axis=-1)
 
 

@@ -1,5 +1,6 @@
 """One episode to look at: a line per action, a picture, a video."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 from csac_jax.config import Config, RobotKind
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import State
-from csac_jax.evaluation.rollout import Moment
+from csac_jax.evaluation import metrics, rollout
+from csac_jax.evaluation.rollout import StepRecord
 from csac_jax.render import picture, view
 from csac_jax.render.picture import View
 from csac_jax.scene import blocks, layout, model
@@ -20,6 +22,12 @@ VIEWS: dict[RobotKind, View] = {
     "hand": View(position=(-0.45, -0.45, 0.45), look_at=(0.0, 0.0, 0.04)),
     "ur5": View(position=(-0.75, -1.05, 0.75), look_at=(0.15, 0.0, 0.25)),
 }
+STOPPED = {
+    "action_cap": "stopped at the action limit",
+    "no_change_cap": "stopped since nothing changed any more",
+    "physics_diverged": "stopped since physics diverged",
+}
+HOLD = 20  # pictures of an action's end
 
 
 class Stage:
@@ -33,7 +41,7 @@ class Stage:
         opengl: str | None,
         views: bool = False,
     ) -> None:
-        self._cfg, self._views = cfg, views  # with what the policy saw beside the scene
+        self._cfg, self._views = cfg, views  # whether to show what the policy saw, too
         self._world = model.build(cfg.scene, cfg.sim)
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
         self._model = model.with_blocks(self._world, self._fields)
@@ -41,38 +49,35 @@ class Stage:
         self._model.geom_rgba[self._world.block_geoms, :3] = colours
         self._data = mujoco.MjData(self._model)
         self._every = max(round(1.0 / (picture.FRAMES_PER_SECOND * cfg.sim.timestep)), 1)
-        seen = VIEWS[cfg.sim.robot]
-        self._draw = picture.artist(self._model, View(seen.position, seen.look_at, size), opengl)
+        eye = dataclasses.replace(VIEWS[cfg.sim.robot], size=size)
+        self._draw = picture.artist(self._model, eye, opengl)
 
-    def still(self, moment: Moment, text: str = "") -> np.ndarray:
+    def still(self, step: StepRecord, text: str = "") -> np.ndarray:
         """The scene before an action, the robot where that action starts: [H, W, 3] uint8."""
-        return self._beside(self._still(moment), moment, text)
+        return self._beside(self._still(step), step, text)
 
-    def _still(self, moment: Moment) -> np.ndarray:
-        scene, pose = moment.before.scene, self._data.qpos
-        pose[self._world.robot_qpos] = moment.joints.start
+    def _still(self, step: StepRecord) -> np.ndarray:
+        scene, pose = step.before.scene, self._data.qpos
+        pose[self._world.robot_qpos] = step.joints.start
         pose[self._world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
         return self._picture()
 
-    def motion(self, moment: Moment, text: str = "") -> Iterator[np.ndarray]:
-        """The action as it runs in C MuJoCo; a still picture where the robot cannot follow the
-        plan.
+    def motion(self, step: StepRecord, text: str = "") -> Iterator[np.ndarray]:
+        """The action as it runs in C MuJoCo; a still picture where the robot cannot do it.
 
-        With views, `text` below it: what is done at first; for HOLD pictures more at the end, what
-        came of it too.
+        With views, HOLD more pictures of the end; `text` below up to its colon, there all of it.
         """
-        shown = self._still(moment)
-        yield self._beside(shown, moment, text.split(":")[0])
-        scene, joints = moment.before.scene, moment.joints
-        recorded = c_physics.trajectory(self._world, self._fields, scene, joints)
+        image, action = self._still(step), text.split(":")[0]
+        yield self._beside(image, step, action)
+        recorded = c_physics.trajectory(self._world, self._fields, step.before.scene, step.joints)
         for pose in recorded.qpos[:: self._every]:
             self._data.qpos[:] = pose
-            shown = self._picture()
-            yield self._beside(shown, moment, text.split(":")[0])
-        yield from [self._beside(shown, moment, text)] * (HOLD if self._views else 0)
+            image = self._picture()
+            yield self._beside(image, step, action)
+        yield from [self._beside(image, step, text)] * (HOLD if self._views else 0)
 
-    def _beside(self, shown: np.ndarray, moment: Moment, text: str) -> np.ndarray:
-        return view.beside(self._cfg, shown, moment, text) if self._views else shown
+    def _beside(self, image: np.ndarray, step: StepRecord, text: str) -> np.ndarray:
+        return view.beside(self._cfg, image, step, text) if self._views else image
 
     def _picture(self) -> np.ndarray:
         mujoco.mj_kinematics(self._model, self._data)
@@ -80,48 +85,75 @@ class Stage:
         return self._draw(self._data)
 
 
-HOLD = 20  # pictures that an action's outcome is shown for
-
-
-def line(number: int, moment: Moment) -> str:
+def line(number: int, step: StepRecord) -> str:
     """What an action did, in words."""
-    before, after, info = moment.before, moment.after, moment.after.info
-    x, y, yaw = moment.action.pose
+    before, after, info = step.before, step.after, step.after.info
+    x, y, yaw = step.action.pose
     where = f"at x {1e3 * x:+.0f} y {1e3 * y:+.0f} mm, yaw {np.degrees(yaw):.0f} deg"
-    if moment.action.primitive == Primitive.PUSH:
+    if step.action.primitive == Primitive.PUSH:
         done = f"push  {where}: moved {info.moved:.0f} cm2"
     else:
         done = f"grasp {where}: {Outcome(int(info.outcome)).name.lower()}"
-    if not moment.joints.reachable:
+    if not step.joints.reachable:
         done += ", out of the robot's reach"
-    gone = np.flatnonzero(before.scene.in_play & ~after.scene.in_play)
-    names = [blocks.COLOUR_NAMES[before.scene.colour[slot]] for slot in gone]
     if info.cleared:
-        done += f" ({', '.join(names)})"
-    lost = f", {info.blocks_lost} left the square" if info.blocks_lost else ""
-    physics_diverged = ", physics failed" if info.physics_diverged else ""
-    worth = f"reward {float(moment.reward):+.2f}"
-    return f"{number:3d} {done}{lost}{physics_diverged}; {worth}; {int(after.scene.in_play.sum())} blocks left"
+        gone = np.flatnonzero(before.scene.in_play & ~after.scene.in_play)
+        colours = (blocks.COLOUR_NAMES[before.scene.colour[slot]] for slot in gone)
+        done += f" ({', '.join(colours)})"
+    if info.blocks_lost:
+        done += f", {_blocks(int(info.blocks_lost))} left the workspace"
+    if info.physics_diverged:
+        done += ", physics diverged"
+    left = _blocks(int(after.scene.in_play.sum()))
+    return f"{number:3d} {done}; reward {float(step.reward):+.2f}; {left} left"
 
 
-def summary(moments: list[Moment]) -> str:
-    """How the episode ended."""
-    last = moments[-1].after
-    taken = sum(int(moment.after.info.cleared) for moment in moments)
-    if last.terminated:
-        how = "the target is taken" if last.scene.target != layout.ANY else "the table is clear"
-    else:
-        how = "physics failed" if last.info.physics_diverged else "cut off"
-    return f"{how} after {len(moments)} actions, {taken} blocks taken"
+def summary(cfg: Config, steps: list[StepRecord]) -> str:
+    """How the episode ended, and what became of the blocks."""
+    actions = f"{len(steps)} action{'s' if len(steps) != 1 else ''}"
+    fate = f"{_blocks(taken(steps))} taken"
+    if lost(steps):
+        fate += f", {_blocks(lost(steps))} left the workspace"
+    return f"{_ending(cfg, steps)} after {actions}: {fate}"
 
 
-def record(stage: Stage, moments: list[Moment], png: Path | None, video: Path | None) -> None:
-    """Writes the picture of the first moment, and the video of them all."""
-    lines = [line(number, moment) for number, moment in enumerate(moments, 1)]
+def _ending(cfg: Config, steps: list[StepRecord]) -> str:
+    last = steps[-1].after
+    if not last.terminated:
+        return STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
+    if last.scene.target != layout.ANY:
+        return "the target is taken" if completed(steps) else "the target is lost"
+    return "the table is clear" if completed(steps) else "no block is left within reach"
+
+
+def completed(steps: list[StepRecord]) -> bool:
+    """Whether the hand took what the task asks for."""
+    last = steps[-1].after
+    got = last.reward > 0 if last.scene.target != layout.ANY else lost(steps) == 0
+    return bool(last.terminated and got)
+
+
+def taken(steps: list[StepRecord]) -> int:
+    """Blocks taken from the table."""
+    return sum(int(step.after.info.cleared) for step in steps)
+
+
+def lost(steps: list[StepRecord]) -> int:
+    """Blocks that left the workspace."""
+    return sum(int(step.after.info.blocks_lost) for step in steps)
+
+
+def _blocks(count: int) -> str:
+    return f"{count} block{'s' if count != 1 else ''}"
+
+
+def record(stage: Stage, steps: list[StepRecord], png: Path | None, video: Path | None) -> None:
+    """Writes the picture of the first step, and the video of them all."""
+    lines = [line(number, step) for number, step in enumerate(steps, 1)]
     if png is not None:
-        picture.write_png(png, stage.still(moments[0], lines[0]))
+        picture.write_png(png, stage.still(steps[0], lines[0]))
     if video is not None:
-        told = zip(moments, lines, strict=True)
+        told = zip(steps, lines, strict=True)
         picture.write_video(
-            video, (frame for moment, text in told for frame in stage.motion(moment, text))
+            video, (frame for step, text in told for frame in stage.motion(step, text))
         )

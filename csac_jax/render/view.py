@@ -5,7 +5,7 @@ import numpy as np
 
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
-from csac_jax.evaluation.rollout import Moment
+from csac_jax.evaluation.rollout import StepRecord
 from csac_jax.render import canvas
 from csac_jax.scene.model import MAX_OPENING
 
@@ -16,23 +16,20 @@ TALLEST = 0.12  # m; higher surfaces are drawn as high as that
 TEXT_LINES = 2
 
 
-def beside(cfg: Config, scene: np.ndarray, moment: Moment, text: str) -> np.ndarray:
-    """The picture of a scene [H, W, 3] with the views of a moment to its right, H px wide, and a
+def beside(cfg: Config, scene: np.ndarray, step: StepRecord, text: str) -> np.ndarray:
+    """The picture of a scene [H, W, 3] with the views of a step to its right, H px wide, and a
     line of text below.
 
     A learned policy: Q of pushes and of grasps, best over yaws, above; below them the height map
     with candidates and action, and what is what. Any other policy: the height map with its action.
     """
     height = scene.shape[0]
-    if moment.thought is None:
-        views = _height_map(cfg, moment, height)
+    if step.debug is None:
+        views = _height_map(cfg, step, height)
     else:
         half = height // 2
-        pushes, grasps = (_q_map(moment, primitive, half) for primitive in Primitive)
-        below = [
-            _height_map(cfg, moment, height - half),
-            _legend(moment, height - half, height - half),
-        ]
+        pushes, grasps = (_q_map(step, primitive, half) for primitive in Primitive)
+        below = [_height_map(cfg, step, height - half), _legend(step, height - half, height - half)]
         views = np.concatenate(
             [
                 np.concatenate([pushes, grasps], axis=1),
@@ -62,11 +59,11 @@ def _upright(values: np.ndarray) -> np.ndarray:
     return values[::-1]
 
 
-def _q_map(moment: Moment, primitive: Primitive, side: int) -> np.ndarray:
+def _q_map(step: StepRecord, primitive: Primitive, side: int) -> np.ndarray:
     """Q of a primitive, both in the same colours."""
-    thought = moment.thought
-    assert thought is not None
-    every = np.asarray(thought.q)
+    debug = step.debug
+    assert debug is not None
+    every = np.asarray(debug.q)
     there = every[np.isfinite(every)]
     low, high = (there.min(), there.max()) if there.size else (0.0, 1.0)
     own = every[primitive][np.isfinite(every[primitive])]
@@ -76,18 +73,18 @@ def _q_map(moment: Moment, primitive: Primitive, side: int) -> np.ndarray:
     return image
 
 
-def _height_map(cfg: Config, moment: Moment, side: int) -> np.ndarray:
+def _height_map(cfg: Config, step: StepRecord, side: int) -> np.ndarray:
     """The height map in grey, candidates as dots, the action as a hand or an arrow."""
-    shade = np.clip(np.asarray(moment.before.obs.height) / TALLEST, 0.0, 1.0)
+    shade = np.clip(np.asarray(step.before.obs.height) / TALLEST, 0.0, 1.0)
     grey = np.repeat((40 + 200 * shade).round().astype(np.uint8)[..., None], 3, axis=2)
     image = canvas.enlarge(_upright(grey), side, side)
-    pose = np.asarray(moment.action.pose, float)
+    pose = np.asarray(step.action.pose, float)
     width = max(side / 160.0, 1.0)
-    if moment.thought is not None:
+    if step.debug is not None:
         for primitive in Primitive:
-            xy = np.asarray(moment.thought.candidates)[primitive, :, :2]
+            xy = np.asarray(step.debug.candidates)[primitive, :, :2]
             canvas.dots(image, _pixels(cfg, xy, side), width, CLOUDS[primitive])
-    _action(cfg, image, int(moment.action.primitive), pose, side, 1.5 * width)
+    _action(cfg, image, int(step.action.primitive), pose, side, 1.5 * width)
     return image
 
 
@@ -121,17 +118,17 @@ def _action(
         )
 
 
-def _legend(moment: Moment, height: int, width: int) -> np.ndarray:
+def _legend(step: StepRecord, height: int, width: int) -> np.ndarray:
     """What the colours mean and what the action is worth."""
     image, scale = np.zeros((height, width, 3), np.uint8), _scale(2 * height)
-    thought = moment.thought
-    assert thought is not None
+    debug = step.debug
+    assert debug is not None
     lines = [
         ("HEIGHT MAP, FROM ABOVE", TITLE),
         ("CANDIDATES, PUSH", CLOUDS[Primitive.PUSH]),
         ("CANDIDATES, GRASP", CLOUDS[Primitive.GRASP]),
         ("CHOSEN", CHOSEN),
-        (f"BEST GRASP {float(thought.best_grasp):+.2f}", TITLE),
+        (f"BEST GRASP {float(debug.best_grasp):+.2f}", TITLE),
     ]
     for number, (text, colour) in enumerate(lines):
         canvas.write(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax import algorithms, presets
+from csac_jax.constants import RENAMED_SUITES
 from csac_jax.io import configs, files
 
 RECORD = "train.json"  # with device, versions and commit, in the folder of a run or of a sweep
@@ -200,7 +201,8 @@ def _evaluations(path: Path) -> list[Evaluation]:
         or "config" not in content
     ):
         return []
-    suite = content.get("suite", "own")
+    suite: str = content.get("suite", "own")
+    suite = RENAMED_SUITES.get(suite, suite)
     parts = content.get("parts") or {Path(suite).stem: content}
     record = {name: content.get(name) for name in ("device", "versions", "commit", "seconds")}
     return [

@@ -174,7 +174,7 @@ def size_leader(slots: tuple[SlotKind, ...]) -> np.ndarray:
 def size_jitter(cfg: SceneConfig) -> np.ndarray:
     """Largest deviation [N] of each slot's block from its nominal size, as a share of it."""
     return np.array(
-        [cfg.mesh_size_jitter if kind in MESH_KINDS else cfg.size_jitter for kind in cfg.slots],
+        [cfg.size_jitter[int(kind in MESH_KINDS)] for kind in cfg.slots],
         np.float32,
     )
 

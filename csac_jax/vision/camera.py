@@ -3,7 +3,7 @@
 The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depth is
 along z. A pixel's ray has no unit length: it advances by 1 m in depth per unit of distance.
 
-    eye = camera.make(CameraConfig(scale=0.5))
+    eye = camera.make(CameraConfig().scaled(0.5))
     picture = camera.render(eye, solids.read(model, data.geom_xpos, data.geom_xmat))
 """
 
@@ -44,16 +44,14 @@ class Picture:
 
 def make(cfg: CameraConfig) -> Camera:
     """The camera of a config."""
-    width, height = cfg.pixels
-    scale = np.array([width, height]) / np.array(cfg.size)
     rotation = level_rotation(np.array(cfg.position), np.array(cfg.look_at))
     return Camera(
-        focal=jnp.asarray(np.array(cfg.focal) * scale, jnp.float32),
-        centre=jnp.asarray((np.array(cfg.centre) + 0.5) * scale - 0.5, jnp.float32),
+        focal=jnp.asarray(cfg.focal, jnp.float32),
+        centre=jnp.asarray(cfg.centre, jnp.float32),
         position=jnp.asarray(cfg.position, jnp.float32),
         rotation=jnp.asarray(rotation, jnp.float32),
-        width=width,
-        height=height,
+        width=cfg.size[0],
+        height=cfg.size[1],
     )
 
 

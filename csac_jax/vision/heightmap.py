@@ -14,8 +14,6 @@ from csac_jax.config import HeightmapConfig
 VIEW_HEIGHT = 0.5
 """Height of the view, m: blocks in play lie below it, parked blocks wholly above."""
 
-BEYOND = -1.0  # m, height of cells outside the workspace in shifted or rotated maps
-BEYOND_COUNT = 65535  # packed
 _HEIGHT_UNIT = 1e-4  # m per count of the packed height
 _CM2 = 1e4  # cm^2 in a m^2
 
@@ -68,18 +66,17 @@ def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Ce
 
 
 def pack(obs: Observation) -> PackedObservation:
-    """Rounds to a colour level and to 0.1 mm; clips heights to 0 .. 6.5534 m."""
-    counts = jnp.clip(jnp.round(obs.height / _HEIGHT_UNIT), 0.0, BEYOND_COUNT - 1.0)
+    """Rounds to a colour level and to 0.1 mm; clips heights to 0 .. 6.5535 m."""
+    counts = jnp.clip(jnp.round(obs.height / _HEIGHT_UNIT), 0.0, 65535.0)
     levels = jnp.clip(jnp.round(obs.colour * 255.0), 0.0, 255.0)
     return PackedObservation(levels.astype(jnp.uint8), counts.astype(jnp.uint16), obs.target)
 
 
 def unpack(packed: PackedObservation) -> Observation:
     """The packed observation, to half a colour level and 0.05 mm."""
-    height = packed.height.astype(jnp.float32) * _HEIGHT_UNIT
     return Observation(
         colour=packed.colour.astype(jnp.float32) / 255.0,
-        height=jnp.where(packed.height == BEYOND_COUNT, BEYOND, height),
+        height=packed.height.astype(jnp.float32) * _HEIGHT_UNIT,
         target=packed.target,
     )
 

@@ -26,12 +26,13 @@ def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
 def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Measured depths m of the exact ones, any shape, and which pixels have one, bool.
 
-    Normal with standard deviation depth_floor + depth_square d^2; source: SensorConfig.
+    Normal with standard deviation floor + square d^2; source: SensorConfig.
     """
     key_noise, key_drop = jax.random.split(key)
     measured, valid = exact, jnp.ones(exact.shape, bool)
-    if cfg.depth_floor > 0.0 or cfg.depth_square > 0.0:
-        std = cfg.depth_floor + cfg.depth_square * exact**2
+    floor, square = cfg.depth_noise
+    if floor > 0.0 or square > 0.0:
+        std = floor + square * exact**2
         measured = exact + std * jax.random.normal(key_noise, exact.shape)
     if cfg.dropped > 0.0:
         valid = jax.random.bernoulli(key_drop, 1.0 - cfg.dropped, exact.shape)
@@ -42,10 +43,11 @@ def pose(key: jax.Array, cfg: SensorConfig, believed: Camera) -> Camera:
     """The real camera: the believed one, moved and rotated a little."""
     key_position, key_rotation = jax.random.split(key)
     position, rotation = believed.position, believed.rotation
-    if cfg.position > 0.0:
-        position = position + cfg.position * jax.random.normal(key_position, (3,))
-    if cfg.rotation > 0.0:
-        half_angle = 0.5 * cfg.rotation * jax.random.normal(key_rotation, (3,))
+    std_position, std_rotation = cfg.pose_noise
+    if std_position > 0.0:
+        position = position + std_position * jax.random.normal(key_position, (3,))
+    if std_rotation > 0.0:
+        half_angle = 0.5 * std_rotation * jax.random.normal(key_rotation, (3,))
         quat = jnp.concatenate([jnp.ones(1), half_angle])  # small angles
         jitter = geometry.quat_to_matrix(quat / jnp.sqrt(jnp.sum(quat**2)))
         rotation = (jitter[:, :, None] * rotation[None]).sum(1)

@@ -15,7 +15,7 @@ import csac_jax
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import bench, evaluation, play, stored, sweep, train
 from csac_jax.config import Config, SceneConfig
-from csac_jax.evaluation import rollout
+from csac_jax.evaluation import policies, rollout
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
 from csac_jax.scene import pool
@@ -113,7 +113,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --seed 2147483647", "--seed: must lie in"),
         (
             "eval shipped --suite nowhere",
-            "--suite: 'nowhere' is neither a case file nor one of: own, random10",
+            "--suite: 'nowhere' is neither a case file nor one of: in_distribution, random10",
         ),
         ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
         ("doctor --fix", "Unrecognized options: --fix"),
@@ -591,12 +591,14 @@ def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyP
 
 
 def test_summary_is_printed(capsys: pytest.CaptureFixture):
-    """Claim: `eval` prints every metric, and a dash for one without cases."""
+    """Claim: `eval` prints every metric, shares in per cent, efficiencies in blocks per action, and a
+    dash for one without cases."""
     from csac_jax.evaluation import metrics
 
     summary = {
         "grasp_success": metrics.wilson(9, 10),
         "completion": metrics.wilson(0, 0),
+        "action_efficiency": {"value": 1.25, "low": 1.0, "high": 1.5, "n": 10},
         "outcomes": {"lifted": 9},
         "counts": {"grasps": 10},
     }
@@ -604,7 +606,22 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
     shown = capsys.readouterr().out
     assert "90.0 %" in shown
     assert "lifted 9" in shown
+    assert "1.250" in shown
+    assert "125" not in shown  # blocks per action are no share
     assert "-" in next(line for line in shown.splitlines() if "completion" in line)
+
+
+def test_progress_is_for_terminals(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `eval` says how many episodes are over on a terminal, and nothing elsewhere."""
+    monkeypatch.setenv("TERM", "xterm")
+    for terminal in ("", "1"):
+        monkeypatch.setenv("FORCE_COLOR", terminal)  # Rich takes this for a terminal
+        with evaluation._progress_bar() as show:
+            show("row", 3, 50)
+        shown = capsys.readouterr()
+        assert shown.out == ""
+        assert ("row" in shown.err and "3/50" in shown.err) == bool(terminal)
+        assert bool(shown.err) == bool(terminal)
 
 
 @pytest.mark.parametrize(("scene", "any_yaw"), [("row", False), ("random", True)])
@@ -613,11 +630,10 @@ def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str,
     scene by any yaw."""
     turned = []
 
-    def episode(_, env, *__):
+    def episode(env, *_):
         turned.append(env.any_yaw)
         yield from ()
 
     monkeypatch.setattr(rollout, "episode", episode)
-    physics = dataclasses.replace(SMOKE.sim, physics="c")
-    play._play(play.PlayOptions(scene=scene), dataclasses.replace(SMOKE, sim=physics), None)
+    play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE))
     assert turned == [any_yaw]

@@ -1,8 +1,9 @@
-"""Metrics of an evaluation, against SciPy and by hand."""
+"""Metrics of an evaluation, by hand."""
+
+import math
 
 import numpy as np
 import pytest
-import scipy.stats
 
 from csac_jax.evaluation import metrics
 from csac_jax.evaluation.metrics import Episodes
@@ -11,13 +12,17 @@ from csac_jax.evaluation.metrics import Episodes
 @pytest.mark.parametrize(
     ("successes", "n"), [(0, 1), (1, 1), (0, 50), (50, 50), (1, 7), (47, 50), (1234, 4321)]
 )
-def test_wilson_agrees_with_scipy(successes: int, n: int):
-    """Claim: the interval of a share is Wilson's 95 % interval."""
-    wanted = scipy.stats.binomtest(successes, n).proportion_ci(0.95, method="wilson")
+def test_wilson_by_its_formula(successes: int, n: int):
+    """Claim: the interval of a share is Wilson's 95 % interval (Wilson 1927)."""
+    share, z = successes / n, 1.959963984540054
+    centre = (share + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z * math.sqrt(share * (1 - share) / n + z**2 / (4 * n * n)) / (1 + z**2 / n)
     got = metrics.wilson(successes, n)
-    np.testing.assert_allclose([got["low"], got["high"]], [wanted.low, wanted.high], atol=1e-12)
-    assert got["value"] == successes / n
+    low, high = max(centre - half, 0.0), min(centre + half, 1.0)
+    np.testing.assert_allclose([got["low"], got["high"]], [low, high], atol=1e-15)
+    assert got["value"] == share
     assert got["n"] == n
+    assert got["low"] <= share <= got["high"]
 
 
 def test_no_cases_no_value():
@@ -126,6 +131,24 @@ def test_intervals_hold_their_values():
     for entry in metrics.summarise(_episodes()).values():
         if "value" in entry:
             assert entry["low"] <= entry["value"] <= entry["high"]
+
+
+def test_efficiency_counts_blocks_per_action():
+    """Claim: the efficiencies are blocks per action and no shares: a grasp that lifts two blocks
+    takes both, and the value exceeds 1."""
+    first = _episodes()
+    both = np.zeros((3, 4), np.int32)
+    both[:, 0] = 2  # the only action of each episode takes both blocks
+    one_action = np.zeros((3, 4), bool)
+    one_action[:, 0] = True
+    got = metrics.summarise(
+        first._replace(valid=one_action, cleared=both, completed=np.ones(3, bool))
+    )
+    for name in metrics.PER_ACTION:
+        assert got[name]["value"] == got[name]["low"] == got[name]["high"] == 2.0
+    shares = {name for name, entry in got.items() if "value" in entry} - set(metrics.PER_ACTION)
+    assert shares == {"grasp_success", "completion", "completion_reachable"}
+    assert all(got[name]["high"] <= 1.0 for name in shares)
 
 
 def test_no_grasps():

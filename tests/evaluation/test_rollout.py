@@ -8,21 +8,22 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.agent import actor_critic
+from csac_jax.agent import learner as learning
 from csac_jax.config import TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
-from csac_jax.evaluation import rollout
+from csac_jax.evaluation import rollout, suites
 from csac_jax.evaluation.metrics import Episodes
+from csac_jax.evaluation.policies import LearnedPolicy, OraclePolicy, RandomPolicy
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action
-from csac_jax.vision import observe
 
 pytestmark = pytest.mark.mjx
 
 CFG = dataclasses.replace(
     presets.smoke(), task=TaskConfig(max_actions=6, max_steps_without_change=3)
 )
+ORACLE, RANDOM = OraclePolicy(CFG), RandomPolicy(CFG)
 EPISODES = 5
 REACH = 0.012  # m
 
@@ -59,6 +60,13 @@ class Magnet(Env):
         )
 
 
+def learned_policy(seed: int) -> LearnedPolicy:
+    """Networks as they begin."""
+    parts = actor_critic.make(CFG)
+    state = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(seed))
+    return LearnedPolicy(CFG, state.online)
+
+
 @pytest.fixture(scope="module")
 def magnet() -> Magnet:
     made = environment.make_env(CFG, stream=1, num_scenes=EPISODES)
@@ -68,7 +76,7 @@ def magnet() -> Magnet:
 @pytest.fixture(scope="module")
 def random(magnet) -> Episodes:
     with jax.debug_key_reuse(True):
-        return rollout.rollout(CFG, magnet, "random", None, EPISODES, 0)
+        return rollout.rollout(magnet, RANDOM, EPISODES, 0)
 
 
 def assert_consistent(episodes: Episodes, max_actions: int) -> None:
@@ -101,7 +109,7 @@ def _blocks(env: Env) -> np.ndarray:
 def test_oracle_by_hand(magnet):
     """Claim: where a grasp above a block always takes it, the oracle takes one block with each
     action, and all."""
-    episodes = rollout.rollout(CFG, magnet, "oracle", None, EPISODES, 0)
+    episodes = rollout.rollout(magnet, ORACLE, EPISODES, 0)
     assert_consistent(episodes, CFG.task.max_actions)
     np.testing.assert_array_equal(episodes.blocks, _blocks(magnet))
     assert np.all(episodes.completed)
@@ -129,7 +137,7 @@ def test_random_episodes_end_at_the_caps(magnet, random):
 def test_same_seed_same_episodes(magnet, random):
     """Claim: the same seed gives the same episodes, another seed others; in parts too, all of them
     are run."""
-    again, other = (rollout.rollout(CFG, magnet, "random", None, EPISODES, seed) for seed in (0, 1))
+    again, other = (rollout.rollout(magnet, RANDOM, EPISODES, seed) for seed in (0, 1))
     for a, b in zip(random, again, strict=True):
         np.testing.assert_array_equal(a, b)
     assert any(not np.array_equal(a, b) for a, b in zip(random, other, strict=True))
@@ -138,7 +146,7 @@ def test_same_seed_same_episodes(magnet, random):
 def test_batches_do_not_matter(magnet, random, monkeypatch):
     """Claim: what an episode draws does not depend on how many run side by side, nor on one left
     over."""
-    begin, key = rollout._program(magnet, "random").begin, jax.random.key(0)
+    begin, key = rollout._program(magnet).begin, jax.random.key(0)
     rows = [
         jax.tree.map(lambda leaf, some=some: leaf[some], magnet.scenes)
         for some in (slice(0, 5), slice(3, 5))
@@ -146,9 +154,7 @@ def test_batches_do_not_matter(magnet, random, monkeypatch):
     whole, part = begin(key, jnp.arange(5), rows[0]), begin(key, jnp.arange(3, 5), rows[1])
     np.testing.assert_allclose(whole.scene.position[3:], part.scene.position, atol=1e-6)
     monkeypatch.setattr(rollout, "SIDE_BY_SIDE", 3)
-    for together, apart in zip(
-        random, rollout.rollout(CFG, magnet, "random", None, EPISODES, 0), strict=True
-    ):
+    for together, apart in zip(random, rollout.rollout(magnet, RANDOM, EPISODES, 0), strict=True):
         np.testing.assert_array_equal(together, apart)
 
 
@@ -158,7 +164,7 @@ def test_endings_by_hand(magnet):
     off by that cap."""
     cfg = dataclasses.replace(CFG, task=TaskConfig(max_actions=2, max_steps_without_change=2))
     short = Magnet(cfg, magnet.physics, magnet.scenes)
-    episodes = rollout.rollout(cfg, short, "oracle", None, EPISODES, 0)
+    episodes = rollout.rollout(short, OraclePolicy(cfg), EPISODES, 0)
     np.testing.assert_array_equal(episodes.ending, np.where(_blocks(magnet) == 2, 0, 1))
 
 
@@ -167,7 +173,7 @@ def test_more_episodes_than_run_at_once(magnet, monkeypatch):
     """Claim: episodes beyond those that run side by side follow in order, each from its own
     scene."""
     monkeypatch.setattr(rollout, "SIDE_BY_SIDE", 3)
-    episodes = rollout.rollout(CFG, magnet, "oracle", None, EPISODES, 0)
+    episodes = rollout.rollout(magnet, ORACLE, EPISODES, 0)
     np.testing.assert_array_equal(episodes.blocks, _blocks(magnet))
     assert np.all(episodes.completed)
 
@@ -175,17 +181,81 @@ def test_more_episodes_than_run_at_once(magnet, monkeypatch):
 @pytest.mark.slow
 def test_learned_needs_its_networks_only(magnet):
     """Claim: the learned policy runs from parameters alone and gives consistent records."""
-    learner = actor_critic.make(CFG)
-    params = jax.jit(lambda key: actor_critic.init(key, learner))(jax.random.key(0)).online
-    assert_consistent(
-        rollout.rollout(CFG, magnet, "learned", params, EPISODES, 0), CFG.task.max_actions
-    )
+    episodes = rollout.rollout(magnet, learned_policy(0), EPISODES, 0)
+    assert_consistent(episodes, CFG.task.max_actions)
 
 
-def test_unknown_policy(magnet):
-    """Claim: a policy that there is not is a ValueError that names those that there are."""
-    with pytest.raises(ValueError, match="'best' is not one of: learned, random, oracle"):
-        rollout.rollout(CFG, magnet, "best", None, 1, 0)
+@pytest.mark.slow
+def test_networks_are_arguments(magnet):
+    """Claim: other weights of the same networks compile nothing again, and act otherwise."""
+    first, other = (learned_policy(seed) for seed in (0, 1))
+    one = rollout.rollout(magnet, first, EPISODES, 0)
+    compiled = rollout._program(magnet).step._cache_size()
+    two = rollout.rollout(magnet, other, EPISODES, 0)
+    assert rollout._program(magnet).step._cache_size() == compiled
+    assert any(not np.array_equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+def test_function_is_a_policy(magnet):
+    """Claim: any object with a config that maps a state and a key to an action can be measured; as
+    it may be no pytree, its calls compile once for it."""
+    calls = []
+
+    class Same:
+        cfg = CFG
+
+        def __call__(self, scene: State, key: jax.Array) -> Action:
+            calls.append(type(scene))
+            return RANDOM(scene, key)
+
+    own, episodes = Same(), rollout.rollout(magnet, RANDOM, EPISODES, 0)
+    for _ in range(2):
+        for a, b in zip(episodes, rollout.rollout(magnet, own, EPISODES, 0), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert calls == [State]
+
+
+def test_progress_counts_finished_episodes(magnet, monkeypatch):
+    """Claim: progress is told after every action how many episodes are over, at last all."""
+    monkeypatch.setattr(rollout, "SIDE_BY_SIDE", 3)
+    told: list[tuple[int, int]] = []
+    episodes = rollout.rollout(magnet, ORACLE, EPISODES, 0, lambda *at: told.append(at))
+    actions = episodes.valid.sum(axis=1)
+    finished = [int((actions[:3] <= n).sum()) for n in range(1, actions[:3].max() + 1)]
+    rest = [3 + int((actions[3:] <= n).sum()) for n in range(1, actions[3:].max() + 1)]
+    assert [count for count, _ in told][: len(finished)] == finished
+    assert told[-1] == (EPISODES, EPISODES)
+    assert len(told) == len(finished) + len(rest)
+
+
+def test_evaluate_gives_metrics(magnet, monkeypatch):
+    """Claim: the metrics of one part come as they are, of several by their names; our policies act
+    in the world of each part's environment, whatever their own config's is."""
+    elsewhere = OraclePolicy(presets.quick())
+    monkeypatch.setitem(suites.SUITES, "one", suites.Suite(lambda *_: {"a": magnet}))
+    monkeypatch.setitem(suites.SUITES, "two", suites.Suite(lambda *_: {"a": magnet, "b": magnet}))
+    told = []
+    one = rollout.evaluate(elsewhere, "one", EPISODES, progress=lambda *at: told.append(at))
+    two = rollout.evaluate(elsewhere, "two", EPISODES)
+    assert two == {"parts": {"a": one, "b": one}}
+    assert one["completion"]["value"] == one["action_efficiency"]["value"] == 1.0
+    assert told[-1] == ("a", EPISODES, EPISODES)
+    random = rollout.evaluate(RandomPolicy(presets.quick()), "one", EPISODES)
+    assert random == rollout.evaluate(RANDOM, "one", EPISODES)
+
+
+@pytest.mark.parametrize("physics", ["c", "mjx"])
+def test_configured_physics_is_kept(physics: str):
+    """Claim: physics that are named are taken; `auto` is the one of this machine."""
+    got = rollout.configured(CFG, physics, "ur5")
+    assert (got.sim.physics, got.sim.robot) == (physics, "ur5")
+    assert dataclasses.replace(got, sim=CFG.sim) == CFG
+
+
+def test_auto_is_c_on_a_cpu():
+    """Claim: on a CPU an evaluation computes physics by C MuJoCo, unless another is named."""
+    wanted = "c" if jax.default_backend() == "cpu" else "mjx"
+    assert rollout.configured(presets.get("fast"), "auto", "hand").sim.physics == wanted
 
 
 @pytest.mark.slow
@@ -194,7 +264,8 @@ def test_oracle_beats_random_in_physics():
     blocks."""
     cfg = presets.smoke()
     env = environment.make_env(cfg, stream=1, num_scenes=12)
-    oracle, random = (rollout.rollout(cfg, env, name, None, 12, 0) for name in ("oracle", "random"))
+    policies = OraclePolicy(cfg), RandomPolicy(cfg)
+    oracle, random = (rollout.rollout(env, policy, 12, 0) for policy in policies)
     for episodes in (oracle, random):
         assert_consistent(episodes, cfg.task.max_actions)
     efficiency = [e.cleared.sum() / e.valid.sum() for e in (oracle, random)]

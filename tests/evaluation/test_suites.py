@@ -73,7 +73,7 @@ def test_cases_share_their_compilation():
     assert all(env.cfg == first.cfg and env.physics is first.physics for env in others)
     begun = rollout._cached.cache_info().misses
     for env in (first, *others):
-        rollout._program(env, "oracle")
+        rollout._program(env)
     assert rollout._cached.cache_info().misses == begun + 1
 
 
@@ -164,8 +164,8 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN.scene.slots))
     everyone = blank.replace(in_play=np.ones_like(blank.in_play))
     monkeypatch.setattr(pool, "settled", lambda *_, **__: everyone)
-    for cfg, policy in ((TARGET, "learned"), (CFG, "oracle"), (CFG, "random")):
-        parts = suites.environments(cfg, "target", EPISODES, 0, policy)
+    for cfg, learned in ((TARGET, True), (CFG, False)):
+        parts = suites.environments(cfg, "target", EPISODES, 0, learned)
         assert tuple(parts) == (*cases.names(), "random10")
         for env in parts.values():
             assert (env.cfg.task.kind, env.cfg.task.max_actions) == ("target", 5)
@@ -180,5 +180,27 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
 
 def test_unknown_suite():
     """Claim: a suite that is none is refused with the names of those that there are."""
-    with pytest.raises(ValueError, match=r"'hard'.*random10, random30, cases, target, generated"):
+    names = "in_distribution, random10, random30, cases, target, generated"
+    with pytest.raises(ValueError, match=f"'hard'.*{names}"):
         suites.environments(CFG, "hard", EPISODES, 0)
+
+
+def test_suite_of_ones_own(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a registered suite is built from config, episodes and a stream that training does not
+    have; a name cannot be taken twice, neither can an old one."""
+    monkeypatch.setattr(suites, "SUITES", dict(suites.SUITES))
+    asked = []
+    suites.register("mine", lambda *at: {"part": asked.append(at)})
+    assert suites.environments(CFG, "mine", EPISODES, 3) == {"part": None}
+    assert asked == [(CFG, EPISODES, 4)]
+    for name in ("mine", "cases", "own"):
+        with pytest.raises(ValueError, match=f"there is a suite '{name}' already"):
+            suites.register(name, lambda *_: {})
+
+
+def test_old_name_of_a_suite(monkeypatch: pytest.MonkeyPatch):
+    """Claim: `own`, as older commands and records say, is the suite `in_distribution`."""
+    monkeypatch.setattr(suites.environment, "make", lambda cfg, stream, count: (stream, count))
+    wanted = {"in_distribution": (1, EPISODES)}
+    for name in ("own", "in_distribution"):
+        assert suites.environments(CFG, name, EPISODES, 0) == wanted

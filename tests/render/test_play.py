@@ -1,14 +1,18 @@
 """`csac-jax play` from the arguments to the files, with our rays."""
 
+import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from csac_jax import cli
+from csac_jax import cli, presets
 from csac_jax.render import gl, play
+from csac_jax.scene import layout
 
 pytestmark = pytest.mark.mjx
 
@@ -38,7 +42,7 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
     assert len(lines) == 2
     assert "grasp at x " in lines[0]
     assert "lifted (red); reward +1.00; 0 blocks left" in lines[0]
-    assert lines[1] == "the table is clear after 1 actions, 1 blocks taken"
+    assert lines[1] == "the table is clear after 1 action: 1 block taken"
     result = json.loads((here / "a" / "b.json").read_text())
     assert (result["actions"], result["cleared"], result["completed"], result["renderer"]) == (
         1,
@@ -46,6 +50,7 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
         True,
         "rays",
     )
+    assert result["blocks_lost"] == 0
     assert (
         imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + play.HOLD
     )  # 4 ms a substep, 25 a second
@@ -61,6 +66,62 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
     red = [np.argwhere(_is_red(image)) for image in pictures]
     row = [places[:, 0].mean() for places in red]
     assert row[-1] < row[0] - 5  # the cube is seen to rise
+
+
+def _step(
+    cleared: int = 0,
+    blocks_lost: int = 0,
+    terminated: bool = False,
+    reward: float = 0.0,
+    target: int = layout.ANY,
+    actions: int = 1,
+    diverged: bool = False,
+) -> Any:
+    """What an episode's summary reads of a step."""
+    info = SimpleNamespace(
+        cleared=cleared, blocks_lost=blocks_lost, physics_diverged=np.bool_(diverged)
+    )
+    after = SimpleNamespace(
+        info=info,
+        terminated=np.bool_(terminated),
+        reward=reward,
+        scene=SimpleNamespace(target=target),
+        actions=np.int32(actions),
+    )
+    return SimpleNamespace(after=after)
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        (
+            [_step(cleared=2), _step(cleared=1, terminated=True)],
+            "the table is clear after 2 actions: 3 blocks taken",
+        ),
+        (
+            [_step(blocks_lost=1, terminated=True)],
+            "no block is left within reach after 1 action: "
+            "0 blocks taken, 1 block left the workspace",
+        ),
+        (
+            [_step(blocks_lost=1), _step(cleared=1, reward=1.0, target=0, terminated=True)],
+            "the target is taken after 2 actions: 1 block taken, 1 block left the workspace",
+        ),
+        (
+            [_step(blocks_lost=1, target=0, terminated=True)],
+            "the target is lost after 1 action: 0 blocks taken, 1 block left the workspace",
+        ),
+        ([_step(actions=30)], "stopped at the action limit after 1 action: 0 blocks taken"),
+        ([_step()], "stopped since nothing changed any more after 1 action: 0 blocks taken"),
+        ([_step(diverged=True)], "stopped since physics diverged after 1 action: 0 blocks taken"),
+    ],
+)
+def test_summary_says_what_became_of_the_blocks(steps: list[Any], said: str):
+    """Claim: the last line of an episode tells blocks taken from blocks lost, and why it ended."""
+    cfg = presets.smoke()
+    task = dataclasses.replace(cfg.task, max_actions=30)
+    assert play.summary(dataclasses.replace(cfg, task=task), steps) == said
+    assert play.completed(steps) == said.startswith(("the table is clear", "the target is taken"))
 
 
 def _is_red(image: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ SIZE = CFG.heightmap.size
 SCENE = np.full((120, 160, 3), 7, np.uint8)
 
 
-def _moment(primitive: int, pose: tuple[float, float, float], learned: bool) -> SimpleNamespace:
+def _step(primitive: int, pose: tuple[float, float, float], learned: bool) -> SimpleNamespace:
     """A block at x 0.1, y -0.15 m; Q of pushes highest at x -0.1, y 0.1 m; candidates at x 0.15, y
     0.15 m."""
     height, q = np.zeros((SIZE, SIZE)), np.full((2, SIZE, SIZE), -np.inf)
@@ -26,12 +26,10 @@ def _moment(primitive: int, pose: tuple[float, float, float], learned: bool) -> 
     q[0, row, col] = 2.0
     cloud = np.tile([0.15, 0.15, 0.0], (2, 8, 1))
     cloud[1, :, 0] = -0.15
-    thought = (
-        SimpleNamespace(q=q, candidates=cloud, best_grasp=np.float32(0.5)) if learned else None
-    )
+    debug = SimpleNamespace(q=q, candidates=cloud, best_grasp=np.float32(0.5)) if learned else None
     action = SimpleNamespace(primitive=np.int32(primitive), pose=np.array(pose))
     before = SimpleNamespace(obs=SimpleNamespace(height=height))
-    return SimpleNamespace(before=before, action=action, thought=thought)
+    return SimpleNamespace(before=before, action=action, debug=debug)
 
 
 def _cell(x: float, y: float) -> tuple[int, int]:
@@ -49,7 +47,7 @@ def _centre(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
 def test_height_map_and_action_lie_where_they_are():
     """Claim: in the height map x runs to the right and y upwards; a grasp is drawn about its place,
     closing along its yaw; a push begins at its place and is as long as it goes."""
-    image = view.beside(CFG, SCENE, _moment(Primitive.GRASP, (-0.1, 0.05, 0.0), learned=False), "")[
+    image = view.beside(CFG, SCENE, _step(Primitive.GRASP, (-0.1, 0.05, 0.0), learned=False), "")[
         :120, 160:
     ]
     assert image.shape == (120, 120, 3)
@@ -60,7 +58,7 @@ def test_height_map_and_action_lie_where_they_are():
     rows, columns = np.argwhere((image == view.CHOSEN).all(axis=2)).T
     assert np.ptp(columns) > 2 * np.ptp(rows)  # along x
     pushed = view.beside(
-        CFG, SCENE, _moment(Primitive.PUSH, (-0.1, 0.0, 0.5 * np.pi), learned=False), ""
+        CFG, SCENE, _step(Primitive.PUSH, (-0.1, 0.0, 0.5 * np.pi), learned=False), ""
     )[:120, 160:]
     rows, columns = np.argwhere((pushed == view.CHOSEN).all(axis=2)).T
     start, end = (
@@ -72,7 +70,7 @@ def test_height_map_and_action_lie_where_they_are():
 def test_learned_policy_shows_its_maps():
     """Claim: a learned policy's maps stand above: pushes left, grasps right; candidates below in
     their colours."""
-    image = view.beside(CFG, SCENE, _moment(Primitive.GRASP, (0.0, 0.0, 0.0), learned=True), "")
+    image = view.beside(CFG, SCENE, _step(Primitive.GRASP, (0.0, 0.0, 0.0), learned=True), "")
     assert image.shape[1] == 160 + 120
     pushes, grasps = image[:60, 160:220], image[:60, 220:280]
     lightest = (253, 231, 37)
@@ -91,8 +89,8 @@ def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tupl
     """Claim: sides are even, as videos need; the scene is untouched, and the text stands below
     everything."""
     scene = np.full((*size, 3), 7, np.uint8)
-    moment = _moment(Primitive.PUSH, (0.0, 0.0, 0.0), learned)
-    bare, told = (view.beside(CFG, scene, moment, text) for text in ("", "grasp: lifted"))
+    step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned)
+    bare, told = (view.beside(CFG, scene, step, text) for text in ("", "grasp: lifted"))
     assert bare.shape == told.shape
     assert all(side % 2 == 0 for side in told.shape[:2])
     np.testing.assert_array_equal(told[: size[0], : size[1]], scene)
@@ -103,6 +101,6 @@ def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tupl
 
 def test_nothing_to_act_on():
     """Claim: maps without a valid cell are drawn, too."""
-    moment = _moment(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True)
-    moment.thought.q[:] = -np.inf
-    assert view.beside(dataclasses.replace(CFG), SCENE, moment, "").any()
+    step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True)
+    step.debug.q[:] = -np.inf
+    assert view.beside(dataclasses.replace(CFG), SCENE, step, "").any()

@@ -1,0 +1,197 @@
+"""What acts: a policy is an object that takes one scene and a key, and returns an action."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from csac_jax import geometry
+from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent.actor_critic import Params
+from csac_jax.agent.learner import Learner
+from csac_jax.config import Config
+from csac_jax.env import State
+from csac_jax.io import checkpoint, policy_file
+from csac_jax.nets import networks
+from csac_jax.sim import oracle
+from csac_jax.sim.primitives import Action
+from csac_jax.training import step
+from csac_jax.vision.heightmap import Observation
+
+
+class Policy(Protocol):
+    """Chooses the action of one scene. Pure: vmap and jit it."""
+
+    @property
+    def cfg(self) -> Config:
+        """Config of the scenes, views and task that the policy acts in."""
+
+    def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
+        """The action in a scene, given as its observation or as the environment's state."""
+
+
+class PolicyDebug(NamedTuple):
+    """What a learned policy computed in a state. P = primitives, J = CEM candidates."""
+
+    q: jax.Array  # [P, H, W] largest value over the yaws; -inf where there is nothing to act on
+    candidates: jax.Array  # [P, J, 3] m, m, rad: the poses of the last CEM round
+    best_grasp: jax.Array  # [] phi_g of CSAC eq. 16, by the critic that acts
+
+
+@struct.dataclass
+class LearnedPolicy:
+    """The greedy policy of trained networks, without exploration.
+
+    The rule that pushes after no visible change (`policy.primitive rule`) needs a State: a bare
+    Observation counts as one after a change.
+    """
+
+    cfg: Config = struct.field(pytree_node=False)
+    params: Params
+    network: Any = struct.field(pytree_node=False, default=None)  # a critic of one's own
+
+    @jax.jit
+    def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
+        """See `Policy`."""
+        actions = self.batched(*jax.tree.map(lambda leaf: leaf[None], (scene, key)))
+        return jax.tree.map(lambda leaf: leaf[0], actions)
+
+    def batched(self, scenes: Observation | State, keys: jax.Array) -> Action:
+        """Actions, leaves [E], of scenes, leaves [E, ...], and keys [E].
+
+        The networks see groups of scenes that fit the memory. Under vmap they would see all.
+        """
+        parts = actor_critic.make(self.cfg, self.network)
+        dense_maps = actor_critic.dense_maps(parts, self.params, _observation(scenes))
+        best = jax.vmap(policy.best_action, (0, None, 0, 0))
+        return best(keys, parts, dense_maps, _steps_without_change(scenes, len(keys)))
+
+    @jax.jit
+    def debug(self, scene: Observation | State, key: jax.Array) -> PolicyDebug:
+        """What the action in this scene with this key follows from."""
+        parts = actor_critic.make(self.cfg, self.network)
+        obs = jax.tree.map(lambda leaf: leaf[None], _observation(scene))
+        batch = actor_critic.dense_maps(parts, self.params, obs)
+        dense_maps = jax.tree.map(lambda leaf: leaf[0], batch)
+        places = geometry.cell_centres(self.cfg.heightmap)
+        q, _ = maps.best_over_yaws(parts.frames, dense_maps, places)
+        candidates = policy.candidates(key, parts, dense_maps)
+        return PolicyDebug(q, candidates, actor_critic.best_grasp(dense_maps))
+
+
+@struct.dataclass
+class LearnerPolicy:
+    """What a learner of one's own does without exploration."""
+
+    cfg: Config = struct.field(pytree_node=False)
+    learner: Learner = struct.field(pytree_node=False)
+    state: Any
+
+    @jax.jit
+    def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
+        """See `Policy`."""
+        obs, unchanged = _observation(scene), jnp.zeros((), jnp.int32)
+        if isinstance(scene, State):
+            unchanged = scene.steps_without_change
+        obs, unchanged = jax.tree.map(lambda leaf: leaf[None], (obs, unchanged))
+        actions = self.learner.act(key, self.state, obs, unchanged)
+        return jax.tree.map(lambda leaf: leaf[0], actions)
+
+
+@struct.dataclass
+class RandomPolicy:
+    """Grasps at a random place above a block, with a random yaw."""
+
+    cfg: Config = struct.field(pytree_node=False)
+
+    @jax.jit
+    def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
+        """See `Policy`."""
+        frames = maps.frames(self.cfg, networks.make(self.cfg.net))
+        valid = maps.actionable_cells(frames, _observation(scene))
+        return policy.random_grasp(key, frames, valid)
+
+
+@struct.dataclass
+class OraclePolicy:
+    """A planner that reads the poses of the blocks: what physics allows at best.
+
+    `cfg` must be that of the environment, whose kinds of blocks it holds.
+    """
+
+    cfg: Config = struct.field(pytree_node=False)
+
+    @jax.jit
+    def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
+        """See `Policy`. Raises TypeError for an observation."""
+        if not isinstance(scene, State):
+            raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
+        cfg = self.cfg
+        return oracle.grasp(cfg.sim, cfg.heightmap, cfg.scene.slots, scene.scene, scene.obs.height)
+
+
+def _observation(scene: Observation | State) -> Observation:
+    return scene.obs if isinstance(scene, State) else scene
+
+
+def _steps_without_change(scenes: Observation | State, num: int) -> jax.Array:
+    return scenes.steps_without_change if isinstance(scenes, State) else jnp.zeros(num, jnp.int32)
+
+
+def in_world(policy: Policy, cfg: Config) -> Policy:
+    """The policy for an environment of this config; a policy of the user's own as it is."""
+    if isinstance(policy, LearnedPolicy | LearnerPolicy | RandomPolicy | OraclePolicy):
+        return dataclasses.replace(policy, cfg=cfg)
+    return policy
+
+
+def act(policy: Policy, states: State, keys: jax.Array) -> Action:
+    """Actions, leaves [E], of a policy in states, leaves [E, ...], with keys [E]."""
+    if isinstance(policy, LearnedPolicy):
+        return policy.batched(states, keys)
+    return jax.vmap(policy)(states, keys)
+
+
+def load_config(source: str | Path) -> Config:
+    """The config of a policy, see `load`."""
+    path = _path(source)
+    return policy_file.load(path)[0] if path.is_file() else checkpoint.load_config(path)
+
+
+def load(source: str | Path, network: Any = None, learner: Learner | None = None) -> Policy:
+    """The policy `shipped`, of a policy file, or of the newest checkpoint in a run's folder.
+
+    Args: network and learner of one's own, where the run was trained with them.
+    Raises FileNotFoundError, PolicyFileError or CheckpointError, with the remedy.
+    """
+    path = _path(source)
+    if path.is_file():
+        return LearnedPolicy(*policy_file.load(path))
+    cfg = checkpoint.load_config(path)
+    blank = step.without_physics(cfg)
+    program = step.make(cfg, env=blank, learner=learner, network=network)
+    state, _ = checkpoint.restore(path, step.abstract_state(program))
+    if learner is not None:
+        return LearnerPolicy(cfg, learner, state.learner)
+    return LearnedPolicy(cfg, state.learner.online, network)
+
+
+def _path(source: str | Path) -> Path:
+    path = policy_file.SHIPPED if source == "shipped" else Path(source)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"there is no folder {path}; give the folder of a run, a policy file, or shipped"
+        )
+    return path
+
+
+POLICIES: dict[str, Callable[[str], Policy]] = {
+    "learned": load,
+    "random": lambda source: RandomPolicy(load_config(source)),
+    "oracle": lambda source: OraclePolicy(load_config(source)),
+}
+"""Kinds of policy by name: each made from a source, whose config it takes, see `load`."""

@@ -1,0 +1,135 @@
+"""Policies as objects: one scene and a key in, an action out."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import env as environment, presets
+from csac_jax.agent import learner as learning, policy
+from csac_jax.constants import Primitive
+from csac_jax.env import State
+from csac_jax.evaluation import policies
+from csac_jax.evaluation.policies import LearnedPolicy, OraclePolicy, RandomPolicy
+from csac_jax.io import policy_file
+
+pytestmark = pytest.mark.mjx
+
+SMOKE = presets.smoke()
+CFG = dataclasses.replace(
+    SMOKE,
+    policy=dataclasses.replace(SMOKE.policy, primitive="rule"),
+    sim=dataclasses.replace(SMOKE.sim, physics="c"),
+)
+SCENES = 3
+
+
+@pytest.fixture(scope="module")
+def learned() -> LearnedPolicy:
+    """Networks as they begin."""
+    learner = learning.make(CFG)
+    params = jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)).online
+    return LearnedPolicy(CFG, params)
+
+
+@pytest.fixture(scope="module")
+def states() -> State:
+    """Settled scenes; the last actions of the second one changed nothing."""
+    env = environment.make(CFG, stream=1, scenes=SCENES)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(SCENES))
+    states = jax.jit(jax.vmap(env.reset))(keys)
+    return states.replace(steps_without_change=jnp.array([0, 2, 0], jnp.int32))
+
+
+def _scene(states: State, number: int) -> State:
+    return jax.tree.map(lambda leaf: leaf[number], states)
+
+
+def _keys() -> jax.Array:
+    return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(5), jnp.arange(SCENES))
+
+
+def test_learned_acts_like_the_agent(learned, states):
+    """Claim: the learned policy is `agent.policy.best_action` of the networks' maps, in a batch and
+    in one scene."""
+    learner = learning.make(CFG)
+
+    @jax.jit
+    def wanted(params, states, keys):
+        dense_maps = learning.look(learner, params, states.obs)
+        best = functools.partial(policy.best_action, cfg=CFG, frames=learner.frames)
+        low, high = learner.bounds
+        return jax.vmap(
+            lambda key, one, unchanged: best(
+                key, state=one, penalty=high - low, steps_without_change=unchanged
+            )
+        )(keys, dense_maps, states.steps_without_change)
+
+    expected = wanted(learned.params, states, _keys())
+    batch = jax.jit(policies.act)(learned, states, _keys())
+    jax.tree.map(np.testing.assert_array_equal, batch, expected)
+    assert batch.primitive.tolist() == [Primitive.GRASP, Primitive.PUSH, Primitive.GRASP]
+    for number in range(SCENES):
+        one = learned(_scene(states, number), _keys()[number])
+        assert one.primitive == expected.primitive[number]
+        np.testing.assert_allclose(one.pose, expected.pose[number], atol=1e-4)
+
+
+def test_observation_serves_for_a_state(learned, states):
+    """Claim: learned and random policy act on a bare observation as in the state; without a state
+    no action counts as one without change."""
+    state, key = _scene(states, 0), jax.random.key(1)
+    for one in (learned, RandomPolicy(CFG)):
+        jax.tree.map(np.testing.assert_array_equal, one(state, key), one(state.obs, key))
+    assert learned(_scene(states, 1), key).primitive == Primitive.PUSH
+    assert learned(_scene(states, 1).obs, key).primitive == Primitive.GRASP
+
+
+def test_oracle_asks_for_a_state(states):
+    """Claim: the oracle acts on a state, and says so where it is given an observation."""
+    state, key = _scene(states, 0), jax.random.key(1)
+    action = OraclePolicy(CFG)(state, key)
+    places = state.scene.position[np.asarray(state.scene.in_play), :2]
+    assert np.linalg.norm(places - action.pose[:2], axis=1).min() < 1e-6
+    with pytest.raises(TypeError, match="give it a State"):
+        OraclePolicy(CFG)(state.obs, key)
+
+
+@pytest.mark.parametrize("kind", [RandomPolicy, OraclePolicy])
+def test_policies_are_pure(kind, states):
+    """Claim: a policy can be vmapped and jitted, itself an argument; it is as in each scene."""
+    batch = jax.jit(lambda one, *at: jax.vmap(one)(*at))(kind(CFG), states, _keys())
+    for number in range(SCENES):
+        one = kind(CFG)(_scene(states, number), _keys()[number])
+        assert one.primitive == batch.primitive[number]
+        np.testing.assert_allclose(one.pose, batch.pose[number], atol=1e-6)
+
+
+def test_debug_is_of_the_action(learned, states):
+    """Claim: the debug view of a state holds the best grasp's value that the agent sees, and
+    candidates next to the action."""
+    state, key = _scene(states, 0), jax.random.key(2)
+    seen, action = learned.debug(state, key), learned(state, key)
+    learner, obs = learning.make(CFG), jax.tree.map(lambda leaf: leaf[:1], states.obs)
+    dense_maps = jax.jit(lambda obs: learning.look(learner, learned.params, obs))(obs)
+    (best,) = jax.vmap(learning.best_grasp)(dense_maps)
+    np.testing.assert_allclose(seen.best_grasp, best, rtol=1e-5)
+    assert seen.q.shape == (2, CFG.heightmap.size, CFG.heightmap.size)
+    places = seen.candidates[Primitive.GRASP, :, :2]
+    assert np.linalg.norm(places - action.pose[:2], axis=1).min() < 2 * CFG.heightmap.cell
+
+
+def test_load_reads_a_file(tmp_path, learned):
+    """Claim: a policy comes from its file, as learned; the other kinds take the config alone."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, learned.params, CFG)
+    read = policies.load(str(path))
+    assert read.cfg == CFG
+    jax.tree.map(np.testing.assert_array_equal, read.params, learned.params)
+    assert policies.POLICIES["random"](str(path)) == RandomPolicy(CFG)
+    assert policies.POLICIES["oracle"](str(path)) == OraclePolicy(CFG)
+    with pytest.raises(FileNotFoundError, match="there is no folder nowhere"):
+        policies.load("nowhere")
