@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.agent import learner as learning
 from csac_jax.config import TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.agent import cem, explore, actor_critic, losses, rewards, softmax
+from csac_jax.agent import actor_critic, cem, explore, losses, rewards, softmax
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.config import Config
 from csac_jax.replay import samplers
