@@ -185,7 +185,7 @@ HAND_ORDER = "actuators must be x, y, z, yaw, finger, not "
         ("hand", "blocks.xml", '<mesh name="prism"', '<mesh name="p"', "mesh 'prism' is missing"),
         ("hand", "blocks.xml", 'class="block"', 'class="b"', "default class 'block' is missing"),
         ("hand", "table.xml", "<worldbody>", '<worldbody><body name="block0"/>', "repeated name"),
-        ("hand", "table.xml", "<mujoco", "<mujocoo", "XML Error"),
+        ("hand", "table.xml", "<mujoco", "<mujocoo", "XML parse error"),
         ("hand", "hand.xml", 'joint1="finger_low"', 'joint1="thumb"', "thumb"),
         ("hand", "hand.xml", 'joint="finger_low"', 'joint="thumb"', "thumb"),
     ],

@@ -36,7 +36,7 @@ def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(
-    ("backend", "installed", "measured", "mesh_size_jitter", "scenes", "chosen"),
+    ("platform", "installed", "measured", "mesh_size_jitter", "scenes", "chosen"),
     [
         ("gpu", True, range(64, 5001), 0.0, 256, "warp"),
         ("cpu", True, range(64, 5001), 0.0, 256, "c"),
@@ -48,11 +48,11 @@ def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_choice(
-    monkeypatch: pytest.MonkeyPatch, backend, installed, measured, mesh_size_jitter, scenes, chosen
+    monkeypatch: pytest.MonkeyPatch, platform, installed, measured, mesh_size_jitter, scenes, chosen
 ):
     """Claim: `auto` is `c` on a CPU, `warp` where measured to be faster, on CUDA, installed, able
     to do the scene; else `mjx`, also on several devices."""
-    monkeypatch.setattr(backend.jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(backend.jax, "default_backend", lambda: platform)
     monkeypatch.setattr(
         backend.importlib.util, "find_spec", lambda name: object() if installed else None
     )
