@@ -119,7 +119,7 @@ def _train(
     from rich.console import Console
 
     from csac_jax.io import checkpoint
-    from csac_jax.report.progress import Group, Terminal
+    from csac_jax.report.progress import Reporters, Terminal
     from csac_jax.runtime import cache
     from csac_jax.training import loop, step
 
@@ -141,7 +141,7 @@ def _train(
                 run_dir,
                 lambda: step.init(program, trunk),
                 lambda num_steps: step.compile_chunk(program, num_steps),
-                Group(reporters),
+                Reporters(reporters),
                 stop,
                 resume=options.resume is not None,
             )
