@@ -50,9 +50,9 @@ format: $(STAMP)  ## rewrite the sources in ruff's format
 bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke for another preset
 	$(BIN)/csac-jax bench $(NAME) $(ARGS)
 
-pictures: $(STAMP)  ## the pictures of README.md, anew
+pictures: $(STAMP)  ## draw the pictures of README.md
 	for shown in row:hand ridge:hand pinwheel:ur5 hole:ur5; do \
-	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 320 240 --no-views --png docs/pictures/$${shown%:*}.png; \
+	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 480 360 --no-views --png docs/pictures/$${shown%:*}.png; \
 	done
 	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
 

@@ -13,7 +13,7 @@ from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import metrics, rollout
 from csac_jax.evaluation.rollout import StepRecord
-from csac_jax.render import picture, view
+from csac_jax.render import media, panels, picture
 from csac_jax.render.picture import View
 from csac_jax.scene import blocks, layout, model
 from csac_jax.sim import c_physics
@@ -41,20 +41,21 @@ class Stage:
         opengl: str | None,
         views: bool = False,
     ) -> None:
-        self._cfg, self._views = cfg, views  # whether to show what the policy saw, too
+        self._cfg, self._height = cfg, size[1]
+        self._views = views  # whether panels show what the policy saw
         self._world = model.build(cfg.scene, cfg.sim)
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
         self._model = model.with_blocks(self._world, self._fields)
         colours = blocks.COLOURS[first.scene.colour[self._world.parts.slot]]
         self._model.geom_rgba[self._world.block_geoms, :3] = colours
         self._data = mujoco.MjData(self._model)
-        self._every = max(round(1.0 / (picture.FRAMES_PER_SECOND * cfg.sim.timestep)), 1)
+        self._every = max(round(1.0 / (media.FRAMES_PER_SECOND * cfg.sim.timestep)), 1)
         eye = dataclasses.replace(VIEWS[cfg.sim.robot], size=size)
-        self._draw = picture.artist(self._model, eye, opengl)
+        self._draw = picture.renderer(self._model, eye, opengl)
 
     def still(self, step: StepRecord, text: str = "") -> np.ndarray:
         """The scene before an action, the robot where that action starts: [H, W, 3] uint8."""
-        return self._beside(self._still(step), step, text)
+        return self._frame(step)(self._still(step), text)
 
     def _still(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos
@@ -67,17 +68,19 @@ class Stage:
 
         With views, HOLD more pictures of the end; `text` below up to its colon, there all of it.
         """
-        image, action = self._still(step), text.split(":")[0]
-        yield self._beside(image, step, action)
+        image, frame, action = self._still(step), self._frame(step), text.split(":")[0]
+        yield frame(image, action)
         recorded = c_physics.trajectory(self._world, self._fields, step.before.scene, step.joints)
         for pose in recorded.qpos[:: self._every]:
             self._data.qpos[:] = pose
             image = self._picture()
-            yield self._beside(image, step, action)
-        yield from [self._beside(image, step, text)] * (HOLD if self._views else 0)
+            yield frame(image, action)
+        yield from [frame(image, text)] * (HOLD if self._views else 0)
 
-    def _beside(self, image: np.ndarray, step: StepRecord, text: str) -> np.ndarray:
-        return view.beside(self._cfg, image, step, text) if self._views else image
+    def _frame(self, step: StepRecord) -> panels.Frame:
+        if self._views:
+            return panels.frame(self._cfg, step, self._height)
+        return lambda scene, text: scene
 
     def _picture(self) -> np.ndarray:
         mujoco.mj_kinematics(self._model, self._data)
@@ -151,9 +154,9 @@ def record(stage: Stage, steps: list[StepRecord], png: Path | None, video: Path 
     """Writes the picture of the first step, and the video of them all."""
     lines = [line(number, step) for number, step in enumerate(steps, 1)]
     if png is not None:
-        picture.write_png(png, stage.still(steps[0], lines[0]))
+        media.write_picture(png, stage.still(steps[0], lines[0]))
     if video is not None:
         told = zip(steps, lines, strict=True)
-        picture.write_video(
+        media.write_video(
             video, (frame for step, text in told for frame in stage.motion(step, text))
         )

@@ -1,8 +1,7 @@
-"""A run on the terminal: a live line there, plain lines where the output goes to a file."""
+"""Progress of a run: a live bar on a terminal, plain lines in a file."""
 
 import time
 from collections.abc import Sequence
-from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
@@ -12,8 +11,8 @@ from csac_jax.training.loop import Record, Reporter
 PLAIN_INTERVAL = 10.0  # s between lines where there is no terminal
 
 
-def text(record: Record, eta: float) -> str:
-    """Speed, success, losses and remaining time in one line."""
+def describe(record: Record, eta: float) -> str:
+    """Speed, success, losses and remaining time `eta`, s, in one line."""
     parts = [f"{record.actions_per_second:.1f}/s"]
     if record.grasp_success is not None:
         parts.append(f"grasp success {record.grasp_success:.0%} of last {record.grasps_counted}")
@@ -21,19 +20,19 @@ def text(record: Record, eta: float) -> str:
         parts.append(f"loss critic {record.critic_loss:.3f} actor {record.actor_loss:.3f}")
     else:
         parts.append("warming up")
-    return ", ".join([*parts, f"{duration(eta)} left"])
+    return ", ".join([*parts, f"{_duration(eta)} left"])
 
 
-def duration(seconds: float) -> str:
-    """Hours, minutes and seconds, as in `1:02:03` or `2:03`."""
+def _duration(seconds: float) -> str:
+    """As in `1:02:03` or `2:03`."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
 class Terminal:
-    """Reporter with a bar if `console` is a terminal, else with a line every `PLAIN_INTERVAL`. Use
-    it in a `with`."""
+    """A reporter with a bar on a terminal, else with a line every PLAIN_INTERVAL. Its `with` ends
+    the bar."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -45,55 +44,50 @@ class Terminal:
             console=console,
         )
         self._task: TaskID | None = None
-        self._shown = -PLAIN_INTERVAL
+        self._printed_at = -PLAIN_INTERVAL
 
     def __enter__(self) -> "Terminal":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
     def say(self, text: str) -> None:
-        """Prints a line, above the bar if there is one."""
+        """Prints a line above the bar."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        """Moves the bar, or prints a line if the last one is some time ago or this is the last
-        chunk."""
+        """Moves the bar; without a terminal, prints a line if one is due."""
         if not self._console.is_terminal:
-            self._plain(record, total_actions, eta)
+            self._print_if_due(record, total_actions, eta)
             return
         if self._task is None:
             self._bar.start()
             self._task = self._bar.add_task("", total=total_actions)
+        description = describe(record, eta)
         self._bar.update(
-            self._task, completed=record.actions, description=text(record, eta), refresh=True
+            self._task, completed=record.actions, description=description, refresh=True
         )
 
-    def _plain(self, record: Record, total_actions: int, eta: float) -> None:
+    def _print_if_due(self, record: Record, total_actions: int, eta: float) -> None:
         now = time.monotonic()
-        if now - self._shown >= PLAIN_INTERVAL or record.actions >= total_actions:
-            self._shown = now
-            self.say(f"{record.actions} of {total_actions} actions, {text(record, eta)}")
+        if now - self._printed_at >= PLAIN_INTERVAL or record.actions >= total_actions:
+            self._printed_at = now
+            self.say(f"{record.actions} of {total_actions} actions, {describe(record, eta)}")
 
 
-class Group:
+class Reporters:
     """Several reporters as one."""
 
     def __init__(self, reporters: Sequence[Reporter]) -> None:
         self._reporters = reporters
 
     def say(self, text: str) -> None:
-        """Passes a line on."""
+        """Passes the line on."""
         for reporter in self._reporters:
             reporter.say(text)
 
     def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        """Passes a chunk's record on."""
+        """Passes the record on."""
         for reporter in self._reporters:
             reporter.progress(record, total_actions, eta)
