@@ -26,6 +26,14 @@ def _require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
+def _is_plain(value: Any) -> bool:
+    """Whether a setting, or every one of a section, is a plain value. A sweep traces some numbers:
+    their ranges were checked before."""
+    if dataclasses.is_dataclass(value):
+        return all(_is_plain(getattr(value, field.name)) for field in dataclasses.fields(value))
+    return isinstance(value, bool | int | float | str | tuple)
+
+
 def _require_choices(cfg: Any, section: str) -> None:
     """Every field of a Literal type, or of a tuple of them, has its values: a typing mistake must
     not pass for the other branch."""
@@ -459,6 +467,8 @@ class CEMConfig:
     without those; or about the best cell, with no use of the actor."""
 
     def __post_init__(self) -> None:
+        if not _is_plain(self):
+            return
         _require_choices(self, "cem.")
         _require(2 <= self.elites <= self.candidates, "cem.elites: must lie in 2 .. cem.candidates")
         _require(self.rounds >= 1, "cem.rounds: at least 1")
@@ -502,6 +512,8 @@ class TargetConfig:
     """beta of the softmax for a Q range of 1; divided by the range of possible returns."""
 
     def __post_init__(self) -> None:
+        if not _is_plain(self):
+            return
         _require_choices(self, "target.")
         _require(0.0 <= self.gamma < 1.0, "target.gamma: must lie in 0 <= gamma < 1")
         _require(self.samples >= 1, "target.samples: at least 1")
@@ -554,6 +566,8 @@ class RewardConfig:
     (ours)."""
 
     def __post_init__(self) -> None:
+        if not _is_plain(self):
+            return
         _require_choices(self, "reward.")
         _require(
             self.distance_weight >= 0.0,
@@ -600,6 +614,8 @@ class ExploreConfig:
     """Share of pushes among random primitives (ours)."""
 
     def __post_init__(self) -> None:
+        if not _is_plain(self):
+            return
         for name in (
             "epsilon_primitive_start",
             "epsilon_primitive_end",
@@ -658,6 +674,8 @@ class LearnConfig:
     """Width of the quadratic part of the Huber loss (CSAC sec. 4)."""
 
     def __post_init__(self) -> None:
+        if not _is_plain(self):
+            return
         _require_choices(self, "learn.")
         _require(self.learning_rate > 0.0, "learn.learning_rate: must be positive")
         _require(0 <= self.augment_shift <= 64, "learn.augment_shift: must lie in 0 .. 64 cells")
@@ -712,6 +730,8 @@ class ReplayConfig:
     """Beta: (a, b) in the end (CSAC sec. 4.3)."""
 
     def __post_init__(self) -> None:
+        if not _is_plain(self):
+            return
         _require_choices(self, "replay.")
         _require(2 <= self.capacity <= 2**30, "replay.capacity: must lie in 2 .. 2^30 transitions")
         _require(0.0 <= self.alpha <= 1.0, "replay.alpha: must lie in 0 .. 1")
@@ -776,6 +796,8 @@ class Config:
     train: TrainConfig = TrainConfig()
 
     def __post_init__(self) -> None:
+        if not _is_plain(self):
+            return
         _require_choices(self, "")
         _require(0 <= self.seed < 2**31, "seed: must lie in 0 .. 2147483647")
         _require(

@@ -1,5 +1,9 @@
-"""What goes wrong with a scene for a reason that its user can mend."""
+"""What goes wrong for a reason that the user can mend. A message is one line with the remedy."""
 
 
 class SceneError(Exception):
-    """A scene that cannot be simulated or settled. The message is one line with the remedy."""
+    """A scene that cannot be simulated or settled."""
+
+
+class DeviceError(Exception):
+    """A device that is asked for and is not there."""

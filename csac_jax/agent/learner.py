@@ -90,9 +90,8 @@ def make(cfg: Config) -> Learner:
     )
 
 
-def with_numbers(learner: Learner, cfg: Config, bounds: tuple[Any, Any]) -> Learner:
-    """The learner of a config that differs in numbers only, which may be traced, and with them the
-    `bounds`."""
+def replace_hyperparams(learner: Learner, cfg: Config, bounds: tuple[Any, Any]) -> Learner:
+    """The learner with the hyper-parameters of `cfg` and their bounds of returns, traced or not."""
     critic_optimiser, actor_optimiser = _optimisers(cfg)
     return dataclasses.replace(
         learner,

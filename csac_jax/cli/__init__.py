@@ -13,7 +13,7 @@ import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.cli import bench, doctor, evaluation, export, play, report, sweep, train
 from csac_jax.cli.errors import PROGRAM, BadArgumentsError, FailedError, complain
-from csac_jax.errors import SceneError
+from csac_jax.errors import DeviceError, SceneError
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         return _dispatch(arguments)
-    except BadArgumentsError as error:
+    except (BadArgumentsError, DeviceError) as error:
         return complain(2, error)
     except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -60,6 +60,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return complain(1, error)
     except KeyboardInterrupt:
         return complain(130, "stopped")
+
+
+def _call(command: Callable[[list[str]], int], arguments: list[str]) -> int:
+    """Runs a command. If JAX starts without a device, DeviceError says so."""
+    try:
+        return command(arguments)
+    except (RuntimeError, AssertionError):
+        from csac_jax.runtime import devices
+
+        devices.require()
+        raise
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -73,4 +84,4 @@ def _dispatch(arguments: list[str]) -> int:
         raise BadArgumentsError(
             f"unknown command '{arguments[0]}'; choose one of: {', '.join(COMMANDS)}"
         )
-    return COMMANDS[arguments[0]](arguments[1:])
+    return _call(COMMANDS[arguments[0]], arguments[1:])

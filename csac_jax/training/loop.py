@@ -17,6 +17,7 @@ from csac_jax.constants import GRASP_WINDOW, OUTCOMES, Outcome, Primitive
 from csac_jax.io import checkpoint, config_json, files
 from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
+from csac_jax.training import memory
 
 LOSSES = ("critic_loss", "actor_loss")
 DIVERGED_SHARE = 1e-3  # share of a chunk's actions whose physics failed beyond which physics is to be doubted; 1e-5 is common
@@ -182,7 +183,8 @@ def compile_program(
     begun, hits = time.perf_counter(), cache.hits()
     program = compiler.lower(compile_chunk(cfg.train.chunk), state).compile()
     seconds = time.perf_counter() - begun
-    reporter.say(f"compiled in {seconds:.1f} s{' (from the cache)' if cache.hits() > hits else ''}")
+    source = " (from the cache)" if cache.hits() > hits else ""
+    reporter.say(f"compiled in {seconds:.1f} s{source}; {memory.compiled_text(program)}")
     return program, seconds
 
 

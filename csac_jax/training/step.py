@@ -25,7 +25,7 @@ from csac_jax.runtime import compiler
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action
 from csac_jax.training import chunked_vmap
-from csac_jax.training.sharding import ALONE, Spread
+from csac_jax.training.sharding import UNSHARDED, DataSharding
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 
@@ -69,10 +69,15 @@ class Program:
     cfg: Config
     env: Env
     learner: Learner
-    spread: Spread = ALONE  # of scenes and batches over devices
-    at_once: int | None = (
-        None  # of several runs side by side, the networks of so many at a time; None for all
-    )
+    sharding: DataSharding = UNSHARDED  # of scenes and batches over devices
+    networks_at_once: int | None = None  # of runs side by side, see `chunked_vmap`; None for all
+
+
+class Hyperparams(NamedTuple):
+    """Settings that enter the program as arguments, in place of constants of its config."""
+
+    values: dict[str, Any]  # value [...] of each setting by its dotted name, such as `learn.tau`
+    return_bounds: tuple[Any, Any]  # smallest and largest possible return, []
 
 
 def make(cfg: Config) -> Program:
@@ -80,8 +85,32 @@ def make(cfg: Config) -> Program:
     return Program(cfg, environment.make(cfg), learning.make(cfg))
 
 
-def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+def replace_hyperparams(program: Program, hyperparams: Hyperparams | None) -> Program:
+    """The program with these hyper-parameters, if there are any, in place of its own."""
+    if hyperparams is None:
+        return program
+    cfg = replace_settings(program.cfg, hyperparams.values)
+    learner = learning.replace_hyperparams(program.learner, cfg, hyperparams.return_bounds)
+    return dataclasses.replace(program, cfg=cfg, learner=learner)
+
+
+def replace_settings(cfg: Config, values: dict[str, Any]) -> Config:
+    """The config with other values of settings, by dotted name. Traced ones are not checked."""
+    sections: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        section, field = name.split(".")
+        sections.setdefault(section, {})[field] = value
+    changed: dict[str, Any] = {
+        name: dataclasses.replace(getattr(cfg, name), **fields) for name, fields in sections.items()
+    }
+    return dataclasses.replace(cfg, **changed)
+
+
+def train_step(
+    program: Program, state: TrainState, hyperparams: Hyperparams | None = None
+) -> tuple[TrainState, StepMetrics]:
     """One action in each of the E scenes and the updates that belong to it."""
+    program = replace_hyperparams(program, hyperparams)
     cfg, env, learner = program.cfg, program.env, program.learner
     key_act, key_learn, key_reset = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
     scenes = state.scenes
@@ -104,7 +133,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
     )
 
     # Simulate.
-    after = program.spread.scenes(jax.vmap(env.step))(scenes, action)
+    after = program.sharding.map_scenes(jax.vmap(env.step))(scenes, action)
 
     # Reward and remember (lines 14-15).
     pushed = action.primitive == Primitive.PUSH
@@ -168,9 +197,9 @@ def _apart(
 ) -> Callable[..., Any]:
     """`part`, what the networks of one run do; of several side by side only so many at a time as
     the program says."""
-    if program.at_once is None:
+    if program.networks_at_once is None:
         return part
-    return chunked_vmap.grouped(part, 1 if one_by_one else program.at_once)
+    return chunked_vmap.vmap_in_chunks(part, 1 if one_by_one else program.networks_at_once)
 
 
 def _learn(
@@ -219,7 +248,7 @@ def _draw(
     keys."""
     cfg, (key_sample, key_augment) = program.cfg, keys
     slots, weights = samplers.sample(key_sample, cfg.replay, replay, progress, cfg.learn.batch)
-    batch = program.spread.batch(ring.gather(replay, slots))
+    batch = program.sharding.shard_batch(ring.gather(replay, slots))
     vary = jax.vmap(augment.vary, (0, None, 0))
     return slots, weights, vary(_keys(key_augment, cfg.learn.batch), cfg, batch)
 
@@ -256,14 +285,17 @@ def init(program: Program, trunk: Any = None) -> TrainState:
 
     trunk: variables that the networks' trunks begin with, see `weights.read`; None for random ones.
     """
-    state = jax.jit(lambda: begin(program, jax.random.key(program.cfg.seed)))()
+    state = jax.jit(lambda: init_state(program, jax.random.key(program.cfg.seed)))()
     return (
         state if trunk is None else state.replace(learner=learning.with_trunk(state.learner, trunk))
     )
 
 
-def begin(program: Program, key: jax.Array) -> TrainState:
+def init_state(
+    program: Program, key: jax.Array, hyperparams: Hyperparams | None = None
+) -> TrainState:
     """The state before the first step of the run whose root key is `key`; pure."""
+    program = replace_hyperparams(program, hyperparams)
     cfg = program.cfg
     key_scenes, key_nets = jax.random.split(jax.random.fold_in(key, np.uint32(2**32 - 1)))
     return TrainState(

@@ -13,7 +13,13 @@ from csac_jax.agent import cem, explore, learner as learning, losses, rewards, s
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
 from csac_jax.replay import samplers
-from csac_jax.training.step import Program, StepMetrics, TrainState
+from csac_jax.training.step import (
+    Hyperparams,
+    Program,
+    StepMetrics,
+    TrainState,
+    replace_hyperparams,
+)
 
 SMOKE = presets.smoke()
 SCENES = 8
@@ -27,11 +33,14 @@ def program(cfg: Config = CFG) -> Program:
     nothing: Any = None
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
     learner = Learner(cfg, nothing, nothing, nothing, nothing, nothing, bounds)
-    return Program(cfg, nothing, learning.with_numbers(learner, cfg, bounds))
+    return Program(cfg, nothing, learning.replace_hyperparams(learner, cfg, bounds))
 
 
-def begin(program: Program, key: jax.Array) -> TrainState:
-    """In place of `step.begin`: scenes [E], networks [3], a ring [4]."""
+def init_state(
+    program: Program, key: jax.Array, hyperparams: Hyperparams | None = None
+) -> TrainState:
+    """In place of `step.init_state`: scenes [E], networks [3], a ring [4]."""
+    program = replace_hyperparams(program, hyperparams)
     params = jax.random.normal(jax.random.fold_in(key, 1), (3,))
     learner = {
         "online": params,
@@ -43,16 +52,19 @@ def begin(program: Program, key: jax.Array) -> TrainState:
     return TrainState(key, jnp.int32(0), scenes, learner, jnp.zeros(4))
 
 
-def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+def train_step(
+    program: Program, state: TrainState, hyperparams: Hyperparams | None = None
+) -> tuple[TrainState, StepMetrics]:
     """In place of `step.train_step`: physics, a batch, a gradient, a schedule that is a branch."""
+    program = replace_hyperparams(program, hyperparams)
     cfg, learner = program.cfg, program.learner
     num = cfg.train.scenes
     key = jax.random.fold_in(state.key, state.step)
     noise = jax.random.normal(key, (num,))
-    scenes = program.spread.scenes(lambda scenes, noise: jnp.sin(scenes + noise))(
+    scenes = program.sharding.map_scenes(lambda scenes, noise: jnp.sin(scenes + noise))(
         state.scenes, noise
     )
-    batch = program.spread.batch(scenes)
+    batch = program.sharding.shard_batch(scenes)
 
     def loss(params: jax.Array) -> jax.Array:
         q = params[0] * batch + params[1] * batch**2 + params[2]
