@@ -1,15 +1,15 @@
-"""Protection against faults of JAX; imports nothing of JAX, so that it acts before JAX starts.
+"""Protection against faults of JAX. It imports nothing of JAX, so that it acts before JAX starts.
 
-1. jax 0.10.2 computes wrong rows for `vmap(M @ row)` followed by a reduction (jax issue 39103), without a word.
-2. So do 0.10.1 and earlier, in the plainer case: with M 3 x 3, `vmap(sum(M @ row))` is wrong in every row beyond the
-   32,768th, up to some 40,000 rows. The fault lies in a fusion, which an XLA flag switches off.
-3. Batched Cholesky factorisations, which batched MJX runs many of, wait for one another in the thread pool of
-   jaxlib 0.10 and hang for ever if the pool is small: on 2 cores, two at once are enough. A pool with more threads
-   than factorisations at once cures it and costs no speed. Its size is read from the environment, once, when the CPU
-   client starts. Virtual devices (`DEVICES_FLAG`) share one pool and wait for one another in it.
-4. jaxlib 0.11 ends the process with a segmentation fault as it compiles a `shard_map` that takes along a constant with
-   no elements, and MJX's models have many: a pattern of Shardy, its default partitioner, seen on CPU devices; programs
-   on several GPUs ended alike. The partitioner before Shardy compiles it.
+1. jax 0.10.2 computes wrong rows for `vmap(M @ row)` followed by a reduction (jax issue 39103).
+2. So do 0.10.1 and earlier in a plainer case: with M 3 x 3, `vmap(sum(M @ row))` is wrong in every
+   row beyond the 32,768th, up to some 40,000 rows. An XLA flag switches that fusion off.
+3. Batched MJX runs many batched Cholesky factorisations. In jaxlib 0.10 they wait for one another
+   in the thread pool and hang for ever if it is small: on 2 cores, two at once are enough. A larger
+   pool cures it at no cost. Its size is read once, when the CPU client starts. Virtual devices
+   (`DEVICES_FLAG`) share one pool.
+4. jaxlib 0.11 ends the process as it compiles a `shard_map` with a constant of no elements, and
+   MJX's models have many. The fault is a pattern of Shardy, the default partitioner, seen on CPU
+   devices; programs on several GPUs ended alike. The partitioner before Shardy compiles it.
 """
 
 import importlib.metadata
@@ -18,15 +18,15 @@ import re
 import sys
 
 BROKEN_JAX = ("0.10.2",)
-FUSION_FLAG = (
-    "--xla_cpu_experimental_ynn_fusion_type"  # given no types, it switches that kind of fusion off
-)
-FUSION_SERIES = "0.10."  # versions of jaxlib that are known to have the flag: XLA ends the process on one it lacks
+# Given no types, the flag switches that kind of fusion off. XLA ends the process on a flag that it
+# does not know, so only versions of jaxlib that are known to have it get it.
+FUSION_FLAG = "--xla_cpu_experimental_ynn_fusion_type"
+FUSION_SERIES = "0.10."
 POOL_VARIABLE = "PJRT_NPROC"  # goes before NPROC
 USER_VARIABLES = (POOL_VARIABLE, "NPROC")  # what a user may have set
 MIN_THREADS = 8  # ours: 2 hangs and 8 does not, on 2 cores with batches of 4 and 8 scenes
 DEVICES_FLAG = "--xla_force_host_platform_device_count"
-DEVICE_THREADS = 4  # ours, per virtual device: of eight that train together, 8 threads in all hung and 32 did not
+DEVICE_THREADS = 4  # ours, per virtual device: eight that train together hang with 8, not with 32
 PARTITIONER_VARIABLE = "JAX_USE_SHARDY_PARTITIONER"
 PARTITIONER_SERIES = "0.11."  # versions of jaxlib whose Shardy is seen to end the process
 
@@ -36,7 +36,8 @@ def refuse_broken_jax() -> None:
     version = importlib.metadata.version("jax")
     if version in BROKEN_JAX:
         raise ImportError(
-            f"jax {version} computes wrong results on the CPU (jax issue 39103); run: pip install 'jax!={version}'"
+            f"jax {version} computes wrong results on the CPU (jax issue 39103); "
+            f"run: pip install 'jax!={version}'"
         )
 
 

@@ -1,21 +1,36 @@
 """What the commands do, as functions; the package root exports them."""
 
-from collections.abc import Callable, Sequence
+import datetime
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+from rich.console import Console
+
+from csac_jax import algorithms
+from csac_jax.agent import actor_critic
 from csac_jax.agent.learner import Learner
-from csac_jax.config import Config
-from csac_jax.evaluation.policies import Policy
+from csac_jax.config import Config, DenseNet121
+from csac_jax.errors import SettingsError
+from csac_jax.evaluation import policies, rollout
+from csac_jax.evaluation.policies import LearnedPolicy, Policy
+from csac_jax.io import policy_file, weights
 from csac_jax.replay.samplers import Sampler
-from csac_jax.runtime import cache, signals
-from csac_jax.sim import auto
-from csac_jax.training import loop, memory, step
+from csac_jax.report.progress import Reporters, Terminal
+from csac_jax.runtime import cache, cluster, provenance, signals
+from csac_jax.sim import backend
+from csac_jax.sweeps import grid, replicas, sweep as sweeps
+from csac_jax.sweeps.grid import SweepPoint
+from csac_jax.sweeps.sweep import SweepPlan, SweepResult
+from csac_jax.training import loop, memory, sharding, step
 from csac_jax.training.loop import Record, Reporter, Summary
-from csac_jax.training.step import TrainState
+from csac_jax.training.sharding import Shard
 
 RUNS = Path("runs")
-Callback = Callable[[Record], None]
+evaluate = rollout.evaluate
+load_policy = policies.load
 
 
 class Run(NamedTuple):
@@ -24,12 +39,12 @@ class Run(NamedTuple):
     run_dir: Path
     cfg: Config
     summary: Summary
-    parts: dict[str, Any]  # learner and network of your own, if any
+    own: dict[str, Any]  # network and learner of one's own, as `load_policy` takes them
 
     @property
     def policy(self) -> Policy:
         """The policy of the last checkpoint."""
-        return load_policy(self.run_dir, **self.parts)
+        return load_policy(self.run_dir, **self.own)
 
 
 def train(
@@ -41,40 +56,186 @@ def train(
     sampler: Sampler | None = None,
     network: Any = None,
     learner: Learner | None = None,
-    callbacks: Sequence[Callback] = (),
-    reporter: Reporter | None = None,
+    callbacks: Sequence[Callable[[Record], None]] = (),
+    reporters: Sequence[Reporter] = (),
+    verbose: bool = True,
     stop: signals.Stop | None = None,
 ) -> Run:
-    """Trains a config in `run_dir` until its actions are done; prints progress and saves.
+    """Trains until the config's actions are done, or until `stop`; logs and saves in `run_dir`.
 
-    Args: run_dir, a new folder, by default runs/PRESET-SEED-TIME. resume, goes on with the run in
-    `run_dir`; its config must be the same but for more `train.actions`. init, a policy to start
-    from: "shipped", a run's folder or a policy file; or torchvision's weights of DenseNet-121, a
-    .safetensors file. sampler, `Sampler`; network, a Flax module, see `nets.networks`; learner,
-    `Learner`: parts of your own, which a resumed run needs again. callbacks, called with the
-    `Record` of each chunk. reporter, shows progress in place of the terminal. stop, see `signals`.
-    Raises ValueError for what cannot be trained, FileExistsError for a folder that exists,
-    TrainingError for a run that fails, CheckpointError for one that cannot be resumed.
+    Args: run_dir, a folder that does not exist, by default runs/PRESET-SEED-TIME. resume, goes on
+    with the run in `run_dir`; only `train.actions` may differ, and be larger. init, networks to
+    start from: "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121
+    as .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of
+    your own, which a resumed run needs again. callbacks, called with the `Record` of each chunk.
+    Raises SettingsError for settings that do not fit, FileExistsError for a folder that exists,
+    TrainingError for a loss that is not finite, CheckpointError for nothing sound to resume.
     """
-    cfg = auto.resolve(cfg)
-    memory.check(cfg)
+    cfg = backend.resolve(cfg)
+    _checked(memory.check, cfg)
     folder = new_folder(f"{cfg.preset}-{cfg.seed}") if run_dir is None else Path(run_dir)
-    begin = initial(cfg, init, network)
-    program_of = _once(lambda: step.make(cfg, learner=learner, sampler=sampler, network=network))
+    start = starting(cfg, init)
     cache.enable()
+    with Terminal(Console(quiet=not verbose)) as terminal:
+        terminal.say(_first_line(folder, cfg))
+        program = step.make(cfg, learner=learner, sampler=sampler, network=network)
 
-    def first_state() -> TrainState:
-        state = step.init(program_of())
-        return state.replace(learner=begin(state.learner))
+        def first_state() -> step.TrainState:
+            state = step.init(program)
+            return state if start is None else state.replace(learner=start(state.learner))
 
-    summary = loop.run(
-        cfg,
-        folder,
-        first_state,
-        lambda num_steps: step.compile_chunk(program_of(), num_steps),
-        _Reporters([reporter or _terminal(), *map(_Called, callbacks)]),
-        stop or signals.Stop(),
-        resume=resume,
+        summary = loop.run(
+            cfg,
+            folder,
+            first_state,
+            lambda num_steps: step.compile_chunk(program, num_steps),
+            Reporters([terminal, *reporters, *map(_Callback, callbacks)]),
+            stop or signals.Stop(),
+            resume=resume,
+        )
+    own = {"network": network, "learner": learner}
+    return Run(folder, cfg, summary, own)
+
+
+def sweep(
+    cfg: Config,
+    seeds: int = 4,
+    vary: Mapping[str, Sequence[Any]] | None = None,
+    run_dir: str | Path | None = None,
+    *,
+    devices: int | None = None,
+    shard: Shard = "seeds",
+    init: str | Path | None = None,
+    verbose: bool = True,
+    stop: signals.Stop | None = None,
+) -> dict[str, Any]:
+    """Trains several seeds, with every combination of settings, side by side in one program.
+
+    Args: seeds, cfg.seed and those after it. vary, values by dotted setting or "algo", as in
+    {"learn.tau": (0.01, 0.02)}. run_dir, a folder that does not exist. devices, how many to use;
+    shard, what they divide: the seeds, or the scenes of each seed. Returns: the summary, grasp
+    success of every combination over its seeds with 95 % intervals. Raises as `train`.
+    """
+    points = _points(cfg, dict(vary or {}))
+    runs = seeds * len(points)
+    points = [point._replace(cfg=backend.resolve(point.cfg, devices or 1, runs)) for point in points]
+    folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
+    plan = SweepPlan(seeds, points)
+    return run_sweep(plan, folder, devices, shard, init, verbose, stop or signals.Stop()).summary
+
+
+def run_sweep(
+    plan: SweepPlan,
+    folder: Path,
+    devices: int | None,
+    shard: Shard,
+    init: str | Path | None,
+    verbose: bool,
+    stop: signals.Stop,
+    resume: bool = False,
+) -> SweepResult:
+    """Runs what is left of a sweep's plan, see `sweep`."""
+    cache.enable()
+    mesh = _checked(sharding.make, devices)
+    for point in plan.points:
+        scenes, batch = point.cfg.train.scenes, point.cfg.learn.batch
+        _checked(sharding.check, mesh, shard, plan.seeds, scenes, batch)
+    _checked(sweeps.check_room, plan, 1 if mesh is None or shard == "scenes" else mesh.size)
+
+    def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
+        return replicas.sweep_program(group, mesh, shard, starting(group.configs[0], init))
+
+    with Terminal(Console(quiet=not (verbose and cluster.is_first()))) as terminal:
+        terminal.say(f"sweep {folder}")
+        return sweeps.run(plan, folder, make_program, terminal, stop, resume=resume)
+
+
+def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
+    """What puts the networks of `source`, see `train`, into a learner's first state.
+
+    Raises SettingsError where they are not those of the config.
+    """
+    if source is None:
+        return None
+    if _is_pretrained(cfg, source):
+        trunk = _checked(weights.read, cfg.net, Path(source))
+        return lambda state: actor_critic.with_trunk(state, trunk)
+    policy = policies.load(source)
+    assert isinstance(policy, LearnedPolicy)
+    wanted = actor_critic.abstract_params(cfg)
+    if _layout(policy.params) != _layout(wanted):
+        raise SettingsError(
+            f"--init {source}: its networks are not those of these settings; "
+            "leave out --net, --learn.critics and --task.kind"
+        )
+    return lambda state: actor_critic.with_params(state, policy.params)
+
+
+def with_networks_of(cfg: Config, source: str | Path) -> Config:
+    """The config with networks of the sizes of the policy `source`, see `train`'s `init`."""
+    if _is_pretrained(cfg, source):
+        return cfg
+    given = policies.load_config(source)
+    learn = {"critics": given.learn.critics, "actor": given.learn.actor}
+    return cfg.change(net=given.net, learn=learn)
+
+
+def new_folder(name: str) -> Path:
+    """A folder under RUNS, with the time in its name, that does not exist yet."""
+    stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
+    return next(path for path in candidates if not path.exists())
+
+
+class _Callback:
+    """A function of records as a reporter."""
+
+    def __init__(self, call: Callable[[Record], None]) -> None:
+        self._call = call
+
+    def say(self, text: str) -> None:
+        pass
+
+    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+        self._call(record)
+
+
+def _checked(call: Callable[..., Any], *args: Any) -> Any:
+    """What `call` returns; its ValueErrors are SettingsErrors."""
+    try:
+        return call(*args)
+    except ValueError as error:
+        raise SettingsError(str(error)) from None
+
+
+def _is_pretrained(cfg: Config, source: str | Path) -> bool:
+    """Whether `source` is a file of weights and no policy."""
+    named = source != "shipped" and Path(source).is_file()
+    return named and isinstance(cfg.net, DenseNet121) and not policy_file.is_policy(Path(source))
+
+
+def _layout(params: Any) -> Any:
+    """Names, shapes and types of networks."""
+    named = jax.tree_util.tree_leaves_with_path(params)
+    return [(str(path), leaf.shape, str(leaf.dtype)) for path, leaf in named]
+
+
+def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
+    """Every combination of the values."""
+    points = []
+    for combination in itertools.product(*vary.values()):
+        values = dict(zip(vary, combination, strict=True))
+        settings = {name: value for name, value in values.items() if name != "algo"}
+        base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
+        named = {name: str(value) for name, value in values.items()}
+        points.append(SweepPoint(grid.name(named), named, step.replace_settings(base, settings)))
+    return grid.with_short_names(points)
+
+
+def _first_line(folder: Path, cfg: Config) -> str:
+    """What is run, and on what."""
+    scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
+    return (
+        f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "
+        f"physics {cfg.sim.physics}, on {provenance.device()}"
     )
-    own = {"learner": learner, "network": network}
-    return Run(folder, cfg, summary, {name: part for name, part in own.items() if part is not None})

@@ -1,4 +1,4 @@
-"""What goes wrong for a reason that the user can mend; the messages are one line with the remedy."""
+"""What goes wrong for a reason that the user can mend. A message is one line with the remedy."""
 
 
 class SettingsError(ValueError):
@@ -7,3 +7,7 @@ class SettingsError(ValueError):
 
 class SceneError(Exception):
     """A scene that cannot be simulated or settled."""
+
+
+class DeviceError(Exception):
+    """A device that is asked for and is not there."""

@@ -19,12 +19,15 @@ import jax, jax.numpy as jnp, mujoco
 from mujoco import mjx
 
 box = '<body pos="{} 0 0.019"><freejoint/><geom type="box" size=".02 .02 .02"/></body>'
-link = '<body pos="{} 1 1"><joint axis="0 1 0"/><geom type="sphere" size=".02" pos=".05 0 0"/></body>'
+ball = '<geom type="sphere" size=".02" pos=".05 0 0"/>'
+link = '<body pos="{} 1 1"><joint axis="0 1 0"/>' + ball + "</body>"
 boxes = "".join(box.format(0.1 * i) for i in range(10))
 links = "".join(link.format(0.1 * i) for i in range(6))
 model = mujoco.MjModel.from_xml_string(f'''<mujoco>
   <option solver="Newton" iterations="4" ls_iterations="8" jacobian="dense"/>
-  <custom><numeric name="max_geom_pairs" data="4"/><numeric name="max_contact_points" data="16"/></custom>
+  <custom>
+    <numeric name="max_geom_pairs" data="4"/><numeric name="max_contact_points" data="16"/>
+  </custom>
   <worldbody><geom type="plane" size="2 2 .1"/>{boxes}{links}</worldbody></mujoco>''')
 assert model.nv == 66, model.nv
 put, data = mjx.put_model(model), mjx.make_data(model)
@@ -85,14 +88,18 @@ def test_virtual_devices_widen_the_pool():
 @pytest.mark.parametrize("name", ["PJRT_NPROC", "NPROC"])
 def test_user_setting_is_kept(name: str):
     """Claim: what the user has set decides."""
-    source = "import csac_jax, os; from csac_jax import _guard; print(os.environ.get('PJRT_NPROC'), *_guard.pool_setting())"
+    source = """
+    import csac_jax, os
+    from csac_jax import _guard
+    print(os.environ.get("PJRT_NPROC"), *_guard.pool_setting())
+    """
     done = _python(source, **{name: "3"})
     assert done.stdout.split() == ["3" if name == "PJRT_NPROC" else "None", name, "3"]
 
 
 def test_rows_are_right():
     """Claim: with the package imported, `vmap(sum(M @ row))` is right in every row."""
-    done = _python("from csac_jax.train import selftest; print(selftest.rows_error())")
+    done = _python("from csac_jax.runtime import selftest; print(selftest.rows_error())")
     assert float(done.stdout) < 1e-5, done.stderr
 
 
@@ -135,8 +142,9 @@ from jax.sharding import Mesh, PartitionSpec
 nothing = np.zeros((0, 3), np.float32)
 line = Mesh(np.array(jax.devices()), ("devices",))
 along = PartitionSpec("devices")
-add = jax.shard_map(lambda x: x + (nothing + x[0]).sum(), mesh=line, in_specs=along, out_specs=along, check_vma=False)
-print(jax.jit(add)(np.arange(4.0, dtype=np.float32)))
+add = lambda x: x + (nothing + x[0]).sum()
+shared = jax.shard_map(add, mesh=line, in_specs=along, out_specs=along, check_vma=False)
+print(jax.jit(shared)(np.arange(4.0, dtype=np.float32)))
 """
 
 

@@ -140,14 +140,24 @@ def abstract_params(cfg: Config, network: Any = None) -> Params:
     return jax.eval_shape(lambda: init(jax.random.key(0), make(cfg, network))).online
 
 
+def with_params(state: LearnerState, params: Params) -> LearnerState:
+    """The state before the first update with these networks, targets included.
+
+    Leaves of `state` may have more leading axes, as those of several runs.
+    """
+
+    def fill(old: jax.Array, new: Any) -> jax.Array:
+        return jnp.broadcast_to(jnp.asarray(new, old.dtype), old.shape)
+
+    online = jax.tree.map(fill, state.online, params)
+    return state.replace(online=online, target=jax.tree.map(jnp.copy, online))
+
+
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
     """The state before the first update, every trunk of the critics being `trunk`, see
     `torchvision.variables`."""
-    online, target = (
-        params.replace(critic=networks.with_trunk(params.critic, trunk))
-        for params in (state.online, state.target)
-    )
-    return state.replace(online=online, target=target)
+    critic = networks.with_trunk(state.online.critic, trunk)
+    return with_params(state, state.online.replace(critic=critic))
 
 
 def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:

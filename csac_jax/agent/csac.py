@@ -85,7 +85,7 @@ class CSAC(Learner):
     def _chunked(self, part: Callable[..., Any], at_once: int | None = None) -> Callable[..., Any]:
         if self.networks_at_once is None:
             return part
-        return chunked_vmap.grouped(part, at_once or self.networks_at_once)
+        return chunked_vmap.vmap_in_chunks(part, at_once or self.networks_at_once)
 
 
 def make(cfg: Config, network: Any = None) -> CSAC:

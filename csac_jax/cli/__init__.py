@@ -24,7 +24,7 @@ from csac_jax.cli import (
     train,
 )
 from csac_jax.cli.errors import PROGRAM, BadArgumentsError, FailedError, complain
-from csac_jax.errors import SceneError
+from csac_jax.errors import DeviceError, SceneError
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         return _dispatch(arguments)
-    except BadArgumentsError as error:
+    except (BadArgumentsError, DeviceError) as error:
         return complain(2, error)
     except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -71,6 +71,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return complain(1, error)
     except KeyboardInterrupt:
         return complain(130, "stopped")
+
+
+def _call(command: Callable[[list[str]], int], arguments: list[str]) -> int:
+    """Runs a command. If JAX starts without a device, DeviceError says so."""
+    try:
+        return command(arguments)
+    except (RuntimeError, AssertionError):
+        from csac_jax.runtime import devices
+
+        devices.require()
+        raise
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -86,7 +97,7 @@ def _dispatch(arguments: list[str]) -> int:
         meant = f"did you mean {near[0]}? " if near else ""
         listed = ", ".join(COMMANDS)
         raise BadArgumentsError(f"unknown command '{name}'; {meant}choose one of: {listed}")
-    return COMMANDS[name](_on_device(rest))
+    return _call(COMMANDS[name], _on_device(rest))
 
 
 def _on_device(arguments: list[str]) -> list[str]:

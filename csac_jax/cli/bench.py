@@ -1,4 +1,4 @@
-"""`csac-jax bench`: scripts of the checkout that measure speed."""
+"""`csac-jax bench`: runs the scripts of a checkout that measure speed."""
 
 import runpy
 from pathlib import Path

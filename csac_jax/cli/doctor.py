@@ -1,9 +1,9 @@
-"""`csac-jax doctor`: whether this machine computes right, and what a run will take of its
-memory."""
+"""`csac-jax doctor`: whether this machine computes right, and whether a run fits its memory."""
 
 import contextlib
 import dataclasses
 import os
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,18 +18,16 @@ _HANGS = "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8
 
 @dataclasses.dataclass(frozen=True)
 class DoctorOptions:
-    """Prints versions, devices and the protections in force, and checks that this machine computes
-    right.
+    """Prints versions, devices and protections, and checks that this machine computes right.
 
-    With --preset PRESET, and settings of it as for `train`, also the memory that such a run will
-    take."""
+    With --preset PRESET, and settings as for `train`, also prints the memory of a run's state."""
 
     json: Path | None = None
     """File to write the result to, as JSON."""
 
 
 def run(arguments: list[str]) -> int:
-    """Prints what it finds; returns the exit code."""
+    """Prints versions, devices and checks; returns the exit code."""
     own, cfg = _split(arguments)
     options = parsing.parse(DoctorOptions, own, "doctor")
     needs = {} if cfg is None else _print_memory(cfg)
@@ -47,15 +45,13 @@ def run(arguments: list[str]) -> int:
     output.write_result(options.json, {**guard, "self_test": tests, **needs}, cfg)
     failed = [check.name for check in checks if not check.passed]
     if failed:
-        raise FailedError(
-            f"self-test failed: {'; '.join(failed)}; do not trust results of these versions here"
-        )
+        names = "; ".join(failed)
+        raise FailedError(f"self-test failed: {names}; do not trust these versions here")
     return 0
 
 
 def _split(arguments: list[str]) -> tuple[list[str], Config | None]:
-    """The arguments of `doctor` itself, and the config that the others ask for, if a preset is
-    among them."""
+    """The arguments of `doctor` itself, and the config of the others if they name a preset."""
     preset = parsing.value_of(arguments, "--preset")
     if parsing.asks_help(arguments):
         return ["--help"], None
@@ -77,33 +73,25 @@ def _split(arguments: list[str]) -> tuple[list[str], Config | None]:
 
 
 def _print_memory(cfg: Config) -> dict[str, Any]:
-    """Prints what a run will hold in memory; returns it for the JSON."""
+    """Prints what a run's state takes; returns it for the JSON."""
     from csac_jax.training import memory
 
-    parts, available = memory.predict(cfg), memory.limit()
-    total = sum(parts.values())
+    parts, available = memory.state_bytes(cfg), memory.limit()
     listed = ", ".join(f"{name} {size / memory.GIB:.2f}" for name, size in parts.items())
-    print(
-        f"memory     {total / memory.GIB:.2f} GiB of {available / memory.GIB:.1f} for {cfg.preset}: {listed}"
-    )
-    stages = memory.stages(cfg)
-    print(
-        f"           step: {', '.join(f'{name} {size / memory.GIB:.2f}' for name, size in stages.items())}"
-    )
-    return {"memory": {"bytes": parts, "step_bytes": stages, "limit_bytes": available}}
+    share = f"{sum(parts.values()) / memory.GIB:.2f} GiB of {available / memory.GIB:.1f}"
+    print(f"memory     {share} for the state of {cfg.preset}: {listed}")
+    return {"memory": {"bytes": parts, "limit_bytes": available}}
 
 
 def _print_machine() -> dict[str, Any]:
-    """Prints versions, devices and the protections in force; returns these for the JSON."""
+    """Prints versions, devices and protections; returns the protections for the JSON."""
     from csac_jax import _guard
     from csac_jax.runtime import compiler, provenance
 
     record = provenance.record()
+    versions = ", ".join(f"{name} {number}" for name, number in provenance.versions().items())
     print(f"device     {record['device']}")
-    print(
-        "versions   "
-        + ", ".join(f"{name} {version}" for name, version in provenance.versions().items())
-    )
+    print(f"versions   {versions}")
     print(f"commit     {record['commit'] or 'none'}")
     variable, threads = _guard.pool_setting()
     guarded = threads >= _guard.needed_threads()
@@ -124,13 +112,12 @@ def _print_machine() -> dict[str, Any]:
 @contextlib.contextmanager
 def _watchdog(seconds: float, message: str) -> Iterator[None]:
     """Ends the process with `message` if the block takes longer than `seconds`."""
-    import threading
 
-    def bark() -> NoReturn:
+    def end() -> NoReturn:
         complain(1, message)
         os._exit(1)
 
-    timer = threading.Timer(seconds, bark)
+    timer = threading.Timer(seconds, end)
     timer.daemon = True
     timer.start()
     try:

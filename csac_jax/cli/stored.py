@@ -1,9 +1,9 @@
-"""What commands read from files: the config of a run, a policy, weights."""
+"""What commands read from files: the config of a run, a policy."""
 
 from pathlib import Path
 from typing import Any
 
-from csac_jax.cli.errors import FailedError, as_bad_arguments, as_failure
+from csac_jax.cli.errors import FailedError, as_failure
 from csac_jax.config import Config
 
 
@@ -26,11 +26,10 @@ def policy(source: str, kind: str = "learned") -> Any:
         return policies.POLICIES[kind](source)
 
 
-def weights(cfg: Config) -> Any:
-    """Variables of the trunk that the networks begin with, None for random ones."""
-    if not cfg.net.weights:
-        return None
-    from csac_jax.io import weights as files
+def with_networks_of(cfg: Config, source: str) -> Config:
+    """The config with networks of the sizes of a policy, to start from it."""
+    from csac_jax import api
+    from csac_jax.io import checkpoint, policy_file
 
-    with as_bad_arguments(ValueError):
-        return files.read(cfg.net)
+    with as_failure(policy_file.PolicyFileError, checkpoint.CheckpointError, FileNotFoundError):
+        return api.with_networks_of(cfg, source)

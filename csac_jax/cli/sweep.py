@@ -8,69 +8,76 @@ from typing import Any, Literal
 import tyro
 
 from csac_jax import presets
-from csac_jax.cli import guards, output, settings, stored
+from csac_jax.cli import guards, output, parsing, settings, stored
 from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments, as_failure
-from csac_jax.config import Algo, Config
-from csac_jax.runtime import signals as stopping
+from csac_jax.config import Config
+from csac_jax.runtime import signals
 from csac_jax.sweeps import grid
+
+
+EXAMPLES = (
+    "quick --seeds 8",
+    "quick --seeds 4 --vary replay.sampler=uniform,beta --vary learn.tau=0.01,0.02",
+    "fast --seeds 4 --devices 4 --init shipped",
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepOptions:
-    """Trains several seeds, with several settings, side by side in one program; or goes on with a
-    sweep that was stopped. Every setting of a preset is an option."""
+    """Trains several seeds with several settings side by side in one program.
+
+    --resume goes on with a sweep that was stopped. Every setting of a preset is an option."""
 
     seeds: int = 4
     """Seeds of every setting: --seed, --seed + 1, ..."""
     vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=A,B,...: a setting, or algo, and the values it takes; once per setting, every
-    combination is run. Items of a tuple are parted by colons: replay.beta_end=1:4,1:12."""
+    combination is run. Colons separate the items of a tuple: replay.end=1:4,1:12."""
     run_dir: Path | None = None
     """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
     resume: Path | None = None
     """Folder of a sweep to go on with, by itself: its settings are the sweep's."""
     shard: Literal["seeds", "scenes"] = "seeds"
-    """What several devices share out: whole seeds, or the scenes and batches of each."""
+    """What several devices divide: the seeds, or the scenes and batches of each seed."""
     devices: int | None = None
     """Devices to use; one if not given, and with several processes all that they have."""
     coordinator: str | None = None
-    """ADDRESS:PORT of the first of several processes, on one host or many; all run the same
-    command. See docs/cluster.md."""
+    """ADDRESS:PORT of the first of several processes, which all run the same command. See
+    docs/cluster.md."""
     processes: int | None = None
     """How many processes there are."""
     process_id: int | None = None
     """Number of this process, from 0."""
     cluster: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Join the processes of a job of SLURM, Open MPI or Kubernetes: JAX finds out where they
-    are."""
+    """Join the processes of a job of SLURM, Open MPI or Kubernetes, which JAX finds itself."""
+    init: str | None = None
+    """Start from the networks of a run, a policy file or `shipped`; brings its net settings."""
     json: Path | None = None
     """File to write the result to, as JSON."""
     seed: int = 0
     """The first seed."""
-    algo: Algo = "csac_beta"
-    """The algorithm: it changes settings of the preset, and settings given as options win over
-    it."""
-
-
-_Options = settings.with_sections(SweepOptions)
+    algo: str = "csac_beta"
+    """The algorithm. It changes settings of the preset; settings given as options win over it."""
 
 
 def run(arguments: list[str]) -> int:
     """Trains all; returns the exit code."""
-    stop = stopping.install()
+    if parsing.asks_short_help(arguments):
+        settings.print_help(SweepOptions, "sweep", EXAMPLES)
+        return 0
+    stop = signals.install()
     options, plan = read(arguments)
-    folder = (
-        options.resume
-        or options.run_dir
-        or output.new_folder(f"sweep-{plan.settings[0].cfg.preset}")
-    )
+    name = f"sweep-{plan.points[0].cfg.preset}"
+    folder = options.resume or options.run_dir or _new_folder(name)
     begun = time.time()
     result = _sweep(options, plan, folder, stop)
-    times = {
+    summary = {
+        "run_dir": str(folder),
+        **result.summary,
         "compile_seconds": result.compile_seconds,
         "wall_seconds": round(time.time() - begun, 1),
+        "stopped_by": result.stopped_by,
     }
-    summary = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
     from csac_jax.runtime import cluster
 
     if cluster.is_first():
@@ -79,8 +86,14 @@ def run(arguments: list[str]) -> int:
     return 0 if result.stopped_by is None else 128 + result.stopped_by
 
 
+def _new_folder(name: str) -> Path:
+    from csac_jax import api
+
+    return api.new_folder(name)
+
+
 def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
-    """Options and plan of a sweep, from the command line or, if it is resumed, from its folder."""
+    """Options and plan of a sweep: from the command line, or from the folder if it is resumed."""
     preset, flags = settings.split(arguments)
     options, cfg = _parse(preset or "quick", flags)
     if options.seeds < 1 or options.seed + options.seeds > 2**31:
@@ -95,12 +108,14 @@ def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
 
 
 def _parse(preset: str, flags: list[str]) -> tuple[SweepOptions, Config]:
-    """Options of a sweep and the config of a setting, whose flags are the last ones."""
-    return settings.parse(_Options, f"sweep {preset}", settings.preset(preset, flags), flags)
+    """Options of a sweep and the config of a point, whose own flags come last."""
+    base, init = settings.preset(preset, flags), parsing.value_of(flags, "--init")
+    base = base if init is None else stored.with_networks_of(base, init)
+    return settings.parse(SweepOptions, f"sweep {preset}", base, flags)
 
 
 def _join(options: SweepOptions) -> None:
-    """Joins the other processes, if there are to be several."""
+    """Joins the other processes, if there are several."""
     place = (options.coordinator, options.processes, options.process_id)
     if not options.cluster and place == (None, None, None):
         return
@@ -115,25 +130,19 @@ def _join(options: SweepOptions) -> None:
 
 
 def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
-    with as_bad_arguments(ValueError):
-        combinations = grid.settings(options.vary)
-    found = [(one, _parse(preset, [*flags, *one.flags])[1]) for one in combinations]
+    from csac_jax.sim import backend
     from csac_jax.sweeps import sweep as sweeping
 
-    devices, members = (
-        _devices(options),
-        options.seeds * len(found),
-    )  # the most that can run side by side
-    each = [
-        sweeping.Setting(one.name, one.values, settings.resolve(cfg, devices, members))
-        for one, cfg in found
-    ]
-    for setting in each:
-        guards.check_physics(setting.cfg)
-        guards.check_host_physics(setting.cfg, devices)
-    plan = sweeping.Plan(options.seeds, each)
+    with as_bad_arguments(ValueError):
+        points = grid.points(options.vary, lambda own: _parse(preset, [*flags, *own])[1])
+    devices, runs = _devices(options), options.seeds * len(points)  # at most so many side by side
+    points = [one._replace(cfg=backend.resolve(one.cfg, devices, runs)) for one in points]
+    for point in points:
+        guards.check_physics(point.cfg)
+        guards.check_host_physics(point.cfg, devices)
+    plan = sweeping.SweepPlan(options.seeds, points)
     with as_bad_arguments(ValueError, sweeping.SweepError):
-        sweeping.check(plan)
+        sweeping.groups_of(plan._replace(seeds=1))
     return plan
 
 
@@ -146,13 +155,8 @@ def _devices(options: SweepOptions) -> int:
 def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:
     from csac_jax.sweeps import sweep as sweeping
 
-    if (
-        preset
-        or options.vary
-        or options.run_dir
-        or options.seeds != SweepOptions.seeds
-        or cfg != presets.get("quick")
-    ):
+    given = (preset, options.vary, options.run_dir)
+    if any(given) or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
         raise BadArgumentsError(
             "sweep --resume: a sweep goes on with its own settings; leave all others out"
         )
@@ -160,41 +164,34 @@ def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: C
         return sweeping.read_plan(folder)
 
 
-def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: stopping.Stop) -> Any:
-    from rich.console import Console
-
+def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: signals.Stop) -> Any:
+    from csac_jax import api
+    from csac_jax.errors import SettingsError
     from csac_jax.io import checkpoint
-    from csac_jax.report.progress import Terminal
-    from csac_jax.runtime import cache, cluster
-    from csac_jax.sweeps import replicas, sweep as sweeping
-    from csac_jax.training import loop, sharding
-
-    cache.enable()
-    with as_bad_arguments(ValueError):
-        line = sharding.make(options.devices)
-        for one in plan.settings:
-            sharding.check(
-                line, options.shard, plan.seeds, one.cfg.train.scenes, one.cfg.learn.batch
-            )
-        sweeping.check_room(plan, 1 if line is None or options.shard == "scenes" else line.size)
-    trunks = {one.cfg.net: stored.weights(one.cfg) for one in plan.settings}
-
-    def engine(group: replicas.Group) -> sweeping.Engine:
-        return replicas.engine(group, line, options.shard, trunks[group.configs[0].net])
+    from csac_jax.runtime import cluster
+    from csac_jax.sweeps import sweep as sweeping
+    from csac_jax.training import loop
 
     with (
-        Terminal(Console(quiet=not cluster.is_first())) as terminal,
         as_failure(sweeping.SweepError, loop.TrainingError, checkpoint.CheckpointError),
+        as_bad_arguments(SettingsError),
     ):
-        terminal.say(f"sweep {folder}")
         try:
-            result = sweeping.run(
-                plan, folder, engine, terminal, stop, resume=options.resume is not None
+            result = api.run_sweep(
+                plan,
+                folder,
+                options.devices,
+                options.shard,
+                options.init,
+                verbose=True,
+                stop=stop,
+                resume=options.resume is not None,
             )
         except FileExistsError:
             raise guards.exists(folder) from None
-        for one in result.summary["settings"]:
-            terminal.say(f"{one['name']}: {_seeds_line(one['grasp_success'])}")
+    if cluster.is_first():
+        for point in result.summary["settings"]:
+            print(f"{point['name']}: {_seeds_line(point['grasp_success'])}")
     return result
 
 
@@ -202,4 +199,5 @@ def _seeds_line(success: dict[str, Any]) -> str:
     if not success["n"]:
         return "no seed is done"
     interval = f" (95 % interval {output.interval(success)})" if success["low"] is not None else ""
-    return f"grasp success {output.percent(success['value'])}{interval}, interquartile mean of {success['n']} seeds"
+    value = f"grasp success {output.percent(success['value'])}{interval}"
+    return f"{value}, interquartile mean of {success['n']} seeds"

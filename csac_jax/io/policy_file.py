@@ -39,6 +39,15 @@ def save(path: Path, params: Params, cfg: Config) -> None:
     files.replace(path, content)
 
 
+def is_policy(path: Path) -> bool:
+    """Whether a .safetensors file holds a config."""
+    try:
+        with safetensors.safe_open(path, "numpy") as file:
+            return _CONFIG in (file.metadata() or {})
+    except (OSError, safetensors.SafetensorError):
+        return False
+
+
 def load(path: Path) -> tuple[Config, Params]:
     """Config and networks of a policy. Raises PolicyFileError where the file is none, or not one of
     this version."""

@@ -1,7 +1,7 @@
-"""Runs side by side whose networks have a device in turn, a few at a time.
+"""`vmap` of runs side by side in chunks, for what their networks do.
 
-All at once, networks that fill a device by themselves take the memory of all for little; one by
-one, their many small products leave it waiting (`experiments/bench`).
+All DenseNet-121s at once need the memory of all and gain little: each fills a device by itself. One
+by one, their many small products leave the device waiting.
 """
 
 from collections.abc import Callable
@@ -12,33 +12,31 @@ import jax.numpy as jnp
 
 from csac_jax.config import Config
 
-_AT_ONCE = 5  # networks of DenseNet-121, ours: five seeds are one group, 16 are four, with 21 GB of temporaries
+_LARGEST = 5  # networks of DenseNet-121 in a chunk, ours: five seeds are one, 16 are four
 
 
-def at_once(cfg: Config, members: int) -> int | None:
-    """Of how many of `members` runs the networks are at work at a time, in groups of one size; None
-    if of all."""
+def chunk_size(cfg: Config, runs: int) -> int | None:
+    """How many networks work at a time, in chunks of one size; None for those of all `runs`."""
     if cfg.net.kind == "small":
         return None
-    return max(size for size in range(1, min(members, _AT_ONCE) + 1) if members % size == 0)
+    return max(size for size in range(1, min(runs, _LARGEST) + 1) if runs % size == 0)
 
 
-def grouped(part: Callable[..., Any], size: int) -> Callable[..., Any]:
-    """`part`, which vmapped runs in groups of `size`, one after the other; a group of one is not
-    vmapped.
+def vmap_in_chunks(function: Callable[..., Any], size: int) -> Callable[..., Any]:
+    """`function`; under `vmap` it runs in chunks of `size` rows, one after the other.
 
-    So a branch stays one in groups of one, where vmapped both sides would be run. The size must
-    divide what it is vmapped over. `part` may close over no tracer of that vmap.
+    A chunk of one row is not vmapped, so that a branch stays one. The size must divide the vmapped
+    axis. `function` may close over no tracer of that vmap.
     """
-    apart = jax.custom_batching.custom_vmap(part)
+    chunked = jax.custom_batching.custom_vmap(function)
 
-    @apart.def_vmap
-    def rule(axis_size: int, in_batched: Any, *given: Any) -> tuple[Any, Any]:
-        def every(leaf: jax.Array, batched: bool) -> jax.Array:
+    @chunked.def_vmap
+    def rule(axis_size: int, in_batched: Any, *arguments: Any) -> tuple[Any, Any]:
+        def batch(leaf: jax.Array, batched: bool) -> jax.Array:
             return leaf if batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
 
-        rows = jax.tree.map(every, given, tuple(in_batched))
-        out = jax.lax.map(lambda one: part(*one), rows, batch_size=size if size > 1 else None)
+        rows = jax.tree.map(batch, arguments, tuple(in_batched))
+        out = jax.lax.map(lambda row: function(*row), rows, batch_size=size if size > 1 else None)
         return out, jax.tree.map(lambda _: True, out)
 
-    return apart
+    return chunked

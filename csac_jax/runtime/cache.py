@@ -1,9 +1,8 @@
 """Compiled programs on disk, so that the second run of a program need not compile it.
 
-The folder is the user's cache directory, a part of its own per kind of machine: on the CPU an entry
-is machine code for the processor that compiled it, and JAX's own key does not name the processor.
-Nothing here can stop a run: an entry that is missing or damaged is compiled anew, a folder that
-cannot be written is not used.
+The folder is the user's cache directory, with a part for each kind of machine: on the CPU an entry
+is machine code for one processor, which JAX's own key does not name. Nothing here can stop a run: a
+damaged entry is compiled again, a folder that cannot be written is not used.
 """
 
 import contextlib
@@ -17,7 +16,7 @@ import jax
 
 from csac_jax import _guard
 
-LARGEST = 4 * 2**30  # bytes kept per kind of machine; the oldest entries go first
+LARGEST = 4 * 2**30  # bytes kept per kind of machine; what is unused for longest goes first
 SHORTEST = 0.5  # s: what compiles faster is not kept
 _ASKED = "/jax/compilation_cache/compile_requests_use_cache"
 _HIT = "/jax/compilation_cache/cache_hits"
@@ -30,11 +29,9 @@ class _Counter:
 
 
 def enable() -> Path | None:
-    """Switches the cache on and returns its folder; None if the user has switched it off or it
-    cannot be written.
+    """Switches the cache on and returns its folder; None if it is off or cannot be written.
 
-    A folder that the user has chosen (JAX_COMPILATION_CACHE_DIR) stays.
-    JAX_ENABLE_COMPILATION_CACHE=0 switches it off.
+    JAX_COMPILATION_CACHE_DIR chooses the folder, JAX_ENABLE_COMPILATION_CACHE=0 switches it off.
     """
     if not jax.config.jax_enable_compilation_cache:
         return None
@@ -45,14 +42,26 @@ def enable() -> Path | None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.parent.chmod(0o700)
+        _date_entries(folder)
     except OSError:
         return None
     if not os.access(folder, os.W_OK | os.X_OK):
         return None
-    _prune(folder, LARGEST)
     jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", LARGEST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
     return folder
+
+
+def _date_entries(folder: Path) -> None:
+    """Gives entries without a time of last use the oldest one; JAX fails on them.
+
+    There are some where a process was killed, or where the cache had no limit.
+    """
+    for entry in folder.glob("*-cache"):
+        last_use = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
+        if not last_use.exists():
+            last_use.write_bytes(bytes(8))
 
 
 def hits() -> int:
@@ -72,9 +81,8 @@ def _listen() -> None:
 
 @functools.cache
 def _quieten() -> None:
-    """On the CPU XLA cries out at every entry: it counts its own tuning, `prefer-no-gather`, among
-    what processors can do. Its C++ log is silenced there, unless the user has chosen a level;
-    failures still raise."""
+    """Silences XLA's C++ log on the CPU, unless the user has chosen a level: it logs a spurious
+    warning for each cached program. Failures still raise."""
     if jax.default_backend() == "cpu" and "JAX_LOGGING_LEVEL" not in os.environ:
         jax.config.update("jax_logging_level", "CRITICAL")
 
@@ -85,8 +93,7 @@ def _folder() -> Path:
 
 
 def _machine() -> str:
-    """Name of the kind of machine: its processor with all that it can do, and the threads that
-    programs are cut for."""
+    """Name of the kind of machine: its processor and the threads that programs are cut for."""
     relevant = (platform.machine(), platform.processor(), _processor(), _guard.pool_setting()[1])
     return hashlib.sha256(repr(relevant).encode()).hexdigest()[:16]
 
@@ -102,18 +109,3 @@ def _processor() -> tuple[str, ...]:
             if line.split("\t")[0].split(":")[0].strip() in wanted
         )
     return ()
-
-
-def _prune(folder: Path, largest: int) -> None:
-    """Deletes the oldest entries until those left take at most `largest` bytes."""
-    entries = []
-    for path in folder.iterdir():
-        with contextlib.suppress(OSError):  # another run may prune as well
-            entries.append((path.stat().st_mtime, path.stat().st_size, path))
-    total = sum(size for _, size, _ in entries)
-    for _, size, path in sorted(entries):
-        if total <= largest:
-            return
-        with contextlib.suppress(OSError):
-            path.unlink()
-            total -= size

@@ -1,7 +1,7 @@
-"""Several hosts: the processes of one sweep, each with the devices of its own host, in one mesh.
+"""The processes of one sweep on several hosts, each with the devices of its own host, in one mesh.
 
-Every process runs the same command. All compute and save; the first alone logs and writes what is
-written once. The sweep's folder must be one that all of them see.
+Every process runs the same command. All compute and save; the first alone logs. All of them must
+see the sweep's folder.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from jax.experimental import multihost_utils
 
 
 class Place(NamedTuple):
-    """Where to meet; fields that are None are left to what JAX detects."""
+    """Where processes meet; JAX detects what is None."""
 
     coordinator: str | None  # address:port of the first process
     processes: int | None
@@ -20,18 +20,12 @@ class Place(NamedTuple):
 
 
 def join(place: Place) -> None:
-    """Joins the other processes. Call it before anything else of JAX. Raises ValueError if they
-    cannot be found."""
-    if (
-        place.processes is not None
-        and place.process_id is not None
-        and not 0 <= place.process_id < place.processes
-    ):
-        raise ValueError(
-            f"--process-id: must lie in 0 .. {place.processes - 1}, not {place.process_id}"
-        )
+    """Joins the other processes, before JAX is used. Raises ValueError if there are none."""
+    processes, own = place.processes, place.process_id
+    if processes is not None and own is not None and not 0 <= own < processes:
+        raise ValueError(f"--process-id: must lie in 0 .. {processes - 1}, not {own}")
     try:
-        jax.distributed.initialize(place.coordinator, place.processes, place.process_id)
+        jax.distributed.initialize(place.coordinator, processes, own)
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"--coordinator, --processes, --process-id: {error}") from None
 
@@ -42,7 +36,7 @@ def is_first() -> bool:
 
 
 def agree(signal: int | None) -> int | None:
-    """The number of a signal that any process has seen, the largest; None if none has. All must
+    """The largest number of a signal that any process has seen, None if there is none. All must
     call it."""
     if jax.process_count() == 1:
         return signal

@@ -1,13 +1,11 @@
-"""How a training program is traced, and what XLA is asked for when it is compiled, where it is seen
-to know it.
+"""How a training program is traced, and which options XLA compiles it with.
 
-On a CPU it has a second library for convolutions, which is about twice as fast as Eigen at those of
-the small net. It is no default, and versions of jaxlib differ in it, so it is asked for only where
-it is seen to compute right.
+On a CPU, XLA has a second library for convolutions, about twice as fast as Eigen at those of the
+small net. It is not the default and differs between versions of jaxlib. It is used only where a
+test shows that it computes right.
 
-On a GPU it would write kernels of its own for each matrix product of DenseNet-121, in many ways,
-and time them all beside the vendor's library: half of the compilation, for kernels that are no
-faster (`experiments/bench`).
+On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
+That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
 """
 
 import functools
@@ -28,11 +26,10 @@ _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float
 
 
 def lower(jitted: Any, *given: Any) -> Any:
-    """`jitted.lower(*given)` while Python's garbage collector rests, which is a quarter to two
-    fifths less time.
+    """`jitted.lower(*given)` without Python's garbage collector, which saves a quarter of the time
+    or more.
 
-    Tracing makes hundreds of thousands of small objects, next to none of them garbage, and the
-    collector would go through them again and again.
+    Tracing makes hundreds of thousands of small objects and next to no garbage.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -44,10 +41,10 @@ def lower(jitted: Any, *given: Any) -> Any:
 
 
 def options(cfg: Config) -> dict[str, Any] | None:
-    """Options of `jax.jit` for the config's training program; None if there is nothing to ask for.
+    """Options of `jax.jit` for the config's training program, None for the defaults.
 
-    The library for convolutions only with the small net: it is slow at kernel gradients, which
-    `conv2d` keeps from it.
+    The second library is for the small net only. It is slow at kernel gradients, which `conv2d`
+    keeps from it.
     """
     if cfg.net.kind == "small":
         return dict(LIBRARY) if has_library() else None
@@ -56,7 +53,7 @@ def options(cfg: Config) -> dict[str, Any] | None:
 
 @functools.cache
 def _knows_vendor() -> bool:
-    """Whether this XLA can be told to leave matrix products to the vendor's library."""
+    """Whether this XLA can leave matrix products to the vendor's library."""
     try:
         jax.jit(jnp.negative, compiler_options=VENDOR).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
@@ -66,8 +63,7 @@ def _knows_vendor() -> bool:
 
 @functools.cache
 def has_library() -> bool:
-    """Whether the back end is a CPU, its XLA knows the library, and a small convolution by it is
-    right."""
+    """Whether this is a CPU whose XLA knows the library and computes a small convolution right."""
     if jax.default_backend() != "cpu":
         return False
     rng = np.random.default_rng(0)

@@ -22,8 +22,7 @@ PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Python's version and that of each package that can change a result; "missing" where one is
-    not installed."""
+    """Versions of Python and of the packages that can change a result, or "missing"."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -34,16 +33,15 @@ def versions() -> dict[str, str]:
 
 
 def device() -> str:
-    """The devices that JAX computes on, in words."""
+    """JAX's devices as text."""
     devices = jax.devices()
     return f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform})"
 
 
 def commit() -> str | None:
-    """Commit of the checkout that the package lies in, with "-dirty" if files differ from it; None
-    outside of one.
+    """Commit of the package's checkout, with "-dirty" if files differ from it; None without one.
 
-    What CSAC_JAX_COMMIT says goes before: in a container the sources come without their history.
+    CSAC_JAX_COMMIT replaces it: in a container the sources come without their history.
     """
     if named := os.environ.get("CSAC_JAX_COMMIT"):
         return named

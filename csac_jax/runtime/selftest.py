@@ -1,5 +1,4 @@
-"""Does this machine compute right? Sums that are known to go wrong somewhere, each against another
-implementation."""
+"""Whether this machine computes right: sums that go wrong somewhere, against other code."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,7 +21,7 @@ class Check(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Is the error within the bound? NaN is not."""
+        """Whether the error is within the bound; NaN is not."""
         return self.error <= self.bound
 
 
@@ -36,8 +35,7 @@ def rows_error() -> float:
 
 
 def cholesky_error() -> float:
-    """Largest error of 64 Choleskys of 66 x 66 in one batch, as MJX computes them, against
-    NumPy."""
+    """Largest error of 64 Choleskys of 66 x 66 in one batch, as MJX has them, against NumPy."""
     factors = np.random.default_rng(0).normal(size=(64, 66, 66))
     matrices = factors @ factors.transpose(0, 2, 1) / 66 + np.eye(66)
     got = jax.jit(jnp.linalg.cholesky)(matrices.astype(np.float32))

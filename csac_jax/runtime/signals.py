@@ -1,9 +1,8 @@
-"""Stopping on SIGINT and SIGTERM: the first asks the loop to save and end, a second of its kind
-ends at once.
+"""SIGINT and SIGTERM: the first asks the loop to save and end, a second of its kind ends at once.
 
-Python runs its own signal handlers only between bytecodes, so not while XLA compiles or a chunk
-runs. The C handler behind `signal.set_wakeup_fd` is not held up by that: it writes the signal's
-number into a socket, which a thread reads.
+Python runs its own signal handlers between bytecodes, so not while XLA compiles or a chunk runs.
+The C handler behind `signal.set_wakeup_fd` does not wait: it writes the signal's number into a
+socket, which a thread reads.
 """
 
 import os
@@ -16,8 +15,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """What the loop looks at between chunks. `signal` is the number of the first signal, None
-    before there is one."""
+    """A flag for the loop: the number of the first signal, None before there is one."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -29,8 +27,7 @@ class Stop:
 
 
 def install() -> Stop:
-    """Starts listening; call it in the main thread, as early as possible. Returns the flag that
-    signals set."""
+    """Starts listening and returns the flag. Call it early, in the main thread."""
     stop = Stop()
     reader, writer = socket.socketpair()
     writer.setblocking(False)
@@ -44,8 +41,7 @@ def install() -> Stop:
 
 
 def _listen(stop: Stop, reader: socket.socket, writer: socket.socket) -> None:
-    """Reads signal numbers for ever. Holds `writer` so that it stays open as long as signals may
-    come."""
+    """Reads signal numbers for ever. It holds `writer`, which must stay open."""
     seen: set[int] = set()
     while writer.fileno() >= 0:
         for number in reader.recv(64):

@@ -1,35 +1,35 @@
-"""The settings of a sweep: `--vary NAME=A,B` as flags of the command line, one combination after
-the other.
+"""The points of a sweep: every combination of the values in `--vary NAME=A,B`.
 
-Without JAX, so that complaints come at once. The flags are read by the same parser as a user's own.
+It needs no JAX, so that complaints come at once. A point's flags go through the same parser as the
+user's own.
 """
 
 import dataclasses
 import difflib
 import itertools
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from csac_jax.config import Algo, Config
+from csac_jax.config import ALTERNATIVES, Config, Section
 
-BASE = "base"  # name of the only setting where nothing is varied
-LONGEST = 120  # characters of a setting's name, which is a folder's
+BASE = "base"  # name of the only point where nothing is varied
+LONGEST = 120  # characters of a point's name, which is a folder's
 
 
-class Setting(NamedTuple):
+class SweepPoint(NamedTuple):
     """One combination of the varied values."""
 
-    name: str  # as in `learn.tau=0.01,replay.sampler=beta`
+    name: str  # as in `learn.tau=0.01,replay.sampler=beta`; of its folder
     values: dict[str, str]  # setting -> value, as given
-    flags: list[str]  # for the parser of `train`
+    cfg: Config  # with the first seed
 
 
-def settings(varied: Sequence[str]) -> list[Setting]:
-    """Every combination of the values of `NAME=A,B,...`, the last name's values changing fastest.
+def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> list[SweepPoint]:
+    """Every combination of the values of `NAME=A,B,...`; the last name's values change fastest.
 
-    Items of a tuple are parted by colons, as in `replay.beta_end=1:4,1:12`. Raises ValueError for a
-    name that is no setting, for no value or an empty one, and for what is given twice.
+    `configure` makes a config of a point's flags. Items of a tuple are separated by colons, as in
+    `replay.end=1:4,1:12`. Raises ValueError for what cannot be varied.
     """
     axes = dict(map(_axis, varied))
     if len(axes) < len(varied):
@@ -37,11 +37,20 @@ def settings(varied: Sequence[str]) -> list[Setting]:
     found = []
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
-        name = ",".join(f"{name}={value}" for name, value in values.items()) or BASE
-        flags = [flag for name, value in values.items() for flag in _flags(name, value)]
-        found.append(Setting(name, values, flags))
-    if any(len(setting.name) > LONGEST for setting in found):
-        found = [setting._replace(name=f"setting-{i}") for i, setting in enumerate(found)]
+        flags = [flag for setting, value in values.items() for flag in _flags(setting, value)]
+        found.append(SweepPoint(name(values), values, configure(flags)))
+    return with_short_names(found)
+
+
+def name(values: dict[str, str]) -> str:
+    """Name of a point."""
+    return ",".join(f"{setting}={value}" for setting, value in values.items()) or BASE
+
+
+def with_short_names(found: list[SweepPoint]) -> list[SweepPoint]:
+    """The points with numbers for names if one is too long for a folder."""
+    if any(len(point.name) > LONGEST for point in found):
+        return [point._replace(name=f"setting-{i}") for i, point in enumerate(found)]
     return found
 
 
@@ -53,43 +62,47 @@ def _axis(text: str) -> tuple[str, list[str]]:
     _kind(name)
     if len(set(values)) < len(values):
         raise ValueError(f"--vary {text}: a value is given twice")
-    if any(
-        "/" in value or (value.startswith((".", "-")) and not _is_number(value)) for value in values
-    ):
+    if not all(map(_names_a_folder, values)):
         raise ValueError(
             f"--vary {text}: a value must not hold a slash nor begin with a dot or dash"
         )
     return name, values
 
 
+def _names_a_folder(value: str) -> bool:
+    return "/" not in value and (not value.startswith((".", "-")) or _is_number(value))
+
+
 def _is_number(value: str) -> bool:
     try:
-        return bool(float(value)) or True
+        float(value)
     except ValueError:
         return False
+    return True
 
 
 def _kinds() -> dict[str, object]:
     """Type of everything that can be varied, by its dotted name."""
-    kinds: dict[str, object] = {"algo": Algo}
+    kinds: dict[str, object] = {"algo": str}
     for section in dataclasses.fields(Config):
-        if dataclasses.is_dataclass(section.type):
-            hints = typing.get_type_hints(section.type)
-            kinds |= {f"{section.name}.{name}": kind for name, kind in hints.items()}
+        default = getattr(Config(), section.name)
+        if isinstance(default, Section):
+            _, alternatives = ALTERNATIVES.get(section.name, ("", (type(default),)))
+            for kind in alternatives:
+                hints = typing.get_type_hints(kind)
+                names = [field.name for field in dataclasses.fields(kind)]
+                kinds |= {f"{section.name}.{name}": hints[name] for name in names}
     return kinds
 
 
 def _kind(name: str) -> object:
     kinds = _kinds()
+    if name == "seed":
+        raise ValueError("--vary: seeds are varied by --seeds")
     if name not in kinds:
         near = difflib.get_close_matches(name, kinds, 1)
-        meant = (
-            f"; perhaps you meant {near[0]}" if near else "; csac-jax train quick --help lists them"
-        )
-        reason = (
-            "seeds are varied by --seeds" if name == "seed" else f"'{name}' is no setting{meant}"
-        )
-        raise ValueError(f"--vary: {reason}")
+        hint = f"perhaps you meant {near[0]}" if near else "csac-jax train quick --help-all lists them"
+        raise ValueError(f"--vary: '{name}' is no setting; {hint}")
     return kinds[name]
 
 

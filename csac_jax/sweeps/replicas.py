@@ -1,12 +1,10 @@
-"""Many runs in one program: members that differ in their seed and in settings that are nothing but
-numbers.
+"""Many runs in one program: replicas, which differ in seed and hyper-parameters.
 
-S = members. `step.train_step` is written for one of them and is vmapped here, once, over all or
-over those of a lane. Of a member's state all leaves have a leading axis S but `step`, which all
-members share: what depends on it stays one schedule for all.
+S = replicas. `step.train_step` is written for one run and vmapped here, once. All leaves of a state
+have a leading axis S but `step`: replicas share the counter, so that a schedule by it stays a
+branch.
 """
 
-import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -16,245 +14,177 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from csac_jax.agent import actor_critic, rewards
+from csac_jax.agent import rewards
 from csac_jax.config import Config
 from csac_jax.runtime import compiler
 from csac_jax.sweeps import pipelined
-from csac_jax.training import chunked_vmap, step
-from csac_jax.training.sharding import AXIS, Shard, Spread
-from csac_jax.training.step import Program, StepMetrics, TrainState
+from csac_jax.nets import chunked_vmap
+from csac_jax.training import step
+from csac_jax.training.sharding import AXIS, DataSharding, Shard
+from csac_jax.training.step import Hyperparams, Program, StepMetrics, TrainState
 
-Array = np.ndarray | jax.Array
-
-NUMBERS = (
-    *("cem.std", "cem.std_min", "target.gamma", "target.inverse_temperature"),
-    *(
-        "reward.success_bonus",
-        "reward.distance_weight",
-        "reward.distance_cap",
-        "reward.eta0",
-        "reward.eta1",
-        "reward.push_level",
-    ),
-    *(
-        "reward.grasp_level",
-        "reward.nothing",
-        "reward.empty",
-        "reward.touched",
-        "reward.dropped",
-        "reward.lifted",
-    ),
-    *("reward.push_better", "reward.push_worse", "reward.dead_band", "reward.lost_block_penalty"),
-    *(
-        "explore.noise_std",
-        "explore.noise_clip",
-        "explore.epsilon_primitive_start",
-        "explore.epsilon_primitive_end",
-    ),
-    *(
-        "explore.epsilon_place_start",
-        "explore.epsilon_place_end",
-        "explore.decay",
-        "explore.push_fraction",
-    ),
-    *(
-        "learn.learning_rate",
-        "learn.actor_learning_rate",
-        "learn.lr_final_fraction",
-        "learn.tau",
-        "learn.gradient_clip",
-    ),
-    *(
-        "learn.huber",
-        "replay.alpha",
-        "replay.per_epsilon",
-        "replay.is_beta_start",
-        "replay.is_beta_end",
-    ),
-    *("replay.beta_start", "replay.beta_middle", "replay.beta_middle_at", "replay.beta_end"),
+_TRACED = {
+    "target": "gamma",
+    "reward": "success_bonus distance_weight eta grasp_levels push_levels lost_block_penalty",
+    "explore": "noise_std epsilon_primitive epsilon_place decay push_fraction",
+    "learn": "learning_rate actor_learning_rate lr_final_fraction tau",
+    "replay": "start middle end",
+}
+TRACED_HYPERPARAMS = tuple(
+    f"{section}.{name}" for section, names in _TRACED.items() for name in names.split()
 )
-"""Settings that enter the program as numbers only: no shape and no branch depends on them."""
+"""Settings that enter a program as numbers only: no shape and no branch depends on them."""
 
 
-def _prefix(members: Any, step: Any, scenes: Any) -> Any:
+def _prefix(replicas: Any, step: Any, scenes: Any) -> Any:
     """A value for each part of a state: its `step`, its scenes and all the rest."""
-    return TrainState(key=members, step=step, scenes=scenes, learner=members, replay=members)
+    return TrainState(key=replicas, step=step, scenes=scenes, learner=replicas, replay=replicas)
 
 
-AXES = _prefix(0, None, 0)  # of a state of members
+AXES = _prefix(0, None, 0)  # of a state of replicas
 
 
-class Members(NamedTuple):
-    """What tells members apart."""
+class Replicas(NamedTuple):
+    """What tells replicas apart."""
 
-    seed: Array  # [S] uint32
-    numbers: dict[str, Array]  # those of NUMBERS that differ, [S, ...] float32
-    bounds: (
-        tuple[Array, Array] | None
-    )  # smallest and largest possible return, [S]; None if no number differs
+    seed: Any  # [S] uint32
+    hyperparams: Hyperparams | None  # leaves [S, ...] float32; None if only the seeds differ
 
 
-class Engine(NamedTuple):
+class SweepProgram(NamedTuple):
     """What the host needs of a group's program."""
 
     init: Callable[[], Any]  # the first state, leaves [S, ...] but `step`
     abstract: Callable[[], Any]  # its shapes, types and places
-    chunk: Callable[
-        [int], Any
-    ]  # number of steps -> jitted function state -> (state, StepMetrics [T, S, ...])
-    member: Callable[[Any, int], Any]  # the state of one member, as `train` has it
+    chunk: Callable[[int], Any]  # steps -> jitted, state -> (state, StepMetrics [T, S, ...])
+    replica: Callable[[Any, int], Any]  # the state of one replica, as `train` has it
 
 
-class Group(NamedTuple):
-    """Configs that one program serves; they differ in seed, names and NUMBERS."""
+class ProgramGroup(NamedTuple):
+    """Configs that one program serves; they differ in seed, names and TRACED_HYPERPARAMS."""
 
     configs: tuple[Config, ...]  # [S]
-    numbers: tuple[str, ...]  # those in which they differ
+    hyperparams: tuple[str, ...]  # those in which they differ
 
 
-def group(configs: Sequence[Config]) -> list[Group]:
-    """The configs in as few groups as can be, in the order of their first members."""
-    found: dict[Config, list[Config]] = {}
+def group(configs: Sequence[Config]) -> list[ProgramGroup]:
+    """The configs in as few groups as can be, in the order of their first ones."""
+    groups: dict[Config, list[Config]] = {}
     for cfg in configs:
-        blank = dict.fromkeys(NUMBERS)
-        shape = dataclasses.replace(cfg, seed=0, preset="", algo="csac")
-        found.setdefault(with_numbers(shape, blank), []).append(cfg)
-    return [Group(tuple(members), _differing(members)) for members in found.values()]
+        unnamed = dataclasses.replace(cfg, seed=0, preset="", algo="csac")
+        blank = step.replace_settings(unnamed, dict.fromkeys(_traced(cfg)))
+        groups.setdefault(blank, []).append(cfg)
+    return [ProgramGroup(tuple(alike), _differing(alike)) for alike in groups.values()]
 
 
 def _differing(configs: Sequence[Config]) -> tuple[str, ...]:
-    return tuple(name for name in NUMBERS if len({number(cfg, name) for cfg in configs}) > 1)
+    return tuple(name for name in _traced(configs[0]) if len(set(_values(configs, name))) > 1)
 
 
-def number(cfg: Config, name: str) -> Any:
-    """The value of a setting by its dotted name, such as `learn.tau`."""
+def _traced(cfg: Config) -> list[str]:
+    """The TRACED_HYPERPARAMS that this config has: alternatives have settings of their own."""
+    return [name for name in TRACED_HYPERPARAMS if _has(cfg, name)]
+
+
+def _has(cfg: Config, name: str) -> bool:
     section, field = name.split(".")
-    return getattr(getattr(cfg, section), field)
+    return field in {one.name for one in dataclasses.fields(getattr(cfg, section))}
 
 
-def with_numbers(cfg: Config, values: dict[str, Any]) -> Config:
-    """The config with other values of settings, which may be traced and are not checked."""
-    cfg = copy.copy(cfg)
-    for name, value in values.items():
-        section, field = name.split(".")
-        changed = copy.copy(getattr(cfg, section))
-        object.__setattr__(changed, field, value)
-        object.__setattr__(cfg, section, changed)
-    return cfg
+def _values(configs: Sequence[Config], name: str) -> list[Any]:
+    """The configs' values of a setting, by its dotted name."""
+    section, field = name.split(".")
+    return [getattr(getattr(cfg, section), field) for cfg in configs]
 
 
-def members(given: Group) -> Members:
-    """What tells the members of a group apart. Arrays of NumPy: every process of a cluster brings
-    its own along.
+def of_group(given: ProgramGroup) -> Replicas:
+    """What tells the runs of a group apart, as arrays of NumPy: every process has its own copy.
 
-    Bounds of returns are found here, from plain numbers.
+    Bounds of returns are computed here, from plain numbers.
     """
     seed = np.array([cfg.seed for cfg in given.configs], np.uint32)
-    numbers: dict[str, Array] = {}
-    numbers |= {
-        name: np.array([number(cfg, name) for cfg in given.configs], np.float32)
-        for name in given.numbers
+    if not given.hyperparams:
+        return Replicas(seed, None)
+    values = {
+        name: np.array(_values(given.configs, name), np.float32) for name in given.hyperparams
     }
-    if not numbers:
-        return Members(seed, {}, None)
-    low, high = np.array(
-        [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in given.configs], np.float32
-    ).T
-    return Members(seed, numbers, (low, high))
-
-
-def _lifted(program: Program, member: Members) -> Program:
-    """The program of one member: its numbers in place of the constants."""
-    if member.bounds is None:
-        return program
-    cfg = with_numbers(program.cfg, member.numbers)
-    return dataclasses.replace(
-        program, cfg=cfg, learner=actor_critic.with_numbers(program.learner, cfg, member.bounds)
-    )
+    bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in given.configs]
+    low, high = np.array(bounds, np.float32).T
+    return Replicas(seed, Hyperparams(values, (low, high)))
 
 
 def init(
-    program: Program, given: Members, mesh: Mesh | None = None, shard: Shard = "seeds"
+    program: Program, replicas: Replicas, mesh: Mesh | None = None, shard: Shard = "seeds"
 ) -> TrainState:
-    """The state of all members before the first step, laid out over the mesh if there is one."""
+    """The state of all replicas before the first step, laid out over the mesh if there is one."""
 
-    def begin(member: Members) -> TrainState:
-        return step.begin(_lifted(program, member), jax.random.key(member.seed))
+    def init_one(replica: Replicas) -> TrainState:
+        return step.init_state(program, jax.random.key(replica.seed), replica.hyperparams)
 
-    build = jax.vmap(begin, out_axes=AXES)
-    return jax.jit(build, out_shardings=shardings(mesh, shard))(given)
+    build = jax.vmap(init_one, out_axes=AXES)
+    return jax.jit(build, out_shardings=shardings(mesh, shard))(replicas)
 
 
 def shardings(mesh: Mesh | None, shard: Shard) -> Any:
-    """Where the leaves of a state of members lie, as a prefix of it; None without a mesh."""
+    """Where the leaves of a state of replicas lie, as a prefix of it; None without a mesh."""
     if mesh is None:
         return None
     every, seeds = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
     if shard == "seeds":
         return _prefix(seeds, every, seeds)
-    scenes = NamedSharding(mesh, PartitionSpec(None, AXIS))
-    return _prefix(every, every, scenes)
+    return _prefix(every, every, NamedSharding(mesh, PartitionSpec(None, AXIS)))
 
 
 def compile_chunk(
     program: Program,
-    given: Members,
+    replicas: Replicas,
     num_steps: int,
     mesh: Mesh | None = None,
     shard: Shard = "seeds",
-    in_lanes: int = 1,
-):
-    """A jitted function state -> (state, StepMetrics [T, S, ...]) of `num_steps` training steps of
-    all members.
+    parts: int = 1,
+) -> Any:
+    """A jitted function state -> (state, StepMetrics [T, S, ...]) of `num_steps` training steps.
 
-    The state is donated. With a mesh over seeds each device scans its own members and hears nothing
-    of the others; metrics end up on every device. Networks that take turns do so, unless numbers
-    are traced, which cannot be lifted out of a loop over members, or scenes are spread. Without a
-    mesh members may run in lanes, which divide them.
+    The state is donated. With a mesh over seeds each device scans its own replicas; metrics end up
+    on every device. Without a mesh the replicas may run in several `parts`, see `pipelined`.
+    Networks work in chunks unless hyper-parameters are traced, which `chunked_vmap` cannot close
+    over, or scenes are sharded.
     """
-    here = len(given.seed) // (
-        in_lanes if mesh is None else mesh.size
-    )  # vmapped in one program of a device
+    vmapped = len(replicas.seed) // (parts if mesh is None else mesh.size)  # in one program
     if mesh is not None and shard == "scenes":
-        program = dataclasses.replace(program, spread=Spread(mesh))
-    elif not given.numbers:
-        program = dataclasses.replace(program, at_once=chunked_vmap.at_once(program.cfg, here))
+        program = dataclasses.replace(program, sharding=DataSharding(mesh))
+    elif replicas.hyperparams is None:
+        at_once = chunked_vmap.chunk_size(program.cfg, vmapped)
+        program = dataclasses.replace(program, learner=program.learner.in_chunks(at_once))
 
-    def chunk(state: TrainState, given: Members) -> tuple[TrainState, StepMetrics]:
-        def one(member: Members, state: TrainState) -> tuple[TrainState, StepMetrics]:
-            return step.train_step(_lifted(program, member), state)
+    def chunk(state: TrainState, replicas: Replicas) -> tuple[TrainState, StepMetrics]:
+        def train_one(replica: Replicas, state: TrainState) -> tuple[TrainState, StepMetrics]:
+            return step.train_step(program, state, replica.hyperparams)
 
-        every = jax.vmap(one, in_axes=(0, AXES), out_axes=(AXES, 0))
-        return jax.lax.scan(lambda carry, _: every(given, carry), state, length=num_steps)
+        train_all = jax.vmap(train_one, in_axes=(0, AXES), out_axes=(AXES, 0))
+        return jax.lax.scan(lambda carry, _: train_all(replicas, carry), state, length=num_steps)
 
-    # What a CPU's library for convolutions makes of vmapped ones, or on several devices, is not
-    # measured.
-    known = program.cfg.net.kind != "small" or (here == 1 and mesh is None)
-    asked = compiler.options(program.cfg) if known else None
-    if mesh is None and in_lanes > 1:
-        shares = [
-            jax.tree.map(lambda leaf, part=part: leaf[part], given)
-            for part in _parts(len(given.seed), in_lanes)
-        ]
-        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=asked)
-        return pipelined.InLanes(
-            jitted, shares, jax.jit(lambda state: _split(state, in_lanes)), jax.jit(_joined)
+    # The CPU's library for convolutions is not measured where they are vmapped or sharded.
+    measured = program.cfg.net.kind != "small" or (vmapped == 1 and mesh is None)
+    options = compiler.options(program.cfg) if measured else None
+    if mesh is None and parts > 1:
+        return _in_parts(
+            jax.jit(chunk, donate_argnums=0, compiler_options=options), replicas, parts
         )
-    if mesh is None:
-        return jax.jit(lambda state: chunk(state, given), donate_argnums=0, compiler_options=asked)
-    if shard == "seeds":
-        chunk = _each_device(mesh, chunk)
-    out = (shardings(mesh, shard), NamedSharding(mesh, PartitionSpec()))
+    out = None
+    if mesh is not None:
+        out = (shardings(mesh, shard), NamedSharding(mesh, PartitionSpec()))
+        chunk = _each_device(mesh, chunk) if shard == "seeds" else chunk
     return jax.jit(
-        lambda state: chunk(state, given),
+        lambda state: chunk(state, replicas),
         donate_argnums=0,
         out_shardings=out,
-        compiler_options=asked,
+        compiler_options=options,
     )
 
 
 def _each_device(mesh: Mesh, chunk: Any) -> Any:
-    """The chunk on each device's share of the members."""
+    """The chunk on each device's share of the replicas."""
     share, every, metrics = PartitionSpec(AXIS), PartitionSpec(), PartitionSpec(None, AXIS)
     state = _prefix(share, every, share)
     return jax.shard_map(
@@ -262,45 +192,38 @@ def _each_device(mesh: Mesh, chunk: Any) -> Any:
     )
 
 
-def _parts(num: int, in_lanes: int) -> list[slice]:
-    """Which of `num` members each lane has."""
-    return [slice(k * num // in_lanes, (k + 1) * num // in_lanes) for k in range(in_lanes)]
+def _in_parts(chunk: Any, replicas: Replicas, parts: int) -> pipelined.Pipelined:
+    """The jitted chunk for all replicas, an equal part of them at a time."""
+    size = len(replicas.seed) // parts
+    slices = [slice(k * size, (k + 1) * size) for k in range(parts)]
+
+    def split(state: TrainState) -> list[TrainState]:
+        return [jax.tree.map(jnp.copy, replica(state, part)) for part in slices]
+
+    shares = [jax.tree.map(lambda leaf, part=part: leaf[part], replicas) for part in slices]
+    return pipelined.Pipelined(chunk, shares, jax.jit(split), jax.jit(_join))
 
 
-def _split(state: TrainState, in_lanes: int) -> list[TrainState]:
-    """The state of each lane, in memory of its own."""
-    return [
-        jax.tree.map(jnp.copy, member(state, part)) for part in _parts(state.key.shape[0], in_lanes)
-    ]
-
-
-def _joined(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, StepMetrics]:
-    """What the lanes return, [S', ...] and [T, S', ...] each, as of all members."""
+def _join(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, StepMetrics]:
+    """States [S', ...] and metrics [T, S', ...] of the parts as those of all replicas."""
     states, metrics = zip(*done, strict=True)
-    every = jax.tree.map(
-        lambda *leaves: jnp.concatenate(leaves), *(one.replace(step=()) for one in states)
-    )
-    return every.replace(step=states[0].step), jax.tree.map(
-        lambda *leaves: jnp.concatenate(leaves, axis=1), *metrics
-    )
+    leading = [state.replace(step=()) for state in states]
+    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *leading)
+    all_metrics = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *metrics)
+    return joined.replace(step=states[0].step), all_metrics
 
 
-def member(state: TrainState, index: int | slice) -> TrainState:
-    """The state of one member, as `train` has it, or of several."""
-    parts = {
-        "key": state.key,
-        "scenes": state.scenes,
-        "learner": state.learner,
-        "replay": state.replay,
-    }
-    return TrainState(step=state.step, **jax.tree.map(lambda leaf: leaf[index], parts))
+def replica(state: TrainState, index: int | slice) -> TrainState:
+    """The state of one replica, as `train` has it, or of several."""
+    own = jax.tree.map(lambda leaf: leaf[index], state.replace(step=()))
+    return own.replace(step=state.step)
 
 
 def abstract(
-    program: Program, given: Members, mesh: Mesh | None = None, shard: Shard = "seeds"
+    program: Program, replicas: Replicas, mesh: Mesh | None = None, shard: Shard = "seeds"
 ) -> TrainState:
     """Shapes, types and places of `init`'s state; nothing is compiled."""
-    shapes = jax.eval_shape(lambda: init(program, given))
+    shapes = jax.eval_shape(lambda: init(program, replicas))
     if mesh is None:
         return shapes
 
@@ -312,26 +235,31 @@ def abstract(
     return jax.tree.map(place, shardings(mesh, shard), shapes)
 
 
-def engine(
-    given: Group, mesh: Mesh | None = None, shard: Shard = "seeds", trunk: Any = None
-) -> Engine:
-    """What the host needs of a group's program. The environment is made here; see `step.init` for
-    `trunk`."""
-    program, each = step.make(given.configs[0]), members(given)
-    in_lanes = pipelined.number(program.cfg, len(given.configs), mesh)
+def sweep_program(
+    given: ProgramGroup,
+    mesh: Mesh | None = None,
+    shard: Shard = "seeds",
+    start: Callable[[Any], Any] | None = None,
+) -> SweepProgram:
+    """The program of a group; its environment is made here.
 
-    def begin() -> TrainState:
-        state = init(program, each, mesh, shard)
-        if trunk is None:
+    Args: start, changes the learners' first state [S, ...], as networks that they start from.
+    """
+    program, replicas = step.make(given.configs[0]), of_group(given)
+    parts = pipelined.num_parts(program.cfg, len(given.configs), mesh)
+
+    def first_state() -> TrainState:
+        state = init(program, replicas, mesh, shard)
+        if start is None:
             return state
-        state = state.replace(learner=actor_critic.with_trunk(state.learner, trunk))
+        state = state.replace(learner=start(state.learner))
         return state if mesh is None else jax.device_put(state, shardings(mesh, shard))
 
-    return Engine(
-        init=begin,
-        abstract=lambda: abstract(program, each, mesh, shard),
-        chunk=lambda num_steps: compile_chunk(program, each, num_steps, mesh, shard, in_lanes),
-        member=member
+    return SweepProgram(
+        init=first_state,
+        abstract=lambda: abstract(program, replicas, mesh, shard),
+        chunk=lambda num_steps: compile_chunk(program, replicas, num_steps, mesh, shard, parts),
+        replica=replica
         if mesh is None
-        else jax.jit(member, out_shardings=NamedSharding(mesh, PartitionSpec())),
+        else jax.jit(replica, out_shardings=NamedSharding(mesh, PartitionSpec())),
     )

@@ -1,13 +1,13 @@
-"""The host's side of a sweep: groups of settings in turn, all members of a group in one program.
+"""The host's side of a sweep: its groups in turn, all runs of a group in one program.
 
 SWEEP/sweep.json                what was asked for; a sweep is resumed from it
-SWEEP/summary.json              every setting's grasp success over its seeds, and every member's
-SWEEP/SETTING/seed-K/           a member, laid out like a run of `train`; its checkpoint is written at the end
-SWEEP/groups/I/checkpoints/     the state of all members of group I, until they are done
+SWEEP/summary.json              grasp success of every point over its seeds, and of every run
+SWEEP/POINT/seed-K/             a run, laid out like one of `train`; its checkpoint comes at the end
+SWEEP/groups/I/checkpoints/     the state of all runs of group I, until they are done
 SWEEP/groups/I/done             their checkpoints are written
 
-A member is one setting with one seed. One whose loss is not finite is given up and named; the
-others go on, whom it cannot reach.
+A run is one point with one seed. One whose loss is not finite is given up and named; it cannot
+reach the others, which go on.
 """
 
 import contextlib
@@ -29,7 +29,8 @@ from csac_jax.evaluation import statistics
 from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
-from csac_jax.sweeps.replicas import Engine, Group, group
+from csac_jax.sweeps.grid import SweepPoint
+from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group
 from csac_jax.training import loop, memory
 
 PLAN = "sweep.json"
@@ -41,36 +42,33 @@ class SweepError(Exception):
     """A sweep that cannot begin or go on; the message is one line with the remedy."""
 
 
-class Setting(NamedTuple):
-    """One combination of the varied values."""
-
-    name: str  # of its folder
-    values: dict[str, str]  # varied setting -> value, as given
-    cfg: Config  # with the first seed
-
-
-class Plan(NamedTuple):
-    """What a sweep runs: every setting with seeds cfg.seed, cfg.seed + 1, ..."""
+class SweepPlan(NamedTuple):
+    """What a sweep runs: every point with seeds cfg.seed, cfg.seed + 1, ..."""
 
     seeds: int
-    settings: list[Setting]
+    points: list[SweepPoint]
 
 
-class Member(NamedTuple):
+class SweepRun(NamedTuple):
     """One run of a sweep."""
 
-    setting: str
+    point: str
     cfg: Config
 
+    @property
+    def folder(self) -> Path:
+        """Where its log and checkpoint lie, within the sweep's folder."""
+        return Path(self.point) / f"seed-{self.cfg.seed}"
 
-class Progress(NamedTuple):
-    """What the host carries for a member from chunk to chunk."""
 
-    run: loop.Progress
+class RunProgress(NamedTuple):
+    """What the host carries for a run from chunk to chunk."""
+
+    progress: loop.Progress
     failed: int | None  # step of the chunk in which a loss was not finite
 
 
-class Result(NamedTuple):
+class SweepResult(NamedTuple):
     """How a sweep ended."""
 
     summary: dict[str, Any]  # as in summary.json
@@ -79,115 +77,101 @@ class Result(NamedTuple):
 
 
 def run(
-    plan: Plan,
+    plan: SweepPlan,
     folder: Path,
-    engine: Callable[[Group], Engine],
+    make_program: Callable[[ProgramGroup], SweepProgram],
     reporter: loop.Reporter,
     stop: Stop,
     resume: bool = False,
-) -> Result:
+) -> SweepResult:
     """Runs what is left of a sweep, or until `stop.signal` is set; saves in both cases.
 
-    Args: folder, made unless `resume`; engine, gives the program of a group, once per group that is
-    not done. Raises SweepError if a chunk is left that no member can go on with, CheckpointError if
-    a checkpoint is damaged.
+    Args: folder, made unless `resume`; make_program, called once for each group that is not done.
+    Raises CheckpointError if a checkpoint is damaged.
     """
     cluster.wait("sweep")  # all have looked whether there is such a folder
     if not resume and cluster.is_first():
         folder.mkdir(parents=True)
         files.replace(folder / PLAN, plan_text(plan))
-    sweep = _Sweep(plan, folder, reporter, stop)
+    sweep = _Sweep(folder, groups_of(plan), reporter, stop)
     compiled = []
-    for index, (given, each) in enumerate(sweep.groups):
+    for index, (given, _) in enumerate(sweep.groups):
         if not sweep.stopping() and not (sweep.group_folder(index) / DONE).exists():
-            compiled += sweep.run_group(index, given, each, engine(given))
+            compiled += sweep.train_group(index, make_program(given))
     summary = summarise(plan, folder)
     if cluster.is_first():
         files.write_json(folder / SUMMARY, summary)
     reporter.say(_ending(folder, sweep.stopped))
-    return Result(summary, compiled, sweep.stopped)
+    return SweepResult(summary, compiled, sweep.stopped)
 
 
-def read_plan(folder: Path) -> Plan:
+def read_plan(folder: Path) -> SweepPlan:
     """The plan of a sweep's folder. Raises SweepError if there is none that can be read."""
     try:
         stored = json.loads((folder / PLAN).read_text())
-        settings = [
-            Setting(one["name"], one["values"], configs.from_dict(one["config"]))
-            for one in stored["settings"]
+        points = [
+            SweepPoint(point["name"], point["values"], configs.from_dict(point["config"]))
+            for point in stored["settings"]
         ]
-        return Plan(stored["seeds"], settings)
+        return SweepPlan(stored["seeds"], points)
     except FileNotFoundError:
         raise SweepError(f"there is no {PLAN} in {folder}; give the folder of a sweep") from None
     except (ValueError, KeyError, TypeError) as error:
         raise SweepError(f"{folder / PLAN} cannot be read ({error}); begin a new sweep") from None
 
 
-def plan_text(plan: Plan) -> str:
+def plan_text(plan: SweepPlan) -> str:
     """What `read_plan` reads, as JSON."""
-    settings = [
-        {"name": one.name, "values": one.values, "config": configs.to_dict(one.cfg)}
-        for one in plan.settings
+    points = [
+        {"name": point.name, "values": point.values, "config": configs.to_dict(point.cfg)}
+        for point in plan.points
     ]
-    return json.dumps({"seeds": plan.seeds, "settings": settings}, indent=2) + "\n"
+    return json.dumps({"seeds": plan.seeds, "settings": points}, indent=2) + "\n"
 
 
-def members_of(plan: Plan) -> list[Member]:
-    """Every setting with every seed."""
+def runs_of(plan: SweepPlan) -> list[SweepRun]:
+    """Every point with every seed."""
     return [
-        Member(one.name, dataclasses.replace(one.cfg, seed=one.cfg.seed + k))
-        for one in plan.settings
+        SweepRun(point.name, dataclasses.replace(point.cfg, seed=point.cfg.seed + k))
+        for point in plan.points
         for k in range(plan.seeds)
     ]
 
 
-def member_folder(folder: Path, one: Member) -> Path:
-    """Where a member's log and checkpoint lie."""
-    return folder / one.setting / f"seed-{one.cfg.seed}"
-
-
-def groups_of(plan: Plan) -> list[tuple[Group, list[Member]]]:
-    """What runs together, each with its members in order."""
-    left = {one.cfg: one for one in members_of(plan)}
-    if len(left) < plan.seeds * len(plan.settings):
+def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
+    """What runs together, each with its runs in order. Raises SweepError if points are equal."""
+    runs = {run.cfg: run for run in runs_of(plan)}
+    if len(runs) < plan.seeds * len(plan.points):
         raise SweepError("--vary: two settings have the same values; leave one of them out")
-    return [(given, [left[cfg] for cfg in given.configs]) for given in group(list(left))]
+    return [(given, [runs[cfg] for cfg in given.configs]) for given in group(list(runs))]
 
 
-def check(plan: Plan) -> None:
-    """Raises ValueError or SweepError for a plan that cannot be run whatever the devices."""
-    groups_of(plan._replace(seeds=1))  # seeds never make a difference
-
-
-def check_room(plan: Plan, devices: int) -> None:
-    """Raises ValueError where the members of a group, spread over `devices`, are known to exceed
-    what a device has room for: its memory, or the scenes that Warp's contacts are laid out for."""
+def check_room(plan: SweepPlan, devices: int) -> None:
+    """Raises ValueError where the runs of a group, divided among `devices`, exceed what a device
+    has room for: its memory, or the scenes of Warp's contacts."""
     for given, _ in groups_of(plan._replace(seeds=1)):
-        cfg, available, alike = given.configs[0], memory.limit(), not given.numbers
-        members = -(-len(given.configs) * plan.seeds // devices)
-        if cfg.sim.physics == "warp" and members * cfg.train.scenes > WARP_WORLDS:
+        cfg, runs = given.configs[0], -(-len(given.configs) * plan.seeds // devices)
+        if cfg.sim.physics == "warp" and runs * cfg.train.scenes > WARP_WORLDS:
             raise ValueError(
-                f"--seeds: {members} members of {cfg.train.scenes} scenes side by side, Warp has room for "
-                f"{WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take --sim.physics mjx"
+                f"--seeds: {runs} runs of {cfg.train.scenes} scenes side by side, Warp has room "
+                f"for {WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take "
+                "--sim.physics mjx"
             )
-        total = memory.sure(cfg, members, alike)
-        if total > available:
-            fit = sum(memory.sure(cfg, fewer, alike) <= available for fewer in range(1, members))
-            raise ValueError(
-                f"--seeds: {members} members side by side take {total / memory.GIB:.1f} GiB, there are "
-                f"{available / memory.GIB:.1f}, enough for {fit}; lower --seeds or --replay.capacity, vary fewer "
-                "numbers or raise --devices"
-            )
+        memory.check(cfg, runs)
 
 
 class _Sweep:
     """A sweep on its way."""
 
-    def __init__(self, plan: Plan, folder: Path, reporter: loop.Reporter, stop: Stop) -> None:
-        self.folder, self.reporter, self.stop = folder, reporter, stop
-        self.groups = groups_of(plan)
+    def __init__(
+        self,
+        folder: Path,
+        groups: list[tuple[ProgramGroup, list[SweepRun]]],
+        reporter: loop.Reporter,
+        stop: Stop,
+    ) -> None:
+        self.folder, self.groups, self.reporter, self.stop = folder, groups, reporter, stop
         self.stopped: int | None = None  # number of the signal that all processes know of
-        self._total = sum(_actions(given.configs) for given, _ in self.groups)
 
     def stopping(self) -> bool:
         """Whether a signal has come to any process. All must ask at once."""
@@ -197,119 +181,45 @@ class _Sweep:
     def group_folder(self, index: int) -> Path:
         return self.folder / "groups" / str(index)
 
-    def run_group(
-        self, index: int, given: Group, each: list[Member], engine: Engine
-    ) -> list[float]:
+    def train_group(self, index: int, program: SweepProgram) -> list[float]:
         """Trains a group to its end or to a signal; returns the time of its compilation, s, if
         there was one."""
-        folder, cfg = self.group_folder(index), given.configs[0]
-        state, progress, step = self._start(folder, each, engine)
-        self.reporter.say(self._title(index, each, step))
+        runs = self.groups[index][1]
+        training = _GroupTraining(self.folder, self.group_folder(index), runs, program)
+        self.reporter.say(self._title(index, training))
         compiled: list[float] = []
         chunk = None
-        with self._logs(each) as logs:
-            while step < loop.total_steps(cfg) and not self.stopping():
-                if all(one.failed is not None for one in progress):
-                    break
+        with training.open_logs() as logs:
+            while not training.over() and not self.stopping():
                 if chunk is None:
-                    chunk, seconds = loop.compile_program(cfg, engine.chunk, state, self.reporter)
+                    chunk, seconds = loop.compile_program(
+                        training.cfg, program.chunk, training.state, self.reporter
+                    )
                     compiled.append(seconds)
                     continue  # a signal may have come meanwhile
-                begun = time.perf_counter()
-                state, metrics = chunk(state)
-                metrics = jax.device_get(metrics)
-                step += cfg.train.chunk
-                progress = self._log(
-                    logs, each, step, metrics, progress, time.perf_counter() - begun
-                )
-                if step % (cfg.train.save_every * cfg.train.chunk) == 0:
-                    _save(folder, step, state, cfg, progress)
-        if checkpoint.latest_step(folder) != step:
-            _save(folder, step, state, cfg, progress)
+                records = training.advance(chunk, logs, self.reporter)
+                if records:
+                    self._show(index, records)
+        if checkpoint.latest_step(training.folder) != training.step:
+            training.save()
         if self.stopped is None:
-            self._finish(folder, step, each, engine, state, progress)
+            training.finish()
         return compiled
 
-    def _start(
-        self, folder: Path, each: list[Member], engine: Engine
-    ) -> tuple[Any, list[Progress], int]:
-        """State of the newest checkpoint, if there is one, else the first one; logs are cut to
-        it."""
-        if checkpoint.latest_step(folder) is None:
-            state, progress, step = (
-                engine.init(),
-                [Progress(loop.Progress(0.0, []), None)] * len(each),
-                0,
-            )
-        else:
-            state, extra = checkpoint.restore(folder, engine.abstract())
-            progress = [Progress(loop.Progress(*run), failed) for run, failed in extra["members"]]
-            step = int(state.step)
-        if cluster.is_first():
-            for one in each:
-                path = member_folder(self.folder, one)
-                path.mkdir(parents=True, exist_ok=True)
-                files.write_json(path / files.CONFIG, configs.to_dict(one.cfg))
-                files.truncate_log(path / files.METRICS, step)
-        return state, progress, step
-
-    def _title(self, index: int, each: list[Member], step: int) -> str:
-        names = list(dict.fromkeys(one.setting for one in each))
+    def _title(self, index: int, training: "_GroupTraining") -> str:
+        names = list(dict.fromkeys(run.point for run in training.runs))
         shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-        since = f", resumed at step {step}" if step else ""
-        return f"group {index + 1} of {len(self.groups)}: {len(each)} members, {shown}{since}"
+        since = f", resumed at step {training.step}" if training.step else ""
+        number = f"group {index + 1} of {len(self.groups)}"
+        return f"{number}: {len(training.runs)} runs, {shown}{since}"
 
-    @contextlib.contextmanager
-    def _logs(self, each: list[Member]) -> Iterator[list[TextIO]]:
-        with contextlib.ExitStack() as stack:
-            paths = [member_folder(self.folder, one) / files.METRICS for one in each]
-            yield [
-                stack.enter_context(open(path if cluster.is_first() else os.devnull, "a"))
-                for path in paths
-            ]
-
-    def _log(
-        self,
-        logs: list[TextIO],
-        each: list[Member],
-        step: int,
-        metrics: Any,
-        before: list[Progress],
-        seconds: float,
-    ) -> list[Progress]:
-        """Writes every member's line of a chunk with `metrics` [T, S, ...], and shows them
-        together."""
-        after, records = [], []
-        for i, (one, given) in enumerate(zip(each, before, strict=True)):
-            own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
-            if given.failed is None and not loop.is_finite(own):
-                self.reporter.say(
-                    f"{one.setting}, seed {one.cfg.seed}: given up at step {step}, a loss is not finite"
-                )
-                given = given._replace(failed=step)
-            if given.failed is None:
-                run, record = loop.record_chunk(one.cfg, step, own, given.run, seconds)
-                logs[i].write(json.dumps(dataclasses.asdict(record)) + "\n")
-                logs[i].flush()
-                given = given._replace(run=run)
-                records.append(record)
-            after.append(given)
-        if records:
-            self._show(each, records)
-        return after
-
-    def _show(self, each: list[Member], records: list[loop.Record]) -> None:
-        """One line about all members: their actions and speed together, means of the rest."""
-        first, index = (
-            records[0],
-            next(i for i, (_, other) in enumerate(self.groups) if other is each),
-        )
-        done = sum(
-            _actions(given.configs) for given, _ in self.groups[:index]
-        ) + first.actions * len(each)
+    def _show(self, index: int, records: list[loop.Record]) -> None:
+        """One line about all runs: their actions and speed together, means of the rest."""
+        actions = [_actions(given.configs) for given, _ in self.groups]
+        done = sum(actions[:index]) + records[0].actions * len(self.groups[index][1])
         speed = sum(record.actions_per_second for record in records)
         shown = dataclasses.replace(
-            first,
+            records[0],
             actions=done,
             actions_per_second=speed,
             grasp_success=_mean([record.grasp_success for record in records]),
@@ -317,27 +227,94 @@ class _Sweep:
             critic_loss=_mean([record.critic_loss for record in records]),
             actor_loss=_mean([record.actor_loss for record in records]),
         )
-        self.reporter.progress(shown, self._total, (self._total - done) / max(speed, 1e-9))
+        total = sum(actions)
+        self.reporter.progress(shown, total, (total - done) / max(speed, 1e-9))
 
-    def _finish(
-        self,
-        folder: Path,
-        step: int,
-        each: list[Member],
-        engine: Engine,
-        state: Any,
-        progress: list[Progress],
+
+class _GroupTraining:
+    """A group on its way: its state and what the host carries for each run."""
+
+    def __init__(
+        self, sweep_folder: Path, folder: Path, runs: list[SweepRun], program: SweepProgram
     ) -> None:
-        """A checkpoint for every member, then the group's own makes room. Done again if it was
-        interrupted."""
-        for i, (one, given) in enumerate(zip(each, progress, strict=True)):
-            if given.failed is None:
-                path = member_folder(self.folder, one)
-                _remove(path / checkpoint.FOLDER)
-                checkpoint.save(path, step, engine.member(state, i), one.cfg, given.run._asdict())
+        """Goes on from the newest checkpoint, if there is one; logs are cut to it."""
+        self.folder, self.runs, self.program = folder, runs, program
+        self.cfg = runs[0].cfg
+        self.paths = [sweep_folder / run.folder for run in runs]
+        if checkpoint.latest_step(folder) is None:
+            self.state, self.step = program.init(), 0
+            self.progress = [RunProgress(loop.Progress(0.0, []), None)] * len(runs)
+        else:
+            self.state, extra = checkpoint.restore(folder, program.abstract())
+            self.step = int(self.state.step)
+            stored = extra["runs"] if "runs" in extra else extra["members"]  # its older name
+            self.progress = [RunProgress(loop.Progress(*own), failed) for own, failed in stored]
         if cluster.is_first():
-            files.replace(folder / DONE, "")
-        _remove(folder / checkpoint.FOLDER)
+            for run, path in zip(runs, self.paths, strict=True):
+                path.mkdir(parents=True, exist_ok=True)
+                files.write_json(path / files.CONFIG, configs.to_dict(run.cfg))
+                files.truncate_log(path / files.METRICS, self.step)
+
+    def over(self) -> bool:
+        """Whether all runs are done or given up."""
+        lost = all(own.failed is not None for own in self.progress)
+        return lost or self.step >= loop.total_steps(self.cfg)
+
+    @contextlib.contextmanager
+    def open_logs(self) -> Iterator[list[TextIO]]:
+        """The runs' logs, to be added to; only the first process has them."""
+        with contextlib.ExitStack() as stack:
+            names = [path / files.METRICS for path in self.paths]
+            names = names if cluster.is_first() else [Path(os.devnull)] * len(names)
+            yield [stack.enter_context(name.open("a")) for name in names]
+
+    def advance(
+        self, chunk: Callable[[Any], Any], logs: list[TextIO], reporter: loop.Reporter
+    ) -> list[loop.Record]:
+        """Runs a chunk, writes the line of every run that is not given up, and saves now and then.
+        Returns the lines."""
+        begun = time.perf_counter()
+        self.state, metrics = chunk(self.state)
+        metrics = jax.device_get(metrics)
+        self.step += self.cfg.train.chunk
+        seconds = time.perf_counter() - begun
+        records = []
+        for i, (run, before) in enumerate(zip(self.runs, self.progress, strict=True)):
+            own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
+            if before.failed is not None:
+                continue
+            if not loop.is_finite(own):
+                self.progress[i] = before._replace(failed=self.step)
+                reporter.say(
+                    f"{run.point}, seed {run.cfg.seed}: given up at step {self.step}, "
+                    "a loss is not finite"
+                )
+                continue
+            after, record = loop.record_chunk(run.cfg, self.step, own, before.progress, seconds)
+            self.progress[i] = before._replace(progress=after)
+            logs[i].write(json.dumps(dataclasses.asdict(record)) + "\n")
+            logs[i].flush()
+            records.append(record)
+        if self.step % (self.cfg.train.save_every * self.cfg.train.chunk) == 0:
+            self.save()
+        return records
+
+    def save(self) -> None:
+        """Writes a checkpoint of the group."""
+        runs = [[list(own.progress), own.failed] for own in self.progress]
+        checkpoint.save(self.folder, self.step, self.state, self.cfg, {"runs": runs})
+
+    def finish(self) -> None:
+        """Writes a checkpoint for every run, then removes the group's own. An interrupted call is
+        repeated when the sweep is resumed."""
+        for i, (run, own) in enumerate(zip(self.runs, self.progress, strict=True)):
+            if own.failed is None:
+                _remove(self.paths[i] / checkpoint.FOLDER)
+                state, extra = self.program.replica(self.state, i), own.progress._asdict()
+                checkpoint.save(self.paths[i], self.step, state, run.cfg, extra)
+        if cluster.is_first():
+            files.replace(self.folder / DONE, "")
+        _remove(self.folder / checkpoint.FOLDER)
 
 
 def _remove(folder: Path) -> None:
@@ -351,12 +328,6 @@ def _actions(configs: Sequence[Config]) -> int:
     return sum(loop.total_steps(cfg) * cfg.train.scenes for cfg in configs)
 
 
-def _save(folder: Path, step: int, state: Any, cfg: Config, progress: list[Progress]) -> None:
-    checkpoint.save(
-        folder, step, state, cfg, {"members": [[list(one.run), one.failed] for one in progress]}
-    )
-
-
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None
@@ -368,30 +339,22 @@ def _ending(folder: Path, stopped: int | None) -> str:
     return f"stopped and saved; go on with: csac-jax sweep --resume {folder}"
 
 
-def summarise(plan: Plan, folder: Path) -> dict[str, Any]:
-    """Grasp success over the last grasps of every member and, over the seeds of each setting, its
+def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:
+    """Grasp success over the last grasps of every run and, over the seeds of each point, its
     interquartile mean.
 
-    Read off the members' logs; one with another number of steps than the plan's does not count.
+    Read off the logs of the runs; a run with another number of steps than the plan's does not
+    count.
     """
-    settings: list[dict[str, Any]] = []
-    for one in plan.settings:
-        rows = [_row(folder, member) for member in members_of(plan._replace(settings=[one]))]
-        done = [
-            row["grasp_success"]
-            for row in rows
-            if row["complete"] and row["grasp_success"] is not None
-        ]
-        settings.append(
-            {
-                "name": one.name,
-                "values": one.values,
-                "grasp_success": _over_seeds(done),
-                "members": rows,
-            }
-        )
-    complete = all(row["complete"] for one in settings for row in one["members"])
-    return {"seeds": plan.seeds, "complete": complete, "settings": settings}
+    points: list[dict[str, Any]] = []
+    for point in plan.points:
+        rows = [_row(folder, run) for run in runs_of(plan._replace(points=[point]))]
+        done = [row["grasp_success"] for row in rows if row["complete"]]
+        success = _over_seeds([value for value in done if value is not None])
+        named = {"name": point.name, "values": point.values}
+        points.append({**named, "grasp_success": success, "runs": rows})
+    complete = all(row["complete"] for point in points for row in point["runs"])
+    return {"seeds": plan.seeds, "complete": complete, "settings": points}
 
 
 def _over_seeds(values: Sequence[float]) -> dict[str, Any]:
@@ -401,19 +364,16 @@ def _over_seeds(values: Sequence[float]) -> dict[str, Any]:
     return statistics.band([np.array(values)])._asdict()
 
 
-def _row(folder: Path, one: Member) -> dict[str, Any]:
-    path = member_folder(folder, one)
-    lines = files.read_log(path / files.METRICS) if (path / files.METRICS).exists() else []
-    last = (
-        lines[-1]
-        if lines
-        else {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
-    )
-    kept = {name: last[name] for name in ("step", "actions", "grasp_success", "grasps_counted")}
-    run_dir = path.relative_to(folder).as_posix()
+_NOTHING = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
+
+
+def _row(folder: Path, run: SweepRun) -> dict[str, Any]:
+    log = folder / run.folder / files.METRICS
+    lines = files.read_log(log) if log.exists() else []
+    last = lines[-1] if lines else _NOTHING
     return {
-        "seed": one.cfg.seed,
-        "run_dir": run_dir,
-        "complete": last["step"] == loop.total_steps(one.cfg),
-        **kept,
+        "seed": run.cfg.seed,
+        "run_dir": run.folder.as_posix(),
+        "complete": last["step"] == loop.total_steps(run.cfg),
+        **{name: last[name] for name in _NOTHING},
     }

@@ -18,6 +18,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
+from csac_jax.training import memory
 
 LOSSES = ("critic_loss", "actor_loss")
 # Share of a chunk's actions beyond which diverged physics is reported; 1e-5 is common.
@@ -187,7 +188,8 @@ def compile_program(
     begun, hits = time.perf_counter(), cache.hits()
     program = compiler.lower(compile_chunk(cfg.train.chunk), state).compile()
     seconds = time.perf_counter() - begun
-    reporter.say(f"compiled in {seconds:.1f} s{' (from the cache)' if cache.hits() > hits else ''}")
+    source = " (from the cache)" if cache.hits() > hits else ""
+    reporter.say(f"compiled in {seconds:.1f} s{source}; {memory.compiled_text(program)}")
     return program, seconds
 
 

@@ -1,9 +1,8 @@
-"""Several devices: a line of them, along which either seeds or the scenes of each seed are spread.
+"""A line of several devices, which divide either the seeds or the scenes of each seed.
 
-Seeds need nothing of one another: each device runs a program of its own on its share of them.
-Scenes share networks and replay, which every device has a copy of: physics runs apart, transitions
-are gathered into every copy of the ring, and a batch is divided among the devices, whose gradients
-are added up.
+Seeds are independent: each device runs a program of its own on its share. Scenes share networks and
+replay, of which every device has a copy. Physics runs apart; transitions are gathered into every
+copy. A batch is divided among the devices and its gradients are added up.
 """
 
 import dataclasses
@@ -19,14 +18,13 @@ AXIS = "devices"
 
 
 @dataclasses.dataclass(frozen=True)
-class Spread:
-    """How one seed's scenes and batches are spread: not at all without a mesh."""
+class DataSharding:
+    """How the scenes and batches of one seed are divided; without a mesh they are not."""
 
     mesh: Mesh | None = None
 
-    def scenes(self, function: Callable) -> Callable:
-        """A function of leaves [E, ...] to leaves [E, ...], scene by scene, as one that runs each
-        device's scenes."""
+    def map_scenes(self, function: Callable) -> Callable:
+        """`function` of leaves [E, ...] to leaves [E, ...], each device on its own scenes."""
         if self.mesh is None:
             return function
         along = PartitionSpec(AXIS)
@@ -34,47 +32,46 @@ class Spread:
             function, mesh=self.mesh, in_specs=along, out_specs=along, check_vma=False
         )
 
-    def batch(self, tree: Any) -> Any:
-        """Leaves [B, ...], of which each device is to hold its share."""
+    def shard_batch(self, tree: Any) -> Any:
+        """Leaves [B, ...], of which each device holds its share."""
         if self.mesh is None:
             return tree
         along = NamedSharding(self.mesh, PartitionSpec(AXIS))
         return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, along), tree)
 
 
-ALONE = Spread()
+UNSHARDED = DataSharding()
 
 
 def make(devices: int | None) -> Mesh | None:
-    """A line of the first `devices` devices of all processes; no mesh for one alone.
+    """A line of the first `devices` devices of all processes; no mesh for a single one.
 
-    If None, one, or with several processes all that there are. Raises ValueError if there are
+    None stands for one device, or for all of several processes. Raises ValueError if there are
     fewer, or if a process were left without one.
     """
-    found, alone = jax.devices(), jax.process_count() == 1
+    present, alone = jax.devices(), jax.process_count() == 1
     wanted = devices
     if wanted is None:
-        wanted = 1 if alone else len(found)
-    if not alone and wanted != len(found):
+        wanted = 1 if alone else len(present)
+    if not alone and wanted != len(present):
         raise ValueError(
-            f"--devices: {wanted} asked for; leave it out: several processes use all {len(found)}"
+            f"--devices: {wanted} asked for; leave it out: several processes use all {len(present)}"
         )
-    if not 1 <= wanted <= len(found):
+    if not 1 <= wanted <= len(present):
         raise ValueError(
-            f"--devices: {wanted} asked for, there are {len(found)} ({found[0].platform}); give 1 .. {len(found)}"
+            f"--devices: {wanted} asked for, there are {len(present)} ({present[0].platform}); "
+            f"give 1 .. {len(present)}"
         )
-    return None if wanted == 1 else Mesh(np.array(found[:wanted]), (AXIS,))
+    return None if wanted == 1 else Mesh(np.array(present[:wanted]), (AXIS,))
 
 
-def check(mesh: Mesh | None, shard: Shard, members: int, scenes: int, batch: int) -> None:
-    """Raises ValueError where the mesh cannot divide what it is to spread: seeds, or scenes and
-    batch."""
+def check(mesh: Mesh | None, shard: Shard, runs: int, scenes: int, batch: int) -> None:
+    """Raises ValueError where the devices cannot divide the runs, or scenes and batch, evenly."""
     size = 1 if mesh is None else mesh.size
-    named = (
-        {"--seeds": members} if shard == "seeds" else {"train.scenes": scenes, "learn.batch": batch}
-    )
-    for name, number in named.items():
+    by_scenes = {"train.scenes": scenes, "learn.batch": batch}
+    for name, number in ({"--seeds": runs} if shard == "seeds" else by_scenes).items():
         if number % size:
             raise ValueError(
-                f"{name}: {number} does not divide among {size} devices; give a multiple of {size}, or other --devices"
+                f"{name}: {number} does not divide among {size} devices; "
+                f"give a multiple of {size}, or other --devices"
             )

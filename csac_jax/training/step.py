@@ -25,7 +25,7 @@ from csac_jax.replay.samplers import Sampler
 from csac_jax.runtime import compiler
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action
-from csac_jax.training.sharding import ALONE, Spread
+from csac_jax.training.sharding import UNSHARDED, DataSharding
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 
@@ -77,7 +77,7 @@ class Program:
     env: Env
     learner: Learner
     sampler: Sampler
-    sharding: Spread = ALONE  # of scenes and batches over devices
+    sharding: DataSharding = UNSHARDED  # of scenes and batches over devices
 
 
 def make(
@@ -100,14 +100,19 @@ def replace_hyperparams(program: Program, hyperparams: Hyperparams | None) -> Pr
     """The program with these hyper-parameters, if there are any, in place of its config's."""
     if hyperparams is None:
         return program
-    sections: dict[str, dict[str, Any]] = {}
-    for name, value in hyperparams.values.items():
-        section, field = name.split(".")
-        sections.setdefault(section, {})[field] = value
-    cfg = program.cfg.change(**sections)
+    cfg = replace_settings(program.cfg, hyperparams.values)
     learner = program.learner.replace_hyperparams(cfg, hyperparams.return_bounds)
     sampler = program.sampler.replace_hyperparams(cfg.replay)
     return dataclasses.replace(program, cfg=cfg, learner=learner, sampler=sampler)
+
+
+def replace_settings(cfg: Config, values: dict[str, Any]) -> Config:
+    """The config with other values of settings, by dotted name; traced ones are not checked."""
+    sections: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        section, field = name.split(".")
+        sections.setdefault(section, {})[field] = value
+    return cfg.change(**sections)
 
 
 def train_step(
@@ -124,7 +129,7 @@ def train_step(
     action = learner.act(key_act, state.learner, scenes.obs, scenes.steps_without_change, taken)
 
     # Simulate.
-    after = program.sharding.scenes(jax.vmap(env.step))(scenes, action)
+    after = program.sharding.map_scenes(jax.vmap(env.step))(scenes, action)
 
     # Reward and remember (lines 14-15).
     info = after.info
@@ -223,7 +228,7 @@ def _draw(
     """A batch as the sampler has it, augmented: slots [B], weights [B], leaves [B, ...]."""
     cfg, (key_sample, key_augment) = program.cfg, keys
     slots, weights = program.sampler.sample(key_sample, replay, progress, cfg.learn.batch)
-    batch = program.sharding.batch(ring.gather(replay, slots))
+    batch = program.sharding.shard_batch(ring.gather(replay, slots))
     augmented = jax.vmap(augment.augment, (0, None, 0))
     return slots, weights, augmented(_keys(key_augment, cfg.learn.batch), cfg, batch)
 

@@ -1,5 +1,4 @@
-"""What physics costs by itself: plain steps from the states that an action starts from, with its
-set-points."""
+"""What physics costs by itself: plain steps from an action's first state with its set-points."""
 
 import concurrent.futures
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""How long calls take, on a machine that does other things as well."""
+"""How long calls take on a busy machine."""
 
 import statistics
 import time
@@ -11,8 +11,7 @@ import jax
 def medians(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
     """Median seconds of every call until its result is there, after one that does not count.
 
-    One after the other in each of `repeats` rounds, so that what else the machine does hits all
-    alike.
+    Each of `repeats` rounds has one call of every kind, so that other load slows all alike.
     """
     for call in calls.values():
         jax.block_until_ready(call())

@@ -6,8 +6,8 @@ PRESET `quick` if none is given, physics the preset's, settings as `csac-jax tra
 For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of
 them: its compilation and the median of REPEATS (3) rounds after one that is not timed. With --shard
 seeds, numbers of seeds that the devices do not divide are left out. Beside a row of one seed on one
-device, `train` is its program as `csac-jax train` has it. `lanes` tells in how many shares seeds
-run that have the program to themselves, see csac_jax/sweeps/pipelined.py. Configurations follow one
+device, `train` is its program as `csac-jax train` has it. `parts` is how many parts the seeds run
+in, see csac_jax/sweeps/pipelined.py. Configurations follow one
 another, so that on a busy machine ratios are worth less than those of `bench step`.
 """
 
@@ -51,22 +51,16 @@ def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
 def measure(
     program: step.Program, seeds: int, devices: int, shard: sharding.Shard, steps: int, repeats: int
 ) -> Any:
-    """A row: `seeds` members on `devices` devices."""
-    cfg, line = program.cfg, sharding.make(devices)
-    sharding.check(line, shard, seeds, cfg.train.scenes, cfg.learn.batch)
+    """A row: `seeds` runs on `devices` devices."""
+    cfg, mesh = program.cfg, sharding.make(devices)
+    sharding.check(mesh, shard, seeds, cfg.train.scenes, cfg.learn.batch)
     (group,) = replicas.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
-    each = replicas.members(group)
-    in_lanes = pipelined.number(cfg, seeds, line)
-    jitted = replicas.compile_chunk(program, each, steps, line, shard, in_lanes)
-    row = _timed(jitted, replicas.init(program, each, line, shard), repeats)
+    each = replicas.of_group(group)
+    parts = pipelined.num_parts(cfg, seeds, mesh)
+    jitted = replicas.compile_chunk(program, each, steps, mesh, shard, parts)
+    row = _timed(jitted, replicas.init(program, each, mesh, shard), repeats)
     rate = seeds * cfg.train.scenes * steps / row["seconds"]
-    return {
-        "seeds": seeds,
-        "devices": devices,
-        "lanes": in_lanes,
-        **row,
-        "actions_per_second": rate,
-    }
+    return {"seeds": seeds, "devices": devices, "parts": parts, **row, "actions_per_second": rate}
 
 
 def _config(preset: str, flags: list[str], options: Any) -> Config:
@@ -95,7 +89,7 @@ def main(arguments: list[str]) -> None:
             sharding.check(
                 sharding.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch
             )
-            most = sweeping.Plan(max(options.seeds), [sweeping.Setting(grid.BASE, {}, cfg)])
+            most = sweeping.SweepPlan(max(options.seeds), [grid.SweepPoint(grid.BASE, {}, cfg)])
             sweeping.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
         raise BadArgumentsError(f"bench sweep: {error}") from None

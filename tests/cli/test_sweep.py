@@ -47,7 +47,8 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("smoke --seeds 0", "--seeds: at least 1"),
         ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
         (
-            "smoke --net.kind densenet121 --net.norm batch --net.margin 0 --net.weights none.safetensors",
+            "smoke --net.kind densenet121 --net.norm batch --net.margin 0 "
+            "--net.weights none.safetensors",
             "net.weights: none.safetensors cannot be read as .safetensors",
         ),
         (
@@ -64,7 +65,7 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
             "smoke --sim.physics c --devices 2",
             "--sim.physics: c computes on the host's cores, for one device",
         ),
-        ("smoke --seeds 100000", "lower --seeds or --replay.capacity, vary fewer numbers"),
+        ("smoke --seeds 100000", "lower --seeds or raise --devices"),
         ("smoke --cluster", "several processes need --run-dir"),
         (
             "smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2",
@@ -133,9 +134,9 @@ def test_settings_reach_their_configs():
             dataclasses.replace(cfg, target=dataclasses.replace(cfg.target, gamma=gamma))
             for gamma in (0.1, 0.3)
         ]
-    assert [one.cfg for one in plan.settings] == wanted
-    assert plan.settings[1].name == "algo=csac,target.gamma=0.3"
-    assert [one.cfg.seed for one in sweep.members_of(plan)[:3]] == [7, 8, 9]
+    assert [one.cfg for one in plan.points] == wanted
+    assert plan.points[1].name == "algo=csac,target.gamma=0.3"
+    assert [one.cfg.seed for one in sweep.runs_of(plan)[:3]] == [7, 8, 9]
 
 
 def test_plan_survives_its_file(tmp_path: Path):
@@ -152,7 +153,7 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(sweep, "run", RUN)
     for name, toy in (
         ("make", toys.program),
-        ("begin", toys.begin),
+        ("init_state", toys.init_state),
         ("train_step", toys.train_step),
     ):
         monkeypatch.setattr(step, name, toy)
@@ -171,7 +172,7 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     result = json.loads(Path("out.json").read_text())
     assert result["complete"]
     assert len(result["compile_seconds"]) == 1
-    assert [row["run_dir"] for row in result["settings"][0]["members"]] == [
+    assert [row["run_dir"] for row in result["settings"][0]["runs"]] == [
         "base/seed-0",
         "base/seed-1",
     ]
@@ -190,7 +191,7 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
         ),
         (
             "fast --physics warp --seeds 2 4",
-            "--seeds: 4 members of 2048 scenes side by side, Warp has room for",
+            "--seeds: 4 runs of 2048 scenes side by side, Warp has room for",
         ),
         ("smoke --train.scene 4", "bench sweep: Unrecognized options: --train.scene"),
     ],
@@ -209,7 +210,7 @@ def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatc
     itself, with where they come from. A small step stands in for the learner's."""
     for name, toy in (
         ("make", toys.program),
-        ("begin", toys.begin),
+        ("init_state", toys.init_state),
         ("train_step", toys.train_step),
     ):
         monkeypatch.setattr(step, name, toy)

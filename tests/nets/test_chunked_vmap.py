@@ -1,4 +1,4 @@
-"""Networks of runs side by side that have a device in turn, a few at a time."""
+"""Networks of runs side by side, a chunk of them at a time."""
 
 import jax
 import jax.numpy as jnp
@@ -10,18 +10,18 @@ from csac_jax.training import chunked_vmap
 
 
 @pytest.mark.parametrize(
-    ("members", "size"), [(1, 1), (2, 2), (5, 5), (7, 1), (8, 4), (12, 4), (16, 4), (20, 5)]
+    ("runs", "size"), [(1, 1), (2, 2), (5, 5), (7, 1), (8, 4), (12, 4), (16, 4), (20, 5)]
 )
-def test_groups_are_of_one_size(members: int, size: int):
-    """Claim: runs of DenseNet-121 are divided into equal groups, as large as they may be; small
+def test_chunks_are_of_one_size(runs: int, size: int):
+    """Claim: runs of DenseNet-121 are divided into equal chunks, as large as they may be; small
     nets are not."""
-    assert chunked_vmap.at_once(presets.paper(), members) == size
-    assert chunked_vmap.at_once(presets.paper_small(), members) is None
+    assert chunked_vmap.chunk_size(presets.paper(), runs) == size
+    assert chunked_vmap.chunk_size(presets.paper_small(), runs) is None
 
 
 @pytest.mark.parametrize("size", [1, 2, 6])
-def test_groups_do_what_each_does(size: int):
-    """Claim: grouped, each of six runs has the value and the shapes that it has alone, what they
+def test_chunks_do_what_each_does(size: int):
+    """Claim: in chunks, each of six runs has the value and the shapes that it has alone, what they
     share included."""
     runs, shared = jnp.arange(12.0).reshape(6, 2), jnp.arange(6.0).reshape(2, 3)
     keys = jax.random.split(jax.random.key(0), 6)
@@ -30,7 +30,7 @@ def test_groups_do_what_each_does(size: int):
         return {"sum": run @ shared, "noise": jax.random.normal(key, (3,)) + run[0]}
 
     with jax.debug_key_reuse(False):  # keys are used twice, to compare
-        got = jax.jit(jax.vmap(chunked_vmap.grouped(part, size), in_axes=(0, 0, None)))(
+        got = jax.jit(jax.vmap(chunked_vmap.vmap_in_chunks(part, size), in_axes=(0, 0, None)))(
             keys, runs, shared
         )
         for i in range(6):
@@ -39,7 +39,7 @@ def test_groups_do_what_each_does(size: int):
 
 
 @pytest.mark.parametrize(("size", "calls"), [(1, 2), (2, 6), (3, 6)])
-def test_branch_stays_one_in_groups_of_one(size: int, calls: int):
+def test_branch_stays_one_in_chunks_of_one(size: int, calls: int):
     """Claim: of six runs, two of which take a costly branch, only these two run it if they come one
     by one."""
     ran = []
@@ -52,7 +52,7 @@ def test_branch_stays_one_in_groups_of_one(size: int, calls: int):
         return jax.lax.cond(costly, cost, lambda: x)
 
     taken = jnp.array([0, 1, 0, 0, 1, 0], bool)
-    got = jax.jit(jax.vmap(chunked_vmap.grouped(part, size)))(taken, jnp.arange(6.0))
+    got = jax.jit(jax.vmap(chunked_vmap.vmap_in_chunks(part, size)))(taken, jnp.arange(6.0))
     jax.effects_barrier()
     np.testing.assert_array_equal(got, [0.0, 2.0, 2.0, 3.0, 5.0, 5.0])
     assert len(ran) == calls

@@ -14,18 +14,20 @@ from csac_jax.runtime import cache
 ROOT = Path(cache.__file__).parents[2]
 
 PROGRAM = """
-import csac_jax, hashlib, json, time
-from csac_jax.train import cache
+import csac_jax, hashlib, json
+from csac_jax.runtime import cache
 import jax, jax.numpy as jnp
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 folder = cache.enable()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 rows = jnp.linspace(0.0, 1.0, 5000).reshape(50, 100)
-begun = time.perf_counter()
-step = lambda x, _: (jnp.tanh(x @ jnp.sort(x.T) / 50) @ x[:50] * 0.5 + jnp.cumsum(x, 1) * 0.01, x.sum())
-program = jax.jit(lambda x: jax.lax.scan(step, x, length=20), donate_argnums=0).lower(rows).compile()
+def step(x, _):
+    return jnp.tanh(x @ jnp.sort(x.T) / 50) @ x[:50] * 0.5 + jnp.cumsum(x, 1) * 0.01, x.sum()
+scan = jax.jit(lambda x: jax.lax.scan(step, x, length=20), donate_argnums=0)
+program = scan.lower(rows).compile()
 before = cache.hits()
-result = hashlib.sha256(b"".join(bytes(memoryview(jax.device_get(leaf))) for leaf in program(rows))).hexdigest()
+leaves = [bytes(memoryview(jax.device_get(leaf))) for leaf in program(rows)]
+result = hashlib.sha256(b"".join(leaves)).hexdigest()
 print(json.dumps({"folder": folder and str(folder), "hits": before, "result": result}))
 """
 
@@ -94,13 +96,48 @@ def test_processors_do_not_share(monkeypatch: pytest.MonkeyPatch):
     assert any("flags" in line for line in cache._processor()) or not Path("/proc/cpuinfo").exists()
 
 
-def test_oldest_entries_go_first(tmp_path: Path):
-    """Claim: entries are deleted, oldest first, until the rest is no larger than it may be."""
-    for i in range(5):
-        (tmp_path / f"{i}-cache").write_bytes(bytes(100))
-        os.utime(tmp_path / f"{i}-cache", (i, i))
-    cache._prune(tmp_path, 250)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["3-cache", "4-cache"]
+LIMITED = """
+import sys
+import csac_jax
+import jax, jax.numpy as jnp
+from csac_jax.runtime import cache
+cache.LARGEST, cache.SHORTEST = int(sys.argv[1]), 0.0
+folder = cache.enable()
+rows = jnp.arange(1000.0)
+for power in map(int, sys.argv[2:]):
+    before = cache.hits()
+    jax.jit(lambda x, power=power: jnp.sort(x) ** power)(rows)
+    print(cache.hits() - before, sum(path.stat().st_size for path in folder.glob("*-cache")))
+"""
+
+
+def _sizes(tmp_path: Path, limit: int, *powers: int) -> list[tuple[int, int]]:
+    """Hits and bytes in the cache after each program of LIMITED."""
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(limit), *map(str, powers)],
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_ENABLE_COMPILATION_CACHE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return [(int(hits), int(size)) for hits, size in map(str.split, done.stdout.splitlines())]
+
+
+@pytest.mark.parametrize("dated", [True, False])
+def test_full_cache_drops_what_is_unused_for_longest(tmp_path: Path, dated: bool):
+    """Claim: the cache grows no larger than it may be, the entry that is unused for longest goes
+    first; entries without a time of last use are the oldest, and no trouble."""
+    (_, first), (_, second), (_, whole) = _sizes(tmp_path, 2**30, 2, 3, 4)
+    if not dated:
+        for path in (tmp_path / "csac_jax").rglob("*-atime"):
+            path.unlink()
+    used, new = _sizes(tmp_path, whole, 2, 5)
+    assert used == (1, whole)
+    assert new[0] == 0
+    assert first < second < new[1] <= whole
+    assert [hits for hits, _ in _sizes(tmp_path, whole, 2, 3)] == [1, 0]
 
 
 def test_suite_runs_without_the_cache():

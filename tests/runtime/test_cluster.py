@@ -54,7 +54,7 @@ def _sweep(folder: Path, processes: int, shard: str = "seeds", after: int = 0) -
 
 
 def _logs(folder: Path) -> dict[str, list[dict]]:
-    """Every member's lines, without what depends on the clock."""
+    """Every run's lines, without what depends on the clock."""
     found = {path.parent.name: files.read_log(path) for path in folder.rglob("metrics.jsonl")}
     return {
         name: [{k: v for k, v in line.items() if k not in UNTIMED} for line in log]

@@ -114,9 +114,8 @@ def test_stopped_run_ends_like_the_uninterrupted(
         said, complained = run.communicate(timeout=300)
     assert run.returncode == 128 + number, complained
     assert "stopped and saved at step" in said
-    print(
-        f"{number.name} {delay:.1f} s after '{start}': {said.strip().splitlines()[-1].split(';')[0]}"
-    )
+    ending = said.strip().splitlines()[-1].split(";")[0]
+    print(f"{number.name} {delay:.1f} s after '{start}': {ending}")
     again = subprocess.run(
         _command("--resume", run_dir), env=environment, capture_output=True, text=True, timeout=300
     )

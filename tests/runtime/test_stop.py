@@ -11,8 +11,8 @@ import pytest
 # XLA.
 PROGRAM = """
 import hashlib, sys, time
-from csac_jax.train import stop
-flag = stop.install()
+from csac_jax.runtime import signals
+flag = signals.install()
 print("ready", flush=True)
 hashlib.pbkdf2_hmac("sha256", b"", b"", int(sys.argv[1]))
 time.sleep(1.0)  # so that the thread that listens has had its turn

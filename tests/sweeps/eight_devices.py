@@ -1,5 +1,5 @@
 """Run with eight virtual devices and a small step in place of the learner's: prints, as JSON, how
-members on eight of them differ from those on one.
+replicas on eight of them differ from those on one.
 
 python -m tests.sweeps.eight_devices FOLDER
 """
@@ -29,7 +29,7 @@ def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
     first."""
     cfg = toys.CFG
     (group,) = replicas.group([dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])])
-    program, each, line = toys.program(cfg), replicas.members(group), sharding.make(devices)
+    program, each, line = toys.program(cfg), replicas.of_group(group), sharding.make(devices)
     state = replicas.init(program, each, line, shard)
     places = jax.tree.map(lambda leaf: leaf.sharding, state)
     chunk = replicas.compile_chunk(program, each, STEPS, line, shard).lower(state).compile()
@@ -83,6 +83,6 @@ def compare(shard: str, folder: Path) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    step.begin, step.train_step = toys.begin, toys.train_step
+    step.init_state, step.train_step = toys.init_state, toys.train_step
     found = {shard: compare(shard, Path(sys.argv[1])) for shard in SEEDS}
     print(json.dumps({"devices": len(jax.devices()), **found}))

@@ -10,6 +10,7 @@ import csac_jax  # noqa: F401  (before JAX)
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import replicas, sweep
+from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.training import sharding, step
 from tests.training import toys
 
@@ -34,16 +35,19 @@ def main(folder: str, after: str, shard: str, *place: str) -> int:
     """Exit code: 0 if the sweep is done, 15 if it was stopped."""
     if place:
         cluster.join(cluster.Place(place[0], int(place[1]), int(place[2])))
-    step.begin, step.train_step, step.make = toys.begin, toys.train_step, toys.program
+    step.init_state, step.train_step, step.make = toys.init_state, toys.train_step, toys.program
     line, stop = sharding.make(None), Stop()
     assert (line is not None) == bool(place)
-    plan = sweep.Plan(2, [sweep.Setting("a", {}, toys.CFG)])
+    plan = sweep.SweepPlan(2, [SweepPoint("a", {}, toys.CFG)])
     last = not place or place[2] == "1"
     reporter = Reporter(stop, int(after) if last else 0)
     resume = (Path(folder) / sweep.PLAN).exists()
     cluster.wait("looked")
-    engine = lambda group: replicas.engine(group, line, shard)  # noqa: E731
-    return sweep.run(plan, Path(folder), engine, reporter, stop, resume).stopped_by or 0
+
+    def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
+        return replicas.sweep_program(group, line, shard)
+
+    return sweep.run(plan, Path(folder), make_program, reporter, stop, resume).stopped_by or 0
 
 
 if __name__ == "__main__":

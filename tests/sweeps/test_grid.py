@@ -5,39 +5,44 @@ import pytest
 from csac_jax.sweeps import grid
 
 
+def _points(varied: list[str]) -> list[grid.SweepPoint]:
+    """Points with their flags in place of a config."""
+    return grid.points(varied, lambda flags: flags)
+
+
 def test_every_combination():
     """Claim: every combination of the values, the last name's changing fastest, each with the flags
     of the parser."""
-    found = grid.settings(["replay.sampler=uniform,beta", "learn.learning-rate=1e-3,-1"])
-    assert [one.values for one in found] == [
+    found = _points(["replay.sampler=uniform,beta", "learn.learning-rate=1e-3,-1"])
+    assert [point.values for point in found] == [
         {"replay.sampler": sampler, "learn.learning_rate": rate}
         for sampler in ("uniform", "beta")
         for rate in ("1e-3", "-1")
     ]
     assert found[1].name == "replay.sampler=uniform,learn.learning_rate=-1"
-    assert found[1].flags == ["--replay.sampler", "uniform", "--learn.learning-rate", "-1"]
+    assert found[1].cfg == ["--replay.sampler", "uniform", "--learn.learning-rate", "-1"]
 
 
-def test_nothing_varied_is_one_setting():
-    """Claim: with nothing to vary there is one setting, with no flags."""
-    assert grid.settings([]) == [grid.Setting("base", {}, [])]
+def test_nothing_varied_is_one_point():
+    """Claim: with nothing to vary there is one point, with no flags."""
+    assert _points([]) == [grid.SweepPoint("base", {}, [])]
 
 
 def test_kinds_of_values():
-    """Claim: tuples are parted by colons, switches are true or false, the algorithm is varied by
-    its name."""
-    flags = [one.flags for one in grid.settings(["replay.beta_end=1:4,1:12"])]
+    """Claim: colons separate the items of a tuple, switches are true or false, the algorithm is
+    varied by its name."""
+    flags = [point.cfg for point in _points(["replay.beta_end=1:4,1:12"])]
     assert flags == [["--replay.beta-end", "1", "4"], ["--replay.beta-end", "1", "12"]]
-    flags = [one.flags for one in grid.settings(["learn.actor=true,false"])]
+    flags = [point.cfg for point in _points(["learn.actor=true,false"])]
     assert flags == [["--learn.actor"], ["--learn.no-actor"]]
-    assert grid.settings(["algo=csac_per"])[0].flags == ["--algo", "csac_per"]
+    assert _points(["algo=csac_per"])[0].cfg == ["--algo", "csac_per"]
 
 
 def test_long_names_give_way_to_numbers():
     """Claim: a folder's name stays short, however much is varied."""
     names = ("beta_start", "beta_middle", "beta_end")
-    found = grid.settings([f"replay.{name}=1.2345678901:2.3456789012,1:2" for name in names])
-    assert [one.name for one in found] == [f"setting-{i}" for i in range(8)]
+    found = _points([f"replay.{name}=1.2345678901:2.3456789012,1:2" for name in names])
+    assert [point.name for point in found] == [f"setting-{i}" for i in range(8)]
 
 
 @pytest.mark.parametrize(
@@ -60,4 +65,4 @@ def test_long_names_give_way_to_numbers():
 def test_bad_input(varied: list[str], message: str):
     """Claim: what cannot be varied is named, with the remedy."""
     with pytest.raises(ValueError, match=message):
-        grid.settings(varied)
+        _points(varied)

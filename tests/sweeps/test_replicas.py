@@ -1,4 +1,4 @@
-"""Members of a sweep in one program, with a small step in place of the learner's."""
+"""Replicas in one program, with a small step in place of the learner's."""
 
 import dataclasses
 import threading
@@ -10,7 +10,7 @@ import pytest
 
 from csac_jax import algorithms, presets
 from csac_jax.sweeps import pipelined, replicas
-from csac_jax.sweeps.replicas import Members
+from csac_jax.sweeps.replicas import Replicas
 from csac_jax.training import sharding, step
 from tests.training import toys
 
@@ -60,7 +60,7 @@ OTHER = {
     "replay.beta_middle_at": 0.6,
     "replay.beta_end": (4.0, 2.0),
 }
-"""Another value of every number."""
+"""Another value of every traced hyper-parameter."""
 
 PER = dataclasses.replace(
     toys.CFG, replay=dataclasses.replace(toys.CFG.replay, sampler="prioritised")
@@ -70,17 +70,17 @@ PER = dataclasses.replace(
 @pytest.fixture(autouse=True)
 def toy_step(monkeypatch: pytest.MonkeyPatch):
     """The small step in place of the real one."""
-    monkeypatch.setattr(step, "begin", toys.begin)
+    monkeypatch.setattr(step, "init_state", toys.init_state)
     monkeypatch.setattr(step, "train_step", toys.train_step)
 
 
-def _seeds(num: int, cfg=toys.CFG) -> replicas.Group:
+def _seeds(num: int, cfg=toys.CFG) -> replicas.ProgramGroup:
     (group,) = replicas.group([dataclasses.replace(cfg, seed=k) for k in range(num)])
     return group
 
 
-def _run(group: replicas.Group, chunks: int = 2) -> tuple[Any, list[Any]]:
-    program, each = toys.program(group.configs[0]), replicas.members(group)
+def _run(group: replicas.ProgramGroup, chunks: int = 2) -> tuple[Any, list[Any]]:
+    program, each = toys.program(group.configs[0]), replicas.of_group(group)
     chunk = replicas.compile_chunk(program, each, 4)
     state, seen = replicas.init(program, each), []
     for _ in range(chunks):
@@ -90,7 +90,7 @@ def _run(group: replicas.Group, chunks: int = 2) -> tuple[Any, list[Any]]:
 
 
 def _alone(cfg, chunks: int = 2) -> tuple[Any, list[Any]]:
-    """As `train` runs it: its numbers are constants, its state has no axis of members."""
+    """As `train` runs it: its numbers are constants, its state has no axis of replicas."""
     program = toys.program(cfg)
     chunk, state, seen = step.compile_chunk(program, 4), step.init(program), []
     for _ in range(chunks):
@@ -108,27 +108,28 @@ def assert_close(a: Any, b: Any, rtol: float, atol: float = 1e-6) -> None:
         np.testing.assert_allclose(one, other, rtol, atol, err_msg=jax.tree_util.keystr(path))
 
 
-def test_members_are_the_runs_of_train():
-    """Claim: each member of a sweep is the run that `train` makes of its seed and settings, to
-    rounding, also where numbers are lifted out of the config, every one of them."""
-    assert OTHER.keys() == set(replicas.NUMBERS)
-    configs = (PER, dataclasses.replace(replicas.with_numbers(PER, OTHER), seed=1))
+def test_replicas_are_the_runs_of_train():
+    """Claim: each replica is the run that `train` makes of its seed and settings, to
+    rounding, also where hyper-parameters are traced, every one of
+    them."""
+    assert OTHER.keys() == set(replicas.TRACED_HYPERPARAMS)
+    configs = (PER, dataclasses.replace(step.replace_settings(PER, OTHER), seed=1))
     (group,) = replicas.group(configs)
-    assert group == (configs, replicas.NUMBERS)
+    assert group == (configs, replicas.TRACED_HYPERPARAMS)
     state, seen = _run(group)
     for k, cfg in enumerate(configs):
         alone, metrics = _alone(cfg)
-        assert_close(replicas.member(state, k), alone, 1e-4)
+        assert_close(replicas.replica(state, k), alone, 1e-4)
         for one, other in zip(seen, metrics, strict=True):
             assert_close(jax.tree.map(lambda leaf, k=k: leaf[:, k], one), other, 1e-4)
 
 
 def test_seeds_differ_and_share_the_counter():
-    """Claim: members of two seeds differ in every scene and network; they share the step counter,
+    """Claim: replicas of two seeds differ in every scene and network; they share the step counter,
     so that a schedule by it stays a branch, a `cond`; a chunk gives their state back in its own
     memory."""
     group = _seeds(2)
-    program, each = toys.program(), replicas.members(group)
+    program, each = toys.program(), replicas.of_group(group)
     state = replicas.init(program, each)
     assert state.scenes.shape == (2, toys.SCENES)
     traced = replicas.compile_chunk(program, each, 4).trace(state)
@@ -144,17 +145,17 @@ def test_seeds_differ_and_share_the_counter():
 
 
 @pytest.mark.parametrize("differ", [False, True])
-def test_lanes_are_the_same_runs(differ: bool):
-    """Claim: in lanes members are what they are side by side, in the same order, also where numbers
-    differ; chunks follow one another, the state is used up."""
+def test_parts_are_the_same_runs(differ: bool):
+    """Claim: in parts replicas are what they are side by side, in the same order, also where
+    hyper-parameters differ; chunks follow one another, the state is used up."""
     configs = [dataclasses.replace(toys.CFG, seed=k) for k in range(6)]
     if differ:
-        configs[3:] = [replicas.with_numbers(cfg, {"target.gamma": 0.1}) for cfg in configs[3:]]
+        configs[3:] = [step.replace_settings(cfg, {"target.gamma": 0.1}) for cfg in configs[3:]]
     (group,) = replicas.group(configs)
     wanted, seen = _run(group)
-    program, each = toys.program(group.configs[0]), replicas.members(group)
+    program, each = toys.program(group.configs[0]), replicas.of_group(group)
     begun = state = replicas.init(program, each)
-    chunk = replicas.compile_chunk(program, each, 4, in_lanes=3).lower(state).compile()
+    chunk = replicas.compile_chunk(program, each, 4, parts=3).lower(state).compile()
     for one in seen:
         state, metrics = chunk(state)
         assert_close(metrics, one, 1e-5)
@@ -162,8 +163,8 @@ def test_lanes_are_the_same_runs(differ: bool):
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(begun))
 
 
-def test_lanes_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
-    """Claim: while the host is at work for one lane, another goes on: both meet in their callbacks,
+def test_parts_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
+    """Claim: while the host is at work for one part, another goes on: both meet in their callbacks,
     or neither ends."""
     meeting = threading.Barrier(2)
 
@@ -171,38 +172,41 @@ def test_lanes_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
         meeting.wait(timeout=20)
         return np.asarray(value)
 
-    def train_step(program: step.Program, state: step.TrainState) -> Any:
-        state, metrics = toys.train_step(program, state)
+    def train_step(program: step.Program, state: step.TrainState, hyperparams: Any) -> Any:
+        state, metrics = toys.train_step(program, state, hyperparams)
         here = jax.ShapeDtypeStruct((), np.float32)
         met = jax.pure_callback(meet, here, state.scenes[0], vmap_method="broadcast_all")
         return state.replace(scenes=state.scenes.at[0].set(met)), metrics
 
     monkeypatch.setattr(step, "train_step", train_step)
     group = _seeds(2)
-    program, each = toys.program(), replicas.members(group)
+    program, each = toys.program(), replicas.of_group(group)
     state = replicas.init(program, each)
-    chunk = replicas.compile_chunk(program, each, 2, in_lanes=2).lower(state).compile()
+    chunk = replicas.compile_chunk(program, each, 2, parts=2).lower(state).compile()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     state, _ = chunk(state)
     assert int(state.step) == 2
 
 
-def test_number_of_lanes(monkeypatch: pytest.MonkeyPatch):
-    """Claim: on a CPU a lane for each; on a GPU two where host and device take turns. One where
+def test_number_of_parts(monkeypatch: pytest.MonkeyPatch):
+    """Claim: on a CPU a part for each; on a GPU two where host and device take turns. One where
     states do not fit twice, for networks that fill a device, and on several devices."""
     small, large, mjx = presets.paper_small(), presets.paper(), presets.smoke()
-    monkeypatch.setattr(pipelined.memory, "limit", lambda: 8 * pipelined.memory.sure(small))
-    assert [pipelined.number(small, members) for members in (1, 3, 4, 5)] == [1, 3, 4, 1]
-    assert [pipelined.number(cfg, 2) for cfg in (mjx, large)] == [2, 1]
-    assert pipelined.number(small, 4, sharding.Mesh(np.array(jax.devices()), (sharding.AXIS,))) == 1
+    state = sum(pipelined.memory.state_bytes(small).values())
+    monkeypatch.setattr(pipelined.memory, "limit", lambda: 8 * state)
+    assert [pipelined.num_parts(small, runs) for runs in (1, 3, 4, 5)] == [1, 3, 4, 1]
+    assert [pipelined.num_parts(cfg, 2) for cfg in (mjx, large)] == [2, 1]
+    assert (
+        pipelined.num_parts(small, 4, sharding.Mesh(np.array(jax.devices()), (sharding.AXIS,))) == 1
+    )
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert [pipelined.number(small, members) for members in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
-    assert pipelined.number(large, 2) == pipelined.number(mjx, 2) == 1
+    assert [pipelined.num_parts(small, runs) for runs in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
+    assert pipelined.num_parts(large, 2) == pipelined.num_parts(mjx, 2) == 1
 
 
 def test_settings_that_are_numbers_share_a_program():
-    """Claim: numbers, names and seeds do not part groups; a sampler, a size or a branch does. Order
-    is kept."""
+    """Claim: numbers, names and seeds do not separate groups; a sampler, a size or a branch does.
+    Order is kept."""
     smoke = presets.smoke()
     learn = dataclasses.replace(smoke.learn, tau=0.5)
     uniform = algorithms.configure(smoke, "csac")
@@ -216,20 +220,20 @@ def test_settings_that_are_numbers_share_a_program():
     assert first == ((configs[0], configs[2]), ("learn.tau",))
     assert second == ((configs[1], configs[3]), ())
     vpg, reactive = (algorithms.configure(smoke, name) for name in ("vpg", "reactive"))
-    assert replicas.group([vpg, reactive])[0].numbers == ("target.gamma",)
+    assert replicas.group([vpg, reactive])[0].hyperparams == ("target.gamma",)
 
 
 def test_seeds_alone_keep_their_constants():
-    """Claim: where only seeds differ, nothing is lifted: numbers stay constants of the program."""
-    each = replicas.members(_seeds(2))
-    assert each == Members(each.seed, {}, None)
+    """Claim: where only seeds differ, nothing is traced: settings stay constants of the program."""
+    each = replicas.of_group(_seeds(2))
+    assert each == Replicas(each.seed, None)
     assert each.seed.tolist() == [0, 1]
 
 
 def test_bounds_are_those_of_the_settings():
-    """Claim: bounds of returns that are lifted are those that each setting has by itself."""
+    """Claim: traced bounds of returns are those that each setting has by itself."""
     other = dataclasses.replace(toys.CFG, target=dataclasses.replace(toys.CFG.target, gamma=0.25))
     (group,) = replicas.group([toys.CFG, other])
-    each = replicas.members(group)
+    each = replicas.of_group(group)
     wanted = np.array([toys.program(cfg).learner.bounds for cfg in (toys.CFG, other)])
-    np.testing.assert_allclose(np.stack(each.bounds, axis=1), wanted, 1e-6)
+    np.testing.assert_allclose(np.stack(each.hyperparams.return_bounds, axis=1), wanted, 1e-6)

@@ -10,45 +10,44 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import presets
+from csac_jax import algorithms, presets
 from csac_jax.io import checkpoint
+from csac_jax.replay import ring
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import sweep
-from csac_jax.sweeps.replicas import Engine, Group
-from csac_jax.sweeps.sweep import Plan, Setting, SweepError
+from csac_jax.sweeps.grid import SweepPoint
+from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram
+from csac_jax.sweeps.sweep import SweepError, SweepPlan
+from csac_jax.training import step
 from tests.training import test_loop
 from tests.training.test_loop import CFG, Fake, State
 
 CHUNKS = 6  # of a group
-MEMBERS = 2
+SEEDS = 2
 
 
-def _setting(name: str, **sections: dict[str, Any]) -> Setting:
+def _point(name: str, **sections: dict[str, Any]) -> SweepPoint:
     changed = {
         key: dataclasses.replace(getattr(CFG, key), **fields) for key, fields in sections.items()
     }
-    return Setting(name, {"x": name}, dataclasses.replace(CFG, **changed))
+    return SweepPoint(name, {"x": name}, dataclasses.replace(CFG, **changed))
 
 
-PLAN = Plan(
-    MEMBERS,
-    [
-        _setting("a"),
-        _setting("b", replay={"sampler": "uniform"}),
-        _setting("c", learn={"tau": 0.5}),
-    ],
+PLAN = SweepPlan(
+    SEEDS,
+    [_point("a"), _point("b", replay={"sampler": "uniform"}), _point("c", learn={"tau": 0.5})],
 )
 
 
-class Engines:
+class Programs:
     """Programs that draw their metrics at random; remembers groups and compilations."""
 
-    def __init__(self, nan_member: int = -1) -> None:
-        self.groups: list[Group] = []
+    def __init__(self, nan_run: int = -1) -> None:
+        self.groups: list[ProgramGroup] = []
         self.compiled = 0
-        self._nan_member = nan_member
+        self._nan_run = nan_run
 
-    def __call__(self, group: Group) -> Engine:
+    def __call__(self, group: ProgramGroup) -> SweepProgram:
         self.groups.append(group)
         uniform = 200 * (group.configs[0].replay.sampler == "uniform")
         seeds = [cfg.seed + 100 * (cfg.learn.tau == 0.5) + uniform for cfg in group.configs]
@@ -62,7 +61,7 @@ class Engines:
         def chunk(num_steps: int):
             self.compiled += 1
             axes: Any = State(key=0, step=None, total=0)
-            fail = jnp.arange(len(seeds)) == self._nan_member
+            fail = jnp.arange(len(seeds)) == self._nan_run
 
             def one(state: State, fails: jax.Array):
                 state, metrics = Fake()._step(state, None)
@@ -76,10 +75,10 @@ class Engines:
                 lambda state: jax.lax.scan(lambda s, _: every(s, fail), state, length=num_steps)
             )
 
-        def member(state: State, index: int) -> State:
+        def replica(state: State, index: int) -> State:
             return State(state.key[index], state.step, state.total[index])
 
-        return Engine(init, lambda: jax.eval_shape(init), chunk, member)
+        return SweepProgram(init, lambda: jax.eval_shape(init), chunk, replica)
 
 
 class Listener(test_loop.Listener):
@@ -87,24 +86,24 @@ class Listener(test_loop.Listener):
 
     def progress(self, record, total_actions, eta) -> None:
         """Reporter."""
-        assert total_actions == 72 * MEMBERS * len(PLAN.settings)
+        assert total_actions == 72 * SEEDS * len(PLAN.points)
         super().progress(record, 72, eta)
 
 
 def _run(
-    folder: Path, listener: Listener, engines: Engines | None = None, resume: bool = False
-) -> sweep.Result:
-    return sweep.run(PLAN, folder, engines or Engines(), listener, listener.stop, resume)
+    folder: Path, listener: Listener, programs: Programs | None = None, resume: bool = False
+) -> sweep.SweepResult:
+    return sweep.run(PLAN, folder, programs or Programs(), listener, listener.stop, resume)
 
 
-def _members() -> list[tuple[str, int]]:
-    return [(one.name, CFG.seed + k) for one in PLAN.settings for k in range(MEMBERS)]
+def _runs() -> list[tuple[str, int]]:
+    return [(one.name, CFG.seed + k) for one in PLAN.points for k in range(SEEDS)]
 
 
 def _final(folder: Path) -> dict[tuple[str, int], list[bytes]]:
-    """State and log, without what depends on the clock, of every member."""
+    """State and log, without what depends on the clock, of every run."""
     found = {}
-    for name, seed in _members():
+    for name, seed in _runs():
         path = folder / name / f"seed-{seed}"
         state, _ = checkpoint.restore(path, jax.eval_shape(test_loop._init))
         leaves = (jax.random.key_data(state.key), state.step, state.total)
@@ -116,19 +115,19 @@ def _final(folder: Path) -> dict[tuple[str, int], list[bytes]]:
 @pytest.fixture(scope="module")
 def uninterrupted(
     tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[Path, Listener, Engines, sweep.Result]:
+) -> tuple[Path, Listener, Programs, sweep.SweepResult]:
     """A sweep that nobody stopped."""
-    folder, listener, engines = tmp_path_factory.mktemp("sweep") / "one", Listener(), Engines()
-    return folder, listener, engines, _run(folder, listener, engines)
+    folder, listener, programs = tmp_path_factory.mktemp("sweep") / "one", Listener(), Programs()
+    return folder, listener, programs, _run(folder, listener, programs)
 
 
-def test_every_member_is_a_run(uninterrupted):
-    """Claim: each member has a folder with config, log and checkpoint, as a run of `train` has; no
+def test_every_run_is_one_of_train(uninterrupted):
+    """Claim: each run has a folder with config, log and checkpoint, as one of `train` has; no
     two are alike."""
     folder, *_ = uninterrupted
-    configs = [checkpoint.load_config(folder / name / f"seed-{seed}") for name, seed in _members()]
-    assert configs == [one.cfg for one in sweep.members_of(PLAN)]
-    for name, seed in _members():
+    configs = [checkpoint.load_config(folder / name / f"seed-{seed}") for name, seed in _runs()]
+    assert configs == [one.cfg for one in sweep.runs_of(PLAN)]
+    for name, seed in _runs():
         log = test_loop._log(folder / name / f"seed-{seed}")
         assert [line["step"] for line in log] == [4 * n for n in range(1, CHUNKS + 1)]
     found = list(_final(folder).values())
@@ -136,17 +135,17 @@ def test_every_member_is_a_run(uninterrupted):
 
 
 def test_group_is_compiled_once(uninterrupted):
-    """Claim: settings that differ in numbers are one group, and a group is compiled once; the
+    """Claim: points that differ in numbers are one group, and a group is compiled once; the
     others have their own."""
-    _, _, engines, result = uninterrupted
-    names = [[cfg.replay.sampler for cfg in group.configs] for group in engines.groups]
+    _, _, programs, result = uninterrupted
+    names = [[cfg.replay.sampler for cfg in group.configs] for group in programs.groups]
     assert names == [[CFG.replay.sampler] * 4, ["uniform"] * 2]
-    assert engines.groups[0].numbers == ("learn.tau",)
-    assert engines.compiled == len(result.compile_seconds) == 2
+    assert programs.groups[0].hyperparams == ("learn.tau",)
+    assert programs.compiled == len(result.compile_seconds) == 2
 
 
 def test_groups_make_room(uninterrupted):
-    """Claim: once its members are saved, nothing is left of a group but the mark that it is
+    """Claim: once its runs are saved, nothing is left of a group but the mark that it is
     done."""
     folder, *_ = uninterrupted
     left = sorted(
@@ -158,28 +157,28 @@ def test_groups_make_room(uninterrupted):
 
 
 def test_progress_is_of_the_whole_sweep(uninterrupted):
-    """Claim: a line per chunk, whose actions grow to those of all members of all settings."""
+    """Claim: a line per chunk, whose actions grow to those of all runs of all points."""
     _, listener, *_ = uninterrupted
     actions = [record.actions for record in listener.records]
     assert actions == [*range(48, 289, 48), *range(312, 433, 24)]
 
 
 def test_summary_is_that_of_the_logs(uninterrupted):
-    """Claim: the combined file has each setting's interquartile mean over the last grasps of its
-    seeds, each member's own and where it lies."""
+    """Claim: the combined file has each point's interquartile mean over the last grasps of its
+    seeds, each run's own and where it lies."""
     folder, _, _, result = uninterrupted
     stored = json.loads((folder / "summary.json").read_text())
     assert stored == result.summary
     assert stored["complete"]
-    for one, setting in zip(stored["settings"], PLAN.settings, strict=True):
-        logs = [test_loop._log(folder / row["run_dir"])[-1] for row in one["members"]]
-        assert [row["seed"] for row in one["members"]] == [5, 6]
-        assert [row["grasp_success"] for row in one["members"]] == [
+    for one, point in zip(stored["settings"], PLAN.points, strict=True):
+        logs = [test_loop._log(folder / row["run_dir"])[-1] for row in one["runs"]]
+        assert [row["seed"] for row in one["runs"]] == [5, 6]
+        assert [row["grasp_success"] for row in one["runs"]] == [
             line["grasp_success"] for line in logs
         ]
         success = one["grasp_success"]
         assert success["value"] == pytest.approx(np.mean([line["grasp_success"] for line in logs]))
-        assert (one["name"], one["values"], success["n"]) == (setting.name, setting.values, MEMBERS)
+        assert (one["name"], one["values"], success["n"]) == (point.name, point.values, SEEDS)
 
 
 @pytest.mark.parametrize("moment", [1, CHUNKS, CHUNKS + 2])
@@ -191,21 +190,21 @@ def test_stopped_sweep_ends_like_the_uninterrupted(moment: int, uninterrupted, t
     assert _run(folder, listener).stopped_by == 2
     assert f"sweep --resume {folder}" in listener.said[-1]
     assert not json.loads((folder / "summary.json").read_text())["complete"]
-    engines = Engines()
-    again = sweep.run(sweep.read_plan(folder), folder, engines, Listener(), Stop(), resume=True)
+    programs = Programs()
+    again = sweep.run(sweep.read_plan(folder), folder, programs, Listener(), Stop(), resume=True)
     assert again.stopped_by is None
     assert again.summary == uninterrupted[3].summary
-    assert len(engines.groups) == (1 if moment >= CHUNKS else 2)
+    assert len(programs.groups) == (1 if moment >= CHUNKS else 2)
     assert _final(folder) == _final(uninterrupted[0])
-    engines = Engines()
-    sweep.run(PLAN, folder, engines, Listener(), Stop(), resume=True)
-    assert engines.groups == []
+    programs = Programs()
+    sweep.run(PLAN, folder, programs, Listener(), Stop(), resume=True)
+    assert programs.groups == []
 
 
 def test_interrupted_ending_is_done_again(
     uninterrupted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Claim: a sweep killed while its members' checkpoints are written ends like the uninterrupted
+    """Claim: a sweep killed while its runs' checkpoints are written ends like the uninterrupted
     once resumed."""
     save, folder = checkpoint.save, tmp_path / "run"
 
@@ -219,23 +218,23 @@ def test_interrupted_ending_is_done_again(
     with pytest.raises(KeyboardInterrupt):
         _run(folder, Listener())
     monkeypatch.setattr(checkpoint, "save", save)
-    engines = Engines()
-    _run(folder, Listener(), engines, resume=True)
+    programs = Programs()
+    _run(folder, Listener(), programs, resume=True)
     assert _final(folder) == _final(uninterrupted[0])
-    assert engines.compiled == 1  # of the group that had not begun
+    assert programs.compiled == 1  # of the group that had not begun
 
 
-def test_member_without_a_finite_loss_is_given_up(uninterrupted, tmp_path: Path):
-    """Claim: a member whose loss is not finite is named, its log ends and it has no checkpoint; the
+def test_run_without_a_finite_loss_is_given_up(uninterrupted, tmp_path: Path):
+    """Claim: a run whose loss is not finite is named, its log ends and it has no checkpoint; the
     others are as they would be without it."""
     folder, listener = tmp_path / "run", Listener()
-    result = _run(folder, listener, Engines(nan_member=1))
+    result = _run(folder, listener, Programs(nan_run=1))
     assert "a, seed 6: given up at step 12, a loss is not finite" in listener.said
     assert [line["step"] for line in test_loop._log(folder / "a" / "seed-6")] == [4, 8]
     assert not (folder / "a" / "seed-6" / "checkpoints").exists()
     first = result.summary["settings"][0]
     assert first["grasp_success"]["n"] == 1
-    assert [row["complete"] for row in first["members"]] == [True, False]
+    assert [row["complete"] for row in first["runs"]] == [True, False]
     before = uninterrupted[0] / "a" / "seed-5"
     assert test_loop._log(folder / "a" / "seed-5") == test_loop._log(before)
 
@@ -254,42 +253,55 @@ def test_bad_folders(tmp_path: Path):
 
 
 def test_equal_settings_are_refused():
-    """Claim: two settings that are the same config are an error before anything starts."""
+    """Claim: two points that are the same config are an error before anything starts."""
     with pytest.raises(SweepError, match="same values"):
-        sweep.check(Plan(1, [_setting("a"), _setting("b")]))
+        sweep.groups_of(SweepPlan(1, [_point("a"), _point("b")]))
 
 
-def test_members_must_fit_together(monkeypatch: pytest.MonkeyPatch):
-    """Claim: what the members of a group need together, those of settings that are numbers
-    included, must fit into the devices; else it is said how many would."""
-    monkeypatch.setattr(sweep.memory, "limit", lambda: 4 * sweep.memory.sure(CFG))
-    for seeds, devices, fits in ((2, 1, True), (3, 1, False), (3, 2, True)):  # of two settings
-        plan = Plan(seeds, [_setting("a"), _setting("c", learn={"tau": 0.5})])
+def test_runs_must_fit_together(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the replays of a group's runs together, those of points that are numbers included,
+    must fit into the devices; else it is said how many would."""
+    slot = ring.bytes_needed(1, step.example(CFG))
+    monkeypatch.setattr(sweep.memory, "limit", lambda: 4 * CFG.replay.capacity * slot)
+    for seeds, devices, fits in ((2, 1, True), (3, 1, False), (3, 2, True)):  # of two points
+        plan = SweepPlan(seeds, [_point("a"), _point("c", learn={"tau": 0.5})])
         if fits:
             sweep.check_room(plan, devices)
         else:
-            with pytest.raises(ValueError, match=r"--seeds: 6 members .* enough for 4"):
+            with pytest.raises(ValueError, match=r"replay\.capacity: .* enough for 4 of 6 runs"):
                 sweep.check_room(plan, devices)
 
 
-def test_networks_of_different_numbers_need_room_at_once(monkeypatch: pytest.MonkeyPatch):
-    """Claim: six seeds of DenseNet-121 have their networks at work three at a time, six of
-    different numbers all at once, for which there must be room."""
-    paper = presets.paper()
-    settings = [
-        Setting(
-            name, {}, dataclasses.replace(paper, learn=dataclasses.replace(paper.learn, tau=tau))
-        )
-        for name, tau in (("a", 0.1), ("b", 0.2))
+def test_group_of_an_older_version_goes_on(
+    uninterrupted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: a group's checkpoint that names its runs `members` is resumed as any other."""
+    save, folder = checkpoint.save, tmp_path / "run"
+
+    def save_as_before(path, step, state, cfg, extra):
+        save(path, step, state, cfg, {"members": extra["runs"]} if "runs" in extra else extra)
+
+    monkeypatch.setattr(checkpoint, "save", save_as_before)
+    assert _run(folder, Listener(1)).stopped_by == 2
+    monkeypatch.setattr(checkpoint, "save", save)
+    assert _run(folder, Listener(), resume=True).stopped_by is None
+    assert _final(folder) == _final(uninterrupted[0])
+
+
+@pytest.mark.xfail(strict=True, reason="stored configs with older names cannot be read yet")
+def test_plan_of_an_older_version_is_read():
+    """Claim: the file of a sweep that an older version began is read, whatever its settings were
+    called then."""
+    plan = sweep.read_plan(Path(__file__).parent / "stored")
+    assert (plan.seeds, [point.name for point in plan.points]) == (2, ["algo=csac", "algo=vpg"])
+    assert [point.cfg for point in plan.points] == [
+        dataclasses.replace(algorithms.configure(presets.smoke(), algo), seed=3)
+        for algo in ("csac", "vpg")
     ]
-    monkeypatch.setattr(sweep.memory, "limit", lambda: sweep.memory.sure(paper, 6))
-    sweep.check_room(Plan(6, settings[:1]), 1)
-    with pytest.raises(ValueError, match=r"--seeds: 6 members .* enough for 4"):
-        sweep.check_room(Plan(3, settings), 1)
 
 
-def test_members_on_warp_must_fit_its_contacts():
-    """Claim: members side by side share Warp's contacts, so that their scenes together are counted;
+def test_runs_on_warp_must_fit_its_contacts():
+    """Claim: runs side by side share Warp's contacts, so that their scenes together are counted;
     in another physics they are not."""
     sections = {
         "scene": {"mesh_size_jitter": 0.0},
@@ -301,12 +313,12 @@ def test_members_on_warp_must_fit_its_contacts():
         ("warp", 103, 1, False),
         ("warp", 103, 2, True),
     ):
-        plan = Plan(seeds, [_setting("a", sim={"physics": physics}, **sections)])
+        plan = SweepPlan(seeds, [_point("a", sim={"physics": physics}, **sections)])
         if fits:
             sweep.check_room(plan, devices)
         else:
             with pytest.raises(
-                ValueError, match=r"--seeds: 103 members of 40 scenes .* room for 4096 scenes"
+                ValueError, match=r"--seeds: 103 runs of 40 scenes .* room for 4096 scenes"
             ):
                 sweep.check_room(plan, devices)
-    sweep.check_room(Plan(103, [_setting("a", sim={"physics": "mjx"}, **sections)]), 1)
+    sweep.check_room(SweepPlan(103, [_point("a", sim={"physics": "mjx"}, **sections)]), 1)

@@ -98,7 +98,7 @@ def test_run_with_batch_norm_resumes(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 2])
-def test_runs_side_by_side_take_turns(size: int, monkeypatch: pytest.MonkeyPatch):
+def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyPatch):
     """Claim: each of four DenseNet runs side by side is the run that `train` makes of its seed, to
     rounding, and their products are made for so many at a time; those of runs whose numbers differ
     are vmapped.
@@ -107,7 +107,7 @@ def test_runs_side_by_side_take_turns(size: int, monkeypatch: pytest.MonkeyPatch
     either way: hence a wide bound for all, and a narrow one for all but a few in a thousand
     numbers.
     """
-    monkeypatch.setattr(chunked_vmap, "_AT_ONCE", size)
+    monkeypatch.setattr(chunked_vmap, "_LARGEST", size)
     smoke = presets.smoke()
     net = NetConfig(
         "densenet121", 4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), block_growth=4, zoom=2
@@ -120,7 +120,7 @@ def test_runs_side_by_side_take_turns(size: int, monkeypatch: pytest.MonkeyPatch
 
     def lowered(configs):
         (group,) = replicas.group(configs)
-        each = replicas.members(group)
+        each = replicas.of_group(group)
         begun = replicas.init(program, each)
         return begun, replicas.compile_chunk(program, each, 6).lower(begun)
 
@@ -132,7 +132,7 @@ def test_runs_side_by_side_take_turns(size: int, monkeypatch: pytest.MonkeyPatch
         one = dataclasses.replace(program, cfg=cfg)
         alone, seen = step.compile_chunk(one, 6)(step.init(one))
         for mine, want in (
-            (replicas.member(after, k), alone),
+            (replicas.replica(after, k), alone),
             (jax.tree.map(lambda leaf, k=k: leaf[:, k], metrics), seen),
         ):
             assert_close(mine, want, 1e-3, 1e-3)

@@ -2,6 +2,7 @@
 enters."""
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -11,9 +12,17 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.agent import actor_critic, cem, explore, losses, rewards, softmax
 from csac_jax.agent.actor_critic import ActorCritic
+from csac_jax.agent.csac import CSAC
 from csac_jax.config import Config
+from csac_jax.nets import networks
 from csac_jax.replay import samplers
-from csac_jax.training.step import Program, StepMetrics, TrainState
+from csac_jax.training.step import (
+    Hyperparams,
+    Program,
+    StepMetrics,
+    TrainState,
+    replace_hyperparams,
+)
 
 SMOKE = presets.smoke()
 SCENES = 8
@@ -26,33 +35,41 @@ def program(cfg: Config = CFG) -> Program:
     """Without environment and networks."""
     nothing: Any = None
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
-    learner = ActorCritic(cfg, nothing, nothing, nothing, nothing, nothing, bounds)
-    return Program(cfg, nothing, actor_critic.with_numbers(learner, cfg, bounds))
+    frames: Any = SimpleNamespace(networks=networks.make(cfg.net))
+    parts = ActorCritic(cfg, frames, nothing, nothing, bounds)
+    learner = CSAC(actor_critic.replace_hyperparams(parts, cfg, bounds))
+    return Program(cfg, nothing, learner, samplers.make(cfg.replay))
 
 
-def begin(program: Program, key: jax.Array) -> TrainState:
-    """In place of `step.begin`: scenes [E], networks [3], a ring [4]."""
+def init_state(
+    program: Program, key: jax.Array, hyperparams: Hyperparams | None = None
+) -> TrainState:
+    """In place of `step.init_state`: scenes [E], networks [3], a ring [4]."""
+    program = replace_hyperparams(program, hyperparams)
     params = jax.random.normal(jax.random.fold_in(key, 1), (3,))
     learner = {
         "online": params,
         "target": params,
-        "optimiser": program.learner.critic_optimiser.init(params),
-        "actor": program.learner.actor_optimiser.init(params),
+        "optimiser": program.learner.parts.critic_optimiser.init(params),
+        "actor": program.learner.parts.actor_optimiser.init(params),
     }
     scenes = jax.random.uniform(jax.random.fold_in(key, 2), (program.cfg.train.scenes,))
     return TrainState(key, jnp.int32(0), scenes, learner, jnp.zeros(4))
 
 
-def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+def train_step(
+    program: Program, state: TrainState, hyperparams: Hyperparams | None = None
+) -> tuple[TrainState, StepMetrics]:
     """In place of `step.train_step`: physics, a batch, a gradient, a schedule that is a branch."""
-    cfg, learner = program.cfg, program.learner
+    program = replace_hyperparams(program, hyperparams)
+    cfg, learner = program.cfg, program.learner.parts
     num = cfg.train.scenes
     key = jax.random.fold_in(state.key, state.step)
     noise = jax.random.normal(key, (num,))
-    scenes = program.spread.scenes(lambda scenes, noise: jnp.sin(scenes + noise))(
+    scenes = program.sharding.map_scenes(lambda scenes, noise: jnp.sin(scenes + noise))(
         state.scenes, noise
     )
-    batch = program.spread.batch(scenes)
+    batch = program.sharding.shard_batch(scenes)
 
     def loss(params: jax.Array) -> jax.Array:
         q = params[0] * batch + params[1] * batch**2 + params[2]
@@ -97,7 +114,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
 def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     """What comes of every number of a config that the losses above do not show, [n]."""
-    cfg, (low, high) = program.cfg, program.learner.bounds
+    cfg, (low, high) = program.cfg, program.learner.parts.bounds
     keys = [jax.random.fold_in(key, i) for i in range(3)]
     share = step.astype(jnp.float32) / 10.0
     found = cem.maximise(
@@ -109,26 +126,27 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
         np.zeros(2, bool),
     )
     outcomes = jnp.arange(5, dtype=jnp.int32)
-    far, zero, changed = jnp.float32(0.4), jnp.float32(0.0), jnp.array(True)
-    grasp = rewards.ActionResult(jnp.int32(1), outcomes, far, zero, zero, changed, jnp.int32(1))
-    axes = rewards.ActionResult(None, 0, None, None, None, None, None)
-    grasps = jax.vmap(rewards.reward, (None, axes))(cfg.reward, grasp)
-    none_lifted, push = jnp.int32(0), jnp.int32(0)
-    gains = (jnp.float32(0.05), jnp.float32(0.5))
-    pushes = [
-        rewards.reward(
-            cfg.reward,
-            rewards.ActionResult(push, none_lifted, zero, zero, gain, changed, jnp.int32(0)),
+    far, zero = jnp.float32(0.4), jnp.float32(0.0)
+
+    def reward(primitive: int, outcome: jax.Array, distance: jax.Array, gain: jax.Array, lost: int):
+        result = rewards.ActionResult(
+            primitive=jnp.int32(primitive),
+            outcome=outcome,
+            distance=distance,
+            phi_before=zero,
+            phi_after=gain,
+            changed=jnp.array(True),
+            blocks_lost=jnp.int32(lost),
         )
-        for gain in gains
-    ]
+        return rewards.reward(cfg.reward, result)
+
+    grasps = jax.vmap(lambda outcome: reward(1, outcome, far, zero, 1))(outcomes)
+    gains = (jnp.float32(0.05), jnp.float32(0.5))
+    pushes = [reward(0, jnp.int32(0), zero, gain, 0) for gain in gains]
     ex = cfg.explore
     chances = [
         explore.probability(start, end, ex.decay, 100 * step)
-        for start, end in (
-            (ex.epsilon_primitive_start, ex.epsilon_primitive_end),
-            (ex.epsilon_place_start, ex.epsilon_place_end),
-        )
+        for start, end in (ex.epsilon_primitive, ex.epsilon_place)
     ]
     noisy = explore.action_noise(keys[1], ex, jnp.zeros(3))
     pushed = jax.random.bernoulli(keys[2], ex.push_fraction, (32,)).astype(jnp.float32).mean()
@@ -140,8 +158,6 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
         pushed,
         a,
         b,
-        samplers.weight_exponent(cfg.replay, share),
     ]
     scalars += [softmax.scaled_inverse_temperature(cfg.target, high - low) * jnp.float32(1.0)]
-    priority = samplers.priority(cfg.replay, jnp.array([0.1, 0.7]))
-    return jnp.concatenate([jnp.stack(scalars), found.action, grasps, noisy, priority])
+    return jnp.concatenate([jnp.stack(scalars), found.action, grasps, noisy])
