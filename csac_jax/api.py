@@ -118,7 +118,9 @@ def sweep(
     """
     points = _points(cfg, dict(vary or {}))
     runs = seeds * len(points)
-    points = [point._replace(cfg=backend.resolve(point.cfg, devices or 1, runs)) for point in points]
+    points = [
+        point._replace(cfg=backend.resolve(point.cfg, devices or 1, runs)) for point in points
+    ]
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
     plan = SweepPlan(seeds, points)
     return run_sweep(plan, folder, devices, shard, init, verbose, stop or signals.Stop()).summary

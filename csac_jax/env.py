@@ -21,7 +21,7 @@ from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.scene import layout, model, pool, sources
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import auto, outcome, physics as simulation
+from csac_jax.sim import backend, outcome, physics as simulation
 from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, observe, sensor
@@ -214,7 +214,7 @@ def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | Non
     random numbers, and needs a pool of `num_scenes` or more; None is the config's `scene.pool`.
     Raises SceneError for blocks that do not come to rest, and for physics that is not installed.
     """
-    cfg = auto.resolve(cfg)
+    cfg = backend.resolve(cfg)
     world = model.build(cfg.scene, cfg.sim)
     scenes = sources.scenes(cfg, stream, num_scenes)
     return Env(cfg, simulation.make(world, cfg.sim), scenes)

@@ -5,11 +5,12 @@ python examples/own_learner.py [PRESET] [RUN_DIR]
 
 import sys
 
-import csac_jax as csac
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
+
+import csac_jax as csac
 
 YAWS, CELLS, GAMMA = 4, 16, 0.5  # of half a turn; along each side of the map
 
@@ -42,7 +43,9 @@ class DQN(csac.Learner):
             epsilon = jnp.maximum(0.05, 0.998**actions_taken)
             key_explore, key_cell = jax.random.split(key)
             elsewhere = jax.random.randint(key_cell, best.shape, 0, q.shape[1])
-            best = jnp.where(jax.random.bernoulli(key_explore, epsilon, best.shape), elsewhere, best)
+            best = jnp.where(
+                jax.random.bernoulli(key_explore, epsilon, best.shape), elsewhere, best
+            )
         row, col, yaw = jnp.unravel_index(best, (CELLS, CELLS, YAWS))
         x, y = ((index + 0.5 - 0.5 * CELLS) * cell for index in (col, row))
         return jax.vmap(csac.Action.grasp)(x, y, yaw * (jnp.pi / YAWS))
@@ -54,7 +57,11 @@ class DQN(csac.Learner):
         y = batch.reward + GAMMA * jnp.where(batch.terminated, 0.0, following)
         x, place_y, yaw = batch.action.pose.T
         col, row = (jnp.clip((c / 0.448 + 0.5) * CELLS, 0, CELLS - 1) for c in (x, place_y))
-        index = (row.astype(int), col.astype(int), jnp.round(yaw * YAWS / jnp.pi).astype(int) % YAWS)
+        index = (
+            row.astype(int),
+            col.astype(int),
+            jnp.round(yaw * YAWS / jnp.pi).astype(int) % YAWS,
+        )
 
         def loss(params):
             q = QMap().apply(params, obs.height)[(jnp.arange(len(y)), *index)]

@@ -5,8 +5,9 @@ python examples/own_network.py [PRESET] [RUN_DIR]
 
 import sys
 
-import csac_jax as csac
 import flax.linen as nn
+
+import csac_jax as csac
 
 
 class PlainNet(nn.Module):

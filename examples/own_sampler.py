@@ -6,9 +6,10 @@ python examples/own_sampler.py [PRESET] [RUN_DIR]
 import dataclasses
 import sys
 
-import csac_jax as csac
 import jax
 import jax.numpy as jnp
+
+import csac_jax as csac
 
 
 @dataclasses.dataclass(frozen=True)

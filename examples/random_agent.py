@@ -5,9 +5,10 @@ python examples/random_agent.py [PRESET] [STEPS]
 
 import sys
 
-import csac_jax as csac
 import jax
 import jax.numpy as jnp
+
+import csac_jax as csac
 
 SCENES = 8
 

@@ -13,8 +13,6 @@ def test_public_names_exist():
     assert set(csac_jax.__all__) < set(dir(csac_jax))
 
 
-
-
 def test_import_leaves_jax_alone():
     """Claim: `import csac_jax` loads neither JAX nor MuJoCo, and `--help` neither."""
     for code in ("import csac_jax", "from csac_jax import cli; cli.main(['--help'])"):

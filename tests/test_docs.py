@@ -10,7 +10,9 @@ from csac_jax import presets
 
 ROOT = Path(csac_jax.__file__).parents[1]
 PAGES = [
-    page for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md")) if "```python" in page.read_text()
+    page
+    for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
+    if "```python" in page.read_text()
 ]
 
 

@@ -12,17 +12,7 @@ from collections.abc import Callable, Sequence
 
 import csac_jax
 from csac_jax import algorithms, presets
-from csac_jax.cli import (
-    bench,
-    doctor,
-    evaluation,
-    export,
-    parsing,
-    play,
-    report,
-    sweep,
-    train,
-)
+from csac_jax.cli import bench, doctor, evaluation, export, parsing, play, report, sweep, train
 from csac_jax.cli.errors import PROGRAM, BadArgumentsError, FailedError, complain
 from csac_jax.errors import DeviceError, SceneError
 
@@ -109,5 +99,5 @@ def _on_device(arguments: list[str]) -> list[str]:
         raise BadArgumentsError(f"--device: '{device}' is not one of: cpu, gpu")
     from csac_jax.runtime import devices
 
-    devices.select(device)
+    devices.select("cpu" if device == "cpu" else "gpu")
     return parsing.without(arguments, "--device")

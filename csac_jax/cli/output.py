@@ -1,21 +1,10 @@
-"""What commands write: folders with the time in their name, JSON with its provenance, shares as
-text."""
+"""What commands write: JSON with its provenance, shares as text."""
 
-import datetime
 from pathlib import Path
 from typing import Any
 
 from csac_jax.config import Config
 from csac_jax.io import files
-
-RUNS = Path("runs")
-
-
-def new_folder(name: str) -> Path:
-    """A folder under RUNS, with the time in its name, that does not exist yet."""
-    stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
-    return next(path for path in candidates if not path.exists())
 
 
 def write_result(path: Path | None, result: dict[str, Any], cfg: Config | None) -> None:

@@ -82,7 +82,7 @@ def print_help(options: type, command: str, examples: Sequence[str]) -> None:
         section, setting = name.split(".")
         value = getattr(getattr(quick, section), setting)
         shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
-        _print_row(f"{_flag(name)} {shown}", _docs(type(getattr(quick, section))).get(setting, ""))
+        _print_row(f"{_flag(name)} {shown}", _docs(getattr(quick, section).__class__).get(setting, ""))
     print(f"\nAll settings: {PROGRAM} {command} PRESET --help-all")
 
 
@@ -98,7 +98,7 @@ def _print_row(flag: str, text: str) -> None:
 
 
 @functools.cache
-def _docs(kind: type) -> dict[str, str]:
+def _docs(kind: Any) -> dict[str, str]:
     """The text below each field of a dataclass, in one line."""
     tree = ast.parse(inspect.getsource(kind))
     body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []

@@ -14,7 +14,6 @@ from csac_jax.config import Config
 from csac_jax.runtime import signals
 from csac_jax.sweeps import grid
 
-
 EXAMPLES = (
     "quick --seeds 8",
     "quick --seeds 4 --vary replay.sampler=uniform,beta --vary learn.tau=0.01,0.02",

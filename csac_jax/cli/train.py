@@ -82,9 +82,9 @@ def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
 
 def _train(options: TrainOptions, cfg: Config, stop: signals.Stop) -> Any:
     from csac_jax import api
+    from csac_jax.errors import SettingsError
     from csac_jax.io import checkpoint, policy_file
     from csac_jax.report.tensorboard import TensorBoard
-    from csac_jax.errors import SettingsError
     from csac_jax.training import loop
 
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")

@@ -173,10 +173,7 @@ def size_leader(slots: tuple[SlotKind, ...]) -> np.ndarray:
 
 def size_jitter(cfg: SceneConfig) -> np.ndarray:
     """Largest deviation [N] of each slot's block from its nominal size, as a share of it."""
-    return np.array(
-        [cfg.size_jitter[int(kind in MESH_KINDS)] for kind in cfg.slots],
-        np.float32,
-    )
+    return np.array([cfg.size_jitter[int(kind in MESH_KINDS)] for kind in cfg.slots], np.float32)
 
 
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:

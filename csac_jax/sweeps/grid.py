@@ -9,7 +9,7 @@ import difflib
 import itertools
 import typing
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from csac_jax.config import ALTERNATIVES, Config, Section
 
@@ -88,7 +88,8 @@ def _kinds() -> dict[str, object]:
         default = getattr(Config(), section.name)
         if isinstance(default, Section):
             _, alternatives = ALTERNATIVES.get(section.name, ("", (type(default),)))
-            for kind in alternatives:
+            kinds_of: Any = alternatives
+            for kind in kinds_of:
                 hints = typing.get_type_hints(kind)
                 names = [field.name for field in dataclasses.fields(kind)]
                 kinds |= {f"{section.name}.{name}": hints[name] for name in names}
@@ -101,7 +102,9 @@ def _kind(name: str) -> object:
         raise ValueError("--vary: seeds are varied by --seeds")
     if name not in kinds:
         near = difflib.get_close_matches(name, kinds, 1)
-        hint = f"perhaps you meant {near[0]}" if near else "csac-jax train quick --help-all lists them"
+        hint = (
+            f"perhaps you meant {near[0]}" if near else "csac-jax train quick --help-all lists them"
+        )
         raise ValueError(f"--vary: '{name}' is no setting; {hint}")
     return kinds[name]
 

@@ -16,9 +16,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from csac_jax.agent import rewards
 from csac_jax.config import Config
+from csac_jax.nets import chunked_vmap
 from csac_jax.runtime import compiler
 from csac_jax.sweeps import pipelined
-from csac_jax.nets import chunked_vmap
 from csac_jax.training import step
 from csac_jax.training.sharding import AXIS, DataSharding, Shard
 from csac_jax.training.step import Hyperparams, Program, StepMetrics, TrainState

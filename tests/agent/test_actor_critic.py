@@ -199,7 +199,9 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
 def test_actor_climbs_the_critic(learner, state, batch):
     """Claim: updates of the actor raise Q(s, mu(s)) and leave the critic and both targets as they
     are."""
-    run = jax.jit(lambda state: actor_critic.update_actor(learner, state, heightmap.unpack(batch.obs)))
+    run = jax.jit(
+        lambda state: actor_critic.update_actor(learner, state, heightmap.unpack(batch.obs))
+    )
 
     @jax.jit
     def value(online: Params) -> jax.Array:
@@ -421,7 +423,9 @@ def test_twin_critics(learner, batch, randomised):
     )
     with jax.numpy_dtype_promotion("standard"):
         state = randomised(begun)
-    look = jax.jit(lambda params: actor_critic.look(learner, params, heightmap.unpack(batch.next_obs)))
+    look = jax.jit(
+        lambda params: actor_critic.look(learner, params, heightmap.unpack(batch.next_obs))
+    )
     both, single = look(state.target), [look(_one(state.target, m)) for m in (0, 1)]
     np.testing.assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
     assert 0.1 < np.mean(single[0].q < single[1].q) < 0.9

@@ -53,7 +53,9 @@ def net(request, cfg) -> Fixed:
     params = jax.tree.map(
         lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), abstract
     )
-    return Fixed(learner, params, jax.jit(lambda params, obs: actor_critic.look(learner, params, obs)))
+    return Fixed(
+        learner, params, jax.jit(lambda params, obs: actor_critic.look(learner, params, obs))
+    )
 
 
 def _hills(seed: int, yaw: float) -> Observation:

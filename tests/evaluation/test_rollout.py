@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
+from csac_jax.agent import actor_critic
 from csac_jax.config import TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
@@ -16,6 +17,7 @@ from csac_jax.evaluation.metrics import Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, OraclePolicy, RandomPolicy
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action
+from csac_jax.vision import observe
 
 pytestmark = pytest.mark.mjx
 

@@ -364,7 +364,7 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
         return samplers.Sample(2 * jnp.arange(num, dtype=jnp.int32), weights)
 
     def update(key, learner, state, batch, given):
-        return state, learning.UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
+        return state, actor_critic.UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
 
     monkeypatch.setattr(samplers, "sample", draw)
     monkeypatch.setattr(learning, "update_critic", update)
@@ -377,7 +377,7 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     replay = ring.init(cfg.replay, step.example(cfg)).replace(
         size=jnp.int32(64), priority=jnp.full(64, 7.0)
     )
-    learner_state = learning.LearnerState(None, None, None, None, jnp.int32(0))
+    learner_state = actor_critic.LearnerState(None, None, None, None, jnp.int32(0))
     _, priority, losses = step._learn(
         Program(cfg, None, None), jax.random.key(0), learner_state, replay
     )
@@ -389,7 +389,7 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     np.testing.assert_allclose(priority, expected, rtol=1e-6)
 
 
-def _opinions() -> tuple[learning.ActorCritic, learning.LearnerState]:
+def _opinions() -> tuple[actor_critic.ActorCritic, actor_critic.LearnerState]:
     """A learner and networks whose critic values every cell differently."""
     learner = actor_critic.make(CFG)
     rng = np.random.default_rng(0)

@@ -151,13 +151,6 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     noisy = explore.action_noise(keys[1], ex, jnp.zeros(3))
     pushed = jax.random.bernoulli(keys[2], ex.push_fraction, (32,)).astype(jnp.float32).mean()
     a, b = samplers.beta_schedule(cfg.replay, share)
-    scalars = [
-        found.value,
-        *pushes,
-        *chances,
-        pushed,
-        a,
-        b,
-    ]
+    scalars = [found.value, *pushes, *chances, pushed, a, b]
     scalars += [softmax.scaled_inverse_temperature(cfg.target, high - low) * jnp.float32(1.0)]
     return jnp.concatenate([jnp.stack(scalars), found.action, grasps, noisy])
