@@ -82,7 +82,9 @@ def print_help(options: type, command: str, examples: Sequence[str]) -> None:
         section, setting = name.split(".")
         value = getattr(getattr(quick, section), setting)
         shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
-        _print_row(f"{_flag(name)} {shown}", _docs(getattr(quick, section).__class__).get(setting, ""))
+        _print_row(
+            f"{_flag(name)} {shown}", _docs(getattr(quick, section).__class__).get(setting, "")
+        )
     print(f"\nAll settings: {PROGRAM} {command} PRESET --help-all")
 
 

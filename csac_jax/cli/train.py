@@ -84,11 +84,14 @@ def _train(options: TrainOptions, cfg: Config, stop: signals.Stop) -> Any:
     from csac_jax import api
     from csac_jax.errors import SettingsError
     from csac_jax.io import checkpoint, policy_file
-    from csac_jax.report.tensorboard import TensorBoard
     from csac_jax.training import loop
 
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")
-    reporters = [TensorBoard(folder)] if options.tensorboard else []
+    reporters = []
+    if options.tensorboard:
+        from csac_jax.report.tensorboard import TensorBoard
+
+        reporters.append(TensorBoard(folder))
     with (
         as_failure(loop.TrainingError, checkpoint.CheckpointError, policy_file.PolicyFileError),
         as_bad_arguments(SettingsError),

@@ -80,7 +80,9 @@ def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> Sizes:
     longest = [choice[choice[:, 0] == choice[:, 0].max()] for choice in choices]
     longest = [np.resize(choice, (2, 3)) for choice in longest]
     num = len(cfg.slots)
-    scale = 1.0 + blocks.spread(cfg) * jax.random.uniform(key_scale, (num,), jnp.float32, -1.0, 1.0)
+    scale = 1.0 + blocks.size_jitter(cfg) * jax.random.uniform(
+        key_scale, (num,), jnp.float32, -1.0, 1.0
+    )
     shared = blocks.size_leader(cfg.slots)
 
     def choose(tables: list[np.ndarray], index: jax.Array) -> jax.Array:

@@ -128,7 +128,7 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 def _half_sizes(cfg: SceneConfig, rng: np.random.Generator) -> np.ndarray:
     """Half sizes [N, 3] m of random shapes and scales; mesh blocks of one kind are alike."""
     choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
-    scales = 1.0 + blocks.spread(cfg) * rng.uniform(-1.0, 1.0, len(cfg.slots))
+    scales = 1.0 + blocks.size_jitter(cfg) * rng.uniform(-1.0, 1.0, len(cfg.slots))
     sizes = np.stack([kind[rng.integers(len(kind))] for kind in choices])
     return (sizes * scales[blocks.size_leader(cfg.slots)][:, None]).astype(np.float32)
 

@@ -367,9 +367,9 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
         return state, actor_critic.UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
 
     monkeypatch.setattr(samplers, "sample", draw)
-    monkeypatch.setattr(learning, "update_critic", update)
+    monkeypatch.setattr(actor_critic, "update_critic", update)
     monkeypatch.setattr(
-        learning, "update_actor", lambda learner, state, obs: (state, jnp.float32(0.0))
+        actor_critic, "update_actor", lambda learner, state, obs: (state, jnp.float32(0.0))
     )
     cfg = dataclasses.replace(
         CFG, replay=ReplayConfig(capacity=64, sampler=sampler, alpha=0.5, per_epsilon=0.25)
@@ -433,7 +433,7 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
         taken.append(obs.height.shape[0])
         return state, jnp.zeros(())
 
-    monkeypatch.setattr(learning, "update_actor", update)
+    monkeypatch.setattr(actor_critic, "update_actor", update)
     for actor_batch in (0, 3):
         cfg = dataclasses.replace(
             CFG, learn=dataclasses.replace(CFG.learn, actor_batch=actor_batch)
