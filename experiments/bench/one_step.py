@@ -4,7 +4,7 @@ States are recorded in C MuJoCo at a random substep of random pushes and planned
 piles of ten blocks. From each, both engines compute where every body is (kinematics), take one step
 without contacts, and one with them, the solver started cold. What differs after a step with
 contacts is measured once more with a solver that converges: what is left then is not the solver's.
-NOTES.md says what it is.
+docs/benchmarks/physics-parity.md says what it is.
 """
 
 import dataclasses
