@@ -1,7 +1,7 @@
 """The tables of a report. Every number comes from a file that says where it was measured."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -55,22 +55,21 @@ def as_json(report: Report) -> dict[str, Any]:
 
 def _curve_json(report: Report, curve: Curve) -> recorded.Json:
     actions, success = curve.points()
-    ahead = lead(report, curve)
+    ends = {"final": curve.final, "ahead": lead(report, curve)}
     return _named(curve.variant) | {
         "seeds": _seeds(curve.runs),
-        "final": curve.final._asdict(),
-        "ahead": None if ahead is None else ahead._asdict(),
         "seconds_to_90": [_time_to_good(run) for run in curve.runs],
         "seconds": [float(run.seconds[-1]) for run in curve.runs],
         "actions": actions.tolist(),
         "success": [band._asdict() for band in success],
+        **_plain(ends),
     }
 
 
 def _score_json(score: Score) -> recorded.Json:
     place = score.place._asdict()
-    bands = {name: band for name in METRICS if (band := score.band(name)) is not None}
-    numbers = {"seeds": _seeds(score.evaluations), "metrics": _plain(bands)}
+    metrics = _plain({name: score.band(name) for name in METRICS})
+    numbers = {"seeds": _seeds(score.evaluations), "metrics": metrics}
     return _named(place.pop("variant")) | place | numbers
 
 
@@ -78,8 +77,8 @@ def _named(variant: Variant) -> recorded.Json:
     return variant._asdict() | {"changed": dict(variant.changed)}
 
 
-def _plain(bands: dict[str, Band]) -> recorded.Json:
-    return {name: band._asdict() for name, band in bands.items()}
+def _plain(bands: Mapping[str, Band | None]) -> recorded.Json:
+    return {name: band and band._asdict() for name, band in bands.items()}
 
 
 def tables(report: Report) -> dict[str, Table]:
@@ -120,7 +119,7 @@ def training(report: Report) -> Table:
                 "seeds": ", ".join(map(str, sorted(set(_seeds(curve.runs))))),
                 "actions": " to ".join(f"{end:,}" for end in ends),
                 LAST: percent(curve.final),
-                "CSAC-beta ahead by": points(lead(report, curve)),
+                "CSAC-beta ahead by": percent(lead(report, curve), "+"),
                 "paper": "-" if mark is None else f"{100 * mark:.0f} %",
                 "time to 90 %": _range([_time_to_good(run) for run in curve.runs]),
                 "training time": _range([float(run.seconds[-1]) for run in curve.runs]),
@@ -162,27 +161,30 @@ def differences(report: Report) -> Table:
                 "part": _part(gap.suite, part),
                 "physics, robot, seed": gap.world,
             }
-            | {title: points(gap.bands.get(metric)) for metric, title in METRICS.items()}
+            | {title: percent(gap.bands.get(metric), "+") for metric, title in METRICS.items()}
         )
     return rows
 
 
 def failures(report: Report) -> Table:
     """Causes of failure, all runs summed: how many, and of how many."""
-    rows = []
-    for score in report.scores:
-        found = [one.metrics.get("failures", {}) for one in score.evaluations]
-        causes = [cause for cause in found[0] if all(cause in each for each in found)]
-        entries = {cause: [each[cause] for each in found] for cause in causes}
-        cells = {cause.replace("_", " "): _sum(each) for cause, each in entries.items()}
-        rows += [_first_cells(score.place) | cells] if cells else []
-    return rows
+    told = {
+        score.place: [one.metrics["failures"] for one in score.evaluations]
+        for score in report.scores
+        if all("failures" in one.metrics for one in score.evaluations)
+    }
+    causes = dict.fromkeys(cause for runs in told.values() for run in runs for cause in run)
+    return [
+        _first_cells(place) | {cause.replace("_", " "): _sum(runs, cause) for cause in causes}
+        for place, runs in told.items()
+    ]
 
 
-def _sum(entries: Sequence[recorded.Json]) -> str:
-    """The cases of several shares, and what they are shares of."""
-    n = sum(entry["n"] for entry in entries)
-    cases = sum(round(entry["n"] * (entry["value"] or 0.0)) for entry in entries)
+def _sum(runs: Sequence[recorded.Json], cause: str) -> str:
+    """The cases of a cause in several runs, and what they are cases of."""
+    shares = [run[cause] for run in runs if cause in run]
+    n = sum(share["n"] for share in shares)
+    cases = sum(round(share["n"] * (share["value"] or 0.0)) for share in shares)
     return f"{cases} / {n}" if n else "-"
 
 
@@ -229,29 +231,21 @@ def _wall_time(one: Run | Evaluation) -> str:
     return "-" if seconds is None else f"{seconds:.0f} s{whole}"
 
 
-def percent(band: Band | None) -> str:
-    """A share with its band."""
+def percent(band: Band | None, sign: str = "") -> str:
+    """A share with its band; with a sign, a difference in points of per cent."""
     if band is None:
         return "-"
-    if band.low is None or band.high is None:
-        return f"{100 * band.value:.1f} %"
-    return f"{100 * band.value:.1f} % ({100 * band.low:.1f} to {100 * band.high:.1f})"
-
-
-def points(band: Band | None) -> str:
-    """A difference in points of per cent with its band."""
-    if band is None or band.low is None or band.high is None:
-        return "-"
-    return f"{100 * band.value:+.1f} ({100 * band.low:+.1f} to {100 * band.high:+.1f})"
+    value, *ends = (f"{100 * x:{sign}.1f}" for x in band[:3] if x is not None)
+    interval = f" ({' to '.join(ends)})" if ends else ""
+    return f"{value}{'' if sign else ' %'}{interval}"
 
 
 def _range(values: Sequence[float | None]) -> str:
     """Least and most of some times; not every run need have one."""
-    there = [value for value in values if value is not None]
-    if not there:
-        return "-"
-    text = f"{min(there):.0f} s" if len(there) == 1 else f"{min(there):.0f} to {max(there):.0f} s"
-    return text if len(there) == len(values) else f"{text} ({len(there)} of {len(values)} runs)"
+    there = sorted(value for value in values if value is not None)
+    ends = dict.fromkeys(f"{value:.0f}" for value in (*there[:1], *there[1:][-1:]))
+    some = f" ({len(there)} of {len(values)} runs)" if len(there) < len(values) else ""
+    return f"{' to '.join(ends)} s{some}" if there else "-"
 
 
 EXPLAINED = (

@@ -14,7 +14,7 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import train
 from csac_jax.config import Algo
 from csac_jax.evaluation import metrics, statistics
-from csac_jax.io import config_json
+from csac_jax.io import config_json, files
 from csac_jax.report import charts, comparison, results, tables
 
 CASES = ("hole", "row")
@@ -287,6 +287,29 @@ def test_labels():
     assert comparison.label(variant, preset=False, most=4) == comparison.label(
         variant, preset=False
     )
+
+
+def test_old_names_are_read_as_todays(tmp_path: Path):
+    """Claim: logs, evaluations and configs with the names of before say what they would say now."""
+    config = _config("csac_beta", 0, reward__lost_block_penalty=0.5)
+    old = json.loads(json.dumps(config))
+    old["reward"]["left"] = old["reward"].pop("lost_block_penalty")
+    old["explore"]["primitive_end"] = old["explore"].pop("epsilon_primitive_end")
+    assert results.variant(old) == results.variant(config)
+    assert results.variant(old).changed == (("reward.lost_block_penalty", "0.5"),)
+    share = metrics.wilson(1, 10)
+    part = {"completion": share, "failures": {"block_left": share, "episode_ill": share}}
+    content = {"policy": "learned", "suite": "own", "parts": {"own": part}, "config": old}
+    (tmp_path / "eval.json").write_text(json.dumps(content))
+    _run(tmp_path / "run", old, [0.5])
+    log = tmp_path / "run" / "metrics.jsonl"
+    log.write_text('{"step": 1, "actions": 8, "ill": 1, "left": 2, "saturated": 3}\n')
+    assert files.read_log(log) == [
+        {"step": 1, "actions": 8, "physics_diverged": 1, "blocks_lost": 2, "contact_overflow": 3}
+    ]
+    one = results.read([tmp_path / "eval.json"]).evaluations[0]
+    assert (one.suite, one.part) == ("in_distribution", "in_distribution")
+    assert set(one.metrics["failures"]) == {"block_lost", "episode_physics_diverged"}
 
 
 def test_command_gives_the_config_back():
