@@ -146,9 +146,6 @@ BENCHES = {
         "100,000 random actions: nothing lost, nothing infinite",
         "bench soak --actions 100000 --scenes 1024",
     ),
-    "memory/cpu": ("memory of training steps on a CPU", "bench memory"),
-    "memory/h200-fast": ("memory of a step of `fast`", "bench memory fast"),
-    "memory/h200-paper_small": ("memory of a step of `paper_small`", "bench memory paper_small"),
 }
 """File of a benchmark -> what it shows, and its command."""
 

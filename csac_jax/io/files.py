@@ -39,7 +39,14 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
     for line in path.read_text().splitlines():
         with contextlib.suppress(ValueError):
-            yield renames.metrics(json.loads(line))
+            yield renamed(json.loads(line))
+
+
+def renamed(content: Any) -> Any:
+    """A line of a log, or an evaluation without its config, with today's names of metrics."""
+    if not isinstance(content, dict):
+        return content
+    return {renames.METRICS.get(name, name): renamed(value) for name, value in content.items()}
 
 
 def truncate_log(path: Path, step: int) -> None:

@@ -1,7 +1,5 @@
 """Names that recorded files carry, and what they are called today."""
 
-from typing import Any
-
 METRICS = {
     "ill": "physics_diverged",
     "left": "blocks_lost",
@@ -33,10 +31,3 @@ SETTINGS = {
     "train.warmup": "train.learning_starts",
 }
 """Old dotted name -> dotted name of a setting."""
-
-
-def metrics(content: Any) -> Any:
-    """A line of a log, or an evaluation without its config, by today's names."""
-    if not isinstance(content, dict):
-        return content
-    return {METRICS.get(name, name): metrics(value) for name, value in content.items()}

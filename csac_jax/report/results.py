@@ -126,8 +126,9 @@ def _add_run(path: Path, results: Results) -> None:
 
 
 def _record(folder: Path, config: Json) -> Json:
-    """What `train` wrote in this folder, or `sweep` in one above; empty where neither did."""
-    for place in (folder, *folder.resolve().parents[:2]):
+    """What `train` wrote in this folder, or `sweep` above a `seed-K`; empty where neither did."""
+    above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
+    for place in (folder, *above):
         record = read_json(place / RECORD)
         if record and record.get("config", config) == config:
             return record
@@ -143,7 +144,7 @@ def _evaluations(path: Path) -> list[Evaluation]:
         return []
     suite: str = content.get("suite", "own")
     suite = renames.METRICS.get(suite, suite)
-    parts = renames.metrics(content.get("parts") or {Path(suite).stem: content})
+    parts = files.renamed(content.get("parts") or {Path(suite).stem: content})
     record = {name: content.get(name) for name in ("device", "versions", "commit", "seconds")}
     asked = content["config"], content["policy"], suite
     return [

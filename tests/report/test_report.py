@@ -209,6 +209,15 @@ def test_numbers_as_json(recorded: Path):
     )
 
 
+def test_evaluation_ends_with_the_mean_of_the_parts(recorded: Path):
+    """Claim: after the parts of a suite a row has their mean, over all episodes."""
+    rows = tables.evaluation(comparison.build(results.read([recorded])))
+    beta = [row for row in rows if row["policy"] == "CSAC-beta (paper)"]
+    assert [row["part"] for row in beta] == ["cases: hole", "cases: row", "cases: mean of 2 parts"]
+    assert (beta[-1]["runs"], beta[-1]["episodes"]) == ("2", "40")
+    assert beta[-1]["completion"].startswith("90.0 % (")
+
+
 def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
     """Claim: CSAC-beta is set against every other variant of which several seeds were measured in
     the same scenes, part by part and over all parts; what was measured once, or in other scenes, is
@@ -450,6 +459,9 @@ def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.
     assert page.count("<svg") == 3
     assert "src=" not in page
     assert "92.5 %" in page
+    assert page.index("<h2>Summary</h2>") < page.index("<svg")
+    assert page.count("<th>completion</th>") == 1
+    assert "head.onclick" in page  # sorts
     shown = capsys.readouterr().out
     assert (out / "results.md").read_text() in shown
     assert "grasp dropped" in shown

@@ -105,7 +105,7 @@ def test_whole_program_takes_what_is_predicted():
 
 
 RECORD = json.loads(
-    (Path(__file__).parents[2] / "experiments/results/bench/memory/cpu.json").read_text()
+    (Path(__file__).parents[2] / "experiments/results/bench-memory-cpu.json").read_text()
 )["configs"]
 
 
