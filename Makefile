@@ -56,7 +56,9 @@ pictures: $(STAMP)  ## draw the pictures of README.md
 	done
 	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
 
-figures: $(STAMP)  ## the figures of recorded results, anew
+figures: $(STAMP)  ## the figures, tables and index of the recorded results
+	$(BIN)/csac-jax report experiments/results --markdown docs/results.md > /dev/null
+	$(BIN)/python -m experiments.records
 	$(BIN)/python -m experiments.figures
 
 doctor: $(STAMP)  ## versions, devices, numerics self-test

@@ -34,7 +34,7 @@ def quick() -> Config:
 
     Blocks of one shape are alike in size, density and friction. Its discount and the end of its
     Beta law, (1, 4), are away from the literature's defaults; neither is shown to be needed. What
-    it costs: experiments/bench/NOTES.md. The actor learns on a part of the batch, which spares
+    it costs: docs/benchmarks/speed-cpu.md. The actor learns on a part of the batch, which spares
     passes; the net's features lie 28 mm apart, not 14, for cheaper passes, its maps' cells still
     14, and its layers see as far.
     """
@@ -57,7 +57,7 @@ def fast() -> Config:
     Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A
     failed grasp costs more than a push that is not worth it, half of the random primitives are
     pushes, and blocks that leave cost. Physics is Warp's where it is installed, hence meshes are of
-    one size. What it learns so, and otherwise: experiments/bench/NOTES.md.
+    one size. What it learns so, and otherwise: docs/benchmarks/learning-ablations.md.
     """
     return Config(
         preset="fast",
@@ -91,7 +91,7 @@ def paper() -> Config:
     action; places are explored by action noise alone, and nothing is augmented. Where the paper is
     silent: tau of SD3, two pixels per cell and two transitions per update, as many as in VPG, one
     of them for the actor. Ours is that cells with nothing to act on are left out. Physics is
-    C's, the fastest for one scene. Result: experiments/results/paper-h200.
+    C's, the fastest for one scene. Result: experiments/results/paper.
     """
     return Config(
         preset="paper",
@@ -125,8 +125,8 @@ def paper_small() -> Config:
     and shifts of what is drawn from the replay, lest 2,500 actions be learned by heart; the squared
     error of Algorithm 1 line 21; discount 0.2; SD3's twin critics; random places at first and
     exploration that ends after some 1,000 actions, as in `quick`. Meshes are of one size, which
-    `sim.physics warp` needs. What each is worth: experiments/bench/NOTES.md; results:
-    experiments/results/paper-small-h200.
+    `sim.physics warp` needs. What each is worth: docs/benchmarks/learning-ablations.md;
+    results: experiments/results/paper_small.
     """
     whole = paper()
     return dataclasses.replace(

@@ -1,7 +1,8 @@
-"""Figures of recorded results, drawn anew by `make figures` into docs/figures: the samplers' speed,
-and whatever `csac-jax report experiments/results` draws."""
+"""Draws the figures that a document links to, from experiments/results into docs/figures."""
 
 import json
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import matplotlib
 matplotlib.use("Agg")  # no display
 import matplotlib.pyplot as plt
 from matplotlib import ticker
+from matplotlib.figure import Figure
 
-from csac_jax.report import charts, report, results
+from csac_jax.report import charts, comparison, results
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, FIGURES = ROOT / "experiments" / "results", ROOT / "docs" / "figures"
@@ -21,35 +23,6 @@ SAMPLERS = {
     "beta": "beta",
     "flashbax": "prioritised, flashbax",
 }
-
-
-def _read(*names: str) -> list[dict[str, Any]]:
-    return [json.loads((RESULTS / name).read_text()) for name in names]
-
-
-def replay() -> None:
-    """Time to draw 64 transitions and replace their priorities against the ring's capacity, on a
-    CPU and a GPU."""
-    records = {
-        "2-core CPU, busy": _read("bench-replay-cpu.json"),
-        "H200": _read("bench-replay-h200-12.json", "bench-replay-h200-18.json"),
-    }
-    figure, panels = plt.subplots(
-        1, len(records), figsize=(9, 3.4), sharey=True, layout="constrained"
-    )
-    for panel, (device, parts) in zip(panels, records.items(), strict=True):
-        rows = [row for part in parts for row in part["capacities"]]
-        for name, label in SAMPLERS.items():
-            microseconds = [1e6 * row["median_seconds"][name] for row in rows]
-            panel.plot([row["capacity"] for row in rows], microseconds, "o-", label=label)
-        panel.set(title=device, xlabel="capacity, transitions", xscale="log", yscale="log")
-        panel.set_xscale("log", base=2)
-        panel.grid(alpha=0.3)
-    panels[0].set_ylabel("median per step, \N{MICRO SIGN}s")
-    panels[1].legend()
-    figure.savefig(FIGURES / "replay.png", dpi=110, metadata={"Software": None})
-
-
 CURVES = {
     "scenes": "scenes side by side",
     "blocks": "blocks on the table",
@@ -58,80 +31,118 @@ CURVES = {
 }
 
 
-def steps() -> None:
-    """Time of a training step against what grows, one figure for each curve that `bench step
-    --curve` recorded."""
+def linked() -> set[str]:
+    """Names of the figures that README and docs show."""
+    documents = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    return {
+        name
+        for path in documents
+        for name in re.findall(r"figures/([\w-]+)\.png", path.read_text())
+    }
+
+
+def figures() -> Iterator[tuple[str, Figure]]:
+    """Name and figure of all that can be drawn."""
+    yield "replay", replay()
+    yield from steps()
+    yield from sweeps()
+    report = comparison.build(results.read([RESULTS]))
+    yield from ((chart.name, chart.figure) for chart in charts.draw(report))
+
+
+def _read(pattern: str) -> list[dict[str, Any]]:
+    """The records of benchmarks whose path has this pattern."""
+    return [json.loads(path.read_text()) for path in sorted(RESULTS.glob(f"bench/{pattern}.json"))]
+
+
+def replay() -> Figure:
+    """Time to draw 64 transitions and replace their priorities, against the ring's capacity."""
+    records = {"2-core CPU, busy": _read("replay/cpu"), "H200": _read("replay/h200-*")}
+    figure, panels = plt.subplots(
+        1, len(records), figsize=(9, 3.4), sharey=True, layout="constrained"
+    )
+    for panel, (device, parts) in zip(panels, records.items(), strict=True):
+        rows = [row for part in parts for row in part["capacities"]]
+        for name, label in SAMPLERS.items():
+            microseconds = [1e6 * row["median_seconds"][name] for row in rows]
+            panel.plot([row["capacity"] for row in rows], microseconds, "o-", label=label)
+        panel.set(title=device, xlabel="capacity, transitions", yscale="log")
+        panel.set_xscale("log", base=2)
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("median per step, \N{MICRO SIGN}s")
+    panels[1].legend()
+    return figure
+
+
+def steps() -> Iterator[tuple[str, Figure]]:
+    """Time of a training step against what grows, a figure per recorded curve."""
     for curve, label in CURVES.items():
-        records = [
-            json.loads(path.read_text())
-            for path in sorted(RESULTS.glob(f"bench-step-*-{curve}.json"))
-        ]
-        if not records:
-            continue
         figure, panel = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
         power = 2 if curve == "map" else 1
-        for record in records:
+        for record in _read(f"step/*-{curve}"):
             points = record["points"]
-            what = f"{record['preset']}, {record['physics']}, {record['device']}"
             sizes, seconds = zip(*((p[curve], p["step_seconds"]) for p in points), strict=True)
-            panel.plot(sizes, seconds, "o-", label=what)
+            panel.plot(sizes, seconds, "o-", label=_name(record))
             grown = [seconds[0] * (size / sizes[0]) ** power for size in sizes]
-            panel.plot(
-                sizes, grown, ":", color="grey", label="in proportion" + " to cells" * (power == 2)
-            )
-        panel.set(xlabel=label, ylabel="time of a training step, s", yscale="log")
-        panel.set_xscale("log", base=2)
-        _plain_numbers(panel)
-        panel.grid(alpha=0.3)
-        panel.legend(fontsize="small")
-        figure.savefig(FIGURES / f"step-{curve}.png", dpi=110, metadata={"Software": None})
-        plt.close(figure)
+            proportion = "in proportion" + " to cells" * (power == 2)
+            panel.plot(sizes, grown, ":", color="grey", label=proportion)
+        panel.set(xlabel=label, ylabel="time of a training step, s")
+        _plain_logarithms(panel)
+        _finish(panel)
+        yield f"step-{curve}", figure
 
 
-def _plain_numbers(panel: Any) -> None:
-    """Ticks of logarithmic axes without powers."""
+def sweeps() -> Iterator[tuple[str, Figure]]:
+    """Time of a step against seeds side by side, and the speed-up by several devices."""
+    seeds, at = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
+    devices, over = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
+    most = 1
+    for record in _read("sweep/*"):
+        rows = record["rows"]
+        alone = [row for row in rows if row["devices"] == 1]
+        if len(alone) > 1:
+            seconds = [row["seconds"] / record["steps"] for row in alone]
+            at.plot([row["seeds"] for row in alone], seconds, "o-", label=_name(record))
+        if len(alone) < len(rows):
+            scenes = f"{rows[0]['seeds']} x {record['scenes']} scenes, {record['preset']}"
+            times = [rows[0]["seconds"] / row["seconds"] for row in rows]
+            counts = [row["devices"] for row in rows]
+            over.plot(counts, times, "o-", label=f"{record['shard']}: {scenes}")
+            most = max(most, *counts)
+    at.set(xlabel="seeds side by side", ylabel="time of a training step, s")
+    _plain_logarithms(at)
+    over.plot([1, most], [1, most], ":", color="grey", label="as many times as devices")
+    over.set(xlabel="devices", ylabel="times as fast as one", xticks=range(1, most + 1))
+    for panel in (at, over):
+        _finish(panel)
+    yield "step-seeds", seeds
+    yield "step-devices", devices
+
+
+def _name(record: dict[str, Any]) -> str:
+    return f"{record['preset']}, {record['physics']}, {record['device']}"
+
+
+def _plain_logarithms(panel: Any) -> None:
+    """Logarithmic axes whose ticks show no powers."""
+    panel.set_xscale("log", base=2)
+    panel.set_yscale("log")
     panel.xaxis.set_major_formatter("{x:g}")
     panel.yaxis.set_major_formatter("{x:g}")
     panel.yaxis.set_minor_locator(ticker.LogLocator(subs=(2.0, 5.0)))
     panel.yaxis.set_minor_formatter("{x:g}")
 
 
-def sweeps() -> None:
-    """Time of a step against seeds side by side, and by how much several devices are faster than
-    one."""
-    records = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("bench-sweep-*.json"))]
-    seeds, at = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
-    devices, over = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
-    for record in records:
-        rows, name = record["rows"], f"{record['preset']}, {record['physics']}, {record['device']}"
-        alone = [row for row in rows if row["devices"] == 1]
-        if len(alone) > 1:
-            at.plot(
-                [row["seeds"] for row in alone],
-                [row["seconds"] / record["steps"] for row in alone],
-                "o-",
-                label=name,
-            )
-        if len(alone) < len(rows):
-            name = f"{record['shard']}: {rows[0]['seeds']} x {record['scenes']} scenes, {record['preset']}"
-            times = [rows[0]["seconds"] / row["seconds"] for row in rows]
-            over.plot([row["devices"] for row in rows], times, "o-", label=name)
-    at.set(xlabel="seeds side by side", ylabel="time of a training step, s", yscale="log")
-    at.set_xscale("log", base=2)
-    _plain_numbers(at)
-    most = max((row["devices"] for record in records for row in record["rows"]), default=1)
-    over.plot([1, most], [1, most], ":", color="grey", label="as many times as devices")
-    over.set(xlabel="devices", ylabel="times as fast as one", xticks=range(1, most + 1))
-    for panel, figure, name in ((at, seeds, "step-seeds"), (over, devices, "step-devices")):
-        panel.grid(alpha=0.3)
-        panel.legend(fontsize="small")
-        figure.savefig(FIGURES / f"{name}.png", dpi=110, metadata={"Software": None})
-        plt.close(figure)
+def _finish(panel: Any) -> None:
+    panel.grid(alpha=0.3)
+    panel.legend(fontsize="small")
 
 
 if __name__ == "__main__":
     FIGURES.mkdir(exist_ok=True)
-    replay()
-    steps()
-    sweeps()
-    charts.save(report.build(results.read([RESULTS])), FIGURES)
+    shown = linked()
+    for name, figure in figures():
+        if name in shown:
+            charts.save(figure, FIGURES / f"{name}.png")
+        else:
+            plt.close(figure)

@@ -12,36 +12,45 @@ from csac_jax.io import files
 
 @dataclasses.dataclass(frozen=True)
 class ReportOptions:
-    """Brings recorded runs and evaluations together, over their seeds; reads only, needs no JAX."""
+    """Tables of recorded runs and evaluations over their seeds; reads only, needs no JAX."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of runs, or of folders of runs, and files that `eval --json` wrote."""
     out: Path | None = None
-    """Folder to write a page with figures to, index.html; needs the extra `bench`."""
+    """Folder to write a page with figures to, index.html; needs the extra `report`."""
+    markdown: Path | None = None
+    """File to write the tables to, as a page of documentation."""
     json: Path | None = None
     """File to write the numbers to, as JSON."""
 
 
 def run(arguments: list[str]) -> int:
-    """Prints the tables, writes the page; returns the exit code."""
+    """Prints the tables and writes what is asked for; returns the exit code."""
     options = parsing.parse(ReportOptions, arguments, "report")
     if not options.runs:
         raise BadArgumentsError(
             "report: give at least one folder of a run, or a file of `eval --json`"
         )
     if options.out is not None:
-        guards.check_extra("--out", "matplotlib", "bench")
-    from csac_jax.report import report as reporting, results
+        guards.check_extra("--out", "matplotlib", "report")
+        guards.check_extra("--out", "jinja2", "report")
+    from csac_jax.report import comparison, results, tables
 
     with as_bad_arguments(ValueError):
-        found = reporting.build(results.read(options.runs))
-    if not (found.curves or found.scores):
-        raise FailedError("; ".join(found.notes))
-    print(reporting.markdown(found), end="")
+        report = comparison.build(results.read(options.runs))
+    if not (report.curves or report.scores):
+        raise FailedError("; ".join(report.notes))
+    text = tables.markdown(report)
+    print(text, end="")
+    if options.markdown is not None:
+        command = (
+            f"csac-jax report {' '.join(map(str, options.runs))} --markdown {options.markdown}"
+        )
+        files.replace(options.markdown, f"# Results\n\nWritten by `{command}`.\n\n{text}")
     if options.out is not None:
         from csac_jax.report import page
 
-        print(*page.write(found, options.out), sep="\n")
+        print(*page.write(report, options.out), sep="\n")
     if options.json is not None:
-        files.write_json(options.json, reporting.as_json(found))
+        files.write_json(options.json, tables.as_json(report))
     return 0

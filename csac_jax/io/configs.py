@@ -35,12 +35,12 @@ def from_dict(values: Any) -> Config:
 
 def differences(a: Config, b: Config) -> list[str]:
     """Dotted names of the settings in which two configs differ, in order of their definition."""
-    flat_a, flat_b = _flat(to_dict(a)), _flat(to_dict(b))
+    flat_a, flat_b = flat(to_dict(a)), flat(to_dict(b))
     names = dict.fromkeys([*flat_a, *flat_b])
     return [name for name in names if flat_a.get(name) != flat_b.get(name)]
 
 
-def _flat(values: dict[str, Any]) -> dict[str, Any]:
+def flat(values: dict[str, Any]) -> dict[str, Any]:
     """Dotted name of each setting -> its value."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
@@ -86,7 +86,7 @@ def _line(values: dict[str, Any], errors: Any) -> str:
 
 def _from_format_1(values: dict[str, Any]) -> dict[str, Any]:
     """The values of a config of format 1 under today's names."""
-    old = {name: value for name, value in _flat(values).items() if "." in name}
+    old = {name: value for name, value in flat(values).items() if "." in name}
     hard = old.pop("learn.target_update", "soft") == "hard"
     period = old.pop("learn.copy_every", 1)
     if hard:

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from csac_jax.io import renames
+
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
 
@@ -30,14 +32,21 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl; one that was cut off while being written is left out."""
+    """The lines of a metrics.jsonl by today's names, without one that was cut off in writing."""
     return list(_complete_lines(path))
 
 
 def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
     for line in path.read_text().splitlines():
         with contextlib.suppress(ValueError):
-            yield json.loads(line)
+            yield renamed(json.loads(line))
+
+
+def renamed(content: Any) -> Any:
+    """A line of a log, or an evaluation without its config, with today's names of metrics."""
+    if not isinstance(content, dict):
+        return content
+    return {renames.METRICS.get(name, name): renamed(value) for name, value in content.items()}
 
 
 def truncate_log(path: Path, step: int) -> None:

@@ -11,11 +11,13 @@ METRICS = {
     "saturated": "contact_overflow",
     "block_left": "block_lost",
     "episode_ill": "episode_physics_diverged",
+    "own": "in_distribution",
 }
-"""Keys of metrics.jsonl and of results of `eval --json`."""
+"""Keys of metrics.jsonl and of results of `eval --json`, and the suite of that name."""
 
 STATE = {
     "scenes.idle": "scenes.steps_without_change",
+    "scenes.noise": "scenes.noise_key",
     "scenes.info.left": "scenes.info.blocks_lost",
     "scenes.info.saturated": "scenes.info.contact_overflow",
     "scenes.info.ill": "scenes.info.physics_diverged",

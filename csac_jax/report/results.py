@@ -1,11 +1,10 @@
-"""Recorded runs and evaluations as they lie in folders. Reads only; needs neither JAX nor an
-accelerator.
+"""Recorded runs and evaluations, read from folders. Needs neither JAX nor an accelerator.
 
-A run is a `metrics.jsonl` with the `config.json` of its folder, or `NAME-metrics.jsonl` with the
-config in a JSON file `NAME*.json` beside it. An evaluation is a file that `csac-jax eval --json`
-wrote. What is neither is passed over.
+A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSON file that
+`csac-jax eval --json` wrote. Other files are passed over.
 """
 
+import contextlib
 import json
 import os
 from collections.abc import Iterator, Sequence
@@ -15,42 +14,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax import algorithms, presets
-from csac_jax.constants import RENAMED_SUITES
-from csac_jax.io import configs, files
+from csac_jax.io import configs, files, renames
 
-RECORD = "train.json"  # with device, versions and commit, in the folder of a run or of a sweep
+RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
 SKIPPED = ("checkpoints", "tensorboard")
-METRIC_NAMES = (
-    "grasp_success",
-    "completion",
-    "completion_reachable",
-    "action_efficiency",
-    "action_efficiency_completed",
-)
-APART = (
-    "seed",
-    "preset",
-    "algo",
-    "sim.physics",
-    "sim.robot",
-)  # settings that are shown by themselves
+NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
 HOST = ("train.chunk", "train.save_every")  # settings that no result depends on
-SHAPE = "train."  # settings of a run's length and shape do not make it another method
+LENGTH = "train."  # settings of a run's length and shape do not make it another method
 
 Json = dict[str, Any]
 
 
 class Variant(NamedTuple):
-    """What runs that differ in nothing but their seed have in common."""
+    """What runs have in common that differ in their seed alone."""
 
     preset: str
     algo: str
-    changed: tuple[tuple[str, str], ...]  # settings away from the preset's, and their values
+    changed: tuple[tuple[str, str], ...]  # settings that differ from the preset's, and their values
 
     @property
-    def method(self) -> bool:
+    def unchanged(self) -> bool:
         """The algorithm as the preset has it, whatever the run's length."""
-        return all(name.startswith(SHAPE) for name, _ in self.changed)
+        return all(name.startswith(LENGTH) for name, _ in self.changed)
 
 
 class Run(NamedTuple):
@@ -87,51 +72,35 @@ class Results(NamedTuple):
 
 
 def read(paths: Sequence[Path]) -> Results:
-    """The runs and evaluations in these folders and files. Raises ValueError for a path that is
-    none of both."""
-    runs: dict[Path, Run] = {}
-    evaluations: dict[Path, list[Evaluation]] = {}
-    notes: list[str] = []
+    """The runs and evaluations in folders and files. Raises ValueError for a path of neither."""
+    results = Results([], [], [])
     for path in paths:
-        found = 0
+        before = len(results.runs) + len(results.evaluations)
         for file in _files(path):
-            if file.name.endswith(files.METRICS):
-                run = _run(file, notes)
-                runs |= {} if run is None else {file: run}
-                found += run is not None
+            if file.name == files.METRICS:
+                _add_run(file, results)
             else:
-                several = _evaluations(file)
-                evaluations |= {file: several} if several else {}
-                found += len(several)
-        if not found:
-            notes.append(
-                f"{path}: nothing is recorded there, neither {files.METRICS} nor a result of `eval --json`"
-            )
-    results = Results(
-        list(runs.values()), [one for several in evaluations.values() for one in several], notes
-    )
-    notes.extend(_without_evaluation(results))
+                results.evaluations.extend(_evaluations(file))
+        if len(results.runs) + len(results.evaluations) == before:
+            results.notes.append(f"{path}: holds no {files.METRICS} and no result of `eval --json`")
+    results.notes.extend(_without_evaluation(results))
     return results
 
 
 def _files(path: Path) -> Iterator[Path]:
-    if path.is_file():
-        yield path
-        return
-    if not path.is_dir():
+    if not path.exists():
         raise ValueError(
             f"there is no file or folder {path}; give folders of runs or files of `eval --json`"
         )
+    if path.is_file():
+        yield path
     for folder, names, contents in os.walk(path):
-        names[:] = sorted(name for name in names if name not in SKIPPED)
-        yield from (
-            Path(folder) / name
-            for name in sorted(contents)
-            if name.endswith((files.METRICS, ".json"))
-        )
+        names[:] = sorted(set(names) - set(SKIPPED))
+        kept = (name for name in sorted(contents) if name.endswith((files.METRICS, ".json")))
+        yield from (Path(folder) / name for name in kept)
 
 
-def _json(path: Path) -> Json:
+def read_json(path: Path) -> Json:
     """The object in a file; empty where it holds none."""
     try:
         content = json.loads(path.read_text())
@@ -140,151 +109,106 @@ def _json(path: Path) -> Json:
     return content if isinstance(content, dict) else {}
 
 
-def _run(path: Path, notes: list[str]) -> Run | None:
-    """The run of a log; None, with a note, where it has no config or no grasp yet."""
-    config, record = _config_of(path)
+def _add_run(path: Path, results: Results) -> None:
+    """Adds the run of a log; a note where it has no config or no grasp yet."""
+    config = read_json(path.parent / files.CONFIG)
+    lines = [line for line in files.read_log(path) if line.get("grasp_success") is not None]
     if not config:
-        notes.append(
-            f"{path}: no config beside it ({files.CONFIG}, or a JSON file of the same name); left out"
+        results.notes.append(f"{path}: no {files.CONFIG} in its folder; left out")
+    elif not lines:
+        results.notes.append(f"{path}: no grasp is recorded yet; left out")
+    else:
+        actions, success, grasps, seconds = (
+            np.array([line[name] for line in lines], float)
+            for name in ("actions", "grasp_success", "grasps_counted", "seconds")
         )
-        return None
-    lines = [line for line in _lines(path) if line.get("grasp_success") is not None]
-    if not lines:
-        notes.append(f"{path}: no grasp is recorded yet; left out")
-        return None
-    actions, success, grasps, seconds = (
-        np.array([line[name] for line in lines], float)
-        for name in ("actions", "grasp_success", "grasps_counted", "seconds")
-    )
-    return Run(path, config, actions, success, grasps, seconds, record)
+        record = _record(path.parent, config)
+        results.runs.append(Run(path, config, actions, success, grasps, seconds, record))
 
 
-def _lines(path: Path) -> Iterator[Json]:
-    """The lines of a log; one that was cut off while being written is left out."""
-    for text in path.read_text().splitlines():
-        try:
-            line = json.loads(text)
-        except ValueError:
-            continue
-        if isinstance(line, dict) and "actions" in line:
-            yield line
-
-
-def _config_of(path: Path) -> tuple[Json, Json]:
-    """Config and record of the run that a log belongs to, each empty where there is none."""
-    stem = path.name.removesuffix(files.METRICS).rstrip("-")
-    beside = [_json(file) for file in sorted(path.parent.glob(f"{stem}*.json"))]
-    trained = [content for content in beside if "config" in content and "wall_seconds" in content]
-    record = trained[0] if trained else {}
-    if not stem:
-        own = _json(path.parent / files.CONFIG)
-        return own, _record_of(path.parent, own)
-    configs = [content["config"] for content in trained + beside if "config" in content]
-    return (configs[0] if configs else {}), record
-
-
-def _record_of(folder: Path, config: Json) -> Json:
-    """What `train` or, two folders up, `sweep` wrote about the run of this folder; empty where
-    neither did."""
-    for place in (folder, *folder.resolve().parents[1:2]):
-        record = _json(place / RECORD)
+def _record(folder: Path, config: Json) -> Json:
+    """What `train` wrote in this folder, or `sweep` above a `seed-K`; empty where neither did."""
+    above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
+    for place in (folder, *above):
+        record = read_json(place / RECORD)
         if record and record.get("config", config) == config:
             return record
     return {}
 
 
 def _evaluations(path: Path) -> list[Evaluation]:
-    content = _json(path)
+    content = read_json(path)
     if (
-        "policy" not in content
-        or not ("parts" in content or "grasp_success" in content)
-        or "config" not in content
+        not {"policy", "config"} <= content.keys()
+        or not {"parts", "grasp_success"} & content.keys()
     ):
         return []
     suite: str = content.get("suite", "own")
-    suite = RENAMED_SUITES.get(suite, suite)
-    parts = content.get("parts") or {Path(suite).stem: content}
+    suite = renames.METRICS.get(suite, suite)
+    parts = files.renamed(content.get("parts") or {Path(suite).stem: content})
     record = {name: content.get(name) for name in ("device", "versions", "commit", "seconds")}
+    asked = content["config"], content["policy"], suite
     return [
-        Evaluation(
-            path,
-            content["config"],
-            content["policy"],
-            suite,
-            part,
-            content.get("seed", 0),
-            metrics,
-            record,
-        )
-        for part, metrics in parts.items()
+        Evaluation(path, *asked, part, content.get("seed", 0), found, record)
+        for part, found in parts.items()
     ]
 
 
 def _without_evaluation(results: Results) -> Iterator[str]:
-    measured = {_identity(one.config) for one in results.evaluations if one.policy == "learned"}
+    """A line for each run that still has its networks and that nothing has measured."""
+    measured = [_identity(one.config) for one in results.evaluations if one.policy == "learned"]
     for run in results.runs:
-        if _identity(run.config) not in measured:
-            folder = run.path.parent
-            yield f"{run.path}: not evaluated; run: csac-jax eval {folder} --json {folder / 'eval.json'}"
+        folder = run.path.parent
+        if (folder / "checkpoints").exists() and _identity(run.config) not in measured:
+            yield f"{folder}: not evaluated; run: csac-jax eval {folder} --json {folder}/eval.json"
 
 
-def _identity(config: Json) -> str:
-    """The config without what an evaluation may choose anew."""
-    return json.dumps(
-        {
-            name: value
-            for name, value in flat(config).items()
-            if name not in ("sim.physics", "sim.robot")
-        }
-    )
+def _identity(config: Json) -> Json:
+    """The settings that an evaluation cannot change."""
+    flat = settings(config)
+    return {name: flat[name] for name in flat if name not in ("sim.physics", "sim.robot")}
 
 
-def flat(config: Json, prefix: str = "") -> Json:
-    """A config's settings by their dotted names."""
-    found: Json = {}
-    for name, value in config.items():
-        found |= (
-            flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-        )
-    return found
+def settings(config: Json) -> Json:
+    """A recorded config's settings by their dotted names of today."""
+    with contextlib.suppress(ValueError):  # written by a version that knew other settings
+        config = configs.to_dict(configs.from_dict(config))
+    return {name: value for name, value in configs.flat(config).items() if name != "format"}
 
 
 def variant(config: Json) -> Variant:
-    """What a recorded config is a variant of; settings that only one of both knows, then or now,
-    are passed over."""
-    preset, algo = (
-        config.get("preset", ""),
-        config.get("algo", "csac_beta"),
-    )  # the first records name no algorithm
+    """What a recorded config is a variant of. Settings that the config lacks are passed over."""
+    preset, algo = config.get("preset", ""), config.get("algo", "csac_beta")
     try:
-        base = flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
+        base = settings(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
     except ValueError:  # a name that is no more
         base = {}
-    own = flat(config)
-    changed = [
-        name
+    own = settings(config)
+    changed = tuple(
+        (name, " ".join(map(str, own[name])) if isinstance(own[name], list) else str(own[name]))
         for name in own
-        if name in base and own[name] != base[name] and name not in (*APART, *HOST)
-    ]
-    return Variant(preset, algo, tuple((name, _text(own[name])) for name in changed))
+        if name in base and own[name] != base[name] and name not in (*NAMED, *HOST)
+    )
+    return Variant(preset, algo, changed)
 
 
-def _text(value: Any) -> str:
-    """A setting's value as on the command line."""
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+def world(config: Json) -> tuple[str, str]:
+    """Physics and robot of a config; the first records name neither."""
+    sim = config.get("sim", {})
+    return sim.get("physics", "mjx"), sim.get("robot", "hand")
 
 
 def command(one: Run | Evaluation) -> str:
     """The command that makes such a run or evaluation, from what its record says."""
+    physics, robot = world(one.config)
     if isinstance(one, Evaluation):
-        sim, counts = one.config["sim"], one.metrics.get("counts", {})
-        run = f"eval RUN --policy {one.policy} --suite {one.suite} --episodes {counts.get('episodes')}"
-        robot = sim.get("robot", "hand")
-        return f"csac-jax {run} --seed {one.seed} --physics {sim.get('physics', 'mjx')} --robot {robot}"
+        episodes = one.metrics.get("counts", {}).get("episodes")
+        asked = f"--policy {one.policy} --suite {one.suite} --episodes {episodes} --seed {one.seed}"
+        return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}"
     its = variant(one.config)
     flags = "".join(f" {_flag(name, value)}" for name, value in its.changed)
-    physics = one.config.get("sim", {}).get("physics", "mjx")
-    return f"csac-jax train {its.preset} --algo {its.algo} --seed {one.config['seed']} --sim.physics {physics}{flags}"
+    seed = f"--seed {one.config['seed']} --sim.physics {physics}"
+    return f"csac-jax train {its.preset} --algo {its.algo} {seed}{flags}"
 
 
 def _flag(name: str, value: str) -> str:

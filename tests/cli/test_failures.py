@@ -84,7 +84,7 @@ def test_version(capsys: pytest.CaptureFixture):
     ("arguments", "option", "extra"),
     [
         ("train smoke --tensorboard", "--tensorboard", "tensorboard"),
-        ("report . --out page", "--out", "bench"),
+        ("report . --out page", "--out", "report"),
     ],
 )
 def test_missing_extra(

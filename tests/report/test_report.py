@@ -14,14 +14,14 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import train
 from csac_jax.config import Algo
 from csac_jax.evaluation import metrics, statistics
-from csac_jax.io import configs
-from csac_jax.report import charts, report, results
+from csac_jax.io import config_json, files
+from csac_jax.report import charts, comparison, results, tables
 
 CASES = ("hole", "row")
 
 
 def _config(algo: Algo, seed: int, **changed: Any) -> dict[str, Any]:
-    config = configs.to_dict(algorithms.configure(presets.get("paper"), algo))
+    config = config_json.to_dict(algorithms.configure(presets.get("paper"), algo))
     config["seed"] = seed
     for name, value in changed.items():
         section, _, field = name.partition("__")
@@ -64,7 +64,7 @@ def _evaluation(
 ) -> None:
     """What `eval --json` writes: 10 grasps in each case, so many of them lifts."""
     share = metrics.wilson(lifted, 10)
-    part = dict.fromkeys(results.METRIC_NAMES, share) | {"counts": {"episodes": episodes}}
+    part = dict.fromkeys(comparison.METRICS, share) | {"counts": {"episodes": episodes}}
     part["failures"] = {"grasp_dropped": metrics.wilson(10 - lifted, 10)}
     asked = {
         "policy": policy,
@@ -94,6 +94,7 @@ def recorded(tmp_path: Path) -> Path:
     )
     _run(root / "vpg", _config("vpg", 0), [0.2, 0.3, 0.4])
     _run(root / "max", _config("csac_beta", 0, target__value="max"), [0.1, 0.2, 0.3])
+    (root / "max" / "checkpoints").mkdir()
     for name, algo, seed, lifted in (
         ("beta/seed-0", "csac_beta", 0, 10),
         ("beta/seed-1", "csac_beta", 1, 8),
@@ -145,13 +146,14 @@ def test_one_seed_has_no_band():
 def test_runs_are_grouped_by_what_they_are(recorded: Path):
     """Claim: runs that differ in their seed alone are one curve, the IQM of both up to where the
     shorter ends."""
-    found = report.build(results.read([recorded]))
-    curves = {report.label(curve.variant, preset=False): curve for curve in found.curves}
+    found = comparison.build(results.read([recorded]))
+    curves = {comparison.label(curve.variant, preset=False): curve for curve in found.curves}
     assert set(curves) == {"CSAC-beta", "VPG", "CSAC-beta, target.value max"}
     both = curves["CSAC-beta"]
-    assert both.actions.tolist() == [200, 300]
-    assert [band.value for band in both.success] == pytest.approx([0.6, 0.85])
-    assert (both.success[0].low, both.success[0].high) == pytest.approx((0.5, 0.7))
+    actions, success = both.points()
+    assert actions.tolist() == [200, 300]
+    assert [band.value for band in success] == pytest.approx([0.6, 0.85])
+    assert (success[0].low, success[0].high) == pytest.approx((0.5, 0.7))
     assert both.final.value == pytest.approx(0.925)
     assert [run.seconds[-1] for run in both.runs] == [40.0, 30.0]
 
@@ -163,20 +165,22 @@ def test_one_policy_measured_twice_is_not_two_runs(recorded: Path):
         recorded / "vpg" / "longer.json", _config("vpg", 0, sim__physics="c"), 9, episodes=40
     )
     scores = [
-        one for one in report.build(results.read([recorded])).scores if one.variant.algo == "vpg"
+        one
+        for one in comparison.build(results.read([recorded])).scores
+        if one.place.variant.algo == "vpg"
     ]
-    assert sorted((one.part, one.episodes) for one in scores) == sorted(
+    assert sorted((one.place.part, one.place.episodes) for one in scores) == sorted(
         (case, n) for case in CASES for n in (10, 40)
     )
     assert {
-        (one.episodes, len(one.evaluations), one.band("completion").value) for one in scores
+        (one.place.episodes, len(one.evaluations), one.band("completion").value) for one in scores
     } == {(10, 1, 0.5), (40, 1, 0.9)}
 
 
 def test_numbers_as_json(recorded: Path):
     """Claim: the JSON has every curve and score with its seeds, and where each number comes
     from."""
-    content = json.loads(json.dumps(report.as_json(report.build(results.read([recorded])))))
+    content = json.loads(json.dumps(tables.as_json(comparison.build(results.read([recorded])))))
     beta = next(c for c in content["curves"] if c["algo"] == "csac_beta" and not c["changed"])
     assert (beta["seeds"], beta["seconds_to_90"]) == ([0, 1], [40.0, 30.0])
     scores = {(score["algo"], score["part"]): score for score in content["scores"]}
@@ -191,9 +195,9 @@ def test_numbers_as_json(recorded: Path):
         {"value": 0.5, "low": wilson["low"], "high": wilson["high"], "n": 1}
     )
     rows = {row["file"]: row for row in content["provenance"]}
-    trained = rows["seed-0/metrics.jsonl"]
+    trained = rows["beta/seed-0/metrics.jsonl"]
     assert (trained["device"], trained["commit"], trained["wall time"]) == ("a card", "abc", "77 s")
-    swept = rows["seed-1/metrics.jsonl"]
+    swept = rows["beta/seed-1/metrics.jsonl"]
     assert (swept["device"], swept["wall time"]) == ("two cards", "99 s, whole sweep")
     assert rows["vpg/metrics.jsonl"]["wall time"] == "40 s"  # no record: the log's last time
     assert (
@@ -205,18 +209,27 @@ def test_numbers_as_json(recorded: Path):
     )
 
 
+def test_evaluation_ends_with_the_mean_of_the_parts(recorded: Path):
+    """Claim: after the parts of a suite a row has their mean, over all episodes."""
+    rows = tables.evaluation(comparison.build(results.read([recorded])))
+    beta = [row for row in rows if row["policy"] == "CSAC-beta (paper)"]
+    assert [row["part"] for row in beta] == ["cases: hole", "cases: row", "cases: mean of 2 parts"]
+    assert (beta[-1]["runs"], beta[-1]["episodes"]) == ("2", "40")
+    assert beta[-1]["completion"].startswith("90.0 % (")
+
+
 def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
     """Claim: CSAC-beta is set against every other variant of which several seeds were measured in
     the same scenes, part by part and over all parts; what was measured once, or in other scenes, is
     not."""
-    assert not report.gaps(report.build(results.read([recorded])))  # VPG has one seed
+    assert not comparison.gaps(comparison.build(results.read([recorded])))  # VPG has one seed
     for seed, lifted in ((1, 3), (2, 4)):
         config = _config("vpg", seed, sim__physics="c")
         _evaluation(recorded / "vpg" / f"more-{seed}.json", config, lifted)
         config = _config("csac_beta", seed, sim__physics="c", target__value="max")
         _evaluation(recorded / "max" / f"other-{seed}.json", config, lifted, episodes=20)
-    whole = report.build(results.read([recorded]))
-    found = report.gaps(whole)
+    whole = comparison.build(results.read([recorded]))
+    found = comparison.gaps(whole)
     assert [(gap.theirs.algo, gap.suite, gap.parts) for gap in found] == [
         ("vpg", "cases", (case,)) for case in CASES
     ] + [("vpg", "cases", CASES)]
@@ -228,10 +241,10 @@ def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
         assert band.low is not None
         assert band.high is not None
         assert 0.3 <= band.low < 0.5 < band.high <= 0.7
-    rows = report.differences(whole)
-    assert [row[2] for row in rows[1:]] == ["cases: hole", "cases: row", "cases: mean of 2 parts"]
-    assert rows[1][4].startswith("+50.0 (+")
-    assert len(report.as_json(whole)["differences"]) == 3
+    rows = tables.differences(whole)
+    assert [row["part"] for row in rows] == ["cases: hole", "cases: row", "cases: mean of 2 parts"]
+    assert rows[0]["grasp success"].startswith("+50.0 (+")
+    assert len(tables.as_json(whole)["differences"]) == 3
 
 
 def test_training_is_compared_where_it_is_alike(tmp_path: Path):
@@ -250,8 +263,8 @@ def test_training_is_compared_where_it_is_alike(tmp_path: Path):
     for seed in range(2):
         _run(tmp_path / "short" / str(seed), _config("csac_per", seed), [0.5])
     _run(tmp_path / "once", _config("vpg", 0), [0.5, 0.5])
-    found = report.build(results.read([tmp_path]))
-    leads = {(c.variant.algo, c.variant.changed): report.lead(found, c) for c in found.curves}
+    found = comparison.build(results.read([tmp_path]))
+    leads = {(c.variant.algo, c.variant.changed): comparison.lead(found, c) for c in found.curves}
     compared = ("csac_beta", (("target.value", "max"),))
     assert [key for key, band in leads.items() if band is not None] == [compared]
     band = leads[compared]
@@ -259,12 +272,11 @@ def test_training_is_compared_where_it_is_alike(tmp_path: Path):
     assert band.value == pytest.approx(0.85 - 0.55)
     assert band.low == pytest.approx(0.2)
     assert band.high == pytest.approx(0.4)
-    column = report.training(found)[0].index("CSAC-beta ahead by")
-    assert sorted(row[column] for row in report.training(found)[1:]) == [
+    assert sorted(row["CSAC-beta ahead by"] for row in tables.training(found)) == [
         "+30.0 (+20.0 to +40.0)",
         *["-"] * 5,
     ]
-    assert sum(curve["ahead"] is not None for curve in report.as_json(found)["curves"]) == 1
+    assert sum(curve["ahead"] is not None for curve in tables.as_json(found)["curves"]) == 1
 
 
 def test_labels():
@@ -273,15 +285,40 @@ def test_labels():
     assert results.variant(_config("vpg", 0, train__chunk=7, train__save_every=3)).changed == ()
     changed = {"net__head": 16, "net__growth": 8, "learn__batch": 4, "learn__tau": 0.5}
     variant = results.variant(_config("vpg", 0, **changed))
-    assert set(report.label(variant).split(", ")[1:]) == {
+    assert set(comparison.label(variant).split(", ")[1:]) == {
         "net.head 16",
         "net.growth 8",
         "learn.batch 4",
         "learn.tau 0.5",
     }
-    short = report.label(variant, preset=False, most=3)
+    short = comparison.label(variant, preset=False, most=3)
     assert (short.count(", "), short[-12:]) == (4, ", others (1)")
-    assert report.label(variant, preset=False, most=4) == report.label(variant, preset=False)
+    assert comparison.label(variant, preset=False, most=4) == comparison.label(
+        variant, preset=False
+    )
+
+
+def test_old_names_are_read_as_todays(tmp_path: Path):
+    """Claim: logs, evaluations and configs with the names of before say what they would say now."""
+    config = _config("csac_beta", 0, reward__lost_block_penalty=0.5)
+    old = json.loads(json.dumps(config))
+    old["reward"]["left"] = old["reward"].pop("lost_block_penalty")
+    old["explore"]["primitive_end"] = old["explore"].pop("epsilon_primitive_end")
+    assert results.variant(old) == results.variant(config)
+    assert results.variant(old).changed == (("reward.lost_block_penalty", "0.5"),)
+    share = metrics.wilson(1, 10)
+    part = {"completion": share, "failures": {"block_left": share, "episode_ill": share}}
+    content = {"policy": "learned", "suite": "own", "parts": {"own": part}, "config": old}
+    (tmp_path / "eval.json").write_text(json.dumps(content))
+    _run(tmp_path / "run", old, [0.5])
+    log = tmp_path / "run" / "metrics.jsonl"
+    log.write_text('{"step": 1, "actions": 8, "ill": 1, "left": 2, "saturated": 3}\n')
+    assert files.read_log(log) == [
+        {"step": 1, "actions": 8, "physics_diverged": 1, "blocks_lost": 2, "contact_overflow": 3}
+    ]
+    one = results.read([tmp_path / "eval.json"]).evaluations[0]
+    assert (one.suite, one.part) == ("in_distribution", "in_distribution")
+    assert set(one.metrics["failures"]) == {"block_lost", "episode_physics_diverged"}
 
 
 def test_command_gives_the_config_back():
@@ -296,7 +333,7 @@ def test_command_gives_the_config_back():
     run = results.Run(Path("x"), config, *[np.zeros(1)] * 4, record={})
     program, command, *flags = results.command(run).split()
     assert (program, command) == ("csac-jax", "train")
-    assert configs.to_dict(train.read(flags)[1]) == config
+    assert config_json.to_dict(train.read(flags)[1]) == config
 
 
 def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -308,10 +345,10 @@ def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.
     assert cli.main(["report", str(recorded), str(tmp_path / "empty"), str(tmp_path / "bare")]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("- ")]
     wanted = (
-        "empty: nothing is recorded",
+        "empty: holds no metrics.jsonl",
         "bare/metrics.jsonl: no config",
-        "bare: nothing is recorded",
-        "max/metrics.jsonl: not evaluated; run: csac-jax eval",
+        "bare: holds no metrics.jsonl",
+        "max: not evaluated; run: csac-jax eval",
         "CSAC-beta (paper): runs end at 300, 400 actions; their curve is drawn up to 300",
         "VPG (paper): one run only",
         "CSAC-beta (paper), target.value max: one run only",
@@ -326,7 +363,7 @@ def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.
     [
         ([], 2, "at least one folder"),
         (["nowhere"], 2, "no file or folder nowhere"),
-        (["."], 1, "nothing is recorded"),
+        (["."], 1, "holds no metrics.jsonl"),
     ],
 )
 def test_nothing_to_report(
@@ -348,8 +385,8 @@ def test_nothing_to_report(
 def test_figures(recorded: Path):
     """Claim: figure 6 has a line per method and the paper's marks at 2,500 actions, figure 9 a mark
     per case."""
-    found = report.build(results.read([recorded]))
-    drawn = {name: figure for name, _, figure in charts.figures(found)}
+    found = comparison.build(results.read([recorded]))
+    drawn = {chart.name: chart.figure for chart in charts.draw(found)}
     assert set(drawn) == {"methods-paper", "variants-paper", "four-cases-cases-paper"}
     lines = drawn["methods-paper"].axes[0].get_lines()
     marks = [
@@ -379,7 +416,8 @@ def test_cases_of_each_preset_and_task(recorded: Path):
     _evaluation(recorded / "fast.json", other, 7)
     _evaluation(recorded / "target.json", other, 3, suite="target")
     drawn = {
-        name: figure for name, _, figure in charts.figures(report.build(results.read([recorded])))
+        chart.name: chart.figure
+        for chart in charts.draw(comparison.build(results.read([recorded])))
     }
     for name, marks, lines in (("cases-paper", 6, 2), ("cases-fast", 3, 2), ("target-fast", 3, 0)):
         shown = drawn[f"four-cases-{name}"].axes[0].get_lines()
@@ -391,20 +429,20 @@ def test_samplers_are_drawn_where_there_are_several(recorded: Path):
     """Claim: figure 7 is drawn of two samplers, not of one that was trained for two lengths."""
     _run(recorded / "long", _config("csac_beta", 0, train__actions=5000), [0.5])
     assert "samplers-paper" not in {
-        name for name, *_ in charts.figures(report.build(results.read([recorded])))
+        chart.name for chart in charts.draw(comparison.build(results.read([recorded])))
     }
     _run(recorded / "per", _config("csac_per", 0), [0.5])
     assert "samplers-paper" in {
-        name for name, *_ in charts.figures(report.build(results.read([recorded])))
+        chart.name for chart in charts.draw(comparison.build(results.read([recorded])))
     }
 
 
 def test_legend_of_many_curves_hides_none(recorded: Path):
     """Claim: a legend lies among a few curves, and below the axes where many curves make it
     large."""
-    curves = report.build(results.read([recorded])).curves
-    for number, below in ((charts.BESIDE, False), (charts.BESIDE + 1, True)):
-        figure = charts._lines((curves * 3)[:number])
+    curves = comparison.build(results.read([recorded])).curves
+    for number, below in ((charts.INSIDE, False), (charts.INSIDE + 1, True)):
+        figure = charts.success((curves * 3)[:number])
         assert (figure.axes[0].get_legend() is None) == below
         assert bool(figure.legends) == below
         if below:
@@ -421,6 +459,9 @@ def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.
     assert page.count("<svg") == 3
     assert "src=" not in page
     assert "92.5 %" in page
+    assert page.index("<h2>Summary</h2>") < page.index("<svg")
+    assert page.count("<th>completion</th>") == 1
+    assert "head.onclick" in page  # sorts
     shown = capsys.readouterr().out
     assert (out / "results.md").read_text() in shown
     assert "grasp dropped" in shown

@@ -1,0 +1,210 @@
+"""Writes experiments/results/README.md: what each record shows, its folder and its command."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from csac_jax.report import results, tables
+
+RESULTS = Path(__file__).resolve().parent / "results"
+COPIES = "the same on another host"
+
+RUNS = {
+    "quick/csac_beta": "what `quick` learns on two CPU cores",
+    "quick/random": "the floor: random places above blocks",
+    "quick/oracle": "the ceiling: a planner that reads the blocks' poses",
+    "paper_small/csac_beta": "CSAC-beta by the paper's protocol with the small net",
+    "paper_small/csac_beta-2": f"{COPIES}; the four cases",
+    "paper_small/csac_beta-3": COPIES,
+    "paper_small/csac_per": "CSAC-PER likewise; the four cases",
+    "paper_small/csac_per-2": COPIES,
+    "paper_small/csac": "CSAC likewise; the four cases",
+    "paper_small/csac-2": COPIES,
+    "paper_small/vpg": "VPG likewise; the four cases",
+    "paper_small/vpg-2": COPIES,
+    "paper_small/reactive": "P+G reactive likewise; the four cases",
+    "paper_small/reactive-2": COPIES,
+    "paper_small/grasp_only": "Grasping-only likewise; the four cases",
+    "paper_small/grasp_only-2": COPIES,
+    "paper_small/max_target": "ablation: no softmax in the target",
+    "paper_small/argmax": "ablation: the best cell, no cross-entropy search",
+    "paper_small/power_law": "ablation: VPG's power law in place of the Beta law",
+    "paper_small/no_actor": "ablation: no actor",
+    "paper_small/one_critic": "ablation: one critic",
+    "paper_small/no_push_reward": "ablation: no reward for pushes",
+    "paper_small/no_colour": "ablation: heights alone",
+    "paper_small/no_augmentation": "ablation: no shifts and no symmetries",
+    "paper_small/no_shift": "ablation: no shifts",
+    "paper/csac_beta": "the paper's protocol with DenseNet-121",
+    "paper/csac_beta-2": "more seeds of it",
+    "paper/csac_beta-3": "more seeds of it",
+    "fast/csac_beta": "what `fast` learns on one GPU",
+    "fast/long": "three times as many actions",
+    "fast/shipped": "the shipped policy (seed 0) on every suite",
+    "fast/updates_128": "twice as many updates",
+    "fast/small_net": "a net with a third of the parameters",
+    "fast/target": "the target task",
+    "fast/target_grasp_only": "the target task without pushes, Grasping-only",
+    "fast/target_no_pushes": "the target task without pushes, CSAC-beta",
+}
+"""Folder of runs -> what it shows. Its command follows from its configs."""
+
+BENCHES = {
+    "train/xeon-quick": ("time of `quick`, Intel Xeon", "train quick"),
+    "train/epyc-quick": ("time of `quick`, AMD EPYC", "train quick"),
+    "train/h200-paper-cold": ("compilation of `paper`", "train paper --train.actions 50"),
+    "train/h200-paper-cached": ("the same from the cache", "train paper --train.actions 50"),
+    "train/h200-fast-cold": (
+        "compilation of `fast` in MJX",
+        "train fast --sim.physics mjx --train.actions 4096",
+    ),
+    "train/h200-fast-cached": (
+        "the same from the cache",
+        "train fast --sim.physics mjx --train.actions 4096",
+    ),
+    "step/xeon-quick": ("a step of `quick` and its stages, Intel Xeon", "bench step quick"),
+    "step/epyc-quick": ("the same, AMD EPYC", "bench step quick"),
+    "step/epyc-quick-scenes": (
+        "a step against scenes",
+        "bench step quick --repeats 3 --curve scenes --smallest 4 --largest 32",
+    ),
+    "step/epyc-quick-map": (
+        "a step against cells of the map",
+        "bench step quick --repeats 3 --curve map --smallest 32 --largest 128",
+    ),
+    "step/epyc-quick-blocks": (
+        "a step against blocks",
+        "bench step quick --repeats 3 --curve blocks --smallest 2 --largest 8",
+    ),
+    "step/epyc-quick-capacity": (
+        "a step against the replay's capacity",
+        "bench step quick --repeats 3 --curve capacity --smallest 1024 --largest 16384",
+    ),
+    "step/h200-fast": (
+        "a step of `fast` on Warp and its stages",
+        "bench step fast --physics warp --repeats 3",
+    ),
+    "sweep/epyc-quick": (
+        "seeds of `quick` one after another",
+        "bench sweep quick --seeds 1 4 --steps 10 --repeats 2",
+    ),
+    "sweep/h200-paper_small": (
+        "seeds of `paper_small` side by side",
+        "bench sweep paper_small --seeds 1 4 16 --steps 10 --repeats 10",
+    ),
+    "sweep/h200-paper_small-2": (
+        COPIES,
+        "bench sweep paper_small --seeds 1 4 16 --steps 10 --repeats 10",
+    ),
+    "sweep/h200-paper": (
+        "16 seeds of `paper` side by side",
+        "bench sweep paper --seeds 16 --steps 13 --repeats 1",
+    ),
+    "sweep/h200-fast-seeds": (
+        "seeds over GPUs, 512 scenes each, 128 updates",
+        "bench sweep fast --physics mjx --steps 1 --devices 1 2 4 --seeds 4 "
+        "--train.scenes 512 --learn.updates 128",
+    ),
+    "sweep/h200-fast-seeds2048": (
+        "seeds over GPUs, 2,048 scenes each",
+        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 4",
+    ),
+    "sweep/h200-fast-seeds8": (
+        "eight seeds over GPUs",
+        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 8",
+    ),
+    "sweep/h200-fast-scenes": (
+        "scenes of one seed over GPUs, 128 updates",
+        "bench sweep fast --physics mjx --steps 1 --devices 1 2 4 --seeds 1 "
+        "--shard scenes --learn.updates 128",
+    ),
+    "sweep/h200-fast-scenes8192": (
+        "8,192 scenes of one seed over GPUs",
+        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 1 "
+        "--shard scenes --train.scenes 8192",
+    ),
+    "act/cpu": ("dense Q maps of DenseNet-121", "bench act --pixels 64 --states 4 --repeats 7"),
+    "act/h200": ("dense Q maps of DenseNet-121 and VPG's way in PyTorch", "bench act"),
+    "replay/cpu": ("the samplers and flashbax's; other work on both cores", "bench replay"),
+    "replay/h200-12": ("the samplers and flashbax's", "bench replay 12 17"),
+    "replay/h200-18": ("the same, larger rings", "bench replay 18 20"),
+    "raycast/cpu": ("our rays and `mjx.ray`", "bench raycast --size 64 --scenes 32 --repeats 7"),
+    "raycast/h200": ("our rays and `mjx.ray`", "bench raycast"),
+    "parity/cpu": (
+        "MJX against C MuJoCo, whole actions",
+        "bench parity --primitives 512 --poses 125",
+    ),
+    "parity/cpu-warp": (
+        "Warp against C MuJoCo, on the CPU",
+        "bench parity --warp --primitives 128 --poses 16",
+    ),
+    "parity/h200-warp": ("Warp against C MuJoCo, whole actions", "bench parity --warp"),
+    "one_step/cpu": ("MJX against C MuJoCo, one step", "bench one_step --states 1000"),
+    "robots/cpu": ("the UR5 against the floating hand", "bench robots --grasps 500"),
+    "soak/h200": (
+        "100,000 random actions: nothing lost, nothing infinite",
+        "bench soak --actions 100000 --scenes 1024",
+    ),
+}
+"""File of a benchmark -> what it shows, and its command."""
+
+HEAD = """# Recorded results
+
+Written by `make figures`. Each file holds the config, device, versions and commit it was made with.
+[docs/results.md](../../docs/results.md) has the numbers of all runs, with intervals;
+[docs/benchmarks](../../docs/benchmarks) has those of the benchmarks. Older records are in the
+history of this folder.
+
+| folder or file | holds |
+|---|---|
+| `PRESET/VARIANT/seed-K/` | a run: `config.json`, `metrics.jsonl`, `eval*.json` |
+| `PRESET/VARIANT/*.json` | the sweep that made the runs, if one did |
+| `bench/NAME/DEVICE-*.json` | what `csac-jax bench NAME`, or a short `csac-jax train`, wrote |
+
+Files keep the names of settings and metrics that they were written with. A variant that ends in a
+number repeats the one without. Most runs on H200s shared a host, so their seconds are upper bounds.
+
+"""
+
+
+def readme() -> str:
+    """The whole file."""
+    return f"{HEAD}{tables.table_text([*_runs(), *_benches()])}\n"
+
+
+def _runs() -> Iterator[dict[str, str]]:
+    for name, claim in RUNS.items():
+        found = results.read([RESULTS / name])
+        commands = dict.fromkeys(_commands(found, RESULTS / name))
+        record = [*found.runs, *found.evaluations][0].record
+        yield _row(claim, name, "; ".join(f"`{command}`" for command in commands), record)
+
+
+def _commands(found: results.Results, folder: Path) -> Iterator[str]:
+    """How the runs of a folder were trained, then measured."""
+    seeds = [str(run.config["seed"]) for run in found.runs]
+    for run in found.runs[:1]:
+        command = results.command(run)
+        if (folder / "sweep.json").exists():
+            command = command.replace("csac-jax train", "csac-jax sweep")
+            yield command.replace("--seed ", f"--seeds {len(seeds)} --seed ")
+        else:
+            yield command.replace(f"--seed {seeds[0]}", f"--seed {'|'.join(seeds)}")
+    yield from (results.command(one) for one in found.evaluations)
+
+
+def _benches() -> Iterator[dict[str, str]]:
+    for name, (claim, command) in BENCHES.items():
+        path = f"bench/{name}.json"
+        record = json.loads((RESULTS / path).read_text())
+        yield _row(claim, path, f"`csac-jax {command}`", record)
+
+
+def _row(claim: str, path: str, command: str, record: dict[str, Any]) -> dict[str, str]:
+    link = f"[{path}]({path})"
+    return {"claim": claim, "folder": link, "command": command, "device": record["device"]}
+
+
+if __name__ == "__main__":
+    (RESULTS / "README.md").write_text(readme())

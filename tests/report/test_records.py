@@ -1,0 +1,69 @@
+"""The recorded results and the documents that are written from them."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from csac_jax import cli
+from experiments import figures, records
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "experiments" / "results"
+RUN = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/seed-\d/(config|train|eval[\w-]*)\.json")
+SWEEP = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/(sweep|summary|train)\.json")
+BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h200)[\w-]*\.json")
+
+
+def test_results_page_is_what_report_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: docs/results.md is what `csac-jax report` writes of the recorded results."""
+    monkeypatch.chdir(ROOT)
+    page = tmp_path / "results.md"
+    assert cli.main(["report", "experiments/results", "--markdown", str(page)]) == 0
+    written = page.read_text().replace(str(page), "docs/results.md")
+    assert written == (ROOT / "docs" / "results.md").read_text()
+
+
+def test_index_is_what_records_writes():
+    """Claim: the README of the recorded results is generated."""
+    assert records.readme() == (RESULTS / "README.md").read_text()
+
+
+def test_every_record_has_a_claim():
+    """Claim: the index names every folder of runs and every benchmark, and nothing else."""
+    runs = {path.parent.parent for path in RESULTS.glob("*/*/seed-*/*.json")}
+    assert {path.relative_to(RESULTS).as_posix() for path in runs} == set(records.RUNS)
+    benches = {path.relative_to(RESULTS / "bench") for path in RESULTS.glob("bench/*/*.json")}
+    assert {path.with_suffix("").as_posix() for path in benches} == set(records.BENCHES)
+
+
+def test_records_lie_in_one_layout():
+    """Claim: a record is a run's, a sweep's or a benchmark's file, each in its place."""
+    files = [path for path in RESULTS.rglob("*") if path.is_file() and path.name != "README.md"]
+    assert len(files) > 400
+    for path in files:
+        name = path.relative_to(RESULTS).as_posix().replace("metrics.jsonl", "config.json")
+        assert any(pattern.fullmatch(name) for pattern in (RUN, SWEEP, BENCH)), name
+        if path.suffix == ".json":
+            assert isinstance(json.loads(path.read_text()), dict)
+
+
+def test_every_figure_is_linked():
+    """Claim: docs/figures holds what README and docs show, and nothing else."""
+    assert {path.stem for path in figures.FIGURES.iterdir()} == figures.linked()
+
+
+def _links() -> Iterator[tuple[Path, str]]:
+    for page in [ROOT / "README.md", RESULTS / "README.md", *(ROOT / "docs").rglob("*.md")]:
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+            if not target.startswith("http"):
+                yield page, target
+
+
+def test_links_lead_somewhere():
+    """Claim: what README, docs and the index link to is there."""
+    links = list(_links())
+    assert len(links) > 50
+    assert not [link for link in links if not (link[0].parent / link[1]).exists()]
