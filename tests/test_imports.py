@@ -48,6 +48,8 @@ ONLY_IN = {
     "tyro": ("cli",),
     "rich": ("report", "cli"),
     "safetensors": ("io",),
+    "matplotlib": ("render", "report"),
+    "imageio": ("render/media.py",),
 }
 JIT_IN = (
     *("training", "sweeps", "evaluation", "env.py"),

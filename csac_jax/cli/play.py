@@ -28,9 +28,9 @@ class PlayOptions:
     """What moves the blocks; with mjx, the motion between two states that a video shows is still C
     MuJoCo's."""
     video: Path | None = None
-    """File to write a video to, such as out.mp4."""
+    """File to write a video to: .mp4, .mkv, .mov, .gif or .webp."""
     png: Path | None = None
-    """File to write a picture of the first moment to."""
+    """File to write a picture of the first moment to: .png, .jpg, .webp or .gif."""
     size: tuple[int, int] = (640, 480)
     """Width and height of picture and video, px, even numbers."""
     views: bool = True
@@ -81,7 +81,19 @@ def _check(options: PlayOptions) -> None:
     guards.check_seed(options.seed)
     if not all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size):
         raise BadArgumentsError("--size: both numbers must be even and lie in 16 .. 4096 px")
-    if options.video is not None:
+    if options.png is not None or options.video is not None:
+        _check_formats(options.png, options.video)
+
+
+def _check_formats(png: Path | None, video: Path | None) -> None:
+    from csac_jax.render import media
+
+    with as_bad_arguments(ValueError):
+        if png is not None:
+            media.check_suffix(png, media.PICTURES)
+        if video is not None:
+            media.check_suffix(video, media.VIDEOS)
+    if video is not None and media.needs_ffmpeg(video):
         guards.check_extra("--video", "imageio_ffmpeg", "video")
 
 

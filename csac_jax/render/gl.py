@@ -1,5 +1,5 @@
-"""Which OpenGL can MuJoCo draw with here? To be asked before MuJoCo is imported, which reads the
-answer."""
+"""Finds an OpenGL backend that MuJoCo can draw with here. MuJoCo reads the choice as it is
+imported."""
 
 import os
 import subprocess
@@ -18,10 +18,9 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 
 
 def choose() -> str | None:
-    """Sets MUJOCO_GL to a backend that draws, unless the user has set it; returns it, None where
-    none does.
+    """Sets MUJOCO_GL to a backend that draws and returns it; None if none draws.
 
-    Each is tried in a process of its own: a broken driver may end the process.
+    The user's own MUJOCO_GL stands.
     """
     given = os.environ.get(VARIABLE, "").lower()
     if given:
@@ -34,6 +33,7 @@ def choose() -> str | None:
 
 
 def _draws(backend: str) -> bool:
+    """Tries a backend in its own process, which a broken driver may end."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _PROBE],

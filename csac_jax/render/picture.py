@@ -1,13 +1,7 @@
-"""Pictures of a MuJoCo model, by its renderer where an OpenGL is found, by our rays where none is;
-PNG and video."""
+"""Pictures of a MuJoCo model: by MuJoCo's renderer with OpenGL, by our rays without."""
 
 import dataclasses
-import itertools
-import struct
-import warnings
-import zlib
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
 
 import jax
 import mujoco
@@ -17,56 +11,71 @@ from csac_jax.config import CameraConfig
 from csac_jax.scene import solids
 from csac_jax.vision import camera
 
-FRAMES_PER_SECOND = 25
+FLOOR = (0.75, 0.76, 0.78, 1.0)
+SKY = (1.0, 1.0, 1.0, 1.0)
 
-Draw = Callable[[mujoco.MjData], np.ndarray]  # a state to a picture [H, W, 3] uint8
+Draw = Callable[[mujoco.MjData], np.ndarray]  # a state -> its picture [H, W, 3] uint8
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """From where a picture is taken."""
+    """Where a picture is taken from."""
 
     position: tuple[float, float, float]  # m
     look_at: tuple[float, float, float]  # m
     size: tuple[int, int] = (640, 480)  # width and height, px
-    field: float = 45.0  # height of the view, degrees
+    fovy: float = 45.0  # vertical field of view, degrees
 
 
-def artist(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
-    """What draws this model: MuJoCo with the OpenGL backend named, our rays if there is none or it
-    fails."""
+def renderer(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
+    """Draws this model with MuJoCo's OpenGL backend; with our rays if there is none or it fails.
+
+    Recolours the model's planes.
+    """
+    model.geom_rgba[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR
     if opengl is not None:
         try:
-            return _by_mujoco(model, view)
-        except Exception:  # a driver that is there but does not work raises nearly anything
+            return _opengl_renderer(model, view)
+        except Exception:  # a broken driver raises nearly anything
             pass
-    return _by_rays(model, view)
+    return _ray_renderer(model, view)
 
 
-def _by_mujoco(model: mujoco.MjModel, view: View) -> Draw:
-    model.vis.global_.fovy = view.field
+def _opengl_renderer(model: mujoco.MjModel, view: View) -> Draw:
+    model.vis.global_.fovy = view.fovy
     model.vis.global_.offwidth, model.vis.global_.offheight = view.size
-    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.3, 0.35
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.35, 0.3
     width, height = view.size
-    renderer = mujoco.Renderer(model, height, width)
+    opengl = mujoco.Renderer(model, height, width)
+    opengl.scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = 0  # the sky is seen from inside
     eye, offset = mujoco.MjvCamera(), np.array(view.look_at) - np.array(view.position)
     eye.lookat[:] = view.look_at
     eye.distance = np.linalg.norm(offset)
     eye.azimuth = np.degrees(np.arctan2(offset[1], offset[0]))
     eye.elevation = np.degrees(np.arcsin(offset[2] / eye.distance))
-    every = mujoco.MjvOption()
-    every.geomgroup[:] = 1
+    options = mujoco.MjvOption()
+    options.geomgroup[:] = 1
 
     def draw(data: mujoco.MjData) -> np.ndarray:
-        renderer.update_scene(data, eye, every)
-        return renderer.render().copy()
+        opengl.update_scene(data, eye, options)
+        _add_sky(opengl.scene)
+        return opengl.render().copy()
 
     return draw
 
 
-def _by_rays(model: mujoco.MjModel, view: View) -> Draw:
+def _add_sky(scene: mujoco.MjvScene) -> None:
+    """Puts a luminous sphere around the scene; MuJoCo's background is black."""
+    sky = scene.geoms[scene.ngeom]
+    sphere, radius = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 20.0)
+    mujoco.mjv_initGeom(sky, sphere, radius, np.zeros(3), np.eye(3).ravel(), np.array(SKY))
+    sky.emission, sky.specular = 1.0, 0.0
+    scene.ngeom += 1
+
+
+def _ray_renderer(model: mujoco.MjModel, view: View) -> Draw:
     width, height = view.size
-    focal = 0.5 * height / np.tan(np.radians(0.5 * view.field))
+    focal = 0.5 * height / np.tan(np.radians(0.5 * view.fovy))
     eye = camera.make(
         CameraConfig(
             size=view.size,
@@ -76,73 +85,16 @@ def _by_rays(model: mujoco.MjModel, view: View) -> Draw:
             look_at=view.look_at,
         )
     )
-    seen = solids.read(model)
+    geoms = solids.read(model)
 
     @jax.jit
     def render(xpos: jax.Array, xmat: jax.Array) -> camera.Picture:
-        return camera.render(eye, solids.place(seen, xpos, xmat))
+        return camera.render(eye, solids.place(geoms, xpos, xmat))
 
     def draw(data: mujoco.MjData) -> np.ndarray:
-        picture = jax.device_get(
-            render(data.geom_xpos.astype(np.float32), data.geom_xmat.astype(np.float32))
-        )
-        sky = np.array([0.92, 0.94, 0.96], np.float32)
-        return np.round(255 * np.where(picture.valid[..., None], picture.colour, sky)).astype(
-            np.uint8
-        )
+        placed = data.geom_xpos.astype(np.float32), data.geom_xmat.astype(np.float32)
+        picture = jax.device_get(render(*placed))
+        colour = np.where(picture.valid[..., None], picture.colour, np.array(SKY[:3], np.float32))
+        return np.round(255 * colour).astype(np.uint8)
 
     return draw
-
-
-def write_png(path: Path, picture: np.ndarray) -> None:
-    """Writes a picture [H, W, 3] uint8; every row as its difference from the one above, which packs
-    flat areas well."""
-    height, width, _ = picture.shape
-    above = np.concatenate([np.zeros_like(picture[:1]), picture[:-1]])
-    rows = (picture - above).reshape(height, -1)  # modulo 256
-    lines = np.concatenate([np.full((height, 1), 2, np.uint8), rows], axis=1)  # filter type 2, "up"
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content))
-            + kind
-            + content
-            + struct.pack(">I", zlib.crc32(kind + content))
-        )
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, red green blue
-    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b""))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts))
-
-
-def write_video(path: Path, pictures: Iterable[np.ndarray]) -> int:
-    """Writes pictures [H, W, 3] uint8, at least one, as a video of FRAMES_PER_SECOND; returns their
-    number.
-
-    Raises OSError where ffmpeg fails, such as for a name that it knows no format of.
-    """
-    import imageio_ffmpeg
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    every = iter(pictures)
-    first = next(every)
-    height, width, _ = first.shape
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (width, height),
-        fps=FRAMES_PER_SECOND,
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-    )
-    count = 0
-    with warnings.catch_warnings():  # the fork is replaced by ffmpeg at once
-        warnings.filterwarnings("ignore", message=".*fork", category=RuntimeWarning)
-        writer.send(None)
-    try:
-        for picture in itertools.chain([first], every):
-            writer.send(np.ascontiguousarray(picture))
-            count += 1
-    finally:
-        writer.close()
-    return count

@@ -11,7 +11,7 @@ from csac_jax.config import Config, RobotKind
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import State
 from csac_jax.evaluation.rollout import Moment
-from csac_jax.render import picture, view
+from csac_jax.render import media, panels, picture
 from csac_jax.render.picture import View
 from csac_jax.scene import blocks, layout, model
 from csac_jax.sim import c_physics
@@ -33,20 +33,21 @@ class Stage:
         opengl: str | None,
         views: bool = False,
     ) -> None:
-        self._cfg, self._views = cfg, views  # with what the policy saw beside the scene
+        self._cfg, self._height = cfg, size[1]
+        self._views = views  # whether panels show what the policy saw
         self._world = model.build(cfg.scene, cfg.sim)
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
         self._model = model.with_blocks(self._world, self._fields)
         colours = blocks.COLOURS[first.scene.colour[self._world.parts.slot]]
         self._model.geom_rgba[self._world.block_geoms, :3] = colours
         self._data = mujoco.MjData(self._model)
-        self._every = max(round(1.0 / (picture.FRAMES_PER_SECOND * cfg.sim.timestep)), 1)
+        self._every = max(round(1.0 / (media.FRAMES_PER_SECOND * cfg.sim.timestep)), 1)
         seen = VIEWS[cfg.sim.robot]
-        self._draw = picture.artist(self._model, View(seen.position, seen.look_at, size), opengl)
+        self._draw = picture.renderer(self._model, View(seen.position, seen.look_at, size), opengl)
 
     def still(self, moment: Moment, text: str = "") -> np.ndarray:
         """The scene before an action, the robot where that action starts: [H, W, 3] uint8."""
-        return self._beside(self._still(moment), moment, text)
+        return self._frame(moment)(self._still(moment), text)
 
     def _still(self, moment: Moment) -> np.ndarray:
         scene, pose = moment.before.scene, self._data.qpos
@@ -61,17 +62,19 @@ class Stage:
         With views, `text` below it: what is done at first; for HOLD pictures more at the end, what
         came of it too.
         """
-        shown = self._still(moment)
-        yield self._beside(shown, moment, text.split(":")[0])
+        shown, frame, begun = self._still(moment), self._frame(moment), text.split(":")[0]
+        yield frame(shown, begun)
         film = c_physics.film(self._world, self._fields, moment.before.scene, moment.drive)
         for pose in film.qpos[:: self._every]:
             self._data.qpos[:] = pose
             shown = self._picture()
-            yield self._beside(shown, moment, text.split(":")[0])
-        yield from [self._beside(shown, moment, text)] * (HOLD if self._views else 0)
+            yield frame(shown, begun)
+        yield from [frame(shown, text)] * (HOLD if self._views else 0)
 
-    def _beside(self, shown: np.ndarray, moment: Moment, text: str) -> np.ndarray:
-        return view.beside(self._cfg, shown, moment, text) if self._views else shown
+    def _frame(self, moment: Moment) -> panels.Frame:
+        if self._views:
+            return panels.frame(self._cfg, moment, self._height)
+        return lambda scene, text: scene
 
     def _picture(self) -> np.ndarray:
         mujoco.mj_kinematics(self._model, self._data)
@@ -118,9 +121,9 @@ def record(stage: Stage, moments: list[Moment], png: Path | None, video: Path | 
     """Writes the picture of the first moment, and the video of them all."""
     lines = [line(number, moment) for number, moment in enumerate(moments, 1)]
     if png is not None:
-        picture.write_png(png, stage.still(moments[0], lines[0]))
+        media.write_picture(png, stage.still(moments[0], lines[0]))
     if video is not None:
         told = zip(moments, lines, strict=True)
-        picture.write_video(
+        media.write_video(
             video, (frame for moment, text in told for frame in stage.motion(moment, text))
         )

@@ -1,12 +1,10 @@
-"""Pictures and videos, read back by ffmpeg; both ways of drawing, beside one another."""
+"""Both ways of drawing a model, against each other, and the choice between them."""
 
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
-import imageio_ffmpeg
 import jax
 import mujoco
 import numpy as np
@@ -28,48 +26,23 @@ BALL = """
 VIEW = View(position=(-1.0, 0.0, 0.8), look_at=(0.0, 0.0, 0.1), size=(96, 64))
 _BOTH = f"""
 import csac_jax, json, sys
-from csac_jax.show import gl
+from csac_jax.render import gl
 backend = gl.choose()
 if backend is None:
     sys.exit(3)
 import mujoco, numpy as np
-from csac_jax.show import picture
-model = mujoco.MjModel.from_xml_string('''{BALL}''')
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-view = picture.View({VIEW.position}, {VIEW.look_at}, {VIEW.size})
-pictures = [draw(model, view)(data) for draw in (picture._by_mujoco, picture._by_rays)]
-print(json.dumps([image.tolist() for image in pictures]))
+from csac_jax.render import picture
+ways = (picture._opengl_renderer, picture._ray_renderer)
+def pictures(xml):
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    view = picture.View({VIEW.position}, {VIEW.look_at}, {VIEW.size})
+    return [draw(model, view)(data) for draw in ways]
+skies = pictures("<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>")
+shown = pictures('''{BALL}''')
+print(json.dumps([[image.tolist() for image in shown], [image[0, 0].tolist() for image in skies]]))
 """
-
-
-def _read(path: Path) -> np.ndarray:
-    """A PNG as ffmpeg reads it, [H, W, 3]."""
-    frames = imageio_ffmpeg.read_frames(str(path))
-    width, height = next(frames)["size"]
-    return np.frombuffer(next(frames), np.uint8).reshape(height, width, 3)
-
-
-def test_png_is_what_was_drawn(tmp_path: Path):
-    """Claim: a picture is written without loss, of any size, into folders that need not exist."""
-    drawn = np.random.default_rng(0).integers(0, 256, (30, 46, 3), np.uint8)
-    picture.write_png(tmp_path / "new" / "a.png", drawn)
-    np.testing.assert_array_equal(_read(tmp_path / "new" / "a.png"), drawn)
-
-
-def test_video_has_every_picture(tmp_path: Path):
-    """Claim: a video has as many pictures as were given, 25 a second, of their size and about their
-    colour."""
-    shades = [np.full((48, 34, 3), shade, np.uint8) for shade in range(40, 240, 8)]
-    assert picture.write_video(tmp_path / "a.mp4", iter(shades)) == len(shades) == 25
-    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4")) == (
-        25,
-        pytest.approx(1.0, abs=0.01),
-    )
-    frames = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"))
-    assert next(frames)["size"] == (34, 48)
-    for shade, frame in zip(shades, frames, strict=True):
-        assert np.abs(np.frombuffer(frame, np.uint8).astype(int) - shade[0, 0, 0]).mean() < 6
 
 
 def test_rays_show_what_stands_where():
@@ -78,7 +51,7 @@ def test_rays_show_what_stands_where():
     model = mujoco.MjModel.from_xml_string(BALL)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    drawn = picture.artist(model, VIEW, None)(data)
+    drawn = picture.renderer(model, VIEW, None)(data)
     assert (drawn.shape, drawn.dtype) == ((64, 96, 3), np.uint8)
     red, green = (_where(drawn, channel) for channel in (0, 1))
     assert green[1] < 48 < red[1]  # y > 0 is left for who looks along x
@@ -95,16 +68,18 @@ def _where(drawn: np.ndarray, channel: int) -> np.ndarray:
 
 def test_both_ways_of_drawing_agree():
     """Claim: MuJoCo's renderer and our rays show the same things in the same places, to the
-    pixel."""
+    pixel, under a white sky."""
     done = subprocess.run(
         [sys.executable, "-c", _BOTH], capture_output=True, text=True, timeout=300
     )
     if done.returncode == 3:
         pytest.skip("no OpenGL here")
     assert done.returncode == 0, done.stderr
-    by_mujoco, by_rays = (np.array(image, np.uint8) for image in json.loads(done.stdout))
+    pictures, skies = json.loads(done.stdout)
+    by_mujoco, by_rays = (np.array(image, np.uint8) for image in pictures)
     for channel in (0, 1):
         np.testing.assert_allclose(_where(by_mujoco, channel), _where(by_rays, channel), atol=1.0)
+    assert skies == [[255, 255, 255]] * 2
 
 
 def test_broken_opengl_gives_way_to_rays(monkeypatch: pytest.MonkeyPatch):
@@ -113,9 +88,9 @@ def test_broken_opengl_gives_way_to_rays(monkeypatch: pytest.MonkeyPatch):
     def broken(*_):
         raise RuntimeError("no context")
 
-    monkeypatch.setattr(picture, "_by_mujoco", broken)
+    monkeypatch.setattr(picture, "_opengl_renderer", broken)
     model = mujoco.MjModel.from_xml_string(BALL)
-    assert picture.artist(model, VIEW, "egl")(mujoco.MjData(model)).shape == (64, 96, 3)
+    assert picture.renderer(model, VIEW, "egl")(mujoco.MjData(model)).shape == (64, 96, 3)
 
 
 @pytest.mark.parametrize(
@@ -148,4 +123,12 @@ def test_probe_fails_on_a_backend_that_is_none():
 def test_no_image_is_kept_on_the_device():
     """Claim: pictures are NumPy arrays."""
     model = mujoco.MjModel.from_xml_string(BALL)
-    assert not isinstance(picture.artist(model, VIEW, None)(mujoco.MjData(model)), jax.Array)
+    assert not isinstance(picture.renderer(model, VIEW, None)(mujoco.MjData(model)), jax.Array)
+
+
+def test_floor_is_light():
+    """Claim: the floor is drawn light, whatever its colour in the model."""
+    model = mujoco.MjModel.from_xml_string(BALL)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert picture.renderer(model, VIEW, None)(data)[-1].min() > 80

@@ -51,10 +51,7 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
     )  # 4 ms a substep, 25 a second
     frames = imageio_ffmpeg.read_frames("a/b.mp4")
     width, height = next(frames)["size"]
-    assert (width, height) == (
-        96 + 64,
-        64 + 16,
-    )  # the height map to the right, two lines of text below
+    assert (width, height) == (96 + 56, 64 + 4)  # the height map to the right, text below
     pictures = [
         np.frombuffer(frame, np.uint8).reshape(height, width, 3)[:64, :96] for frame in frames
     ]
@@ -79,6 +76,8 @@ def _is_red(image: np.ndarray) -> np.ndarray:
         ("--seed -1", 2, "--seed: must lie in"),
         ("--policy nowhere", 1, "there is no folder nowhere"),
         ("--robot ur10", 2, "robot"),
+        ("--png a.txt", 2, "a.txt: its name must end in one of: .png, .jpg"),
+        ("--video a.png", 2, "a.png: its name must end in one of: .mp4, .mkv, .mov, .gif, .webp"),
     ],
 )
 def test_bad_arguments_are_one_line(

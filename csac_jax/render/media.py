@@ -1,0 +1,48 @@
+"""Pictures and videos as files; the suffix names the format."""
+
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+
+FRAMES_PER_SECOND = 25
+FILMS = (".mp4", ".mkv", ".mov")  # by ffmpeg
+VIDEOS = (*FILMS, ".gif", ".webp")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".gif")
+
+
+def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
+    """Raises ValueError for a suffix that is none of these."""
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: its name must end in one of: {', '.join(suffixes)}")
+
+
+def needs_ffmpeg(path: Path) -> bool:
+    """Whether a video of this suffix is written by ffmpeg."""
+    return path.suffix.lower() in FILMS
+
+
+def write_picture(path: Path, picture: np.ndarray) -> None:
+    """Writes a picture [H, W, 3] uint8; makes its folder."""
+    check_suffix(path, PICTURES)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    imageio.imwrite(path, picture)
+
+
+def write_video(path: Path, pictures: Iterable[np.ndarray]) -> None:
+    """Writes pictures [H, W, 3] uint8, H and W even, as FRAMES_PER_SECOND; makes the folder.
+
+    Raises OSError where ffmpeg fails.
+    """
+    check_suffix(path, VIDEOS)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    settings: dict[str, Any] = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0}
+    if needs_ffmpeg(path):
+        settings = {"fps": FRAMES_PER_SECOND, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    with imageio.get_writer(path, **settings) as writer, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*fork", RuntimeWarning)  # ffmpeg replaces the fork
+        for picture in pictures:
+            writer.append_data(picture)

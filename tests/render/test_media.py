@@ -1,0 +1,84 @@
+"""Pictures and videos, read back from their files."""
+
+import warnings
+from pathlib import Path
+
+import imageio.v2 as imageio
+import imageio_ffmpeg
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from csac_jax.render import media
+
+SHADES = range(40, 240, 8)
+
+
+@pytest.mark.parametrize("suffix", media.PICTURES)
+def test_picture_has_the_format_of_its_suffix(tmp_path: Path, suffix: str):
+    """Claim: every suffix that is offered gives a file of that format, in folders that need not
+    exist."""
+    path = tmp_path / "new" / f"a{suffix.upper()}"
+    media.write_picture(path, np.full((30, 46, 3), 90, np.uint8))
+    with Image.open(path) as image:
+        assert image.format == {"jpg": "JPEG"}.get(suffix[1:], suffix[1:].upper())
+        assert np.abs(np.asarray(image.convert("RGB")).astype(int) - 90).max() <= 2
+
+
+def test_png_is_what_was_drawn(tmp_path: Path):
+    """Claim: PNG loses nothing."""
+    drawn = np.random.default_rng(0).integers(0, 256, (31, 46, 3), np.uint8)
+    media.write_picture(tmp_path / "a.png", drawn)
+    np.testing.assert_array_equal(imageio.imread(tmp_path / "a.png"), drawn)
+
+
+@pytest.mark.parametrize("suffix", media.VIDEOS)
+def test_video_has_every_picture(tmp_path: Path, suffix: str):
+    """Claim: a video has as many pictures as were given, of their size and about their colour; its
+    writing warns of nothing."""
+    path = tmp_path / "new" / f"a{suffix}"
+    jax.devices()  # warns of forks from now on
+    with warnings.catch_warnings(record=True) as complaints:
+        warnings.simplefilter("always")
+        media.write_video(path, (np.full((48, 34, 3), shade, np.uint8) for shade in SHADES))
+    assert not complaints
+    frames = imageio.mimread(path)
+    assert len(frames) == len(SHADES)
+    for shade, frame in zip(SHADES, frames, strict=True):
+        assert frame.shape[:2] == (48, 34)
+        assert np.abs(frame[..., :3].astype(int) - shade).mean() < 6
+
+
+@pytest.mark.parametrize("suffix", media.VIDEOS)
+def test_video_runs_at_25_pictures_a_second(tmp_path: Path, suffix: str):
+    """Claim: a second of video is 25 pictures."""
+    path = tmp_path / f"a{suffix}"
+    media.write_video(path, (np.full((16, 16, 3), shade, np.uint8) for shade in SHADES))
+    if suffix in media.FILMS:
+        _, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
+        assert seconds == pytest.approx(len(SHADES) / 25, abs=0.01)
+        return
+    with Image.open(path) as image:
+        durations = []
+        for number in range(len(SHADES)):
+            image.seek(number)
+            image.load()
+            durations.append(image.info["duration"])
+    assert durations == [40] * len(SHADES)  # ms
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a", "a.mp4", "a.bmp"])
+def test_unknown_picture_format_names_those_that_work(tmp_path: Path, name: str):
+    """Claim: another suffix is one line that names the formats, and writes nothing."""
+    with pytest.raises(ValueError, match=r"its name must end in one of: \.png, \.jpg, .*\.gif$"):
+        media.write_picture(tmp_path / name, np.zeros((4, 4, 3), np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a", "a.png"])
+def test_unknown_video_format_names_those_that_work(tmp_path: Path, name: str):
+    """Claim: another suffix is one line that names the formats, and writes nothing."""
+    with pytest.raises(ValueError, match=r"its name must end in one of: \.mp4, .*\.webp$"):
+        media.write_video(tmp_path / name, iter([np.zeros((4, 4, 3), np.uint8)]))
+    assert not list(tmp_path.iterdir())

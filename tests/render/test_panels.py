@@ -1,0 +1,167 @@
+"""Panels right of the scene: what they show, where, and how often they are drawn."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+
+from csac_jax import presets
+from csac_jax.constants import Primitive
+from csac_jax.render import panels
+from csac_jax.scene.model import MAX_OPENING
+
+CFG = presets.smoke()
+SIZE = CFG.heightmap.size
+HEIGHT = 480  # px
+HIGHEST = to_hex(colormaps["viridis"](1.0))
+
+
+def _moment(primitive: int, pose: tuple[float, float, float], learned: bool) -> SimpleNamespace:
+    """A block at x 0.1, y -0.15 m; Q of pushes highest at x -0.1, y 0.1 m; push candidates at
+    x 0.15, y 0.15 m, grasp candidates at x -0.15, y 0.15 m."""
+    height, q = np.zeros((SIZE, SIZE)), np.full((2, SIZE, SIZE), -np.inf)
+    row, col = _cell(0.1, -0.15)
+    height[row - 1 : row + 2, col - 1 : col + 2] = 0.1
+    q[:, 4:-4, 4:-4] = 0.0
+    row, col = _cell(-0.1, 0.1)
+    q[0, row, col] = 2.0
+    candidates = np.tile([0.15, 0.15, 0.0], (2, 8, 1))
+    candidates[1, :, 0] = -0.15
+    thought = SimpleNamespace(q=q, candidates=candidates) if learned else None
+    action = SimpleNamespace(primitive=np.int32(primitive), pose=np.array(pose))
+    before = SimpleNamespace(obs=SimpleNamespace(height=height))
+    return SimpleNamespace(before=before, action=action, thought=thought)
+
+
+def _cell(x: float, y: float) -> tuple[int, int]:
+    """Row and column of the height map."""
+    row, col = (int((value / CFG.heightmap.extent + 0.5) * SIZE) for value in (y, x))
+    return row, col
+
+
+def _map(fig: Figure, title: str) -> Axes:
+    (axes,) = [axes for axes in fig.axes if axes.get_title().startswith(title)]
+    return axes
+
+
+def _drawn(fig: Figure, axes: Axes) -> tuple[np.ndarray, np.ndarray]:
+    """Colours [n, 3] uint8 and places (x, y) [n, 2], m, of the pixels of a map."""
+    canvas = FigureCanvasAgg(fig)
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[::-1, :, :3]  # row 0 is the lowest
+    left, bottom, right, top = np.round(axes.bbox.extents).astype(int)
+    row, col = np.mgrid[bottom:top, left:right].reshape(2, -1)
+    centres = np.stack([col, row], axis=1) + 0.5
+    return pixels[row, col], 1e-3 * axes.transData.inverted().transform(centres)
+
+
+def _places(fig: Figure, title: str, colour: str) -> np.ndarray:
+    """Places (x, y) [n, 2], m, of a colour in a map."""
+    colours, places = _drawn(fig, _map(fig, title))
+    off = np.abs(colours - 255 * np.array(to_rgb(colour))).max(axis=1)
+    return places[off <= 1.0]
+
+
+def test_height_map_and_grasp_lie_where_they_are():
+    """Claim: x runs to the right and y upwards; a grasp is drawn at its place, along its yaw."""
+    fig = panels.figure(CFG, _moment(Primitive.GRASP, (-0.1, 0.05, 0.0), learned=False), HEIGHT)
+    colours, places = _drawn(fig, _map(fig, "Height map"))
+    inner = np.abs(places).max(axis=1) < 0.215  # without the frame
+    dark = inner & (colours.max(axis=1) < 100)
+    np.testing.assert_allclose(
+        places[dark].mean(axis=0), [0.1, -0.15], atol=0.5 * CFG.heightmap.cell
+    )
+    hand = _places(fig, "Height map", panels.CHOSEN)
+    np.testing.assert_allclose(hand.mean(axis=0), [-0.1, 0.05], atol=0.003)
+    width, height = np.ptp(hand, axis=0)
+    assert width == pytest.approx(MAX_OPENING, abs=0.01)
+    assert height == pytest.approx(1e-3 * panels.FINGER, abs=0.01)
+
+
+def test_push_is_an_arrow_over_its_way():
+    """Claim: a push begins at its place, is as long as it goes, and is widest near its end."""
+    yaw = 0.5 * np.pi
+    fig = panels.figure(CFG, _moment(Primitive.PUSH, (-0.1, 0.0, yaw), learned=False), HEIGHT)
+    arrow = _places(fig, "Height map", panels.CHOSEN)
+    ends = arrow[:, 1].min(), arrow[:, 1].max()
+    assert ends == pytest.approx((0.0, CFG.sim.push_length), abs=0.005)
+    begin, end = (np.ptp(arrow[part, 0]) for part in (arrow[:, 1] < 0.04, arrow[:, 1] > 0.06))
+    assert end > 2 * begin
+
+
+def test_learned_policy_shows_its_maps():
+    """Claim: of a learned policy, Q of pushes and of grasps is shown on one scale, cells with
+    nothing to act on apart, and the candidates of both in the height map."""
+    fig = panels.figure(CFG, _moment(Primitive.GRASP, (0.0, 0.0, 0.0), learned=True), HEIGHT)
+    best = _places(fig, "Push value, best +2.00", HIGHEST)
+    np.testing.assert_allclose(best.mean(axis=0), [-0.1, 0.1], atol=0.5 * CFG.heightmap.cell)
+    assert not len(_places(fig, "Grasp value, best +0.00", HIGHEST))
+    invalid = np.abs(_places(fig, "Push value", panels.INVALID)).max(axis=1)
+    assert invalid.min() == pytest.approx((0.5 * SIZE - 4) * CFG.heightmap.cell, abs=0.003)
+    for primitive, x in ((Primitive.PUSH, 0.15), (Primitive.GRASP, -0.15)):
+        places = _places(fig, "Height map", panels.CANDIDATES[primitive])
+        np.testing.assert_allclose(places.mean(axis=0), [x, 0.15], atol=0.003)
+
+
+@pytest.mark.parametrize("chosen", list(Primitive))
+def test_action_is_drawn_in_its_own_q_map(chosen: Primitive):
+    """Claim: the Q map of the chosen primitive shows the action, the other does not."""
+    fig = panels.figure(CFG, _moment(chosen, (0.0, 0.0, 0.0), learned=True), HEIGHT)
+    shown = [len(_places(fig, f"{kind.name.title()} value", panels.CHOSEN)) for kind in Primitive]
+    assert [count > 0 for count in shown] == [kind == chosen for kind in Primitive]
+
+
+@pytest.mark.parametrize("learned", [True, False])
+@pytest.mark.parametrize("size", [(120, 160), (98, 130), (16, 16)])
+def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tuple[int, int]):
+    """Claim: sides are even, as videos need; the scene is untouched, and the text stands below
+    everything."""
+    scene = np.full((*size, 3), 7, np.uint8)
+    moment = _moment(Primitive.PUSH, (0.0, 0.0, 0.0), learned)
+    complete = panels.frame(CFG, moment, size[0])
+    bare, told = (complete(scene, text) for text in ("", "grasp: lifted"))
+    assert bare.shape == told.shape
+    assert bare.dtype == np.uint8
+    assert all(side % 2 == 0 for side in told.shape[:2])
+    np.testing.assert_array_equal(told[: size[0], : size[1]], scene)
+    np.testing.assert_array_equal(told[: size[0]], bare[: size[0]])
+    assert (told[size[0] :] < 255).any()
+    assert (bare[size[0] :] == 255).all()
+
+
+def test_long_text_stays_in_sight():
+    """Claim: a text too long for one line goes on in the next."""
+    short, long = (panels.text_line("word " * count, 600, HEIGHT) < 255 for count in (8, 24))
+    lines = [_runs(image.any(axis=(1, 2))) for image in (short, long)]
+    assert lines == [1, 2]
+    assert not long[:, -5:].any()
+
+
+def _runs(rows: np.ndarray) -> int:
+    """How many separate runs of True there are."""
+    return int(np.sum(np.diff(rows.astype(int), prepend=0) == 1))
+
+
+def test_panels_are_drawn_once(monkeypatch: pytest.MonkeyPatch):
+    """Claim: however many pictures an action has, its panels are drawn once."""
+    drawn = []
+    draw = FigureCanvasAgg.draw
+    monkeypatch.setattr(FigureCanvasAgg, "draw", lambda self: (drawn.append(self), draw(self)))
+    complete = panels.frame(CFG, _moment(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True), 120)
+    panels.text_line.cache_clear()
+    for shade in range(5):
+        assert complete(np.full((120, 160, 3), shade, np.uint8), "push")[0, 0, 0] == shade
+    assert len(drawn) == 2  # panels and text
+
+
+def test_nothing_to_act_on():
+    """Claim: Q maps without a valid cell are drawn, too."""
+    moment = _moment(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True)
+    moment.thought.q[:] = -np.inf
+    fig = panels.figure(CFG, moment, HEIGHT)
+    assert len(_places(fig, "Push value, nowhere", panels.INVALID)) > 20000
