@@ -109,7 +109,7 @@ def _draw_q_maps(cfg: Config, fig: Figure, step: StepRecord) -> None:
     assert step.debug is not None
     every = np.ma.masked_invalid(step.debug.q)
     colours = matplotlib.colormaps["viridis"].with_extremes(bad=INVALID)
-    limits = (every.min(), every.max()) if every.count() else (0.0, 1.0)
+    limits = (every.min(), every.max())
     for primitive, left in zip(Primitive, COLUMNS, strict=True):
         values = every[primitive]
         best = f"best {values.max():+.2f}" if values.count() else "nowhere"

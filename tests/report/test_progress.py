@@ -33,6 +33,7 @@ def test_plain_lines_are_rare_but_the_last_is_there():
             f"{actions} of 6 actions, 1.0/s, grasp success 100% of last 1, warming up, 1:06:40 left"
             for actions in (2, 6)
         ),
+        "",
     ]
 
 
