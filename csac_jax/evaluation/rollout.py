@@ -154,14 +154,15 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     after = env.step(state, action)
     if not isinstance(policy, LearnedPolicy):
         return StepRecord(state, action, drive, after, after.reward, None)
-    debug, info = policy.debug(state, key), after.info
+    key, info = jax.random.clone(key), after.info  # the debug view is of the same draws
+    debug = policy.debug(state, key)
     reward = rewards.reward(  # phi is the acting critic's; in training it is the target critic's
         policy.cfg.reward,
         action.primitive,
         info.outcome,
         info.distance,
         debug.best_grasp,
-        policy.debug(after, key).best_grasp,
+        policy.debug(after, jax.random.clone(key)).best_grasp,
         info.moved > CHANGE_AREA,
         info.blocks_lost,
     )
