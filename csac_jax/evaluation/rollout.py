@@ -154,13 +154,14 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     after = env.step(state, action)
     if not isinstance(policy, LearnedPolicy):
         return StepRecord(state, action, joints, after, after.reward, None)
-    debug, info = policy.debug(state, key), after.info
+    key, info = jax.random.clone(key), after.info  # the debug view is of the same draws
+    debug = policy.debug(state, key)
     result = rewards.ActionResult(
         primitive=action.primitive,
         outcome=info.outcome,
         distance=info.distance,
         phi_before=debug.best_grasp,  # the acting critic's; in training it is the target critic's
-        phi_after=policy.debug(after, key).best_grasp,
+        phi_after=policy.debug(after, jax.random.clone(key)).best_grasp,
         changed=info.moved > CHANGE_AREA,
         blocks_lost=info.blocks_lost,
     )

@@ -81,21 +81,22 @@ def test_learned_acts_like_the_agent(learned, states):
 def test_observation_serves_for_a_state(learned, states):
     """Claim: learned and random policy act on a bare observation as in the state; without a state
     no action counts as one without change."""
-    state, key = _scene(states, 0), jax.random.key(1)
+    state, other = _scene(states, 0), _scene(states, 1)
     for one in (learned, RandomPolicy(CFG)):
-        jax.tree.map(np.testing.assert_array_equal, one(state, key), one(state.obs, key))
-    assert learned(_scene(states, 1), key).primitive == Primitive.PUSH
-    assert learned(_scene(states, 1).obs, key).primitive == Primitive.GRASP
+        a, b = (one(seen, jax.random.key(1)) for seen in (state, state.obs))
+        jax.tree.map(np.testing.assert_array_equal, a, b)
+    assert learned(other, jax.random.key(1)).primitive == Primitive.PUSH
+    assert learned(other.obs, jax.random.key(1)).primitive == Primitive.GRASP
 
 
 def test_oracle_asks_for_a_state(states):
     """Claim: the oracle acts on a state, and says so where it is given an observation."""
-    state, key = _scene(states, 0), jax.random.key(1)
-    action = OraclePolicy(CFG)(state, key)
+    state = _scene(states, 0)
+    action = OraclePolicy(CFG)(state, jax.random.key(1))
     places = state.scene.position[np.asarray(state.scene.in_play), :2]
     assert np.linalg.norm(places - action.pose[:2], axis=1).min() < 1e-6
     with pytest.raises(TypeError, match="give it a State"):
-        OraclePolicy(CFG)(state.obs, key)
+        OraclePolicy(CFG)(state.obs, jax.random.key(1))
 
 
 @pytest.mark.parametrize("kind", [RandomPolicy, OraclePolicy])
@@ -111,8 +112,8 @@ def test_policies_are_pure(kind, states):
 def test_debug_is_of_the_action(learned, states):
     """Claim: the debug view of a state holds the best grasp's value that the agent sees, and
     candidates next to the action."""
-    state, key = _scene(states, 0), jax.random.key(2)
-    seen, action = learned.debug(state, key), learned(state, key)
+    state = _scene(states, 0)
+    seen, action = (look(state, jax.random.key(2)) for look in (learned.debug, learned))
     learner, obs = learning.make(CFG), jax.tree.map(lambda leaf: leaf[:1], states.obs)
     dense_maps = jax.jit(lambda obs: learning.look(learner, learned.params, obs))(obs)
     (best,) = jax.vmap(learning.best_grasp)(dense_maps)
