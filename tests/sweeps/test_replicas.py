@@ -109,9 +109,8 @@ def assert_close(a: Any, b: Any, rtol: float, atol: float = 1e-6) -> None:
 
 
 def test_replicas_are_the_runs_of_train():
-    """Claim: each replica is the run that `train` makes of its seed and settings, to
-    rounding, also where hyper-parameters are traced, every one of
-    them."""
+    """Claim: each replica is the run that `train` makes of its seed and settings, to rounding, also
+    where hyper-parameters are traced, every one of them."""
     assert OTHER.keys() == set(replicas.TRACED_HYPERPARAMS)
     configs = (PER, dataclasses.replace(step.replace_settings(PER, OTHER), seed=1))
     (group,) = replicas.group(configs)
