@@ -34,15 +34,15 @@ def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> l
     axes = dict(map(_axis, varied))
     if len(axes) < len(varied):
         raise ValueError("--vary: a setting is given twice; name it once, with all its values")
-    found = []
+    combined = []
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
         name = ",".join(f"{name}={value}" for name, value in values.items()) or BASE
         flags = [flag for name, value in values.items() for flag in _flags(name, value)]
-        found.append(SweepPoint(name, values, configure(flags)))
-    if any(len(point.name) > LONGEST for point in found):
-        return [point._replace(name=f"setting-{i}") for i, point in enumerate(found)]
-    return found
+        combined.append(SweepPoint(name, values, configure(flags)))
+    if any(len(point.name) > LONGEST for point in combined):
+        return [point._replace(name=f"setting-{i}") for i, point in enumerate(combined)]
+    return combined
 
 
 def _axis(text: str) -> tuple[str, list[str]]:
