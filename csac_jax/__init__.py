@@ -1,4 +1,4 @@
-"""A robot learns to push and grasp in clutter: physics, vision, networks and learner in one program.
+"""A robot learns to push and grasp in clutter: physics, vision, networks, learner in one program.
 
     import csac_jax as csac
 

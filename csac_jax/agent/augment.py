@@ -75,7 +75,7 @@ def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
 
 
 def _stays(cfg: Config, height: jax.Array, step: jax.Array) -> jax.Array:
-    """Whether all blocks of a map [H, W] m, shifted by `step` [2] m, stay above the workspace, []."""
+    """Whether all blocks of a map [H, W] m, shifted by `step` [2] m, stay in the workspace."""
     place = geometry.cell_centres(cfg.heightmap) + step[None, None]
     stays = jnp.all(jnp.abs(place) <= 0.5 * cfg.heightmap.extent, axis=-1)
     return jnp.all((height <= BARE) | stays)

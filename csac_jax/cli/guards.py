@@ -47,5 +47,6 @@ def check_host_physics(cfg: Config, devices: int) -> None:
     """C physics serves one device."""
     if cfg.sim.physics == "c" and devices > 1:
         raise BadArgumentsError(
-            "--sim.physics: c computes on the host's cores, for one device; leave out --devices or take mjx"
+            "--sim.physics: c computes on the host's cores, for one device; "
+            "leave out --devices or take mjx"
         )

@@ -129,11 +129,11 @@ def _join(options: SweepOptions) -> None:
 
 
 def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
-    from csac_jax.sim import backend
-    from csac_jax.sweeps import sweep as sweeping
-
     with as_bad_arguments(ValueError):
         points = grid.points(options.vary, lambda own: _parse(preset, [*flags, *own])[1])
+    from csac_jax.sim import backend  # with JAX, so after those complaints
+    from csac_jax.sweeps import sweep as sweeping
+
     devices, runs = _devices(options), options.seeds * len(points)  # at most so many side by side
     points = [one._replace(cfg=backend.resolve(one.cfg, devices, runs)) for one in points]
     for point in points:

@@ -34,12 +34,12 @@ def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> l
     axes = dict(map(_axis, varied))
     if len(axes) < len(varied):
         raise ValueError("--vary: a setting is given twice; name it once, with all its values")
-    found = []
+    combined = []
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
         flags = [flag for setting, value in values.items() for flag in _flags(setting, value)]
-        found.append(SweepPoint(name(values), values, configure(flags)))
-    return with_short_names(found)
+        combined.append(SweepPoint(name(values), values, configure(flags)))
+    return with_short_names(combined)
 
 
 def name(values: dict[str, str]) -> str:

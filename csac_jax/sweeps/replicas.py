@@ -67,7 +67,7 @@ class ProgramGroup(NamedTuple):
     hyperparams: tuple[str, ...]  # those in which they differ
 
 
-def group(configs: Sequence[Config]) -> list[ProgramGroup]:
+def group_configs(configs: Sequence[Config]) -> list[ProgramGroup]:
     """The configs in as few groups as can be, in the order of their first ones."""
     groups: dict[Config, list[Config]] = {}
     for cfg in configs:
@@ -97,18 +97,18 @@ def _values(configs: Sequence[Config], name: str) -> list[Any]:
     return [getattr(getattr(cfg, section), field) for cfg in configs]
 
 
-def of_group(given: ProgramGroup) -> Replicas:
+def of_group(group: ProgramGroup) -> Replicas:
     """What tells the runs of a group apart, as arrays of NumPy: every process has its own copy.
 
     Bounds of returns are computed here, from plain numbers.
     """
-    seed = np.array([cfg.seed for cfg in given.configs], np.uint32)
-    if not given.hyperparams:
+    seed = np.array([cfg.seed for cfg in group.configs], np.uint32)
+    if not group.hyperparams:
         return Replicas(seed, None)
     values = {
-        name: np.array(_values(given.configs, name), np.float32) for name in given.hyperparams
+        name: np.array(_values(group.configs, name), np.float32) for name in group.hyperparams
     }
-    bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in given.configs]
+    bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in group.configs]
     low, high = np.array(bounds, np.float32).T
     return Replicas(seed, Hyperparams(values, (low, high)))
 
@@ -236,7 +236,7 @@ def abstract(
 
 
 def sweep_program(
-    given: ProgramGroup,
+    group: ProgramGroup,
     mesh: Mesh | None = None,
     shard: Shard = "seeds",
     start: Callable[[Any], Any] | None = None,
@@ -245,8 +245,8 @@ def sweep_program(
 
     Args: start, changes the learners' first state [S, ...], as networks that they start from.
     """
-    program, replicas = step.make(given.configs[0]), of_group(given)
-    parts = pipelined.num_parts(program.cfg, len(given.configs), mesh)
+    program, replicas = step.make(group.configs[0]), of_group(group)
+    parts = pipelined.num_parts(program.cfg, len(group.configs), mesh)
 
     def first_state() -> TrainState:
         state = init(program, replicas, mesh, shard)

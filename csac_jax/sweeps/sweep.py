@@ -30,7 +30,7 @@ from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group
+from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
 
 PLAN = "sweep.json"
@@ -95,9 +95,9 @@ def run(
         files.replace(folder / PLAN, plan_text(plan))
     sweep = _Sweep(folder, groups_of(plan), reporter, stop)
     compiled = []
-    for index, (given, _) in enumerate(sweep.groups):
+    for index, (group, _) in enumerate(sweep.groups):
         if not sweep.stopping() and not (sweep.group_folder(index) / DONE).exists():
-            compiled += sweep.train_group(index, make_program(given))
+            compiled += sweep.train_group(index, make_program(group))
     summary = summarise(plan, folder)
     if cluster.is_first():
         files.write_json(folder / SUMMARY, summary)
@@ -143,14 +143,14 @@ def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
     runs = {run.cfg: run for run in runs_of(plan)}
     if len(runs) < plan.seeds * len(plan.points):
         raise SweepError("--vary: two settings have the same values; leave one of them out")
-    return [(given, [runs[cfg] for cfg in given.configs]) for given in group(list(runs))]
+    return [(group, [runs[cfg] for cfg in group.configs]) for group in group_configs(list(runs))]
 
 
 def check_room(plan: SweepPlan, devices: int) -> None:
     """Raises ValueError where the runs of a group, divided among `devices`, exceed what a device
     has room for: its memory, or the scenes of Warp's contacts."""
-    for given, _ in groups_of(plan._replace(seeds=1)):
-        cfg, runs = given.configs[0], -(-len(given.configs) * plan.seeds // devices)
+    for group, _ in groups_of(plan._replace(seeds=1)):
+        cfg, runs = group.configs[0], -(-len(group.configs) * plan.seeds // devices)
         if cfg.sim.physics == "warp" and runs * cfg.train.scenes > WARP_WORLDS:
             raise ValueError(
                 f"--seeds: {runs} runs of {cfg.train.scenes} scenes side by side, Warp has room "
@@ -215,7 +215,7 @@ class _Sweep:
 
     def _show(self, index: int, records: list[loop.Record]) -> None:
         """One line about all runs: their actions and speed together, means of the rest."""
-        actions = [_actions(given.configs) for given, _ in self.groups]
+        actions = [_actions(group.configs) for group, _ in self.groups]
         done = sum(actions[:index]) + records[0].actions * len(self.groups[index][1])
         speed = sum(record.actions_per_second for record in records)
         shown = dataclasses.replace(
@@ -279,25 +279,29 @@ class _GroupTraining:
         self.step += self.cfg.train.chunk
         seconds = time.perf_counter() - begun
         records = []
-        for i, (run, before) in enumerate(zip(self.runs, self.progress, strict=True)):
-            own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
-            if before.failed is not None:
-                continue
-            if not loop.is_finite(own):
-                self.progress[i] = before._replace(failed=self.step)
-                reporter.say(
-                    f"{run.point}, seed {run.cfg.seed}: given up at step {self.step}, "
-                    "a loss is not finite"
-                )
-                continue
-            after, record = loop.record_chunk(run.cfg, self.step, own, before.progress, seconds)
-            self.progress[i] = before._replace(progress=after)
-            logs[i].write(json.dumps(dataclasses.asdict(record)) + "\n")
-            logs[i].flush()
-            records.append(record)
+        for i, log in enumerate(logs):
+            if self.progress[i].failed is None:
+                own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
+                records += self._record(i, own, seconds, log, reporter)
         if self.step % (self.cfg.train.save_every * self.cfg.train.chunk) == 0:
             self.save()
         return records
+
+    def _record(
+        self, i: int, metrics: Any, seconds: float, log: TextIO, reporter: loop.Reporter
+    ) -> list[loop.Record]:
+        """Writes the line of run i, whose `metrics` are [T, ...]; none if it is given up now."""
+        run, before = self.runs[i], self.progress[i]
+        if not loop.is_finite(metrics):
+            self.progress[i] = before._replace(failed=self.step)
+            reason = f"given up at step {self.step}, a loss is not finite"
+            reporter.say(f"{run.point}, seed {run.cfg.seed}: {reason}")
+            return []
+        after, record = loop.record_chunk(run.cfg, self.step, metrics, before.progress, seconds)
+        self.progress[i] = before._replace(progress=after)
+        log.write(json.dumps(dataclasses.asdict(record)) + "\n")
+        log.flush()
+        return [record]
 
     def save(self) -> None:
         """Writes a checkpoint of the group."""

@@ -43,7 +43,7 @@ def check(cfg: Config, runs: int = 1) -> None:
     needed, capacity = runs * cfg.replay.capacity * slot, available // (runs * slot)
     if needed <= available:
         return
-    taken = f"{needed / GIB:.1f} GiB are needed, there are {available / GIB:.1f}"
+    taken = f"the replay takes {needed / GIB:.1f} GiB, there are {available / GIB:.1f}"
     remedy = f"lower --replay.capacity from {cfg.replay.capacity} to {capacity} at most"
     if capacity < max(cfg.train.scenes, cfg.learn.batch):
         remedy = "lower --heightmap.size"

@@ -54,7 +54,7 @@ def measure(
     """A row: `seeds` runs on `devices` devices."""
     cfg, mesh = program.cfg, sharding.make(devices)
     sharding.check(mesh, shard, seeds, cfg.train.scenes, cfg.learn.batch)
-    (group,) = replicas.group([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
+    (group,) = replicas.group_configs([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
     each = replicas.of_group(group)
     parts = pipelined.num_parts(cfg, seeds, mesh)
     jitted = replicas.compile_chunk(program, each, steps, mesh, shard, parts)

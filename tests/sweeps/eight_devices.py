@@ -28,7 +28,9 @@ def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
     """State after two chunks, their metrics, and the second chunk's state from a checkpoint of the
     first."""
     cfg = toys.CFG
-    (group,) = replicas.group([dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])])
+    (group,) = replicas.group_configs(
+        [dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])]
+    )
     program, each, line = toys.program(cfg), replicas.of_group(group), sharding.make(devices)
     state = replicas.init(program, each, line, shard)
     places = jax.tree.map(lambda leaf: leaf.sharding, state)

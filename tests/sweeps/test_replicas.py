@@ -75,7 +75,7 @@ def toy_step(monkeypatch: pytest.MonkeyPatch):
 
 
 def _seeds(num: int, cfg=toys.CFG) -> replicas.ProgramGroup:
-    (group,) = replicas.group([dataclasses.replace(cfg, seed=k) for k in range(num)])
+    (group,) = replicas.group_configs([dataclasses.replace(cfg, seed=k) for k in range(num)])
     return group
 
 
@@ -109,12 +109,11 @@ def assert_close(a: Any, b: Any, rtol: float, atol: float = 1e-6) -> None:
 
 
 def test_replicas_are_the_runs_of_train():
-    """Claim: each replica is the run that `train` makes of its seed and settings, to
-    rounding, also where hyper-parameters are traced, every one of
-    them."""
+    """Claim: each replica is the run that `train` makes of its seed and settings, to rounding, also
+    where hyper-parameters are traced, every one of them."""
     assert OTHER.keys() == set(replicas.TRACED_HYPERPARAMS)
     configs = (PER, dataclasses.replace(step.replace_settings(PER, OTHER), seed=1))
-    (group,) = replicas.group(configs)
+    (group,) = replicas.group_configs(configs)
     assert group == (configs, replicas.TRACED_HYPERPARAMS)
     state, seen = _run(group)
     for k, cfg in enumerate(configs):
@@ -151,7 +150,7 @@ def test_parts_are_the_same_runs(differ: bool):
     configs = [dataclasses.replace(toys.CFG, seed=k) for k in range(6)]
     if differ:
         configs[3:] = [step.replace_settings(cfg, {"target.gamma": 0.1}) for cfg in configs[3:]]
-    (group,) = replicas.group(configs)
+    (group,) = replicas.group_configs(configs)
     wanted, seen = _run(group)
     program, each = toys.program(group.configs[0]), replicas.of_group(group)
     begun = state = replicas.init(program, each)
@@ -216,11 +215,11 @@ def test_settings_that_are_numbers_share_a_program():
         dataclasses.replace(smoke, learn=learn),
         dataclasses.replace(uniform, seed=3),
     ]
-    first, second = replicas.group(configs)
+    first, second = replicas.group_configs(configs)
     assert first == ((configs[0], configs[2]), ("learn.tau",))
     assert second == ((configs[1], configs[3]), ())
     vpg, reactive = (algorithms.configure(smoke, name) for name in ("vpg", "reactive"))
-    assert replicas.group([vpg, reactive])[0].hyperparams == ("target.gamma",)
+    assert replicas.group_configs([vpg, reactive])[0].hyperparams == ("target.gamma",)
 
 
 def test_seeds_alone_keep_their_constants():
@@ -233,7 +232,7 @@ def test_seeds_alone_keep_their_constants():
 def test_bounds_are_those_of_the_settings():
     """Claim: traced bounds of returns are those that each setting has by itself."""
     other = dataclasses.replace(toys.CFG, target=dataclasses.replace(toys.CFG.target, gamma=0.25))
-    (group,) = replicas.group([toys.CFG, other])
+    (group,) = replicas.group_configs([toys.CFG, other])
     each = replicas.of_group(group)
     wanted = np.array([toys.program(cfg).learner.bounds for cfg in (toys.CFG, other)])
     np.testing.assert_allclose(np.stack(each.hyperparams.return_bounds, axis=1), wanted, 1e-6)

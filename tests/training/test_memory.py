@@ -42,7 +42,9 @@ def test_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, runs: int):
     """Claim: rings larger than memory are refused; the capacity named fits, the next one does
     not."""
     monkeypatch.setattr(memory, "limit", lambda: 100 * 2**20)
-    with pytest.raises(ValueError, match=r"^replay\.capacity: .* GiB are needed") as caught:
+    with pytest.raises(
+        ValueError, match=r"^replay\.capacity: the replay takes .* GiB, there are"
+    ) as caught:
         memory.check(_smoke(replay={"capacity": 100_000}), runs)
     named = re.search(r"lower --replay.capacity from 100000 to (\d+) at most", str(caught.value))
     assert named

@@ -119,7 +119,7 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
     )
 
     def lowered(configs):
-        (group,) = replicas.group(configs)
+        (group,) = replicas.group_configs(configs)
         each = replicas.of_group(group)
         begun = replicas.init(program, each)
         return begun, replicas.compile_chunk(program, each, 6).lower(begun)
