@@ -39,7 +39,7 @@ def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None
     Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m; target [..., H, W] bool or
     None.
     """
-    maps = [height[..., None] / _HEIGHT_SCALE]
+    maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
     if colour is not None:
         mean, std = (jnp.broadcast_to(v, colour.shape) for v in (_COLOUR_MEAN, _COLOUR_STD))
         normalised = (colour - mean) / std
