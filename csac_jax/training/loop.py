@@ -219,7 +219,7 @@ def _check_finite(run_dir: Path, metrics: Any, step: int) -> None:
             )
             raise TrainingError(
                 f"{name} is not finite in the chunk that ended at step {step}; {kept}; "
-                "lower learn.learning_rate or learn.gradient_clip and train anew"
+                "lower learn.learning_rate and train again"
             )
 
 
