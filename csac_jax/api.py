@@ -224,6 +224,8 @@ def _layout(params: Any) -> Any:
 
 def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
     """Every combination of the values."""
+    for name in vary:
+        _checked(grid.kind_of, name)
     points = []
     for combination in itertools.product(*vary.values()):
         values = dict(zip(vary, combination, strict=True))

@@ -148,7 +148,7 @@ def train_step(
     # than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.learning_starts
     done = _updates_done(cfg, state.step)
-    learned, priority, losses = _learn(program, key_learn, done, state.learner, replay)
+    learned, priority, losses = _learn(program, key_learn, state.learner, replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, replay.priority)
 
@@ -191,18 +191,12 @@ def _result(action: Action, info: environment.Info) -> ActionResult:
     )
 
 
-def _updates_done(cfg: Config, step: jax.Array) -> jax.Array:
-    """Updates before training step `step` [] int32."""
-    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1  # step of the first updates
-    return jnp.maximum(step - first, 0) * cfg.learn.updates
-
-
 def _learn(
-    program: Program, key: jax.Array, done: jax.Array, state: Any, replay: ReplayState
+    program: Program, key: jax.Array, state: Any, replay: ReplayState, done: jax.Array
 ) -> tuple[Any, jax.Array, dict[str, jax.Array]]:
     """The updates, each on a batch of its own, then the end of the step on (part of) the last.
 
-    Args: done [] int32, updates before this step.
+    `done` [] int32 updates came before.
     """
     cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
@@ -230,6 +224,12 @@ def _learn(
         "q_mean": jnp.mean(info.q),
     }
     return state, priority, losses
+
+
+def _updates_done(cfg: Config, step: jax.Array) -> jax.Array:
+    """Updates [] int32 before training step `step` [] that were not dropped."""
+    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1
+    return jnp.maximum(step - first, 0) * cfg.learn.updates
 
 
 def _draw(
