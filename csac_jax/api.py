@@ -74,6 +74,8 @@ def train(
     cfg = backend.resolve(cfg)
     _checked(memory.check, cfg)
     folder = new_folder(f"{cfg.preset}-{cfg.seed}") if run_dir is None else Path(run_dir)
+    if resume:
+        loop.check_resumable(cfg, folder)
     start = starting(cfg, init)
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
@@ -159,7 +161,7 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
     """
     if source is None:
         return None
-    if _is_pretrained(cfg, source):
+    if isinstance(cfg.net, DenseNet121) and _is_weights(source):
         trunk = _checked(weights.read, cfg.net, Path(source))
         return lambda state: actor_critic.with_trunk(state, trunk)
     policy = policies.load(source)
@@ -175,7 +177,7 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
 
 def with_networks_of(cfg: Config, source: str | Path) -> Config:
     """The config with networks of the sizes of the policy `source`, see `train`'s `init`."""
-    if _is_pretrained(cfg, source):
+    if _is_weights(source):
         return cfg
     given = policies.load_config(source)
     learn = {"critics": given.learn.critics, "actor": given.learn.actor}
@@ -210,10 +212,10 @@ def _checked(call: Callable[..., Any], *args: Any) -> Any:
         raise SettingsError(str(error)) from None
 
 
-def _is_pretrained(cfg: Config, source: str | Path) -> bool:
+def _is_weights(source: str | Path) -> bool:
     """Whether `source` is a file of weights and no policy."""
-    named = source != "shipped" and Path(source).is_file()
-    return named and isinstance(cfg.net, DenseNet121) and not policy_file.is_policy(Path(source))
+    path = Path(source)
+    return source != "shipped" and path.is_file() and not policy_file.is_policy(path)
 
 
 def _layout(params: Any) -> Any:

@@ -42,6 +42,7 @@ A robot learns to push and grasp in clutter.
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 
+`--device cpu` or `--device gpu` says where JAX computes.
 `{PROGRAM} COMMAND --help` lists the options of a command; --version prints the version.
 """
 

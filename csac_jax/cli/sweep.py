@@ -62,7 +62,7 @@ class SweepOptions:
 def run(arguments: list[str]) -> int:
     """Trains all; returns the exit code."""
     if parsing.asks_short_help(arguments):
-        settings.print_help(SweepOptions, "sweep", EXAMPLES)
+        settings.print_help(SweepOptions, "sweep", EXAMPLES, arguments)
         return 0
     stop = signals.install()
     options, plan = read(arguments)

@@ -47,8 +47,9 @@ Engine = Callable[[Scene, jax.Array, Action], Any]  # scenes, heights [E, H, W] 
 
 def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind = "mjx") -> Config:
     """Scenes of `in_play` blocks in these slots, with contacts enough for ten."""
-    jitter = 0.0 if physics == "warp" else SceneConfig().mesh_size_jitter
-    scene = SceneConfig(slots=slots, min_blocks=in_play, mesh_size_jitter=jitter)
+    boxes, meshes = SceneConfig().size_jitter
+    jitter = (boxes, 0.0 if physics == "warp" else meshes)
+    scene = SceneConfig(slots=slots, min_blocks=in_play, size_jitter=jitter)
     sim = dataclasses.replace(TEN.sim, physics=physics)
     return dataclasses.replace(presets.get("quick"), scene=scene, sim=sim)
 

@@ -21,6 +21,7 @@ from csac_jax.agent import maps, policy
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.env import Env, State
+from csac_jax.nets import networks
 from csac_jax.runtime import provenance
 from csac_jax.sim.primitives import Action
 from experiments.bench._options import read
@@ -97,7 +98,7 @@ def _doubled(cfg: Config) -> Config:
 def soak(actions: int, scenes: int) -> dict[str, Any]:
     """At least `actions` random actions in `scenes` scenes side by side."""
     cfg = pile_config(TEN.scene.slots, len(TEN.scene.slots))
-    env, frames = environment.make_env(cfg), maps.frames(cfg)
+    env, frames = environment.make_env(cfg), maps.frames(cfg, networks.make(cfg.net))
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, scenes))
 

@@ -31,12 +31,11 @@ import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, policy, rewards
-from csac_jax.agent.actor_critic import Transition
+from csac_jax.agent import actor_critic, policy
+from csac_jax.agent.learner import Transition
 from csac_jax.cli import parsing
 from csac_jax.cli.errors import BadArgumentsError
 from csac_jax.config import Config, PhysicsKind
-from csac_jax.constants import CHANGE_AREA, Primitive
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring
 from csac_jax.runtime import cache, compiler, provenance
@@ -105,22 +104,17 @@ def _compile_together(programs: dict[str, tuple[Any, tuple[Any, ...]]]) -> dict[
 
 def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable[[], Any]]:
     """The stages of `train_step`, each a call of a program of its own."""
-    cfg, env, learner = program.cfg, program.env, program.learner
+    cfg, env, parts = program.cfg, program.env, program.learner.parts
     scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
     keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
     choose = jax.vmap(policy.act, (0, None, 0, 0, None))
 
     def act(keys: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
-        return choose(keys, learner, maps, steps_without_change, jnp.int32(0))
+        return choose(keys, parts, maps, steps_without_change, jnp.int32(0))
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
-        pushed = action.primitive == Primitive.PUSH
-        phi = step._around(learner, nets.target, before.obs, after.obs, pushed)
-        info, changed = after.info, after.info.moved > CHANGE_AREA
-        result = rewards.ActionResult(
-            action.primitive, info.outcome, info.distance, *phi, changed, info.blocks_lost
-        )
-        return jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
+        result = step._result(action, after.info)
+        return program.learner.reward(cfg.reward, nets, before.obs, after.obs, result)[0]
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
@@ -135,12 +129,14 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
-        "look": jit(lambda params, obs: actor_critic.look(learner, params, obs)),
+        "look": jit(lambda params, obs: actor_critic.dense_maps(parts, params, obs)),
         "act": jax.jit(act),
         "simulate": jax.jit(jax.vmap(env.step)),
         "reward": jit(reward),
         "remember": jax.jit(remember, donate_argnums=0),
-        "learn": jit(lambda key, nets, replay: step._learn(program, key, nets, replay)),
+        "learn": jit(
+            lambda key, nets, replay: step._learn(program, key, nets, replay, nets.updates)
+        ),
         "replace": jax.jit(replace),
     }
     maps = jax.eval_shape(stages["look"], nets.online, scenes.obs)
@@ -187,22 +183,22 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 def _learning(program: step.Program, nets: Any, replay: Any) -> dict[str, Callable[[], Any]]:
     """What learning is made of, each a call of a program of its own; a call of each but
     `update_actor` is an update."""
-    cfg, learner = program.cfg, program.learner
+    cfg, parts = program.cfg, program.learner.parts
     key, keys = jax.random.key(3), jax.random.split(jax.random.key(4), cfg.learn.batch)
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
 
     def next_value(nets: Any, batch: Transition) -> jax.Array:
-        maps = actor_critic.look(learner, nets.target, heightmap.unpack(batch.next_obs))
-        return jax.vmap(actor_critic.next_value, (None, 0, 0))(learner, keys, maps)
+        maps = actor_critic.dense_maps(parts, nets.target, heightmap.unpack(batch.next_obs))
+        return jax.vmap(actor_critic.next_value, (None, 0, 0))(parts, keys, maps)
 
     draw = jit(
         lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
     )
     value = jit(next_value)
     critic = jit(
-        lambda nets, batch, weights: actor_critic.update_critic(key, learner, nets, batch, weights)
+        lambda nets, batch, weights: actor_critic.update_critic(key, parts, nets, batch, weights)
     )
-    actor = jit(lambda nets, obs: actor_critic.update_actor(learner, nets, heightmap.unpack(obs)))
+    actor = jit(lambda nets, obs: actor_critic.update_actor(parts, nets, heightmap.unpack(obs)))
     _, weights, batch = draw(replay)
     part = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
     return {
@@ -372,7 +368,7 @@ def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Confi
     if physics is None:
         physics = cfg.sim.physics if parsing.value_of(flags, "--sim.physics") else "auto"
     if physics == "warp":
-        cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, mesh_size_jitter=0.0))
+        cfg = cfg.change(scene={"size_jitter": (cfg.scene.size_jitter[0], 0.0)})
     return backend.resolve(
         dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=physics))
     )

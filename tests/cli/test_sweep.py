@@ -46,10 +46,10 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("", "sweep: give a preset first, one of: smoke, quick"),
         ("smoke --seeds 0", "--seeds: at least 1"),
         ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
+        ("smok", "unknown preset 'smok'; did you mean smoke?"),
         (
-            "smoke --net.kind densenet121 --net.norm batch --net.margin 0 "
-            "--net.weights none.safetensors",
-            "net.weights: none.safetensors cannot be read as .safetensors",
+            "smoke --vary replay.sampler=uniform,beta --replay.end 1 4",
+            "--replay.end: --replay.sampler uniform has no such setting",
         ),
         (
             "smoke --vary learn.tua=0.1",
@@ -57,7 +57,7 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ),
         ("smoke --vary learn.tau=", "--vary learn.tau=: give a setting and its values"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
-        ("smoke --vary learn.tau=0.1,2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("smoke --vary learn.tau=0.1,2", "learn.tau: must be above 0, at most 1, not 2.0"),
         ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
         ("smoke --vary learn.tau=0.1,0.10", "--vary: two settings have the same values"),
         ("smoke --devices 4096", "--devices: 4096 asked for, there are "),
@@ -141,7 +141,7 @@ def test_settings_reach_their_configs():
 
 def test_plan_survives_its_file(tmp_path: Path):
     """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
-    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
+    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.end=1:4,1:12"])
     (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
     assert command.read(["--resume", str(tmp_path)])[1] == plan
 
@@ -152,7 +152,7 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     resumed, it ends with 0 and its results. A small step stands in for the learner's."""
     monkeypatch.setattr(sweep, "run", RUN)
     for name, toy in (
-        ("make", toys.program),
+        ("make", lambda cfg, **_: toys.program(cfg)),
         ("init_state", toys.init_state),
         ("train_step", toys.train_step),
     ):
