@@ -7,7 +7,7 @@ from typing import NoReturn
 
 from csac_jax.cli import settings
 from csac_jax.cli.errors import BadArgumentsError
-from csac_jax.config import Algo, Config
+from csac_jax.config import Config
 
 
 class Parser(argparse.ArgumentParser):
@@ -38,10 +38,7 @@ class _Run:
     """A preset's settings, as `csac-jax train` takes them."""
 
     seed: int = 0
-    algo: Algo = "csac_beta"
-
-
-_SETTINGS = settings.with_sections(_Run)
+    algo: str = "csac_beta"
 
 
 def split(parser: Parser, arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
@@ -55,6 +52,6 @@ def config(name: str, preset: str, flags: Sequence[str]) -> Config:
     """The preset with settings as `csac-jax train` takes them, for the benchmark `name`. Raises
     BadArgumentsError."""
     try:
-        return settings.parse(_SETTINGS, f"bench {name}", settings.preset(preset, flags), flags)[1]
+        return settings.parse(_Run, f"bench {name}", settings.preset(preset, flags), flags)[1]
     except BadArgumentsError as error:
         raise BadArgumentsError(f"bench {name}: {error}") from None

@@ -13,7 +13,7 @@ import importlib.util
 import json
 import math
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +23,18 @@ from csac_jax import presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.errors import BadArgumentsError
-from csac_jax.config import DENSENET_STRIDE, Config, HeightmapConfig, NetConfig
+from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
 from csac_jax.runtime import compiler, provenance
 from csac_jax.training import step
 from csac_jax.vision.heightmap import Observation
 from experiments.bench._options import read
 from experiments.bench._timing import medians
+
+
+class FineDenseNet(DenseNet121):
+    """DenseNet-121 whose maps are as fine as the height map."""
+
+    output_stride: ClassVar[int] = 1
 
 
 def _canvas(pixels: int, multiple: int) -> int:
@@ -44,8 +50,8 @@ def _densenet(pixels: int, zoom: int) -> Config:
     """The preset `paper` with maps of `pixels` cells, as fine as its height map."""
     paper = presets.paper()
     try:
-        margin = _canvas(pixels, max(DENSENET_STRIDE // zoom, 1)) / pixels - 1.0
-        net = dataclasses.replace(paper.net, margin=margin, zoom=zoom, output_stride=1)
+        margin = _canvas(pixels, max(DenseNet121.STRIDE // zoom, 1)) / pixels - 1.0
+        net = FineDenseNet(**dataclasses.asdict(paper.net) | {"margin": margin, "zoom": zoom})
         return dataclasses.replace(paper, heightmap=HeightmapConfig(size=pixels), net=net)
     except ValueError as error:
         raise BadArgumentsError(f"bench act: {error}") from None
@@ -80,20 +86,22 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     params, obs = _random(abstract.online), _observations(cfg.heightmap.size, states)
     begun = time.perf_counter()
     jitted = jax.jit(
-        lambda params, obs: actor_critic.look(learner, params, obs).q,
+        lambda params, obs: actor_critic.dense_maps(learner, params, obs).q,
         compiler_options=compiler.options(cfg),
     )
-    look = jitted.lower(params, obs).compile()
+    dense_maps = jitted.lower(params, obs).compile()
     compiled = time.perf_counter() - begun
-    seconds = medians({"look": lambda: look(params, obs)}, repeats)["look"]
+    seconds = medians({"maps": lambda: dense_maps(params, obs)}, repeats)["maps"]
+    memory = dense_maps.memory_analysis()
+    assert memory is not None
     return {
         "states": states,
         "pixels_of_a_pass": learner.frames.tables.canvas
-        * (cfg.net.zoom if cfg.net.kind == "densenet121" else 1),
-        "maps": list(look.out_info.shape),
+        * (cfg.net.zoom if isinstance(cfg.net, DenseNet121) else 1),
+        "maps": list(dense_maps.out_info.shape),
         "seconds_per_state": seconds / states,
         "compile_seconds": round(compiled, 1),
-        "temporary_bytes": look.memory_analysis().temp_size_in_bytes,
+        "temporary_bytes": memory.temp_size_in_bytes,
     }
 
 
@@ -107,7 +115,9 @@ def _update_memory(learner: ActorCritic) -> int:
     )
     update = jax.jit(lambda *given: actor_critic.update_critic(jax.random.key(0), learner, *given))
     compiled = update.lower(state, batch, jax.ShapeDtypeStruct((size,), jnp.float32)).compile()
-    return compiled.memory_analysis().temp_size_in_bytes
+    memory = compiled.memory_analysis()
+    assert memory is not None
+    return memory.temp_size_in_bytes
 
 
 def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
@@ -167,7 +177,7 @@ def _torch_trunk(layers: tuple[int, ...], growth: int) -> Any:
     return nn.Sequential(*parts, nn.BatchNorm2d(channels))
 
 
-def _vpg(net: NetConfig, pixels: int, repeats: int) -> dict[str, Any]:
+def _vpg(net: DenseNet121, pixels: int, repeats: int) -> dict[str, Any]:
     """Time of the Q maps of one state as VPG makes them, in PyTorch; float32, PyTorch's
     defaults."""
     if importlib.util.find_spec("torch") is None:
@@ -177,7 +187,7 @@ def _vpg(net: NetConfig, pixels: int, repeats: int) -> dict[str, Any]:
     from torch.nn import functional
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    side = math.ceil(2.0 * math.sqrt(2.0) * pixels / DENSENET_STRIDE) * DENSENET_STRIDE
+    side = math.ceil(2.0 * math.sqrt(2.0) * pixels / DenseNet121.STRIDE) * DenseNet121.STRIDE
     trunks = [
         [_torch_trunk(net.block_layers, net.block_growth) for _ in range(2)] for _ in range(2)
     ]
@@ -234,13 +244,14 @@ def main(arguments: list[str]) -> None:
     pixels, repeats = options["pixels"], options["repeats"]
     cfg = _densenet(pixels, options["zoom"])
     ours = [_ours(cfg, states, repeats) for states in (1, options["states"])]
+    assert isinstance(cfg.net, DenseNet121)
     vpg = _vpg(cfg.net, pixels, min(repeats, 3))
     ratios = (
         [vpg["seconds_per_state"] / one["seconds_per_state"] for one in ours]
         if "missing" not in vpg
         else None
     )
-    nets = {"default": NetConfig(), "quick": presets.quick().net, "fast": presets.fast().net}
+    nets = {"default": SmallNet(), "quick": presets.quick().net, "fast": presets.fast().net}
     result = {
         "options": options,
         "densenet121": ours,

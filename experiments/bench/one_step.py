@@ -47,7 +47,7 @@ def record(bench: Bench, count: int) -> list[State]:
     cfg, world = bench.cfg, bench.world
     settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, STREAM, SCENES)
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(count) % SCENES], settled)
-    height = bench.look(scenes)
+    height = bench.heights(scenes)
     pushes = bench.push(jax.random.split(jax.random.key(0), count), scenes)
     grasps = bench.oracle(scenes, height)
     odd = np.arange(count) // SCENES % 2 == 1
@@ -76,8 +76,9 @@ def _by_mjx(
     bench: Bench, states: list[State], contacts: bool, effort: tuple[int, int]
 ) -> np.ndarray:
     """Positions [2, S, bodies, 3] m of all bodies, before and after a step."""
-    sim = dataclasses.replace(bench.cfg.sim, iterations=effort[0], line_search=effort[1])
+    sim = bench.cfg.sim
     world = model.build(bench.cfg.scene, sim)
+    world.model.opt.iterations, world.model.opt.ls_iterations = effort
     if not contacts:
         world.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     physics = mjx_physics.make(world, sim)

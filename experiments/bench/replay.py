@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.cli.errors import BadArgumentsError
-from csac_jax.config import ReplayConfig
+from csac_jax.config import BetaReplay, PrioritisedReplay, ReplayConfig, UniformReplay
 from csac_jax.replay import ring, samplers
 from csac_jax.runtime import provenance
 
@@ -42,17 +42,17 @@ def _new_errors(slots: jax.Array, items: Any, weights: jax.Array) -> jax.Array:
     return noise + 0.0 * (weights + items["reward"] + jnp.sum(items["obs"], axis=-1))
 
 
-def _ours(sampler: Any, capacity: int) -> tuple[Any, Step]:
+def _ours(cfg: ReplayConfig) -> tuple[Any, Step]:
     """A full ring and its step."""
-    cfg = ReplayConfig(capacity=capacity, sampler=sampler)
-    state = ring.init(cfg, ITEM)
+    sampler, capacity = samplers.make(cfg), cfg.capacity
+    state = ring.init(sampler.init(capacity), ITEM).replace(size=jnp.int32(capacity))
     errors = jnp.exp(jax.random.normal(jax.random.key(0), (capacity,)))
-    state = state.replace(size=jnp.int32(capacity), priority=samplers.priority(cfg, errors))
+    state = sampler.update(state, jnp.arange(capacity), errors)
 
     def step(state: ring.ReplayState, key: jax.Array) -> ring.ReplayState:
-        slots, weights = samplers.sample(key, cfg, state, jnp.float32(0.5), BATCH)
+        slots, weights = sampler.sample(key, state, jnp.float32(0.5), BATCH)
         errors = _new_errors(slots, ring.gather(state, slots), weights)
-        return ring.set_priorities(state, slots, samplers.priority(cfg, errors))
+        return sampler.update(state, slots, errors)
 
     return state, step
 
@@ -61,8 +61,8 @@ def _flashbax(capacity: int) -> tuple[Any, Step]:
     """The same by flashbax, which leaves weights and the floor to its user."""
     import flashbax
 
-    cfg = ReplayConfig()
-    exponent = 0.5 * (cfg.is_beta_start + cfg.is_beta_end)
+    cfg = PrioritisedReplay()
+    exponent = 0.5 * sum(cfg.is_beta)
     buffer = flashbax.make_prioritised_item_buffer(
         max_length=capacity,
         min_length=1,
@@ -112,9 +112,9 @@ def _timer(state: Any, step: Step, steps: int) -> Callable[[], float]:
 def measure(capacity: int) -> dict[str, Any]:
     """Median seconds per step for one capacity."""
     timers = {
-        "uniform": _timer(*_ours("uniform", capacity), STEPS),
-        "prioritised": _timer(*_ours("prioritised", capacity), STEPS),
-        "beta": _timer(*_ours("beta", capacity), max(SORTED // capacity, 1)),
+        "uniform": _timer(*_ours(UniformReplay(capacity=capacity)), STEPS),
+        "prioritised": _timer(*_ours(PrioritisedReplay(capacity=capacity)), STEPS),
+        "beta": _timer(*_ours(BetaReplay(capacity=capacity)), max(SORTED // capacity, 1)),
         "flashbax": _timer(*_flashbax(capacity), STEPS),
     }
     seconds: dict[str, list[float]] = {name: [] for name in timers}
@@ -138,8 +138,8 @@ def _exponents(arguments: list[str]) -> range:
             "bench replay: give two exponents of 2, the smallest and the largest capacity, or none"
         )
     smallest, largest = map(int, arguments)
-    if not 1 <= smallest <= largest <= 24:
-        raise BadArgumentsError("bench replay: exponents must lie in 1 .. 24, the smaller first")
+    if not BATCH <= 2**smallest <= 2**largest <= 2**24:
+        raise BadArgumentsError("bench replay: exponents must lie in 6 .. 24, the smaller first")
     return range(smallest, largest + 1)
 
 

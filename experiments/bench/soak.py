@@ -21,6 +21,7 @@ from csac_jax.agent import maps, policy
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.env import Env, State
+from csac_jax.nets import networks
 from csac_jax.runtime import provenance
 from csac_jax.sim.primitives import Action
 from experiments.bench._options import read
@@ -37,7 +38,7 @@ class Tally:
     actions: jax.Array
     physics_diverged: jax.Array  # scenes that were quarantined
     not_finite: jax.Array  # NaN or infinity in a state that counts as healthy
-    unaccounted: jax.Array  # actions after which in play + cleared + left is not what it was
+    unaccounted: jax.Array  # actions after which in play + cleared + lost is not what it was
     cleared: jax.Array
     blocks_lost: jax.Array
     contact_overflow: jax.Array  # substeps with every contact slot in use
@@ -97,7 +98,7 @@ def _doubled(cfg: Config) -> Config:
 def soak(actions: int, scenes: int) -> dict[str, Any]:
     """At least `actions` random actions in `scenes` scenes side by side."""
     cfg = pile_config(TEN.scene.slots, len(TEN.scene.slots))
-    env, frames = environment.make_env(cfg), maps.frames(cfg)
+    env, frames = environment.make_env(cfg), maps.frames(cfg, networks.make(cfg.net))
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, scenes))
 
