@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,21 @@ from csac_jax.env import AutoResetEnv, Env, State, make_env
 from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, layout, sources
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import auto, oracle
+from csac_jax.sim import backend, oracle
 from csac_jax.sim.primitives import Action
 
 pytestmark = pytest.mark.mjx
 
+
+class ShortTask(TaskConfig):
+    """An episode is cut off after three actions without visible change."""
+
+    max_steps_without_change: ClassVar[int] = 3
+
+
 CONFIG = Config(
     scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=16, settle_time=1.5),
-    task=TaskConfig(max_actions=6, max_steps_without_change=3),
+    task=ShortTask(max_actions=6),
 )
 SCENES = 8
 BARE = (0.15, 0.15, 0.0)  # x, y and yaw of a place where nothing lies
@@ -158,7 +165,7 @@ def stepped(lab: Lab) -> State:
     )
 
 
-_CASES = {  # the cube's place, actions and steps_without_change actions so far, the action
+_CASES = {  # the cube's place, actions and steps without change so far, the action
     "last chance": ((0.0, 0.0), 5, 2, Primitive.GRASP, (0.01, 0.0, 0.0)),
     "cap": ((0.0, 0.0), 5, 0, Primitive.GRASP, BARE),
     "steps_without_change": ((0.0, 0.0), 2, 2, Primitive.GRASP, BARE),
@@ -289,15 +296,15 @@ def test_no_change_cap_truncates(state_of):
 
 
 def test_episode_goes_on(state_of):
-    """Claim: below both caps the episode goes on, and an action without visible change counts as
-    steps_without_change."""
+    """Claim: below both caps the episode goes on, and an action without visible change is
+    counted."""
     state = state_of("on")
     assert (state.done, state.actions, state.steps_without_change) == (False, 1, 2)
 
 
 def test_visible_change_ends_the_count_without_change(state_of):
-    """Claim: an action that moves a block more than CHANGE_AREA resets the count of
-    steps_without_change."""
+    """Claim: an action that moves a block more than CHANGE_AREA resets the count of actions
+    without change."""
     state = state_of("moved")
     assert state.info.moved > CHANGE_AREA
     assert (state.done, state.steps_without_change, state.reward) == (False, 0, 0.0)
@@ -436,8 +443,8 @@ _ENTRIES = ("position", "quaternion", "velocity", "half_size", "density", "frict
     ],
 )
 def test_failed_physics_stays_in_its_scene(lab: Lab, where: str, value: float):
-    """Claim: NaN, infinity or 1e6 in one scene marks that scene physics_diverged and truncates it;
-    the others' results are the same, bit for bit. What cannot be a scene is replaced by an empty
+    """Claim: NaN, infinity or 1e6 in one scene marks that scene as diverged and truncates it; the
+    others' results are the same, bit for bit. What cannot be a scene is replaced by an empty
     one; a sound one stays as it was."""
     state = lab.reset(jax.random.split(jax.random.key(4), SCENES))
     action, sick = lab.oracle(state), 2
@@ -447,24 +454,24 @@ def test_failed_physics_stays_in_its_scene(lab: Lab, where: str, value: float):
     assert not good.info.physics_diverged.any()
     for index in range(SCENES):
         assert (_leaves(_at(good, index)) == _leaves(_at(bad, index))) == (index != sick)
-    physics_diverged = _at(bad, sick)
+    diverged = _at(bad, sick)
     assert (
-        physics_diverged.truncated,
-        physics_diverged.terminated,
-        physics_diverged.reward,
-        physics_diverged.info.cleared,
-        physics_diverged.info.blocks_lost,
+        diverged.truncated,
+        diverged.terminated,
+        diverged.reward,
+        diverged.info.cleared,
+        diverged.info.blocks_lost,
     ) == (True, False, 0.0, 0, 0)
-    for leaf in jax.tree.leaves((physics_diverged.scene, physics_diverged.obs)):
+    for leaf in jax.tree.leaves((diverged.scene, diverged.obs)):
         assert np.isfinite(leaf).all()
     expected = (
         _at(state.scene, sick) if where == "action.pose" else layout.parked(CONFIG.scene.slots)
     )
-    jax.tree.map(np.testing.assert_array_equal, physics_diverged.scene, expected)
+    jax.tree.map(np.testing.assert_array_equal, diverged.scene, expected)
 
 
 def test_target_that_is_no_slot_counts_as_divergence(lab: Lab):
-    """Claim: a target beyond the slots makes a scene physics_diverged; it does not pass for a table
+    """Claim: a scene whose target is beyond the slots has diverged; it does not pass for a table
     cleared of its target."""
     scene = _stack(*[_cube(0.0, 0.0)] * SCENES)
     wild = dataclasses.replace(
@@ -591,5 +598,5 @@ def test_make_env_chooses_physics(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sources, "scenes", lambda *_: None)
     sim = dataclasses.replace(CONFIG.sim, physics="auto")
     env = make_env(dataclasses.replace(CONFIG, sim=sim))
-    assert env.cfg.sim == auto.resolve(dataclasses.replace(CONFIG, sim=sim)).sim
+    assert env.cfg.sim == backend.resolve(dataclasses.replace(CONFIG, sim=sim)).sim
     assert env.cfg.sim.physics != "auto"

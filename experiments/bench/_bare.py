@@ -14,6 +14,7 @@ from csac_jax.scene.layout import Scene
 from csac_jax.sim import mjx_physics, primitives, robot
 from csac_jax.sim.c_physics import CPhysics
 from csac_jax.sim.mjx_physics import MjxPhysics
+from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action
 from csac_jax.sim.quiet_mjx import mjx
 from csac_jax.sim.robot import JointTrajectory
@@ -29,16 +30,15 @@ def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> Joint
     return jax.jit(jax.vmap(joints))(height, actions)
 
 
-def loop(
-    physics: MjxPhysics | CPhysics, scenes: Scene, joints: JointTrajectory
-) -> Callable[[], Any]:
-    """As many plain steps as an action has, of scenes and joints with leaves [E, ...]; a call runs
-    them all."""
-    return (
-        _mjx(physics, scenes, joints)
-        if isinstance(physics, MjxPhysics)
-        else _c(physics, scenes, joints)
-    )
+def loop(physics: Physics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
+    """As many plain steps as an action has, of scenes and joints with leaves [E, ...].
+
+    A call runs them all.
+    """
+    if isinstance(physics, MjxPhysics):
+        return _mjx(physics, scenes, joints)
+    assert isinstance(physics, CPhysics)
+    return _c(physics, scenes, joints)
 
 
 def _mjx(physics: MjxPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:

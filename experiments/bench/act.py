@@ -23,7 +23,7 @@ from csac_jax import presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.errors import BadArgumentsError
-from csac_jax.config import Config, DenseNet121, HeightmapConfig, SmallNet
+from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
 from csac_jax.runtime import compiler, provenance
 from csac_jax.training import step
 from csac_jax.vision.heightmap import Observation
@@ -31,8 +31,8 @@ from experiments.bench._options import read
 from experiments.bench._timing import medians
 
 
-class Fine(DenseNet121):
-    """DenseNet-121 with maps as fine as its input."""
+class FineDenseNet(DenseNet121):
+    """DenseNet-121 whose maps are as fine as the height map."""
 
     output_stride: ClassVar[int] = 1
 
@@ -50,8 +50,8 @@ def _densenet(pixels: int, zoom: int) -> Config:
     """The preset `paper` with maps of `pixels` cells, as fine as its height map."""
     paper = presets.paper()
     try:
-        margin = _canvas(pixels, max(Fine.STRIDE // zoom, 1)) / pixels - 1.0
-        net = Fine(norm="batch", head=paper.net.head, margin=margin, zoom=zoom)
+        margin = _canvas(pixels, max(DenseNet121.STRIDE // zoom, 1)) / pixels - 1.0
+        net = FineDenseNet(**dataclasses.asdict(paper.net) | {"margin": margin, "zoom": zoom})
         return dataclasses.replace(paper, heightmap=HeightmapConfig(size=pixels), net=net)
     except ValueError as error:
         raise BadArgumentsError(f"bench act: {error}") from None
@@ -89,17 +89,19 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
         lambda params, obs: actor_critic.dense_maps(learner, params, obs).q,
         compiler_options=compiler.options(cfg),
     )
-    look = jitted.lower(params, obs).compile()
+    dense_maps = jitted.lower(params, obs).compile()
     compiled = time.perf_counter() - begun
-    seconds = medians({"look": lambda: look(params, obs)}, repeats)["look"]
+    seconds = medians({"maps": lambda: dense_maps(params, obs)}, repeats)["maps"]
+    memory = dense_maps.memory_analysis()
+    assert memory is not None
     return {
         "states": states,
         "pixels_of_a_pass": learner.frames.tables.canvas
-        * (cfg.net.zoom if cfg.net.kind == "densenet121" else 1),
-        "maps": list(look.out_info.shape),
+        * (cfg.net.zoom if isinstance(cfg.net, DenseNet121) else 1),
+        "maps": list(dense_maps.out_info.shape),
         "seconds_per_state": seconds / states,
         "compile_seconds": round(compiled, 1),
-        "temporary_bytes": look.memory_analysis().temp_size_in_bytes,
+        "temporary_bytes": memory.temp_size_in_bytes,
     }
 
 
@@ -113,10 +115,12 @@ def _update_memory(learner: ActorCritic) -> int:
     )
     update = jax.jit(lambda *given: actor_critic.update_critic(jax.random.key(0), learner, *given))
     compiled = update.lower(state, batch, jax.ShapeDtypeStruct((size,), jnp.float32)).compile()
-    return compiled.memory_analysis().temp_size_in_bytes
+    memory = compiled.memory_analysis()
+    assert memory is not None
+    return memory.temp_size_in_bytes
 
 
-def _small(net: SmallNet, states: int, repeats: int) -> dict[str, Any]:
+def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
     """A small net with the map and the batch of `quick`."""
     cfg = dataclasses.replace(presets.quick(), net=net)
     learner = actor_critic.make(cfg)
@@ -183,7 +187,7 @@ def _vpg(net: DenseNet121, pixels: int, repeats: int) -> dict[str, Any]:
     from torch.nn import functional
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    side = math.ceil(2.0 * math.sqrt(2.0) * pixels / net.STRIDE) * net.STRIDE
+    side = math.ceil(2.0 * math.sqrt(2.0) * pixels / DenseNet121.STRIDE) * DenseNet121.STRIDE
     trunks = [
         [_torch_trunk(net.block_layers, net.block_growth) for _ in range(2)] for _ in range(2)
     ]
@@ -240,6 +244,7 @@ def main(arguments: list[str]) -> None:
     pixels, repeats = options["pixels"], options["repeats"]
     cfg = _densenet(pixels, options["zoom"])
     ours = [_ours(cfg, states, repeats) for states in (1, options["states"])]
+    assert isinstance(cfg.net, DenseNet121)
     vpg = _vpg(cfg.net, pixels, min(repeats, 3))
     ratios = (
         [vpg["seconds_per_state"] / one["seconds_per_state"] for one in ours]

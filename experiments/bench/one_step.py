@@ -47,7 +47,7 @@ def record(bench: Bench, count: int) -> list[State]:
     cfg, world = bench.cfg, bench.world
     settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, STREAM, SCENES)
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(count) % SCENES], settled)
-    height = bench.look(scenes)
+    height = bench.heights(scenes)
     pushes = bench.push(jax.random.split(jax.random.key(0), count), scenes)
     grasps = bench.oracle(scenes, height)
     odd = np.arange(count) // SCENES % 2 == 1

@@ -68,7 +68,7 @@ class Bench:
     def __init__(self, cfg: Config) -> None:
         self.cfg = cfg
         self.world = model.build(cfg.scene, cfg.sim)
-        self.look = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))
+        self.heights = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))
         plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
         self.oracle = jax.jit(jax.vmap(plan))
         self.push = jax.jit(jax.vmap(_push))
@@ -93,7 +93,7 @@ class Bench:
 
     def run(self, engines: dict[str, Engine], scenes: Scene, actions: Action) -> dict[str, Any]:
         """Results of each engine: ends [E, N, 3], outcomes, overflows and failures [E]."""
-        height = self.look(scenes)
+        height = self.heights(scenes)
         result = {}
         for name, engine in engines.items():
             after, trace, plan = jax.block_until_ready(engine(scenes, height, actions))
@@ -136,7 +136,7 @@ def piles(
     rows, engines = [], bench.engines | bench.references
     for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))
-        grasps = bench.oracle(scenes, bench.look(scenes))
+        grasps = bench.oracle(scenes, bench.heights(scenes))
         pushes = bench.push(keys, scenes)
         rows.append((scenes, *(bench.run(engines, scenes, act) for act in (grasps, pushes))))
     starts = np.concatenate([row[0].position for row in rows])
@@ -204,7 +204,7 @@ def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
     total, size = len(blocks.SHAPES) * poses, min(BATCH, poses)
     padded = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[: -total % size]]), scenes)
     runs = [
-        bench.run(bench.engines, batch, bench.oracle(batch, bench.look(batch)))
+        bench.run(bench.engines, batch, bench.oracle(batch, bench.heights(batch)))
         for batch in _batches(padded, size)
     ]
     lifted = {
@@ -242,8 +242,8 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
             in_play=np.arange(len(half)) == slot,
         )
         fields = jax.device_get(model.scene_fields(bench.world, dropped))
-        scene = pool.rest(bench.world, cfg.scene, cfg.heightmap.extent, dropped, fields)
-        at_rest += [scene] if scene is not None else []
+        ended = pool.rest(bench.world, cfg.scene, cfg.heightmap.extent, dropped, fields)
+        at_rest += [ended] if ended is not None else []
     return jax.tree.map(lambda *leaves: np.stack(leaves), *at_rest)
 
 

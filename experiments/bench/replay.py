@@ -44,10 +44,10 @@ def _new_errors(slots: jax.Array, items: Any, weights: jax.Array) -> jax.Array:
 
 def _ours(cfg: ReplayConfig) -> tuple[Any, Step]:
     """A full ring and its step."""
-    sampler = samplers.make(cfg)
-    state = ring.init(sampler.init(cfg.capacity), ITEM).replace(size=jnp.int32(cfg.capacity))
-    errors = jnp.exp(jax.random.normal(jax.random.key(0), (cfg.capacity,)))
-    state = sampler.update(state, jnp.arange(cfg.capacity), errors)
+    sampler, capacity = samplers.make(cfg), cfg.capacity
+    state = ring.init(sampler.init(capacity), ITEM).replace(size=jnp.int32(capacity))
+    errors = jnp.exp(jax.random.normal(jax.random.key(0), (capacity,)))
+    state = sampler.update(state, jnp.arange(capacity), errors)
 
     def step(state: ring.ReplayState, key: jax.Array) -> ring.ReplayState:
         slots, weights = sampler.sample(key, state, jnp.float32(0.5), BATCH)
@@ -138,8 +138,8 @@ def _exponents(arguments: list[str]) -> range:
             "bench replay: give two exponents of 2, the smallest and the largest capacity, or none"
         )
     smallest, largest = map(int, arguments)
-    if not 1 <= smallest <= largest <= 24:
-        raise BadArgumentsError("bench replay: exponents must lie in 1 .. 24, the smaller first")
+    if not BATCH <= 2**smallest <= 2**largest <= 2**24:
+        raise BadArgumentsError("bench replay: exponents must lie in 6 .. 24, the smaller first")
     return range(smallest, largest + 1)
 
 

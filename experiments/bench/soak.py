@@ -38,7 +38,7 @@ class Tally:
     actions: jax.Array
     physics_diverged: jax.Array  # scenes that were quarantined
     not_finite: jax.Array  # NaN or infinity in a state that counts as healthy
-    unaccounted: jax.Array  # actions after which in play + cleared + left is not what it was
+    unaccounted: jax.Array  # actions after which in play + cleared + lost is not what it was
     cleared: jax.Array
     blocks_lost: jax.Array
     contact_overflow: jax.Array  # substeps with every contact slot in use

@@ -17,7 +17,6 @@ the map, or transitions in the ring; contact caps grow with the blocks. On an ac
 import argparse
 import concurrent.futures
 import contextlib
-import dataclasses
 import functools
 import json
 import resource
@@ -32,6 +31,8 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from csac_jax import presets
 from csac_jax.agent import actor_critic, policy
+from csac_jax.agent.actor_critic import ActorCritic
+from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
 from csac_jax.cli import parsing
 from csac_jax.cli.errors import BadArgumentsError
@@ -49,7 +50,7 @@ from experiments.bench._timing import medians
 
 CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
 _PARTS = ("draw", "next_value", "update_critic", "update_actor")  # of learning
-_SEPARATE = ("look", "act", "simulate", "reward", "remember", "learn", "replace")
+_SEPARATE = ("dense_maps", "act", "simulate", "reward", "remember", "learn", "replace")
 
 
 def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, float]]:
@@ -104,7 +105,9 @@ def _compile_together(programs: dict[str, tuple[Any, tuple[Any, ...]]]) -> dict[
 
 def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable[[], Any]]:
     """The stages of `train_step`, each a call of a program of its own."""
-    cfg, env, parts = program.cfg, program.env, program.learner.parts
+    cfg, env, learner = program.cfg, program.env, program.learner
+    assert isinstance(learner, CSAC)
+    parts = learner.parts
     scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
     keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
     choose = jax.vmap(policy.act, (0, None, 0, 0, None))
@@ -114,12 +117,12 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         result = step._result(action, after.info)
-        return program.learner.reward(cfg.reward, nets, before.obs, after.obs, result)[0]
+        return learner.reward(cfg.reward, nets, before.obs, after.obs, result)[0]
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
-        seen = Transition(packed[0], action, jnp.zeros(num), packed[1], after.terminated)
-        return ring.add(replay, seen, ~after.info.physics_diverged)
+        transition = Transition(packed[0], action, jnp.zeros(num), packed[1], after.terminated)
+        return ring.add(replay, transition, ~after.info.physics_diverged)
 
     def replace(keys: jax.Array, after: Any) -> Any:
         fresh = jax.vmap(env.auto_reset)(keys, after)
@@ -129,21 +132,19 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
-        "look": jit(lambda params, obs: actor_critic.dense_maps(parts, params, obs)),
+        "dense_maps": jit(lambda params, obs: actor_critic.dense_maps(parts, params, obs)),
         "act": jax.jit(act),
         "simulate": jax.jit(jax.vmap(env.step)),
         "reward": jit(reward),
         "remember": jax.jit(remember, donate_argnums=0),
-        "learn": jit(
-            lambda key, nets, replay: step._learn(program, key, nets, replay, nets.updates)
-        ),
+        "learn": jit(lambda key, nets, replay: step._learn(program, key, nets, replay)),
         "replace": jax.jit(replace),
     }
-    maps = jax.eval_shape(stages["look"], nets.online, scenes.obs)
+    maps = jax.eval_shape(stages["dense_maps"], nets.online, scenes.obs)
     action = jax.eval_shape(stages["act"], keys, maps, scenes.steps_without_change)
     after = jax.eval_shape(stages["simulate"], scenes, action)
     shapes = {
-        "look": (nets.online, scenes.obs),
+        "dense_maps": (nets.online, scenes.obs),
         "act": (keys, maps, scenes.steps_without_change),
         "simulate": (scenes, action),
         "reward": (nets, scenes, action, after),
@@ -153,7 +154,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     }
     run = _compile_together({name: (stages[name], arguments) for name, arguments in shapes.items()})
 
-    maps = run["look"](nets.online, scenes.obs)
+    maps = run["dense_maps"](nets.online, scenes.obs)
     action = run["act"](keys, maps, scenes.steps_without_change)
     after = run["simulate"](scenes, action)
     replay = run["remember"](jax.tree.map(jnp.copy, state.replay), scenes, action, after)
@@ -165,7 +166,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         return replay.head
 
     calls: dict[str, Callable[[], Any]] = {
-        "look": lambda: run["look"](nets.online, scenes.obs),
+        "dense_maps": lambda: run["dense_maps"](nets.online, scenes.obs),
         "act": lambda: run["act"](keys, maps, scenes.steps_without_change),
         "simulate": lambda: run["simulate"](scenes, action),
         "reward": lambda: run["reward"](nets, scenes, action, after),
@@ -173,17 +174,19 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "learn": lambda: run["learn"](key, nets, filled),
         "replace": lambda: run["replace"](keys, after),
     }
-    calls |= _learning(program, nets, filled)
+    calls |= _learning(program, parts, nets, filled)
     calls["bare_loop"] = _bare.loop(
         env.physics, scenes.scene, _bare.joint_trajectories(cfg, scenes.obs.height, action)
     )
     return calls
 
 
-def _learning(program: step.Program, nets: Any, replay: Any) -> dict[str, Callable[[], Any]]:
+def _learning(
+    program: step.Program, parts: ActorCritic, nets: Any, replay: Any
+) -> dict[str, Callable[[], Any]]:
     """What learning is made of, each a call of a program of its own; a call of each but
     `update_actor` is an update."""
-    cfg, parts = program.cfg, program.learner.parts
+    cfg = program.cfg
     key, keys = jax.random.key(3), jax.random.split(jax.random.key(4), cfg.learn.batch)
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
 
@@ -200,12 +203,12 @@ def _learning(program: step.Program, nets: Any, replay: Any) -> dict[str, Callab
     )
     actor = jit(lambda nets, obs: actor_critic.update_actor(parts, nets, heightmap.unpack(obs)))
     _, weights, batch = draw(replay)
-    part = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
+    obs = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
     return {
         "draw": lambda: draw(replay),
         "next_value": lambda: value(nets, batch),
         "update_critic": lambda: critic(nets, batch, weights),
-        "update_actor": lambda: actor(nets, part),
+        "update_actor": lambda: actor(nets, obs),
     }
 
 
@@ -298,27 +301,21 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
 
 def _at(cfg: Config, curve: str, value: int) -> Config:
     """The config with `value` scenes, blocks, cells along a side or transitions."""
-    scene, sim, train, replay = cfg.scene, cfg.sim, cfg.train, cfg.replay
+    scene, sim = cfg.scene, cfg.sim
     if curve == "scenes":
-        return dataclasses.replace(
-            cfg,
-            train=dataclasses.replace(train, scenes=value),
-            replay=dataclasses.replace(replay, capacity=max(replay.capacity, value)),
-        )
+        capacity = max(cfg.replay.capacity, value)
+        return cfg.change(train={"scenes": value}, replay={"capacity": capacity})
     if curve == "map":
-        return dataclasses.replace(cfg, heightmap=dataclasses.replace(cfg.heightmap, size=value))
+        return cfg.change(heightmap={"size": value})
     if curve == "capacity":
-        return dataclasses.replace(cfg, replay=dataclasses.replace(replay, capacity=value))
+        return cfg.change(replay={"capacity": value})
     share = value / len(scene.slots)
     slots = tuple(scene.slots[i % len(scene.slots)] for i in range(value))
-    return dataclasses.replace(
-        cfg,
-        scene=dataclasses.replace(scene, slots=slots, min_blocks=value, pool=min(scene.pool, 64)),
-        sim=dataclasses.replace(
-            sim,
-            geom_pairs=max(round(share * sim.geom_pairs), 4),
-            contacts=max(round(share * sim.contacts), 16),
-        ),
+    pairs = max(round(share * sim.geom_pairs), 4)
+    contacts = max(round(share * sim.contacts), 16)
+    return cfg.change(
+        scene={"slots": slots, "min_blocks": value, "pool": min(scene.pool, 64)},
+        sim={"geom_pairs": pairs, "contacts": contacts},
     )
 
 
@@ -369,9 +366,7 @@ def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Confi
         physics = cfg.sim.physics if parsing.value_of(flags, "--sim.physics") else "auto"
     if physics == "warp":
         cfg = cfg.change(scene={"size_jitter": (cfg.scene.size_jitter[0], 0.0)})
-    return backend.resolve(
-        dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=physics))
-    )
+    return backend.resolve(cfg.change(sim={"physics": physics}))
 
 
 def _values(smallest: int, largest: int) -> list[int]:

@@ -35,7 +35,7 @@ MANY = SceneConfig(
     ),
     min_blocks=5,
 )
-BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_jitter=0.25)
+BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_jitter=(0.25, 0.25))
 EXTENT = {
     MANY: HeightmapConfig().extent,
     BOXES: 2.0 * (arrange.RADIUS + 0.001),
@@ -53,7 +53,7 @@ class Drawn(NamedTuple):
     lowest: np.ndarray  # [P] m, of a corner
     overlap: np.ndarray  # [P] m, deepest contact
     distance: np.ndarray  # [P, N, N] m between blocks in play, FAR where farther or not in play
-    moved: np.ndarray  # [P] m, distance_cap that a block has moved after half a second
+    moved: np.ndarray  # [P] m, farthest that a block has moved after half a second
 
     def at(self, level: float) -> slice:
         """The scenes of this level."""
@@ -212,7 +212,7 @@ def _is(shape: np.ndarray) -> np.ndarray:
 
 
 def _sizes(cfg: SceneConfig) -> tuple[float, float]:
-    return 1.0 - cfg.size_jitter, 1.0 + cfg.size_jitter
+    return 1.0 - cfg.size_jitter[0], 1.0 + cfg.size_jitter[0]
 
 
 def test_mesh_blocks_of_one_kind_are_alike(drawn: Drawn):

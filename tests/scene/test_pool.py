@@ -1,8 +1,8 @@
 """Settled scenes in C MuJoCo, and their cache."""
 
-import dataclasses
 import stat
 from pathlib import Path
+from typing import ClassVar
 
 import jax
 import mujoco
@@ -191,7 +191,13 @@ def test_unwritable_cache_is_no_error(
 def test_hopeless_configuration_is_one_line(small: model.World):
     """Claim: a configuration whose blocks never come to rest ends with one line that names what to
     change."""
-    falling = dataclasses.replace(ONE, drop_height=1.0, settle_time=0.5)  # lands after 0.45 s
+
+    class HighDrop(SceneConfig):
+        """Blocks land after 0.45 s."""
+
+        drop_height: ClassVar[float] = 1.0
+
+    falling = HighDrop(slots=ONE.slots, min_blocks=ONE.min_blocks, settle_time=0.5)
     with pytest.raises(SceneError, match=r"scene\.settle_time") as error:
         pool.settled(small, falling, EXTENT, 0, 4)
     assert "\n" not in str(error.value)

@@ -13,13 +13,11 @@ from csac_jax.scene import model
 from csac_jax.sim import backend, physics, robot
 
 
-def _config(kind: PhysicsKind, mesh_size_jitter: float = 0.0, scenes: int = 256) -> Config:
+def _config(kind: PhysicsKind, mesh_jitter: float = 0.0, scenes: int = 256) -> Config:
     fast = presets.fast()
-    return dataclasses.replace(
-        fast,
-        scene=dataclasses.replace(fast.scene, mesh_size_jitter=mesh_size_jitter),
-        sim=dataclasses.replace(fast.sim, physics=kind),
-        train=dataclasses.replace(fast.train, scenes=scenes),
+    jitter = (fast.scene.size_jitter[0], mesh_jitter)
+    return fast.change(
+        scene={"size_jitter": jitter}, sim={"physics": kind}, train={"scenes": scenes}
     )
 
 
@@ -36,7 +34,7 @@ def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(
-    ("platform", "installed", "measured", "mesh_size_jitter", "scenes", "chosen"),
+    ("platform", "installed", "measured", "mesh_jitter", "scenes", "chosen"),
     [
         ("gpu", True, range(64, 5001), 0.0, 256, "warp"),
         ("cpu", True, range(64, 5001), 0.0, 256, "c"),
@@ -48,7 +46,7 @@ def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_choice(
-    monkeypatch: pytest.MonkeyPatch, platform, installed, measured, mesh_size_jitter, scenes, chosen
+    monkeypatch: pytest.MonkeyPatch, platform, installed, measured, mesh_jitter, scenes, chosen
 ):
     """Claim: `auto` is `c` on a CPU, `warp` where measured to be faster, on CUDA, installed, able
     to do the scene; else `mjx`, also on several devices."""
@@ -57,7 +55,7 @@ def test_choice(
         backend.importlib.util, "find_spec", lambda name: object() if installed else None
     )
     monkeypatch.setattr(backend, "WARP_SCENES", measured)
-    cfg = _config("auto", mesh_size_jitter, scenes)
+    cfg = _config("auto", mesh_jitter, scenes)
     assert backend.resolve(cfg) == dataclasses.replace(
         cfg, sim=dataclasses.replace(cfg.sim, physics=chosen)
     )

@@ -40,7 +40,7 @@ def _substeps() -> Substep:
     return Substep(touching, rise, gap, np.array([False, True, True, False]))
 
 
-CLOSES_AT_1 = dataclasses.replace(SimConfig(), grasp_phases=(1, 1, 2), push_phases=(1, 1, 2))
+CLOSES_AT_1 = dataclasses.replace(SimConfig(), grasp_phases=(1, 1, 2))
 
 
 def test_trace_by_hand():

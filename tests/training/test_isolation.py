@@ -108,7 +108,7 @@ def _entries(state: TrainState, part: str, leaf: str) -> int:
 
 
 def test_good_scenes_are_none_of_them_ill(chunk):
-    """Claim: with nothing amiss no scene is physics_diverged and every transition is stored."""
+    """Claim: with nothing amiss physics diverges in no scene and every transition is stored."""
     _, _, good = chunk
     assert not good.metrics.physics_diverged.any()
     assert good.state.replay.size == SCENES
@@ -135,7 +135,7 @@ def test_bad_entry_stays_in_its_scene(chunk):
 
 
 def test_block_out_of_place_stays_in_its_scene(chunk):
-    """Claim: a block marked as in play where it is parked makes its scene physics_diverged, one
+    """Claim: a block marked as in play where it is parked makes physics diverge there, one
     marked as parked where it lies is taken away; nothing changes elsewhere."""
     state, run, good = chunk
     seen = set()

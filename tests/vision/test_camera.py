@@ -49,12 +49,10 @@ def test_depth_agrees_with_opengl(tmp_path, make):
     """Claim: depths are those of MuJoCo's own renderer to 2 mm in every pixel two pixels off an
     edge or more."""
     model, data = make(np.random.default_rng(5))
-    eye = camera.make(CameraConfig(scale=0.5, position=(-0.7, -0.3, 0.6), look_at=(0.1, 0.0, 0.1)))
+    eye = camera.make(CameraConfig(position=(-0.7, -0.3, 0.6), look_at=(0.1, 0.0, 0.1)).scaled(0.5))
     expected = _opengl_depth(tmp_path, model, data, eye)
     picture = jax.device_get(_render(eye, mujoco_rays.read(model, data)))
-    depth = np.where(
-        picture.valid, picture.depth, expected.max()
-    )  # the renderer's distance_cap plane
+    depth = np.where(picture.valid, picture.depth, expected.max())  # the renderer's far plane
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(1.0 / depth, 2, mode="edge"), (5, 5))
     bend = np.abs(windows + windows[..., ::-1, ::-1] - 2.0 / depth[..., None, None]).max((2, 3))
     clear = bend < 0.01  # the inverse depth of a plane is linear in the image
@@ -85,8 +83,8 @@ def test_points_project_to_their_pixels(scale):
     """Claim: pixel -> point -> pixel is the identity at any depth and any scale, by the pinhole
     equation."""
     eye = camera.make(
-        CameraConfig(
-            scale=scale, focal=(600.0, 620.0), centre=(330.0, 236.0), position=(0.3, 0.4, 0.5)
+        CameraConfig(focal=(600.0, 620.0), centre=(330.0, 236.0), position=(0.3, 0.4, 0.5)).scaled(
+            scale
         )
     )
     depth = np.random.default_rng(0).uniform(0.2, 2.0, (eye.height, eye.width)).astype(np.float32)
@@ -110,7 +108,7 @@ def test_colours_are_flat_shaded():
     )
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    picture = _render(camera.make(CameraConfig(scale=0.1)), mujoco_rays.read(model, data))
+    picture = _render(camera.make(CameraConfig().scaled(0.1)), mujoco_rays.read(model, data))
     colour, valid = np.asarray(picture.colour), np.asarray(picture.valid)
     assert colour.shape == (48, 64, 3)
     np.testing.assert_allclose(colour[~valid], np.broadcast_to(shade.SKY, colour[~valid].shape))
@@ -126,13 +124,10 @@ def test_colours_are_flat_shaded():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"size": (320, 240)}, "camera.centre: .* another image size"),
+        ({"size": (320, 240)}, "camera.centre: .* give the camera.size"),
         ({"size": (640, 480), "centre": (159.5, 119.5)}, "camera.centre"),
         ({"focal": (80.0, 80.0)}, "camera.focal"),
         ({"focal": (618.0, 300.0)}, "camera.focal"),
-        ({"scale": 0.3331}, "camera.scale: .*whole"),
-        ({"scale": 0.0}, "camera.scale"),
-        ({"scale": 2.0}, "camera.scale"),
         ({"size": (8, 8), "centre": (3.5, 3.5)}, "camera.size"),
         ({"position": (0.0, 0.0, 0.7)}, "camera.position"),
     ],
@@ -142,4 +137,13 @@ def test_wrong_intrinsics_are_refused(change, message):
     in one line."""
     with pytest.raises(ValueError, match=message) as error:
         dataclasses.replace(CameraConfig(), **change)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("share", "message"), [(0.3331, "camera: .*whole"), (0.0, "camera.size")])
+def test_scaled_images_have_whole_pixels(share, message):
+    """Claim: a share of the image that is no image, or has parts of pixels, is refused in one
+    line."""
+    with pytest.raises(ValueError, match=message) as error:
+        CameraConfig().scaled(share)
     assert "\n" not in str(error.value)

@@ -11,7 +11,7 @@ from csac_jax.config import CameraConfig, HeightmapConfig
 from csac_jax.vision import camera, heightmap, observe, raycast
 
 CFG = HeightmapConfig(64, view="oblique")
-_EYE, _FINE = camera.make(CameraConfig(scale=0.25)), camera.make(CameraConfig(scale=0.5))
+_EYE, _FINE = (camera.make(CameraConfig().scaled(share)) for share in (0.25, 0.5))
 
 
 def _by_hand(

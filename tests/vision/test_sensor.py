@@ -18,13 +18,13 @@ from csac_jax.sim import outcome
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import camera, heightmap, observe, sensor
 
-ERRORS = SensorConfig(depth_floor=0.001, depth_square=0.0014, dropped=0.1, colour=0.05)
+ERRORS = SensorConfig(depth_noise=(0.001, 0.0014), dropped=0.1, colour=0.05)
 SMALL = HeightmapConfig(32)
 
 
 @pytest.mark.parametrize("distance", [0.3, 1.0, 2.0])
 def test_depth_errors_grow_with_the_square(distance):
-    """Claim: depths are normal about the true ones with sigma = depth_floor + depth_square d^2, and
+    """Claim: depths are normal about the true ones with sigma = floor + square d^2, and
     the stated share is dropped."""
     true = jnp.full((200, 200), distance)
     measured, kept = sensor.depth(jax.random.key(0), ERRORS, true)
@@ -36,7 +36,7 @@ def test_depth_errors_grow_with_the_square(distance):
 def test_the_camera_is_jittered():
     """Claim: place and orientation scatter about the believed ones with the stated standard
     deviations, as rotations."""
-    errors, eye = SensorConfig(position=0.01, rotation=0.02), camera.make(CameraConfig())
+    errors, eye = SensorConfig(pose_noise=(0.01, 0.02)), camera.make(CameraConfig())
     keys = jax.random.split(jax.random.key(1), 3000)
     real = jax.jit(jax.vmap(lambda key: sensor.pose(key, errors, eye)))(keys)
     shift = np.asarray(real.position) - np.asarray(eye.position)
@@ -79,7 +79,7 @@ class Still:
 
 
 def _env(**changes) -> Env:
-    cfg = dataclasses.replace(presets.smoke(), heightmap=SMALL, camera=CameraConfig(scale=0.1))
+    cfg = dataclasses.replace(presets.smoke(), heightmap=SMALL, camera=CameraConfig().scaled(0.1))
     return Env(dataclasses.replace(cfg, **changes), Still(), _scenes(cfg))
 
 
@@ -105,9 +105,7 @@ _PUSH = Action(primitive=jnp.int32(0), pose=jnp.array([0.15, 0.15, 0.0]))
     [
         (SMALL, ERRORS),
         pytest.param(
-            OBLIQUE,
-            dataclasses.replace(ERRORS, position=0.005, rotation=0.01),
-            marks=pytest.mark.slow,
+            OBLIQUE, dataclasses.replace(ERRORS, pose_noise=(0.005, 0.01)), marks=pytest.mark.slow
         ),
     ],
 )
@@ -131,7 +129,7 @@ def test_views_differ_from_step_to_step(view, errors):
 @pytest.mark.slow
 def test_orthographic_errors():
     """Claim: from above, heights err as depths do from VIEW_HEIGHT, and a dropped cell is empty."""
-    env = _env(sensor=dataclasses.replace(ERRORS, depth_square=0.01))
+    env = _env(sensor=dataclasses.replace(ERRORS, depth_noise=(0.001, 0.01)))
     scene = env._sample_scene(jax.random.key(0))
     noisy = jax.jit(jax.vmap(lambda key: observe.observe(env.cfg, scene, key)))
     views, true = noisy(jax.random.split(jax.random.key(3), 500)), _look(env, scene)
@@ -189,11 +187,8 @@ def test_an_episode_with_errors_needs_a_key():
     ("build", "message"),
     [
         (lambda: SensorConfig(dropped=1.0), "sensor.dropped"),
-        (lambda: SensorConfig(depth_square=-0.1), "sensor.depth_square"),
-        (
-            lambda: Config(sensor=SensorConfig(rotation=0.01)),
-            "sensor.position, sensor.rotation.*ortho",
-        ),
+        (lambda: SensorConfig(depth_noise=(0.0, -0.1)), "sensor.depth_noise"),
+        (lambda: Config(sensor=SensorConfig(pose_noise=(0.0, 0.01))), "sensor.pose_noise.*ortho"),
         (lambda: HeightmapConfig(view="side"), "heightmap.view"),
         (lambda: HeightmapConfig(size=60), "heightmap.size"),
         (lambda: dataclasses.replace(Config(), heightmap=HeightmapConfig(size=80)), "net.margin"),
