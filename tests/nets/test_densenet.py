@@ -13,10 +13,11 @@ import pytest
 
 os.environ.setdefault("KERAS_BACKEND", "jax")
 
-from csac_jax.config import NetConfig
+from csac_jax.config import DenseNet121
 from csac_jax.nets import densenet
+from tests.sections import with_constants
 
-TINY = NetConfig(kind="densenet121", block_layers=(1, 1, 1, 1), block_growth=4, head=8)
+TINY = with_constants(DenseNet121(block_layers=(1, 1, 1, 1), head=8), block_growth=4)
 PARAMETERS = 7_037_504  # of a trunk without the top, running statistics included
 KERAS = {"norm1": "0_bn", "conv1": "1_conv", "norm2": "1_bn", "conv2": "2_conv"}
 
@@ -89,7 +90,7 @@ def _scale(entry: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
     """Compares every module with Keras's in both modes of batch norm; returns how many outputs were
     compared."""
-    cfg = NetConfig(kind="densenet121", norm="batch", block_layers=block_layers)
+    cfg = DenseNet121(norm="batch", block_layers=block_layers)
     trunk = densenet.Trunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(4, size, size, 3)), jnp.float32)
@@ -184,7 +185,7 @@ def test_every_stage_of_densenet_121_is_kerass():
 def test_number_of_parameters():
     """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running
     statistics."""
-    trunk = densenet.Trunk(NetConfig(kind="densenet121", norm="batch"))
+    trunk = densenet.Trunk(DenseNet121(norm="batch"))
     blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
     variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
     sizes = {
@@ -199,14 +200,14 @@ def test_trunks_see_colour_height_and_mask():
     """Claim: a trunk each for colour, for height and for the mask, the latter two three times over;
     cells are repeated as far as the trunk does not double them itself."""
     maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
-    zoomed = NetConfig(kind="densenet121", zoom=4)
+    zoomed = DenseNet121(zoom=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
     assert seen.shape == (3, 2, 8, 8, 3)
     np.testing.assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
     for trunk, channel in ((1, 3), (2, 4)):
         for copy in range(3):
             np.testing.assert_array_equal(seen[trunk, :, ::2, 1::2, copy], maps[..., channel])
-    blind = NetConfig(kind="densenet121", colour=False)
+    blind = DenseNet121(colour=False)
     only = densenet._trunk_inputs(blind, maps[..., 3:4])
     np.testing.assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
 
@@ -259,7 +260,7 @@ def test_trunks_have_weights_of_their_own():
 def test_head_upsamples(zoom: int, output_stride: int, factor: int):
     """Claim: maps have the resolution that `output_stride` says; they are bilinear between the
     features' cells, which keep their places, and constant features give a constant map."""
-    cfg = NetConfig(kind="densenet121", zoom=zoom, output_stride=output_stride)
+    cfg = with_constants(DenseNet121(zoom=zoom), output_stride=output_stride)
     plane = jnp.asarray(
         np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None], jnp.float32
     )
@@ -284,7 +285,7 @@ def test_group_norm_sees_one_map():
     np.testing.assert_allclose(together[1, 2], apply(variables, features[1, 2:])[0], atol=1e-5)
 
 
-HALF = dataclasses.replace(TINY, dtype="bfloat16")
+HALF = with_constants(TINY, dtype="bfloat16")
 
 
 def test_bfloat16_has_float32_parameters():
