@@ -144,6 +144,7 @@ def run_sweep(
     for point in plan.points:
         scenes, batch = point.cfg.train.scenes, point.cfg.learn.batch
         _checked(sharding.check, mesh, shard, plan.seeds, scenes, batch)
+        starting(point.cfg, init)
     _checked(sweeps.check_room, plan, 1 if mesh is None or shard == "scenes" else mesh.size)
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:

@@ -373,7 +373,7 @@ def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pyt
         shown = capsys.readouterr().out
         cfg = presets.quick().change(replay={"sampler": "uniform"})
         sections = [one for name in _names(cfg) if isinstance(one := getattr(cfg, name), Section)]
-        assert len(sections) == 14
+        assert len(sections) == 15
         for section in sections:
             for name in _names(section):
                 assert f"{_flag(f'{section.SECTION}.{name}')} " in shown
@@ -402,7 +402,7 @@ def test_help_is_short(capsys: pytest.CaptureFixture, command: str, preset: str)
         assert f"\n  {_flag(option.name)} " in shown
     cfg = presets.get(preset)
     assert f"\n  --train.actions {cfg.train.actions} " in shown
-    assert f"\n  --scene.slots {' '.join(cfg.scene.slots)}\n" in shown
+    assert f"\n  --scene.slots {' '.join(cfg.scene.slots)}" in shown
     text = " ".join(shown.split())
     assert "auto: c on a CPU, warp on one CUDA device where it is known to be faster" in text
     assert "None" not in shown

@@ -282,11 +282,11 @@ def test_labels():
     """Claim: settings that no result depends on name no variant; a label in a figure names as many
     as it is told to."""
     assert results.variant(_config("vpg", 0, train__chunk=7, train__save_every=3)).changed == ()
-    changed = {"net__head": 16, "net__growth": 8, "learn__batch": 4, "learn__tau": 0.5}
+    changed = {"net__head": 16, "net__zoom": 1, "learn__batch": 4, "learn__tau": 0.5}
     variant = results.variant(_config("vpg", 0, **changed))
     assert set(comparison.label(variant).split(", ")[1:]) == {
         "net.head 16",
-        "net.growth 8",
+        "net.zoom 1",
         "learn.batch 4",
         "learn.tau 0.5",
     }
