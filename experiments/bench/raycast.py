@@ -24,7 +24,7 @@ import numpy as np
 
 from csac_jax import geometry, presets
 from csac_jax.cli.errors import BadArgumentsError
-from csac_jax.config import HeightmapConfig
+from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.runtime import provenance
 from csac_jax.scene import blocks, model as models
 from csac_jax.scene.model import World
@@ -73,11 +73,13 @@ def _ours(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -
     return lambda: compiled(*poses)
 
 
-def _peer(world: World, poses: tuple[jax.Array, jax.Array], origin: jax.Array) -> Call:
+def _peer(
+    world: World, sim: SimConfig, poses: tuple[jax.Array, jax.Array], origin: jax.Array
+) -> Call:
     """Distances and geoms, leaves [E, R]."""
     from mujoco import mjx  # after csac_jax.sim, which keeps it from complaining of optional parts
 
-    physics = mjx_physics.make(world, presets.get("fast").sim)
+    physics = mjx_physics.make(world, sim)
     model = physics.model.replace(mat_rgba=jnp.ones((1, 4)))
     hand = sorted(set(range(1, world.model.nbody)) - set(world.block_bodies.tolist()))
     part = PEER_ROWS * round(len(origin) ** 0.5)
@@ -106,12 +108,12 @@ def _limit() -> Call:
 
 def measure(size: int, scenes: int, repeats: int) -> dict[str, Any]:
     """Rays per second of both casters and the arithmetic limit."""
-    cfg = presets.get("fast")
+    cfg = presets.get("fast").change(sim={"physics": "mjx"})
     world = models.build(cfg.scene, cfg.sim)
     poses, origin = _poses(np.random.default_rng(0), scenes, len(world.slots)), _origins(size)
     calls = {
         "ours": _ours(world, poses, origin),
-        "mjx": _peer(world, poses, origin),
+        "mjx": _peer(world, cfg.sim, poses, origin),
         "matrix_product": _limit(),
     }
     seconds = medians(calls, repeats)

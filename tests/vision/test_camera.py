@@ -128,7 +128,7 @@ def test_colours_are_flat_shaded():
         ({"size": (640, 480), "centre": (159.5, 119.5)}, "camera.centre"),
         ({"focal": (80.0, 80.0)}, "camera.focal"),
         ({"focal": (618.0, 300.0)}, "camera.focal"),
-        ({"size": (8, 8), "centre": (3.5, 3.5)}, "camera.size"),
+        ({"size": (4, 4), "centre": (1.5, 1.5)}, "camera.size: must lie in 8"),
         ({"position": (0.0, 0.0, 0.7)}, "camera.position"),
     ],
 )
