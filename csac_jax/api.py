@@ -21,9 +21,9 @@ from csac_jax.replay.samplers import Sampler
 from csac_jax.report.progress import Reporters, Terminal
 from csac_jax.runtime import cache, cluster, provenance, signals
 from csac_jax.sim import backend
-from csac_jax.sweeps import grid, replicas, sweep as sweeps
+from csac_jax.sweeps import grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.sweeps.sweep import SweepPlan, SweepResult
+from csac_jax.sweeps.runner import SweepPlan, SweepResult
 from csac_jax.training import loop, memory, sharding, step
 from csac_jax.training.loop import Record, Reporter, Summary
 from csac_jax.training.sharding import Shard
@@ -145,14 +145,14 @@ def run_sweep(
         scenes, batch = point.cfg.train.scenes, point.cfg.learn.batch
         _checked(sharding.check, mesh, shard, plan.seeds, scenes, batch)
         starting(point.cfg, init)
-    _checked(sweeps.check_room, plan, 1 if mesh is None or shard == "scenes" else mesh.size)
+    _checked(runner.check_room, plan, 1 if mesh is None or shard == "scenes" else mesh.size)
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
         return replicas.sweep_program(group, mesh, shard, starting(group.configs[0], init))
 
     with Terminal(Console(quiet=not (verbose and cluster.is_first()))) as terminal:
         terminal.say(f"sweep {folder}")
-        return sweeps.run(plan, folder, make_program, terminal, stop, resume=resume)
+        return runner.run(plan, folder, make_program, terminal, stop, resume=resume)
 
 
 def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:

@@ -20,7 +20,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
-from csac_jax.sweeps.sweep import SweepResult
+from csac_jax.sweeps.runner import SweepResult
 from csac_jax.training import step
 from csac_jax.training.loop import Record
 
@@ -219,7 +219,7 @@ def test_complete_run_is_made_longer(trained, tmp_path: Path):
 
 
 class Sweeps:
-    """In place of `sweeps.run`: keeps what it is called with."""
+    """In place of `runner.run`: keeps what it is called with."""
 
     def __init__(self) -> None:
         self.called: list[Any] = []
@@ -235,7 +235,7 @@ class Sweeps:
 def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Sweeps:
     """No run is trained, folders are made in `tmp_path`."""
     stub = Sweeps()
-    monkeypatch.setattr(api.sweeps, "run", stub)
+    monkeypatch.setattr(api.runner, "run", stub)
     monkeypatch.chdir(tmp_path)
     return stub
 

@@ -207,7 +207,7 @@ def test_checker_reads_the_package():
         ("api.py", "from csac_jax.cli import settings", "cli is imported"),
         ("agent/a.py", "from csac_jax import specs", "specs is imported"),
         ("errors.py", "from csac_jax import constants", "constants is imported"),
-        ("render/a.py", "from csac_jax.cli.errors import FailedError", "cli is imported"),
+        ("render/a.py", "from csac_jax.cli.failures import FailedError", "cli is imported"),
         ("cli/a.py", "from csac_jax import __main__", "__main__ is imported"),
         ("render/a.py", "import tyro", "tyro is imported"),
         ("training/a.py", "from rich.console import Console", "rich is imported"),

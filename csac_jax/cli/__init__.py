@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.cli import bench, doctor, evaluation, export, parsing, play, report, sweep, train
-from csac_jax.cli.errors import PROGRAM, BadArgumentsError, FailedError, complain
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError, FailedError, complain
 from csac_jax.errors import DeviceError, SceneError
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from csac_jax.cli.errors import PROGRAM, BadArgumentsError
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError
 
 Arguments = TypeVar("Arguments")
 

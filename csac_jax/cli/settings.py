@@ -13,7 +13,7 @@ from typing import Any
 
 from csac_jax import algorithms, config, presets
 from csac_jax.cli import parsing
-from csac_jax.cli.errors import PROGRAM, as_bad_arguments
+from csac_jax.cli.failures import PROGRAM, as_bad_arguments
 from csac_jax.config import Config
 
 PRESETS = ", ".join(presets.PRESETS)

@@ -8,7 +8,7 @@ from typing import Any
 import tyro
 
 from csac_jax.cli import guards, output, parsing, settings, stored
-from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments, as_failure
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, as_failure
 from csac_jax.config import Config
 from csac_jax.runtime import signals
 

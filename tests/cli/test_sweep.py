@@ -11,12 +11,12 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import sweep as command
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
-from csac_jax.sweeps import sweep
+from csac_jax.sweeps import runner
 from csac_jax.training import loop, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
-RUN = sweep.run
+RUN = runner.run
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +27,7 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         raise AssertionError("the sweep began")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sweep, "run", forbidden)
+    monkeypatch.setattr(runner, "run", forbidden)
     monkeypatch.setattr(signals, "install", signals.Stop)
 
 
@@ -97,7 +97,7 @@ def test_no_sweep_to_resume(capsys: pytest.CaptureFixture):
     ("error", "code", "message"),
     [
         (FileExistsError(), 2, "there exists; give another --run-dir"),
-        (sweep.SweepError("all are lost"), 1, "all are lost"),
+        (runner.SweepError("all are lost"), 1, "all are lost"),
         (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
         (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
     ],
@@ -115,7 +115,7 @@ def test_failures(
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(sweep, "run", fail)
+    monkeypatch.setattr(runner, "run", fail)
     assert cli.main(["sweep", "smoke", "--run-dir", "there"]) == code
     assert capsys.readouterr().err.startswith(f"csac-jax: {message}")
 
@@ -136,13 +136,13 @@ def test_settings_reach_their_configs():
         ]
     assert [one.cfg for one in plan.points] == wanted
     assert plan.points[1].name == "algo=csac,target.gamma=0.3"
-    assert [one.cfg.seed for one in sweep.runs_of(plan)[:3]] == [7, 8, 9]
+    assert [one.cfg.seed for one in runner.runs_of(plan)[:3]] == [7, 8, 9]
 
 
 def test_plan_survives_its_file(tmp_path: Path):
     """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
     _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.end=1:4,1:12"])
-    (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
+    (tmp_path / runner.PLAN).write_text(runner.plan_text(plan))
     assert command.read(["--resume", str(tmp_path)])[1] == plan
 
 
@@ -150,7 +150,7 @@ def test_plan_survives_its_file(tmp_path: Path):
 def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: a sweep that is stopped by a signal exits with 130 or 143 and says how to go on;
     resumed, it ends with 0 and its results. A small step stands in for the learner's."""
-    monkeypatch.setattr(sweep, "run", RUN)
+    monkeypatch.setattr(runner, "run", RUN)
     for name, toy in (
         ("make", lambda cfg, **_: toys.program(cfg)),
         ("init_state", toys.init_state),

@@ -91,7 +91,7 @@ def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
     """Compares every module with Keras's in both modes of batch norm; returns how many outputs were
     compared."""
     cfg = DenseNet121(norm="batch", block_layers=block_layers)
-    trunk = densenet.Trunk(cfg)
+    trunk = densenet.DenseNetTrunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(4, size, size, 3)), jnp.float32)
 
@@ -185,7 +185,7 @@ def test_every_stage_of_densenet_121_is_kerass():
 def test_number_of_parameters():
     """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running
     statistics."""
-    trunk = densenet.Trunk(DenseNet121(norm="batch"))
+    trunk = densenet.DenseNetTrunk(DenseNet121(norm="batch"))
     blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
     variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
     sizes = {
@@ -214,7 +214,9 @@ def test_trunks_see_colour_height_and_mask():
 
 def test_a_zoomed_trunk_doubles_its_cells():
     """Claim: with a zoom a trunk says of maps what one without says of pixels repeated."""
-    whole, doubling = (densenet.Trunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2))
+    whole, doubling = (
+        densenet.DenseNetTrunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2)
+    )
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
     variables = random_variables(whole, 0, (1, 64, 64, 3))
     repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
@@ -243,7 +245,7 @@ def test_inputs():
 def test_trunks_have_weights_of_their_own():
     """Claim: each trunk has its own weights, and features are joined colour first: changing what
     one trunk sees, or one trunk's weights, changes its share of the features only."""
-    critic = densenet.Critic(TINY)
+    critic = densenet.DenseNetCritic(TINY)
     maps = jnp.asarray(np.random.default_rng(2).normal(size=(1, 64, 64, 4)), jnp.float32)
     variables = random_variables(critic, 0, maps.shape)
     features = jax.jit(lambda variables, maps: critic.apply(variables, maps)[1])
@@ -276,7 +278,7 @@ def test_head_upsamples(zoom: int, output_stride: int, factor: int):
 def test_group_norm_sees_one_map():
     """Claim: with group norm the maps of a picture do not depend on what else is in the batch, in
     the head either."""
-    head = densenet.Head(TINY)
+    head = densenet.DenseNetHead(TINY)
     features = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, 2, 16)), jnp.float32)
     variables = random_variables(head, 0, (1, 2, 2, 16))
     apply = jax.jit(head.apply)
@@ -290,7 +292,7 @@ HALF = with_constants(TINY, dtype="bfloat16")
 
 def test_bfloat16_has_float32_parameters():
     """Claim: in bfloat16 parameters and Q stay float32, features are bfloat16."""
-    critic, maps = densenet.Critic(HALF), jax.ShapeDtypeStruct((1, 64, 64, 4), jnp.float32)
+    critic, maps = densenet.DenseNetCritic(HALF), jax.ShapeDtypeStruct((1, 64, 64, 4), jnp.float32)
     with jax.numpy_dtype_promotion("standard"):  # Flax's norm promotes in half precision
         (q, features), variables = jax.eval_shape(critic.init_with_output, jax.random.key(0), maps)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
@@ -301,8 +303,8 @@ def test_bfloat16_has_float32_parameters():
 def test_bfloat16_is_near_float32():
     """Claim: Q in bfloat16 is that in float32 within 5 % of the largest."""
     maps = jnp.asarray(np.random.default_rng(4).normal(size=(1, 64, 64, 4)), jnp.float32)
-    variables = random_variables(densenet.Critic(TINY), 0, maps.shape)
+    variables = random_variables(densenet.DenseNetCritic(TINY), 0, maps.shape)
     with jax.numpy_dtype_promotion("standard"):
-        q, _ = jax.jit(densenet.Critic(HALF).apply)(variables, maps)
-    wanted, _ = jax.jit(densenet.Critic(TINY).apply)(variables, maps)
+        q, _ = jax.jit(densenet.DenseNetCritic(HALF).apply)(variables, maps)
+    wanted, _ = jax.jit(densenet.DenseNetCritic(TINY).apply)(variables, maps)
     assert 0.0 < np.abs(q - wanted).max() <= 0.05 * np.abs(wanted).max()

@@ -143,7 +143,7 @@ def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: boo
     actor, _ = jax.eval_shape(head.init_with_output, jax.random.key(0), features)
     assert q.shape == actor.shape == (1, frames.side, frames.side, dense.OUTPUTS)
     assert frames.side * nets.stride == frames.tables.canvas == 96
-    assert isinstance(critic, densenet.Critic if kind == "densenet121" else dense.Critic)
+    assert isinstance(critic, densenet.DenseNetCritic if kind == "densenet121" else dense.Critic)
 
 
 def test_states_of_densenet_are_seen_in_groups():

@@ -332,7 +332,7 @@ def test_command_gives_the_config_back():
         "net__head": 16,
     }
     config = _config("csac_per", 7, **changed)
-    run = results.Run(Path("x"), config, *[np.zeros(1)] * 4, record={})
+    run = results.RecordedRun(Path("x"), config, *[np.zeros(1)] * 4, record={})
     program, command, *flags = results.command(run).split()
     assert (program, command) == ("csac-jax", "train")
     assert configs.to_dict(train.read(flags)[1]) == config
