@@ -166,13 +166,18 @@ def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: C
 def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: signals.Stop) -> Any:
     from csac_jax import api
     from csac_jax.errors import SettingsError
-    from csac_jax.io import checkpoint
+    from csac_jax.io import checkpoint, policy_file
     from csac_jax.runtime import cluster
     from csac_jax.sweeps import runner
     from csac_jax.training import loop
 
     with (
-        as_failure(runner.SweepError, loop.TrainingError, checkpoint.CheckpointError),
+        as_failure(
+            runner.SweepError,
+            loop.TrainingError,
+            checkpoint.CheckpointError,
+            policy_file.PolicyFileError,
+        ),
         as_bad_arguments(SettingsError),
     ):
         try:

@@ -376,7 +376,7 @@ def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pyt
         assert len(sections) == 15
         for section in sections:
             for name in _names(section):
-                assert f"{_flag(f'{section.SECTION}.{name}')} " in shown
+                assert re.search(rf"{_flag(f'{section.SECTION}.{name}')}[ ,]", shown)
         assert {"--seed", "--algo"} <= set(shown.split())
         assert "--preset" not in shown
         assert "--replay.end" not in shown
