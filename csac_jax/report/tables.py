@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from csac_jax.constants import GRASP_WINDOW
+from csac_jax.evaluation.metrics import PER_ACTION
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import comparison, results as recorded
 from csac_jax.report.comparison import (
@@ -154,7 +155,7 @@ def _evaluation_row(
     runs = max(len(score.evaluations) for score in scores)
     episodes = sum(score.place.episodes * len(score.evaluations) for score in scores)
     counts = {"runs": str(runs), "episodes": str(episodes)}
-    cells = {title: percent(band(metric)) for metric, title in METRICS.items()}
+    cells = {title: shown(metric, band(metric)) for metric, title in METRICS.items()}
     return _first_cells(place) | counts | cells
 
 
@@ -170,7 +171,7 @@ def differences(report: Report) -> Table:
                 "part": _part(gap.suite, part),
                 "physics, robot, seed": gap.world,
             }
-            | {title: percent(gap.bands.get(metric), "+") for metric, title in METRICS.items()}
+            | {t: shown(metric, gap.bands.get(metric), "+") for metric, t in METRICS.items()}
         )
     return rows
 
@@ -238,6 +239,14 @@ def _wall_time(one: RecordedRun | Evaluation) -> str:
         seconds = one.record.get("seconds")
     whole = ", whole sweep" if "settings" in one.record else ""
     return "-" if seconds is None else f"{seconds:.0f} s{whole}"
+
+
+def shown(metric: str, band: Band | None, sign: str = "") -> str:
+    """A metric with its band: a share in per cent, blocks per action as a number."""
+    if metric not in PER_ACTION or band is None:
+        return percent(band, sign)
+    value, *ends = (f"{x:{sign}.3f}" for x in band[:3] if x is not None)
+    return f"{value} ({' to '.join(ends)})" if ends else value
 
 
 def percent(band: Band | None, sign: str = "") -> str:
