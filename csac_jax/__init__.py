@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from csac_jax.agent.learner import Learner, Transition, UpdateInfo
     from csac_jax.api import Run, evaluate, load_policy, sweep, train
     from csac_jax.config import Config
-    from csac_jax.env import Env, State, auto_reset, make_env
+    from csac_jax.env import AutoResetEnv, Env, State, make_env
     from csac_jax.evaluation.policies import Policy
     from csac_jax.replay.samplers import Sample, Sampler
     from csac_jax.sim.primitives import Action
@@ -65,7 +65,7 @@ _HOMES = {
     "csac_jax.agent.learner": ("Learner", "Transition", "UpdateInfo"),
     "csac_jax.api": ("Run", "evaluate", "load_policy", "sweep", "train"),
     "csac_jax.config": ("Config",),
-    "csac_jax.env": ("Env", "State", "auto_reset", "make_env"),
+    "csac_jax.env": ("AutoResetEnv", "Env", "State", "make_env"),
     "csac_jax.evaluation.policies": ("Policy",),
     "csac_jax.replay.samplers": ("Sample", "Sampler"),
     "csac_jax.sim.primitives": ("Action",),
@@ -74,6 +74,7 @@ _HOMES = {
 
 __all__ = [
     "Action",
+    "AutoResetEnv",
     "Config",
     "Env",
     "Learner",
@@ -86,7 +87,6 @@ __all__ = [
     "Transition",
     "UpdateInfo",
     "algorithms",
-    "auto_reset",
     "evaluate",
     "load_policy",
     "make_env",

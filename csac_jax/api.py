@@ -21,9 +21,9 @@ from csac_jax.replay.samplers import Sampler
 from csac_jax.report.progress import Reporters, Terminal
 from csac_jax.runtime import cache, cluster, provenance, signals
 from csac_jax.sim import backend
-from csac_jax.sweeps import grid, replicas, sweep as sweeps
+from csac_jax.sweeps import grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.sweeps.sweep import SweepPlan, SweepResult
+from csac_jax.sweeps.runner import SweepPlan, SweepResult
 from csac_jax.training import loop, memory, sharding, step
 from csac_jax.training.loop import Record, Reporter, Summary
 from csac_jax.training.sharding import Shard
@@ -74,6 +74,8 @@ def train(
     cfg = backend.resolve(cfg)
     _checked(memory.check, cfg)
     folder = new_folder(f"{cfg.preset}-{cfg.seed}") if run_dir is None else Path(run_dir)
+    if resume:
+        loop.check_resumable(cfg, folder)
     start = starting(cfg, init)
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
@@ -142,14 +144,15 @@ def run_sweep(
     for point in plan.points:
         scenes, batch = point.cfg.train.scenes, point.cfg.learn.batch
         _checked(sharding.check, mesh, shard, plan.seeds, scenes, batch)
-    _checked(sweeps.check_room, plan, 1 if mesh is None or shard == "scenes" else mesh.size)
+        starting(point.cfg, init)
+    _checked(runner.check_room, plan, 1 if mesh is None or shard == "scenes" else mesh.size)
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
         return replicas.sweep_program(group, mesh, shard, starting(group.configs[0], init))
 
     with Terminal(Console(quiet=not (verbose and cluster.is_first()))) as terminal:
         terminal.say(f"sweep {folder}")
-        return sweeps.run(plan, folder, make_program, terminal, stop, resume=resume)
+        return runner.run(plan, folder, make_program, terminal, stop, resume=resume)
 
 
 def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
@@ -159,7 +162,7 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
     """
     if source is None:
         return None
-    if _is_pretrained(cfg, source):
+    if isinstance(cfg.net, DenseNet121) and _is_weights(source):
         trunk = _checked(weights.read, cfg.net, Path(source))
         return lambda state: actor_critic.with_trunk(state, trunk)
     policy = policies.load(source)
@@ -175,7 +178,7 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
 
 def with_networks_of(cfg: Config, source: str | Path) -> Config:
     """The config with networks of the sizes of the policy `source`, see `train`'s `init`."""
-    if _is_pretrained(cfg, source):
+    if _is_weights(source):
         return cfg
     given = policies.load_config(source)
     learn = {"critics": given.learn.critics, "actor": given.learn.actor}
@@ -210,10 +213,10 @@ def _checked(call: Callable[..., Any], *args: Any) -> Any:
         raise SettingsError(str(error)) from None
 
 
-def _is_pretrained(cfg: Config, source: str | Path) -> bool:
+def _is_weights(source: str | Path) -> bool:
     """Whether `source` is a file of weights and no policy."""
-    named = source != "shipped" and Path(source).is_file()
-    return named and isinstance(cfg.net, DenseNet121) and not policy_file.is_policy(Path(source))
+    path = Path(source)
+    return source != "shipped" and path.is_file() and not policy_file.is_policy(path)
 
 
 def _layout(params: Any) -> Any:
@@ -224,6 +227,8 @@ def _layout(params: Any) -> Any:
 
 def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
     """Every combination of the values."""
+    for name in vary:
+        _checked(grid.kind_of, name)
     points = []
     for combination in itertools.product(*vary.values()):
         values = dict(zip(vary, combination, strict=True))

@@ -85,9 +85,9 @@ def _check_choice(name: str, kind: Any, value: Any) -> None:
 
 def _check_bounds(name: str, value: Any, low: float, high: float, above: bool) -> None:
     items = value if isinstance(value, tuple) else (value,)
-    span = f"must lie in {low:g} .. {high:g}" if high < math.inf else f"must be at least {low:g}"
+    span = f"must lie in {low:g} .. {high:.10g}" if high < math.inf else f"must be at least {low:g}"
     if above:
-        span = f"must be above {low:g}" + (f", at most {high:g}" if high < math.inf else "")
+        span = f"must be above {low:g}" + (f", at most {high:.10g}" if high < math.inf else "")
     for item in items:
         good = (low < item if above else low <= item) and item <= high
         _require(good, f"{name}: {span}, not {item}")
@@ -108,7 +108,7 @@ class SceneConfig(Section):
     pool: int = _count(1024)
     """Pre-settled scenes that episodes are sampled from, per block count."""
     arranged: float = _share(0.0)
-    """Share of those scenes that are packed arrangements; the others are dropped."""
+    """Share of the scenes that are packed arrangements; the others are dropped."""
     size_jitter: tuple[float, float] = _bounded((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of block sizes between scenes: boxes and arches, and the other kinds.
     The latter are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
@@ -303,7 +303,7 @@ class SmallNet(Section):
     SECTION: ClassVar[str] = "net"
 
     dtype: ClassVar[str] = "auto"
-    """What a net computes in: bfloat16 on accelerators, float32 on a CPU. Parameters are float32."""
+    """Type of computation: bfloat16 on accelerators, float32 on a CPU. Parameters are float32."""
 
     kind: Literal["small"] = "small"
     """`small`, or `densenet121`: the paper's, 100 times the work."""

@@ -1,7 +1,6 @@
-"""A learner of your own: plain DQN on a dense map of grasps, with four yaws.
+"""A learner of your own: Q-learning on a dense map of grasps.
 
-python examples/own_learner.py [PRESET] [RUN_DIR]
-"""
+python examples/own_learner.py [PRESET] [RUN_DIR]"""
 
 import sys
 
@@ -12,71 +11,49 @@ import optax
 
 import csac_jax as csac
 
-YAWS, CELLS, GAMMA = 4, 16, 0.5  # of half a turn; along each side of the map
+YAWS, SIDE, ADAM = 4, 0.448, optax.adam(1e-3)  # yaws of half a turn; side of the workspace, m
 
 
-class QMap(nn.Module):
-    """Height maps [N, H, H] m -> Q [N, CELLS, CELLS, YAWS]."""
-
+class QMap(nn.Module):  # height maps [N, H, H] m -> Q of grasps [N, H / 4, H / 4, YAWS]
     @nn.compact
     def __call__(self, height):
-        stride = height.shape[1] // CELLS
-        x = nn.relu(nn.Conv(32, (2 * stride, 2 * stride), strides=stride)(20 * height[..., None]))
+        x = nn.relu(nn.Conv(32, (8, 8), strides=4)(20 * height[..., None]))
         return nn.Dense(YAWS, kernel_init=nn.initializers.zeros)(nn.relu(nn.Conv(32, (5, 5))(x)))
 
 
-class DQN(csac.Learner):
-    """State: parameters, those of the target network, the optimiser's."""
-
-    def __init__(self, cfg):
-        self.cfg, self.optimiser = cfg, optax.adam(cfg.learn.learning_rate)
-
+class QLearner(csac.Learner):  # state: parameters, and the optimiser's state
     def init(self, key):
-        size = self.cfg.heightmap.size
-        params = QMap().init(key, jnp.zeros((1, size, size)))
-        return params, params, self.optimiser.init(params)
+        params = QMap().init(key, jnp.zeros((1, 64, 64)))
+        return params, ADAM.init(params)
 
     def act(self, key, state, obs, steps_without_change, actions_taken=None):
-        q = QMap().apply(state[0], obs.height).reshape(len(obs.height), -1)
-        best, cell = jnp.argmax(q, axis=1), 0.448 / CELLS
-        if actions_taken is not None:
-            epsilon = jnp.maximum(0.05, 0.998**actions_taken)
-            key_explore, key_cell = jax.random.split(key)
-            elsewhere = jax.random.randint(key_cell, best.shape, 0, q.shape[1])
-            best = jnp.where(
-                jax.random.bernoulli(key_explore, epsilon, best.shape), elsewhere, best
-            )
-        row, col, yaw = jnp.unravel_index(best, (CELLS, CELLS, YAWS))
-        x, y = ((index + 0.5 - 0.5 * CELLS) * cell for index in (col, row))
-        return jax.vmap(csac.Action.grasp)(x, y, yaw * (jnp.pi / YAWS))
+        q = QMap().apply(state[0], obs.height)
+        if actions_taken is not None:  # explore, by noise that fades
+            q += 0.998**actions_taken * jax.random.normal(key, q.shape)
+        row, col, yaw = jnp.unravel_index(jnp.argmax(q.reshape(len(q), -1), 1), q.shape[1:])
+        x, y = (((cell + 0.5) / q.shape[1] - 0.5) * SIDE for cell in (col, row))
+        return csac.Action.grasp(x, y, yaw * jnp.pi / YAWS)
 
     def update(self, key, state, batch, weights):
-        params, target, optimiser = state
-        obs, next_obs = csac.unpack(batch.obs), csac.unpack(batch.next_obs)
-        following = jnp.max(QMap().apply(target, next_obs.height), axis=(1, 2, 3))
-        y = batch.reward + GAMMA * jnp.where(batch.terminated, 0.0, following)
-        x, place_y, yaw = batch.action.pose.T
-        col, row = (jnp.clip((c / 0.448 + 0.5) * CELLS, 0, CELLS - 1) for c in (x, place_y))
-        index = (
-            row.astype(int),
-            col.astype(int),
-            jnp.round(yaw * YAWS / jnp.pi).astype(int) % YAWS,
-        )
+        next_q = QMap().apply(state[0], csac.unpack(batch.next_obs).height)
+        target = batch.reward + 0.5 * jnp.where(batch.terminated, 0.0, next_q.max((1, 2, 3)))
+        x, y, yaw = batch.action.pose.T
+        row, col = (((place / SIDE + 0.5) * next_q.shape[1]).astype(int) for place in (y, x))
+        index = jnp.arange(len(y)), row, col, jnp.round(yaw * YAWS / jnp.pi).astype(int) % YAWS
 
         def loss(params):
-            q = QMap().apply(params, obs.height)[(jnp.arange(len(y)), *index)]
-            return jnp.mean(weights * (y - q) ** 2), q
+            error = target - QMap().apply(params, csac.unpack(batch.obs).height)[index]
+            value = jnp.mean(weights * error**2)
+            return value, csac.UpdateInfo(value, jnp.mean(target - error), error)
 
-        (value, q), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-        change, optimiser = self.optimiser.update(gradient, optimiser)
-        params = optax.apply_updates(params, change)
-        target = optax.incremental_update(params, target, 0.02)
-        return (params, target, optimiser), csac.UpdateInfo(value, jnp.mean(q), y - q)
+        gradient, info = jax.grad(loss, has_aux=True)(state[0])
+        change, adam = ADAM.update(gradient, state[1])
+        return (optax.apply_updates(state[0], change), adam), info
 
 
 def main(preset="quick", run_dir=None):
     cfg = csac.presets.get(preset).change(reward=csac.algorithms.VPG_REWARD)
-    return csac.train(cfg, run_dir, learner=DQN(cfg))
+    return csac.train(cfg, run_dir, learner=QLearner())
 
 
 if __name__ == "__main__":

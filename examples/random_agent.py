@@ -14,15 +14,16 @@ SCENES = 8
 
 
 def main(preset="quick", steps="20"):
-    env = csac.auto_reset(csac.make_env(csac.presets.get(preset)))
-    low, high = env.action_spec.pose.minimum, env.action_spec.pose.maximum
+    scenes = csac.make_env(csac.presets.get(preset))
+    env, bounds = csac.AutoResetEnv(scenes), scenes.action_spec.pose
 
     def step(state, key):
         key_act, key_reset = jax.random.split(key)
-        pose = jax.random.uniform(key_act, (SCENES, 3), minval=low, maxval=high)
+        pose = jax.random.uniform(key_act, (SCENES, 3), float, bounds.minimum, bounds.maximum)
         action = jax.vmap(csac.Action.grasp)(*pose.T)
-        state = jax.vmap(env.step)(jax.random.split(key_reset, SCENES), state, action)
-        return state, state.info.cleared
+        keys_reset = jax.random.split(key_reset, SCENES)
+        state, after = jax.vmap(env.step)(keys_reset, state, action)
+        return state, after.info.cleared
 
     state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), SCENES))
     keys = jax.random.split(jax.random.key(1), int(steps))

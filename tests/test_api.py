@@ -1,9 +1,30 @@
-"""The public names of the package."""
+"""The public names of the package, and what `train` and `sweep` do with their arguments."""
 
+import dataclasses
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
 
 import csac_jax
+from csac_jax import algorithms, api, presets
+from csac_jax.agent import actor_critic
+from csac_jax.agent.actor_critic import LearnerState, Params
+from csac_jax.config import Config, DenseNet121
+from csac_jax.errors import SettingsError
+from csac_jax.io import checkpoint, policy_file
+from csac_jax.runtime.signals import Stop
+from csac_jax.sweeps.replicas import group_configs
+from csac_jax.sweeps.runner import SweepResult
+from csac_jax.training import step
+from csac_jax.training.loop import Record
+
+SMOKE = presets.smoke()
 
 
 def test_public_names_exist():
@@ -26,3 +47,274 @@ def test_import_leaves_jax_alone():
 def test_unknown_name_is_an_attribute_error():
     """Claim: a name that the package lacks is an AttributeError that says so."""
     assert not hasattr(csac_jax, "make_robot")
+
+
+def _learner_state(cfg: Config, seed: int = 0) -> LearnerState:
+    parts = actor_critic.make(cfg)
+    return jax.jit(lambda: actor_critic.init(jax.random.key(seed), parts))()
+
+
+def _policy(path: Path, cfg: Config) -> Params:
+    """Networks that no seed gives, saved as a policy file."""
+    rng = np.random.default_rng(0)
+    blank = actor_critic.abstract_params(cfg)
+    params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
+    policy_file.save(path, params, cfg)
+    return params
+
+
+def _assert_same(found: Any, wanted: Any) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(np.array_equal(*pair) for pair in pairs)
+
+
+def _assert_starts_from(state: LearnerState, params: Params, fresh: LearnerState) -> None:
+    """`state` has these networks as online and target ones, and all else as a fresh one has it."""
+    _assert_same(state.online, params)
+    _assert_same(state.target, params)
+    assert not _equal(fresh.online.critic, params.critic)
+    _assert_same(state.critic_optimiser, fresh.critic_optimiser)
+    _assert_same(state.actor_optimiser, fresh.actor_optimiser)
+    assert int(state.updates) == 0
+
+
+def test_first_state_has_the_networks_of_the_policy(tmp_path: Path):
+    """Claim: `init` puts a policy's networks into online and target ones; the optimisers are those
+    of a fresh run."""
+    params = _policy(tmp_path / "policy.safetensors", SMOKE)
+    start = api.starting(SMOKE, tmp_path / "policy.safetensors")
+    assert start is not None
+    fresh = _learner_state(SMOKE)
+    _assert_starts_from(start(fresh), params, fresh)
+    assert api.starting(SMOKE, None) is None
+
+
+@pytest.mark.parametrize("seeds", [2, 3])
+def test_first_states_of_several_runs_have_the_networks_of_the_policy(tmp_path: Path, seeds: int):
+    """Claim: so do the runs of a sweep, each of them, whose states have an axis of runs."""
+    params = _policy(tmp_path / "policy.safetensors", SMOKE)
+    start = api.starting(SMOKE, tmp_path / "policy.safetensors")
+    assert start is not None
+    each = [_learner_state(SMOKE, seed) for seed in range(seeds)]
+    found = start(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
+    for k, fresh in enumerate(each):
+        own = jax.tree.map(lambda leaf, k=k: leaf[k], found)
+        _assert_starts_from(own, params, fresh)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"net": {"growth": 8}},
+        {"net": {"dilations": (1, 2, 1)}},
+        {"net": {"colour": False}},
+        {"net": {"kind": "densenet121", "margin": 0.0}},
+        {"learn": {"critics": 2}},
+        {"task": {"kind": "target"}},
+    ],
+)
+def test_other_networks_are_refused(tmp_path: Path, changes: dict[str, Any]):
+    """Claim: networks of other sizes, or of another number, than the config's are a SettingsError
+    of one line, before there is a folder."""
+    path = tmp_path / "policy.safetensors"
+    _policy(path, SMOKE)
+    with pytest.raises(SettingsError, match=f"^--init {path}: its networks are not") as caught:
+        api.train(SMOKE.change(**changes), tmp_path / "run", init=path, verbose=False)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_networks_of_a_policy_can_be_asked_for(tmp_path: Path):
+    """Claim: a config takes over a policy's net, its number of critics and whether it has an actor,
+    and then starts from it; nothing else changes."""
+    given = SMOKE.change(net={"growth": 8}, learn={"critics": 2, "tau": 0.5})
+    path = tmp_path / "policy.safetensors"
+    params = _policy(path, given)
+    cfg = api.with_networks_of(SMOKE, path)
+    assert cfg == SMOKE.change(net={"growth": 8}, learn={"critics": 2})
+    start, fresh = api.starting(cfg, path), _learner_state(cfg)
+    assert start is not None
+    _assert_starts_from(start(fresh), params, fresh)
+
+
+def test_weights_that_cannot_be_read_are_refused(tmp_path: Path):
+    """Claim: for DenseNet-121 a file that is no policy is one of weights; a SettingsError names it
+    if it holds none."""
+    path = tmp_path / "densenet121.safetensors"
+    path.write_bytes(b"no tensors")
+    cfg = SMOKE.change(net=DenseNet121(rotations=4, margin=0.0))
+    with pytest.raises(SettingsError, match=f"{path} cannot be read") as caught:
+        api.starting(cfg, path)
+    assert "\n" not in str(caught.value)
+    assert api.with_networks_of(cfg, path) == cfg
+
+
+def _stopped() -> Stop:
+    """As after a signal that came before the first chunk: a run saves its first state."""
+    stop = Stop()
+    stop.signal = 15
+    return stop
+
+
+def _saved(run: api.Run) -> step.TrainState:
+    blank = step.make(run.cfg, env=step.without_physics(run.cfg))
+    state, _ = checkpoint.restore(run.run_dir, step.abstract_state(blank))
+    return state
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[api.Run, list[Record]]:
+    """A run, and what its callback was given."""
+    records: list[Record] = []
+    folder = tmp_path_factory.mktemp("api") / "run"
+    return api.train(SMOKE, folder, callbacks=[records.append], verbose=False), records
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_run_is_complete(trained, capsys: pytest.CaptureFixture):
+    """Claim: a run returns its folder, config and summary; each chunk's record reaches the
+    callbacks."""
+    run, records = trained
+    assert (run.cfg, run.summary.actions, run.summary.stopped_by) == (SMOKE, 64, None)
+    assert [record.actions for record in records] == [8 * n for n in range(1, 9)]
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_run_starts_from_another(trained, tmp_path: Path):
+    """Claim: a run with `init` begins with the last networks of that run, in scenes of its own
+    seed, and its optimisers are fresh."""
+    run, _ = trained
+    cfg = SMOKE.change(seed=1)
+    plain, begun = (
+        api.train(cfg, tmp_path / name, init=init, stop=_stopped(), verbose=False)
+        for name, init in (("plain", None), ("begun", run.run_dir))
+    )
+    assert (begun.summary.step, begun.summary.stopped_by) == (0, 15)
+    fresh, state, last = map(_saved, (plain, begun, run))
+    _assert_starts_from(state.learner, last.learner.online, fresh.learner)
+    _assert_same(begun.policy.params, run.policy.params)
+    _assert_same(state.scenes, fresh.scenes)
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_complete_run_is_made_longer(trained, tmp_path: Path):
+    """Claim: a complete run that is resumed with more `train.actions` takes them."""
+    run, _ = trained
+    records: list[Record] = []
+    longer = SMOKE.change(train={"actions": 72})
+    done = api.train(longer, run.run_dir, resume=True, callbacks=[records.append], verbose=False)
+    assert [record.actions for record in records] == [72]
+    assert (done.summary.step, done.summary.actions) == (36, 72)
+    assert int(_saved(done).learner.updates) > 0
+
+
+class Sweeps:
+    """In place of `runner.run`: keeps what it is called with."""
+
+    def __init__(self) -> None:
+        self.called: list[Any] = []
+        self.resume: list[bool] = []
+
+    def __call__(self, plan, folder, make_program, reporter, stop, resume=False) -> SweepResult:
+        self.called.append((plan, folder, make_program, stop))
+        self.resume.append(resume)
+        return SweepResult({"seeds": plan.seeds}, [], None)
+
+
+@pytest.fixture
+def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Sweeps:
+    """No run is trained, folders are made in `tmp_path`."""
+    stub = Sweeps()
+    monkeypatch.setattr(api.runner, "run", stub)
+    monkeypatch.chdir(tmp_path)
+    return stub
+
+
+def test_sweep_has_every_combination(sweeps: Sweeps, capsys: pytest.CaptureFixture):
+    """Claim: `sweep` runs every combination of the values, algorithms before settings, and returns
+    the summary; it says which folder it takes."""
+    vary = {"learn.tau": (0.1, 0.2), "algo": ("csac", "vpg"), "replay.capacity": (128,)}
+    assert api.sweep(SMOKE.change(seed=3), 2, vary) == {"seeds": 2}
+    ((plan, folder, _, stop),) = sweeps.called
+    assert (plan.seeds, sweeps.resume, stop.signal) == (2, [False], None)
+    assert folder.parent == Path("runs")
+    assert folder.name.startswith("sweep-smoke-20")
+    assert f"sweep {folder}" in capsys.readouterr().out
+    combinations = [(tau, algo) for tau in (0.1, 0.2) for algo in ("csac", "vpg")]
+    assert [point.name for point in plan.points] == [
+        f"learn.tau={tau},algo={algo},replay.capacity=128" for tau, algo in combinations
+    ]
+    for point, (tau, algo) in zip(plan.points, combinations, strict=True):
+        assert point.values == {"learn.tau": str(tau), "algo": algo, "replay.capacity": "128"}
+        wanted = algorithms.configure(SMOKE.change(seed=3), algo)
+        assert point.cfg == wanted.change(learn={"tau": tau}, replay={"capacity": 128})
+
+
+def test_sweep_of_seeds_alone_is_one_point(sweeps: Sweeps, tmp_path: Path, capsys):
+    """Claim: with nothing to vary there is one point; the folder and the stop are the caller's, and
+    nothing is printed unless it is asked for."""
+    stop = Stop()
+    api.sweep(SMOKE, run_dir=tmp_path / "mine", stop=stop, verbose=False)
+    ((plan, folder, _, given),) = sweeps.called
+    assert (plan.seeds, [point.cfg for point in plan.points]) == (4, [SMOKE])
+    assert (folder, given) == (tmp_path / "mine", stop)
+    assert capsys.readouterr().out == ""
+
+
+def test_sweep_decides_on_physics(sweeps: Sweeps, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `auto` is resolved for all runs together before they are planned."""
+    asked = []
+
+    def resolve(cfg: Config, devices: int, runs: int) -> Config:
+        asked.append((devices, runs))
+        return cfg.change(sim={"physics": "c"})
+
+    monkeypatch.setattr(api.backend, "resolve", resolve)
+    api.sweep(presets.quick(), 3, {"learn.tau": (0.1, 0.2)}, verbose=False)
+    ((plan, *_),) = sweeps.called
+    assert asked == [(1, 6)] * 2
+    assert {point.cfg.sim.physics for point in plan.points} == {"c"}
+
+
+@pytest.mark.mjx
+def test_runs_of_a_sweep_start_from_a_policy(sweeps: Sweeps, tmp_path: Path, monkeypatch):
+    """Claim: `init` is where each run of a sweep starts from, the learners of all groups."""
+    params = _policy(tmp_path / "policy.safetensors", SMOKE)
+    given = []
+    monkeypatch.setattr(api.replicas, "sweep_program", lambda *args: given.append(args))
+    api.sweep(SMOKE, 2, init=tmp_path / "policy.safetensors", verbose=False)
+    ((plan, _, make_program, _),) = sweeps.called
+    (group,) = group_configs([dataclasses.replace(plan.points[0].cfg, seed=k) for k in range(2)])
+    make_program(group)
+    ((asked, mesh, shard, start),) = given
+    assert (asked, mesh, shard) == (group, None, "seeds")
+    _assert_same(start(_learner_state(SMOKE)).online, params)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"vary": {"learn.bath": (1,)}}, r"'learn\.bath' is no setting"),
+        ({"vary": {"learn": (1,)}}, r"'learn' is no setting"),
+        ({"vary": {"seed": (1, 2)}}, r"seeds are varied by"),
+        ({"vary": {"learn.tau": (2.0,)}}, r"^learn\.tau: must be above 0"),
+        ({"vary": {"algo": ("dqn",)}}, r"unknown algorithm 'dqn'"),
+        ({"devices": 10_000}, r"--devices: 10000 asked for"),
+    ],
+)
+def test_sweep_refuses_what_cannot_be(sweeps: Sweeps, arguments: dict[str, Any], message: str):
+    """Claim: a sweep that cannot be is a ValueError of one line, before anything starts."""
+    with pytest.raises(ValueError, match=message) as caught:
+        api.sweep(SMOKE, **arguments, verbose=False)
+    assert "\n" not in str(caught.value)
+    assert sweeps.called == []

@@ -14,6 +14,7 @@ PAGES = [
     for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
     if "```python" in page.read_text()
 ]
+NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 
 
 def blocks(page: Path) -> list[str]:
@@ -30,11 +31,12 @@ def test_readme_has_an_example():
 @pytest.mark.optax
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the blocks of a page run, one after the other, with a small preset for `quick` and few
-    episodes."""
+    """Claim: the blocks of a page run, one after the other, with a small preset for `quick`, few
+    episodes and few seeds."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(presets, "quick", presets.smoke)
-    namespace: dict = {}
+    monkeypatch.setitem(presets.PRESETS, "quick", presets.smoke)
+    namespace = {"__name__": page.stem}
     for block in blocks(page):
-        small = re.sub(r"episodes=\d+", "episodes=2", block)
+        small = NUMBERS.sub(r"\1=2", block)
         exec(compile(small, page.name, "exec"), namespace)

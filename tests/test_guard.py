@@ -14,9 +14,8 @@ from csac_jax import _guard
 
 # Ten free boxes and six hinges: 66 degrees of freedom, in contact, eight scenes at a time.
 BATCHED_STEPS = """
-import csac_jax.sim
+from csac_jax.sim.quiet_mjx import mjx
 import jax, jax.numpy as jnp, mujoco
-from mujoco import mjx
 
 box = '<body pos="{} 0 0.019"><freejoint/><geom type="box" size=".02 .02 .02"/></body>'
 ball = '<geom type="sphere" size=".02" pos=".05 0 0"/>'

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.cli import bench, doctor, evaluation, export, parsing, play, report, sweep, train
-from csac_jax.cli.errors import PROGRAM, BadArgumentsError, FailedError, complain
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError, FailedError, complain
 from csac_jax.errors import DeviceError, SceneError
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
@@ -42,6 +42,7 @@ A robot learns to push and grasp in clutter.
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 
+`--device cpu` or `--device gpu` says where JAX computes.
 `{PROGRAM} COMMAND --help` lists the options of a command; --version prints the version.
 """
 

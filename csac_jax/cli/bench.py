@@ -4,7 +4,7 @@ import runpy
 from pathlib import Path
 
 import csac_jax
-from csac_jax.cli.errors import PROGRAM, BadArgumentsError
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError
 
 BENCHMARKS = Path(csac_jax.__file__).parents[1] / "experiments" / "bench"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from csac_jax.cli import output, parsing, settings, train
-from csac_jax.cli.errors import BadArgumentsError, FailedError, complain
+from csac_jax.cli.failures import BadArgumentsError, FailedError, complain
 from csac_jax.config import Config
 
 _HANGS = "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8 and try again"

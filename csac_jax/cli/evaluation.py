@@ -10,7 +10,7 @@ from typing import Any, Literal
 import tyro
 
 from csac_jax.cli import guards, output, parsing, stored
-from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
 from csac_jax.config import Config
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 
 from csac_jax.cli import parsing, stored
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import importlib.util
 from pathlib import Path
 
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from csac_jax.cli.errors import PROGRAM, BadArgumentsError
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError
 
 Arguments = TypeVar("Arguments")
 
@@ -19,9 +19,12 @@ def parse(
     arguments: Sequence[str],
     command: str,
     default: Any = tyro.MISSING_NONPROP,
+    help_flag: str = "--help",
 ) -> Arguments:
-    """`arguments` of `command` as a `kind`. Prints help and exits; bad ones raise
-    BadArgumentsError."""
+    """`arguments` of `command` as a `kind`. Prints help and exits.
+
+    Raises BadArgumentsError for bad ones; it points to the help that `help_flag` shows.
+    """
     prog = f"{PROGRAM} {command}"
     if asks_help(arguments):
         tyro.cli(kind, prog=prog, args=["--help"], default=default)
@@ -30,7 +33,7 @@ def parse(
         with contextlib.redirect_stderr(complaint), _wide_terminal():
             return tyro.cli(kind, prog=prog, args=arguments, default=default)
     except SystemExit:
-        raise BadArgumentsError(_one_line(complaint.getvalue(), prog)) from None
+        raise BadArgumentsError(_one_line(complaint.getvalue(), f"{prog} {help_flag}")) from None
     except ValueError as error:  # a range check of the outermost dataclass
         raise BadArgumentsError(str(error)) from None
 
@@ -80,7 +83,7 @@ def _wide_terminal() -> Iterator[None]:
             os.environ["COLUMNS"] = before
 
 
-def _one_line(box: str, prog: str) -> str:
+def _one_line(box: str, help_command: str) -> str:
     """The message in tyro's box of several lines, with its first suggestion."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
     lines = [line.strip("│ ") for line in plain.splitlines() if not line.startswith(("╭", "╰"))]
@@ -97,4 +100,4 @@ def _one_line(box: str, prog: str) -> str:
         else None
     )
     meant = f"; perhaps you meant {hint}" if hint else ""
-    return f"{message or 'the arguments cannot be read'}{meant}; see {prog} --help"
+    return f"{message or 'the arguments cannot be read'}{meant}; see {help_command}"

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from csac_jax import presets
 from csac_jax.cli import guards, output, parsing, stored
-from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,20 +49,20 @@ def run(arguments: list[str]) -> int:
         opengl = gl.choose()  # before MuJoCo is imported
     begun = time.time()
     env, steps = _play(options, _policy(options))
-    from csac_jax.render import play as playing
+    from csac_jax.render import episode
 
-    print(playing.summary(env.cfg, steps))
+    print(episode.summary(env.cfg, steps))
     if drawn:
-        stage = playing.Stage(env.cfg, steps[0].before, options.size, opengl, options.views)
-        playing.record(stage, steps, options.png, options.video)
+        stage = episode.Stage(env.cfg, steps[0].before, options.size, opengl, options.views)
+        episode.record(stage, steps, options.png, options.video)
     result = {
         "scene": options.scene,
         "policy": options.policy,
         "renderer": (opengl or "rays") if drawn else None,
         "actions": len(steps),
-        "cleared": playing.taken(steps),
-        "blocks_lost": playing.lost(steps),
-        "completed": playing.completed(steps),
+        "cleared": episode.taken(steps),
+        "blocks_lost": episode.lost(steps),
+        "completed": episode.completed(steps),
         "seconds": round(time.time() - begun, 1),
     }
     output.write_result(options.json, result, env.cfg)
@@ -102,7 +102,7 @@ def _policy(options: PlayOptions) -> Any:
 def _play(options: PlayOptions, policy: Any) -> tuple[Any, list[Any]]:
     """The environment and the records of the episode's steps, each printed as it happens."""
     from csac_jax.evaluation import rollout, suites
-    from csac_jax.render import play as playing
+    from csac_jax.render import episode
     from csac_jax.runtime import cache
 
     cache.enable()
@@ -117,7 +117,7 @@ def _play(options: PlayOptions, policy: Any) -> tuple[Any, list[Any]]:
     steps: list[Any] = []
     for step in rollout.episode(env, policy.replace(cfg=env.cfg), options.seed):
         steps.append(step)
-        print(playing.line(len(steps), step), flush=True)
+        print(episode.line(len(steps), step), flush=True)
     return env, steps
 
 

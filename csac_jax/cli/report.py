@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 
 from csac_jax.cli import guards, parsing
-from csac_jax.cli.errors import BadArgumentsError, FailedError, as_bad_arguments
+from csac_jax.cli.failures import BadArgumentsError, FailedError, as_bad_arguments
 from csac_jax.io import files
 
 

@@ -5,12 +5,15 @@ import dataclasses
 import functools
 import inspect
 import itertools
+import textwrap
+import typing
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from csac_jax import algorithms, config, presets
 from csac_jax.cli import parsing
-from csac_jax.cli.errors import PROGRAM, as_bad_arguments
+from csac_jax.cli.failures import PROGRAM, as_bad_arguments
 from csac_jax.config import Config
 
 PRESETS = ", ".join(presets.PRESETS)
@@ -20,7 +23,14 @@ FIRST = (
     *("learn.updates", "target.gamma", "replay.sampler", "replay.capacity", "net.kind"),
 )
 """The settings that people change first."""
-WIDTH = 100
+WIDTH, COLUMN = 100, 32  # of the short help, and where its texts begin
+_METAVARS = {
+    (bool,): "",
+    (Path,): "PATH",
+    (int,): "N",
+    (str,): "TEXT",
+    (tuple[str, ...],): "NAME=A,B",
+}
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -39,20 +49,9 @@ def preset(name: str, flags: Sequence[str]) -> Config:
 
 
 def parse(options: type, command: str, base: Config, flags: Sequence[str]) -> tuple[Any, Config]:
-    """The `options` of a command, and `base` with the settings that the flags give.
-
-    A flag that names an alternative, such as --replay.sampler, decides which settings there are.
-    """
-    for name, (tag, _) in config.ALTERNATIVES.items():
-        choice = parsing.value_of(flags, f"--{name}.{tag}")
-        if choice is not None:
-            with as_bad_arguments(ValueError):
-                base = base.change(**{name: {tag: choice}})
-    sections = {
-        field.name: getattr(base, field.name)
-        for field in dataclasses.fields(Config)
-        if isinstance(getattr(base, field.name), config.Section)
-    }
+    """The `options` of a command, and `base` with the settings that the flags give."""
+    with as_bad_arguments(ValueError):
+        sections = _sections(base, flags)
     fields: Any = [
         (name, type(section), dataclasses.field(default=section))
         for name, section in sections.items()
@@ -62,42 +61,68 @@ def parse(options: type, command: str, base: Config, flags: Sequence[str]) -> tu
         f"_{options.__name__}", fields, bases=(options,), frozen=True, namespace=namespace
     )
     default = kind(seed=base.seed, algo=base.algo)
-    given: Any = parsing.parse(kind, flags, command, default)
+    given: Any = parsing.parse(kind, flags, command, default, "--help-all")
     with as_bad_arguments(ValueError):
         changed = {name: getattr(given, name) for name in (*sections, "algo", "seed")}
         return given, dataclasses.replace(base, **changed)
 
 
-def print_help(options: type, command: str, examples: Sequence[str]) -> None:
+def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:
+    """The sections of a config; a flag such as --replay.sampler decides which settings one has.
+
+    Raises ValueError for a flag that is a setting of another alternative.
+    """
+    sections = {name: getattr(base, name) for name in _names(base)}
+    sections = {name: one for name, one in sections.items() if isinstance(one, config.Section)}
+    for name, (tag, kinds) in config.ALTERNATIVES.items():
+        choice = parsing.value_of(flags, f"--{name}.{tag}") or getattr(sections[name], tag)
+        sections[name] = config.alternative(sections[name], choice)
+        others = set().union(*map(_names, kinds)) - _names(sections[name])
+        for flag in flags:
+            prefix, _, setting = flag.split("=")[0].replace("-", "_").rpartition(".")
+            if prefix == f"__{name}" and setting in others:
+                raise ValueError(f"{flag}: --{name}.{tag} {choice} has no such setting")
+    return sections
+
+
+def _names(section: Any) -> set[str]:
+    return {field.name for field in dataclasses.fields(section)}
+
+
+def print_help(
+    options: type, command: str, examples: Sequence[str], arguments: Sequence[str]
+) -> None:
     """The short help of a command that takes settings: examples, options, the settings of FIRST."""
+    name, flags = split(arguments)
+    cfg = preset(name or "quick", flags)
     print(f"usage: {PROGRAM} {command} PRESET [--OPTION VALUE ...]\n")
-    print(f"{inspect.cleandoc(options.__doc__ or '')}\n\nPresets: {PRESETS}\n\nexamples:")
+    print(inspect.cleandoc(options.__doc__ or ""))
+    print(f"\npresets: {PRESETS}\nalgorithms: {', '.join(algorithms.ALGORITHMS)}\n\nexamples:")
     for example in examples:
         print(f"  {PROGRAM} {command} {example}")
     print("\noptions:")
-    for field in dataclasses.fields(options):
-        _print_row(_flag(field.name), _docs(options).get(field.name, ""))
-    print("\nsettings that people change first, with the values of quick:")
-    quick = presets.quick()
-    for name in FIRST:
-        section, setting = name.split(".")
-        value = getattr(getattr(quick, section), setting)
-        shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
-        _print_row(
-            f"{_flag(name)} {shown}", _docs(getattr(quick, section).__class__).get(setting, "")
-        )
-    print(f"\nAll settings: {PROGRAM} {command} PRESET --help-all")
+    for option in dataclasses.fields(options):
+        value = _METAVARS.get(typing.get_args(option.type)[:1], option.default)
+        _print_row(option.name, value, _docs(options)[option.name])
+    _print_row("device", "cpu|gpu", "Where JAX computes; by default on a GPU, if there is one.")
+    print(f"\nsettings that people change first, with the values of {cfg.preset}:")
+    for setting in FIRST:
+        section_name, field = setting.split(".")
+        section = getattr(cfg, section_name)
+        _print_row(setting, getattr(section, field), _docs(section.__class__)[field])
+    print(f"\nAll settings: {PROGRAM} {command} {name or 'PRESET'} --help-all")
 
 
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
-def _print_row(flag: str, text: str) -> None:
-    """A flag and the first sentence of what it does."""
-    sentence = text.replace("`", "").split(". ")[0].split("; ")[0].split(": ")[0].rstrip(".:;")
-    start = f"  {flag:<32} " if len(flag) <= 32 else f"  {flag}\n{'':35}"
-    print(f"{start}{sentence}"[: WIDTH + (0 if len(flag) <= 32 else len(flag) + 3)])
+def _print_row(name: str, value: Any, text: str) -> None:
+    """A flag with its value and, in a column of its own, what it does."""
+    shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    flag = f"  --{name.replace('_', '-')} {shown}"
+    if len(flag) >= COLUMN:
+        print(flag)
+        flag = ""
+    paragraph = textwrap.TextWrapper(WIDTH, flag.ljust(COLUMN), " " * COLUMN)
+    paragraph.break_long_words = paragraph.break_on_hyphens = False
+    print(paragraph.fill(text.replace("`", "")))
 
 
 @functools.cache

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from csac_jax.cli.errors import FailedError, as_failure
+from csac_jax.cli.failures import FailedError, as_failure
 from csac_jax.config import Config
 
 

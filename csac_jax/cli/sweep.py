@@ -9,7 +9,7 @@ import tyro
 
 from csac_jax import presets
 from csac_jax.cli import guards, output, parsing, settings, stored
-from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments, as_failure
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, as_failure
 from csac_jax.config import Config
 from csac_jax.runtime import signals
 from csac_jax.sweeps import grid
@@ -62,7 +62,7 @@ class SweepOptions:
 def run(arguments: list[str]) -> int:
     """Trains all; returns the exit code."""
     if parsing.asks_short_help(arguments):
-        settings.print_help(SweepOptions, "sweep", EXAMPLES)
+        settings.print_help(SweepOptions, "sweep", EXAMPLES, arguments)
         return 0
     stop = signals.install()
     options, plan = read(arguments)
@@ -132,16 +132,16 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     with as_bad_arguments(ValueError):
         points = grid.points(options.vary, lambda own: _parse(preset, [*flags, *own])[1])
     from csac_jax.sim import backend  # with JAX, so after those complaints
-    from csac_jax.sweeps import sweep as sweeping
+    from csac_jax.sweeps import runner
 
     devices, runs = _devices(options), options.seeds * len(points)  # at most so many side by side
     points = [one._replace(cfg=backend.resolve(one.cfg, devices, runs)) for one in points]
     for point in points:
         guards.check_physics(point.cfg)
         guards.check_host_physics(point.cfg, devices)
-    plan = sweeping.SweepPlan(options.seeds, points)
-    with as_bad_arguments(ValueError, sweeping.SweepError):
-        sweeping.groups_of(plan._replace(seeds=1))
+    plan = runner.SweepPlan(options.seeds, points)
+    with as_bad_arguments(ValueError, runner.SweepError):
+        runner.groups_of(plan._replace(seeds=1))
     return plan
 
 
@@ -152,27 +152,32 @@ def _devices(options: SweepOptions) -> int:
 
 
 def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:
-    from csac_jax.sweeps import sweep as sweeping
+    from csac_jax.sweeps import runner
 
     given = (preset, options.vary, options.run_dir)
     if any(given) or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
         raise BadArgumentsError(
             "sweep --resume: a sweep goes on with its own settings; leave all others out"
         )
-    with as_failure(sweeping.SweepError):
-        return sweeping.read_plan(folder)
+    with as_failure(runner.SweepError):
+        return runner.read_plan(folder)
 
 
 def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: signals.Stop) -> Any:
     from csac_jax import api
     from csac_jax.errors import SettingsError
-    from csac_jax.io import checkpoint
+    from csac_jax.io import checkpoint, policy_file
     from csac_jax.runtime import cluster
-    from csac_jax.sweeps import sweep as sweeping
+    from csac_jax.sweeps import runner
     from csac_jax.training import loop
 
     with (
-        as_failure(sweeping.SweepError, loop.TrainingError, checkpoint.CheckpointError),
+        as_failure(
+            runner.SweepError,
+            loop.TrainingError,
+            checkpoint.CheckpointError,
+            policy_file.PolicyFileError,
+        ),
         as_bad_arguments(SettingsError),
     ):
         try:

@@ -8,7 +8,7 @@ from typing import Any
 import tyro
 
 from csac_jax.cli import guards, output, parsing, settings, stored
-from csac_jax.cli.errors import BadArgumentsError, as_bad_arguments, as_failure
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, as_failure
 from csac_jax.config import Config
 from csac_jax.runtime import signals
 
@@ -17,6 +17,7 @@ EXAMPLES = (
     "quick --algo vpg --seed 1           # another algorithm and seed",
     "fast --init shipped                 # start from the shipped policy's networks",
     "quick --replay.sampler beta --replay.end 1 4",
+    "--resume runs/a                     # go on with a run that was stopped",
 )
 
 
@@ -43,7 +44,7 @@ class TrainOptions:
 def run(arguments: list[str]) -> int:
     """Trains; returns the exit code."""
     if parsing.asks_short_help(arguments):
-        settings.print_help(TrainOptions, "train", EXAMPLES)
+        settings.print_help(TrainOptions, "train", EXAMPLES, arguments)
         return 0
     stop = signals.install()
     options, cfg = read(arguments)

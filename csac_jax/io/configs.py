@@ -107,12 +107,13 @@ def _from_format_1(values: dict[str, Any]) -> dict[str, Any]:
     }
     for name, value in old.items():
         _put(new, values, renames.SETTINGS.get(name, name), value)
-    phases = SimConfig(grasp_phases=tuple(new["sim"]["grasp_phases"])).push_phases
+    grasp_phases = tuple(old.get("sim.grasp_phases", SimConfig().grasp_phases))
+    phases = SimConfig(grasp_phases=grasp_phases).push_phases
     if push_phases is not None and tuple(push_phases) != phases:
         raise ValueError(f"sim.push_phases: is {phases} now and cannot be {push_phases}")
     if scale != 1.0:
-        camera = CameraConfig(**{k: tuple(v) for k, v in new["camera"].items()}).scaled(scale)
-        new["camera"] = dataclasses.asdict(camera)
+        fields = {name: tuple(value) for name, value in new.get("camera", {}).items()}
+        new["camera"] = dataclasses.asdict(CameraConfig(**fields).scaled(scale))
     return new
 
 

@@ -38,7 +38,7 @@ def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None
     Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m; target [..., H, W] bool or
     None. I = 1, + 3, + 1.
     """
-    maps = [height[..., None] / _HEIGHT_SCALE]
+    maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
     if colour is not None:
         maps.insert(0, jnp.where(height[..., None] > COLOUR_MIN_HEIGHT, colour - 0.5, 0.0))
     if target is not None:

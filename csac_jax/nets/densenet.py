@@ -39,7 +39,7 @@ def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None
     Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m; target [..., H, W] bool or
     None.
     """
-    maps = [height[..., None] / _HEIGHT_SCALE]
+    maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
     if colour is not None:
         mean, std = (jnp.broadcast_to(v, colour.shape) for v in (_COLOUR_MEAN, _COLOUR_STD))
         normalised = (colour - mean) / std
@@ -158,7 +158,7 @@ class TransitionLayer(nn.Module):
         return _piece(average_pool(_convolution(self.cfg, channels // 2, 1, "conv")(maps)))
 
 
-class Trunk(nn.Module):
+class DenseNetTrunk(nn.Module):
     """DenseNet-121 without its top: [B, H, W, 3] -> [B, H / 32, W / 32, 1024], after the last norm.
 
     With `cfg.zoom` above 1 each cell stands for 2 x 2 pixels: [B, H / 16, W / 16, 1024].
@@ -179,7 +179,7 @@ class Trunk(nn.Module):
         return _norm(self.cfg, pieces, train, "norm5")
 
 
-class Head(nn.Module):
+class DenseNetHead(nn.Module):
     """Twice norm, ReLU and a 1 x 1 convolution, then upsampling (VPG); the last bias is ours.
 
     [..., h, w, F] -> [..., s h, s w, OUTPUTS] float32, s = 32 / (zoom * output_stride).
@@ -203,7 +203,7 @@ def _upsample(maps: jax.Array, factor: int) -> jax.Array:
     return jax.image.resize(maps, (*batch, factor * rows, factor * cols, channels), "bilinear")
 
 
-class Critic(nn.Module):
+class DenseNetCritic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads.
 
     The backward pass keeps outputs of convolutions and computes those of norms again.
@@ -222,9 +222,9 @@ class Critic(nn.Module):
             split_rngs={"params": True},
         )
         inputs = _trunk_inputs(self.cfg, maps)
-        features = apply(Trunk(self.cfg, name="trunk"), inputs)  # [T, B, h, w, f]
+        features = apply(DenseNetTrunk(self.cfg, name="trunk"), inputs)  # [T, B, h, w, f]
         features = jnp.concatenate(list(features), axis=-1)
-        return Head(self.cfg, name="head")(features, train), features
+        return DenseNetHead(self.cfg, name="head")(features, train), features
 
 
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:

@@ -55,8 +55,8 @@ def _small(cfg: SmallNet) -> Networks:
 
 def _densenet(cfg: DenseNet121) -> Networks:
     return Networks(
-        densenet.Critic(cfg),
-        densenet.Head(cfg),
+        densenet.DenseNetCritic(cfg),
+        densenet.DenseNetHead(cfg),
         cfg.output_stride,
         cfg.colour,
         densenet.inputs,

@@ -34,7 +34,7 @@ def variables(cfg: DenseNet121, tensors: Mapping[str, np.ndarray]) -> Any:
 
     Raises ValueError naming the first tensor that is missing, misshapen or not known.
     """
-    trunk, blank = densenet.Trunk(cfg), jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
+    trunk, blank = densenet.DenseNetTrunk(cfg), jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     wanted = jax.eval_shape(trunk.init, jax.random.key(0), blank)
     names = set()
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import comparison
-from csac_jax.report.comparison import NAMES, Curve, Place, Report, Score, label
+from csac_jax.report.comparison import NAMES, Curve, EvaluatedPart, Report, Score, label
 from csac_jax.report.results import Variant
 from csac_jax.report.tables import PAPER_ACTIONS, PAPER_CASES, PAPER_TRAINING
 
@@ -147,7 +147,7 @@ def _cases(scores: Sequence[Score]) -> Figure:
     return figure
 
 
-def _style(group: Place, runs: int, index: int) -> dict[str, Any]:
+def _style(group: EvaluatedPart, runs: int, index: int) -> dict[str, Any]:
     """Name and colour of a variant's marks."""
     variant = group.variant
     name = _short(variant) if group.policy == "learned" else group.policy

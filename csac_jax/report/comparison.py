@@ -8,7 +8,7 @@ import numpy as np
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import results as recorded
-from csac_jax.report.results import Evaluation, Results, Run, Variant
+from csac_jax.report.results import Evaluation, RecordedRun, Results, Variant
 
 NAMES = {
     "grasp_only": "Grasping-only",
@@ -32,7 +32,7 @@ class Curve(NamedTuple):
     """The runs of a variant together."""
 
     variant: Variant
-    runs: list[Run]
+    runs: list[RecordedRun]
 
     @property
     def ends(self) -> list[int]:
@@ -54,7 +54,7 @@ class Curve(NamedTuple):
         return statistics.curves([(run.actions, run.success) for run in self.runs])
 
 
-class Place(NamedTuple):
+class EvaluatedPart(NamedTuple):
     """What the evaluations of one score have in common."""
 
     variant: Variant
@@ -75,7 +75,7 @@ class Place(NamedTuple):
 class Score(NamedTuple):
     """The evaluations of a variant in one part of a suite together."""
 
-    place: Place
+    place: EvaluatedPart
     evaluations: list[Evaluation]
 
     def band(self, metric: str) -> Band | None:
@@ -132,13 +132,13 @@ def _grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[
     return found
 
 
-def _place(one: Evaluation) -> Place:
+def _place(one: Evaluation) -> EvaluatedPart:
     variant = recorded.variant(one.config)
     if one.policy != "learned":  # what its run was trained with does not matter
         variant = Variant(variant.preset, one.policy, ())
     episodes = one.metrics.get("counts", {}).get("episodes", 0)
     world = recorded.world(one.config)
-    return Place(variant, one.policy, one.suite, one.part, *world, one.seed, episodes)
+    return EvaluatedPart(variant, one.policy, one.suite, one.part, *world, one.seed, episodes)
 
 
 def _curve_notes(curve: Curve) -> Iterable[str]:
@@ -159,7 +159,7 @@ def label(variant: Variant, preset: bool = True, most: int | None = None) -> str
     return ", ".join([f"{name} ({variant.preset})" if preset else name, *changed])
 
 
-def together(scores: Iterable[Score]) -> Iterable[tuple[Place, list[Score]]]:
+def together(scores: Iterable[Score]) -> Iterable[tuple[EvaluatedPart, list[Score]]]:
     """Scores that differ in their part alone, with what they share."""
     return _grouped(scores, lambda score: score.place._replace(part="")).items()
 

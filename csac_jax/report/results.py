@@ -38,7 +38,7 @@ class Variant(NamedTuple):
         return all(name.startswith(LENGTH) for name, _ in self.changed)
 
 
-class Run(NamedTuple):
+class RecordedRun(NamedTuple):
     """One training run."""
 
     path: Path
@@ -66,7 +66,7 @@ class Evaluation(NamedTuple):
 class Results(NamedTuple):
     """All that was found, and a line about each thing that is missing."""
 
-    runs: list[Run]
+    runs: list[RecordedRun]
     evaluations: list[Evaluation]
     notes: list[str]
 
@@ -123,7 +123,7 @@ def _add_run(path: Path, results: Results) -> None:
             for name in ("actions", "grasp_success", "grasps_counted", "seconds")
         )
         record = _record(path.parent, config)
-        results.runs.append(Run(path, config, actions, success, grasps, seconds, record))
+        results.runs.append(RecordedRun(path, config, actions, success, grasps, seconds, record))
 
 
 def _record(folder: Path, config: Json) -> Json:
@@ -198,7 +198,7 @@ def world(config: Json) -> tuple[str, str]:
     return sim.get("physics", "mjx"), sim.get("robot", "hand")
 
 
-def command(one: Run | Evaluation) -> str:
+def command(one: RecordedRun | Evaluation) -> str:
     """The command that makes such a run or evaluation, from what its record says."""
     physics, robot = world(one.config)
     if isinstance(one, Evaluation):

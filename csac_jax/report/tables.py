@@ -10,8 +10,17 @@ import numpy as np
 from csac_jax.constants import GRASP_WINDOW
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import comparison, results as recorded
-from csac_jax.report.comparison import METRICS, Curve, Place, Report, Score, gaps, label, lead
-from csac_jax.report.results import Evaluation, Run, Variant
+from csac_jax.report.comparison import (
+    METRICS,
+    Curve,
+    EvaluatedPart,
+    Report,
+    Score,
+    gaps,
+    label,
+    lead,
+)
+from csac_jax.report.results import Evaluation, RecordedRun, Variant
 
 PAPER_TRAINING = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
 """Grasp success over the last 200 grasps of 2,500 actions, from the text to figures 6 and 7 (CSAC
@@ -27,11 +36,11 @@ GOOD = 0.9  # grasp success whose time is reported
 Table = list[dict[str, str]]  # rows; column -> cell
 
 
-def _seeds(runs: Sequence[Run | Evaluation]) -> list[int]:
+def _seeds(runs: Sequence[RecordedRun | Evaluation]) -> list[int]:
     return sorted(one.config.get("seed", 0) for one in runs)
 
 
-def _time_to_good(run: Run) -> float | None:
+def _time_to_good(run: RecordedRun) -> float | None:
     """Training seconds after which the success of a full window first reached GOOD."""
     there = np.flatnonzero((run.success >= GOOD) & (run.grasps >= GRASP_WINDOW))
     return float(run.seconds[there[0]]) if there.size else None
@@ -140,7 +149,7 @@ def evaluation(report: Report) -> Table:
 
 
 def _evaluation_row(
-    place: Place, scores: Sequence[Score], band: Callable[[str], Band | None]
+    place: EvaluatedPart, scores: Sequence[Score], band: Callable[[str], Band | None]
 ) -> dict[str, str]:
     runs = max(len(score.evaluations) for score in scores)
     episodes = sum(score.place.episodes * len(score.evaluations) for score in scores)
@@ -188,7 +197,7 @@ def _sum(runs: Sequence[recorded.Json], cause: str) -> str:
     return f"{cases} / {n}" if n else "-"
 
 
-def _first_cells(its: Place) -> dict[str, str]:
+def _first_cells(its: EvaluatedPart) -> dict[str, str]:
     name = its.policy if its.policy != "learned" else label(its.variant)
     part = _part(its.suite, its.part)
     return {"policy": name, "part": part, "physics, robot, seed": its.world}
@@ -200,7 +209,7 @@ def _part(suite: str, part: str) -> str:
 
 def provenance(report: Report) -> Table:
     """Where every number comes from, a row per file."""
-    every: list[Run | Evaluation] = [*report.results.runs, *report.results.evaluations]
+    every: list[RecordedRun | Evaluation] = [*report.results.runs, *report.results.evaluations]
     by_path = {one.path: one for one in every}
     root = os.path.commonpath([path.parent for path in by_path]) if by_path else ""
     return [
@@ -216,14 +225,14 @@ def provenance(report: Report) -> Table:
     ]
 
 
-def _versions(one: Run | Evaluation) -> str:
+def _versions(one: RecordedRun | Evaluation) -> str:
     versions = one.record.get("versions") or {}
     names = [name for name in ("python", "jax", "mujoco") if name in versions]
     return ", ".join(f"{name} {versions[name]}" for name in names)
 
 
-def _wall_time(one: Run | Evaluation) -> str:
-    if isinstance(one, Run):
+def _wall_time(one: RecordedRun | Evaluation) -> str:
+    if isinstance(one, RecordedRun):
         seconds = one.record.get("wall_seconds", float(one.seconds[-1]))
     else:
         seconds = one.record.get("seconds")

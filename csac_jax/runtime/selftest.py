@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.sim import selftest as physics
+from csac_jax.sim import reference_check as physics
 
 ROWS = 32_775  # rows beyond 32,768 are those that go wrong
 

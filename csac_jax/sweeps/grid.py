@@ -59,7 +59,7 @@ def _axis(text: str) -> tuple[str, list[str]]:
     name, values = name.replace("-", "_"), rest.split(",")
     if not equals or not all(values):
         raise ValueError(f"--vary {text}: give a setting and its values, as in learn.tau=0.01,0.02")
-    _kind(name)
+    kind_of(name)
     if len(set(values)) < len(values):
         raise ValueError(f"--vary {text}: a value is given twice")
     if not all(map(_names_a_folder, values)):
@@ -96,7 +96,8 @@ def _kinds() -> dict[str, object]:
     return kinds
 
 
-def _kind(name: str) -> object:
+def kind_of(name: str) -> object:
+    """Type of a setting by its dotted name. Raises ValueError for what cannot be varied."""
     kinds = _kinds()
     if name == "seed":
         raise ValueError("--vary: seeds are varied by --seeds")
@@ -111,10 +112,10 @@ def _kind(name: str) -> object:
 
 def _flags(name: str, value: str) -> list[str]:
     flag = "--" + name.replace("_", "-")
-    if _kind(name) is bool:
+    if kind_of(name) is bool:
         if value not in ("true", "false"):
             raise ValueError(f"--vary {name}: {value!r} is neither true nor false")
         section, _, field = flag.rpartition(".")
         return [flag if value == "true" else f"{section}.no-{field}"]
-    items = value.split(":") if typing.get_origin(_kind(name)) is tuple else [value]
+    items = value.split(":") if typing.get_origin(kind_of(name)) is tuple else [value]
     return [flag, *items]

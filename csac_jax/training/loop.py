@@ -162,6 +162,16 @@ def _begin(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Pr
 
 def _resume(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
     """State of the newest checkpoint; lines of the log that are newer than it are dropped."""
+    check_resumable(cfg, run_dir)
+    files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
+    state, extra = checkpoint.restore(run_dir, jax.eval_shape(init))
+    step = int(state.step)
+    files.truncate_log(run_dir / files.METRICS, step)
+    return state, Progress(extra["seconds"], extra["grasps"]), step
+
+
+def check_resumable(cfg: Config, run_dir: Path) -> None:
+    """Raises SettingsError where the run has other settings, CheckpointError where it is none."""
     stored = checkpoint.load_config(run_dir)
     longer = stored.change(train={"actions": max(stored.train.actions, cfg.train.actions)})
     if names := configs.differences(longer, cfg):
@@ -169,11 +179,6 @@ def _resume(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, P
             f"{run_dir} was trained with other values of {', '.join(names)}; leave them out, or "
             "begin a new run; only train.actions may grow"
         )
-    files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
-    state, extra = checkpoint.restore(run_dir, jax.eval_shape(init))
-    step = int(state.step)
-    files.truncate_log(run_dir / files.METRICS, step)
-    return state, Progress(extra["seconds"], extra["grasps"]), step
 
 
 def compile_program(
@@ -219,7 +224,7 @@ def _check_finite(run_dir: Path, metrics: Any, step: int) -> None:
             )
             raise TrainingError(
                 f"{name} is not finite in the chunk that ended at step {step}; {kept}; "
-                "lower learn.learning_rate or learn.gradient_clip and train anew"
+                "lower learn.learning_rate and train again"
             )
 
 

@@ -147,7 +147,8 @@ def train_step(
     # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch would cost more
     # than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.learning_starts
-    learned, priority, losses = _learn(program, key_learn, state.learner, replay)
+    done = _updates_done(cfg, state.step)
+    learned, priority, losses = _learn(program, key_learn, state.learner, replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, replay.priority)
 
@@ -191,16 +192,19 @@ def _result(action: Action, info: environment.Info) -> ActionResult:
 
 
 def _learn(
-    program: Program, key: jax.Array, state: Any, replay: ReplayState
+    program: Program, key: jax.Array, state: Any, replay: ReplayState, done: jax.Array
 ) -> tuple[Any, jax.Array, dict[str, jax.Array]]:
-    """The updates, each on a batch of its own, then the end of the step on (part of) the last."""
+    """The updates, each on a batch of its own, then the end of the step on (part of) the last.
+
+    `done` [] int32 updates came before.
+    """
     cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
 
     def update(carry, i):
         state, priority = carry
         *keys_draw, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
-        progress = state.updates.astype(jnp.float32) / total
+        progress = (done + i).astype(jnp.float32) / total
         current = replay.replace(priority=priority)
         slots, weights, batch = _draw(program, keys_draw, current, progress)
         state, info = learner.update(key_update, state, batch, weights)
@@ -220,6 +224,12 @@ def _learn(
         "q_mean": jnp.mean(info.q),
     }
     return state, priority, losses
+
+
+def _updates_done(cfg: Config, step: jax.Array) -> jax.Array:
+    """Updates [] int32 before training step `step` [] that were not dropped."""
+    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1
+    return jnp.maximum(step - first, 0) * cfg.learn.updates
 
 
 def _draw(

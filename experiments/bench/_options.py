@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from csac_jax.cli import settings
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import ActorCritic
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
 from csac_jax.runtime import compiler, provenance
 from csac_jax.training import step

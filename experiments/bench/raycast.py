@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry, presets
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.runtime import provenance
 from csac_jax.scene import blocks, model as models

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import BetaReplay, PrioritisedReplay, ReplayConfig, UniformReplay
 from csac_jax.replay import ring, samplers
 from csac_jax.runtime import provenance

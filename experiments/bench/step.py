@@ -35,7 +35,7 @@ from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
 from csac_jax.cli import parsing
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, PhysicsKind
 from csac_jax.nets.convolution import conv2d
 from csac_jax.replay import ring

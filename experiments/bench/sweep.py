@@ -19,11 +19,11 @@ from typing import Any
 
 import jax
 
-from csac_jax.cli.errors import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.runtime import compiler, provenance
 from csac_jax.sim import backend
-from csac_jax.sweeps import grid, pipelined, replicas, sweep as sweeping
+from csac_jax.sweeps import grid, pipelined, replicas, runner
 from csac_jax.training import sharding, step
 from experiments.bench._options import Parser, config, split
 
@@ -89,8 +89,8 @@ def main(arguments: list[str]) -> None:
             sharding.check(
                 sharding.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch
             )
-            most = sweeping.SweepPlan(max(options.seeds), [grid.SweepPoint(grid.BASE, {}, cfg)])
-            sweeping.check_room(most, 1 if options.shard == "scenes" else devices)
+            most = runner.SweepPlan(max(options.seeds), [grid.SweepPoint(grid.BASE, {}, cfg)])
+            runner.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
         raise BadArgumentsError(f"bench sweep: {error}") from None
     program = step.make(cfg)

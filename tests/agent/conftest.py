@@ -1,6 +1,5 @@
 """Small configs, networks that are all random, and scenes drawn on a height map."""
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -12,23 +11,21 @@ from csac_jax import presets
 from csac_jax.agent import actor_critic, maps
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.maps import Frames
-from csac_jax.config import Config, NetConfig
+from csac_jax.config import Config, SmallNet
+from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
 
 
 @pytest.fixture(scope="session")
 def cfg() -> Config:
     """The smallest preset with eight yaws, and a run so long that no schedule moves on."""
-    net = NetConfig(rotations=8, growth=4, dilations=(1, 2), stem=4, head=8)
-    smoke = presets.smoke()
-    return dataclasses.replace(
-        smoke, net=net, train=dataclasses.replace(smoke.train, actions=1_000_000)
-    )
+    net = SmallNet(rotations=8, growth=4, dilations=(1, 2), stem=4, head=8)
+    return presets.smoke().change(net=net, train={"actions": 1_000_000})
 
 
 @pytest.fixture(scope="session")
 def frames(cfg: Config) -> Frames:
-    return maps.frames(cfg)
+    return maps.frames(cfg, networks.make(cfg.net))
 
 
 @pytest.fixture(scope="session")

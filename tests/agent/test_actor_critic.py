@@ -9,13 +9,15 @@ import optax
 import pytest
 
 from csac_jax.agent import actor, actor_critic, maps, softmax
-from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params, Transition
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
+from csac_jax.agent.learner import Transition
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import TargetConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
+from tests.sections import with_constants
 
 pytestmark = pytest.mark.optax
 B = 6
@@ -81,7 +83,9 @@ def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
     Where everything ends the target is the reward, so that the error tells Q. Both primitives,
     poses all over.
     """
-    look = jax.jit(lambda params, obs: actor_critic.look(learner, params, heightmap.unpack(obs)).q)
+    look = jax.jit(
+        lambda params, obs: actor_critic.dense_maps(learner, params, heightmap.unpack(obs)).q
+    )
     read = jax.jit(jax.vmap(lambda q, p, pose: maps.read(learner.frames, q, p, pose)))
     q = look(state.online, batch.obs)
     rng = np.random.default_rng(0)
@@ -206,7 +210,7 @@ def test_actor_climbs_the_critic(learner, state, batch):
     @jax.jit
     def value(online: Params) -> jax.Array:
         """Mean of Q(s, mu(s)) over states and primitives."""
-        seen = actor_critic.look(learner, online, heightmap.unpack(batch.obs))
+        seen = actor_critic.dense_maps(learner, online, heightmap.unpack(batch.obs))
         poses = [
             jax.vmap(lambda one, p=p: actor.pose(learner.frames, one, p))(seen) for p in Primitive
         ]
@@ -279,9 +283,9 @@ def _smooth(frames) -> DenseMaps:
     return DenseMaps(q=q, logits=10.0 * q, valid=jnp.ones(q.shape, bool))
 
 
-def _with_target(learner: ActorCritic, **settings) -> ActorCritic:
-    cfg = dataclasses.replace(learner.cfg, target=dataclasses.replace(TargetConfig(), **settings))
-    return dataclasses.replace(learner, cfg=cfg)
+def _changed(learner: ActorCritic, **sections) -> ActorCritic:
+    """The same learner with other sections."""
+    return dataclasses.replace(learner, cfg=learner.cfg.change(**sections))
 
 
 @pytest.mark.slow
@@ -292,7 +296,8 @@ def test_next_value_lies_within_the_map(learner):
     low, high = float(state.q.min()), float(state.q.max())
     means = []
     for beta in (0.0, 1e5):
-        own = _with_target(learner, inverse_temperature=beta, samples=256)
+        target = with_constants(TargetConfig(samples=256), inverse_temperature=beta)
+        own = _changed(learner, target=target)
         run = jax.jit(jax.vmap(lambda key, own=own: actor_critic.next_value(own, key, state)))
         values = np.asarray(run(jax.random.split(jax.random.key(1), 16)))
         assert np.all((values >= low) & (values <= high))
@@ -327,15 +332,6 @@ def test_best_grasp():
     assert actor_critic.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0
 
 
-def _changed(learner: ActorCritic, section: str, **settings) -> ActorCritic:
-    """The same learner with other settings of one section."""
-    cfg = learner.cfg
-    cfg = dataclasses.replace(
-        cfg, **{section: dataclasses.replace(getattr(cfg, section), **settings)}
-    )
-    return dataclasses.replace(learner, cfg=cfg)
-
-
 def _run(learner: ActorCritic):
     return jax.jit(
         lambda state, batch: actor_critic.update_critic(
@@ -355,7 +351,7 @@ def _random_maps(shape, seed: int = 0) -> DenseMaps:
 def test_max_target_is_the_best_valid_cell(learner):
     """Claim: V(s') by `max` is NumPy's maximum over the valid cells of both primitives, the limit
     of the softmax over the map; without a valid cell, over all."""
-    own, state = _with_target(learner, value="max"), _random_maps((2, 4, 6, 6))
+    own, state = _changed(learner, target=TargetConfig(value="max")), _random_maps((2, 4, 6, 6))
     best = np.asarray(state.q)[np.asarray(state.valid)].max()
     assert actor_critic.next_value(own, jax.random.key(0), state) == best
     np.testing.assert_allclose(softmax.exact(state.q, 1e6, state.valid), best, rtol=1e-6)
@@ -370,8 +366,12 @@ def test_max_target_is_the_best_valid_cell(learner):
 @pytest.mark.parametrize("value", ["max", "softmax"])
 def test_a_policy_that_never_pushes_expects_nothing_of_pushes(learner, value):
     """Claim: with `policy.primitive` grasp, V(s') does not change with the map of pushes."""
-    own = _changed(_with_target(learner, value=value), "explore", push_fraction=0.0)
-    own = _changed(own, "policy", primitive="grasp")
+    own = _changed(
+        learner,
+        target=TargetConfig(value=value),
+        explore={"push_fraction": 0.0},
+        policy={"primitive": "grasp"},
+    )
     state = _smooth(learner.frames)
     high = state.replace(q=state.q.at[Primitive.PUSH].add(3.0))
     run = jax.jit(lambda s: actor_critic.next_value(own, jax.random.key(0), s))
@@ -380,10 +380,10 @@ def test_a_policy_that_never_pushes_expects_nothing_of_pushes(learner, value):
 
 def test_max_target_reaches_the_update(learner, state, batch, update):
     """Claim: y = r + gamma max Q'(s', .), by NumPy from the target critic's maps."""
-    own = _with_target(learner, value="max", gamma=0.5)
-    seen = jax.jit(lambda params, obs: actor_critic.look(learner, params, heightmap.unpack(obs)))(
-        state.target, batch.next_obs
-    )
+    own = _changed(learner, target=TargetConfig(value="max", gamma=0.5))
+    seen = jax.jit(
+        lambda params, obs: actor_critic.dense_maps(learner, params, heightmap.unpack(obs))
+    )(state.target, batch.next_obs)
     best = np.where(seen.valid, seen.q, -np.inf).reshape(B, -1).max(axis=1)
     going, ended = _run(own)(state, batch)[1].error, update(state, _ended(batch))[1].error
     np.testing.assert_allclose(going - ended, 0.5 * np.clip(best, *learner.bounds), atol=1e-5)
@@ -392,15 +392,15 @@ def test_max_target_reaches_the_update(learner, state, batch, update):
 @pytest.mark.slow
 def test_squared_loss_reaches_the_update(learner, state, batch):
     """Claim: with `squared` the loss is the mean of the squared errors, line 21."""
-    info = _run(_changed(learner, "learn", loss="squared"))(state, batch)[1]
+    info = _run(_changed(learner, learn={"loss": "squared"}))(state, batch)[1]
     np.testing.assert_allclose(info.critic_loss, np.mean(np.asarray(info.error) ** 2), rtol=1e-5)
 
 
 @pytest.mark.slow
 def test_hard_targets_reach_the_update(learner, state, batch):
-    """Claim: with hard updates and C = 2, the targets stay after one update and are the networks
+    """Claim: with tau = 1 and C = 2, the targets stay after one update and are the networks
     after two."""
-    run = _run(_changed(learner, "learn", target_update="hard", target_update_period=2))
+    run = _run(_changed(learner, learn={"tau": 1.0, "target_update_period": 2}))
     first, _ = run(state, batch)
     jax.tree.map(np.testing.assert_array_equal, first.target, state.target)
     second, _ = run(first, batch)
@@ -416,7 +416,7 @@ def _one(params: Params, m: int) -> Params:
 def test_twin_critics(learner, batch, randomised):
     """Claim: of two critics the maps are the lower value in each cell; each is trained on its own
     loss, towards one target from the lower maps, and they differ from the start."""
-    twin = _changed(_with_target(learner, value="max"), "learn", critics=2)
+    twin = _changed(learner, target=TargetConfig(value="max"), learn={"critics": 2})
     begun = jax.jit(lambda key: actor_critic.init(key, twin))(jax.random.key(0))
     assert all(
         np.any(leaf[0] != leaf[1]) for leaf in jax.tree.leaves(begun.online.critic) if leaf.ndim > 3
@@ -424,7 +424,7 @@ def test_twin_critics(learner, batch, randomised):
     with jax.numpy_dtype_promotion("standard"):
         state = randomised(begun)
     look = jax.jit(
-        lambda params: actor_critic.look(learner, params, heightmap.unpack(batch.next_obs))
+        lambda params: actor_critic.dense_maps(learner, params, heightmap.unpack(batch.next_obs))
     )
     both, single = look(state.target), [look(_one(state.target, m)) for m in (0, 1)]
     np.testing.assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
@@ -457,21 +457,9 @@ def _alone(learner: ActorCritic, state: LearnerState, m: int) -> LearnerState:
 def test_without_an_actor(learner, state, observations):
     """Claim: without an actor the logits are the critic's map, ten to one, and an update of the
     actor is none."""
-    own = _changed(learner, "learn", actor=False)
-    seen = jax.jit(lambda obs: actor_critic.look(own, state.online, obs))(observations(2, 4))
+    own = _changed(learner, learn={"actor": False})
+    seen = jax.jit(lambda obs: actor_critic.dense_maps(own, state.online, obs))(observations(2, 4))
     np.testing.assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
     after, loss = actor_critic.update_actor(own, state, observations(2, 4))
     jax.tree.map(np.testing.assert_array_equal, after, state)
     assert loss == 0.0
-
-
-def test_without_the_mask(learner, state, observations):
-    """Claim: without masking every cell above the workspace is valid, whatever lies there; with it,
-    far fewer are."""
-    own = _changed(learner, "policy", mask=False)
-    valid = jax.jit(lambda obs: actor_critic.look(own, state.online, obs))(observations(2, 4)).valid
-    np.testing.assert_array_equal(valid, np.broadcast_to(learner.frames.inside, valid.shape))
-    masked = jax.jit(lambda obs: actor_critic.look(learner, state.online, obs))(
-        observations(2, 4)
-    ).valid
-    assert np.mean(masked) < 0.7 * np.mean(valid)

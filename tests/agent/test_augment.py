@@ -1,6 +1,5 @@
 """Augmentation of transitions."""
 
-import dataclasses
 import itertools
 
 import jax
@@ -8,21 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chisquare, kstest
+from scipy.stats import chisquare
 
 from csac_jax import geometry, presets
 from csac_jax.agent import augment, maps
 from csac_jax.agent.learner import Transition
 from csac_jax.constants import Primitive
-from csac_jax.env import Env
+from csac_jax.nets import networks
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.sim.primitives import Action
-from csac_jax.vision import heightmap, rotate
+from csac_jax.vision import heightmap, observe, rotate
 
 FLAGS = list(itertools.product((False, True), repeat=3))
 CFG = presets.smoke()  # four yaws: turning to the nearest cell is exact
-FRAMES = maps.frames(CFG)
+FRAMES = maps.frames(CFG, networks.make(CFG.net))
 
 apply_symmetry = jax.jit(augment.apply_symmetry)
 
@@ -54,7 +53,7 @@ ROTATION = Rotation.from_euler("zyx", [[0.4, 0.3, 0.0], [1.1, -0.2, 0.35], [2.0,
 POSITION = np.array([[0.06, 0.05, 0.05], [-0.12, 0.02, 0.04], [0.03, -0.14, 0.0243]])
 POSE = np.array([0.071, -0.033, 0.6])
 
-look = jax.jit(Env(CFG, None, None).look)
+look = jax.jit(lambda scene: observe.observe(CFG, scene))
 
 
 def _transition(
@@ -203,9 +202,7 @@ def test_random_symmetry_draws_all_eight_alike(transition):
     assert chisquare(counts).pvalue > 1e-4
 
 
-shift_and_rotate = jax.jit(
-    lambda transition, yaw, cells: augment.shift_and_rotate(CFG, transition, yaw, cells)
-)
+shift = jax.jit(lambda transition, cells: augment.shift(CFG, transition, cells))
 CELL = CFG.heightmap.cell
 
 
@@ -219,8 +216,8 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
     """Claim: a shift by whole cells gives height, colour and target mask of the shifted scene,
     table that comes in included, and moves the action as far; another shift takes it back, cell by
     cell."""
-    moved = shift_and_rotate(transition, jnp.float32(0.0), jnp.array(cells, jnp.int32))
-    seen = heightmap.pack(_observe(_shifted(cells)))
+    moved = shift(transition, jnp.array(cells, jnp.int32))
+    seen = heightmap.pack(look(_shifted(cells)))
     for obs in (moved.obs, moved.next_obs):
         off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
         assert np.mean(off > 1) < 0.005  # a ray along an edge
@@ -230,51 +227,13 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
     np.testing.assert_allclose(
         moved.action.pose, np.add(POSE, [cells[1] * CELL, cells[0] * CELL, 0.0]), atol=1e-6
     )
-    back = shift_and_rotate(moved, jnp.float32(0.0), -jnp.array(cells, jnp.int32))
+    back = shift(moved, -jnp.array(cells, jnp.int32))
     assert _signature(back) == _signature(transition)
-
-
-@pytest.mark.parametrize("turns", [1, 2, 3])
-def test_quarter_turns_are_exact(transition, turns):
-    """Claim: a quarter turn only permutes cells."""
-    moved = shift_and_rotate(transition, jnp.float32(turns * np.pi / 2), jnp.zeros(2, jnp.int32))
-    np.testing.assert_array_equal(
-        moved.obs.height, np.rot90(transition.obs.height, -turns)
-    )  # rows point up
-    np.testing.assert_array_equal(moved.obs.colour, np.rot90(transition.obs.colour, -turns))
-
-
-@pytest.mark.parametrize("yaw", [0.1, -0.37, 1.3, 3.0])
-def test_a_turn_is_exact_in_the_action_and_nearest_in_the_map(transition, yaw):
-    """Claim: place and yaw of the action turn with the scene; a cell shows what lies at most half a
-    cell a side from its place in the map before."""
-    index = np.arange(32, dtype=np.uint16)
-    place = np.asarray(geometry.cell_centres(CFG.heightmap))
-    source = np.asarray(geometry.rotate2d(jnp.float32(-yaw), jnp.asarray(place)))
-    inside = np.abs(source).max(-1) < 0.5 * CFG.heightmap.extent - 1e-6
-    for axis, ramp in enumerate(
-        (np.tile(index, (32, 1)), np.tile(index[:, None], (1, 32)))
-    ):  # x, y in low counts
-        flat = transition.obs.replace(height=jnp.asarray(ramp))
-        moved = shift_and_rotate(
-            transition.replace(obs=flat, next_obs=flat), jnp.float32(yaw), jnp.zeros(2, jnp.int32)
-        )
-        shown = (np.asarray(moved.obs.height) + 0.5) * CELL - 0.5 * CFG.heightmap.extent
-        assert np.abs(shown - source[..., axis])[inside].max() <= 0.5 * CELL + 1e-6
-        assert np.all(
-            np.asarray(moved.obs.height)[np.abs(source).max(-1) > 0.5 * CFG.heightmap.extent + 1e-6]
-            == 0
-        )
-    x, y, turned = np.asarray(moved.action.pose)
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    np.testing.assert_allclose([x, y], np.array([[cos, -sin], [sin, cos]]) @ POSE[:2], atol=1e-6)
-    np.testing.assert_allclose(turned, (POSE[2] + yaw) % (2 * np.pi), atol=1e-5)
 
 
 def test_what_would_be_cut_off_stays(transition):
     """Claim: a shift that would push a block, the place of an action or the end of a push out
     leaves all as it was."""
-    still = jnp.float32(0.0)
     bare = transition.replace(
         obs=transition.obs.replace(height=jnp.zeros((32, 32), jnp.uint16)),
         next_obs=transition.next_obs.replace(height=jnp.zeros((32, 32), jnp.uint16)),
@@ -296,71 +255,15 @@ def test_what_would_be_cut_off_stays(transition):
     )
     for before, cells, primitive, pose, goes in cases:
         action = Action(primitive=jnp.int32(primitive), pose=jnp.asarray(pose, jnp.float32))
-        after = shift_and_rotate(before.replace(action=action), still, jnp.array(cells, jnp.int32))
+        after = shift(before.replace(action=action), jnp.array(cells, jnp.int32))
         assert (not np.array_equal(after.action.pose, action.pose)) == goes
         if not goes:
             assert _signature(after) == _signature(before)
 
 
-BORDERED = dataclasses.replace(CFG, net=dataclasses.replace(CFG.net, border=True))
-shift_bordered = jax.jit(
-    lambda transition, cells: augment.shift_and_rotate(
-        BORDERED, transition, jnp.float32(0.0), cells
-    )
-)
-
-
-def test_the_border_moves_along(transition):
-    """Claim: with `net.border` cells that come in are marked, all else as without;
-    the net sees the border where it would be, had the workspace moved with its blocks."""
-    cells = jnp.array([2, 1], jnp.int32)
-    moved, plain = (
-        shift_bordered(transition, cells),
-        shift_and_rotate(transition, jnp.float32(0.0), cells),
-    )
-    beyond = np.zeros((32, 32), bool)
-    beyond[:2] = beyond[:, :1] = True
-    for obs, wanted in zip((moved.obs, moved.next_obs), (plain.obs, plain.next_obs), strict=True):
-        seen = heightmap.unpack(obs)
-        np.testing.assert_array_equal(
-            seen.height, np.where(beyond, heightmap.BEYOND, heightmap.unpack(wanted).height)
-        )
-        net_input = np.asarray(maps.rotated_inputs(maps.frames(BORDERED), seen))[
-            0
-        ]  # the frame that is not turned
-        np.testing.assert_array_equal(net_input[..., -1], np.pad(~beyond, 2))
-        np.testing.assert_array_equal(
-            net_input[..., :-1], maps.rotated_inputs(FRAMES, heightmap.unpack(wanted))[0]
-        )
-    assert not np.array_equal(moved.obs.height, transition.obs.height)
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize(
-    ("cell", "step", "goes"),
-    [(26, 1, True), (27, 1, False), (27, -1, True), (1, 1, True), (4, -1, False)],
-)
-def test_nothing_comes_near_a_border_that_is_none(
-    transition, axis: int, cell: int, step: int, goes: bool
-):
-    """Claim: with `net.border` a shift that brings what stands within 5 cm of the side it goes to
-    is left out, as the net would see a border there; at the other side, whose border moves along,
-    it is not."""
-    height = np.zeros((32, 32), np.uint16)
-    height[(cell, 16) if axis == 0 else (16, cell)] = (
-        500  # 14 mm cells: the centre of cell 27 is 161 mm off, of 28 175
-    )
-    lone = transition.obs.replace(height=jnp.asarray(height))
-    cells = jnp.array([step, 0] if axis == 0 else [0, step], jnp.int32)
-    lone = transition.replace(
-        obs=lone, next_obs=lone, action=transition.action.replace(primitive=jnp.int32(1))
-    )
-    assert (not np.array_equal(shift_bordered(lone, cells).obs.height, height)) == goes
-
-
 def test_augment_is_what_the_config_says(transition):
-    """Claim: by default `augment` draws the same symmetry as `random_symmetry`; shifts and
-    rotations stay in their bounds and reach them; with everything off it changes nothing."""
+    """Claim: by default `augment` draws the same symmetry as `random_symmetry`; shifts stay in
+    their bounds and reach them; with everything off it changes nothing."""
     same = jax.jit(augment.augment, static_argnums=1)
     for seed in range(3):
         default, drawn = (
@@ -368,18 +271,13 @@ def test_augment_is_what_the_config_says(transition):
             augment.random_symmetry(jax.random.key(seed), transition),
         )
         jax.tree.map(np.testing.assert_array_equal, default, drawn)
-    off = dataclasses.replace(CFG, learn=dataclasses.replace(CFG.learn, augment=False))
+    off = CFG.change(learn={"augment": False})
     jax.tree.map(
         np.testing.assert_array_equal, same(jax.random.key(0), off, transition), transition
     )
-    wide = dataclasses.replace(off, learn=dataclasses.replace(off.learn, augment_shift=2))
+    wide = off.change(learn={"augment_shift": 2})
     keys = jax.random.split(jax.random.key(1), 300)
     poses = jax.jit(jax.vmap(lambda key: augment.augment(key, wide, transition).action.pose))(keys)
     shifts = (np.asarray(poses) - POSE)[:, :2] / CELL
     np.testing.assert_allclose(shifts, shifts.round(), atol=1e-4)
     assert len(np.unique(shifts.round(), axis=0)) == 25
-    turning = dataclasses.replace(off, learn=dataclasses.replace(off.learn, augment_turn=0.2))
-    poses = jax.jit(jax.vmap(lambda key: augment.augment(key, turning, transition).action.pose))(
-        keys
-    )
-    assert kstest((np.asarray(poses)[:, 2] - POSE[2]) / 0.2, "uniform", args=(-1, 2)).pvalue > 1e-3

@@ -11,29 +11,25 @@ import optax
 import pytest
 
 from csac_jax.agent import actor_critic
-from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Transition
-from csac_jax.config import NetConfig
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState
+from csac_jax.agent.learner import Transition
+from csac_jax.config import DenseNet121
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
+from tests.sections import with_constants
 
 pytestmark = pytest.mark.optax
 B = 4
-NET = NetConfig(
-    kind="densenet121",
-    norm="batch",
-    rotations=4,
-    block_layers=(1, 1, 1, 1),
+NET = with_constants(
+    DenseNet121(norm="batch", rotations=4, block_layers=(1, 1, 1, 1), head=8, margin=0.0, zoom=2),
     block_growth=4,
-    head=8,
-    margin=0.0,
-    zoom=2,
 )
 
 
 @pytest.fixture(scope="module")
 def learner(cfg) -> ActorCritic:
     """Its steps are plain gradients; its target, the largest value, compiles fast."""
-    quick = dataclasses.replace(cfg, net=NET, target=dataclasses.replace(cfg.target, value="max"))
+    quick = cfg.change(net=NET, target={"value": "max"})
     plain = dataclasses.replace(actor_critic.make(quick), critic_optimiser=optax.sgd(0.1))
     return dataclasses.replace(plain, actor_optimiser=optax.sgd(0.1))
 
@@ -104,7 +100,7 @@ def _same(first: Any, other: Any) -> None:
 def test_acting_uses_running_statistics(learner, state, observations):
     """Claim: a state's maps do not depend on what else is looked at, but on the running statistics
     of both nets."""
-    look = jax.jit(lambda params, obs: actor_critic.look(learner, params, obs))
+    look = jax.jit(lambda params, obs: actor_critic.dense_maps(learner, params, obs))
     obs = observations(2, 4)
     others = jax.tree.map(lambda leaf: leaf.at[1].set(jnp.zeros((), leaf.dtype)), obs)
     both, one = look(state.online, obs), look(state.online, others)

@@ -9,6 +9,7 @@ import pytest
 
 from csac_jax.agent import box, cem
 from csac_jax.config import CEMConfig
+from tests.sections import with_constants
 
 NO_START = jnp.zeros((0, 3))
 CELLS = 2.0 * (jnp.arange(32, dtype=jnp.float32) + 0.5) / 32 - 1.0  # centres of map cells
@@ -95,7 +96,7 @@ def test_yaw_is_searched_across_the_seam(mean_yaw, peak_yaw):
     score = functools.partial(
         peaks, jnp.array([[0.1, -0.2, peak_yaw]]), jnp.ones(1), jnp.full(1, 0.2)
     )
-    cfg = CEMConfig(std=0.15, rounds=4)
+    cfg = with_constants(CEMConfig(rounds=4), std=0.15)
     found = search(cfg, score, jnp.array([0.1, -0.2, mean_yaw]), num=100)
     assert np.mean(found.value > 0.98) >= 0.98
 
@@ -108,7 +109,10 @@ def test_more_rounds_come_nearer(estimator):
 
     def median_miss(rounds):
         found = search(
-            CEMConfig(std=0.2, rounds=rounds, std_estimator=estimator), score, jnp.zeros(3), num=100
+            with_constants(CEMConfig(rounds=rounds, std_estimator=estimator), std=0.2),
+            score,
+            jnp.zeros(3),
+            num=100,
         )
         return np.median(np.linalg.norm(found.action - peak[None], axis=-1))
 
@@ -131,7 +135,11 @@ def test_best_sample_is_kept():
 def test_samples_stay_in_the_box():
     """Claim: no sample leaves the box: a score that pays only outside it is never paid."""
     outside = lambda u: jnp.where(jnp.any(jnp.abs(u) > 1.0) | (u[2] == 1.0), 1.0, 0.0)  # noqa: E731
-    cfg, mean, start = CEMConfig(std=2.0), jnp.array([1.5, -1.0, 0.99]), jnp.full((2, 3), 1.0)
+    cfg, mean, start = (
+        with_constants(CEMConfig(), std=2.0),
+        jnp.array([1.5, -1.0, 0.99]),
+        jnp.full((2, 3), 1.0),
+    )
     assert search(cfg, outside, mean, start).value[0] == 0.0
 
 

@@ -1,6 +1,5 @@
 """A turned scene gives the turned maps and the turned best action, with fixed random networks."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,23 +11,19 @@ import pytest
 from csac_jax.agent import actor_critic, maps
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.maps import DenseMaps
-from csac_jax.config import HeightmapConfig, NetConfig
+from csac_jax.config import DenseNet121, HeightmapConfig, SmallNet
 from csac_jax.nets import dense
 from csac_jax.vision.heightmap import Observation
+from tests.sections import with_constants
 
 K = 12  # no yaw of 45 degrees, where the nearest cell of a diagonal is a matter of rounding
 QUARTER = K // 4
 SIZE = 96
 NETS = {
-    "small": NetConfig(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8, margin=0.5),
-    "densenet121": NetConfig(
-        kind="densenet121",
-        rotations=K,
-        block_layers=(1, 1, 1, 1),
+    "small": SmallNet(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8, margin=0.5),
+    "densenet121": with_constants(
+        DenseNet121(rotations=K, block_layers=(1, 1, 1, 1), head=8, margin=0.5, zoom=2),
         block_growth=8,
-        head=8,
-        margin=0.5,
-        zoom=2,
     ),
 }
 
@@ -45,7 +40,7 @@ class Fixed(NamedTuple):
 def net(request, cfg) -> Fixed:
     """Either net, random in every parameter; nothing but `look` is compiled."""
     learner = actor_critic.make(
-        dataclasses.replace(cfg, net=NETS[request.param], heightmap=HeightmapConfig(size=SIZE))
+        cfg.change(net=NETS[request.param], heightmap=HeightmapConfig(size=SIZE))
     )
     rng = np.random.default_rng(0)
     with jax.numpy_dtype_promotion("standard"):
@@ -54,7 +49,7 @@ def net(request, cfg) -> Fixed:
         lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), abstract
     )
     return Fixed(
-        learner, params, jax.jit(lambda params, obs: actor_critic.look(learner, params, obs))
+        learner, params, jax.jit(lambda params, obs: actor_critic.dense_maps(learner, params, obs))
     )
 
 

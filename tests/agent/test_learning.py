@@ -40,11 +40,11 @@ def learn(
     """Trains an algorithm on a problem for a number of actions and plays EPISODES fresh
     episodes."""
     cfg = toys.config(algo, actions, cap, push)
-    toy, learner = problem(cfg), actor_critic.make(cfg)
-    state = step.init(step.Program(cfg, toy, learner))
-    state, metrics = step.compile_chunk(step.Program(cfg, toy, learner), cfg.train.steps)(state)
+    toy = problem(cfg)
+    program = step.make(cfg, env=toy)
+    state, metrics = step.compile_chunk(program, cfg.train.steps)(step.init(program))
     assert np.all(np.isfinite(metrics.critic_loss))
-    begun, ended, primitives = jax.jit(functools.partial(_play, toy, learner))(
+    begun, ended, primitives = jax.jit(functools.partial(_play, toy, actor_critic.make(cfg)))(
         jax.random.key(99), state.learner.online
     )
     chosen = np.array(
@@ -66,7 +66,7 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
         keys = jax.vmap(jax.random.fold_in, (None, 0))(
             jax.random.fold_in(key, i), jnp.arange(EPISODES)
         )
-        dense_maps = actor_critic.look(learner, params, state.obs)
+        dense_maps = actor_critic.dense_maps(learner, params, state.obs)
         best = jax.vmap(policy.best_action, (0, None, 0, 0))
         action = best(keys, learner, dense_maps, state.steps_without_change)
         after = jax.vmap(toy.step)(state, action)
@@ -76,7 +76,7 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
 
     first = jax.vmap(lambda i: toy.reset(jax.random.fold_in(key, i)))(1000 + jnp.arange(EPISODES))
     last, primitives = jax.lax.scan(act, first, jnp.arange(toy.cfg.task.max_actions))
-    return actor_critic.look(learner, params, first.obs), last, primitives
+    return actor_critic.dense_maps(learner, params, first.obs), last, primitives
 
 
 @pytest.mark.parametrize(

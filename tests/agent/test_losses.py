@@ -7,12 +7,13 @@ import pytest
 
 from csac_jax.agent import losses
 from csac_jax.config import LearnConfig
+from tests.sections import with_constants
 
 
 @pytest.mark.parametrize("width", [0.5, 1.0])
 def test_huber_gradient_is_bounded(width):
     """Claim: the gradient is finite, at most the width, for every finite error."""
-    cfg = LearnConfig(loss="huber", huber=width)
+    cfg = with_constants(LearnConfig(loss="huber"), huber=width)
     gradient = jax.vmap(jax.grad(lambda e: losses.td_loss(cfg, e)))(
         jnp.array([1e30, -3e38, width, 0.0])
     )
@@ -53,24 +54,25 @@ def test_soft_target_by_hand():
 def test_td_loss_by_hand(loss, expected):
     """Claim: errors 0.5 and -3 cost 0.125 and 4 by Huber of width 2, and their squares by line
     21."""
-    got = losses.td_loss(LearnConfig(loss=loss, huber=2.0), jnp.array([0.5, -3.0]))
+    cfg = with_constants(LearnConfig(loss=loss), huber=2.0)
+    got = losses.td_loss(cfg, jnp.array([0.5, -3.0]))
     np.testing.assert_array_equal(got, expected)
 
 
 @pytest.mark.parametrize("updates", [1, 2, 3, 4, 6, 7])
 def test_hard_targets_are_copied_every_c_updates(updates):
-    """Claim: targets are the online network after every third update if C = 3, bit for bit, and
-    untouched otherwise."""
+    """Claim: with tau = 1, targets are the online network after every third update if C = 3, bit
+    for bit, and untouched otherwise."""
     online, target = {"a": jnp.array([0.1, 7.0])}, {"a": jnp.array([3.0, -1.0])}
-    cfg = LearnConfig(target_update="hard", target_update_period=3, tau=0.5)
+    cfg = LearnConfig(target_update_period=3, tau=1.0)
     got = losses.update_target(cfg, online, target, jnp.int32(updates))
     np.testing.assert_array_equal(got["a"], (online if updates % 3 == 0 else target)["a"])
 
 
-def test_soft_targets_follow_each_update():
-    """Claim: soft targets move by tau at every update, whatever C is."""
+@pytest.mark.parametrize(("period", "moves"), [(1, [0.25] * 4), (3, [0.0, 0.0, 0.25, 0.0])])
+def test_targets_follow_every_c_updates(period, moves):
+    """Claim: targets move by tau at every update, and with C = 3 at every third alone."""
     online, target = {"a": jnp.array([1.0])}, {"a": jnp.array([0.0])}
-    cfg = LearnConfig(target_update="soft", target_update_period=3, tau=0.25)
-    assert [
-        float(losses.update_target(cfg, online, target, jnp.int32(n))["a"][0]) for n in (1, 2, 3)
-    ] == [0.25] * 3
+    cfg = LearnConfig(target_update_period=period, tau=0.25)
+    updated = [losses.update_target(cfg, online, target, jnp.int32(n)) for n in (1, 2, 3, 4)]
+    assert [float(one["a"][0]) for one in updated] == moves

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax.agent import actor_critic, maps
-from csac_jax.config import NetConfig
+from csac_jax.config import SmallNet
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.vision.heightmap import Observation
@@ -261,19 +261,16 @@ def test_nothing_is_valid_outside_of_the_workspace(cfg, frames):
     assert not np.any(maps.actionable_cells(frames, full.replace(height=jnp.zeros((size, size)))))
 
 
-def test_without_mask_every_cell_counts(cfg, frames):
-    """Claim: with no masking every cell above the workspace counts; in the target task, grasps of
-    the target alone."""
-    obs = _one_block(cfg)
-    obs = obs.replace(
-        target=obs.height > 0.01, height=jnp.maximum(obs.height, 0.02)
-    )  # the target amid another block
-    np.testing.assert_array_equal(maps.all_cells(frames, obs), np.stack([frames.inside] * 2))
-    with_target = dataclasses.replace(frames, shows_target=True)
-    valid = np.asarray(maps.all_cells(with_target, obs))
-    np.testing.assert_array_equal(valid[PUSH], frames.inside)
-    np.testing.assert_array_equal(valid[GRASP], maps.actionable_cells(with_target, obs)[GRASP])
+def test_target_task_grasps_the_target_alone(cfg, frames):
+    """Claim: in the target task a grasp is valid above the target alone, a push ahead of which any
+    block lies."""
+    lone = _one_block(cfg)
+    amid = lone.replace(target=lone.height > 0.01, height=jnp.maximum(lone.height, 0.02))
+    valid = maps.actionable_cells(dataclasses.replace(frames, shows_target=True), amid)
+    np.testing.assert_array_equal(valid[GRASP], maps.actionable_cells(frames, lone)[GRASP])
+    np.testing.assert_array_equal(valid[PUSH], maps.actionable_cells(frames, amid)[PUSH])
     assert 0 < valid[GRASP].sum() < frames.inside.sum() / 4
+    assert np.all(valid[PUSH] == frames.inside)
 
 
 def test_best_cells(frames):
@@ -309,16 +306,14 @@ def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
     such successor.
     """
     four = actor_critic.make(
-        dataclasses.replace(
-            cfg, net=NetConfig(rotations=4, growth=4, dilations=(1, 2), stem=4, head=8)
-        )
+        cfg.change(net=SmallNet(rotations=4, growth=4, dilations=(1, 2), stem=4, head=8))
     )
     params = randomised(actor_critic.init(jax.random.key(0), four)).online
     scenes = observations(2, 0)
     turned = jax.tree.map(
         lambda field: jnp.rot90(field, -1, axes=(1, 2)), scenes
     )  # rows are y: this is +90 degrees
-    look = jax.jit(lambda obs: actor_critic.look(four, params, obs))
+    look = jax.jit(lambda obs: actor_critic.dense_maps(four, params, obs))
     before, after = look(scenes), look(turned)
     for k in (0, 2):
         np.testing.assert_array_equal(after.valid[:, :, k + 1], before.valid[:, :, k])

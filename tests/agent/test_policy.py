@@ -102,14 +102,8 @@ def test_without_exploration_it_acts_greedily(cfg, frames, learner):
     """Claim: with no noise, random primitive nor random place, what is tried is valid and worth the
     best value."""
     state = _state(frames, 7)
-    calm = ExploreConfig(
-        noise_std=0.0,
-        epsilon_primitive_start=0.0,
-        epsilon_primitive_end=0.0,
-        epsilon_place_start=0.0,
-        epsilon_place_end=0.0,
-    )
-    own = dataclasses.replace(cfg, explore=calm)
+    calm = ExploreConfig(noise_std=0.0, epsilon_primitive=(0.0, 0.0), epsilon_place=(0.0, 0.0))
+    own = cfg.change(explore=calm)
     act = jax.jit(
         jax.vmap(
             lambda key: policy.act(key, _learner(learner, own), state, jnp.int32(0), jnp.int32(0))
@@ -126,17 +120,10 @@ def test_without_exploration_it_acts_greedily(cfg, frames, learner):
     assert np.all(values >= np.max(np.where(state.valid, state.q, -np.inf)) - 1e-3)
 
 
-def _with(cfg, section: str, **settings):
-    """The config with other settings of one section."""
-    return dataclasses.replace(
-        cfg, **{section: dataclasses.replace(getattr(cfg, section), **settings)}
-    )
-
-
 def test_best_pixel(cfg, frames, learner):
     """Claim: with `argmax` a primitive's pose is that of NumPy's largest valid cell, exactly,
     whatever the key."""
-    own, state = _with(cfg, "policy", place="argmax"), _state(frames, 4)
+    own, state = cfg.change(policy={"place": "argmax"}), _state(frames, 4)
     run = jax.jit(
         jax.vmap(lambda key: policy.greedy(key, _learner(learner, own), state, jnp.int32(0)))
     )
@@ -176,8 +163,7 @@ def test_choice_of_primitive(rule, values, steps_without_change, expected):
 def test_rule_reaches_the_action(cfg, frames, learner, steps_without_change):
     """Claim: what is done follows the rule with and without exploration, where values say the
     opposite."""
-    own = _with(cfg, "policy", primitive="rule")
-    own = _with(own, "explore", epsilon_primitive_start=0.0, epsilon_primitive_end=0.0)
+    own = cfg.change(policy={"primitive": "rule"}, explore={"epsilon_primitive": (0.0, 0.0)})
     state = _state(frames, 5)
     wrong = Primitive.GRASP if steps_without_change else Primitive.PUSH
     state = state.replace(q=state.q.at[wrong].add(5.0))
@@ -242,7 +228,7 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, learner, start, 
     """Claim: with the default settings, of 1,000 searches on maps of one to five peaks at least 98
     % reach the highest value within 1 %, whatever the actor proposes; from an actor alone that
     knows nothing of it, hardly one does."""
-    own = dataclasses.replace(cfg, cem=CEMConfig(start=start))
+    own = cfg.change(cem=CEMConfig(start=start))
 
     def reached(i: jax.Array) -> jax.Array:
         state = _peaked(jax.random.fold_in(jax.random.key(3), i), frames)
@@ -256,9 +242,9 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, learner, start, 
     assert least <= share <= most, share
 
 
-def test_random_places_without_the_mask(cfg, frames):
-    """Claim: what is not masked is explored: random places of both primitives reach cells with
-    nothing under them."""
+def test_random_places_reach_all_that_is_valid(frames):
+    """Claim: where every cell is valid, random places of both primitives reach the whole
+    workspace."""
     valid = jnp.broadcast_to(frames.inside, (2, *frames.inside.shape))
     u = jax.jit(jax.vmap(lambda key: policy.random_places(key, frames, valid)))(
         jax.random.split(jax.random.key(0), 400)
@@ -269,7 +255,7 @@ def test_random_places_without_the_mask(cfg, frames):
 def test_candidates_are_those_of_the_search(cfg, frames, learner):
     """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
     key."""
-    one = dataclasses.replace(cfg, cem=dataclasses.replace(cfg.cem, rounds=1, start="actor"))
+    one = cfg.change(cem={"rounds": 1, "start": "actor"})
     state, key = _state(frames, 0), jax.random.key(3)
     tried = jax.jit(lambda key: policy.candidates(key, _learner(learner, one), state))(key)
     assert tried.shape == (2, cfg.cem.candidates, 3)

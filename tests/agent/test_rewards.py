@@ -11,6 +11,7 @@ from csac_jax import algorithms
 from csac_jax.agent import rewards
 from csac_jax.config import RewardConfig
 from csac_jax.constants import Outcome, Primitive
+from tests.sections import with_constants
 
 CFG = RewardConfig()
 
@@ -41,9 +42,10 @@ def test_grasp_rewards(outcome, expected):
 
 @pytest.mark.parametrize("outcome", Outcome)
 def test_each_outcome_has_its_own_level(outcome):
-    """Claim: each outcome of a grasp is rewarded by the setting of its name."""
-    cfg = RewardConfig(nothing=-5.0, empty=-4.0, touched=-3.0, dropped=-2.0, lifted=-1.0)
-    assert rewards.grasp_effect(cfg, jnp.int32(outcome)) == getattr(cfg, outcome.name.lower())
+    """Claim: each outcome of a grasp is rewarded by the level in its place."""
+    cfg = RewardConfig(grasp_levels=(-5.0, -4.0, -3.0, -2.0, -1.0))
+    levels = {"NOTHING": -5.0, "EMPTY": -4.0, "TOUCHED": -3.0, "DROPPED": -2.0, "LIFTED": -1.0}
+    assert rewards.grasp_effect(cfg, jnp.int32(outcome)) == levels[outcome.name]
 
 
 @pytest.mark.parametrize(
@@ -65,7 +67,7 @@ def test_distance_is_a_loss():
     """Claim: r = r2 - w r1: 0.2 m at w = 2 cost 0.4, of a push and of a grasp, and beyond 1 m no
     more than at 1 m."""
     cfg = RewardConfig(distance_weight=2.0)
-    near = RewardConfig(distance_weight=2.0, distance_cap=0.1)
+    near = with_constants(cfg, distance_cap=0.1)
     np.testing.assert_allclose(reward(cfg, Primitive.GRASP, Outcome.LIFTED, 0.2), 1.6, rtol=1e-6)
     np.testing.assert_allclose(reward(cfg, Primitive.PUSH, distance=0.2, after=1.0), 0.1, rtol=1e-5)
     assert rewards.base(cfg, jnp.array(False), jnp.float32(7.0)) == -2.0
@@ -90,31 +92,31 @@ def test_scale():
     """Claim: eq. 13 by hand: eta0 + eta1 2^(s - s_max)."""
     assert rewards.scale(CFG, CFG.push_level) == 0.5
     assert rewards.scale(CFG, CFG.grasp_level) == 1.0
-    assert rewards.scale(RewardConfig(eta0=0.25, eta1=3.0, grasp_level=2.0), 0.0) == 1.0
+    other = with_constants(RewardConfig(eta=(0.25, 3.0)), grasp_level=2.0)
+    assert rewards.scale(other, 0.0) == 1.0
 
 
 @pytest.mark.parametrize(
     "cfg",
     [
         CFG,
-        RewardConfig(eta0=0.5, distance_weight=1.5),
+        RewardConfig(eta=(0.5, 1.0), distance_weight=1.5),
         RewardConfig(
-            push_better=9.0,
-            push_worse=2.0,
-            nothing=1.0,
-            empty=1.0,
-            touched=1.0,
-            dropped=1.0,
-            success_bonus=0.0,
+            push_levels=(2.0, 9.0), grasp_levels=(1.0, 1.0, 1.0, 1.0, 1.0), success_bonus=0.0
         ),
-        RewardConfig(lifted=0.0, success_bonus=-3.0, push_better=-0.5),
-        RewardConfig(eta1=-2.0),
-        RewardConfig(lost_block_penalty=1.5),
         RewardConfig(
-            distance_weight=3.0, distance_cap=0.5, push_level=-2.0, grasp_level=0.5, eta0=0.1
+            grasp_levels=(-1.0, -0.5, -0.25, 0.0, 0.0), success_bonus=-3.0, push_levels=(-1.0, -0.5)
+        ),
+        RewardConfig(eta=(0.0, -2.0)),
+        RewardConfig(lost_block_penalty=1.5),
+        with_constants(
+            RewardConfig(distance_weight=3.0, eta=(0.1, 1.0)),
+            distance_cap=0.5,
+            push_level=-2.0,
+            grasp_level=0.5,
         ),
         algorithms.VPG_REWARD,
-        dataclasses.replace(algorithms.VPG_REWARD, push_worse=-3.0, push_better=5.0),
+        dataclasses.replace(algorithms.VPG_REWARD, push_levels=(-3.0, 5.0)),
     ],
 )
 @pytest.mark.parametrize("gamma", [0.0, 0.5, 0.9])

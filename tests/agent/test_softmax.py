@@ -1,7 +1,5 @@
 """The softmax value and the noisy actions it is estimated from."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +8,7 @@ from scipy import stats
 
 from csac_jax.agent import box, softmax
 from csac_jax.config import TargetConfig
+from tests.sections import with_constants
 
 CFG = TargetConfig()
 NUM = 20_000
@@ -17,7 +16,7 @@ NUM = 20_000
 noisy_actions = jax.jit(softmax.noisy_actions, static_argnums=(1, 3))
 
 MEANS = [(0.0, 0.0, 0.0), (0.95, -1.0, 0.98), (-0.7, 0.6, -1.0), (1.0, 1.0, 0.3)]
-CONFIGS = [CFG, TargetConfig(std=5.0, clip=0.5), TargetConfig(std=1.0, clip=3.0)]
+CONFIGS = [CFG, with_constants(CFG, std=5.0, clip=0.5), with_constants(CFG, std=1.0, clip=3.0)]
 
 
 def reference(cfg: TargetConfig, mean: tuple[float, ...], dim: int):
@@ -66,7 +65,7 @@ def test_log_density_is_that_of_the_samples(cfg, mean):
 
 def test_no_atoms_at_the_bounds():
     """Claim: no two noisy actions share the bound, as the clipped normals of line 13 would."""
-    noise, _ = sampled_noise(TargetConfig(std=0.5, clip=0.5), (0.0, 0.9, 0.0))
+    noise, _ = sampled_noise(with_constants(CFG, std=0.5, clip=0.5), (0.0, 0.9, 0.0))
     for dim in range(3):
         assert np.sum(noise[:, dim] == noise[:, dim].max()) <= 2
 
@@ -131,7 +130,7 @@ def test_exact_by_hand():
 def test_expectation_is_that_of_the_continuous_softmax(beta):
     """Claim: the estimate's mean is the softmax over all actions in reach, found by summing over a
     fine grid."""
-    cfg, mean = TargetConfig(std=0.2, clip=0.5), (0.8, -0.3, 0.9)
+    cfg, mean = with_constants(CFG, std=0.2, clip=0.5), (0.8, -0.3, 0.9)
     key_wave, key_phase, key_sample = jax.random.split(jax.random.key(5), 3)
     waves = 6.0 * jax.random.normal(key_wave, (8, 2))
     phases = jax.random.uniform(key_phase, (8,), maxval=6.0)
@@ -169,7 +168,7 @@ def test_inverse_temperature_follows_the_range_of_q():
     )
     np.testing.assert_allclose(10.0 * small, large, rtol=1e-5)
     assert (
-        softmax.scaled_inverse_temperature(dataclasses.replace(CFG, inverse_temperature=12.0), 6.0)
+        softmax.scaled_inverse_temperature(with_constants(CFG, inverse_temperature=12.0), 6.0)
         == 2.0
     )
 

@@ -5,23 +5,39 @@ import typing
 
 import pytest
 
-from csac_jax.agent import cem, losses, policy, rewards
-from csac_jax.config import CEMConfig, LearnConfig, PolicyConfig, RewardConfig
+from csac_jax import config
+from csac_jax.agent import actor_critic, cem, losses, policy, rewards
+from csac_jax.config import CEMConfig, LearnConfig, PolicyConfig, RewardConfig, TargetConfig
+from csac_jax.nets import networks
+from csac_jax.replay import samplers
 
 
 @pytest.mark.parametrize(
     ("table", "section", "name"),
     [
+        (actor_critic.NEXT_VALUES, TargetConfig, "value"),
         (cem.STD_ESTIMATORS, CEMConfig, "std_estimator"),
         (policy.CEM_STARTS, CEMConfig, "start"),
         (policy.POSE_SEARCHES, PolicyConfig, "place"),
         (policy.PRIMITIVE_RULES, PolicyConfig, "primitive"),
         (rewards.GOOD_PUSH, RewardConfig, "push_effect"),
         (losses.TD_LOSSES, LearnConfig, "loss"),
-        (losses.TARGET_UPDATES, LearnConfig, "target_update"),
     ],
 )
 def test_tables_are_total(table, section, name):
     """Claim: each table has every value that the config allows for its setting, and no other."""
     field = next(field for field in dataclasses.fields(section) if field.name == name)
     assert set(table) == set(typing.get_args(field.type))
+
+
+@pytest.mark.parametrize(
+    ("table", "union", "section"),
+    [
+        (networks.BUILDERS, config.NetConfig, "net"),
+        (samplers.BUILDERS, config.ReplayConfig, "replay"),
+    ],
+)
+def test_tables_of_sections_are_total(table, union, section):
+    """Claim: each table has every alternative of its section, and no other; so has the config's."""
+    assert set(table) == set(typing.get_args(union))
+    assert set(table) == set(config.ALTERNATIVES[section][1])

@@ -14,13 +14,13 @@ from flax import struct
 
 from csac_jax import algorithms
 from csac_jax.config import (
+    BetaReplay,
     CEMConfig,
     Config,
     ExploreConfig,
     HeightmapConfig,
     LearnConfig,
-    NetConfig,
-    ReplayConfig,
+    SmallNet,
     TargetConfig,
     TaskConfig,
     TrainConfig,
@@ -132,18 +132,16 @@ def config(algo: str, actions: int, max_actions: int, push: float | None = None)
     """A small config of an algorithm; `push` replaces what any push earns, before Gamma = 0.5."""
     small = Config(
         heightmap=HeightmapConfig(size=16),
-        net=NetConfig(rotations=4, growth=8, dilations=(1,), stem=8, head=16, margin=0.25),
+        net=SmallNet(rotations=4, growth=8, dilations=(1,), stem=8, head=16, margin=0.25),
         cem=CEMConfig(candidates=16, elites=4, rounds=2),
         target=TargetConfig(samples=16),
-        explore=ExploreConfig(push_fraction=0.5, epsilon_place_end=0.1),
+        explore=ExploreConfig(push_fraction=0.5, epsilon_place=(0.5, 0.1)),
         learn=LearnConfig(learning_rate=5e-3, batch=32, updates=2, tau=0.1),
-        replay=ReplayConfig(capacity=1024),
+        replay=BetaReplay(capacity=1024),
         task=TaskConfig(max_actions=max_actions),
         train=TrainConfig(scenes=8, actions=actions, learning_starts=64),
     )
     cfg = algorithms.configure(small, algo)
     if push is None:
         return cfg
-    return dataclasses.replace(
-        cfg, reward=dataclasses.replace(cfg.reward, push_better=push, push_worse=push)
-    )
+    return cfg.change(reward={"push_levels": (push, push)})

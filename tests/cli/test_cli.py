@@ -7,21 +7,27 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from typing import ClassVar
 
+import jax
 import pytest
 
 import csac_jax
-from csac_jax import algorithms, cli, presets
+from csac_jax import algorithms, api, cli, presets
 from csac_jax.cli import bench, evaluation, play, stored, sweep, train
-from csac_jax.config import Config, SceneConfig
-from csac_jax.evaluation import policies, rollout
+from csac_jax.config import BetaReplay, Config, DenseNet121, SceneConfig, Section, UniformReplay
+from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
+from csac_jax.report.progress import Terminal
 from csac_jax.runtime import signals
 from csac_jax.scene import pool
+from csac_jax.training import loop
 
 ROOT = Path(csac_jax.__file__).parents[1]
 SMOKE = presets.smoke()
+SUMMARY = loop.Summary(4, 8, 1.5, 0.5, None, 0, None)
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +39,7 @@ def no_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         raise AssertionError("training began")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(train, "_train", forbidden)
+    monkeypatch.setattr(api, "Terminal", forbidden)
     monkeypatch.setattr(signals, "install", signals.Stop)
 
 
@@ -62,19 +68,19 @@ def run_dir(tmp_path: Path) -> Path:
     [
         (
             "trian quick",
-            "unknown command 'trian'; choose one of: train, sweep, eval, play, report, export, doctor",
+            "unknown command 'trian'; did you mean train? choose one of: train, sweep, eval, play",
         ),
         ("train", "give a preset first, one of: smoke, quick"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
-        ("train quik", "unknown preset 'quik'; choose one of: smoke, quick"),
+        ("train quik", "unknown preset 'quik'; did you mean quick? choose one of: smoke, quick"),
         (
             "train quick --learn.bath 3",
-            "--learn.bath, 3; perhaps you meant --learn.batch; see csac-jax train quick --help",
+            "--learn.bath, 3; perhaps you meant --learn.batch; see csac-jax train quick --help-all",
         ),
         ("train quick --preset smoke", "--preset"),
         ("train quick --learn.batch", "--learn.batch"),
         ("train quick --learn.batch many", "--learn.batch: invalid literal for int"),
-        ("train quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("train quick --learn.tau 2", "learn.tau: must be above 0, at most 1, not 2.0"),
         ("train quick --learn.batch 65", "learn.batch: 65 transitions cannot be drawn"),
         (
             "train quick --scene.slots box ball",
@@ -82,14 +88,21 @@ def run_dir(tmp_path: Path) -> Path:
         ),
         (
             "train quick --replay.sampler best",
-            "invalid choice 'best' for argument '--replay.sampler'",
+            "replay.sampler: 'best' is not one of: uniform, prioritised, beta",
         ),
-        ("train quick --replay.alpha 1.5", "replay.alpha: must lie in 0 .. 1"),
-        ("train quick --replay.capacity 0", "replay.capacity: must lie in 2 .. 2^30"),
-        ("train quick --seed -1", "seed: must lie in 0 .. 2147483647"),
-        ("train quick smoke", "Unrecognized options: smoke"),
         (
-            "train quick --algo dqn",
+            "train quick --replay.sampler prioritised --replay.end 1 4",
+            "--replay.end: --replay.sampler prioritised has no such setting",
+        ),
+        ("train quick --net.zoom=2", "--net.zoom=2: --net.kind small has no such setting"),
+        ("train quick --explore.decay 1.5", "explore.decay: must be above 0, at most 1, not 1.5"),
+        ("train quick --replay.capacity 0", "replay.capacity: must lie in 2 .. 1073741824, not 0"),
+        ("train quick --seed -1", "seed: must lie in 0 .. 2147483647, not -1"),
+        ("train smoke --device tpu", "--device: 'tpu' is not one of: cpu, gpu"),
+        ("train quick smoke", "Unrecognized options: smoke"),
+        ("train quick --algo csac_bta", "unknown algorithm 'csac_bta'; did you mean csac_beta?"),
+        (
+            "train smoke --algo dqn",
             "unknown algorithm 'dqn'; choose one of: csac, csac_per, csac_beta, vpg, grasp_only",
         ),
         ("train quick --algo=", "unknown algorithm ''"),
@@ -99,14 +112,14 @@ def run_dir(tmp_path: Path) -> Path:
             "explore.push_fraction: must be 0 where",
         ),
         ("train quick --learn.actor-batch 33", "learn.actor_batch: must not exceed learn.batch"),
-        ("train quick --learn.critics 3", "learn.critics: must be 1 or 2"),
+        ("train quick --learn.critics 3", "invalid choice '3' for argument '--learn.critics'"),
         ("train quick --learn.loss mse", "invalid choice 'mse' for argument '--learn.loss'"),
-        ("train quick --cem.elites 65", "cem.elites: must lie in 2 .. cem.candidates"),
+        ("train quick --cem.elites 65", "cem.elites: must not exceed cem.candidates"),
         (
             "train quick --run-dir .",
             ". exists; give another --run-dir, or go on with it by --resume",
         ),
-        ("eval", "Folder of the run"),
+        ("eval", "A run's folder, a policy file, or shipped"),
         ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
@@ -119,10 +132,10 @@ def run_dir(tmp_path: Path) -> Path:
         ("doctor --fix", "Unrecognized options: --fix"),
         (
             "train smoke --sim.physics warp",
-            "scene.mesh_size_jitter: must be 0 where sim.physics is warp",
+            "scene.size_jitter: the second must be 0 where sim.physics is warp",
         ),
         (
-            "train smoke --sim.physics warp --scene.mesh-size-jitter 0",
+            "train smoke --sim.physics warp --scene.size-jitter 0.1 0",
             "--sim.physics: warp computes on CUDA",
         ),
         ("bench", "bench: unknown benchmark ''; choose one of: "),
@@ -135,7 +148,7 @@ def run_dir(tmp_path: Path) -> Path:
             "bench step: heightmap.size: must be a multiple of 8",
         ),
         ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
-        ("bench step --learn.critics 3", "bench step: learn.critics: must be 1 or 2"),
+        ("bench step --learn.tau 2", "bench step: learn.tau: must be above 0, at most 1"),
         ("bench step smoke --learn.update 2", "bench step: Unrecognized options: --learn.update"),
         (
             "bench step fast --physics warp --curve scenes --smallest 8192 --largest 8192",
@@ -143,17 +156,14 @@ def run_dir(tmp_path: Path) -> Path:
         ),
         ("doctor --preset", "doctor: give a preset after --preset, one of: smoke, quick"),
         ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
-        ("doctor --preset quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("doctor --preset quick --learn.tau 2", "learn.tau: must be above 0, at most 1"),
         ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
         ("bench soak --actions 0", "bench soak: --actions: must be at least 1"),
         (
             "bench act --pixels 40",
             "bench act: net.margin: DenseNet-121 needs maps of a multiple of 32 cells, not 40",
         ),
-        (
-            "bench act --zoom 64",
-            "bench act: net.zoom, net.output_stride: their product must divide 32",
-        ),
+        ("bench act --zoom 64", "bench act: net.zoom: must divide 32"),
         (
             "train paper --net.margin 0.1",
             "net.margin: DenseNet-121 needs maps of a multiple of 16 cells, not 246",
@@ -197,9 +207,11 @@ def test_scenes_that_never_settle(
 ):
     """Claim: blocks that do not come to rest are a failure of one line that names what to change,
     not a traceback."""
-    falling = SceneConfig(
-        slots=("box",), min_blocks=1, drop_height=1.0, settle_time=0.5
-    )  # lands after 0.45 s
+
+    class Falling(SceneConfig):  # lands after 0.45 s
+        drop_height: ClassVar[float] = 1.0
+
+    falling = Falling(slots=("box",), min_blocks=1, settle_time=0.5)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(pool, "_ROUND", 8)
     monkeypatch.setattr(stored, "config", lambda _: dataclasses.replace(SMOKE, scene=falling))
@@ -231,9 +243,43 @@ def test_resume_with_another_preset(capsys: pytest.CaptureFixture, run_dir: Path
 
 
 def test_resume_excludes_run_dir(capsys: pytest.CaptureFixture, run_dir: Path):
-    """Claim: --resume and --run-dir exclude one another."""
-    code, line = _fails(capsys, "train", "--resume", str(run_dir), "--run-dir", "x")
-    assert (code, "exclude one another" in line) == (2, True)
+    """Claim: --resume excludes --run-dir and --init."""
+    for option in ("--run-dir", "--init"):
+        code, line = _fails(capsys, "train", "--resume", str(run_dir), option, "x")
+        assert (code, "takes neither --run-dir nor --init" in line) == (2, True)
+
+
+@pytest.mark.parametrize("command", ["train", "sweep"])
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("nothing", "there is no folder nothing; give the folder of a run, a policy file"),
+        ("bad.safetensors", "bad.safetensors cannot be read as .safetensors"),
+    ],
+)
+def test_nothing_to_start_from(
+    capsys: pytest.CaptureFixture, tmp_path: Path, command: str, source: str, message: str
+):
+    """Claim: --init of what holds no networks is one line and exit code 1, or 2 for weights of
+    DenseNet-121."""
+    (tmp_path / "bad.safetensors").write_bytes(b"bad")
+    code, line = _fails(capsys, command, "smoke", "--init", source)
+    assert (code, message in line) == (1, True)
+    flags = ["--net.kind", "densenet121", "--net.margin", "0", "--init", source]
+    code, line = _fails(capsys, command, "smoke", *flags)
+    assert (code, message in line) == (1 if source == "nothing" else 2, True)
+
+
+def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
+    """Claim: --init brings the settings of its networks; others given as options are refused."""
+    cfg = train.read(["smoke", "--init", "shipped"])[1]
+    assert cfg.net == api.load_policy("shipped").cfg.net
+    assert cfg.learn.batch == SMOKE.learn.batch
+    code, line = _fails(capsys, "train", "fast", "--init", "shipped", "--net.growth", "8")
+    assert (code, "--init shipped: its networks are not those of these settings" in line) == (
+        2,
+        True,
+    )
 
 
 def test_nothing_is_overwritten(capsys: pytest.CaptureFixture, run_dir: Path):
@@ -257,15 +303,27 @@ def test_resume_takes_the_config_of_the_run(run_dir: Path, flag: str, preset: st
 
 def test_flags_reach_the_config():
     """Claim: settings on the command line reach the config, the rest is the preset's."""
-    flags = "--seed 3 --learn.batch 4 --scene.slots box prism --replay.beta-end 2 3"
+    flags = "--seed 3 --learn.batch 4 --scene.slots box prism --replay.end 2 3"
     _, cfg = train.read(["smoke", *flags.split()])
     assert cfg == dataclasses.replace(
         SMOKE,
         seed=3,
         learn=dataclasses.replace(SMOKE.learn, batch=4),
         scene=dataclasses.replace(SMOKE.scene, slots=("box", "prism")),
-        replay=dataclasses.replace(SMOKE.replay, beta_end=(2.0, 3.0)),
+        replay=dataclasses.replace(SMOKE.replay, end=(2.0, 3.0)),
     )
+
+
+def test_flags_choose_the_alternative():
+    """Claim: --replay.sampler and --net.kind choose their section, which keeps what it shares with
+    the preset's and takes its own settings."""
+    flags = "--replay.sampler=uniform --net.margin 0 --net.kind densenet121 --net.zoom 2"
+    _, cfg = train.read(["smoke", *flags.split()])
+    assert cfg.replay == UniformReplay(capacity=SMOKE.replay.capacity)
+    assert cfg.net == DenseNet121(rotations=4, head=4, margin=0.0, zoom=2)
+    flags = "--algo csac --replay.sampler beta --replay.end 1 5"
+    _, cfg = train.read(["smoke", *flags.split()])
+    assert cfg.replay == BetaReplay(capacity=SMOKE.replay.capacity, end=(1.0, 5.0))
 
 
 @pytest.mark.parametrize("flag", ["--algo vpg", "--algo=vpg", "--algo csac --algo vpg"])
@@ -305,19 +363,105 @@ def _flag(name: str) -> str:
 
 
 def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
-    """Claim: every setting of a config is a flag of `train`, and none but these and the options."""
+    """Claim: --help-all shows every setting of a config as a flag of `train` and `sweep`, those of
+    the chosen alternative among them."""
     monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["train", "quick", "--help"])
-    assert ended.value.code in (0, None)
+    for command in ("train", "sweep"):
+        with pytest.raises(SystemExit) as ended:
+            cli.main([command, "quick", "--help-all", "--replay.sampler", "uniform"])
+        assert ended.value.code in (0, None)
+        shown = capsys.readouterr().out
+        cfg = presets.quick().change(replay={"sampler": "uniform"})
+        sections = [one for name in _names(cfg) if isinstance(one := getattr(cfg, name), Section)]
+        assert len(sections) == 15
+        for section in sections:
+            for name in _names(section):
+                assert re.search(rf"{_flag(f'{section.SECTION}.{name}')}[ ,]", shown)
+        assert {"--seed", "--algo"} <= set(shown.split())
+        assert "--preset" not in shown
+        assert "--replay.end" not in shown
+
+
+def _names(section: Section) -> list[str]:
+    return [field.name for field in dataclasses.fields(section)]
+
+
+@pytest.mark.parametrize("command", ["train", "sweep"])
+@pytest.mark.parametrize("preset", presets.PRESETS)
+def test_help_is_short(capsys: pytest.CaptureFixture, command: str, preset: str):
+    """Claim: --help has at most 80 lines of 100 columns: examples, every option, and the settings
+    that people change first, each with its whole text and the preset's value."""
+    assert cli.main([command, preset, "--help"]) == 0
     shown = capsys.readouterr().out
-    for field in dataclasses.fields(Config):
-        if dataclasses.is_dataclass(field.type):
-            for setting in dataclasses.fields(field.type):
-                assert f"{_flag(f'{field.name}.{setting.name}')}" in shown
-    assert "--seed" in shown
-    assert "--algo {csac,csac_per,csac_beta,vpg,grasp_only,reactive}" in shown
-    assert "--preset" not in shown
+    lines = shown.splitlines()
+    assert len(lines) <= 80
+    assert max(map(len, lines)) <= 100
+    assert shown.count(f"\n  csac-jax {command} ") >= 3
+    options = {"train": train.TrainOptions, "sweep": sweep.SweepOptions}[command]
+    for option in dataclasses.fields(options):
+        assert f"\n  {_flag(option.name)} " in shown
+    cfg = presets.get(preset)
+    assert f"\n  --train.actions {cfg.train.actions} " in shown
+    assert f"\n  --scene.slots {' '.join(cfg.scene.slots)}" in shown
+    text = " ".join(shown.split())
+    assert "auto: c on a CPU, warp on one CUDA device where it is known to be faster" in text
+    assert "None" not in shown
+    assert lines[-1] == f"All settings: csac-jax {command} {preset} --help-all"
+
+
+@pytest.mark.parametrize("arguments", ["train", "sweep", "train --seed 3", "sweep --seeds 2"])
+def test_help_without_a_preset(capsys: pytest.CaptureFixture, arguments: str):
+    """Claim: without a preset, help is that of `quick`; it comes before all complaints."""
+    assert cli.main([*arguments.split(), "-h"]) == 0
+    shown = capsys.readouterr().out
+    assert "with the values of quick:" in shown
+    assert shown.endswith("PRESET --help-all\n")
+
+
+def test_examples_of_the_help_are_read(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: the parser takes every example that the help shows."""
+    for example in (*train.EXAMPLES, *sweep.EXAMPLES):
+        words = example.split("#")[0].replace("runs/a", str(run_dir)).split()
+        command = sweep if example in sweep.EXAMPLES else train
+        if "--devices" not in words:
+            command.read(words)
+
+
+def test_both_names_are_commands():
+    """Claim: `csac-jax` and `csac_jax` are the same command."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == dict.fromkeys(("csac-jax", "csac_jax"), "csac_jax.cli:main")
+
+
+@pytest.mark.parametrize(
+    ("device", "code", "line"),
+    [
+        ("cpu", 2, "csac-jax: there is no file or folder nowhere; give folders of runs"),
+        ("gpu", 2, "csac-jax: --device gpu: JAX finds none here; leave it out for the cpu"),
+    ],
+)
+def test_device_is_selected(device: str, code: int, line: str):
+    """Claim: `--device cpu` is taken by any command, whatever JAX_PLATFORMS says; `--device gpu`
+    without one is one line and exit code 2."""
+    if device == "gpu" and jax.default_backend() == "gpu":
+        pytest.skip("there is a GPU")
+    command = [sys.executable, "-m", "csac_jax", "report", "nowhere", "--device", device]
+    environment = {**os.environ, "JAX_PLATFORMS": "tpu", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert done.stderr.startswith(line)
+    assert done.stderr.count("\n") == 1
+
+
+def test_old_suite_is_accepted(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `eval --suite own`, as older commands say, measures in_distribution."""
+
+    def build(*_):
+        raise ValueError("in_distribution is asked for")
+
+    monkeypatch.setitem(suites.SUITES, "in_distribution", suites.Suite(build))
+    code, line = _fails(capsys, "eval", "shipped", "--suite", "own", "--episodes", "1")
+    assert (code, line) == (2, "csac-jax: in_distribution is asked for\n")
 
 
 def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
@@ -448,29 +592,34 @@ def test_replay_benchmark(capsys: pytest.CaptureFixture):
     assert {"device", "versions", "commit", "item", "batch", "repeats"} <= result.keys()
 
 
-def test_automatic_physics_is_resolved(tmp_path: Path):
+def test_automatic_physics_is_resolved(monkeypatch: pytest.MonkeyPatch):
     """Claim: `--sim.physics auto` reaches a run as what it stands for here, and may be asked for
     again when the run is resumed; the first line of a run says what it runs on."""
-    _, cfg = train.read(["smoke", "--sim.physics", "auto", "--seed", "3"])
     in_c = dataclasses.replace(SMOKE.sim, physics="c")
-    assert cfg == dataclasses.replace(SMOKE, seed=3, sim=in_c)
-    folder = tmp_path / "runs" / "three"
+    wanted, folder = dataclasses.replace(SMOKE, seed=3, sim=in_c), Path("runs/three")
     checkpoint.save(
-        folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, cfg, {"seconds": 1.0, "grasps": []}
+        folder, 4, {"step": checkpoint.jax.numpy.int32(4)}, wanted, {"seconds": 1.0, "grasps": []}
     )
-    assert train.read(["--resume", str(folder), "--sim.physics", "auto"])[1] == cfg
-    assert sweep.read(["smoke", "--sim.physics", "auto"])[1].settings[0].cfg.sim == in_c
-    line = train.first_line(folder, cfg)
-    wanted = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics c, on 1 x cpu (cpu)"
-    assert line == f"run {folder}: {wanted}"
+    begun = []
+    monkeypatch.setattr(api, "Terminal", Terminal)
+    monkeypatch.setattr(api.cache, "enable", lambda: None)
+    monkeypatch.setattr(api.step, "make", lambda cfg, **_: None)
+    monkeypatch.setattr(api.loop, "run", lambda cfg, *_, **__: begun.append(cfg) or SUMMARY)
+    for flags in (["smoke", "--seed", "3"], ["--resume", str(folder)]):
+        assert cli.main(["train", *flags, "--sim.physics", "auto"]) == 0
+    assert begun == [wanted, wanted]
+    assert sweep.read(["smoke", "--sim.physics", "auto"])[1].points[0].cfg.sim == in_c
+    line = api._first_line(folder, wanted)
+    said = "preset smoke, algorithm csac_beta, seed 3, 2 scenes, physics c, on 1 x cpu (cpu)"
+    assert line == f"run {folder}: {said}"
 
 
-def test_default_run_dirs_do_not_collide(tmp_path: Path):
+def test_default_run_dirs_do_not_collide():
     """Claim: two runs begun in the same second get folders of their own."""
-    first = train.new_run_dir(SMOKE)
+    first = api.new_folder("smoke-0")
     assert first.name.startswith("smoke-0-20")
     first.mkdir(parents=True)
-    assert train.new_run_dir(SMOKE) != first
+    assert api.new_folder("smoke-0") != first
 
 
 def test_help_comes_without_jax():
@@ -478,10 +627,12 @@ def test_help_comes_without_jax():
     source = """
 import contextlib, io, sys
 from csac_jax import cli
-for line in ("", "--help", "train --help", "eval --help", "train quick --learn.bath 3", "eval x -y"):
+for line in ("", "--help", "train --help", "sweep --help", "train quick --help-all", "eval --help",
+             "train quick --learn.bath 3", "eval x -y"):
     nothing = io.StringIO()
-    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(nothing), contextlib.redirect_stderr(nothing):
-        cli.main(line.split())
+    with contextlib.redirect_stdout(nothing), contextlib.redirect_stderr(nothing):
+        with contextlib.suppress(SystemExit):
+            cli.main(line.split())
 print("jax" in sys.modules)
 """
     done = subprocess.run(
@@ -504,11 +655,10 @@ def test_reader_that_stops_reading_is_no_error():
 def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int):
     """Claim: a stopped run exits with 128 + the signal; --json has the result, the config and where
     it comes from."""
-    from csac_jax.training import loop
 
-    def trained(options, cfg, run_dir, stop, trunk):
+    def trained(options, cfg, stop):
         stop.signal = code - 128 if code else None
-        return loop.Summary(4, 8, 1.5, 0.5, None, 0, stop.signal)
+        return api.Run(Path("runs/a"), cfg, SUMMARY._replace(stopped_by=stop.signal), {})
 
     monkeypatch.setattr(train, "_train", trained)
     assert cli.main(["train", "smoke", "--seed", "3", "--json", "out/result.json"]) == code
@@ -542,7 +692,8 @@ def test_doctor_shows_memory(
     from csac_jax.runtime import selftest
 
     monkeypatch.setattr(selftest, "CHECKS", ())
-    flags = "--preset smoke --scene.slots box box --scene.min-blocks 1 --json doctor.json --replay.capacity 128"
+    flags = "--preset smoke --scene.slots box box --scene.min-blocks 1"
+    flags += " --json doctor.json --replay.capacity 128"
     assert cli.main(["doctor", *flags.split()]) == 0
     assert re.search(
         r"memory +0\.00 GiB of [\d.]+ for the state of smoke: replay 0\.00, scenes",
@@ -590,8 +741,8 @@ def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyP
 
 
 def test_summary_is_printed(capsys: pytest.CaptureFixture):
-    """Claim: `eval` prints every metric, shares in per cent, efficiencies in blocks per action, and a
-    dash for one without cases."""
+    """Claim: `eval` prints every metric: shares in per cent, efficiencies in blocks per action, a
+    dash where there are no cases."""
     from csac_jax.evaluation import metrics
 
     summary = {

@@ -123,7 +123,7 @@ def test_training_that_fails(
     """Claim: a run that fails is one line and an exit code; a folder that someone else has made
     meanwhile as well."""
     monkeypatch.setattr(cache, "enable", lambda: None)
-    monkeypatch.setattr(step, "make", lambda cfg: None)
+    monkeypatch.setattr(step, "make", lambda cfg, **_: None)
     monkeypatch.setattr(loop, "run", _raises(error))
     assert cli.main(["train", "smoke", "--run-dir", "there"]) == code
     assert capsys.readouterr().err == f"csac-jax: {line}\n"
@@ -172,7 +172,7 @@ def test_export_overwrites_nothing(capsys: pytest.CaptureFixture):
             "train quick --learn.bath 3",
             "Unrecognized options: --learn.bath, 3; perhaps you meant --learn.batch",
         ),
-        ("train quick --learn.tau 2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("train quick --learn.tau 2", "learn.tau: must be above 0, at most 1, not 2.0"),
         (f"train quick {'x' * 60}", f"Unrecognized options: {'x' * 60}"),
     ],
 )
@@ -194,7 +194,7 @@ def test_complaint_is_the_same_on_any_terminal(
     else:
         monkeypatch.setenv("COLUMNS", columns)
     assert cli.main(arguments.split()) == 2
-    assert capsys.readouterr().err == f"csac-jax: {line}; see csac-jax train quick --help\n"
+    assert capsys.readouterr().err == f"csac-jax: {line}; see csac-jax train quick --help-all\n"
     assert os.environ.get("COLUMNS") == columns
 
 

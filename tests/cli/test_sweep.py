@@ -11,12 +11,12 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import sweep as command
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
-from csac_jax.sweeps import sweep
+from csac_jax.sweeps import runner
 from csac_jax.training import loop, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
-RUN = sweep.run
+RUN = runner.run
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +27,7 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         raise AssertionError("the sweep began")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sweep, "run", forbidden)
+    monkeypatch.setattr(runner, "run", forbidden)
     monkeypatch.setattr(signals, "install", signals.Stop)
 
 
@@ -46,10 +46,10 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("", "sweep: give a preset first, one of: smoke, quick"),
         ("smoke --seeds 0", "--seeds: at least 1"),
         ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
+        ("smok", "unknown preset 'smok'; did you mean smoke?"),
         (
-            "smoke --net.kind densenet121 --net.norm batch --net.margin 0 "
-            "--net.weights none.safetensors",
-            "net.weights: none.safetensors cannot be read as .safetensors",
+            "smoke --vary replay.sampler=uniform,beta --replay.end 1 4",
+            "--replay.end: --replay.sampler uniform has no such setting",
         ),
         (
             "smoke --vary learn.tua=0.1",
@@ -57,7 +57,7 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ),
         ("smoke --vary learn.tau=", "--vary learn.tau=: give a setting and its values"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
-        ("smoke --vary learn.tau=0.1,2", "learn.tau: must lie in 0 < tau <= 1"),
+        ("smoke --vary learn.tau=0.1,2", "learn.tau: must be above 0, at most 1, not 2.0"),
         ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
         ("smoke --vary learn.tau=0.1,0.10", "--vary: two settings have the same values"),
         ("smoke --devices 4096", "--devices: 4096 asked for, there are "),
@@ -97,7 +97,7 @@ def test_no_sweep_to_resume(capsys: pytest.CaptureFixture):
     ("error", "code", "message"),
     [
         (FileExistsError(), 2, "there exists; give another --run-dir"),
-        (sweep.SweepError("all are lost"), 1, "all are lost"),
+        (runner.SweepError("all are lost"), 1, "all are lost"),
         (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
         (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
     ],
@@ -115,7 +115,7 @@ def test_failures(
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(sweep, "run", fail)
+    monkeypatch.setattr(runner, "run", fail)
     assert cli.main(["sweep", "smoke", "--run-dir", "there"]) == code
     assert capsys.readouterr().err.startswith(f"csac-jax: {message}")
 
@@ -136,13 +136,13 @@ def test_settings_reach_their_configs():
         ]
     assert [one.cfg for one in plan.points] == wanted
     assert plan.points[1].name == "algo=csac,target.gamma=0.3"
-    assert [one.cfg.seed for one in sweep.runs_of(plan)[:3]] == [7, 8, 9]
+    assert [one.cfg.seed for one in runner.runs_of(plan)[:3]] == [7, 8, 9]
 
 
 def test_plan_survives_its_file(tmp_path: Path):
     """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
-    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.beta_end=1:4,1:12"])
-    (tmp_path / sweep.PLAN).write_text(sweep.plan_text(plan))
+    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.end=1:4,1:12"])
+    (tmp_path / runner.PLAN).write_text(runner.plan_text(plan))
     assert command.read(["--resume", str(tmp_path)])[1] == plan
 
 
@@ -150,9 +150,9 @@ def test_plan_survives_its_file(tmp_path: Path):
 def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: a sweep that is stopped by a signal exits with 130 or 143 and says how to go on;
     resumed, it ends with 0 and its results. A small step stands in for the learner's."""
-    monkeypatch.setattr(sweep, "run", RUN)
+    monkeypatch.setattr(runner, "run", RUN)
     for name, toy in (
-        ("make", toys.program),
+        ("make", lambda cfg, **_: toys.program(cfg)),
         ("init_state", toys.init_state),
         ("train_step", toys.train_step),
     ):

@@ -1,7 +1,6 @@
 """Policies as objects: one scene and a key in, an action out."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.agent import learner as learning, policy
+from csac_jax.agent import actor_critic, policy
 from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import policies
@@ -30,15 +29,15 @@ SCENES = 3
 @pytest.fixture(scope="module")
 def learned() -> LearnedPolicy:
     """Networks as they begin."""
-    learner = learning.make(CFG)
-    params = jax.jit(lambda key: learning.init(key, learner))(jax.random.key(0)).online
+    parts = actor_critic.make(CFG)
+    params = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(0)).online
     return LearnedPolicy(CFG, params)
 
 
 @pytest.fixture(scope="module")
 def states() -> State:
     """Settled scenes; the last actions of the second one changed nothing."""
-    env = environment.make(CFG, stream=1, scenes=SCENES)
+    env = environment.make_env(CFG, stream=1, num_scenes=SCENES)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(SCENES))
     states = jax.jit(jax.vmap(env.reset))(keys)
     return states.replace(steps_without_change=jnp.array([0, 2, 0], jnp.int32))
@@ -55,18 +54,13 @@ def _keys() -> jax.Array:
 def test_learned_acts_like_the_agent(learned, states):
     """Claim: the learned policy is `agent.policy.best_action` of the networks' maps, in a batch and
     in one scene."""
-    learner = learning.make(CFG)
+    parts = actor_critic.make(CFG)
 
     @jax.jit
     def wanted(params, states, keys):
-        dense_maps = learning.look(learner, params, states.obs)
-        best = functools.partial(policy.best_action, cfg=CFG, frames=learner.frames)
-        low, high = learner.bounds
-        return jax.vmap(
-            lambda key, one, unchanged: best(
-                key, state=one, penalty=high - low, steps_without_change=unchanged
-            )
-        )(keys, dense_maps, states.steps_without_change)
+        dense_maps = actor_critic.dense_maps(parts, params, states.obs)
+        best = jax.vmap(policy.best_action, (0, None, 0, 0))
+        return best(keys, parts, dense_maps, states.steps_without_change)
 
     expected = wanted(learned.params, states, _keys())
     batch = jax.jit(policies.act)(learned, states, _keys())
@@ -114,9 +108,9 @@ def test_debug_is_of_the_action(learned, states):
     candidates next to the action."""
     state = _scene(states, 0)
     seen, action = (look(state, jax.random.key(2)) for look in (learned.debug, learned))
-    learner, obs = learning.make(CFG), jax.tree.map(lambda leaf: leaf[:1], states.obs)
-    dense_maps = jax.jit(lambda obs: learning.look(learner, learned.params, obs))(obs)
-    (best,) = jax.vmap(learning.best_grasp)(dense_maps)
+    parts, obs = actor_critic.make(CFG), jax.tree.map(lambda leaf: leaf[:1], states.obs)
+    dense_maps = jax.jit(lambda obs: actor_critic.dense_maps(parts, learned.params, obs))(obs)
+    (best,) = jax.vmap(actor_critic.best_grasp)(dense_maps)
     np.testing.assert_allclose(seen.best_grasp, best, rtol=1e-5)
     assert seen.q.shape == (2, CFG.heightmap.size, CFG.heightmap.size)
     places = seen.candidates[Primitive.GRASP, :, :2]

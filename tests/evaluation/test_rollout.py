@@ -1,6 +1,7 @@
 """Episodes of fixed policies."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +22,14 @@ from csac_jax.vision import observe
 
 pytestmark = pytest.mark.mjx
 
-CFG = dataclasses.replace(
-    presets.smoke(), task=TaskConfig(max_actions=6, max_steps_without_change=3)
-)
+
+class ShortTask(TaskConfig):
+    """Ends after three actions without change."""
+
+    max_steps_without_change: ClassVar[int] = 3
+
+
+CFG = dataclasses.replace(presets.smoke(), task=ShortTask(max_actions=6))
 ORACLE, RANDOM = OraclePolicy(CFG), RandomPolicy(CFG)
 EPISODES = 5
 REACH = 0.012  # m
@@ -163,7 +169,7 @@ def test_batches_do_not_matter(magnet, random, monkeypatch):
 def test_endings_by_hand(magnet):
     """Claim: with two actions at most, scenes of two blocks are cleared and those of three are cut
     off by that cap."""
-    cfg = dataclasses.replace(CFG, task=TaskConfig(max_actions=2, max_steps_without_change=2))
+    cfg = dataclasses.replace(CFG, task=ShortTask(max_actions=2))
     short = Magnet(cfg, magnet.physics, magnet.scenes)
     episodes = rollout.rollout(short, OraclePolicy(cfg), EPISODES, 0)
     np.testing.assert_array_equal(episodes.ending, np.where(_blocks(magnet) == 2, 0, 1))

@@ -56,7 +56,7 @@ def test_cases_are_the_shipped_files():
 def test_suite_is_the_same_for_every_policy(suite: str):
     """Claim: scenes that are dropped or drawn do not depend on what a policy was trained with."""
     alike = dataclasses.replace(
-        CFG.scene, size_jitter=0.0, mesh_size_jitter=0.0, density=(600.0, 600.0), arranged=0.5
+        CFG.scene, size_jitter=(0.0, 0.0), density=(600.0, 600.0), arranged=0.5
     )
     (one,), (other,) = (
         suites.environments(cfg, suite, 2, 0).values()
@@ -200,7 +200,7 @@ def test_suite_of_ones_own(monkeypatch: pytest.MonkeyPatch):
 
 def test_old_name_of_a_suite(monkeypatch: pytest.MonkeyPatch):
     """Claim: `own`, as older commands and records say, is the suite `in_distribution`."""
-    monkeypatch.setattr(suites.environment, "make", lambda cfg, stream, count: (stream, count))
+    monkeypatch.setattr(suites.environment, "make_env", lambda cfg, stream, count: (stream, count))
     wanted = {"in_distribution": (1, EPISODES)}
     for name in ("own", "in_distribution"):
         assert suites.environments(CFG, name, EPISODES, 0) == wanted

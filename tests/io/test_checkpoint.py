@@ -1,9 +1,11 @@
 """Checkpoints: what comes back, and what is refused."""
 
 import dataclasses
+import functools
 import json
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +14,9 @@ import pytest
 from flax import struct
 
 from csac_jax import presets
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, renames
 from csac_jax.io.checkpoint import CheckpointError
+from csac_jax.training import step as training
 
 CFG = presets.smoke()
 
@@ -185,7 +188,7 @@ def test_no_sound_step_is_left(run_dir: Path):
     """Claim: with no sound step left the message says so."""
     for step in (4, 8):
         _data_file(run_dir, step).unlink()
-    with pytest.raises(CheckpointError, match="train anew"):
+    with pytest.raises(CheckpointError, match="train again"):
         checkpoint.restore(run_dir, _abstract())
 
 
@@ -228,3 +231,55 @@ def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert json.loads((folder / checkpoint.MANIFEST).read_text())
     with pytest.raises(CheckpointError, match=r"another version.*sweep: unknown setting"):
         checkpoint.load_config(tmp_path)
+
+
+def _tree(leaves: dict[str, jax.Array]) -> dict[str, Any]:
+    """Nested dicts with these leaves by dotted name."""
+    tree: dict[str, Any] = {}
+    for name, leaf in leaves.items():
+        *path, last = name.split(".")
+        functools.reduce(lambda node, part: node.setdefault(part, {}), path, tree)[last] = leaf
+    return tree
+
+
+def _leaves(names: Iterable[str]) -> dict[str, jax.Array]:
+    """A leaf for each name, all different, the first a key."""
+    first, *others = names
+    plain = {name: jnp.arange(3.0) + i for i, name in enumerate(others)}
+    return {first: jax.random.key(5), **plain}
+
+
+def _same_leaves(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    return jax.tree.map(_bits, a) == jax.tree.map(_bits, b)
+
+
+def test_old_names_of_leaves_are_read(tmp_path: Path):
+    """Claim: a checkpoint whose leaves have the old names of `renames.STATE` comes back under
+    today's, each leaf in its place, next to leaves that kept their names."""
+    old = _leaves([*renames.STATE, "step", "scenes.reward"])
+    new = {renames.STATE.get(name, name): leaf for name, leaf in old.items()}
+    assert len(new) == len(old)
+    checkpoint.save(tmp_path, 4, _tree(old), CFG, {})
+    state, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
+    assert _same_leaves(state, _tree(new))
+
+
+def test_new_names_of_leaves_are_read(tmp_path: Path):
+    """Claim: today's names are read as they are, in a checkpoint that holds an old name too: then
+    the program is told of a leaf that it does not know."""
+    new = _leaves([*renames.STATE.values(), "step"])
+    checkpoint.save(tmp_path, 4, _tree(new), CFG, {})
+    state, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
+    assert _same_leaves(state, _tree(new))
+    checkpoint.save(tmp_path, 8, _tree({**new, "scenes.idle": jnp.int32(0)}), CFG, {})
+    with pytest.raises(CheckpointError, match=r"scenes\.idle as int32\[\], the program needs noth"):
+        checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
+
+
+def test_states_leaves_have_the_names_of_today():
+    """Claim: `renames.STATE` leads to leaves that a run's state has."""
+    cfg = CFG.change(sensor={"dropped": 0.1})  # only with noise there is a key of noise
+    program = training.make(cfg, env=training.without_physics(cfg))
+    names = {name for name, _ in checkpoint._named(training.abstract_state(program))}
+    assert set(renames.STATE.values()) <= names
+    assert not set(renames.STATE) & names

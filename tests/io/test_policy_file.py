@@ -11,9 +11,9 @@ import pytest
 import safetensors.numpy
 
 from csac_jax import presets
+from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.io import configs, policy_file
-from csac_jax.training import step
 
 CFG = presets.get("smoke")
 
@@ -21,7 +21,7 @@ CFG = presets.get("smoke")
 @pytest.fixture(scope="module")
 def params() -> Params:
     """Variables of the networks of CFG, all different."""
-    blank = step.abstract_state(CFG).learner.online
+    blank = actor_critic.abstract_params(CFG)
     leaves, tree = jax.tree.flatten(blank)
     rng = np.random.default_rng(0)
     return jax.tree.unflatten(
@@ -67,8 +67,12 @@ def test_what_is_read_is_what_was_written(tmp_path: Path, params: Params):
         ),
         (lambda tensors, remarks: remarks.pop("config"), "holds no config"),
         (
-            lambda tensors, remarks: remarks.update(config='{"seed": 1}'),
-            r"another version of csac_jax \(\w+: setting",
+            lambda tensors, remarks: remarks.update(config='{"format": 2, "sweep": 1}'),
+            r"another version of csac_jax \(sweep: unknown setting",
+        ),
+        (
+            lambda tensors, remarks: remarks.update(config='{"seed": 1, "net": {"depth": 1}}'),
+            r"another version of csac_jax \(net\.depth: unknown setting",
         ),
     ],
 )

@@ -1,7 +1,6 @@
 """Pretrained weights: files that the tests write, in the names and shapes of torchvision's
 densenet121."""
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,20 +12,16 @@ import safetensors.numpy
 
 from csac_jax import cli, presets
 from csac_jax.agent import actor_critic
-from csac_jax.config import NetConfig
+from csac_jax.config import DenseNet121
 from csac_jax.io import weights
 from csac_jax.nets import torchvision
 from csac_jax.runtime import signals
+from tests.sections import with_constants
 
 LAYERS, GROWTH = (1, 2, 1, 1), 4
-NET = NetConfig(
-    kind="densenet121",
-    norm="batch",
-    rotations=4,
-    block_layers=LAYERS,
+NET = with_constants(
+    DenseNet121(norm="batch", rotations=4, block_layers=LAYERS, head=8, margin=0.0),
     block_growth=GROWTH,
-    head=8,
-    margin=0.0,
 )
 
 
@@ -66,16 +61,16 @@ def tensors() -> dict[str, np.ndarray]:
     }
 
 
-def _config(path: Path, tensors: dict[str, np.ndarray]) -> NetConfig:
-    """A config that asks for a file with these tensors, which is written."""
+def _file(path: Path, tensors: dict[str, np.ndarray]) -> Path:
+    """The file `path`, written with these tensors."""
     safetensors.numpy.save_file(tensors, path)
-    return dataclasses.replace(NET, weights=str(path))
+    return path
 
 
 def test_weights_reach_their_places(tmp_path, tensors):
     """Claim: every tensor of the file is in the trunk, kernels turned to [k, k, I, O]; a
     half-precision file too."""
-    got = weights.read(_config(tmp_path / "w.safetensors", tensors))
+    got = weights.read(NET, _file(tmp_path / "w.safetensors", tensors))
     layer = "denseblock2", "denselayer2"
     params, statistics = (got[kind][layer[0]][layer[1]] for kind in ("params", "batch_stats"))
     prefix = "features.denseblock2.denselayer2."
@@ -96,9 +91,8 @@ def test_weights_reach_their_places(tmp_path, tensors):
     np.testing.assert_allclose(
         sum(leaf.sum(dtype=np.float64) for leaf in jax.tree.leaves(got)), wanted, rtol=1e-6
     )
-    half = weights.read(
-        _config(tmp_path / "h.safetensors", {n: t.astype(np.float16) for n, t in tensors.items()})
-    )
+    rounded = {name: tensor.astype(np.float16) for name, tensor in tensors.items()}
+    half = weights.read(NET, _file(tmp_path / "h.safetensors", rounded))
     assert {leaf.dtype for leaf in jax.tree.leaves(half)} == {np.dtype("float32")}
 
 
@@ -108,7 +102,7 @@ def test_names_of_densenet_121_fit():
     zeros = {
         name: np.broadcast_to(np.float32(0.0), shape) for name, shape in _names((6, 12, 24, 16), 32)
     }
-    got = torchvision.variables(NetConfig(kind="densenet121", norm="batch"), zeros)
+    got = torchvision.variables(DenseNet121(norm="batch"), zeros)
     assert sum(leaf.size for leaf in jax.tree.leaves(got)) == 7_037_504
 
 
@@ -136,9 +130,9 @@ def test_bad_tensor_is_named(tmp_path, tensors, change, message):
     """Claim: a missing, an extra and a misshapen tensor is an error of one line with its name and
     the file's."""
     change(tensors)
-    cfg = _config(tmp_path / "w.safetensors", tensors)
-    with pytest.raises(ValueError, match=f"^net.weights: in .*w.safetensors, {message}; bring .*$"):
-        weights.read(cfg)
+    path = _file(tmp_path / "w.safetensors", tensors)
+    with pytest.raises(ValueError, match=f"^in .*w.safetensors, {message}; bring .*$"):
+        weights.read(NET, path)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\x80\x04pickle"])
@@ -149,22 +143,31 @@ def test_file_that_cannot_be_read(tmp_path, content):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(
-        ValueError,
-        match=r"^net.weights: .*w.safetensors cannot be read as .safetensors \(.*\); give ",
+        ValueError, match=r"^.*w.safetensors cannot be read as .safetensors \(.*\); give "
     ):
-        weights.read(dataclasses.replace(NET, weights=str(path)))
+        weights.read(NET, path)
 
 
-def test_command_line_complains_before_training(tmp_path, capsys):
-    """Claim: `train` refuses a bad weights file with exit code 2 and one line, before anything is
-    made."""
-    run = tmp_path / "run"
-    flags = ["--net.weights", str(tmp_path / "none.safetensors"), "--run-dir", str(run)]
+@pytest.mark.parametrize(
+    ("content", "code", "message"),
+    [("nothing", 1, "there is no"), ("pickle", 2, "cannot be read as"), ("net", 2, "the shape")],
+)
+def test_command_line_complains_before_training(tmp_path, tensors, capsys, content, code, message):
+    """Claim: `train` refuses weights that are no .safetensors or of another net with exit code 2,
+    that are not there with 1, in one line, before anything is made."""
+    run, path = tmp_path / "run", tmp_path / "w.safetensors"
+    if content == "pickle":
+        path.write_bytes(b"pickle")
+    elif content == "net":
+        _file(path, tensors)
+    flags = ["--init", str(path), "--run-dir", str(run)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(signals, "install", signals.Stop)
-        assert cli.main(["train", "paper", *flags]) == 2
+        assert cli.main(["train", "paper", *flags]) == code
     line = capsys.readouterr().err
-    assert line.startswith("csac-jax: net.weights: ")
+    assert line.startswith("csac-jax: ")
+    assert "w.safetensors" in line
+    assert message in line
     assert line.count("\n") == 1
     assert not run.exists()
 
@@ -173,13 +176,12 @@ def test_command_line_complains_before_training(tmp_path, capsys):
 def test_networks_begin_with_the_weights(tmp_path, tensors):
     """Claim: every trunk of every critic, online and target, begins with the file's weights and
     statistics; heads and optimisers are as without."""
-    smoke = presets.smoke()
-    cfg = dataclasses.replace(smoke, net=NET, learn=dataclasses.replace(smoke.learn, critics=2))
+    cfg = presets.smoke().change(net=NET, learn={"critics": 2})
     learner = actor_critic.make(cfg)
     with jax.numpy_dtype_promotion("standard"):
         abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, 7, leaf.dtype), abstract)
-    trunk = weights.read(_config(tmp_path / "w.safetensors", tensors))
+    trunk = weights.read(NET, _file(tmp_path / "w.safetensors", tensors))
     state = actor_critic.with_trunk(blank, trunk)
     for params in (state.online, state.target):
         for kind in ("params", "batch_stats"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.training import chunked_vmap
+from csac_jax.nets import chunked_vmap
 
 
 @pytest.mark.parametrize(

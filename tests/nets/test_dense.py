@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.config import NetConfig
+from csac_jax.config import SmallNet
 from csac_jax.nets import dense
-from csac_jax.vision import heightmap
+from tests.sections import with_constants
 
-CFG = NetConfig(growth=8, dilations=(1, 2), stem=16, head=8)
+CFG = SmallNet(growth=8, dilations=(1, 2), stem=16, head=8)
 EPSILON = 1e-6  # of Flax's group norm
 CHANNELS = 4
 GROUP = 8  # channels per group
@@ -25,7 +25,7 @@ def params() -> dict:
     return _random(CFG)
 
 
-def _random(cfg: NetConfig) -> dict:
+def _random(cfg: SmallNet) -> dict:
     """Parameters that are all random: scales and biases too, which start at 1 and 0."""
     rng = np.random.default_rng(1)
     fresh = dense.Critic(cfg).init(jax.random.key(0), jnp.zeros((1, 16, 16, CHANNELS)))
@@ -34,7 +34,7 @@ def _random(cfg: NetConfig) -> dict:
     )
 
 
-def _apply(params: dict, maps: np.ndarray, cfg: NetConfig = CFG) -> np.ndarray:
+def _apply(params: dict, maps: np.ndarray, cfg: SmallNet = CFG) -> np.ndarray:
     return np.asarray(jax.jit(dense.Critic(cfg).apply)(params, jnp.asarray(maps, jnp.float32))[0])
 
 
@@ -66,7 +66,7 @@ def _norm(maps: np.ndarray, weights: dict) -> np.ndarray:
     return np.maximum(normal * weights["scale"] + weights["bias"], 0.0)
 
 
-def _numpy_net(params: dict, maps: np.ndarray, cfg: NetConfig = CFG) -> np.ndarray:
+def _numpy_net(params: dict, maps: np.ndarray, cfg: SmallNet = CFG) -> np.ndarray:
     """The critic's values of each cell of the features, in float64: kernels twice the stride wide
     lie half of it over the edge."""
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params["params"])
@@ -82,7 +82,7 @@ def _numpy_net(params: dict, maps: np.ndarray, cfg: NetConfig = CFG) -> np.ndarr
 
 
 @pytest.mark.parametrize("cfg", [CFG, COARSE])
-def test_net_is_numpys(cfg: NetConfig):
+def test_net_is_numpys(cfg: SmallNet):
     """Claim: densely connected, group norm over the whole map, 1/stride of the resolution, three
     maps."""
     maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
@@ -97,7 +97,7 @@ def test_half_precision_is_near(params):
     maps = jnp.asarray(np.random.default_rng(0).normal(size=(4, 32, 32, CHANNELS)), jnp.float32)
 
     def run(dtype: str):
-        net = dense.Critic(dataclasses.replace(CFG, dtype=dtype))
+        net = dense.Critic(with_constants(CFG, dtype=dtype))
         q, pull = jax.jit(lambda params: jax.vjp(lambda p: net.apply(p, maps)[0], params))(params)
         return q, jax.tree.leaves(jax.jit(pull)(jnp.ones_like(q)))
 
@@ -154,19 +154,7 @@ def test_bare_table_is_zero():
     """Claim: where nothing lies the input is 0, whatever the table's colour; a block's height
     comes out near 1."""
     height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
-    net_input = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, None, border=False))
+    net_input = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, None))
     np.testing.assert_array_equal(net_input[0, 0], 0.0)
     np.testing.assert_array_equal(net_input[0, 1, :3], 0.0)
     np.testing.assert_allclose(net_input[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)
-
-
-def test_border_is_a_map_of_its_own():
-    """Claim: with the border the input is 1 on the workspace, bare or not, and 0 in every map
-    beyond it."""
-    height = jnp.array([[0.0, 0.05], [heightmap.BEYOND, 0.001]])
-    net_input = np.asarray(
-        dense.inputs(jnp.full((2, 2, 3), 0.9), height, jnp.ones((2, 2), bool), border=True)
-    )
-    np.testing.assert_array_equal(net_input[..., -1], [[1.0, 1.0], [0.0, 1.0]])
-    np.testing.assert_array_equal(net_input[1, 0, :4], 0.0)
-    np.testing.assert_allclose(net_input[0, 1, 3], 1.0, rtol=1e-6)

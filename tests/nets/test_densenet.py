@@ -13,10 +13,11 @@ import pytest
 
 os.environ.setdefault("KERAS_BACKEND", "jax")
 
-from csac_jax.config import NetConfig
+from csac_jax.config import DenseNet121
 from csac_jax.nets import densenet
+from tests.sections import with_constants
 
-TINY = NetConfig(kind="densenet121", block_layers=(1, 1, 1, 1), block_growth=4, head=8)
+TINY = with_constants(DenseNet121(block_layers=(1, 1, 1, 1), head=8), block_growth=4)
 PARAMETERS = 7_037_504  # of a trunk without the top, running statistics included
 KERAS = {"norm1": "0_bn", "conv1": "1_conv", "norm2": "1_bn", "conv2": "2_conv"}
 
@@ -89,8 +90,8 @@ def _scale(entry: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
     """Compares every module with Keras's in both modes of batch norm; returns how many outputs were
     compared."""
-    cfg = NetConfig(kind="densenet121", norm="batch", block_layers=block_layers)
-    trunk = densenet.Trunk(cfg)
+    cfg = DenseNet121(norm="batch", block_layers=block_layers)
+    trunk = densenet.DenseNetTrunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(4, size, size, 3)), jnp.float32)
 
@@ -184,7 +185,7 @@ def test_every_stage_of_densenet_121_is_kerass():
 def test_number_of_parameters():
     """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running
     statistics."""
-    trunk = densenet.Trunk(NetConfig(kind="densenet121", norm="batch"))
+    trunk = densenet.DenseNetTrunk(DenseNet121(norm="batch"))
     blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
     variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
     sizes = {
@@ -199,21 +200,23 @@ def test_trunks_see_colour_height_and_mask():
     """Claim: a trunk each for colour, for height and for the mask, the latter two three times over;
     cells are repeated as far as the trunk does not double them itself."""
     maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
-    zoomed = NetConfig(kind="densenet121", zoom=4)
+    zoomed = DenseNet121(zoom=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
     assert seen.shape == (3, 2, 8, 8, 3)
     np.testing.assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
     for trunk, channel in ((1, 3), (2, 4)):
         for copy in range(3):
             np.testing.assert_array_equal(seen[trunk, :, ::2, 1::2, copy], maps[..., channel])
-    blind = NetConfig(kind="densenet121", colour=False)
+    blind = DenseNet121(colour=False)
     only = densenet._trunk_inputs(blind, maps[..., 3:4])
     np.testing.assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
 
 
 def test_a_zoomed_trunk_doubles_its_cells():
     """Claim: with a zoom a trunk says of maps what one without says of pixels repeated."""
-    whole, doubling = (densenet.Trunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2))
+    whole, doubling = (
+        densenet.DenseNetTrunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2)
+    )
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
     variables = random_variables(whole, 0, (1, 64, 64, 3))
     repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
@@ -242,7 +245,7 @@ def test_inputs():
 def test_trunks_have_weights_of_their_own():
     """Claim: each trunk has its own weights, and features are joined colour first: changing what
     one trunk sees, or one trunk's weights, changes its share of the features only."""
-    critic = densenet.Critic(TINY)
+    critic = densenet.DenseNetCritic(TINY)
     maps = jnp.asarray(np.random.default_rng(2).normal(size=(1, 64, 64, 4)), jnp.float32)
     variables = random_variables(critic, 0, maps.shape)
     features = jax.jit(lambda variables, maps: critic.apply(variables, maps)[1])
@@ -259,7 +262,7 @@ def test_trunks_have_weights_of_their_own():
 def test_head_upsamples(zoom: int, output_stride: int, factor: int):
     """Claim: maps have the resolution that `output_stride` says; they are bilinear between the
     features' cells, which keep their places, and constant features give a constant map."""
-    cfg = NetConfig(kind="densenet121", zoom=zoom, output_stride=output_stride)
+    cfg = with_constants(DenseNet121(zoom=zoom), output_stride=output_stride)
     plane = jnp.asarray(
         np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None], jnp.float32
     )
@@ -275,7 +278,7 @@ def test_head_upsamples(zoom: int, output_stride: int, factor: int):
 def test_group_norm_sees_one_map():
     """Claim: with group norm the maps of a picture do not depend on what else is in the batch, in
     the head either."""
-    head = densenet.Head(TINY)
+    head = densenet.DenseNetHead(TINY)
     features = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, 2, 16)), jnp.float32)
     variables = random_variables(head, 0, (1, 2, 2, 16))
     apply = jax.jit(head.apply)
@@ -284,12 +287,12 @@ def test_group_norm_sees_one_map():
     np.testing.assert_allclose(together[1, 2], apply(variables, features[1, 2:])[0], atol=1e-5)
 
 
-HALF = dataclasses.replace(TINY, dtype="bfloat16")
+HALF = with_constants(TINY, dtype="bfloat16")
 
 
 def test_bfloat16_has_float32_parameters():
     """Claim: in bfloat16 parameters and Q stay float32, features are bfloat16."""
-    critic, maps = densenet.Critic(HALF), jax.ShapeDtypeStruct((1, 64, 64, 4), jnp.float32)
+    critic, maps = densenet.DenseNetCritic(HALF), jax.ShapeDtypeStruct((1, 64, 64, 4), jnp.float32)
     with jax.numpy_dtype_promotion("standard"):  # Flax's norm promotes in half precision
         (q, features), variables = jax.eval_shape(critic.init_with_output, jax.random.key(0), maps)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
@@ -300,8 +303,8 @@ def test_bfloat16_has_float32_parameters():
 def test_bfloat16_is_near_float32():
     """Claim: Q in bfloat16 is that in float32 within 5 % of the largest."""
     maps = jnp.asarray(np.random.default_rng(4).normal(size=(1, 64, 64, 4)), jnp.float32)
-    variables = random_variables(densenet.Critic(TINY), 0, maps.shape)
+    variables = random_variables(densenet.DenseNetCritic(TINY), 0, maps.shape)
     with jax.numpy_dtype_promotion("standard"):
-        q, _ = jax.jit(densenet.Critic(HALF).apply)(variables, maps)
-    wanted, _ = jax.jit(densenet.Critic(TINY).apply)(variables, maps)
+        q, _ = jax.jit(densenet.DenseNetCritic(HALF).apply)(variables, maps)
+    wanted, _ = jax.jit(densenet.DenseNetCritic(TINY).apply)(variables, maps)
     assert 0.0 < np.abs(q - wanted).max() <= 0.05 * np.abs(wanted).max()

@@ -10,15 +10,21 @@ import pytest
 
 from csac_jax import presets
 from csac_jax.agent import maps
-from csac_jax.config import Config, HeightmapConfig, NetConfig
+from csac_jax.config import Config, DenseNet121, SmallNet
 from csac_jax.nets import dense, densenet, networks
+from tests.sections import with_constants
+
+TINY = {
+    "small": SmallNet(margin=0.5, rotations=4),
+    "densenet121": with_constants(
+        DenseNet121(margin=0.5, rotations=4, block_layers=(1, 1, 1, 1), head=8), block_growth=4
+    ),
+}
 
 
 def _config(size: int = 224, **net: Any) -> Config:
     fields = {"kind": "densenet121", "margin": 0.4286, **net}
-    return dataclasses.replace(
-        presets.smoke(), heightmap=HeightmapConfig(size=size), net=NetConfig(**fields)
-    )
+    return presets.smoke().change(heightmap={"size": size}, net=fields)
 
 
 @pytest.mark.parametrize(
@@ -37,39 +43,26 @@ def _config(size: int = 224, **net: Any) -> Config:
         (
             40,
             {"margin": 0.0},
-            r"net.margin: .* multiple of 32 cells, not 40; no margin .* heightmap.size than 40",
+            r"net.margin: .* multiple of 32 cells, not 40; take another heightmap.size than 40",
         ),
         (
             64,
             {"margin": 0.125, "zoom": 2},
             r"net.margin: .* multiple of 16 cells, not 72; try 0.0000",
         ),
-        (224, {"zoom": 3}, "net.zoom, net.output_stride: their product must divide 32"),
-        (224, {"output_stride": 64}, "net.zoom, net.output_stride: their product must divide 32"),
-        (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: at least one layer"),
-        (224, {"block_growth": 30}, "net.block_growth: must be a multiple of 4"),
+        (224, {"zoom": 3}, "net.zoom: must divide 8"),
+        (224, {"zoom": 16}, "net.zoom: must divide 8"),
+        (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: must be at least 1, not 0"),
         (224, {"norm": "layer"}, "net.norm: 'layer' is not one of: group, batch"),
         (224, {"kind": "resnet"}, "net.kind: 'resnet' is not one of: small, densenet121"),
-        (224, {"weights": "x.safetensors"}, "net.weights: need --net.norm batch"),
-        (224, {"border": True}, "net.border: only of --net.kind small"),
-        (
-            64,
-            {"kind": "small", "margin": 0.125, "norm": "batch"},
-            "net.norm batch, net.weights: only of",
-        ),
-        (
-            64,
-            {"kind": "small", "margin": 0.125, "weights": "x"},
-            "net.norm batch, net.weights: only of",
-        ),
-        (64, {"kind": "small", "stride": 3}, "net.stride: must be 2 or 4"),
-        (64, {"kind": "small", "subcells": 3}, "net.subcells: must divide net.stride, 2"),
-        (64, {"kind": "small", "subcells": 4}, "net.subcells: must divide net.stride, 2"),
-        (
-            64,
-            {"kind": "small", "stride": 4, "subcells": 3},
-            "net.subcells: must divide net.stride, 4",
-        ),
+        (224, {"stem": 16}, "net.stem: unknown setting"),
+        (64, {"kind": "small", "norm": "batch"}, "net.norm: unknown setting"),
+        (64, {"kind": "small", "stride": 3}, "net.stride: 3 is not one of: 2, 4"),
+        (64, {"kind": "small", "subcells": 3}, "net.subcells: 3 is not one of: 1, 2, 4"),
+        (64, {"kind": "small", "subcells": 4}, "net.subcells: at most net.stride, 2"),
+        (64, {"kind": "small", "stride": 4, "subcells": 8}, "net.subcells: 8 is not one of"),
+        (64, {"kind": "small", "dilations": ()}, "net.dilations: at least one layer"),
+        (64, {"rotations": 5}, "net.rotations: must be even"),
         (
             64,
             {"kind": "small", "margin": 0.22},
@@ -98,7 +91,8 @@ def test_suggested_margins_do():
                 _config(size, margin=0.2, zoom=zoom)
             for word in str(raised.value).split("try ")[1].split(", "):
                 margin, side = word.split(" (")
-                frames = maps.frames(_config(size, margin=float(margin), zoom=zoom))
+                cfg = _config(size, margin=float(margin), zoom=zoom)
+                frames = maps.frames(cfg, networks.make(cfg.net))
                 assert frames.tables.canvas == int(side.removesuffix(" cells)"))
 
 
@@ -111,8 +105,9 @@ def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
     cfg = _config(
         64, kind="small", margin=0.125, stride=stride, subcells=finer, dilations=(1,), growth=4
     )
-    frames, net = maps.frames(cfg), networks.critic(cfg.net)
-    (q, _), _ = jax.eval_shape(net.init_with_output, jax.random.key(0), jnp.zeros((1, 72, 72, 4)))
+    nets, blank = networks.make(cfg.net), jnp.zeros((1, 72, 72, 4))
+    frames = maps.frames(cfg, nets)
+    (q, _), _ = jax.eval_shape(nets.critic.init_with_output, jax.random.key(0), blank)
     assert (frames.stride, frames.side, frames.cell) == (
         cells,
         72 // cells,
@@ -127,54 +122,45 @@ def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
 def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: bool):
     """Claim: either net, with and without colour and mask, gives maps of the size that the frames
     say, and the actor's head gives maps of the same size from its features."""
-    cfg = _config(
-        64,
-        kind=kind,
-        margin=0.5,
-        colour=colour,
-        rotations=4,
-        block_layers=(1, 1, 1, 1),
-        block_growth=4,
+    cfg = presets.smoke().change(
+        heightmap={"size": 64},
+        net=dataclasses.replace(TINY[kind], colour=colour),
+        task={"kind": "target" if target else "clear"},
     )
-    cfg = dataclasses.replace(
-        cfg, task=dataclasses.replace(cfg.task, kind="target" if target else "clear")
-    )
-    frames = maps.frames(cfg)
+    nets = networks.make(cfg.net)
+    frames = maps.frames(cfg, nets)
     seen = jax.eval_shape(
-        lambda colour, height, mask: networks.inputs(
-            cfg.net, colour, height, mask if frames.shows_target else None
+        lambda colour, height, mask: nets.inputs(
+            colour, height, mask if frames.shows_target else None
         ),
         jnp.zeros((1, 96, 96, 3)),
         jnp.zeros((1, 96, 96)),
         jnp.zeros((1, 96, 96), bool),
     )
     assert seen.shape == (1, 96, 96, 3 * colour + 1 + target)
-    critic, head = networks.critic(cfg.net), networks.head(cfg.net)
+    critic, head = nets.critic, nets.head
     (q, features), _ = jax.eval_shape(critic.init_with_output, jax.random.key(0), seen)
     actor, _ = jax.eval_shape(head.init_with_output, jax.random.key(0), features)
     assert q.shape == actor.shape == (1, frames.side, frames.side, dense.OUTPUTS)
-    assert frames.side * networks.stride(cfg.net) == frames.tables.canvas == 96
-    assert isinstance(critic, densenet.Critic if kind == "densenet121" else dense.Critic)
+    assert frames.side * nets.stride == frames.tables.canvas == 96
+    assert isinstance(critic, densenet.DenseNetCritic if kind == "densenet121" else dense.Critic)
 
 
 def test_states_of_densenet_are_seen_in_groups():
     """Claim: DenseNet-121 sees one state of 640 px at a time, four of 320, and what it says of each
     is what it says of its passes by themselves; the small net sees all at once."""
-    assert (
-        networks.states_at_once(_config(224, margin=0.4286, kind="densenet121", zoom=2).net, 320)
-        == 1
-    )
-    assert networks.states_at_once(_config(224, margin=0.4286, kind="densenet121").net, 320) == 4
-    assert networks.states_at_once(NetConfig(), 72) is None
-    net = NetConfig(kind="densenet121", block_layers=(1, 1, 1, 1), block_growth=4, head=8)
-    critic = networks.critic(net)
+    assert networks.make(DenseNet121(zoom=2)).states_at_once(320) == 1
+    assert networks.make(DenseNet121()).states_at_once(320) == 4
+    assert networks.make(SmallNet()).states_at_once(72) is None
+    nets = networks.make(TINY["densenet121"])
+    critic = nets.critic
     net_input = jax.random.normal(jax.random.key(0), (3, 2, 32, 32, 4))
     variables = critic.init(jax.random.key(1), net_input[0])
     for group in (1, 2, 3):
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(networks, "_FULL", 32 * group**0.5)
-            assert networks.states_at_once(net, 32) == group
-            got = networks.look(critic, variables, net_input)
+            assert nets.states_at_once(32) == group
+            got = networks.apply(nets, variables, net_input)
         apart = [critic.apply(variables, one) for one in net_input]
         for leaf, *wanted in zip(got, *apart, strict=True):
             np.testing.assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
@@ -184,15 +170,13 @@ def test_states_of_densenet_are_seen_in_groups():
 def test_looks_at_any_number_of_states_share_products(kind: str):
     """Claim: one state and eight go through products of the same shapes with DenseNet-121, of
     others with the small net, which takes all at once."""
-    critic = networks.critic(
-        _config(64, kind=kind, margin=0.5, block_layers=(1, 1, 1, 1), block_growth=4).net
-    )
-    variables = jax.eval_shape(critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
+    nets = networks.make(TINY[kind])
+    variables = jax.eval_shape(nets.critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
 
     def products(states: int) -> set[str]:
         net_input = jax.ShapeDtypeStruct((states, 2, 640, 640, 4), jnp.float32)
         text = (
-            jax.jit(lambda variables, net_input: networks.look(critic, variables, net_input))
+            jax.jit(lambda variables, net_input: networks.apply(nets, variables, net_input))
             .lower(variables, net_input)
             .as_text()
         )

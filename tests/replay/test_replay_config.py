@@ -5,38 +5,33 @@ import jax.numpy as jnp
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import ReplayConfig
-from csac_jax.replay import ring
+from csac_jax.config import BetaReplay, PrioritisedReplay, UniformReplay
+from csac_jax.replay import ring, samplers
 from csac_jax.training import step
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("capacity", 0),
-        ("capacity", 1),
-        ("capacity", 2**30 + 1),
-        ("alpha", -0.1),
-        ("alpha", 1.1),
-        ("alpha", float("nan")),
-        ("floor", 0.0),
-        ("floor", -1.0),
-        ("floor", 2.0),
-        ("is_beta_start", -0.1),
-        ("is_beta_start", 1.1),
-        ("is_beta_end", -0.1),
-        ("is_beta_end", 1.1),
-        ("beta_start", (0.0, 1.0)),
-        ("beta_middle", (1.0, -1.0)),
-        ("beta_end", (1.0, 0.0)),
-        ("beta_middle_at", 0.0),
-        ("beta_middle_at", 1.0),
+        ("start", (0.0, 1.0)),
+        ("start", (float("nan"), 1.0)),
+        ("middle", (1.0, -1.0)),
+        ("end", (1.0, 0.0)),
+        ("rank_by", "age"),
     ],
 )
 def test_values_out_of_range(name, value):
     """Claim: a value out of range is a ValueError that begins with the setting's name."""
     with pytest.raises(ValueError, match=rf"^replay\.{name}:"):
-        ReplayConfig(**{name: value})
+        BetaReplay(**{name: value})
+
+
+@pytest.mark.parametrize("kind", [UniformReplay, PrioritisedReplay, BetaReplay])
+@pytest.mark.parametrize("capacity", [0, 1, 2**30 + 1])
+def test_capacity_out_of_range(kind, capacity):
+    """Claim: so is a capacity below 2 or above 2^30, with every sampler."""
+    with pytest.raises(ValueError, match=r"^replay\.capacity: must lie in 2 \.\."):
+        kind(capacity=capacity)
 
 
 @pytest.mark.parametrize("preset", ["smoke", "quick"])
@@ -45,7 +40,8 @@ def test_bytes_are_those_of_the_ring(preset):
     besides."""
     cfg = presets.get(preset)
     example = step.example(cfg)
-    state = jax.eval_shape(lambda: ring.init(cfg.replay, example))
+    sampler = samplers.make(cfg.replay)
+    state = jax.eval_shape(lambda: ring.init(sampler.init(cfg.replay.capacity), example))
     arrays = [*jax.tree.leaves(state.items), state.priority]
     expected = sum(leaf.size * leaf.dtype.itemsize for leaf in arrays)
     assert ring.bytes_needed(cfg.replay.capacity, example) == expected

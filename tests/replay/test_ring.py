@@ -9,22 +9,29 @@ import pytest
 from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from csac_jax.config import ReplayConfig
+from csac_jax.config import BetaReplay, PrioritisedReplay
 from csac_jax.replay import ring, samplers
+from csac_jax.replay.samplers import Sampler
+from tests.sections import with_constants
 
 CAPACITY, NUM, BATCH = 7, 3, 5
-CFG = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=0.7, per_epsilon=0.05)
-PLAIN = ReplayConfig(capacity=CAPACITY)  # its priorities are abs(error)
+REPLAY = with_constants(PrioritisedReplay(), alpha=0.7, per_epsilon=0.05)
+PRIORITISED = samplers.Prioritised(REPLAY)
+PLAIN = samplers.make(BetaReplay())  # its priorities are abs(error)
 EXAMPLE = {"id": jnp.int32(0), "map": jnp.zeros((2, 2), jnp.uint16)}
 
 add, gather = jax.jit(ring.add), jax.jit(ring.gather)
-sample = jax.jit(samplers.sample, static_argnums=(1, 4))
+sample = jax.jit(PRIORITISED.sample, static_argnums=3)
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def set_errors(state, slots, errors, cfg=PLAIN):
+def set_errors(state, slots, errors, sampler: Sampler = PLAIN):
     """Stores abs(errors), or what a prioritised sampler makes of them."""
-    return ring.set_priorities(state, slots, samplers.priority(cfg, errors))
+    return sampler.update(state, slots, errors)
+
+
+def empty(capacity: int = CAPACITY) -> ring.ReplayState:
+    return ring.init(PRIORITISED.init(capacity), EXAMPLE)
 
 
 def items(ids) -> dict[str, jax.Array]:
@@ -37,7 +44,7 @@ def items(ids) -> dict[str, jax.Array]:
 
 
 def filled_ring(ids) -> ring.ReplayState:
-    state = ring.init(CFG, EXAMPLE)
+    state = empty()
     for i in ids:
         state = add(state, items([i]), jnp.array([True]))
     return state
@@ -45,12 +52,12 @@ def filled_ring(ids) -> ring.ReplayState:
 
 class RingModel(RuleBasedStateMachine):
     """Claim: after any sequence of adds and errors, the ring holds what a list of slots would, with
-    the priorities (abs(error) + floor)^alpha; draws are of filled slots, their weights (n P)^-beta
-    over the batch's largest."""
+    the priorities (abs(error) + epsilon)^alpha; draws are of filled slots, their weights
+    (n P)^-beta over the batch's largest."""
 
     def __init__(self):
         super().__init__()
-        self.state = ring.init(CFG, EXAMPLE)
+        self.state = empty()
         self.ids, self.priority = np.zeros(CAPACITY, int), np.zeros(CAPACITY)
         self.head = self.stored = self.last_id = 0
 
@@ -80,7 +87,9 @@ class RingModel(RuleBasedStateMachine):
         if self.size == 0:
             return
         slots = [slot % self.size for slot in slots]
-        self.state = set_errors(self.state, jnp.array(slots), jnp.array(errors, jnp.float32), CFG)
+        self.state = set_errors(
+            self.state, jnp.array(slots), jnp.array(errors, jnp.float32), PRIORITISED
+        )
         finite = [(abs(e) + 0.05) ** 0.7 for e in errors if np.isfinite(e)]
         largest = max([*self.priority[slots], *finite])
         new = [(abs(e) + 0.05) ** 0.7 if np.isfinite(e) else largest for e in errors]
@@ -93,7 +102,7 @@ class RingModel(RuleBasedStateMachine):
     def sample(self, seed, progress):
         if self.size == 0:
             return
-        slots, weights = sample(jax.random.key(seed), CFG, self.state, jnp.float32(progress), BATCH)
+        slots, weights = sample(jax.random.key(seed), self.state, jnp.float32(progress), BATCH)
         assert set(np.asarray(slots)) <= set(range(self.size))
         probability = self.priority[np.asarray(slots)] / self.priority.sum()
         expected = (self.size * probability) ** -(0.4 + 0.6 * progress)
@@ -119,7 +128,7 @@ class TestRingModelLong(RingModel.TestCase):
 def test_valid_items_are_packed():
     """Claim: invalid items leave no gap: ids 1 _ 3, then _ 5 6 fill slots 0 to 3; the rest stays
     unwritten."""
-    state = add(ring.init(CFG, EXAMPLE), items([1, 2, 3]), jnp.array([True, False, True]))
+    state = add(empty(), items([1, 2, 3]), jnp.array([True, False, True]))
     state = add(state, items([4, 5, 6]), jnp.array([False, True, True]))
     assert state.items["id"].tolist() == [1, 3, 5, 6, 0, 0, 0]
     assert (int(state.head), int(state.size)) == (4, 4)
@@ -175,7 +184,7 @@ def test_gather_returns_the_items_of_its_slots():
 def test_types_are_those_of_the_example():
     """Claim: add and set_priorities return a state of the same types and shapes: a compiled loop
     takes it again."""
-    state = ring.init(CFG, EXAMPLE)
+    state = empty()
     added = add(state, items([1]), jnp.array([True]))
     updated = set_errors(added, jnp.array([0]), jnp.array([1.0]))
     signature = functools.partial(
@@ -187,15 +196,14 @@ def test_types_are_those_of_the_example():
 def test_too_many_items_at_once():
     """Claim: more items than slots is an error that names the setting."""
     with pytest.raises(ValueError, match=r"replay\.capacity"):
-        ring.add(ring.init(CFG, EXAMPLE), items(range(1, 9)), jnp.ones(8, bool))
+        ring.add(empty(), items(range(1, 9)), jnp.ones(8, bool))
 
 
 def test_donated_ring_is_not_copied():
     """Claim: with the state donated, a compiled loop of adds and error updates copies no replay
     memory."""
-    state = ring.init(
-        ReplayConfig(capacity=512), {"id": jnp.int32(0), "map": jnp.zeros((64, 64), jnp.uint16)}
-    )
+    example = {"id": jnp.int32(0), "map": jnp.zeros((64, 64), jnp.uint16)}
+    state = ring.init(PLAIN.init(512), example)
     new = {"id": jnp.arange(1, 9), "map": jnp.ones((8, 64, 64), jnp.uint16)}
 
     def step(state, i):

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from csac_jax.config import ReplayConfig
+from csac_jax.config import BetaReplay, Config, PrioritisedReplay, UniformReplay
 from csac_jax.replay import ring, samplers
+from csac_jax.replay.samplers import Sampler
+from tests.sections import with_constants
 
 NUM = 20_000
 CAPACITY = 1000
@@ -18,18 +20,27 @@ P = 1e-3  # tests of fit: keys are fixed, so that one passes always or never
 
 beta_slots = jax.jit(samplers.beta_slots, static_argnums=5)
 proportional_slots = jax.jit(samplers.proportional_slots, static_argnums=2)
-sample = jax.jit(samplers.sample, static_argnums=(1, 4))
+sample = jax.jit(lambda key, sampler, *args: sampler.sample(key, *args), static_argnums=(1, 4))
+
+SAMPLERS = {
+    "uniform": samplers.make(UniformReplay()),
+    "prioritised": samplers.make(PrioritisedReplay()),
+    "beta": samplers.make(BetaReplay()),
+}
 
 
-def stored(cfg: ReplayConfig, errors, size: int | None = None) -> ring.ReplayState:
-    """A ring with these errors in its first slots."""
+def prioritised(**constants) -> samplers.Prioritised:
+    return samplers.Prioritised(with_constants(PrioritisedReplay(), **constants))
+
+
+def stored(sampler: Sampler, errors, size: int | None = None) -> ring.ReplayState:
+    """A ring with a slot for each of these errors, the first `size` of which are filled."""
     errors = jnp.asarray(errors, jnp.float32)
     size = errors.size if size is None else size
-    filled = jnp.arange(errors.size) < size
-    priority = jnp.where(filled, samplers.priority(cfg, errors), 0.0)
-    return dataclasses.replace(
-        ring.init(cfg, jnp.int32(0)), size=jnp.int32(size), priority=priority
-    )
+    slots = jnp.arange(errors.size)
+    state = ring.init(sampler.init(errors.size), jnp.int32(0))
+    state = sampler.update(dataclasses.replace(state, size=jnp.int32(size)), slots, errors)
+    return dataclasses.replace(state, priority=jnp.where(slots < size, state.priority, 0.0))
 
 
 def ranks(values: np.ndarray, slots: np.ndarray) -> np.ndarray:
@@ -57,8 +68,8 @@ def assert_fits(cells: np.ndarray, probability: np.ndarray) -> None:
 
 @pytest.mark.parametrize(
     ("a", "b"),
-    [(1.0, 1.0), (0.5, 0.5), (1.0, 2.0), (1.0, 12.0), (2.0, 5.0), (12.0, 1.0), (0.5, 3.0), (3.0, 3.0), (1.0, 4.0),
-     (0.75, 0.75)],
+    [(1.0, 1.0), (0.5, 0.5), (1.0, 2.0), (1.0, 12.0), (2.0, 5.0), (12.0, 1.0), (0.5, 3.0),
+     (3.0, 3.0), (1.0, 4.0), (0.75, 0.75)],
 )  # fmt: skip
 @pytest.mark.parametrize("size", [CAPACITY, 400])
 def test_ranks_follow_the_beta_law(a, b, size):
@@ -88,11 +99,9 @@ def test_beta_draws_follow_scipys_law(a, b):
 def test_drawing_has_no_open_loop():
     """Claim: no sampler has a loop of unknown length, whose condition a GPU hands to the host at
     every turn."""
-    for sampler in ("uniform", "prioritised", "beta"):
-        cfg = ReplayConfig(sampler=sampler, capacity=CAPACITY)
-        text = str(jax.make_jaxpr(lambda key, c=cfg: samplers.sample(key, c, stored(c, np.zeros(9)), 0.5, 64))(
-            jax.random.key(0)
-        ))  # fmt: skip
+    for sampler in SAMPLERS.values():
+        draw = lambda key, s=sampler: s.sample(key, stored(s, np.zeros(9)), 0.5, 64)  # noqa: E731
+        text = str(jax.make_jaxpr(draw)(jax.random.key(0)))
         assert "random_bits" in text
         assert "while" not in text
         assert "random_gamma" not in text  # of a loop inside
@@ -107,16 +116,17 @@ LAWS = {
 
 @pytest.mark.parametrize(
     ("law", "alpha", "size"),
-    [("normal", 0.0, CAPACITY), ("normal", 0.3, CAPACITY), ("normal", 0.6, CAPACITY), ("normal", 1.0, CAPACITY),
-     ("normal", 0.6, 400), ("twelve decades", 0.2, CAPACITY), ("twelve decades", 0.6, CAPACITY),
-     ("twelve decades", 1.0, CAPACITY), ("one giant", 0.6, CAPACITY), ("one giant", 1.0, 700)],
+    [("normal", 0.0, CAPACITY), ("normal", 0.3, CAPACITY), ("normal", 0.6, CAPACITY),
+     ("normal", 1.0, CAPACITY), ("normal", 0.6, 400), ("twelve decades", 0.2, CAPACITY),
+     ("twelve decades", 0.6, CAPACITY), ("twelve decades", 1.0, CAPACITY),
+     ("one giant", 0.6, CAPACITY), ("one giant", 1.0, 700)],
 )  # fmt: skip
 def test_prioritised_draws_follow_the_priorities(law, alpha, size):
-    """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + floor, in a ring that is full
-    or partly filled."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", alpha=alpha, per_epsilon=1e-6)
+    """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + epsilon, in a ring that is
+    full or partly filled."""
+    own = prioritised(alpha=alpha, per_epsilon=1e-6)
     errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
-    slots, _ = sample(jax.random.key(0), cfg, stored(cfg, errors, size), jnp.float32(0.0), NUM)
+    slots, _ = sample(jax.random.key(0), own, stored(own, errors, size), jnp.float32(0.0), NUM)
     assert slots.max() < size
     assert_fits(np.asarray(slots), (np.abs(errors[:size].astype(float)) + 1e-6) ** alpha)
 
@@ -132,9 +142,10 @@ def test_uniform_slots_are_uniform(size):
 
 def test_alpha_zero_is_uniform_over_what_is_stored():
     """Claim: alpha = 0 draws every filled slot alike, whatever its error."""
-    cfg = ReplayConfig(capacity=8, sampler="prioritised", alpha=0.0)
     assert (
-        stored(cfg, [1e-3, 1.0, 1e6, 0.0, 5.0, 5.0, 5.0, 5.0], 4).priority.tolist()
+        stored(
+            prioritised(alpha=0.0), [1e-3, 1.0, 1e6, 0.0, 5.0, 5.0, 5.0, 5.0], 4
+        ).priority.tolist()
         == [1.0] * 4 + [0.0] * 4
     )
 
@@ -198,28 +209,26 @@ def test_top_decile_shares():
         np.testing.assert_allclose(np.mean(np.asarray(slots) < CAPACITY // 10), share, atol=0.012)
 
 
-@pytest.mark.parametrize("sampler", ["prioritised", "beta"])
+@pytest.mark.parametrize(
+    "sampler",
+    [prioritised(alpha=1.0, per_epsilon=1e-3), samplers.make(BetaReplay(start=(1.0, 12.0)))],
+)
 def test_items_with_large_errors_are_drawn_most(sampler):
     """Claim: through the ring, with items numbered from 1 and wrapped, the largest error is drawn
     most."""
-    cfg = ReplayConfig(
-        capacity=8, sampler=sampler, beta_start=(1.0, 12.0), alpha=1.0, per_epsilon=1e-3
-    )
-    state = ring.init(cfg, {"id": jnp.int32(0)})
+    state = ring.init(sampler.init(8), {"id": jnp.int32(0)})
     for i in range(1, 12):
         state = ring.add(state, {"id": jnp.array([i])}, jnp.array([True]))
     ids = np.asarray(state.items["id"])
     errors = np.where(ids == 7, -5.0, 0.1 * ids)
-    state = ring.set_priorities(
-        state, jnp.arange(8), samplers.priority(cfg, jnp.array(errors, jnp.float32))
-    )
-    slots, _ = sample(jax.random.key(0), cfg, state, jnp.float32(0.0), NUM)
+    state = sampler.update(state, jnp.arange(8), jnp.array(errors, jnp.float32))
+    slots, _ = sample(jax.random.key(0), sampler, state, jnp.float32(0.0), NUM)
     count = np.bincount(ring.gather(state, slots)["id"], minlength=12)
     assert count[:4].sum() == 0
     assert count.argmax() == 7
     share = (
         special.betainc(1.0, 12.0, 1 / 8)
-        if sampler == "beta"
+        if isinstance(sampler, samplers.Beta)
         else 5.001 / (np.abs(errors).sum() + 8e-3)
     )
     np.testing.assert_allclose(count[7] / NUM, share, atol=0.01)
@@ -227,29 +236,29 @@ def test_items_with_large_errors_are_drawn_most(sampler):
 
 def test_ranking_by_reward():
     """Claim: by `rank_by` reward, rank 0 is the largest reward, signed, whatever the errors."""
-    cfg = ReplayConfig(capacity=CAPACITY, rank_by="reward", beta_start=(1.0, 12.0))
+    sampler = samplers.make(BetaReplay(rank_by="reward", start=(1.0, 12.0)))
     rewards = np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)
 
     @dataclasses.dataclass
     class Items:
         reward: jax.Array
 
-    state = stored(cfg, np.random.default_rng(1).normal(size=CAPACITY), 400)
+    state = stored(sampler, np.random.default_rng(1).normal(size=CAPACITY), 400)
     state = dataclasses.replace(state, items=Items(jnp.asarray(rewards)))
-    slots, _ = samplers.sample(jax.random.key(0), cfg, state, jnp.float32(0.0), NUM)
+    slots, _ = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), NUM)
     probability = np.diff(special.betainc(1.0, 12.0, np.linspace(0.0, 1.0, 401)))
     assert_fits(ranks(rewards[:400], np.asarray(slots)), probability)
 
 
-@pytest.mark.parametrize("sampler", ["prioritised", "beta"])
-def test_equal_errors_are_drawn_equally(sampler):
+@pytest.mark.parametrize("replay", [PrioritisedReplay(), BetaReplay(start=(1.0, 12.0))])
+def test_equal_errors_are_drawn_equally(replay):
     """Claim: slots of equal errors are drawn alike: none is preferred, by either law."""
-    cfg = ReplayConfig(capacity=20, sampler=sampler, beta_start=(1.0, 12.0))
-    state = stored(cfg, jnp.ones(20), 10)
+    sampler = samplers.make(replay)
+    state = stored(sampler, jnp.ones(20), 10)
     keys = jax.random.split(jax.random.key(0), 4000)
-    slots = jax.jit(
-        jax.vmap(lambda key: samplers.sample(key, cfg, state, jnp.float32(0.0), 1).slots)
-    )(keys)
+    slots = jax.jit(jax.vmap(lambda key: sampler.sample(key, state, jnp.float32(0.0), 1).slots))(
+        keys
+    )
     assert_fits(np.asarray(slots).ravel(), np.ones(10))
 
 
@@ -264,31 +273,26 @@ def test_nan_is_ranked_first():
     assert slots.max() < 4
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
+@pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
 def test_errors_that_are_not_numbers(sampler):
     """Claim: after updates with NaN and infinite errors, slots are inside, weights positive and at
     most 1."""
-    cfg = ReplayConfig(capacity=8, sampler=sampler)
-    state = stored(cfg, [0.5, 2.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0], 4)
+    state = stored(sampler, [0.5, 2.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0], 4)
     for errors in ([jnp.nan, 1.0, -2.0], [jnp.inf, -jnp.inf, jnp.nan], [jnp.nan] * 3):
-        state = ring.set_priorities(
-            state, jnp.array([0, 2, 3]), samplers.priority(cfg, jnp.array(errors))
-        )
-        slots, weights = sample(jax.random.key(0), cfg, state, jnp.float32(0.5), NUM)
+        state = sampler.update(state, jnp.array([0, 2, 3]), jnp.array(errors))
+        slots, weights = sample(jax.random.key(0), sampler, state, jnp.float32(0.5), NUM)
         assert np.all((slots >= 0) & (slots < 4))
         assert np.all((weights > 0.0) & (weights <= 1.0))
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
+@pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
 @pytest.mark.parametrize("size", [0, 1, 2, 7, 8])
 @pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
 def test_slots_are_always_inside(sampler, size, progress):
     """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots. Weights
     are at most 1."""
-    cfg = ReplayConfig(capacity=8, sampler=sampler)
-    slots, weights = sample(
-        jax.random.key(0), cfg, stored(cfg, jnp.ones(8), size), jnp.float32(progress), 500
-    )
+    state = stored(sampler, jnp.ones(8), size)
+    slots, weights = sample(jax.random.key(0), sampler, state, jnp.float32(progress), 500)
     assert slots.dtype == np.int32
     assert slots.min() >= 0
     assert slots.max() < (size or 8)
@@ -298,20 +302,20 @@ def test_slots_are_always_inside(sampler, size, progress):
         1.0,
         1.0,
     )
-    seldom = sampler == "beta" and progress == 1.0  # Beta(1, 12)
+    seldom = isinstance(sampler, samplers.Beta) and progress == 1.0  # Beta(1, 12)
     assert size == 0 or seldom or np.unique(slots).size == size
 
 
 @pytest.mark.parametrize("progress", [-1.0, 0.0, 0.3, 1.0, 2.0])
 @pytest.mark.parametrize("law", LAWS)
 def test_weights_by_formula(progress, law):
-    """Claim: w_i = (n P(i))^-beta / max_j w_j over the batch, beta from `is_beta_start` to
-    `is_beta_end` in a line."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", is_beta_start=0.2, is_beta_end=0.8)
+    """Claim: w_i = (n P(i))^-beta / max_j w_j over the batch, beta from the first to the
+    second of `is_beta` in a line."""
+    sampler = prioritised(is_beta=(0.2, 0.8))
+    cfg = sampler.cfg
     errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
-    slots, weights = sample(
-        jax.random.key(0), cfg, stored(cfg, errors, 900), jnp.float32(progress), 64
-    )
+    state = stored(sampler, errors, 900)
+    slots, weights = sample(jax.random.key(0), sampler, state, jnp.float32(progress), 64)
     mass = (np.abs(errors[:900].astype(float)) + cfg.per_epsilon) ** cfg.alpha
     expected = (900 * mass / mass.sum())[np.asarray(slots)] ** -(
         0.2 + 0.6 * np.clip(progress, 0.0, 1.0)
@@ -323,42 +327,34 @@ def test_weights_by_formula(progress, law):
 def test_full_weights_take_the_bias_away():
     """Claim: with exponent 1, a weighted mean over prioritised draws is the mean over what is
     stored."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler="prioritised", is_beta_start=1.0)
+    full = prioritised(is_beta=(1.0, 1.0))
     values = np.random.default_rng(0).uniform(1.0, 2.0, CAPACITY).astype(np.float32)
-    slots, weights = sample(jax.random.key(0), cfg, stored(cfg, values**3), jnp.float32(0.0), NUM)
+    slots, weights = sample(jax.random.key(0), full, stored(full, values**3), jnp.float32(0.0), NUM)
     plain = values[np.asarray(slots)].mean()
     weighted = np.average(values[np.asarray(slots)], weights=weights)
     assert plain > values.mean() + 0.05
     np.testing.assert_allclose(weighted, values.mean(), atol=0.01)
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "beta"])
-def test_other_samplers_do_not_weight(sampler):
+@pytest.mark.parametrize("name", ["uniform", "beta"])
+def test_other_samplers_do_not_weight(name):
     """Claim: weights of uniform and beta draws are ones, whatever the errors."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler=sampler)
-    state = stored(cfg, np.random.default_rng(0).normal(size=CAPACITY))
-    np.testing.assert_array_equal(
-        sample(jax.random.key(0), cfg, state, jnp.float32(0.3), 64).weights, 1.0
-    )
+    state = stored(SAMPLERS[name], np.random.default_rng(0).normal(size=CAPACITY))
+    drawn = sample(jax.random.key(0), SAMPLERS[name], state, jnp.float32(0.3), 64)
+    np.testing.assert_array_equal(drawn.weights, 1.0)
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
+@pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
 def test_batched_seeds_are_each_by_itself(sampler):
     """Claim: draws and updates of three seeds under vmap are those of each seed alone."""
-    cfg = ReplayConfig(capacity=100, sampler=sampler)
-    states = [
-        stored(cfg, np.random.default_rng(seed).normal(size=100), 70 + seed) for seed in range(3)
-    ]
+    errors = np.random.default_rng(0).normal(size=(3, 100))
+    states = [stored(sampler, errors[seed], 70 + seed) for seed in range(3)]
     keys = jax.random.split(jax.random.key(0), 3)
 
     def step(key, state):
-        slots, weights = samplers.sample(key, cfg, state, jnp.float32(0.3), 32)
+        slots, weights = sampler.sample(key, state, jnp.float32(0.3), 32)
         errors = jnp.sin(slots.astype(jnp.float32))
-        return (
-            slots,
-            weights,
-            ring.set_priorities(state, slots, samplers.priority(cfg, errors)).priority,
-        )
+        return slots, weights, sampler.update(state, slots, errors).priority
 
     together = jax.jit(jax.vmap(step))(
         keys, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
@@ -372,20 +368,20 @@ def test_batched_seeds_are_each_by_itself(sampler):
 
 @pytest.mark.parametrize(
     ("progress", "expected"),
-    [(-1.0, (0.5, 0.5)), (0.0, (0.5, 0.5)), (0.2, (0.75, 0.75)), (0.4, (1.0, 1.0)), (0.7, (1.0, 6.5)),
-     (1.0, (1.0, 12.0)), (2.0, (1.0, 12.0))],
+    [(-1.0, (0.5, 0.5)), (0.0, (0.5, 0.5)), (0.2, (0.75, 0.75)), (0.4, (1.0, 1.0)),
+     (0.7, (1.0, 6.5)), (1.0, (1.0, 12.0)), (2.0, (1.0, 12.0))],
 )  # fmt: skip
 def test_schedule_by_hand(progress, expected):
     """Claim: (a, b) goes from (0.5, 0.5) to (1, 1) at 40 % and on to (1, 12), in straight lines,
     and stays there."""
     np.testing.assert_allclose(
-        samplers.beta_schedule(ReplayConfig(), jnp.float32(progress)), expected, rtol=1e-5
+        samplers.beta_schedule(BetaReplay(), jnp.float32(progress)), expected, rtol=1e-5
     )
 
 
 def test_one_law_for_the_whole_run():
     """Claim: with start, middle and end the same, (a, b) never changes: VPG's Beta(1, 2)."""
-    cfg = ReplayConfig(beta_start=(1.0, 2.0), beta_middle=(1.0, 2.0), beta_end=(1.0, 2.0))
+    cfg = BetaReplay(start=(1.0, 2.0), middle=(1.0, 2.0), end=(1.0, 2.0))
     for progress in np.linspace(-0.5, 1.5, 21):
         np.testing.assert_array_equal(
             samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0]
@@ -395,20 +391,21 @@ def test_one_law_for_the_whole_run():
 def test_sampler_follows_the_schedule():
     """Claim: the share of the worst tenth falls from 20.5 % over 10 % to none as training goes
     on."""
-    cfg = ReplayConfig(capacity=CAPACITY)
-    state = stored(cfg, jnp.arange(CAPACITY, 0, -1))
+    sampler = SAMPLERS["beta"]
+    state = stored(sampler, jnp.arange(CAPACITY, 0, -1))
     for progress, share in ((0.0, 0.205), (0.4, 0.10), (1.0, 0.0)):
-        slots = np.asarray(sample(jax.random.key(0), cfg, state, jnp.float32(progress), NUM).slots)
+        slots = np.asarray(
+            sample(jax.random.key(0), sampler, state, jnp.float32(progress), NUM).slots
+        )
         np.testing.assert_allclose(np.mean(slots >= 0.9 * CAPACITY), share, atol=0.012)
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "prioritised", "beta"])
+@pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
 def test_keys_differ(sampler):
     """Claim: two keys give two draws, one key one."""
-    cfg = ReplayConfig(capacity=CAPACITY, sampler=sampler)
-    state = stored(cfg, jnp.ones(CAPACITY))
+    state = stored(sampler, jnp.ones(CAPACITY))
     first, again, other = (
-        sample(jax.random.key(i), cfg, state, jnp.float32(0.3), 32).slots for i in (0, 0, 1)
+        sample(jax.random.key(i), sampler, state, jnp.float32(0.3), 32).slots for i in (0, 0, 1)
     )
     np.testing.assert_array_equal(first, again)
     assert np.any(first != other)
@@ -419,7 +416,7 @@ def test_unknown_sampler():
     with pytest.raises(
         ValueError, match=r"replay\.sampler: 'rank' is not one of: uniform, prioritised, beta"
     ):
-        dataclasses.replace(ReplayConfig(capacity=8), sampler="rank")
+        Config().change(replay={"sampler": "rank"})
 
 
 @pytest.mark.slow
@@ -429,7 +426,7 @@ def test_as_a_sum_tree_after_a_million_updates():
     1e-5."""
     sum_tree = pytest.importorskip("flashbax.buffers.sum_tree")
     capacity, batch, updates = 2**12, 64, 2**20
-    cfg = ReplayConfig(capacity=capacity, sampler="prioritised", per_epsilon=1e-9)
+    sampler = prioritised(per_epsilon=1e-9)
     rng = np.random.default_rng(0)
     priorities = (10.0 ** rng.uniform(-6.0, 6.0, (updates // batch, batch))).astype(np.float32)
     slots = np.stack(
@@ -438,21 +435,13 @@ def test_as_a_sum_tree_after_a_million_updates():
 
     def update(carry, given):
         state, tree = carry
-        masses = samplers.priority(cfg, given[1])
-        return (
-            ring.set_priorities(state, given[0], masses),
-            sum_tree.set_batch_scan(tree, given[0], masses),
-        ), None
+        state = sampler.update(state, *given)
+        return (state, sum_tree.set_batch_scan(tree, given[0], state.priority[given[0]])), None
 
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        begun = (
-            stored(cfg, jnp.ones(capacity)),
-            sum_tree.set_batch_scan(
-                sum_tree.init(capacity),
-                jnp.arange(capacity),
-                samplers.priority(cfg, jnp.ones(capacity)),
-            ),
-        )
+        full = stored(sampler, jnp.ones(capacity))
+        tree = sum_tree.init(capacity)
+        begun = (full, sum_tree.set_batch_scan(tree, jnp.arange(capacity), full.priority))
         state, tree = jax.jit(functools.partial(jax.lax.scan, update))(begun, (slots, priorities))[
             0
         ]
@@ -461,7 +450,7 @@ def test_as_a_sum_tree_after_a_million_updates():
         )
     truth = np.ones(capacity)
     for these, new in zip(slots, priorities, strict=True):
-        truth[these] = (new.astype(float) + 1e-9) ** cfg.alpha
+        truth[these] = (new.astype(float) + 1e-9) ** sampler.cfg.alpha
     top, ours = samplers._pyramid(state.priority)[0].sum(), np.asarray(state.priority, float)
     np.testing.assert_allclose(top, truth.sum(), rtol=1e-5)
     np.testing.assert_allclose(top, tree.nodes[0], rtol=1e-4)

@@ -12,16 +12,15 @@ import scipy.stats
 
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import train
-from csac_jax.config import Algo
 from csac_jax.evaluation import metrics, statistics
-from csac_jax.io import config_json, files
+from csac_jax.io import configs, files
 from csac_jax.report import charts, comparison, results, tables
 
 CASES = ("hole", "row")
 
 
-def _config(algo: Algo, seed: int, **changed: Any) -> dict[str, Any]:
-    config = config_json.to_dict(algorithms.configure(presets.get("paper"), algo))
+def _config(algo: str, seed: int, **changed: Any) -> dict[str, Any]:
+    config = configs.to_dict(algorithms.configure(presets.get("paper"), algo))
     config["seed"] = seed
     for name, value in changed.items():
         section, _, field = name.partition("__")
@@ -99,7 +98,7 @@ def recorded(tmp_path: Path) -> Path:
         ("beta/seed-0", "csac_beta", 0, 10),
         ("beta/seed-1", "csac_beta", 1, 8),
     ):
-        _evaluation(root / name / "eval.json", _config(algo, seed, sim__physics="c"), lifted)  # type: ignore[arg-type]
+        _evaluation(root / name / "eval.json", _config(algo, seed, sim__physics="c"), lifted)
     _evaluation(root / "vpg" / "eval.json", _config("vpg", 0, sim__physics="c"), 5)
     (root / "vpg" / "checkpoints").mkdir()
     (root / "vpg" / "checkpoints" / "metrics.jsonl").write_text("not a log\n")
@@ -283,11 +282,11 @@ def test_labels():
     """Claim: settings that no result depends on name no variant; a label in a figure names as many
     as it is told to."""
     assert results.variant(_config("vpg", 0, train__chunk=7, train__save_every=3)).changed == ()
-    changed = {"net__head": 16, "net__growth": 8, "learn__batch": 4, "learn__tau": 0.5}
+    changed = {"net__head": 16, "net__zoom": 1, "learn__batch": 4, "learn__tau": 0.5}
     variant = results.variant(_config("vpg", 0, **changed))
     assert set(comparison.label(variant).split(", ")[1:]) == {
         "net.head 16",
-        "net.growth 8",
+        "net.zoom 1",
         "learn.batch 4",
         "learn.tau 0.5",
     }
@@ -302,8 +301,10 @@ def test_old_names_are_read_as_todays(tmp_path: Path):
     """Claim: logs, evaluations and configs with the names of before say what they would say now."""
     config = _config("csac_beta", 0, reward__lost_block_penalty=0.5)
     old = json.loads(json.dumps(config))
+    assert old.pop("format") == 2
     old["reward"]["left"] = old["reward"].pop("lost_block_penalty")
-    old["explore"]["primitive_end"] = old["explore"].pop("epsilon_primitive_end")
+    start, end = old["explore"].pop("epsilon_primitive")
+    old["explore"] |= {"primitive_start": start, "primitive_end": end}
     assert results.variant(old) == results.variant(config)
     assert results.variant(old).changed == (("reward.lost_block_penalty", "0.5"),)
     share = metrics.wilson(1, 10)
@@ -324,16 +325,17 @@ def test_old_names_are_read_as_todays(tmp_path: Path):
 def test_command_gives_the_config_back():
     """Claim: the command in the provenance, parsed, is the run's config."""
     changed = {
-        "policy__mask": False,
-        "replay__beta_end": [1.0, 6.0],
+        "learn__augment": False,
+        "policy__place": "argmax",
+        "reward__grasp_levels": [-1.5, -1.5, -1.5, -1.0, 1.0],
         "train__actions": 900,
         "net__head": 16,
     }
     config = _config("csac_per", 7, **changed)
-    run = results.Run(Path("x"), config, *[np.zeros(1)] * 4, record={})
+    run = results.RecordedRun(Path("x"), config, *[np.zeros(1)] * 4, record={})
     program, command, *flags = results.command(run).split()
     assert (program, command) == ("csac-jax", "train")
-    assert config_json.to_dict(train.read(flags)[1]) == config
+    assert configs.to_dict(train.read(flags)[1]) == config
 
 
 def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):

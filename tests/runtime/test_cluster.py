@@ -12,7 +12,7 @@ import pytest
 import csac_jax
 from csac_jax.io import files
 from csac_jax.runtime import cluster
-from csac_jax.sweeps.sweep import SUMMARY
+from csac_jax.sweeps.runner import SUMMARY
 
 ROOT = Path(csac_jax.__file__).parents[1]
 UNTIMED = ("seconds", "actions_per_second")

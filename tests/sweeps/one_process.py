@@ -1,6 +1,6 @@
 """One process of a sweep, with a small step in place of the learner's.
 
-python -m tests.sweeps.one_process FOLDER STOP_AFTER SHARD [COORDINATOR PROCESSES PROCESS_ID]
+python -m tests.runner.one_process FOLDER STOP_AFTER SHARD [COORDINATOR PROCESSES PROCESS_ID]
 """
 
 import sys
@@ -9,7 +9,7 @@ from pathlib import Path
 import csac_jax  # noqa: F401  (before JAX)
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
-from csac_jax.sweeps import replicas, sweep
+from csac_jax.sweeps import replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.training import sharding, step
 from tests.training import toys
@@ -38,16 +38,16 @@ def main(folder: str, after: str, shard: str, *place: str) -> int:
     step.init_state, step.train_step, step.make = toys.init_state, toys.train_step, toys.program
     line, stop = sharding.make(None), Stop()
     assert (line is not None) == bool(place)
-    plan = sweep.SweepPlan(2, [SweepPoint("a", {}, toys.CFG)])
+    plan = runner.SweepPlan(2, [SweepPoint("a", {}, toys.CFG)])
     last = not place or place[2] == "1"
     reporter = Reporter(stop, int(after) if last else 0)
-    resume = (Path(folder) / sweep.PLAN).exists()
+    resume = (Path(folder) / runner.PLAN).exists()
     cluster.wait("looked")
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
         return replicas.sweep_program(group, line, shard)
 
-    return sweep.run(plan, Path(folder), make_program, reporter, stop, resume).stopped_by or 0
+    return runner.run(plan, Path(folder), make_program, reporter, stop, resume).stopped_by or 0
 
 
 if __name__ == "__main__":

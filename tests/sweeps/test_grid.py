@@ -31,8 +31,8 @@ def test_nothing_varied_is_one_point():
 def test_kinds_of_values():
     """Claim: colons separate the items of a tuple, switches are true or false, the algorithm is
     varied by its name."""
-    flags = [point.cfg for point in _points(["replay.beta_end=1:4,1:12"])]
-    assert flags == [["--replay.beta-end", "1", "4"], ["--replay.beta-end", "1", "12"]]
+    flags = [point.cfg for point in _points(["replay.end=1:4,1:12"])]
+    assert flags == [["--replay.end", "1", "4"], ["--replay.end", "1", "12"]]
     flags = [point.cfg for point in _points(["learn.actor=true,false"])]
     assert flags == [["--learn.actor"], ["--learn.no-actor"]]
     assert _points(["algo=csac_per"])[0].cfg == ["--algo", "csac_per"]
@@ -40,8 +40,8 @@ def test_kinds_of_values():
 
 def test_long_names_give_way_to_numbers():
     """Claim: a folder's name stays short, however much is varied."""
-    names = ("beta_start", "beta_middle", "beta_end")
-    found = _points([f"replay.{name}=1.2345678901:2.3456789012,1:2" for name in names])
+    names = ("start", "middle", "end")
+    found = _points([f"replay.{name}=1.234567890123:2.345678901234,1:2" for name in names])
     assert [point.name for point in found] == [f"setting-{i}" for i in range(8)]
 
 
@@ -57,9 +57,9 @@ def test_long_names_give_way_to_numbers():
         (["learn.tau=0.1,0.1"], "a value is given twice"),
         (["learn.tau=0.1", "learn.tau=0.2"], "a setting is given twice"),
         (["learn.actor=yes"], "neither true nor false"),
-        (["net.weights=a/b"], "slash"),
-        (["net.weights=.."], "begin with a dot"),
-        (["net.weights=--seed"], "begin with a dot or dash"),
+        (["algo=a/b"], "slash"),
+        (["algo=.."], "begin with a dot"),
+        (["algo=--seed"], "begin with a dot or dash"),
     ],
 )
 def test_bad_input(varied: list[str], message: str):

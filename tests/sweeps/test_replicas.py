@@ -17,54 +17,27 @@ from tests.training import toys
 pytestmark = pytest.mark.optax
 
 OTHER = {
-    "cem.std": 0.35,
-    "cem.std_min": 0.2,
     "target.gamma": 0.4,
-    "target.inverse_temperature": 5.0,
     "reward.success_bonus": 0.5,
     "reward.distance_weight": 0.2,
-    "reward.distance_cap": 0.3,
-    "reward.eta0": 0.1,
-    "reward.eta1": 0.7,
-    "reward.push_level": 0.5,
-    "reward.grasp_level": 2.0,
-    "reward.nothing": -2.0,
-    "reward.empty": -0.9,
-    "reward.touched": -0.3,
-    "reward.dropped": 0.2,
-    "reward.lifted": 3.0,
-    "reward.push_better": 0.6,
-    "reward.push_worse": -0.4,
-    "reward.dead_band": 0.02,
+    "reward.eta": (0.1, 0.7),
+    "reward.grasp_levels": (-2.0, -0.9, -0.3, 0.2, 3.0),
+    "reward.push_levels": (-0.4, 0.6),
     "reward.lost_block_penalty": 0.7,
     "explore.noise_std": 0.2,
-    "explore.noise_clip": 0.1,
-    "explore.epsilon_primitive_start": 0.9,
-    "explore.epsilon_primitive_end": 0.2,
-    "explore.epsilon_place_start": 0.8,
-    "explore.epsilon_place_end": 0.1,
+    "explore.epsilon_primitive": (0.9, 0.2),
+    "explore.epsilon_place": (0.8, 0.1),
     "explore.decay": 0.99,
     "explore.push_fraction": 0.6,
     "learn.learning_rate": 3e-3,
     "learn.actor_learning_rate": 2e-3,
     "learn.lr_final_fraction": 0.5,
     "learn.tau": 0.3,
-    "learn.gradient_clip": 0.5,
-    "learn.huber": 0.05,
-    "replay.alpha": 0.9,
-    "replay.per_epsilon": 0.3,
-    "replay.is_beta_start": 0.2,
-    "replay.is_beta_end": 0.7,
-    "replay.beta_start": (2.0, 3.0),
-    "replay.beta_middle": (3.0, 1.0),
-    "replay.beta_middle_at": 0.6,
-    "replay.beta_end": (4.0, 2.0),
+    "replay.start": (2.0, 3.0),
+    "replay.middle": (3.0, 1.0),
+    "replay.end": (4.0, 2.0),
 }
 """Another value of every traced hyper-parameter."""
-
-PER = dataclasses.replace(
-    toys.CFG, replay=dataclasses.replace(toys.CFG.replay, sampler="prioritised")
-)
 
 
 @pytest.fixture(autouse=True)
@@ -112,7 +85,7 @@ def test_replicas_are_the_runs_of_train():
     """Claim: each replica is the run that `train` makes of its seed and settings, to rounding, also
     where hyper-parameters are traced, every one of them."""
     assert OTHER.keys() == set(replicas.TRACED_HYPERPARAMS)
-    configs = (PER, dataclasses.replace(step.replace_settings(PER, OTHER), seed=1))
+    configs = (toys.CFG, step.replace_settings(toys.CFG, OTHER).change(seed=1))
     (group,) = replicas.group_configs(configs)
     assert group == (configs, replicas.TRACED_HYPERPARAMS)
     state, seen = _run(group)
@@ -207,14 +180,8 @@ def test_settings_that_are_numbers_share_a_program():
     """Claim: numbers, names and seeds do not separate groups; a sampler, a size or a branch does.
     Order is kept."""
     smoke = presets.smoke()
-    learn = dataclasses.replace(smoke.learn, tau=0.5)
     uniform = algorithms.configure(smoke, "csac")
-    configs = [
-        smoke,
-        uniform,
-        dataclasses.replace(smoke, learn=learn),
-        dataclasses.replace(uniform, seed=3),
-    ]
+    configs = [smoke, uniform, smoke.change(learn={"tau": 0.5}), uniform.change(seed=3)]
     first, second = replicas.group_configs(configs)
     assert first == ((configs[0], configs[2]), ("learn.tau",))
     assert second == ((configs[1], configs[3]), ())
@@ -231,8 +198,8 @@ def test_seeds_alone_keep_their_constants():
 
 def test_bounds_are_those_of_the_settings():
     """Claim: traced bounds of returns are those that each setting has by itself."""
-    other = dataclasses.replace(toys.CFG, target=dataclasses.replace(toys.CFG.target, gamma=0.25))
+    other = toys.CFG.change(target={"gamma": 0.25})
     (group,) = replicas.group_configs([toys.CFG, other])
     each = replicas.of_group(group)
-    wanted = np.array([toys.program(cfg).learner.bounds for cfg in (toys.CFG, other)])
+    wanted = np.array([toys.program(cfg).learner.parts.bounds for cfg in (toys.CFG, other)])
     np.testing.assert_allclose(np.stack(each.hyperparams.return_bounds, axis=1), wanted, 1e-6)

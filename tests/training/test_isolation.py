@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import Config, ReplayConfig, SimConfig
 from csac_jax.training import step
 from csac_jax.training.step import StepMetrics, TrainState
 
@@ -21,12 +20,10 @@ pytestmark = [
 ]  # minutes of compilation; tests/test_env.py has the small version
 
 SCENES = 64
-_SMOKE = presets.smoke()
-CFG: Config = dataclasses.replace(
-    _SMOKE,
-    sim=SimConfig(grasp_phases=(4, 3, 4), push_phases=(3, 5, 3), geom_pairs=6, contacts=16),
-    replay=ReplayConfig(capacity=2 * SCENES),
-    train=dataclasses.replace(_SMOKE.train, scenes=SCENES, learning_starts=SCENES),
+CFG = presets.smoke().change(
+    sim={"grasp_phases": (4, 3, 4)},
+    replay={"capacity": 2 * SCENES},
+    train={"scenes": SCENES, "learning_starts": SCENES},
 )
 BAD = (np.nan, np.inf, 1e6)
 LEAVES = (

@@ -1,10 +1,10 @@
 """The host loop, with a tiny program in place of the learner."""
 
-import dataclasses
 import json
 import math
+import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ from flax import struct
 
 from csac_jax import presets
 from csac_jax.config import Config, TrainConfig
-from csac_jax.io import checkpoint
+from csac_jax.errors import SettingsError
+from csac_jax.io import checkpoint, configs
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import loop
@@ -22,7 +23,8 @@ from csac_jax.training.loop import Record, TrainingError
 
 E = 3
 TRAIN = TrainConfig(scenes=E, actions=72, learning_starts=12, chunk=4, save_every=2)
-CFG = dataclasses.replace(presets.smoke(), train=TRAIN, seed=5)  # 24 steps, 6 chunks
+CFG = presets.smoke().change(train=TRAIN, seed=5)  # 24 steps, 6 chunks
+LONGER = CFG.change(train={"actions": 96})  # 32 steps, 8 chunks
 UNTIMED = ("seconds", "actions_per_second")
 
 
@@ -101,11 +103,11 @@ class Fake:
 
 
 class Listener:
-    """Keeps what a run reports; sets the stop flag after `stop_after` chunks."""
+    """Keeps what a run of `total` actions reports; sets the stop flag after `stop_after` chunks."""
 
-    def __init__(self, stop_after: int | None = None, signal: int = 2) -> None:
+    def __init__(self, stop_after: int | None = None, signal: int = 2, total: int = 72) -> None:
         self.stop, self.said, self.records = Stop(), [], []
-        self._stop_after, self._signal = stop_after, signal
+        self._stop_after, self._signal, self._total = stop_after, signal, total
         if stop_after == 0:
             self.stop.signal = signal
 
@@ -115,7 +117,7 @@ class Listener:
 
     def progress(self, record: Record, total_actions: int, eta: float) -> None:
         """Reporter."""
-        assert total_actions == 72
+        assert total_actions == self._total
         assert eta >= 0.0
         self.records.append(record)
         if len(self.records) == self._stop_after:
@@ -164,7 +166,7 @@ def test_run_ends_complete(tmp_path: Path):
 
 def test_steps_are_rounded_up_to_whole_chunks():
     """Claim: the number of steps is rounded up to whole chunks."""
-    cfg = dataclasses.replace(CFG, train=dataclasses.replace(TRAIN, actions=73))
+    cfg = CFG.change(train={"actions": 73})
     assert cfg.train.steps == 25
     assert loop.total_steps(cfg) == 28
     assert loop.total_steps(CFG) == 24
@@ -264,10 +266,7 @@ def test_kernels_of_warp_are_announced(tmp_path: Path):
     """Claim: before the first step on Warp, during which nothing is shown for minutes, the reason
     is."""
     for physics, told in (("mjx", 0), ("warp", 1)):
-        scene = dataclasses.replace(CFG.scene, mesh_size_jitter=0.0)
-        cfg = dataclasses.replace(
-            CFG, scene=scene, sim=dataclasses.replace(CFG.sim, physics=physics)
-        )
+        cfg = CFG.change(scene={"size_jitter": (0.1, 0.0)}, sim={"physics": physics})
         listener = Listener(1)
         _run(tmp_path / physics, listener, Fake(), cfg=cfg)
         assert sum("Warp builds its kernels" in said for said in listener.said) == told
@@ -280,12 +279,45 @@ def test_existing_folder_is_left_alone(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_resume_needs_the_same_config(tmp_path: Path):
-    """Claim: a run is resumed with its own config only; the message names what differs."""
-    _run(tmp_path / "run", Listener(1), Fake())
-    other = dataclasses.replace(CFG, learn=dataclasses.replace(CFG.learn, tau=0.5))
-    with pytest.raises(TrainingError, match=r"learn\.tau"):
-        _run(tmp_path / "run", Listener(), Fake(), resume=True, cfg=other)
+@pytest.mark.parametrize("stop_after", [1, 3, None])
+def test_resumed_with_more_actions_goes_on_to_the_longer_end(tmp_path: Path, stop_after: int):
+    """Claim: a stopped or complete run that is resumed with more `train.actions` ends bit for bit
+    as one that had them from the start; its folder holds the new number, and can be resumed."""
+    _run(tmp_path / "whole", Listener(total=96), Fake(), cfg=LONGER)
+    run_dir = tmp_path / "run"
+    _run(run_dir, Listener(stop_after), Fake())
+    second = Listener(5, total=96)
+    _run(run_dir, second, Fake(), resume=True, cfg=LONGER)
+    summary = _run(run_dir, Listener(total=96), Fake(), resume=True, cfg=LONGER)
+    assert (summary.step, summary.actions, summary.stopped_by) == (32, 96, None)
+    assert _final(run_dir) == _final(tmp_path / "whole")
+    assert _log(run_dir) == _log(tmp_path / "whole")
+    assert checkpoint.load_config(run_dir) == LONGER
+    assert configs.from_dict(json.loads((run_dir / "config.json").read_text())) == LONGER
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"learn": {"tau": 0.5}}, "learn.tau"),
+        ({"learn": {"tau": 0.5}, "train": {"actions": 96}}, "learn.tau"),
+        ({"train": {"actions": 60}}, "train.actions"),
+        ({"train": {"actions": 96, "save_every": 3}}, "train.save_every"),
+        ({"seed": 6, "replay": {"sampler": "uniform"}}, "seed, replay.sampler, replay.rank_by"),
+    ],
+)
+def test_resume_needs_the_same_config(tmp_path: Path, changes: dict[str, Any], named: str):
+    """Claim: a run is resumed with its own config and no fewer actions; the message names, in one
+    line, what differs, and the run is left as it was."""
+    run_dir = tmp_path / "run"
+    _run(run_dir, Listener(1), Fake())
+    before = _final(run_dir), _log(run_dir), (run_dir / "config.json").read_text()
+    fake = Fake()
+    with pytest.raises(SettingsError, match=rf"other values of {re.escape(named)}") as caught:
+        _run(run_dir, Listener(), fake, resume=True, cfg=CFG.change(**changes))
+    assert "\n" not in str(caught.value)
+    assert fake.compiled == []
+    assert (_final(run_dir), _log(run_dir), (run_dir / "config.json").read_text()) == before
 
 
 def test_resume_needs_a_checkpoint(tmp_path: Path):

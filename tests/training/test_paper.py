@@ -3,7 +3,7 @@ smallest size."""
 
 import dataclasses
 import re
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +11,26 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import NetConfig
+from csac_jax.config import DenseNet121
 from csac_jax.env import Env
 from csac_jax.io import checkpoint
+from csac_jax.nets import chunked_vmap
 from csac_jax.sweeps import replicas
-from csac_jax.training import chunked_vmap, step
+from csac_jax.training import step
 from tests.sweeps.test_replicas import assert_close
 from tests.training.test_step import assert_same, copy, equal
 
 pytestmark = pytest.mark.mjx
 TRUNK = 7_037_504
+
+
+class Tiny(DenseNet121):
+    """The network with few channels."""
+
+    block_growth: ClassVar[int] = 4
+
+
+TINY = Tiny(rotations=4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), zoom=2)
 
 
 class Still(Env):
@@ -36,7 +46,7 @@ def test_paper_has_densenet_121_twice():
     """Claim: the state of the preset `paper` can be made: a trunk each for colour and height,
     online and target, and a ring that holds all 2,500 actions."""
     cfg = presets.paper()
-    state = step.abstract_state(cfg)
+    state = step.abstract_state(step.make(cfg, env=step.without_physics(cfg)))
     for params in (state.learner.online, state.learner.target):
         trunks = [params.critic[kind]["trunk"] for kind in ("params", "batch_stats")]
         assert sum(leaf.size for leaf in jax.tree.leaves(trunks)) == 2 * TRUNK
@@ -49,10 +59,8 @@ def test_paper_has_densenet_121_twice():
 def test_paper_can_be_traced():
     """Claim: the whole training step of `paper` can be traced, and gives back a state of the same
     shapes and types."""
-    cfg = presets.paper()
-    cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, pool=1))
-    program = step.make(cfg)
-    state = step.abstract_state(cfg)
+    program = step.make(presets.paper().change(scene={"pool": 1}))
+    state = step.abstract_state(program)
     after, metrics = jax.eval_shape(step.compile_chunk(program, 1), state)
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), state
@@ -64,18 +72,7 @@ def test_paper_can_be_traced():
 def test_run_with_batch_norm_resumes(tmp_path):
     """Claim: a run of DenseNet with batch norm learns, moves its statistics, and goes on after a
     checkpoint as if nothing had happened, in every bit of every leaf."""
-    smoke = presets.smoke()
-    net = NetConfig(
-        "densenet121",
-        4,
-        margin=0.0,
-        head=8,
-        norm="batch",
-        block_layers=(1, 1, 1, 1),
-        block_growth=4,
-        zoom=2,
-    )
-    cfg = dataclasses.replace(smoke, net=net)
+    cfg = presets.smoke().change(net=dataclasses.replace(TINY, norm="batch"))
     program = step.make(cfg)
     program = dataclasses.replace(program, env=Still(cfg, program.env.physics, program.env.scenes))
     begun = step.init(program)
@@ -108,11 +105,7 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
     numbers.
     """
     monkeypatch.setattr(chunked_vmap, "_LARGEST", size)
-    smoke = presets.smoke()
-    net = NetConfig(
-        "densenet121", 4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), block_growth=4, zoom=2
-    )
-    configs = [dataclasses.replace(smoke, net=net, seed=k) for k in range(4)]
+    configs = [presets.smoke().change(net=TINY, seed=k) for k in range(4)]
     program = step.make(configs[0])
     program = dataclasses.replace(
         program, env=Still(configs[0], program.env.physics, program.env.scenes)
@@ -143,7 +136,7 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
             )
         assert np.all(np.isfinite(seen.critic_loss))
 
-    slower = dataclasses.replace(configs[3], learn=dataclasses.replace(smoke.learn, tau=0.5))
+    slower = configs[3].change(learn={"tau": 0.5})
     with jax.debug_key_reuse(False):
         _, vmapped = lowered([*configs[:3], slower])
     assert _runs_together(vmapped) == {4}

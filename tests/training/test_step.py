@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, rewards
-from csac_jax.config import ReplayConfig
-from csac_jax.constants import Primitive
+from csac_jax.agent import actor_critic, csac, rewards
+from csac_jax.agent.csac import CSAC
+from csac_jax.agent.learner import UpdateInfo
+from csac_jax.config import PrioritisedReplay
+from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env
 from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
@@ -23,9 +25,7 @@ from csac_jax.vision.heightmap import Observation
 
 pytestmark = pytest.mark.mjx
 
-CFG = dataclasses.replace(
-    presets.smoke(), replay=ReplayConfig(capacity=1024)
-)  # a ring larger than all else
+CFG = presets.smoke().change(replay={"capacity": 1024})  # a ring larger than all else
 T = CFG.train.chunk
 NUM_SEEN = T * CFG.train.scenes
 HOST = ("callback", "infeed", "outfeed", "device_put", "debug_print")
@@ -177,14 +177,14 @@ class Losing(Env):
 def test_blocks_that_left_reach_the_reward(run):
     """Claim: a step takes `reward.lost_block_penalty` where a block has left, from grasps of
     nothing and worthless pushes alike."""
-    reward = dataclasses.replace(CFG.reward, lost_block_penalty=0.75)
-    cfg = dataclasses.replace(CFG, reward=reward)
+    cfg = CFG.change(reward={"lost_block_penalty": 0.75})
+    reward = cfg.reward
     env = Losing(cfg, run.program.env.physics, run.program.env.scenes)
-    program = Program(cfg, env, actor_critic.make(cfg))
+    program = step.make(cfg, env=env)
     _, metrics = jax.jit(functools.partial(step.train_step, program))(copy(run.states[0]))
     grasp, push = (
-        reward.nothing - 0.75,
-        rewards.scale(reward, reward.push_level) * reward.push_worse - 0.75,
+        reward.grasp_levels[Outcome.NOTHING] - 0.75,
+        rewards.scale(reward, reward.push_level) * reward.push_levels[0] - 0.75,
     )
     np.testing.assert_allclose(
         metrics.reward, np.where(metrics.primitive == Primitive.GRASP, grasp, push), rtol=1e-6
@@ -197,7 +197,7 @@ def test_temporary_memory_does_not_grow_with_the_ring():
     at most."""
     temporary, rings = [], []
     for capacity in (512, 2048):
-        program = step.make(dataclasses.replace(CFG, replay=ReplayConfig(capacity=capacity)))
+        program = step.make(CFG.change(replay={"capacity": capacity}))
         env = Still(program.env.cfg, program.env.physics, program.env.scenes)
         program = dataclasses.replace(program, env=env)
         state = step.init(program)
@@ -265,6 +265,8 @@ def test_nothing_is_learned_before_the_warm_up(run):
     assert [int(s.learner.updates) for s in run.states] == [
         CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)
     ]
+    for counted in run.states:
+        assert step._updates_done(CFG, counted.step) == counted.learner.updates
     assert all(np.all(np.isfinite(m.critic_loss)) for m in run.metrics)
 
 
@@ -360,27 +362,25 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     num = CFG.learn.batch
     weights, error = jnp.linspace(0.5, 1.0, num), jnp.linspace(-1.0, 1.0, num)
 
-    def draw(key, cfg, state, progress, num):
+    def draw(self, key, state, progress, num):
         return samplers.Sample(2 * jnp.arange(num, dtype=jnp.int32), weights)
 
-    def update(key, learner, state, batch, given):
-        return state, actor_critic.UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
+    def update(self, key, state, batch, given):
+        return state, UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
 
-    monkeypatch.setattr(samplers, "sample", draw)
-    monkeypatch.setattr(actor_critic, "update_critic", update)
-    monkeypatch.setattr(
-        actor_critic, "update_actor", lambda learner, state, obs: (state, jnp.float32(0.0))
-    )
-    cfg = dataclasses.replace(
-        CFG, replay=ReplayConfig(capacity=64, sampler=sampler, alpha=0.5, per_epsilon=0.25)
-    )
-    replay = ring.init(cfg.replay, step.example(cfg)).replace(
-        size=jnp.int32(64), priority=jnp.full(64, 7.0)
-    )
+    nothing: Any = None
+    cfg = CFG.change(replay={"capacity": 64, "sampler": sampler})
+    made = samplers.make(cfg.replay)
+    monkeypatch.setattr(type(made), "sample", draw)
+    monkeypatch.setattr(PrioritisedReplay, "alpha", 0.5)
+    monkeypatch.setattr(PrioritisedReplay, "per_epsilon", 0.25)
+    monkeypatch.setattr(CSAC, "update", update)
+    monkeypatch.setattr(CSAC, "end_step", lambda self, state, obs: (state, jnp.float32(0.0)))
+    replay = ring.init(jnp.full(64, 7.0), step.example(cfg)).replace(size=jnp.int32(64))
     learner_state = actor_critic.LearnerState(None, None, None, None, jnp.int32(0))
-    _, priority, losses = step._learn(
-        Program(cfg, None, None), jax.random.key(0), learner_state, replay
-    )
+    program = Program(cfg, nothing, CSAC(nothing), made)
+    key, done = jax.random.key(0), jnp.int32(0)
+    _, priority, losses = step._learn(program, key, learner_state, replay, done)
     np.testing.assert_allclose(losses["critic_loss"], np.sum(weights * error), rtol=1e-5)
     expected = np.full(64, 7.0)
     expected[: 2 * num : 2] = (
@@ -415,8 +415,13 @@ def test_only_pushes_ask_for_the_best_grasps():
     pushed, else 0."""
     learner, state = _opinions()
     before, after = _pictures(2, seed=1), _pictures(2, seed=2)
-    around = jax.jit(lambda pushed: step._around(learner, state.target, before, after, pushed))
-    one = jax.jit(lambda obs: step._best_grasps(learner, state.target, obs))
+    around = jax.jit(lambda pushed: csac._best_grasps(learner, state.target, before, after, pushed))
+
+    @jax.jit
+    def one(obs: Observation) -> jax.Array:
+        dense_maps = actor_critic.dense_maps(learner, state.target, obs)
+        return jax.vmap(actor_critic.best_grasp)(dense_maps)
+
     wanted = np.stack([one(before), one(after)])
     assert np.all(np.abs(wanted) > 1e-3)
     np.testing.assert_allclose(around(jnp.array([False, True])), wanted, rtol=1e-4, atol=1e-5)
@@ -426,7 +431,6 @@ def test_only_pushes_ask_for_the_best_grasps():
 def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
     """Claim: the actor's update takes `learn.actor_batch` of the batch's transitions, all if that
     is 0."""
-    nothing: Any = None
     taken = []
 
     def update(learner, state, obs):
@@ -435,13 +439,10 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(actor_critic, "update_actor", update)
     for actor_batch in (0, 3):
-        cfg = dataclasses.replace(
-            CFG, learn=dataclasses.replace(CFG.learn, actor_batch=actor_batch)
-        )
-        program = Program(cfg, nothing, actor_critic.make(cfg))
-        state = jax.eval_shape(
-            lambda program=program: actor_critic.init(jax.random.key(0), program.learner)
-        )
-        replay = jax.eval_shape(lambda: ring.init(CFG.replay, step.example(CFG)))
-        jax.eval_shape(functools.partial(step._learn, program), jax.random.key(0), state, replay)
+        cfg = CFG.change(learn={"actor_batch": actor_batch})
+        program = step.make(cfg, env=step.without_physics(cfg))
+        state = jax.eval_shape(program.learner.init, jax.random.key(0))
+        replay = jax.eval_shape(lambda: ring.init(jnp.zeros(64), step.example(CFG)))
+        learn = functools.partial(step._learn, program)
+        jax.eval_shape(learn, jax.random.key(0), state, replay, jnp.int32(0))
     assert taken == [CFG.learn.batch, 3]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax import cli, presets
-from csac_jax.render import gl, play
+from csac_jax.render import episode, gl
 from csac_jax.scene import layout
 
 pytestmark = pytest.mark.mjx
@@ -52,7 +52,7 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
     )
     assert result["blocks_lost"] == 0
     assert (
-        imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + play.HOLD
+        imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + episode.HOLD
     )  # 4 ms a substep, 25 a second
     frames = imageio_ffmpeg.read_frames("a/b.mp4")
     width, height = next(frames)["size"]
@@ -117,8 +117,9 @@ def test_summary_says_what_became_of_the_blocks(steps: list[Any], said: str):
     """Claim: the last line of an episode tells blocks taken from blocks lost, and why it ended."""
     cfg = presets.smoke()
     task = dataclasses.replace(cfg.task, max_actions=30)
-    assert play.summary(dataclasses.replace(cfg, task=task), steps) == said
-    assert play.completed(steps) == said.startswith(("the table is clear", "the target is taken"))
+    assert episode.summary(dataclasses.replace(cfg, task=task), steps) == said
+    taken = ("the table is clear", "the target is taken")
+    assert episode.completed(steps) == said.startswith(taken)
 
 
 def _is_red(image: np.ndarray) -> np.ndarray:
