@@ -232,10 +232,13 @@ def test_auto_reset_replaces_finished_scenes_alone(lab: Lab, stepped: State):
             return state
 
     auto = AutoResetEnv(Replay(lab.env.cfg, lab.env.physics, lab.env.scenes))
-    keys = jax.random.split(jax.random.key(1), SCENES)
-    state, after = jax.jit(jax.vmap(auto.step))(keys, stepped, _action_of(stepped))
+
+    def keys() -> jax.Array:
+        return jax.random.split(jax.random.key(1), SCENES)
+
+    state, after = jax.jit(jax.vmap(auto.step))(keys(), stepped, _action_of(stepped))
     jax.tree.map(np.testing.assert_array_equal, after, stepped)
-    fresh = jax.jit(jax.vmap(lab.env.auto_reset))(keys, stepped)
+    fresh = jax.jit(jax.vmap(lab.env.auto_reset))(keys(), stepped)
     done = np.asarray(stepped.done)
     assert done.any()
     assert not done.all()
@@ -245,9 +248,8 @@ def test_auto_reset_replaces_finished_scenes_alone(lab: Lab, stepped: State):
     assert not state.done.any()
     one = jax.tree.map(lambda leaf: leaf[0], stepped)
     action = jax.tree.map(lambda leaf: leaf[0], _action_of(stepped))
-    _, ends = jax.jit(lambda s: jax.lax.scan(lambda s, key: auto.step(key, s, action), s, keys))(
-        one
-    )
+    scan = jax.jit(lambda s: jax.lax.scan(lambda s, key: auto.step(key, s, action), s, keys()))
+    _, ends = scan(one)
     np.testing.assert_array_equal(ends.done, np.arange(SCENES) == 0)
 
 
