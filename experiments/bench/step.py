@@ -137,7 +137,9 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "simulate": jax.jit(jax.vmap(env.step)),
         "reward": jit(reward),
         "remember": jax.jit(remember, donate_argnums=0),
-        "learn": jit(lambda key, nets, replay: step._learn(program, key, nets, replay)),
+        "learn": jit(
+            lambda key, nets, replay: step._learn(program, key, nets, replay, nets.updates)
+        ),
         "replace": jax.jit(replace),
     }
     maps = jax.eval_shape(stages["dense_maps"], nets.online, scenes.obs)
