@@ -170,7 +170,7 @@ def run_dir(tmp_path: Path) -> Path:
         ),
         ("bench parity --poses x", "bench parity: argument --poses: invalid int value: 'x'"),
         ("bench replay 12", "bench replay: give two exponents of 2"),
-        ("bench replay 14 12", "bench replay: exponents must lie in 1 .. 24"),
+        ("bench replay 14 12", "bench replay: exponents must lie in 6 .. 24"),
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):

@@ -11,7 +11,7 @@ import pytest
 
 import csac_jax
 from csac_jax import cli, presets
-from csac_jax.cli import doctor, errors
+from csac_jax.cli import doctor, failures
 from csac_jax.errors import SceneError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.runtime import cache, signals
@@ -37,8 +37,8 @@ def _raises(error: BaseException):
 @pytest.mark.parametrize(
     ("error", "code", "line"),
     [
-        (errors.BadArgumentsError("no"), 2, "no"),
-        (errors.FailedError("two\n  lines"), 1, "two lines"),
+        (failures.BadArgumentsError("no"), 2, "no"),
+        (failures.FailedError("two\n  lines"), 1, "two lines"),
         (SceneError("never at rest"), 1, "never at rest"),
         (
             PermissionError(13, "Permission denied", "a.json"),
