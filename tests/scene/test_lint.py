@@ -1,6 +1,7 @@
 """The linter against MJX itself: what it refuses, MJX refuses too, or computes as if it were not
 there."""
 
+import importlib
 import inspect
 from typing import Any
 
@@ -12,20 +13,9 @@ from csac_jax.errors import SceneError
 from csac_jax.scene import lint, model
 from csac_jax.sim.quiet_mjx import mjx
 
-from mujoco.mjx._src import (  # isort: skip
-    collision_driver,
-    constraint,
-    derivative,
-    forward,
-    inverse,
-    passive,
-    scan,
-    sensor,
-    smooth,
-    solver,
-    support,
-    types,
-)
+from mujoco.mjx._src import collision_driver, types  # isort: skip
+
+COMPUTING = "constraint derivative forward inverse passive scan sensor smooth solver support"
 
 SCENE = """
 <mujoco>
@@ -246,19 +236,8 @@ def _missing(kind: Any, mjx_kind: Any) -> set[Any]:
 
 def _sources() -> str:
     """The code of MJX that computes."""
-    modules = (
-        constraint,
-        derivative,
-        forward,
-        inverse,
-        passive,
-        scan,
-        sensor,
-        smooth,
-        solver,
-        support,
-    )
-    modules += (collision_driver,)
+    modules = [importlib.import_module(f"mujoco.mjx._src.{name}") for name in COMPUTING.split()]
+    modules.append(collision_driver)
     return "".join(inspect.getsource(module) for module in modules)
 
 
