@@ -49,18 +49,12 @@ def switch_off_broken_fusion() -> None:
 
 
 def switch_off_broken_partitioner() -> None:
-    """Has this jaxlib partition programs without Shardy, unless the user has chosen.
-
-    A JAX that is imported already has read the variable, and is told.
-    """
-    if (
-        not importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES)
-        or PARTITIONER_VARIABLE in os.environ
-    ):
-        return
-    os.environ[PARTITIONER_VARIABLE] = "false"
-    if "jax" in sys.modules:
-        sys.modules["jax"].config.update(PARTITIONER_VARIABLE.lower(), False)
+    """Has this jaxlib partition programs without Shardy, unless the user has chosen."""
+    broken = importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES)
+    if broken and PARTITIONER_VARIABLE not in os.environ:
+        os.environ[PARTITIONER_VARIABLE] = "false"
+        if "jax" in sys.modules:  # it has read the variable already
+            sys.modules["jax"].config.update(PARTITIONER_VARIABLE.lower(), False)
 
 
 def widen_thread_pool() -> None:
@@ -70,8 +64,7 @@ def widen_thread_pool() -> None:
 
 
 def needed_threads() -> int:
-    """Threads in the pool without which batched MJX may hang, by the virtual devices that XLA is
-    told to make."""
+    """Fewer threads than these may hang batched MJX; it depends on XLA's virtual devices."""
     counts = re.findall(rf"{DEVICES_FLAG}=(\d+)", os.environ.get("XLA_FLAGS", "")) or ["1"]
     return max(MIN_THREADS, DEVICE_THREADS * int(counts[-1]))
 

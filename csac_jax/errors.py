@@ -5,9 +5,13 @@ class SettingsError(ValueError):
     """Settings, arguments or files that do not fit one another or this machine."""
 
 
-class SceneError(Exception):
-    """A scene that cannot be simulated or settled."""
-
-
 class DeviceError(Exception):
     """A device that is asked for and is not there."""
+
+
+class FailedError(Exception):
+    """What was asked for has failed; the kind of errors of checkpoints, policies and runs."""
+
+
+class SceneError(FailedError):
+    """A scene that cannot be simulated or settled."""

@@ -5,7 +5,6 @@ A file per command, whose `run` takes its arguments and returns the exit code. J
 once the arguments are known to be good, so that help and complaints come at once.
 """
 
-import difflib
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -13,8 +12,8 @@ from collections.abc import Callable, Sequence
 import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.cli import bench, doctor, evaluation, export, parsing, play, report, sweep, train
-from csac_jax.cli.failures import PROGRAM, BadArgumentsError, FailedError, complain
-from csac_jax.errors import DeviceError, SceneError
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError, complain
+from csac_jax.errors import DeviceError, FailedError, SettingsError
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
@@ -48,52 +47,42 @@ A robot learns to push and grasp in clutter.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command in `argv` (without the program's name; the process's own if None); returns
-    the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    """Runs the command in `argv`, by default the process's arguments; returns the exit code."""
     try:
-        return _dispatch(arguments)
-    except (BadArgumentsError, DeviceError) as error:
+        return _dispatch(list(sys.argv[1:] if argv is None else argv))
+    except (BadArgumentsError, SettingsError, DeviceError) as error:
         return complain(2, error)
     except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (FailedError, SceneError, OSError) as error:
+    except (FailedError, OSError) as error:
         return complain(1, error)
     except KeyboardInterrupt:
         return complain(130, "stopped")
 
 
-def _call(command: Callable[[list[str]], int], arguments: list[str]) -> int:
-    """Runs a command. If JAX starts without a device, DeviceError says so."""
+def _dispatch(arguments: list[str]) -> int:
+    name, *rest = arguments or [""]
+    if name in ("", "-h", "--help"):
+        print(USAGE, end="")
+        return 0 if name else 2
+    if name == "--version":
+        print(csac_jax.__version__)
+        return 0
+    if name not in COMMANDS:
+        raise BadArgumentsError(algorithms.unknown("command", name, COMMANDS))
     try:
-        return command(arguments)
+        return COMMANDS[name](_on_device(rest))
     except (RuntimeError, AssertionError):
         from csac_jax.runtime import devices
 
-        devices.require()
+        devices.require()  # JAX may have started without a device
         raise
-
-
-def _dispatch(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE, end="")
-        return 0 if arguments else 2
-    if arguments[0] == "--version":
-        print(csac_jax.__version__)
-        return 0
-    name, *rest = arguments
-    if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, 1)
-        meant = f"did you mean {near[0]}? " if near else ""
-        listed = ", ".join(COMMANDS)
-        raise BadArgumentsError(f"unknown command '{name}'; {meant}choose one of: {listed}")
-    return _call(COMMANDS[name], _on_device(rest))
 
 
 def _on_device(arguments: list[str]) -> list[str]:
     """The arguments without --device, which decides where JAX computes."""
-    device = parsing.value_of(arguments, "--device")
+    device, rest = parsing.take(arguments, "--device")
     if device is None:
         return arguments
     if device not in ("cpu", "gpu"):
@@ -101,4 +90,4 @@ def _on_device(arguments: list[str]) -> list[str]:
     from csac_jax.runtime import devices
 
     devices.select("cpu" if device == "cpu" else "gpu")
-    return parsing.without(arguments, "--device")
+    return rest

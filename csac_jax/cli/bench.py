@@ -4,6 +4,7 @@ import runpy
 from pathlib import Path
 
 import csac_jax
+from csac_jax.algorithms import unknown
 from csac_jax.cli.failures import PROGRAM, BadArgumentsError
 
 BENCHMARKS = Path(csac_jax.__file__).parents[1] / "experiments" / "bench"
@@ -11,17 +12,14 @@ BENCHMARKS = Path(csac_jax.__file__).parents[1] / "experiments" / "bench"
 
 def run(arguments: list[str]) -> int:
     """Runs `main` of a script; returns the exit code."""
-    scripts = {path.stem: path for path in BENCHMARKS.glob("[!_]*.py")}
+    scripts = {path.stem: path for path in sorted(BENCHMARKS.glob("[!_]*.py"))}
     if not scripts:
-        raise BadArgumentsError(
-            f"bench: there is nothing in {BENCHMARKS}; benchmarks come with a checkout"
-        )
-    names = ", ".join(sorted(scripts))
-    if arguments[:1] in (["-h"], ["--help"]):
-        print(f"usage: {PROGRAM} bench NAME ..., with NAME one of: {names}")
-        return 0
+        raise BadArgumentsError(f"bench: no scripts in {BENCHMARKS}; they come with a checkout")
     name, *rest = arguments or [""]
+    if name in ("-h", "--help"):
+        print(f"usage: {PROGRAM} bench NAME ..., with NAME one of: {', '.join(scripts)}")
+        return 0
     if name not in scripts:
-        raise BadArgumentsError(f"bench: unknown benchmark '{name}'; choose one of: {names}")
+        raise BadArgumentsError(f"bench: {unknown('benchmark', name, scripts)}")
     runpy.run_path(str(scripts[name]))["main"](rest)
     return 0

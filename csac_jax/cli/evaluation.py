@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import tyro
 
-from csac_jax.cli import guards, output, parsing, stored
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
+from csac_jax.cli import output, parsing
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
 from csac_jax.config import Config
 
 
@@ -43,16 +43,16 @@ def run(arguments: list[str]) -> int:
     options = parsing.parse(EvalOptions, arguments, "eval")
     if options.episodes < 1:
         raise BadArgumentsError("--episodes: at least 1")
-    guards.check_seed(options.seed)
-    policy = stored.policy(options.source, options.policy)
+    check_seed(options.seed)
+    from csac_jax.evaluation import policies
+
+    policy = policies.POLICIES[options.policy](options.source)
     begun = time.time()
     cfg, result = _evaluate(options, policy)
     seconds = round(time.time() - begun, 1)
     for part, summary in result.get("parts", {Path(options.suite).stem: result}).items():
-        print_summary(
-            f"{options.policy} policy, {part}: {options.episodes} episodes, seed {options.seed}",
-            summary,
-        )
+        title = f"{options.policy} policy, {part}: {options.episodes} episodes, seed {options.seed}"
+        print_summary(title, summary)
     asked = {name: getattr(options, name) for name in ("policy", "suite", "seed")}
     output.write_result(options.json, {**asked, "seconds": seconds, **result}, cfg)
     return 0
@@ -76,17 +76,11 @@ def _evaluate(options: EvalOptions, policy: Any) -> tuple[Config, dict[str, Any]
 def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A line on the terminal with the part and its finished episodes; nothing elsewhere."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn())
-    bar = Progress(
-        *columns,
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
+    columns = ("{task.description}", BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
     task = bar.add_task("preparing scenes", total=None)
 
     def show(part: str, finished: int, episodes: int) -> None:
@@ -101,23 +95,16 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from csac_jax.evaluation.metrics import PER_ACTION
+    from csac_jax.evaluation.statistics import Band
+    from csac_jax.report import tables
 
-    unit = "action_efficiency: blocks per action"
-    table = Table("metric", "value", "95 % interval", "n", title=title, caption=unit)
+    caption = "in brackets: 95 % interval; action_efficiency: blocks per action"
+    table = Table("metric", "value", "n", title=title, caption=caption)
     for name, entry in {**summary, **summary.get("failures", {})}.items():
-        if "value" not in entry:
-            continue
-        cells = ("-", "-")
-        if entry["n"] and name in PER_ACTION:
-            cells = (f"{entry['value']:.3f}", f"{entry['low']:.3f} .. {entry['high']:.3f}")
-        elif entry["n"]:
-            cells = (output.percent(entry["value"]), output.interval(entry))
-        table.add_row(name, *cells, str(entry["n"]))
-    console = Console()
+        if "value" in entry:
+            band = Band(**entry) if entry["n"] else None
+            table.add_row(name, tables.shown(metric=name, band=band), str(entry["n"]))
+    console = Console(highlight=False)
     console.print(table)
     for name in ("outcomes", "counts"):
-        console.print(
-            f"{name}: " + ", ".join(f"{key} {count}" for key, count in summary[name].items()),
-            highlight=False,
-        )
+        console.print(f"{name}:", ", ".join(f"{key} {n}" for key, n in summary[name].items()))

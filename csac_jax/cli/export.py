@@ -5,7 +5,7 @@ from pathlib import Path
 
 import tyro
 
-from csac_jax.cli import parsing, stored
+from csac_jax.cli import parsing
 from csac_jax.cli.failures import BadArgumentsError
 
 
@@ -26,9 +26,10 @@ def run(arguments: list[str]) -> int:
         raise BadArgumentsError(f"{options.file}: the name of a policy file ends in .safetensors")
     if options.file.exists():
         raise BadArgumentsError(f"{options.file} exists; give another name")
+    from csac_jax.evaluation import policies
     from csac_jax.io import policy_file
 
-    policy = stored.policy(str(options.run_dir))
+    policy = policies.load(options.run_dir)
     policy_file.save(options.file, policy.params, policy.cfg)
     print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
     return 0

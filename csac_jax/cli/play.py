@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from csac_jax import presets
-from csac_jax.cli import guards, output, parsing, stored
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
+from csac_jax.cli import output, parsing
+from csac_jax.cli.failures import as_bad_arguments, check_extra, check_seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,7 @@ def run(arguments: list[str]) -> int:
 
         opengl = gl.choose()  # before MuJoCo is imported
     begun = time.time()
-    env, steps = _play(options, _policy(options))
+    env, steps = _play(options, _policy(options.policy))
     from csac_jax.render import episode
 
     print(episode.summary(env.cfg, steps))
@@ -69,34 +69,29 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
+@as_bad_arguments(ValueError)
 def _check(options: PlayOptions) -> None:
-    guards.check_seed(options.seed)
+    check_seed(options.seed)
     if not all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size):
-        raise BadArgumentsError("--size: both numbers must be even and lie in 16 .. 4096 px")
-    if options.png is not None or options.video is not None:
-        _check_formats(options.png, options.video)
-
-
-def _check_formats(png: Path | None, video: Path | None) -> None:
+        raise ValueError("--size: both numbers must be even and lie in 16 .. 4096 px")
+    if options.png is None and options.video is None:
+        return
     from csac_jax.render import media
 
-    with as_bad_arguments(ValueError):
-        if png is not None:
-            media.check_suffix(png, media.PICTURES)
-        if video is not None:
-            media.check_suffix(video, media.VIDEOS)
-    if video is not None and media.needs_ffmpeg(video):
-        guards.check_extra("--video", "imageio_ffmpeg", "video")
+    if options.png is not None:
+        media.check_suffix(options.png, media.PICTURES)
+    if options.video is not None:
+        media.check_suffix(options.video, media.VIDEOS)
+        if media.needs_ffmpeg(options.video):
+            check_extra("--video", "imageio_ffmpeg", "video")
 
 
-def _policy(options: PlayOptions) -> Any:
+def _policy(source: str) -> Any:
     """The policy; without networks it has the config of `quick`."""
     from csac_jax.evaluation import policies
 
-    without_networks = {"oracle": policies.OraclePolicy, "random": policies.RandomPolicy}
-    if options.policy in without_networks:
-        return without_networks[options.policy](presets.quick())
-    return stored.policy(options.policy)
+    kinds = {"oracle": policies.OraclePolicy, "random": policies.RandomPolicy}
+    return kinds[source](presets.quick()) if source in kinds else policies.load(source)
 
 
 def _play(options: PlayOptions, policy: Any) -> tuple[Any, list[Any]]:
@@ -108,10 +103,7 @@ def _play(options: PlayOptions, policy: Any) -> tuple[Any, list[Any]]:
     cache.enable()
     cfg = rollout.configured(policy.cfg, options.physics, options.robot)
     with as_bad_arguments(ValueError):
-        suite = (
-            suites.IN_DISTRIBUTION if options.scene == "random" else str(_case_file(options.scene))
-        )
-        (env,) = suites.environments(cfg, suite, 1, options.seed).values()
+        (env,) = suites.environments(cfg, _suite(options.scene), 1, options.seed).values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")
     steps: list[Any] = []
@@ -121,14 +113,16 @@ def _play(options: PlayOptions, policy: Any) -> tuple[Any, list[Any]]:
     return env, steps
 
 
-def _case_file(scene: str) -> Path:
-    """File of a shipped case by name, or the user's own. Raises ValueError if there is neither."""
+def _suite(scene: str) -> str:
+    """The suite of one part whose scenes are asked for. Raises ValueError if there is none."""
+    from csac_jax.evaluation import suites
     from csac_jax.scene import cases
 
+    if scene == "random":
+        return suites.IN_DISTRIBUTION
     if scene in cases.names():
-        return cases.shipped(scene)
+        return str(cases.shipped(scene))
     if Path(scene).is_file():
-        return Path(scene)
-    raise ValueError(
-        f"--scene: '{scene}' is neither a case file nor one of: random, {', '.join(cases.names())}"
-    )
+        return scene
+    known = ", ".join(("random", *cases.names()))
+    raise ValueError(f"--scene: '{scene}' is neither a case file nor one of: {known}")

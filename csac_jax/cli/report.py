@@ -5,8 +5,9 @@ from pathlib import Path
 
 import tyro
 
-from csac_jax.cli import guards, parsing
-from csac_jax.cli.failures import BadArgumentsError, FailedError, as_bad_arguments
+from csac_jax.cli import parsing
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.errors import FailedError
 from csac_jax.io import files
 
 
@@ -29,11 +30,10 @@ def run(arguments: list[str]) -> int:
     options = parsing.parse(ReportOptions, arguments, "report")
     if not options.runs:
         raise BadArgumentsError(
-            "report: give at least one folder of a run, or a file of `eval --json`"
+            "report: give at least one folder of a run or file of `eval --json`"
         )
     if options.out is not None:
-        guards.check_extra("--out", "matplotlib", "report")
-        guards.check_extra("--out", "jinja2", "report")
+        check_extra("--out", "jinja2", "report")
     from csac_jax.report import comparison, results, tables
 
     with as_bad_arguments(ValueError):
@@ -43,9 +43,8 @@ def run(arguments: list[str]) -> int:
     text = tables.markdown(report)
     print(text, end="")
     if options.markdown is not None:
-        command = (
-            f"csac-jax report {' '.join(map(str, options.runs))} --markdown {options.markdown}"
-        )
+        runs = " ".join(map(str, options.runs))
+        command = f"{PROGRAM} report {runs} --markdown {options.markdown}"
         files.replace(options.markdown, f"# Results\n\nWritten by `{command}`.\n\n{text}")
     if options.out is not None:
         from csac_jax.report import page

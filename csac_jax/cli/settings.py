@@ -1,19 +1,18 @@
 """PRESET and settings on the command line -> Config; what `train`, `sweep` and `doctor` share."""
 
-import ast
+import argparse
 import dataclasses
-import functools
 import inspect
-import itertools
-import textwrap
+import re
 import typing
 from collections.abc import Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from csac_jax import algorithms, config, presets
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import PROGRAM, as_bad_arguments
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError, as_bad_arguments, exists
 from csac_jax.config import Config
 
 PRESETS = ", ".join(presets.PRESETS)
@@ -23,14 +22,8 @@ FIRST = (
     *("learn.updates", "target.gamma", "replay.sampler", "replay.capacity", "net.kind"),
 )
 """The settings that people change first."""
-WIDTH, COLUMN = 100, 32  # of the short help, and where its texts begin
-_METAVARS = {
-    (bool,): "",
-    (Path,): "PATH",
-    (int,): "N",
-    (str,): "TEXT",
-    (tuple[str, ...],): "NAME=A,B",
-}
+_METAVARS: Any = {bool: "", Path: "PATH", int: "N", str: "TEXT", tuple[str, ...]: "NAME=A,B"}
+_LAYOUT = partial(argparse.RawDescriptionHelpFormatter, max_help_position=32, width=100)
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -40,31 +33,41 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     return None, list(arguments)
 
 
+def check_new(command: str, preset: str | None, folder: Path | None) -> None:
+    """A new run needs a preset and a folder that does not exist."""
+    if preset is None:
+        raise BadArgumentsError(f"{command}: give a preset first, one of: {PRESETS}")
+    if folder is not None and folder.exists():
+        raise exists(folder)
+
+
+@as_bad_arguments(ValueError)
 def preset(name: str, flags: Sequence[str]) -> Config:
-    """The preset, of the algorithm that the flags name."""
-    algo = parsing.value_of(flags, "--algo")
-    with as_bad_arguments(ValueError):
-        cfg = presets.get(name)
-        return cfg if algo is None else algorithms.configure(cfg, algo)
+    """The preset, of the algorithm and with networks of the policy that the flags name."""
+    cfg = presets.get(name)
+    algo, init = (parsing.take(flags, option)[0] for option in ("--algo", "--init"))
+    if algo is not None:
+        cfg = algorithms.configure(cfg, algo)
+    if init is None or parsing.asks_help(flags):
+        return cfg
+    from csac_jax import api
+
+    return api.with_networks_of(cfg, init)
 
 
+@as_bad_arguments(ValueError)
 def parse(options: type, command: str, base: Config, flags: Sequence[str]) -> tuple[Any, Config]:
     """The `options` of a command, and `base` with the settings that the flags give."""
-    with as_bad_arguments(ValueError):
-        sections = _sections(base, flags)
-    fields: Any = [
-        (name, type(section), dataclasses.field(default=section))
-        for name, section in sections.items()
-    ]
-    namespace = {"__doc__": options.__doc__}
-    kind = dataclasses.make_dataclass(
-        f"_{options.__name__}", fields, bases=(options,), frozen=True, namespace=namespace
+    sections = _sections(base, flags)
+    fields = [(name, type(section)) for name, section in sections.items()]
+    kind: Any = dataclasses.make_dataclass(
+        options.__name__, fields, bases=(options,), frozen=True, kw_only=True
     )
-    default = kind(seed=base.seed, algo=base.algo)
-    given: Any = parsing.parse(kind, flags, command, default, "--help-all")
-    with as_bad_arguments(ValueError):
-        changed = {name: getattr(given, name) for name in (*sections, "algo", "seed")}
-        return given, dataclasses.replace(base, **changed)
+    kind.__doc__ = options.__doc__
+    default = kind(**sections, seed=base.seed, algo=base.algo)
+    given = parsing.parse(kind, list(flags), command, default)
+    changed = {name: getattr(given, name) for name in (*sections, "algo", "seed")}
+    return given, dataclasses.replace(base, **changed)
 
 
 def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:
@@ -72,12 +75,13 @@ def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:
 
     Raises ValueError for a flag that is a setting of another alternative.
     """
-    sections = {name: getattr(base, name) for name in _names(base)}
-    sections = {name: one for name, one in sections.items() if isinstance(one, config.Section)}
+    sections: dict[str, Any] = {
+        name: one for name, one in vars(base).items() if isinstance(one, config.Section)
+    }
     for name, (tag, kinds) in config.ALTERNATIVES.items():
-        choice = parsing.value_of(flags, f"--{name}.{tag}") or getattr(sections[name], tag)
+        choice = parsing.take(flags, f"--{name}.{tag}")[0] or getattr(sections[name], tag)
         sections[name] = config.alternative(sections[name], choice)
-        others = set().union(*map(_names, kinds)) - _names(sections[name])
+        others = set().union(*(vars(kind()) for kind in kinds)) - vars(sections[name]).keys()
         for flag in flags:
             prefix, _, setting = flag.split("=")[0].replace("-", "_").rpartition(".")
             if prefix == f"__{name}" and setting in others:
@@ -85,53 +89,42 @@ def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:
     return sections
 
 
-def _names(section: Any) -> set[str]:
-    return {field.name for field in dataclasses.fields(section)}
-
-
-def print_help(
-    options: type, command: str, examples: Sequence[str], arguments: Sequence[str]
-) -> None:
+def print_help(options: type, command: str, examples: Sequence[str], arguments: list[str]) -> None:
     """The short help of a command that takes settings: examples, options, the settings of FIRST."""
     name, flags = split(arguments)
     cfg = preset(name or "quick", flags)
-    print(f"usage: {PROGRAM} {command} PRESET [--OPTION VALUE ...]\n")
-    print(inspect.cleandoc(options.__doc__ or ""))
-    print(f"\npresets: {PRESETS}\nalgorithms: {', '.join(algorithms.ALGORITHMS)}\n\nexamples:")
-    for example in examples:
-        print(f"  {PROGRAM} {command} {example}")
-    print("\noptions:")
+    listed = "".join(f"\n  {PROGRAM} {command} {example}" for example in examples)
+    parser = argparse.ArgumentParser(
+        usage=f"{PROGRAM} {command} PRESET [--OPTION VALUE ...]",
+        description=f"{inspect.getdoc(options)}\n\npresets: {PRESETS}\n"
+        f"algorithms: {', '.join(algorithms.ALGORITHMS)}\n\nexamples:{listed}",
+        epilog=f"All settings: {PROGRAM} {command} {name or 'PRESET'} --help-all",
+        add_help=False,
+        formatter_class=_LAYOUT,
+    )
     for option in dataclasses.fields(options):
-        value = _METAVARS.get(typing.get_args(option.type)[:1], option.default)
-        _print_row(option.name, value, _docs(options)[option.name])
-    _print_row("device", "cpu|gpu", "Where JAX computes; by default on a GPU, if there is one.")
-    print(f"\nsettings that people change first, with the values of {cfg.preset}:")
+        kind = next(iter(typing.get_args(option.type)), None)
+        _add(parser, option.name, _METAVARS.get(kind, option.default), _docs(options)[option.name])
+    _add(parser, "device", "cpu|gpu", "Where JAX computes; by default on a GPU, if there is one.")
+    title = f"settings that people change first, with the values of {cfg.preset}"
+    first = parser.add_argument_group(title)
     for setting in FIRST:
         section_name, field = setting.split(".")
         section = getattr(cfg, section_name)
-        _print_row(setting, getattr(section, field), _docs(section.__class__)[field])
-    print(f"\nAll settings: {PROGRAM} {command} {name or 'PRESET'} --help-all")
+        _add(first, setting, getattr(section, field), _docs(section.__class__)[field])
+    parser.print_help()
 
 
-def _print_row(name: str, value: Any, text: str) -> None:
-    """A flag with its value and, in a column of its own, what it does."""
+def _add(group: Any, name: str, value: Any, text: str) -> None:
+    """Adds a row to the help: a flag with its value, and what it does."""
     shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    flag = f"  --{name.replace('_', '-')} {shown}"
-    if len(flag) >= COLUMN:
-        print(flag)
-        flag = ""
-    paragraph = textwrap.TextWrapper(WIDTH, flag.ljust(COLUMN), " " * COLUMN)
-    paragraph.break_long_words = paragraph.break_on_hyphens = False
-    print(paragraph.fill(text.replace("`", "")))
+    flag, text = f"--{name.replace('_', '-')}", text.replace("`", "").replace("%", "%%")
+    group.add_argument(flag, metavar=shown, help=text)
 
 
-@functools.cache
+@cache
 def _docs(kind: Any) -> dict[str, str]:
-    """The text below each field of a dataclass, in one line."""
-    tree = ast.parse(inspect.getsource(kind))
-    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
-    docs = {}
-    for field, text in itertools.pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-            docs[ast.unparse(field.target)] = " ".join(ast.literal_eval(text.value).split())
-    return docs
+    """The text beside or below each field of a dataclass, in one line."""
+    field = r'^    (\w+): .*(?:  # (.*)|\n    """([^"]*)""")$'
+    found = re.findall(field, inspect.getsource(kind), re.MULTILINE)
+    return {name: " ".join((beside or below).split()) for name, beside, below in found}

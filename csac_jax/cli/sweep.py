@@ -8,8 +8,8 @@ from typing import Any, Literal
 import tyro
 
 from csac_jax import presets
-from csac_jax.cli import guards, output, parsing, settings, stored
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, as_failure
+from csac_jax.cli import failures, output, parsing, settings
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
 from csac_jax.config import Config
 from csac_jax.runtime import signals
 from csac_jax.sweeps import grid
@@ -41,8 +41,7 @@ class SweepOptions:
     devices: int | None = None
     """Devices to use; one if not given, and with several processes all that they have."""
     coordinator: str | None = None
-    """ADDRESS:PORT of the first of several processes, which all run the same command. See
-    docs/cluster.md."""
+    """ADDRESS:PORT of the first of several processes of the same command; see docs/cluster.md."""
     processes: int | None = None
     """How many processes there are."""
     process_id: int | None = None
@@ -61,56 +60,66 @@ class SweepOptions:
 
 def run(arguments: list[str]) -> int:
     """Trains all; returns the exit code."""
-    if parsing.asks_short_help(arguments):
+    if parsing.SHORT_HELP.intersection(arguments):
         settings.print_help(SweepOptions, "sweep", EXAMPLES, arguments)
         return 0
     stop = signals.install()
     options, plan = read(arguments)
-    name = f"sweep-{plan.points[0].cfg.preset}"
-    folder = options.resume or options.run_dir or _new_folder(name)
-    begun = time.time()
-    result = _sweep(options, plan, folder, stop)
-    summary = {
-        "run_dir": str(folder),
-        **result.summary,
-        "compile_seconds": result.compile_seconds,
-        "wall_seconds": round(time.time() - begun, 1),
-        "stopped_by": result.stopped_by,
-    }
+    begun, resume = time.time(), options.resume is not None
+    from csac_jax import api
     from csac_jax.runtime import cluster
 
+    name = f"sweep-{plan.points[0].cfg.preset}"
+    folder = options.resume or options.run_dir or api.new_folder(name)
+    how = (options.devices, options.shard, options.init)
+    try:
+        result = api.run_sweep(plan, folder, *how, verbose=True, stop=stop, resume=resume)
+    except FileExistsError:  # somebody has made it meanwhile
+        raise failures.exists(folder) from None
     if cluster.is_first():
-        output.write_result(options.json, summary, None)
-        output.write_result(folder / "train.json", summary, None)  # `report` reads it
+        _report(options, folder, result, round(time.time() - begun, 1))
     return 0 if result.stopped_by is None else 128 + result.stopped_by
 
 
-def _new_folder(name: str) -> Path:
-    from csac_jax import api
+def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) -> None:
+    """Prints grasp success of every setting, and writes the result."""
+    from csac_jax.evaluation.statistics import Band
+    from csac_jax.report import tables
 
-    return api.new_folder(name)
+    for point in result.summary["settings"]:
+        band = Band(**point["grasp_success"])
+        success = tables.shown(metric="grasp_success", band=band) if band.n else "unknown"
+        print(f"{point['name']}: grasp success {success}, interquartile mean of {band.n} seeds")
+    times = {"compile_seconds": result.compile_seconds, "wall_seconds": seconds}
+    written = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
+    for path in (options.json, folder / "train.json"):  # `report` reads the second
+        output.write_result(path, written)
 
 
 def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
     """Options and plan of a sweep: from the command line, or from the folder if it is resumed."""
     preset, flags = settings.split(arguments)
-    options, cfg = _parse(preset or "quick", flags)
+    name = preset or "quick"
+    options, cfg = _parse(name, flags)
     if options.seeds < 1 or options.seed + options.seeds > 2**31:
         raise BadArgumentsError("--seeds: at least 1, and no seed may exceed 2147483647")
     _join(options)
-    if options.resume is not None:
-        return options, _stored_plan(options.resume, preset, options, cfg)
-    if preset is None:
-        raise BadArgumentsError(f"sweep: give a preset first, one of: {settings.PRESETS}")
-    guards.check_new(options.run_dir)
-    return options, _new_plan(preset, flags, options)
+    if options.resume is None:
+        settings.check_new("sweep", preset, options.run_dir)
+        return options, _new_plan(name, flags, options)
+    given = (preset, options.vary, options.run_dir)
+    if any(given) or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
+        raise BadArgumentsError(
+            "sweep --resume: a sweep goes on with its own settings; leave all others out"
+        )
+    from csac_jax.sweeps import runner
+
+    return options, runner.read_plan(options.resume)
 
 
 def _parse(preset: str, flags: list[str]) -> tuple[SweepOptions, Config]:
     """Options of a sweep and the config of a point, whose own flags come last."""
-    base, init = settings.preset(preset, flags), parsing.value_of(flags, "--init")
-    base = base if init is None else stored.with_networks_of(base, init)
-    return settings.parse(SweepOptions, f"sweep {preset}", base, flags)
+    return settings.parse(SweepOptions, f"sweep {preset}", settings.preset(preset, flags), flags)
 
 
 def _join(options: SweepOptions) -> None:
@@ -137,10 +146,9 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     devices, runs = _devices(options), options.seeds * len(points)  # at most so many side by side
     points = [one._replace(cfg=backend.resolve(one.cfg, devices, runs)) for one in points]
     for point in points:
-        guards.check_physics(point.cfg)
-        guards.check_host_physics(point.cfg, devices)
+        failures.check_physics(point.cfg, devices)
     plan = runner.SweepPlan(options.seeds, points)
-    with as_bad_arguments(ValueError, runner.SweepError):
+    with as_bad_arguments(runner.SweepError):
         runner.groups_of(plan._replace(seeds=1))
     return plan
 
@@ -149,59 +157,3 @@ def _devices(options: SweepOptions) -> int:
     """Devices of a sweep, those of other processes too; 2 stands for several."""
     alone = options.processes in (None, 1) and not options.cluster
     return (options.devices or 1) if alone else 2
-
-
-def _stored_plan(folder: Path, preset: str | None, options: SweepOptions, cfg: Config) -> Any:
-    from csac_jax.sweeps import runner
-
-    given = (preset, options.vary, options.run_dir)
-    if any(given) or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
-        raise BadArgumentsError(
-            "sweep --resume: a sweep goes on with its own settings; leave all others out"
-        )
-    with as_failure(runner.SweepError):
-        return runner.read_plan(folder)
-
-
-def _sweep(options: SweepOptions, plan: Any, folder: Path, stop: signals.Stop) -> Any:
-    from csac_jax import api
-    from csac_jax.errors import SettingsError
-    from csac_jax.io import checkpoint, policy_file
-    from csac_jax.runtime import cluster
-    from csac_jax.sweeps import runner
-    from csac_jax.training import loop
-
-    with (
-        as_failure(
-            runner.SweepError,
-            loop.TrainingError,
-            checkpoint.CheckpointError,
-            policy_file.PolicyFileError,
-        ),
-        as_bad_arguments(SettingsError),
-    ):
-        try:
-            result = api.run_sweep(
-                plan,
-                folder,
-                options.devices,
-                options.shard,
-                options.init,
-                verbose=True,
-                stop=stop,
-                resume=options.resume is not None,
-            )
-        except FileExistsError:
-            raise guards.exists(folder) from None
-    if cluster.is_first():
-        for point in result.summary["settings"]:
-            print(f"{point['name']}: {_seeds_line(point['grasp_success'])}")
-    return result
-
-
-def _seeds_line(success: dict[str, Any]) -> str:
-    if not success["n"]:
-        return "no seed is done"
-    interval = f" (95 % interval {output.interval(success)})" if success["low"] is not None else ""
-    value = f"grasp success {output.percent(success['value'])}{interval}"
-    return f"{value}, interquartile mean of {success['n']} seeds"

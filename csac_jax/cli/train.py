@@ -3,12 +3,11 @@
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any
 
 import tyro
 
-from csac_jax.cli import guards, output, parsing, settings, stored
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, as_failure
+from csac_jax.cli import failures, output, parsing, settings
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.runtime import signals
 
@@ -43,49 +42,13 @@ class TrainOptions:
 
 def run(arguments: list[str]) -> int:
     """Trains; returns the exit code."""
-    if parsing.asks_short_help(arguments):
+    if parsing.SHORT_HELP.intersection(arguments):
         settings.print_help(TrainOptions, "train", EXAMPLES, arguments)
         return 0
     stop = signals.install()
     options, cfg = read(arguments)
-    begun = time.time()
-    done = _train(options, cfg, stop)
-    wall_seconds = round(time.time() - begun, 1)
-    result = {"run_dir": str(done.run_dir), **done.summary._asdict(), "wall_seconds": wall_seconds}
-    output.write_result(options.json, result, done.cfg)
-    output.write_result(done.run_dir / "train.json", result, done.cfg)  # `report` reads it
-    return stop.exit_code
-
-
-def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
-    """Options and config of a run, from the command line and, if it is resumed, its checkpoint."""
-    preset, flags = settings.split(arguments)
-    base = settings.preset(preset or "quick", flags)
-    resumed, init = (parsing.value_of(flags, name) for name in ("--resume", "--init"))
-    if resumed is not None and not parsing.asks_help(flags):
-        trained = stored.config(Path(resumed))
-        base = dataclasses.replace(trained, preset=preset or trained.preset)
-    elif init is not None:
-        base = stored.with_networks_of(base, init)
-    options, cfg = settings.parse(TrainOptions, f"train {preset or 'PRESET'}", base, flags)
-    if options.resume is not None:
-        if options.run_dir is not None or options.init is not None:
-            raise BadArgumentsError("--resume: a resumed run takes neither --run-dir nor --init")
-    elif preset is None:
-        raise BadArgumentsError(f"train: give a preset first, one of: {settings.PRESETS}")
-    else:
-        guards.check_new(options.run_dir)
-    guards.check_physics(cfg)
-    if options.tensorboard:
-        guards.check_extra("--tensorboard", "tensorboardX", "tensorboard")
-    return options, cfg
-
-
-def _train(options: TrainOptions, cfg: Config, stop: signals.Stop) -> Any:
+    begun, resume = time.time(), options.resume is not None
     from csac_jax import api
-    from csac_jax.errors import SettingsError
-    from csac_jax.io import checkpoint, policy_file
-    from csac_jax.training import loop
 
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")
     reporters = []
@@ -93,18 +56,36 @@ def _train(options: TrainOptions, cfg: Config, stop: signals.Stop) -> Any:
         from csac_jax.report.tensorboard import TensorBoard
 
         reporters.append(TensorBoard(folder))
-    with (
-        as_failure(loop.TrainingError, checkpoint.CheckpointError, policy_file.PolicyFileError),
-        as_bad_arguments(SettingsError),
-    ):
-        try:
-            return api.train(
-                cfg,
-                folder,
-                resume=options.resume is not None,
-                init=options.init,
-                reporters=reporters,
-                stop=stop,
-            )
-        except FileExistsError:
-            raise guards.exists(folder) from None
+    try:
+        done = api.train(
+            cfg, folder, resume=resume, init=options.init, reporters=reporters, stop=stop
+        )
+    except FileExistsError:  # somebody has made it meanwhile
+        raise failures.exists(folder) from None
+    seconds = round(time.time() - begun, 1)
+    result = {"run_dir": str(folder), **done.summary._asdict(), "wall_seconds": seconds}
+    for path in (options.json, folder / "train.json"):  # `report` reads the second
+        output.write_result(path, result, done.cfg)
+    return stop.exit_code
+
+
+def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
+    """Options and config of a run, from the command line and, if it is resumed, its checkpoint."""
+    preset, flags = settings.split(arguments)
+    resumed, _ = parsing.take(flags, "--resume")
+    if resumed is None or parsing.asks_help(flags):
+        base = settings.preset(preset or "quick", flags)
+    else:
+        from csac_jax.io import checkpoint
+
+        base = checkpoint.load_config(Path(resumed))
+        base = dataclasses.replace(base, preset=preset or base.preset)
+    options, cfg = settings.parse(TrainOptions, f"train {preset or 'PRESET'}", base, flags)
+    if options.resume is None:
+        settings.check_new("train", preset, options.run_dir)
+    elif options.run_dir is not None or options.init is not None:
+        raise BadArgumentsError("--resume: a resumed run takes neither --run-dir nor --init")
+    failures.check_physics(cfg)
+    if options.tensorboard:
+        failures.check_extra("--tensorboard", "tensorboardX", "tensorboard")
+    return options, cfg

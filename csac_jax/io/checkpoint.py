@@ -23,6 +23,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import LatestN
 
 from csac_jax.config import Config
+from csac_jax.errors import FailedError
 from csac_jax.io import configs, renames
 from csac_jax.runtime import cluster
 
@@ -31,7 +32,7 @@ MANIFEST = "manifest.sha256"
 KEPT = 2
 
 
-class CheckpointError(Exception):
+class CheckpointError(FailedError):
     """A checkpoint that is missing, damaged or made for another program; the message is one line
     with the remedy."""
 

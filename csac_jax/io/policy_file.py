@@ -18,6 +18,7 @@ import safetensors.numpy
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
+from csac_jax.errors import FailedError
 from csac_jax.io import configs, files
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
@@ -25,7 +26,7 @@ SHIPPED_SHA256 = "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf
 _CONFIG = "config"  # the config's name among the file's remarks
 
 
-class PolicyFileError(Exception):
+class PolicyFileError(FailedError):
     """A file that is no policy, or a damaged one; the message is one line with the remedy."""
 
 

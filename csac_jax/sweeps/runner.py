@@ -25,6 +25,7 @@ import jax
 import numpy as np
 
 from csac_jax.config import WARP_WORLDS, Config
+from csac_jax.errors import FailedError
 from csac_jax.evaluation import statistics
 from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cluster
@@ -38,7 +39,7 @@ SUMMARY = "summary.json"
 DONE = "done"
 
 
-class SweepError(Exception):
+class SweepError(FailedError):
     """A sweep that cannot begin or go on; the message is one line with the remedy."""
 
 

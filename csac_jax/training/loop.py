@@ -14,7 +14,7 @@ import numpy as np
 
 from csac_jax.config import Config
 from csac_jax.constants import GRASP_WINDOW, OUTCOMES, Outcome, Primitive
-from csac_jax.errors import SettingsError
+from csac_jax.errors import FailedError, SettingsError
 from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
@@ -25,7 +25,7 @@ LOSSES = ("critic_loss", "actor_loss")
 DIVERGED_SHARE = 1e-3
 
 
-class TrainingError(Exception):
+class TrainingError(FailedError):
     """A run that cannot go on; the message is one line with the remedy."""
 
 

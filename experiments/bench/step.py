@@ -365,7 +365,7 @@ def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
 def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Config:
     cfg = config("step", preset, flags)
     if physics is None:
-        physics = cfg.sim.physics if parsing.value_of(flags, "--sim.physics") else "auto"
+        physics = cfg.sim.physics if parsing.take(flags, "--sim.physics")[0] else "auto"
     if physics == "warp":
         cfg = cfg.change(scene={"size_jitter": (cfg.scene.size_jitter[0], 0.0)})
     return backend.resolve(cfg.change(sim={"physics": physics}))

@@ -12,7 +12,7 @@ import pytest
 import csac_jax
 from csac_jax import cli, presets
 from csac_jax.cli import doctor, failures
-from csac_jax.errors import SceneError
+from csac_jax.errors import FailedError, SceneError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.runtime import cache, signals
 from csac_jax.training import loop, step
@@ -38,7 +38,7 @@ def _raises(error: BaseException):
     ("error", "code", "line"),
     [
         (failures.BadArgumentsError("no"), 2, "no"),
-        (failures.FailedError("two\n  lines"), 1, "two lines"),
+        (FailedError("two\n  lines"), 1, "two lines"),
         (SceneError("never at rest"), 1, "never at rest"),
         (
             PermissionError(13, "Permission denied", "a.json"),
