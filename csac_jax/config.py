@@ -4,7 +4,7 @@ Lengths are metres, angles radians, times seconds unless a name says otherwise. 
 raises `ValueError` with the setting's name. A section that holds traced values is not checked.
 Numbers marked (ours) are measured choices; the others name their source.
 
-Alternatives are unions: `ReplayConfig` and `NetConfig`. Class variables are constants.
+Alternatives are unions: `ReplayConfig` and `NetConfig`. Names without a type are constants.
 """
 
 import dataclasses
@@ -84,11 +84,11 @@ class SceneConfig(Section, section="scene"):
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
     """Kind of each block slot; a box slot draws a cube, cuboid, plank or tile in every scene."""
     min_blocks: int = _bounded(5, 1)
-    """Fewest blocks in play in a scene; the most is the number of slots."""
+    """Fewest blocks in play in a scene; the most: the number of slots."""
     pool: int = _bounded(1024, 1)
     """Pre-settled scenes that episodes are sampled from, per block count."""
     arranged: float = _bounded(0.0, 0.0, 1.0)
-    """Share of the scenes that are packed arrangements; the others are dropped."""
+    """Share of scenes that are packed; the others are dropped."""
     size_jitter: tuple[float, float] = _bounded((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of block sizes between scenes: boxes and arches, and the other kinds.
     The latter are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
@@ -99,14 +99,12 @@ class SceneConfig(Section, section="scene"):
     drop_extent: tuple[float, float] = _bounded((0.248, 0.248), 0.05, 0.448)
     """Range of the side of the square that blocks are dropped in, m (VPG: 0.248)."""
     settle_time: float = _bounded(2.5, 0.5, 20.0)
-    """Time that blocks are given to come to rest, s (ours)."""
+    """Time that blocks have to come to rest, s (ours)."""
 
     def check(self) -> None:
-        _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
-        _require(
-            self.min_blocks <= len(self.slots),
-            "scene.min_blocks: must lie in 1 .. number of scene.slots",
-        )
+        most = len(self.slots)
+        _require(most >= 1, "scene.slots: at least one block slot is needed")
+        _require(self.min_blocks <= most, f"scene.min_blocks: at most the {most} scene.slots")
         for name in ("density", "friction", "drop_extent"):
             low, high = getattr(self, name)
             _require(low <= high, f"scene.{name}: low <= high is needed")
@@ -116,12 +114,11 @@ class SceneConfig(Section, section="scene"):
 class TaskConfig(Section, section="task"):
     """What an episode asks for, and when it is cut off."""
 
-    max_steps_without_change = 10  # actions without visible change that cut it off (VPG)
+    max_steps_without_change = 10  # actions in a row without visible change that cut it off (VPG)
 
     kind: Literal["clear", "target"] = "clear"
     """`clear`: take every block. `target`: get one marked block, then the next (CSAC sec. 4.4)."""
-    max_actions: int = _bounded(15, 1)
-    """Actions after which an episode is cut off."""
+    max_actions: int = _bounded(15, 1)  # Actions after which an episode is cut off.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +129,7 @@ class SimConfig(Section, section="sim"):
     iterations = 4  # Newton iterations of the constraint solver; fewer break grasps (ours)
     line_search = 8  # line-search steps of one Newton iteration (ours)
     approach = 0.10  # height above the place at which a primitive starts and ends, m
-    grasp_depth = 0.035  # depth of the finger tips below the surface there, m (VPG: 0.03 to 0.04)
+    grasp_depth = 0.035  # how far the finger tips go below the surface, m (VPG: 0.03 to 0.04)
     clearance = 0.012  # lowest height of the finger tips above the table, m (VPG: 0.01 to 0.02)
     push_length = 0.10  # length of a push, m (VPG)
     push_depth = 0.02  # how far below the local top the tips push, m (ours)
@@ -148,8 +145,7 @@ class SimConfig(Section, section="sim"):
     """Substeps of a grasp: descend, close the fingers, lift."""
     geom_pairs: int = _bounded(12, 1)
     """Pairs of geoms that MJX examines per collision function, nearest first."""
-    contacts: int = _bounded(48, 1)
-    """Contacts that MJX keeps per step, deepest first."""
+    contacts: int = _bounded(48, 1)  # Contacts that MJX keeps per step, deepest first.
 
     @property
     def substeps(self) -> int:
@@ -169,12 +165,10 @@ class CameraConfig(Section, section="camera"):
 
     size: tuple[int, int] = _bounded((640, 480), 8, 4096)
     """Width and height of the image that `focal` and `centre` belong to, px."""
-    focal: tuple[float, float] = (618.62, 618.62)
-    """Focal lengths along the image's width and height, px."""
+    focal: tuple[float, float] = (618.62, 618.62)  # Focal lengths along width and height, px.
     centre: tuple[float, float] = (319.5, 239.5)
     """Where the optical axis meets the image, from the left and from the top, px."""
-    position: tuple[float, float, float] = (-0.5, 0.0, 0.5)
-    """Where the camera stands, m."""
+    position: tuple[float, float, float] = (-0.5, 0.0, 0.5)  # Where the camera stands, m.
     look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Point in the middle of the view, m; the image is level."""
 
@@ -202,10 +196,8 @@ class CameraConfig(Section, section="camera"):
             _require(in_range, f"camera.focal: not 0.3 to 10 times the sides of {image}")
         alike = abs(self.focal[0] / self.focal[1] - 1.0) <= 0.1
         _require(alike, f"camera.focal: {self.focal} px must be alike to 10 %")
-        _require(
-            math.dist(self.position[:2], self.look_at[:2]) > 1e-3,
-            "camera.position: must not stand straight above or below camera.look_at",
-        )
+        apart = math.dist(self.position[:2], self.look_at[:2]) > 1e-3
+        _require(apart, "camera.position: must not stand straight above or below camera.look_at")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,8 +210,7 @@ class SensorConfig(Section, section="sensor"):
 
     depth_noise: tuple[float, float] = _bounded((0.0, 0.0), 0.0, 0.1)
     """Standard deviation of a depth: floor, m, and factor of the squared distance, 1/m."""
-    dropped: float = _bounded(0.0, 0.0, 0.9)
-    """Probability that a pixel has no depth."""
+    dropped: float = _bounded(0.0, 0.0, 0.9)  # Probability that a pixel has no depth.
     pose_noise: tuple[float, float] = _bounded((0.0, 0.0), 0.0, 0.2)
     """Standard deviation of the camera's place, m, and orientation, rad, drawn in every view."""
     colour: float = _bounded(0.0, 0.0, 0.5)
@@ -235,10 +226,8 @@ class SensorConfig(Section, section="sensor"):
 class HeightmapConfig(Section, section="heightmap"):
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 
-    size: int = _bounded(64, 16)
-    """H = W, cells."""
-    extent: float = _bounded(0.448, 0.1, 1.0)
-    """Side of the square workspace, m (VPG)."""
+    size: int = _bounded(64, 16)  # H = W, cells.
+    extent: float = _bounded(0.448, 0.1, 1.0)  # Side of the square workspace, m (VPG).
     view: Literal["ortho", "oblique"] = "ortho"
     """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image, projected;
     what blocks hide from it is empty (CSAC sec. 3.1, VPG)."""
@@ -256,24 +245,18 @@ class HeightmapConfig(Section, section="heightmap"):
 class SmallNet(Section, section="net"):
     """Densely connected convolutions with group norm, at 1/`stride` of the map's size (ours)."""
 
-    dtype = "auto"  # computes in bfloat16 on accelerators, float32 on a CPU; parameters are float32
+    dtype = "auto"  # bfloat16 on accelerators, float32 on a CPU; parameters are float32
 
-    kind: Literal["small"] = "small"
-    """`small`, or `densenet121`: the paper's, 100 times the work."""
-    rotations: int = _bounded(16, 4)
-    """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
-    colour: bool = True
-    """Whether the net sees colours, or heights alone."""
+    kind: Literal["small"] = "small"  # `small`, or `densenet121`: the paper's, 100 times the work.
+    rotations: int = _bounded(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
+    colour: bool = True  # Whether the net sees colours, or heights alone.
     margin: float = _bounded(0.125, 0.0, 0.5)
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
-    head: int = _bounded(32, 4)
-    """Channels of the 1 x 1 convolution before each head (VPG 64)."""
-    growth: int = _bounded(24, 4)
-    """Channels that each dense layer adds."""
+    head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
+    growth: int = _bounded(24, 4)  # Channels that each dense layer adds.
     dilations: tuple[int, ...] = _bounded((1, 2, 4, 1), 1)
     """Dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
-    stem: int = _bounded(16, 4)
-    """Channels of the first convolution."""
+    stem: int = _bounded(16, 4)  # Channels of the first convolution.
     stride: Literal[2, 4] = 2
     """Cells of the input per cell of the features, along each axis: 4 is a quarter of the work."""
     subcells: Literal[1, 2, 4] = 1
@@ -300,32 +283,25 @@ class DenseNet121(Section, section="net"):
     dtype = SmallNet.dtype
     block_growth = 32  # channels that each dense layer adds (Huang et al., table 1)
     STRIDE = 32  # pixels of the input per cell of the features, along each axis
-    output_stride = 4
-    """Cells of the map per cell that its outputs are upsampled to (ours; the paper 1, at 16 times
-    the memory: what is upsampled is bilinear, and so is reading it)."""
+    output_stride = (
+        4  # map cells per cell of the outputs (ours; the paper 1, at 16 times the memory)
+    )
 
-    kind: Literal["densenet121"] = "densenet121"
-    """The paper's network; `small` is ours."""
-    rotations: int = _bounded(16, 4)
-    """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
-    colour: bool = True
-    """Whether the net sees colours, or heights alone."""
+    kind: Literal["densenet121"] = "densenet121"  # The paper's network; `small` is ours.
+    rotations: int = _bounded(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
+    colour: bool = True  # Whether the net sees colours, or heights alone.
     margin: float = _bounded(0.125, 0.0, 0.5)
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
-    head: int = _bounded(32, 4)
-    """Channels of the 1 x 1 convolution before each head (VPG 64)."""
+    head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
     norm: Literal["group", "batch"] = "group"
     """`batch`, as in the paper, or `group`, which is the same while acting and while learning."""
     block_layers: tuple[int, int, int, int] = _bounded((6, 12, 24, 16), 1)
     """Dense layers of each block (Huang et al., arXiv:1608.06993, table 1)."""
-    zoom: int = _bounded(1, 1)
-    """Pixels of the input per cell of the map, along each axis (VPG 2)."""
+    zoom: int = _bounded(1, 1)  # Pixels of the input per cell of the map, along each axis (VPG 2).
 
     def check(self) -> None:
-        _require(
-            self.STRIDE % (self.zoom * self.output_stride) == 0,
-            f"net.zoom: must divide {self.STRIDE // self.output_stride}",
-        )
+        largest = self.STRIDE // self.output_stride
+        _require(largest % self.zoom == 0, f"net.zoom: must divide {largest}")
 
     def check_canvas(self, size: int) -> None:
         """Raises ValueError if the strides do not divide the rotated maps of `size` cells."""
@@ -357,12 +333,9 @@ class CEMConfig(Section, section="cem"):
     (yaw; ours)."""
     std_min = 0.01  # least standard deviation of a round, in the units of `std` (ours)
 
-    candidates: int = _bounded(64, 1)
-    """J, actions sampled in a round."""
-    elites: int = _bounded(6, 2)
-    """K, best actions that the next round's distribution is fitted to."""
-    rounds: int = _bounded(3, 1)
-    """Rounds of sampling and fitting."""
+    candidates: int = _bounded(64, 1)  # J, actions sampled in a round.
+    elites: int = _bounded(6, 2)  # K, best actions that the next round's distribution is fitted to.
+    rounds: int = _bounded(3, 1)  # Rounds of sampling and fitting.
     std_estimator: Literal["std", "mad"] = "std"
     """Of the elites: standard deviation, or line 12's mean absolute deviation with 1 / (K - 1)."""
     start: Literal["both", "actor", "cells"] = "both"
@@ -395,10 +368,8 @@ class TargetConfig(Section, section="target"):
     value: Literal["softmax", "max"] = "softmax"
     """V(s'): softmax over noisy target actions (line 17), or its limit, the largest value of the
     dense map (eq. 9)."""
-    gamma: float = _bounded(0.5, 0.0, 1.0)
-    """Discount (VPG)."""
-    samples: int = _bounded(50, 1)
-    """Noisy target actions per primitive in the softmax (SD3)."""
+    gamma: float = _bounded(0.5, 0.0, 1.0)  # Discount (VPG).
+    samples: int = _bounded(50, 1)  # Noisy target actions per primitive in the softmax (SD3).
 
     def check(self) -> None:
         _require(self.gamma < 1.0, "target.gamma: must be below 1")
@@ -413,26 +384,21 @@ class RewardConfig(Section, section="reward"):
     push_level = 0.0  # s_c of eq. 13, the push's level
     grasp_level = 1.0  # s_g of eq. 13, the grasp's level, which is s_max
 
-    success_bonus: float = 1.0
-    """r2 of eq. 11: the hand comes back with a block."""
+    success_bonus: float = 1.0  # r2 of eq. 11: the hand comes back with a block.
     distance_weight: float = _bounded(0.0, 0.0)
     """w: penalty per metre between the place and where the tips acted (eq. 10, sign turned)."""
-    eta: tuple[float, float] = (0.0, 1.0)
-    """eta_0 and eta_1 of eq. 13."""
+    eta: tuple[float, float] = (0.0, 1.0)  # eta_0 and eta_1 of eq. 13.
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
     push_effect: Literal["value", "change"] = "value"
     """What makes a push good: the best grasp gains value (eq. 16), or the map has changed (VPG)."""
-    push_levels: tuple[float, float] = (-1.0, 1.0)
-    """I_c of eq. 16: any other push, a good push."""
+    push_levels: tuple[float, float] = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = _bounded(0.0, 0.0)
     """Cost of an action after which a block has left the workspace for good (ours)."""
 
     def check(self) -> None:
-        _require(
-            list(self.grasp_levels) == sorted(self.grasp_levels),
-            "reward.grasp_levels: nothing <= empty <= touched <= dropped <= lifted is needed",
-        )
+        rising = list(self.grasp_levels) == sorted(self.grasp_levels)
+        _require(rising, "reward.grasp_levels: no level may be below the one before it")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -465,21 +431,18 @@ class LearnConfig(Section, section="learn"):
     """Adam's step size, actor head (ours)."""
     lr_final_fraction: float = _bounded(0.05, 0.0, 1.0, above=True)
     """Both step sizes fall linearly to this share of themselves over the run (ours)."""
-    batch: int = _bounded(32, 1)
-    """B, transitions per update (N of Algorithm 1)."""
+    batch: int = _bounded(32, 1)  # B, transitions per update (N of Algorithm 1).
     updates: int = _bounded(2, 1)
     """Critic updates per training step, that is, per `train.scenes` actions; the actor has one."""
     actor_batch: int = _bounded(0, 0)
-    """Transitions of the last batch that the actor's update is made on; 0: all."""
-    augment: bool = True
-    """Show each drawn transition under a random symmetry of the square."""
+    """Transitions of the last batch that the actor learns on; 0: all."""
+    augment: bool = True  # Show each drawn transition under a random symmetry of the square.
     augment_shift: int = _bounded(0, 0, 64)
     """Largest shift of a drawn transition along each axis, cells; none where that would cut
     something off."""
     critics: Literal[1, 2] = 1
     """Critics; of two, the lower Q counts in each cell (TD3's twin, arXiv:1802.09477)."""
-    actor: bool = True
-    """Learn the policy network; without it, mu(s) is read off the critic's own map."""
+    actor: bool = True  # Learn the policy network; without it, mu(s) is read off the critic's map.
     tau: float = _bounded(0.02, 0.0, 1.0, above=True)
     """Share of the online network in a target update (Algorithm 1 lines 24-26); 1 copies."""
     target_update_period: int = _bounded(1, 1)
@@ -497,8 +460,7 @@ class UniformReplay(Section, section="replay"):
 
     sampler: Literal["uniform"] = "uniform"
     """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
-    capacity: int = _bounded(4096, 2, 2**30)
-    """C, transitions kept."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -512,8 +474,7 @@ class PrioritisedReplay(Section, section="replay"):
 
     sampler: Literal["prioritised"] = "prioritised"
     """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
-    capacity: int = _bounded(4096, 2, 2**30)
-    """C, transitions kept."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -527,14 +488,13 @@ class BetaReplay(Section, section="replay"):
 
     sampler: Literal["beta"] = "beta"
     """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
-    capacity: int = _bounded(4096, 2, 2**30)
-    """C, transitions kept."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
     rank_by: Literal["error", "reward"] = "error"
     """Rank 0: the largest abs(TD error) (sec. 3.5) or reward (Algorithm 1 line 15)."""
     start: tuple[float, float] = _bounded((0.5, 0.5), 0.0, above=True)
     """(a, b) at first (CSAC sec. 4.3)."""
     middle: tuple[float, float] = _bounded((1.0, 1.0), 0.0, above=True)
-    """(a, b) on the way (CSAC sec. 3.5: uniform)."""
+    """(a, b) on the way (sec. 3.5: uniform)."""
     end: tuple[float, float] = _bounded((1.0, 12.0), 0.0, above=True)
     """(a, b) in the end (CSAC sec. 4.3)."""
 
@@ -546,16 +506,13 @@ ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay
 class TrainConfig(Section, section="train"):
     """Length and shape of a run."""
 
-    scenes: int = _bounded(8, 1)
-    """E, scenes simulated in parallel; each takes one action per training step."""
-    actions: int = _bounded(2000, 1)
-    """Actions of the whole run over all scenes."""
-    learning_starts: int = _bounded(64, 1)
-    """Actions before the first update."""
+    scenes: int = _bounded(8, 1)  # E, parallel scenes; each takes one action per training step.
+    actions: int = _bounded(2000, 1)  # Actions of the whole run over all scenes.
+    learning_starts: int = _bounded(64, 1)  # Actions before the first update.
     chunk: int = _bounded(10, 1)
     """Training steps in one call of the compiled program; between calls the host logs and saves."""
     save_every: int = _bounded(50, 1)
-    """Chunks between checkpoints; the last chunk and a stop are always saved."""
+    """Chunks between checkpoints; the last and a stop are always saved."""
 
     @property
     def steps(self) -> int:
@@ -571,15 +528,13 @@ ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(Section, section=""):
+class Config(Section):
     """A run: everything that decides its result."""
 
-    preset: str = "quick"
-    """Name of the preset that this config was made from."""
+    preset: str = "quick"  # Name of the preset that this config was made from.
     algo: str = "csac_beta"
     """Name of the algorithm that was asked for; what it is made of stands in the sections."""
-    seed: int = _bounded(0, 0, 2**31 - 1)
-    """Number that all randomness of the run follows from."""
+    seed: int = _bounded(0, 0, 2**31 - 1)  # Number that all randomness of the run follows from.
     scene: SceneConfig = SceneConfig()
     task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()
@@ -602,11 +557,8 @@ class Config(Section, section=""):
         A dict changes fields of a section, `{"sampler": "uniform"}` its alternative; settings that
         both alternatives have are kept. Raises ValueError for an unknown name or a bad value.
         """
-        for name in sections:
-            _require(name in _names(self), f"{name}: unknown setting")
-        return dataclasses.replace(
-            self, **{name: _changed(getattr(self, name), value) for name, value in sections.items()}
-        )
+        values = {name: _changed(getattr(self, name, None), new) for name, new in sections.items()}
+        return _replaced(self, values)
 
     def check(self) -> None:
         """Raises ValueError for sections that do not fit one another."""
@@ -648,25 +600,34 @@ class Config(Section, section=""):
 
 def _changed(section: Any, value: Any) -> Any:
     """A section with the fields of a dict, maybe of another alternative; else `value` itself."""
-    if not isinstance(value, dict):
+    if not isinstance(value, dict) or not isinstance(section, Section):
         return value
     tag, _ = ALTERNATIVES.get(section.SECTION, ("", ()))
-    if value.get(tag, getattr(section, tag, None)) != getattr(section, tag, None):
-        section = alternative(section, value[tag])
-    for name in value:
-        _require(name in _names(section), f"{section.SECTION}.{name}: unknown setting")
-    return dataclasses.replace(section, **value)
+    return _replaced(alternative(section, value[tag]) if tag in value else section, value)
+
+
+def _replaced(section: Any, values: dict[str, Any]) -> Any:
+    for name in values:
+        known = name in names(section)
+        _require(known, f"{section.SECTION}.{name}: unknown setting".lstrip("."))
+    return dataclasses.replace(section, **values)
 
 
 def alternative(section: Any, choice: str) -> Any:
     """The alternative of that name, with what it shares with `section`."""
-    tag, kinds = ALTERNATIVES[section.SECTION]
-    named = {kind.__dataclass_fields__[tag].default: kind for kind in typing.cast(Any, kinds)}
-    listed = ", ".join(named)
-    _require(choice in named, f"{section.SECTION}.{tag}: {choice!r} is not one of: {listed}")
-    shared = (_names(named[choice]) & _names(section)) - {tag}
-    return named[choice](**{name: getattr(section, name) for name in shared})
+    kind = alternative_kind(section.SECTION, choice)
+    shared = names(kind) & names(section) - {ALTERNATIVES[section.SECTION][0]}
+    return kind(**{name: getattr(section, name) for name in shared})
 
 
-def _names(section: Any) -> set[str]:
+def alternative_kind(section: str, choice: Any) -> Any:
+    """Class of the alternative of that name. Raises ValueError for an unknown one."""
+    tag, kinds = ALTERNATIVES[section]
+    choices = [getattr(kind, tag) for kind in kinds]
+    _require(choice in choices, f"{section}.{tag}: {choice!r} is not one of: {', '.join(choices)}")
+    return kinds[choices.index(choice)]
+
+
+def names(section: Any) -> set[str]:
+    """Names of the settings of a section or of its class."""
     return {field.name for field in dataclasses.fields(section)}

@@ -1,10 +1,9 @@
 """PRESET and settings on the command line -> Config; what `train`, `sweep` and `doctor` share."""
 
-import ast
 import dataclasses
 import functools
 import inspect
-import itertools
+import re
 import textwrap
 import typing
 from collections.abc import Sequence
@@ -127,11 +126,7 @@ def _print_row(name: str, value: Any, text: str) -> None:
 
 @functools.cache
 def _docs(kind: Any) -> dict[str, str]:
-    """The text below each field of a dataclass, in one line."""
-    tree = ast.parse(inspect.getsource(kind))
-    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
-    docs = {}
-    for field, text in itertools.pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-            docs[ast.unparse(field.target)] = " ".join(ast.literal_eval(text.value).split())
-    return docs
+    """The text beside or below each field of a dataclass, in one line."""
+    field = r'^    (\w+): .*(?:  # (.*)|\n    """([^"]*)""")$'
+    found = re.findall(field, inspect.getsource(kind), re.MULTILINE)
+    return {name: " ".join((beside or below).split()) for name, beside, below in found}
