@@ -1,7 +1,6 @@
 """The processes of one sweep on several hosts, each with the devices of its own host, in one mesh.
 
-Every process runs the same command. All compute and save; the first alone logs. All of them must
-see the sweep's folder.
+Every process runs the same command and sees the sweep's folder; the first alone logs.
 """
 
 from typing import NamedTuple
@@ -36,12 +35,10 @@ def is_first() -> bool:
 
 
 def agree(signal: int | None) -> int | None:
-    """The largest number of a signal that any process has seen, None if there is none. All must
-    call it."""
+    """The largest signal that any process has seen, None if there is none. All must call it."""
     if jax.process_count() == 1:
         return signal
-    seen = multihost_utils.process_allgather(np.int32(signal or 0))
-    return int(np.max(seen)) or None
+    return int(np.max(multihost_utils.process_allgather(np.int32(signal or 0)))) or None
 
 
 def wait(name: str) -> None:
