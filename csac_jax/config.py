@@ -29,14 +29,17 @@ def _require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(_bounded,))
 class Section:
-    """A group of settings: choices and bounds of its fields are checked when it is built."""
+    """A group of settings, each a frozen dataclass: choices and bounds of its fields are checked
+    when it is built."""
 
     SECTION: ClassVar[str] = ""  # its name in `Config`
     __pydantic_config__: ClassVar[Any] = {"extra": "forbid"}  # unknown keys of a file
 
     def __init_subclass__(cls, section: str | None = None) -> None:
         cls.SECTION = cls.SECTION if section is None else section
+        dataclasses.dataclass(frozen=True)(cls)
 
     def __post_init__(self) -> None:
         if not _is_plain(self):
@@ -75,7 +78,6 @@ def _fault(field: Any, value: Any) -> str | None:
     return f"{span}, not {value}"
 
 
-@dataclasses.dataclass(frozen=True)
 class SceneConfig(Section, section="scene"):
     """What lies on the table."""
 
@@ -83,12 +85,9 @@ class SceneConfig(Section, section="scene"):
 
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
     """Kind of each block slot; a box slot draws a cube, cuboid, plank or tile in every scene."""
-    min_blocks: int = _bounded(5, 1)
-    """Fewest blocks in play in a scene; the most: the number of slots."""
-    pool: int = _bounded(1024, 1)
-    """Pre-settled scenes that episodes are sampled from, per block count."""
-    arranged: float = _bounded(0.0, 0.0, 1.0)
-    """Share of scenes that are packed; the others are dropped."""
+    min_blocks: int = _bounded(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
+    pool: int = _bounded(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
+    arranged: float = _bounded(0.0, 0.0, 1.0)  # Share of packed scenes; the others are dropped.
     size_jitter: tuple[float, float] = _bounded((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of block sizes between scenes: boxes and arches, and the other kinds.
     The latter are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
@@ -98,8 +97,7 @@ class SceneConfig(Section, section="scene"):
     """Range of the sliding friction between blocks and table."""
     drop_extent: tuple[float, float] = _bounded((0.248, 0.248), 0.05, 0.448)
     """Range of the side of the square that blocks are dropped in, m (VPG: 0.248)."""
-    settle_time: float = _bounded(2.5, 0.5, 20.0)
-    """Time that blocks have to come to rest, s (ours)."""
+    settle_time: float = _bounded(2.5, 0.5, 20.0)  # Time for blocks to come to rest, s (ours).
 
     def check(self) -> None:
         most = len(self.slots)
@@ -110,7 +108,6 @@ class SceneConfig(Section, section="scene"):
             _require(low <= high, f"scene.{name}: low <= high is needed")
 
 
-@dataclasses.dataclass(frozen=True)
 class TaskConfig(Section, section="task"):
     """What an episode asks for, and when it is cut off."""
 
@@ -121,7 +118,6 @@ class TaskConfig(Section, section="task"):
     max_actions: int = _bounded(15, 1)  # Actions after which an episode is cut off.
 
 
-@dataclasses.dataclass(frozen=True)
 class SimConfig(Section, section="sim"):
     """Physics and the two motion primitives; both primitives take `substeps` physics steps."""
 
@@ -139,12 +135,10 @@ class SimConfig(Section, section="sim"):
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
     `warp` on one CUDA device where it is known to be faster, else `mjx`."""
-    robot: RobotKind = "hand"
-    """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
+    robot: RobotKind = "hand"  # `hand`: the RG2 alone, floating, for training. `ur5`: on the arm.
     grasp_phases: tuple[int, int, int] = _bounded((60, 50, 80), 1)
     """Substeps of a grasp: descend, close the fingers, lift."""
-    geom_pairs: int = _bounded(12, 1)
-    """Pairs of geoms that MJX examines per collision function, nearest first."""
+    geom_pairs: int = _bounded(12, 1)  # Geom pairs examined per collision function, nearest first.
     contacts: int = _bounded(48, 1)  # Contacts that MJX keeps per step, deepest first.
 
     @property
@@ -159,18 +153,15 @@ class SimConfig(Section, section="sim"):
         return vertical, self.substeps - 2 * vertical, vertical
 
 
-@dataclasses.dataclass(frozen=True)
 class CameraConfig(Section, section="camera"):
     """A pinhole camera; pixel centres are whole numbers. The default is VPG's."""
 
     size: tuple[int, int] = _bounded((640, 480), 8, 4096)
     """Width and height of the image that `focal` and `centre` belong to, px."""
     focal: tuple[float, float] = (618.62, 618.62)  # Focal lengths along width and height, px.
-    centre: tuple[float, float] = (319.5, 239.5)
-    """Where the optical axis meets the image, from the left and from the top, px."""
+    centre: tuple[float, float] = (319.5, 239.5)  # Optical axis in the image, from left, top, px.
     position: tuple[float, float, float] = (-0.5, 0.0, 0.5)  # Where the camera stands, m.
-    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Point in the middle of the view, m; the image is level."""
+    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # What the level view is centred on, m.
 
     def scaled(self, share: float) -> "CameraConfig":
         """The same view with fewer pixels: half of VPG's fill a height map of 64 cells.
@@ -200,7 +191,6 @@ class CameraConfig(Section, section="camera"):
         _require(apart, "camera.position: must not stand straight above or below camera.look_at")
 
 
-@dataclasses.dataclass(frozen=True)
 class SensorConfig(Section, section="sensor"):
     """Errors of a real depth camera; all 0: none, at no cost.
 
@@ -222,7 +212,6 @@ class SensorConfig(Section, section="sensor"):
         return self != SensorConfig()
 
 
-@dataclasses.dataclass(frozen=True)
 class HeightmapConfig(Section, section="heightmap"):
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 
@@ -241,7 +230,6 @@ class HeightmapConfig(Section, section="heightmap"):
         _require(self.size % 8 == 0, "heightmap.size: must be a multiple of 8")
 
 
-@dataclasses.dataclass(frozen=True)
 class SmallNet(Section, section="net"):
     """Densely connected convolutions with group norm, at 1/`stride` of the map's size (ours)."""
 
@@ -254,13 +242,10 @@ class SmallNet(Section, section="net"):
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
     head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
     growth: int = _bounded(24, 4)  # Channels that each dense layer adds.
-    dilations: tuple[int, ...] = _bounded((1, 2, 4, 1), 1)
-    """Dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
+    dilations: tuple[int, ...] = _bounded((1, 2, 4, 1), 1)  # Dilation of each dense layer, 3 x 3.
     stem: int = _bounded(16, 4)  # Channels of the first convolution.
-    stride: Literal[2, 4] = 2
-    """Cells of the input per cell of the features, along each axis: 4 is a quarter of the work."""
-    subcells: Literal[1, 2, 4] = 1
-    """Cells of the maps per cell of the features, along each axis, at most `stride`."""
+    stride: Literal[2, 4] = 2  # Input cells per feature cell, each axis; 4: a quarter of the work.
+    subcells: Literal[1, 2, 4] = 1  # Map cells per feature cell, along each axis; at most `stride`.
 
     def check(self) -> None:
         _require(len(self.dilations) >= 1, "net.dilations: at least one layer")
@@ -275,7 +260,6 @@ class SmallNet(Section, section="net"):
         )
 
 
-@dataclasses.dataclass(frozen=True)
 class DenseNet121(Section, section="net"):
     """The paper's network (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/32
     of the resolution of its input."""
@@ -324,7 +308,6 @@ def canvas_size(size: int, margin: float) -> int:
     return round(size * (1 + margin) / 2) * 2
 
 
-@dataclasses.dataclass(frozen=True)
 class CEMConfig(Section, section="cem"):
     """Cross-entropy method over (x, y, yaw), Algorithm 1 lines 8-13; QT-Opt, arXiv:1806.10293."""
 
@@ -346,7 +329,6 @@ class CEMConfig(Section, section="cem"):
         _require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
 
 
-@dataclasses.dataclass(frozen=True)
 class PolicyConfig(Section, section="policy"):
     """How an action is chosen from the dense maps."""
 
@@ -357,7 +339,6 @@ class PolicyConfig(Section, section="policy"):
     grasp (CSAC sec. 3.4); or always a grasp."""
 
 
-@dataclasses.dataclass(frozen=True)
 class TargetConfig(Section, section="target"):
     """TD target, eq. 9 and Algorithm 1 lines 17-19, softmax as in SD3 (arXiv:2010.09177)."""
 
@@ -375,7 +356,6 @@ class TargetConfig(Section, section="target"):
         _require(self.gamma < 1.0, "target.gamma: must be below 1")
 
 
-@dataclasses.dataclass(frozen=True)
 class RewardConfig(Section, section="reward"):
     """Rewards, CSAC eqs. 10-16."""
 
@@ -401,7 +381,6 @@ class RewardConfig(Section, section="reward"):
         _require(rising, "reward.grasp_levels: no level may be below the one before it")
 
 
-@dataclasses.dataclass(frozen=True)
 class ExploreConfig(Section, section="explore"):
     """Exploration: action noise (Algorithm 1 line 13), random primitive, random place."""
 
@@ -418,7 +397,6 @@ class ExploreConfig(Section, section="explore"):
     """Share of pushes among random primitives (ours)."""
 
 
-@dataclasses.dataclass(frozen=True)
 class LearnConfig(Section, section="learn"):
     """Losses and optimiser."""
 
@@ -432,21 +410,17 @@ class LearnConfig(Section, section="learn"):
     lr_final_fraction: float = _bounded(0.05, 0.0, 1.0, above=True)
     """Both step sizes fall linearly to this share of themselves over the run (ours)."""
     batch: int = _bounded(32, 1)  # B, transitions per update (N of Algorithm 1).
-    updates: int = _bounded(2, 1)
-    """Critic updates per training step, that is, per `train.scenes` actions; the actor has one."""
-    actor_batch: int = _bounded(0, 0)
-    """Transitions of the last batch that the actor learns on; 0: all."""
+    updates: int = _bounded(2, 1)  # Critic updates per `train.scenes` actions; the actor has one.
+    actor_batch: int = _bounded(0, 0)  # Part of the last batch that the actor learns on; 0: all.
     augment: bool = True  # Show each drawn transition under a random symmetry of the square.
     augment_shift: int = _bounded(0, 0, 64)
     """Largest shift of a drawn transition along each axis, cells; none where that would cut
     something off."""
-    critics: Literal[1, 2] = 1
-    """Critics; of two, the lower Q counts in each cell (TD3's twin, arXiv:1802.09477)."""
+    critics: Literal[1, 2] = 1  # Of two, each cell's lower Q counts (TD3's twin, arXiv:1802.09477).
     actor: bool = True  # Learn the policy network; without it, mu(s) is read off the critic's map.
     tau: float = _bounded(0.02, 0.0, 1.0, above=True)
     """Share of the online network in a target update (Algorithm 1 lines 24-26); 1 copies."""
-    target_update_period: int = _bounded(1, 1)
-    """C, critic updates between two updates of the targets (sec. 3.4 copies every C)."""
+    target_update_period: int = _bounded(1, 1)  # C of sec. 3.4, critic updates per target update.
     loss: Literal["huber", "squared"] = "huber"
     """Of the TD error: Huber (CSAC sec. 4) or squared (Algorithm 1 line 21)."""
 
@@ -454,7 +428,6 @@ class LearnConfig(Section, section="learn"):
         _require(self.actor_batch <= self.batch, "learn.actor_batch: must not exceed learn.batch")
 
 
-@dataclasses.dataclass(frozen=True)
 class UniformReplay(Section, section="replay"):
     """CSAC's replay: all transitions are equally likely."""
 
@@ -463,7 +436,6 @@ class UniformReplay(Section, section="replay"):
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
-@dataclasses.dataclass(frozen=True)
 class PrioritisedReplay(Section, section="replay"):
     """CSAC-PER's replay: probability ~ (abs(TD error) + epsilon)^alpha, losses weighted against it
     (Schaul et al., arXiv:1511.05952)."""
@@ -477,7 +449,6 @@ class PrioritisedReplay(Section, section="replay"):
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
-@dataclasses.dataclass(frozen=True)
 class BetaReplay(Section, section="replay"):
     """CSAC-beta's replay: ranks by abs(TD error), rank / n ~ Beta(a, b), CSAC sec. 3.5.
 
@@ -502,17 +473,14 @@ class BetaReplay(Section, section="replay"):
 ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay
 
 
-@dataclasses.dataclass(frozen=True)
 class TrainConfig(Section, section="train"):
     """Length and shape of a run."""
 
     scenes: int = _bounded(8, 1)  # E, parallel scenes; each takes one action per training step.
     actions: int = _bounded(2000, 1)  # Actions of the whole run over all scenes.
     learning_starts: int = _bounded(64, 1)  # Actions before the first update.
-    chunk: int = _bounded(10, 1)
-    """Training steps in one call of the compiled program; between calls the host logs and saves."""
-    save_every: int = _bounded(50, 1)
-    """Chunks between checkpoints; the last and a stop are always saved."""
+    chunk: int = _bounded(10, 1)  # Training steps per compiled call; the host logs between calls.
+    save_every: int = _bounded(50, 1)  # Chunks per checkpoint; the last and a stop always save.
 
     @property
     def steps(self) -> int:
@@ -527,13 +495,11 @@ ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
 """Sections that are unions: the field that names the alternative, and the alternatives."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Config(Section):
     """A run: everything that decides its result."""
 
     preset: str = "quick"  # Name of the preset that this config was made from.
-    algo: str = "csac_beta"
-    """Name of the algorithm that was asked for; what it is made of stands in the sections."""
+    algo: str = "csac_beta"  # Algorithm that was asked for; the sections say what it is made of.
     seed: int = _bounded(0, 0, 2**31 - 1)  # Number that all randomness of the run follows from.
     scene: SceneConfig = SceneConfig()
     task: TaskConfig = TaskConfig()
