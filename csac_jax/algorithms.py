@@ -88,9 +88,7 @@ ALGORITHMS: dict[str, Algorithm] = {
 
 def register(name: str, algorithm: Algorithm) -> None:
     """Makes `algorithm`, a function from a config to a config, known as `name` to API and commands.
-
-    Raises ValueError if the name is taken.
-    """
+    Raises ValueError if the name is taken."""
     if name in ALGORITHMS:
         raise ValueError(f"algorithm '{name}' exists; choose another name")
     ALGORITHMS[name] = algorithm

@@ -156,10 +156,8 @@ def run_sweep(
 
 
 def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
-    """What puts the networks of `source`, see `train`, into a learner's first state.
-
-    Raises SettingsError where they are not those of the config.
-    """
+    """What puts the networks of `source`, see `train`, into a learner's first state. Raises
+    SettingsError where they are not those of the config."""
     if source is None:
         return None
     if isinstance(cfg.net, DenseNet121) and _is_weights(source):

@@ -254,15 +254,11 @@ class SmallNet(Section, section="net"):
     def check_canvas(self, size: int) -> None:
         """Raises ValueError if the strides do not divide the rotated maps of `size` cells."""
         side = canvas_size(size, self.margin)
-        _require(
-            side % 4 == 0,
-            f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little",
-        )
+        _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4")
 
 
 class DenseNet121(Section, section="net"):
-    """The paper's network (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/32
-    of the resolution of its input."""
+    """The paper's (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/32."""
 
     dtype = SmallNet.dtype
     block_growth = 32  # channels that each dense layer adds (Huang et al., table 1)
@@ -335,8 +331,7 @@ class PolicyConfig(Section, section="policy"):
     place: Literal["cem", "argmax"] = "cem"
     """Where: by the cross-entropy method, between cells and yaws, or the best cell (VPG)."""
     primitive: Literal["argmax", "rule", "grasp"] = "argmax"
-    """Which primitive: that of larger value; a push after an action without visible change, else a
-    grasp (CSAC sec. 3.4); or always a grasp."""
+    """That of larger value; a push after no visible change, else a grasp (sec. 3.4); a grasp."""
 
 
 class TargetConfig(Section, section="target"):
@@ -347,8 +342,7 @@ class TargetConfig(Section, section="target"):
     clip = 0.5  # bound of that noise (SD3)
 
     value: Literal["softmax", "max"] = "softmax"
-    """V(s'): softmax over noisy target actions (line 17), or its limit, the largest value of the
-    dense map (eq. 9)."""
+    """V(s'): softmax over noisy target actions (line 17), or the dense map's maximum (eq. 9)."""
     gamma: float = _bounded(0.5, 0.0, 1.0)  # Discount (VPG).
     samples: int = _bounded(50, 1)  # Noisy target actions per primitive in the softmax (SD3).
 
@@ -414,8 +408,7 @@ class LearnConfig(Section, section="learn"):
     actor_batch: int = _bounded(0, 0)  # Part of the last batch that the actor learns on; 0: all.
     augment: bool = True  # Show each drawn transition under a random symmetry of the square.
     augment_shift: int = _bounded(0, 0, 64)
-    """Largest shift of a drawn transition along each axis, cells; none where that would cut
-    something off."""
+    """Largest shift of a drawn transition along each axis, cells; none that would cut it off."""
     critics: Literal[1, 2] = 1  # Of two, each cell's lower Q counts (TD3's twin, arXiv:1802.09477).
     actor: bool = True  # Learn the policy network; without it, mu(s) is read off the critic's map.
     tau: float = _bounded(0.02, 0.0, 1.0, above=True)
@@ -528,40 +521,28 @@ class Config(Section):
 
     def check(self) -> None:
         """Raises ValueError for sections that do not fit one another."""
-        _require(
-            self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0,
-            "explore.push_fraction: must be 0 where policy.primitive is grasp, which never pushes",
-        )
+        may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
+        _require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
         batch, starts = self.learn.batch, self.train.learning_starts
         _require(
             batch <= starts,
             f"learn.batch: {batch} transitions cannot be drawn after train.learning_starts = "
             f"{starts}; raise train.learning_starts or lower learn.batch",
         )
-        _require(
-            max(self.train.scenes, batch) <= self.replay.capacity,
-            "replay.capacity: must hold train.scenes and learn.batch transitions",
-        )
-        _require(
-            self.heightmap.view == "oblique" or self.sensor.pose_noise == (0.0, 0.0),
-            "sensor.pose_noise: must be 0 where heightmap.view is ortho, which has no camera",
-        )
+        holds = max(self.train.scenes, batch) <= self.replay.capacity
+        _require(holds, "replay.capacity: must hold train.scenes and learn.batch transitions")
+        has_camera = self.heightmap.view == "oblique" or self.sensor.pose_noise == (0.0, 0.0)
+        _require(has_camera, "sensor.pose_noise: must be 0 where heightmap.view is ortho")
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         _require(rotations % 2 == 0, "net.rotations: must be even")
         _require(rotations <= most, f"net.rotations: at most {most} for heightmap.size {size}")
         self.net.check_canvas(size)
         if self.sim.physics == "warp":
-            meshes = set(MESH_KINDS) & set(self.scene.slots)
-            _require(
-                self.scene.size_jitter[1] == 0.0 or not meshes,
-                "scene.size_jitter: the second must be 0 where sim.physics is warp, whose meshes "
-                "have one size in all scenes",
-            )
-            _require(
-                self.train.scenes <= WARP_WORLDS,
-                f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp",
-            )
+            alike = self.scene.size_jitter[1] == 0.0 or not set(MESH_KINDS) & set(self.scene.slots)
+            _require(alike, "scene.size_jitter: the second must be 0 where sim.physics is warp")
+            few = self.train.scenes <= WARP_WORLDS
+            _require(few, f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp")
 
 
 def _changed(section: Any, value: Any) -> Any:

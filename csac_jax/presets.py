@@ -22,7 +22,7 @@ PROTOCOL = TEN_BLOCKS.change(
     replay={"capacity": 2500},
     train={"scenes": 1, "actions": 2500, "learning_starts": 32, "chunk": 50, "save_every": 10},
 )
-"""The paper's: 2,500 actions in one scene; C's physics are the fastest for one."""
+"""The paper's: one scene of ten blocks, 2,500 actions. C's physics are the fastest for one."""
 WIDE_NET = {
     "stride": 4,
     "subcells": 4,
@@ -36,11 +36,10 @@ WIDE_NET = {
 def quick() -> Config:
     """Learns to clear five blocks on a 2-core CPU; what was measured is in experiments/results.
 
-    Blocks of one shape are alike in size, density and friction. Its discount and the end of its
-    Beta law, (1, 4), are away from the literature's defaults; neither is shown to be needed. What
-    it costs: docs/benchmarks/speed-cpu.md. The actor learns on a part of the batch, which spares
-    passes; the net's features lie 28 mm apart, not 14, for cheaper passes, its maps' cells still
-    14, and its layers see as far.
+    Blocks of one shape are alike in size, density and friction. Discount and the end of the Beta
+    law are not the literature's; neither is shown to be needed. For cheaper passes the actor learns
+    on a part of the batch, and the net's features lie 28 mm apart, not 14; its maps' cells still
+    14, and its layers see as far. What it costs: docs/benchmarks/speed-cpu.md.
     """
     net = {"stride": 4, "subcells": 2, "dilations": (1, 2, 1), "stem": 32, "growth": 32, "head": 48}
     return Config().change(
@@ -55,13 +54,12 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, three quarters of the scenes packed, 2,048 side by side, for
-    one GPU.
+    """Ten blocks of all eight shapes, most scenes packed, 2,048 side by side, for one GPU.
 
     Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A
-    failed grasp costs more than a push that is not worth it, half of the random primitives are
-    pushes, and blocks that leave cost. Physics is Warp's where it is installed, hence meshes are of
-    one size. What it learns so, and otherwise: docs/benchmarks/learning-ablations.md.
+    failed grasp costs more than a poor push, half of the random primitives are pushes, and blocks
+    that leave cost. Physics is Warp's where it is installed, hence meshes are of one size.
+    What it learns so, and otherwise: docs/benchmarks/learning-ablations.md.
     """
     packed = {"pool": 4096, "arranged": 0.75, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)}
     length = {"actions": 163840, "learning_starts": 4096, "chunk": 2, "save_every": 20}
@@ -80,8 +78,7 @@ def fast() -> Config:
 
 
 def paper() -> Config:
-    """The protocol of the paper, for one GPU: DenseNet-121 on maps of 224 cells, one scene, 2,500
-    actions, ten blocks.
+    """The protocol of the paper, for one GPU, with DenseNet-121 on maps of 224 cells.
 
     Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per
     action; places are explored by action noise alone, and nothing is augmented. Where the paper is
@@ -103,13 +100,12 @@ def paper() -> Config:
 
 
 def paper_small() -> Config:
-    """The protocol of `paper` with the small net on maps of 64 cells: one scene of ten blocks,
-    2,500 actions.
+    """The protocol of `paper` with the small net on maps of 64 cells.
 
-    Ours, beside the net: batches of 32, and with them Adam 1e-3; no more than one update an action,
-    and shifts of what is drawn from the replay, lest 2,500 actions be learned by heart; the squared
-    error of Algorithm 1 line 21; discount 0.2; SD3's twin critics; random places at first and
-    exploration that ends after some 1,000 actions, as in `quick`. Meshes are of one size, which
+    Also ours: batches of 32, and with them Adam 1e-3; one update an action, and shifts of what is
+    drawn from the replay, so that 2,500 actions are not learned by heart; the squared error of
+    Algorithm 1 line 21; discount 0.2; SD3's twin critics; random places at first, and exploration
+    that ends after some 1,000 actions, as in `quick`. Meshes are of one size, which
     `sim.physics warp` needs. What each is worth: docs/benchmarks/learning-ablations.md;
     results: experiments/results/paper_small.
     """
@@ -147,9 +143,7 @@ PRESETS: dict[str, Preset] = {
 
 def register(name: str, preset: Preset) -> None:
     """Makes `preset`, a function that returns a config, known as `name` to API and commands.
-
-    Raises ValueError if the name is taken.
-    """
+    Raises ValueError if the name is taken."""
     if name in PRESETS:
         raise ValueError(f"preset '{name}' exists; choose another name")
     PRESETS[name] = preset

@@ -5,9 +5,8 @@
     RUN/checkpoints/STEP/manifest.sha256  digest of every file above, written last
 
 Orbax makes a step's folder appear all at once, but restores flipped bits and casts other dtypes
-without a word. So every file is checked against the manifest, and every leaf's shape and dtype
-against what the program expects. A step that fails is an error, never a reason to go back to an
-older one silently.
+silently. So every file is checked against the manifest, and every leaf's shape and dtype against
+what the program expects. A step that fails is an error, never a reason to take an older one.
 """
 
 import hashlib
@@ -29,8 +28,7 @@ KEPT = 2
 
 
 class CheckpointError(Exception):
-    """A checkpoint that is missing, damaged or made for another program; the message is one line
-    with the remedy."""
+    """A checkpoint that is missing, damaged or another program's; the message has the remedy."""
 
 
 def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any]) -> Path:

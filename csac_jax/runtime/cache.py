@@ -50,10 +50,8 @@ def enable() -> Path | None:
 
 
 def _date_entries(folder: Path) -> None:
-    """Gives entries without a time of last use the oldest one; JAX fails on them.
-
-    There are some where a process was killed, or where the cache had no limit.
-    """
+    """Gives entries without a time of last use, which a killed process leaves, the oldest one: JAX
+    fails on them."""
     for entry in folder.glob("*-cache"):
         last_use = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
         if not last_use.exists():
