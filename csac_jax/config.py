@@ -29,7 +29,7 @@ def _require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
-@typing.dataclass_transform(frozen_default=True, field_specifiers=(_bounded,))
+@typing.dataclass_transform(frozen_default=True)
 class Section:
     """A group of settings, each a frozen dataclass: choices and bounds of its fields are checked
     when it is built."""

@@ -65,7 +65,7 @@ def has_library() -> bool:
     shapes = ((1, 8, 8, 40), (3, 3, 40, 24))
     maps, kernel = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
     try:
-        program = jax.jit(lambda *given: conv2d(*given, 1, 1, 1), compiler_options=LIBRARY)
+        program = jax.jit(lambda m, k: conv2d(m, k, 1, 1, 1), compiler_options=LIBRARY)
         got = np.asarray(program(maps, kernel))
     except jax.errors.JaxRuntimeError:
         return False
