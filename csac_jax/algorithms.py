@@ -5,7 +5,6 @@ stay the preset's, so that two algorithms on one preset differ in nothing else. 
 the table of what differs. `register` adds an algorithm of your own.
 """
 
-import dataclasses
 import difflib
 from collections.abc import Callable, Iterable
 
@@ -23,27 +22,28 @@ VPG_REWARD = RewardConfig(
 changes the map."""
 
 
-def _csac(cfg: Config) -> Config:
-    return cfg.change(
-        policy={"place": "cem", "primitive": "argmax"},
-        target={"value": "softmax"},
-        learn={"actor": True},
-    )
-
-
 def csac(cfg: Config) -> Config:
     """Continuous pose by CEM, softmax target, actor; all transitions are equally likely."""
-    return _csac(cfg).change(replay={"sampler": "uniform"})
+    return _csac(cfg, "uniform")
 
 
 def csac_per(cfg: Config) -> Config:
     """CSAC with prioritised replay."""
-    return _csac(cfg).change(replay={"sampler": "prioritised"})
+    return _csac(cfg, "prioritised")
 
 
 def csac_beta(cfg: Config) -> Config:
     """CSAC with beta-ranked replay, sec. 3.5; the law of the ranks is the preset's."""
-    return _csac(cfg).change(replay={"sampler": "beta"})
+    return _csac(cfg, "beta")
+
+
+def _csac(cfg: Config, sampler: str) -> Config:
+    return cfg.change(
+        policy={"place": "cem", "primitive": "argmax"},
+        target={"value": "softmax"},
+        learn={"actor": True},
+        replay={"sampler": sampler},
+    )
 
 
 def vpg(cfg: Config) -> Config:
@@ -53,18 +53,13 @@ def vpg(cfg: Config) -> Config:
     Deviations: Adam for SGD with momentum, batches for single transitions, random places while
     learning as for all.
     """
+    learn = {"actor": False, "critics": 1, "loss": "huber", "tau": 1.0, "target_update_period": 1}
     return cfg.change(
         reward=VPG_REWARD,
         policy={"place": "argmax", "primitive": "argmax"},
         target={"value": "max", "gamma": 0.5},
         explore={"noise_std": 0.0, "epsilon_primitive": (0.5, 0.1), "push_fraction": 0.5},
-        learn={
-            "actor": False,
-            "critics": 1,
-            "loss": "huber",
-            "tau": 1.0,
-            "target_update_period": 1,
-        },
+        learn=learn,
         replay={"sampler": "beta", "start": (1.0, 2.0), "middle": (1.0, 2.0), "end": (1.0, 2.0)},
     )
 
@@ -78,8 +73,7 @@ def reactive(cfg: Config) -> Config:
 
 
 def grasp_only(cfg: Config) -> Config:
-    """The baseline Grasping-only of CSAC sec. 4.1 and VPG: greedy, deterministic, never pushes, no
-    future.
+    """The baseline Grasping-only of CSAC sec. 4.1 and VPG: greedy, never pushes, no future.
 
     Deviation: as of `reactive`.
     """
@@ -87,20 +81,14 @@ def grasp_only(cfg: Config) -> Config:
 
 
 ALGORITHMS: dict[str, Algorithm] = {
-    "csac": csac,
-    "csac_per": csac_per,
-    "csac_beta": csac_beta,
-    "vpg": vpg,
-    "grasp_only": grasp_only,
-    "reactive": reactive,
+    algorithm.__name__: algorithm
+    for algorithm in (csac, csac_per, csac_beta, vpg, grasp_only, reactive)
 }
 
 
 def register(name: str, algorithm: Algorithm) -> None:
     """Makes `algorithm`, a function from a config to a config, known as `name` to API and commands.
-
-    Raises ValueError if the name is taken.
-    """
+    Raises ValueError if the name is taken."""
     if name in ALGORITHMS:
         raise ValueError(f"algorithm '{name}' exists; choose another name")
     ALGORITHMS[name] = algorithm
@@ -110,7 +98,7 @@ def configure(cfg: Config, name: str) -> Config:
     """The config made one of the algorithm `name`. Raises ValueError for an unknown name."""
     if name not in ALGORITHMS:
         raise ValueError(unknown("algorithm", name, ALGORITHMS))
-    return dataclasses.replace(ALGORITHMS[name](cfg), algo=name)
+    return ALGORITHMS[name](cfg).change(algo=name)
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 from rich.console import Console
 
 from csac_jax import algorithms
@@ -16,7 +15,7 @@ from csac_jax.config import Config, DenseNet121
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import policies, rollout
 from csac_jax.evaluation.policies import LearnedPolicy, Policy
-from csac_jax.io import policy_file, weights
+from csac_jax.io import leaves, policy_file, weights
 from csac_jax.replay.samplers import Sampler
 from csac_jax.report.progress import Reporters, Terminal
 from csac_jax.runtime import cache, cluster, provenance, signals
@@ -79,7 +78,11 @@ def train(
     start = starting(cfg, init)
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
-        terminal.say(_first_line(folder, cfg))
+        scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
+        terminal.say(
+            f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "
+            f"physics {cfg.sim.physics}, on {provenance.device()}"
+        )
         program = step.make(cfg, learner=learner, sampler=sampler, network=network)
 
         def first_state() -> step.TrainState:
@@ -95,8 +98,7 @@ def train(
             stop or signals.Stop(),
             resume=resume,
         )
-    own = {"network": network, "learner": learner}
-    return Run(folder, cfg, summary, own)
+    return Run(folder, cfg, summary, {"network": network, "learner": learner})
 
 
 def sweep(
@@ -120,9 +122,7 @@ def sweep(
     """
     points = _points(cfg, dict(vary or {}))
     runs = seeds * len(points)
-    points = [
-        point._replace(cfg=backend.resolve(point.cfg, devices or 1, runs)) for point in points
-    ]
+    points = [one._replace(cfg=backend.resolve(one.cfg, devices or 1, runs)) for one in points]
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
     plan = SweepPlan(seeds, points)
     return run_sweep(plan, folder, devices, shard, init, verbose, stop or signals.Stop()).summary
@@ -156,10 +156,8 @@ def run_sweep(
 
 
 def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
-    """What puts the networks of `source`, see `train`, into a learner's first state.
-
-    Raises SettingsError where they are not those of the config.
-    """
+    """What puts the networks of `source`, see `train`, into a learner's first state. Raises
+    SettingsError where they are not those of the config."""
     if source is None:
         return None
     if isinstance(cfg.net, DenseNet121) and _is_weights(source):
@@ -167,8 +165,7 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
         return lambda state: actor_critic.with_trunk(state, trunk)
     policy = policies.load(source)
     assert isinstance(policy, LearnedPolicy)
-    wanted = actor_critic.abstract_params(cfg)
-    if _layout(policy.params) != _layout(wanted):
+    if leaves.layout(policy.params) != leaves.layout(actor_critic.abstract_params(cfg)):
         raise SettingsError(
             f"--init {source}: its networks are not those of these settings; "
             "leave out --net, --learn.critics and --task.kind"
@@ -192,17 +189,16 @@ def new_folder(name: str) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
-class _Callback:
+class _Callback(NamedTuple):
     """A function of records as a reporter."""
 
-    def __init__(self, call: Callable[[Record], None]) -> None:
-        self._call = call
+    call: Callable[[Record], None]
 
     def say(self, text: str) -> None:
         pass
 
     def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        self._call(record)
+        self.call(record)
 
 
 def _checked(call: Callable[..., Any], *args: Any) -> Any:
@@ -219,12 +215,6 @@ def _is_weights(source: str | Path) -> bool:
     return source != "shipped" and path.is_file() and not policy_file.is_policy(path)
 
 
-def _layout(params: Any) -> Any:
-    """Names, shapes and types of networks."""
-    named = jax.tree_util.tree_leaves_with_path(params)
-    return [(str(path), leaf.shape, str(leaf.dtype)) for path, leaf in named]
-
-
 def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
     """Every combination of the values."""
     for name in vary:
@@ -232,17 +222,8 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
     points = []
     for combination in itertools.product(*vary.values()):
         values = dict(zip(vary, combination, strict=True))
-        settings = {name: value for name, value in values.items() if name != "algo"}
-        base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
         named = {name: str(value) for name, value in values.items()}
-        points.append(SweepPoint(grid.name(named), named, step.replace_settings(base, settings)))
+        algo = values.pop("algo", None)
+        base = cfg if algo is None else algorithms.configure(cfg, algo)
+        points.append(SweepPoint(grid.name(named), named, step.replace_settings(base, values)))
     return grid.with_short_names(points)
-
-
-def _first_line(folder: Path, cfg: Config) -> str:
-    """What is run, and on what."""
-    scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
-    return (
-        f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "
-        f"physics {cfg.sim.physics}, on {provenance.device()}"
-    )

@@ -4,7 +4,7 @@ Lengths are metres, angles radians, times seconds unless a name says otherwise. 
 raises `ValueError` with the setting's name. A section that holds traced values is not checked.
 Numbers marked (ours) are measured choices; the others name their source.
 
-Alternatives are unions: `ReplayConfig` and `NetConfig`. Class variables are constants.
+Alternatives are unions: `ReplayConfig` and `NetConfig`. Names without a type are constants.
 """
 
 import dataclasses
@@ -24,39 +24,31 @@ def _bounded(default: Any, low: float, high: float = math.inf, above: bool = Fal
     return dataclasses.field(default=default, metadata={"bounds": (low, high, above)})
 
 
-def _count(default: Any, low: int = 1) -> Any:
-    return _bounded(default, low)
-
-
-def _positive(default: Any) -> Any:
-    return _bounded(default, 0.0, above=True)
-
-
-def _share(default: Any) -> Any:
-    return _bounded(default, 0.0, 1.0)
-
-
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise ValueError(message)
 
 
+@typing.dataclass_transform(frozen_default=True)
 class Section:
-    """A group of settings: choices and bounds of its fields are checked when it is built."""
+    """A group of settings, each a frozen dataclass: choices and bounds of its fields are checked
+    when it is built."""
 
-    SECTION: ClassVar[str]  # its name in `Config`
+    SECTION: ClassVar[str] = ""  # its name in `Config`
     __pydantic_config__: ClassVar[Any] = {"extra": "forbid"}  # unknown keys of a file
 
+    def __init_subclass__(cls, section: str | None = None) -> None:
+        cls.SECTION = cls.SECTION if section is None else section
+        dataclasses.dataclass(frozen=True)(cls)
+
     def __post_init__(self) -> None:
-        fields: Any = dataclasses.fields(typing.cast(Any, self))
-        values = {field.name: getattr(self, field.name) for field in fields}
-        if not all(map(_is_plain, values.values())):
+        if not _is_plain(self):
             return
-        for field in fields:
-            name = f"{self.SECTION}.{field.name}".lstrip(".")
-            _check_choice(name, field.type, values[field.name])
-            if bounds := field.metadata.get("bounds"):
-                _check_bounds(name, values[field.name], *bounds)
+        for field in dataclasses.fields(typing.cast(Any, self)):
+            value = getattr(self, field.name)
+            for item in value if isinstance(value, tuple) else (value,):
+                if fault := _fault(field, item):
+                    raise ValueError(f"{self.SECTION}.{field.name}: {fault}".lstrip("."))
         self.check()
 
     def check(self) -> None:
@@ -65,50 +57,37 @@ class Section:
 
 def _is_plain(value: Any) -> bool:
     """Whether a value can be checked: a sweep's numbers may be traced."""
-    if isinstance(value, tuple):
-        return all(map(_is_plain, value))
-    if isinstance(value, Section):
-        return all(_is_plain(getattr(value, name)) for name in _names(value))
+    if isinstance(value, Section | tuple):
+        return all(map(_is_plain, value if isinstance(value, tuple) else vars(value).values()))
     return isinstance(value, int | float | str)
 
 
-def _check_choice(name: str, kind: Any, value: Any) -> None:
-    """A typing mistake must not pass for the other branch."""
-    items = value if isinstance(value, tuple) else (value,)
-    kind = typing.get_args(kind)[0] if typing.get_origin(kind) is tuple else kind
-    if typing.get_origin(kind) is Literal:
-        choices = typing.get_args(kind)
-        for item in items:
-            listed = ", ".join(map(str, choices))
-            _require(item in choices, f"{name}: {item!r} is not one of: {listed}")
+def _fault(field: Any, value: Any) -> str | None:
+    """What is wrong with a value of a field, or an item of one; None if nothing is."""
+    kind = typing.get_args(field.type)[0] if typing.get_origin(field.type) is tuple else field.type
+    choices = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal and value not in choices:
+        return f"{value!r} is not one of: {', '.join(map(str, choices))}"
+    low, high, above = field.metadata.get("bounds", (None, None, None))
+    if low is None or ((low < value if above else low <= value) and value <= high):
+        return None
+    span = f"must lie in {low:g} .. {high:.10g}"
+    if above or high == math.inf:
+        most = f", at most {high:.10g}" if high < math.inf else ""
+        span = f"must be {'above' if above else 'at least'} {low:g}{most}"
+    return f"{span}, not {value}"
 
 
-def _check_bounds(name: str, value: Any, low: float, high: float, above: bool) -> None:
-    items = value if isinstance(value, tuple) else (value,)
-    span = f"must lie in {low:g} .. {high:.10g}" if high < math.inf else f"must be at least {low:g}"
-    if above:
-        span = f"must be above {low:g}" + (f", at most {high:.10g}" if high < math.inf else "")
-    for item in items:
-        good = (low < item if above else low <= item) and item <= high
-        _require(good, f"{name}: {span}, not {item}")
-
-
-@dataclasses.dataclass(frozen=True)
-class SceneConfig(Section):
+class SceneConfig(Section, section="scene"):
     """What lies on the table."""
 
-    SECTION: ClassVar[str] = "scene"
-    drop_height: ClassVar[float] = 0.15
-    """Height of the first drop, m (VPG); later blocks start higher, so that none overlap."""
+    drop_height = 0.15  # height of the first drop, m (VPG); later blocks start above it
 
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
     """Kind of each block slot; a box slot draws a cube, cuboid, plank or tile in every scene."""
-    min_blocks: int = _count(5)
-    """Fewest blocks in play in a scene; the most is the number of slots."""
-    pool: int = _count(1024)
-    """Pre-settled scenes that episodes are sampled from, per block count."""
-    arranged: float = _share(0.0)
-    """Share of the scenes that are packed arrangements; the others are dropped."""
+    min_blocks: int = _bounded(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
+    pool: int = _bounded(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
+    arranged: float = _bounded(0.0, 0.0, 1.0)  # Share of packed scenes; the others are dropped.
     size_jitter: tuple[float, float] = _bounded((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of block sizes between scenes: boxes and arches, and the other kinds.
     The latter are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
@@ -118,70 +97,49 @@ class SceneConfig(Section):
     """Range of the sliding friction between blocks and table."""
     drop_extent: tuple[float, float] = _bounded((0.248, 0.248), 0.05, 0.448)
     """Range of the side of the square that blocks are dropped in, m (VPG: 0.248)."""
-    settle_time: float = _bounded(2.5, 0.5, 20.0)
-    """Time that blocks are given to come to rest, s (ours)."""
+    settle_time: float = _bounded(2.5, 0.5, 20.0)  # Time for blocks to come to rest, s (ours).
 
     def check(self) -> None:
-        _require(len(self.slots) >= 1, "scene.slots: at least one block slot is needed")
-        _require(
-            self.min_blocks <= len(self.slots),
-            "scene.min_blocks: must lie in 1 .. number of scene.slots",
-        )
+        most = len(self.slots)
+        _require(most >= 1, "scene.slots: at least one block slot is needed")
+        _require(self.min_blocks <= most, f"scene.min_blocks: at most the {most} scene.slots")
         for name in ("density", "friction", "drop_extent"):
             low, high = getattr(self, name)
             _require(low <= high, f"scene.{name}: low <= high is needed")
 
 
-@dataclasses.dataclass(frozen=True)
-class TaskConfig(Section):
+class TaskConfig(Section, section="task"):
     """What an episode asks for, and when it is cut off."""
 
-    SECTION: ClassVar[str] = "task"
-    max_steps_without_change: ClassVar[int] = 10
-    """Actions in a row without visible change after which an episode is cut off (VPG)."""
+    max_steps_without_change = 10  # actions in a row without visible change that cut it off (VPG)
 
     kind: Literal["clear", "target"] = "clear"
     """`clear`: take every block. `target`: get one marked block, then the next (CSAC sec. 4.4)."""
-    max_actions: int = _count(15)
-    """Actions after which an episode is cut off."""
+    max_actions: int = _bounded(15, 1)  # Actions after which an episode is cut off.
 
 
-@dataclasses.dataclass(frozen=True)
-class SimConfig(Section):
+class SimConfig(Section, section="sim"):
     """Physics and the two motion primitives; both primitives take `substeps` physics steps."""
 
-    SECTION: ClassVar[str] = "sim"
-    timestep: ClassVar[float] = 0.004
-    """Length of a physics step, s."""
-    iterations: ClassVar[int] = 4
-    """Newton iterations of the constraint solver; fewer break grasps (ours)."""
-    line_search: ClassVar[int] = 8
-    """Line-search steps of one Newton iteration (ours)."""
-    approach: ClassVar[float] = 0.10
-    """Height above the place at which a primitive starts and ends, m."""
-    grasp_depth: ClassVar[float] = 0.035
-    """How far below the surface seen at the place the finger tips go, m (VPG: 0.03 to 0.04)."""
-    clearance: ClassVar[float] = 0.012
-    """Lowest height of the finger tips above the table, m (VPG: 0.01 to 0.02)."""
-    push_length: ClassVar[float] = 0.10
-    """Length of a push, m (VPG)."""
-    push_depth: ClassVar[float] = 0.02
-    """How far below the local top the tips push, m (ours)."""
-    window: ClassVar[float] = 0.02
-    """Side of the window whose highest surface counts as the local top, m (a finger's width)."""
+    timestep = 0.004  # length of a physics step, s
+    iterations = 4  # Newton iterations of the constraint solver; fewer break grasps (ours)
+    line_search = 8  # line-search steps of one Newton iteration (ours)
+    approach = 0.10  # height above the place at which a primitive starts and ends, m
+    grasp_depth = 0.035  # how far the finger tips go below the surface, m (VPG: 0.03 to 0.04)
+    clearance = 0.012  # lowest height of the finger tips above the table, m (VPG: 0.01 to 0.02)
+    push_length = 0.10  # length of a push, m (VPG)
+    push_depth = 0.02  # how far below the local top the tips push, m (ours)
+    window = 0.02  # side of the window whose highest surface is the local top, m (a finger's width)
 
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
     `warp` on one CUDA device where it is known to be faster, else `mjx`."""
-    robot: RobotKind = "hand"
-    """`hand`: the RG2 by itself, floating, for training. `ur5`: the same hand on the arm."""
-    grasp_phases: tuple[int, int, int] = _count((60, 50, 80))
+    robot: RobotKind = "hand"  # `hand`: the RG2 alone, floating, for training. `ur5`: on the arm.
+    grasp_phases: tuple[int, int, int] = _bounded((60, 50, 80), 1)
     """Substeps of a grasp: descend, close the fingers, lift."""
-    geom_pairs: int = _count(12)
-    """Pairs of geoms that MJX examines per collision function, nearest first."""
-    contacts: int = _count(48)
-    """Contacts that MJX keeps per step, deepest first."""
+    geom_pairs: int = _bounded(12, 1)  # Geom pairs examined per collision function, nearest first.
+    contacts: int = _bounded(48, 1)  # Contacts that MJX keeps per step, deepest first.
 
     @property
     def substeps(self) -> int:
@@ -195,22 +153,15 @@ class SimConfig(Section):
         return vertical, self.substeps - 2 * vertical, vertical
 
 
-@dataclasses.dataclass(frozen=True)
-class CameraConfig(Section):
+class CameraConfig(Section, section="camera"):
     """A pinhole camera; pixel centres are whole numbers. The default is VPG's."""
-
-    SECTION: ClassVar[str] = "camera"
 
     size: tuple[int, int] = _bounded((640, 480), 8, 4096)
     """Width and height of the image that `focal` and `centre` belong to, px."""
-    focal: tuple[float, float] = (618.62, 618.62)
-    """Focal lengths along the image's width and height, px."""
-    centre: tuple[float, float] = (319.5, 239.5)
-    """Where the optical axis meets the image, from the left and from the top, px."""
-    position: tuple[float, float, float] = (-0.5, 0.0, 0.5)
-    """Where the camera stands, m."""
-    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Point in the middle of the view, m; the image is level."""
+    focal: tuple[float, float] = (618.62, 618.62)  # Focal lengths along width and height, px.
+    centre: tuple[float, float] = (319.5, 239.5)  # Optical axis in the image, from left, top, px.
+    position: tuple[float, float, float] = (-0.5, 0.0, 0.5)  # Where the camera stands, m.
+    look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # What the level view is centred on, m.
 
     def scaled(self, share: float) -> "CameraConfig":
         """The same view with fewer pixels: half of VPG's fill a height map of 64 cells.
@@ -218,50 +169,38 @@ class CameraConfig(Section):
         Raises ValueError where the image would not have a whole number of pixels.
         """
         size = (round(self.size[0] * share), round(self.size[1] * share))
-        whole = all(
-            abs(side * share - new) < 1e-6 for side, new in zip(self.size, size, strict=True)
-        )
+        whole = math.dist(size, (self.size[0] * share, self.size[1] * share)) < 1e-6
         _require(whole, f"camera: {share} of {self.size} px is not a whole number of pixels")
         focal = (self.focal[0] * share, self.focal[1] * share)
         centre = ((self.centre[0] + 0.5) * share - 0.5, (self.centre[1] + 0.5) * share - 0.5)
         return dataclasses.replace(self, size=size, focal=focal, centre=centre)
 
     def check(self) -> None:
-        sides = f"an image of {self.size[0]} x {self.size[1]} px"
+        image = f"an image of {self.size[0]} x {self.size[1]} px"
         for side, focal, centre in zip(self.size, self.focal, self.centre, strict=True):
             _require(
                 abs(centre - 0.5 * (side - 1)) <= 0.1 * side,
-                f"camera.centre: {self.centre} is not near the middle of {sides}; "
+                f"camera.centre: {self.centre} is not near the middle of {image}; "
                 "give the camera.size that the intrinsics belong to",
             )
-            _require(
-                0.3 <= focal / side <= 10.0,
-                f"camera.focal: {self.focal} px is not 0.3 to 10 times the sides of {sides}",
-            )
-        _require(
-            abs(self.focal[0] / self.focal[1] - 1.0) <= 0.1,
-            f"camera.focal: {self.focal} px must be alike to 10 %",
-        )
-        _require(
-            math.dist(self.position[:2], self.look_at[:2]) > 1e-3,
-            "camera.position: must not stand straight above or below camera.look_at",
-        )
+            in_range = 0.3 <= focal / side <= 10.0
+            _require(in_range, f"camera.focal: not 0.3 to 10 times the sides of {image}")
+        alike = abs(self.focal[0] / self.focal[1] - 1.0) <= 0.1
+        _require(alike, f"camera.focal: {self.focal} px must be alike to 10 %")
+        apart = math.dist(self.position[:2], self.look_at[:2]) > 1e-3
+        _require(apart, "camera.position: must not stand straight above or below camera.look_at")
 
 
-@dataclasses.dataclass(frozen=True)
-class SensorConfig(Section):
+class SensorConfig(Section, section="sensor"):
     """Errors of a real depth camera; all 0: none, at no cost.
 
     Depth errors: sigma = floor + square d^2. Khoshelham and Elberink (Sensors 12, 2012, 1437-1454)
     measured a square of 0.0014 for a structured-light camera.
     """
 
-    SECTION: ClassVar[str] = "sensor"
-
     depth_noise: tuple[float, float] = _bounded((0.0, 0.0), 0.0, 0.1)
     """Standard deviation of a depth: floor, m, and factor of the squared distance, 1/m."""
-    dropped: float = _bounded(0.0, 0.0, 0.9)
-    """Probability that a pixel has no depth."""
+    dropped: float = _bounded(0.0, 0.0, 0.9)  # Probability that a pixel has no depth.
     pose_noise: tuple[float, float] = _bounded((0.0, 0.0), 0.0, 0.2)
     """Standard deviation of the camera's place, m, and orientation, rad, drawn in every view."""
     colour: float = _bounded(0.0, 0.0, 0.5)
@@ -273,16 +212,11 @@ class SensorConfig(Section):
         return self != SensorConfig()
 
 
-@dataclasses.dataclass(frozen=True)
-class HeightmapConfig(Section):
+class HeightmapConfig(Section, section="heightmap"):
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 
-    SECTION: ClassVar[str] = "heightmap"
-
-    size: int = _count(64, 16)
-    """H = W, cells."""
-    extent: float = _bounded(0.448, 0.1, 1.0)
-    """Side of the square workspace, m (VPG)."""
+    size: int = _bounded(64, 16)  # H = W, cells.
+    extent: float = _bounded(0.448, 0.1, 1.0)  # Side of the square workspace, m (VPG).
     view: Literal["ortho", "oblique"] = "ortho"
     """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image, projected;
     what blocks hide from it is empty (CSAC sec. 3.1, VPG)."""
@@ -296,87 +230,58 @@ class HeightmapConfig(Section):
         _require(self.size % 8 == 0, "heightmap.size: must be a multiple of 8")
 
 
-@dataclasses.dataclass(frozen=True)
-class SmallNet(Section):
+class SmallNet(Section, section="net"):
     """Densely connected convolutions with group norm, at 1/`stride` of the map's size (ours)."""
 
-    SECTION: ClassVar[str] = "net"
+    dtype = "auto"  # bfloat16 on accelerators, float32 on a CPU; parameters are float32
 
-    dtype: ClassVar[str] = "auto"
-    """Type of computation: bfloat16 on accelerators, float32 on a CPU. Parameters are float32."""
-
-    kind: Literal["small"] = "small"
-    """`small`, or `densenet121`: the paper's, 100 times the work."""
-    rotations: int = _count(16, 4)
-    """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
-    colour: bool = True
-    """Whether the net sees colours, or heights alone."""
+    kind: Literal["small"] = "small"  # `small`, or `densenet121`: the paper's, 100 times the work.
+    rotations: int = _bounded(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
+    colour: bool = True  # Whether the net sees colours, or heights alone.
     margin: float = _bounded(0.125, 0.0, 0.5)
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
-    head: int = _count(32, 4)
-    """Channels of the 1 x 1 convolution before each head (VPG 64)."""
-    growth: int = _count(24, 4)
-    """Channels that each dense layer adds."""
-    dilations: tuple[int, ...] = _count((1, 2, 4, 1))
-    """Dilation of each dense layer's 3 x 3 convolution; their number is the depth."""
-    stem: int = _count(16, 4)
-    """Channels of the first convolution."""
-    stride: Literal[2, 4] = 2
-    """Cells of the input per cell of the features, along each axis: 4 is a quarter of the work."""
-    subcells: Literal[1, 2, 4] = 1
-    """Cells of the maps per cell of the features, along each axis, at most `stride`."""
+    head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
+    growth: int = _bounded(24, 4)  # Channels that each dense layer adds.
+    dilations: tuple[int, ...] = _bounded((1, 2, 4, 1), 1)  # Dilation of each dense layer, 3 x 3.
+    stem: int = _bounded(16, 4)  # Channels of the first convolution.
+    stride: Literal[2, 4] = 2  # Input cells per feature cell, each axis; 4: a quarter of the work.
+    subcells: Literal[1, 2, 4] = 1  # Map cells per feature cell, along each axis; at most `stride`.
 
     def check(self) -> None:
-        _check_rotations(self.rotations)
         _require(len(self.dilations) >= 1, "net.dilations: at least one layer")
         _require(self.subcells <= self.stride, f"net.subcells: at most net.stride, {self.stride}")
 
     def check_canvas(self, size: int) -> None:
         """Raises ValueError if the strides do not divide the rotated maps of `size` cells."""
         side = canvas_size(size, self.margin)
-        _require(
-            side % 4 == 0,
-            f"net.margin: rotated maps of {side} cells are not a multiple of 4; change it a little",
-        )
+        _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4")
 
 
-@dataclasses.dataclass(frozen=True)
-class DenseNet121(Section):
-    """The paper's network (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/32
-    of the resolution of its input."""
+class DenseNet121(Section, section="net"):
+    """The paper's (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/32."""
 
-    SECTION: ClassVar[str] = "net"
-    dtype: ClassVar[str] = SmallNet.dtype
-    block_growth: ClassVar[int] = 32
-    """Channels that each dense layer adds (Huang et al., table 1)."""
-    STRIDE: ClassVar[int] = 32  # pixels of the input per cell of the features, along each axis
-    output_stride: ClassVar[int] = 4
-    """Cells of the map per cell that its outputs are upsampled to (ours; the paper 1, at 16 times
-    the memory: what is upsampled is bilinear, and so is reading it)."""
+    dtype = SmallNet.dtype
+    block_growth = 32  # channels that each dense layer adds (Huang et al., table 1)
+    STRIDE = 32  # pixels of the input per cell of the features, along each axis
+    output_stride = (
+        4  # map cells per cell of the outputs (ours; the paper 1, at 16 times the memory)
+    )
 
-    kind: Literal["densenet121"] = "densenet121"
-    """The paper's network; `small` is ours."""
-    rotations: int = _count(16, 4)
-    """K, yaws of the dense map over a full turn (CSAC sec. 3.2)."""
-    colour: bool = True
-    """Whether the net sees colours, or heights alone."""
+    kind: Literal["densenet121"] = "densenet121"  # The paper's network; `small` is ours.
+    rotations: int = _bounded(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
+    colour: bool = True  # Whether the net sees colours, or heights alone.
     margin: float = _bounded(0.125, 0.0, 0.5)
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
-    head: int = _count(32, 4)
-    """Channels of the 1 x 1 convolution before each head (VPG 64)."""
+    head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
     norm: Literal["group", "batch"] = "group"
     """`batch`, as in the paper, or `group`, which is the same while acting and while learning."""
-    block_layers: tuple[int, int, int, int] = _count((6, 12, 24, 16))
+    block_layers: tuple[int, int, int, int] = _bounded((6, 12, 24, 16), 1)
     """Dense layers of each block (Huang et al., arXiv:1608.06993, table 1)."""
-    zoom: int = _count(1)
-    """Pixels of the input per cell of the map, along each axis (VPG 2)."""
+    zoom: int = _bounded(1, 1)  # Pixels of the input per cell of the map, along each axis (VPG 2).
 
     def check(self) -> None:
-        _check_rotations(self.rotations)
-        _require(
-            self.STRIDE % (self.zoom * self.output_stride) == 0,
-            f"net.zoom: must divide {self.STRIDE // self.output_stride}",
-        )
+        largest = self.STRIDE // self.output_stride
+        _require(largest % self.zoom == 0, f"net.zoom: must divide {largest}")
 
     def check_canvas(self, size: int) -> None:
         """Raises ValueError if the strides do not divide the rotated maps of `size` cells."""
@@ -394,32 +299,22 @@ class DenseNet121(Section):
 NetConfig = SmallNet | DenseNet121
 
 
-def _check_rotations(rotations: int) -> None:
-    _require(rotations % 2 == 0, "net.rotations: must be even")
-
-
 def canvas_size(size: int, margin: float) -> int:
     """Cells along a side of the rotated maps of a height map of `size` cells."""
     return round(size * (1 + margin) / 2) * 2
 
 
-@dataclasses.dataclass(frozen=True)
-class CEMConfig(Section):
+class CEMConfig(Section, section="cem"):
     """Cross-entropy method over (x, y, yaw), Algorithm 1 lines 8-13; QT-Opt, arXiv:1806.10293."""
 
-    SECTION: ClassVar[str] = "cem"
-    std: ClassVar[float] = 0.3
+    std = 0.3
     """Standard deviation of the first round, in units of half the workspace (x, y) and half a turn
     (yaw; ours)."""
-    std_min: ClassVar[float] = 0.01
-    """Least standard deviation of a round, in the units of `std` (ours)."""
+    std_min = 0.01  # least standard deviation of a round, in the units of `std` (ours)
 
-    candidates: int = _count(64)
-    """J, actions sampled in a round."""
-    elites: int = _count(6, 2)
-    """K, best actions that the next round's distribution is fitted to."""
-    rounds: int = _count(3)
-    """Rounds of sampling and fitting."""
+    candidates: int = _bounded(64, 1)  # J, actions sampled in a round.
+    elites: int = _bounded(6, 2)  # K, best actions that the next round's distribution is fitted to.
+    rounds: int = _bounded(3, 1)  # Rounds of sampling and fitting.
     std_estimator: Literal["std", "mad"] = "std"
     """Of the elites: standard deviation, or line 12's mean absolute deviation with 1 / (K - 1)."""
     start: Literal["both", "actor", "cells"] = "both"
@@ -430,133 +325,95 @@ class CEMConfig(Section):
         _require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
 
 
-@dataclasses.dataclass(frozen=True)
-class PolicyConfig(Section):
+class PolicyConfig(Section, section="policy"):
     """How an action is chosen from the dense maps."""
-
-    SECTION: ClassVar[str] = "policy"
 
     place: Literal["cem", "argmax"] = "cem"
     """Where: by the cross-entropy method, between cells and yaws, or the best cell (VPG)."""
     primitive: Literal["argmax", "rule", "grasp"] = "argmax"
-    """Which primitive: that of larger value; a push after an action without visible change, else a
-    grasp (CSAC sec. 3.4); or always a grasp."""
+    """That of larger value; a push after no visible change, else a grasp (sec. 3.4); a grasp."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TargetConfig(Section):
+class TargetConfig(Section, section="target"):
     """TD target, eq. 9 and Algorithm 1 lines 17-19, softmax as in SD3 (arXiv:2010.09177)."""
 
-    SECTION: ClassVar[str] = "target"
-    inverse_temperature: ClassVar[float] = 20.0
-    """beta of the softmax for a return range of 1; divided by the range of returns (ours)."""
-    std: ClassVar[float] = 0.2
-    """Standard deviation of their noise, in CEM's units (SD3)."""
-    clip: ClassVar[float] = 0.5
-    """Bound of their noise, same units (SD3)."""
+    inverse_temperature = 20.0  # beta of the softmax; it is divided by the range of returns (ours)
+    std = 0.2  # of the noise of target actions, in CEM's units (SD3)
+    clip = 0.5  # bound of that noise (SD3)
 
     value: Literal["softmax", "max"] = "softmax"
-    """V(s'): softmax over noisy target actions (line 17), or its limit, the largest value of the
-    dense map (eq. 9)."""
-    gamma: float = _bounded(0.5, 0.0, 1.0)
-    """Discount (VPG)."""
-    samples: int = _count(50)
-    """Noisy target actions per primitive in the softmax (SD3)."""
+    """V(s'): softmax over noisy target actions (line 17), or the dense map's maximum (eq. 9)."""
+    gamma: float = _bounded(0.5, 0.0, 1.0)  # Discount (VPG).
+    samples: int = _bounded(50, 1)  # Noisy target actions per primitive in the softmax (SD3).
 
     def check(self) -> None:
         _require(self.gamma < 1.0, "target.gamma: must be below 1")
 
 
-@dataclasses.dataclass(frozen=True)
-class RewardConfig(Section):
+class RewardConfig(Section, section="reward"):
     """Rewards, CSAC eqs. 10-16."""
 
-    SECTION: ClassVar[str] = "reward"
-    distance_cap: ClassVar[float] = 1.0
-    """Distance beyond which its penalty grows no more, m (ours: so that returns are bounded)."""
-    dead_band: ClassVar[float] = 0.1
-    """Gain in the best grasp's value that a good push must exceed (ours)."""
-    push_level: ClassVar[float] = 0.0
-    """s_c of eq. 13, the push's level."""
-    grasp_level: ClassVar[float] = 1.0
-    """s_g of eq. 13, the grasp's level, which is s_max."""
+    distance_cap = 1.0  # m; beyond it the distance's penalty is constant (ours: bounds returns)
+    dead_band = 0.1  # gain in the best grasp's value that a good push must exceed (ours)
+    push_level = 0.0  # s_c of eq. 13, the push's level
+    grasp_level = 1.0  # s_g of eq. 13, the grasp's level, which is s_max
 
-    success_bonus: float = 1.0
-    """r2 of eq. 11: the hand comes back with a block."""
+    success_bonus: float = 1.0  # r2 of eq. 11: the hand comes back with a block.
     distance_weight: float = _bounded(0.0, 0.0)
     """w: penalty per metre between the place and where the tips acted (eq. 10, sign turned)."""
-    eta: tuple[float, float] = (0.0, 1.0)
-    """eta_0 and eta_1 of eq. 13."""
+    eta: tuple[float, float] = (0.0, 1.0)  # eta_0 and eta_1 of eq. 13.
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
     push_effect: Literal["value", "change"] = "value"
     """What makes a push good: the best grasp gains value (eq. 16), or the map has changed (VPG)."""
-    push_levels: tuple[float, float] = (-1.0, 1.0)
-    """I_c of eq. 16: any other push, a good push."""
+    push_levels: tuple[float, float] = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = _bounded(0.0, 0.0)
     """Cost of an action after which a block has left the workspace for good (ours)."""
 
     def check(self) -> None:
-        _require(
-            list(self.grasp_levels) == sorted(self.grasp_levels),
-            "reward.grasp_levels: nothing <= empty <= touched <= dropped <= lifted is needed",
-        )
+        rising = list(self.grasp_levels) == sorted(self.grasp_levels)
+        _require(rising, "reward.grasp_levels: no level may be below the one before it")
 
 
-@dataclasses.dataclass(frozen=True)
-class ExploreConfig(Section):
+class ExploreConfig(Section, section="explore"):
     """Exploration: action noise (Algorithm 1 line 13), random primitive, random place."""
-
-    SECTION: ClassVar[str] = "explore"
 
     noise_std: float = _bounded(0.01, 0.0)
     """delta: standard deviation of the action noise, in CEM's units (ours: 0.03 spoils grasps). The
     noise is clipped at three of them (c of line 13, ours)."""
-    epsilon_primitive: tuple[float, float] = _share((0.5, 0.1))
+    epsilon_primitive: tuple[float, float] = _bounded((0.5, 0.1), 0.0, 1.0)
     """Probability of a random primitive, at first and in the end (VPG)."""
-    epsilon_place: tuple[float, float] = _share((0.5, 0.0))
+    epsilon_place: tuple[float, float] = _bounded((0.5, 0.0), 0.0, 1.0)
     """Probability of a random place with something to act on, at first and in the end (ours)."""
     decay: float = _bounded(0.998, 0.0, 1.0, above=True)
     """Factor of both probabilities per action, until they reach their end (ours; VPG 0.9998)."""
-    push_fraction: float = _share(0.25)
+    push_fraction: float = _bounded(0.25, 0.0, 1.0)
     """Share of pushes among random primitives (ours)."""
 
 
-@dataclasses.dataclass(frozen=True)
-class LearnConfig(Section):
+class LearnConfig(Section, section="learn"):
     """Losses and optimiser."""
 
-    SECTION: ClassVar[str] = "learn"
-    gradient_clip: ClassVar[float] = 10.0
-    """Bound of the gradient's global norm (ours)."""
-    huber: ClassVar[float] = 1.0
-    """Width of the quadratic part of the Huber loss (CSAC sec. 4)."""
+    gradient_clip = 10.0  # bound of the gradient's global norm (ours)
+    huber = 1.0  # width of the quadratic part of the Huber loss (CSAC sec. 4)
 
-    learning_rate: float = _positive(1e-3)
+    learning_rate: float = _bounded(1e-3, 0.0, above=True)
     """Adam's step size, critic (ours; CSAC and VPG 1e-4 on a pretrained DenseNet-121)."""
-    actor_learning_rate: float = _positive(3e-4)
+    actor_learning_rate: float = _bounded(3e-4, 0.0, above=True)
     """Adam's step size, actor head (ours)."""
     lr_final_fraction: float = _bounded(0.05, 0.0, 1.0, above=True)
     """Both step sizes fall linearly to this share of themselves over the run (ours)."""
-    batch: int = _count(32)
-    """B, transitions per update (N of Algorithm 1)."""
-    updates: int = _count(2)
-    """Critic updates per training step, that is, per `train.scenes` actions; the actor has one."""
-    actor_batch: int = _count(0, 0)
-    """Transitions of the last batch that the actor's update is made on; 0: all."""
-    augment: bool = True
-    """Show each drawn transition under a random symmetry of the square."""
+    batch: int = _bounded(32, 1)  # B, transitions per update (N of Algorithm 1).
+    updates: int = _bounded(2, 1)  # Critic updates per `train.scenes` actions; the actor has one.
+    actor_batch: int = _bounded(0, 0)  # Part of the last batch that the actor learns on; 0: all.
+    augment: bool = True  # Show each drawn transition under a random symmetry of the square.
     augment_shift: int = _bounded(0, 0, 64)
-    """Largest shift of a drawn transition along each axis, cells; none where that would cut
-    something off."""
-    critics: Literal[1, 2] = 1
-    """Critics; of two, the lower Q counts in each cell (TD3's twin, arXiv:1802.09477)."""
-    actor: bool = True
-    """Learn the policy network; without it, mu(s) is read off the critic's own map."""
+    """Largest shift of a drawn transition along each axis, cells; none that would cut it off."""
+    critics: Literal[1, 2] = 1  # Of two, each cell's lower Q counts (TD3's twin, arXiv:1802.09477).
+    actor: bool = True  # Learn the policy network; without it, mu(s) is read off the critic's map.
     tau: float = _bounded(0.02, 0.0, 1.0, above=True)
     """Share of the online network in a target update (Algorithm 1 lines 24-26); 1 copies."""
-    target_update_period: int = _count(1)
-    """C, critic updates between two updates of the targets (sec. 3.4 copies every C)."""
+    target_update_period: int = _bounded(1, 1)  # C of sec. 3.4, critic updates per target update.
     loss: Literal["huber", "squared"] = "huber"
     """Of the TD error: Huber (CSAC sec. 4) or squared (Algorithm 1 line 21)."""
 
@@ -564,81 +421,59 @@ class LearnConfig(Section):
         _require(self.actor_batch <= self.batch, "learn.actor_batch: must not exceed learn.batch")
 
 
-@dataclasses.dataclass(frozen=True)
-class UniformReplay(Section):
+class UniformReplay(Section, section="replay"):
     """CSAC's replay: all transitions are equally likely."""
-
-    SECTION: ClassVar[str] = "replay"
 
     sampler: Literal["uniform"] = "uniform"
     """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
-    capacity: int = _bounded(4096, 2, 2**30)
-    """C, transitions kept."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
-@dataclasses.dataclass(frozen=True)
-class PrioritisedReplay(Section):
+class PrioritisedReplay(Section, section="replay"):
     """CSAC-PER's replay: probability ~ (abs(TD error) + epsilon)^alpha, losses weighted against it
     (Schaul et al., arXiv:1511.05952)."""
 
-    SECTION: ClassVar[str] = "replay"
-    is_beta: ClassVar[tuple[float, float]] = (0.4, 1.0)
-    """Exponent of the importance weights at first and in the end, linear (Schaul et al.)."""
-    alpha: ClassVar[float] = 0.6
-    """0 is uniform, 1 proportional to the priority (Schaul et al., sec. 4)."""
-    per_epsilon: ClassVar[float] = 0.01
-    """Added to abs(TD error), so that no transition is out of reach (ours)."""
+    is_beta = (0.4, 1.0)  # exponent of the importance weights, linear from .. to (Schaul et al.)
+    alpha = 0.6  # 0 is uniform, 1 proportional to the priority (Schaul et al., sec. 4)
+    per_epsilon = 0.01  # added to abs(TD error), so that no transition is out of reach (ours)
 
     sampler: Literal["prioritised"] = "prioritised"
     """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
-    capacity: int = _bounded(4096, 2, 2**30)
-    """C, transitions kept."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
-@dataclasses.dataclass(frozen=True)
-class BetaReplay(Section):
+class BetaReplay(Section, section="replay"):
     """CSAC-beta's replay: ranks by abs(TD error), rank / n ~ Beta(a, b), CSAC sec. 3.5.
 
     One law for the whole run: give start, middle and end the same. VPG's is (1, 2).
     """
 
-    SECTION: ClassVar[str] = "replay"
-    middle_at: ClassVar[float] = 0.4
-    """Share of all updates after which (a, b) is `middle` (ours)."""
+    middle_at = 0.4  # share of all updates after which (a, b) is `middle` (ours)
 
     sampler: Literal["beta"] = "beta"
     """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
-    capacity: int = _bounded(4096, 2, 2**30)
-    """C, transitions kept."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
     rank_by: Literal["error", "reward"] = "error"
     """Rank 0: the largest abs(TD error) (sec. 3.5) or reward (Algorithm 1 line 15)."""
-    start: tuple[float, float] = _positive((0.5, 0.5))
+    start: tuple[float, float] = _bounded((0.5, 0.5), 0.0, above=True)
     """(a, b) at first (CSAC sec. 4.3)."""
-    middle: tuple[float, float] = _positive((1.0, 1.0))
-    """(a, b) on the way (CSAC sec. 3.5: uniform)."""
-    end: tuple[float, float] = _positive((1.0, 12.0))
+    middle: tuple[float, float] = _bounded((1.0, 1.0), 0.0, above=True)
+    """(a, b) on the way (sec. 3.5: uniform)."""
+    end: tuple[float, float] = _bounded((1.0, 12.0), 0.0, above=True)
     """(a, b) in the end (CSAC sec. 4.3)."""
 
 
 ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainConfig(Section):
+class TrainConfig(Section, section="train"):
     """Length and shape of a run."""
 
-    SECTION: ClassVar[str] = "train"
-
-    scenes: int = _count(8)
-    """E, scenes simulated in parallel; each takes one action per training step."""
-    actions: int = _count(2000)
-    """Actions of the whole run over all scenes."""
-    learning_starts: int = _count(64)
-    """Actions before the first update."""
-    chunk: int = _count(10)
-    """Training steps in one call of the compiled program; between calls the host logs and saves."""
-    save_every: int = _count(50)
-    """Chunks between checkpoints; the last chunk and a stop are always saved."""
+    scenes: int = _bounded(8, 1)  # E, parallel scenes; each takes one action per training step.
+    actions: int = _bounded(2000, 1)  # Actions of the whole run over all scenes.
+    learning_starts: int = _bounded(64, 1)  # Actions before the first update.
+    chunk: int = _bounded(10, 1)  # Training steps per compiled call; the host logs between calls.
+    save_every: int = _bounded(50, 1)  # Chunks per checkpoint; the last and a stop always save.
 
     @property
     def steps(self) -> int:
@@ -653,18 +488,12 @@ ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
 """Sections that are unions: the field that names the alternative, and the alternatives."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Config(Section):
     """A run: everything that decides its result."""
 
-    SECTION: ClassVar[str] = ""
-
-    preset: str = "quick"
-    """Name of the preset that this config was made from."""
-    algo: str = "csac_beta"
-    """Name of the algorithm that was asked for; what it is made of stands in the sections."""
-    seed: int = _bounded(0, 0, 2**31 - 1)
-    """Number that all randomness of the run follows from."""
+    preset: str = "quick"  # Name of the preset that this config was made from.
+    algo: str = "csac_beta"  # Algorithm that was asked for; the sections say what it is made of.
+    seed: int = _bounded(0, 0, 2**31 - 1)  # Number that all randomness of the run follows from.
     scene: SceneConfig = SceneConfig()
     task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()
@@ -687,72 +516,65 @@ class Config(Section):
         A dict changes fields of a section, `{"sampler": "uniform"}` its alternative; settings that
         both alternatives have are kept. Raises ValueError for an unknown name or a bad value.
         """
-        for name in sections:
-            _require(name in _names(self), f"{name}: unknown setting")
-        return dataclasses.replace(
-            self, **{name: _changed(getattr(self, name), value) for name, value in sections.items()}
-        )
+        values = {name: _changed(getattr(self, name, None), new) for name, new in sections.items()}
+        return _replaced(self, values)
 
     def check(self) -> None:
         """Raises ValueError for sections that do not fit one another."""
-        _require(
-            self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0,
-            "explore.push_fraction: must be 0 where policy.primitive is grasp, which never pushes",
-        )
+        may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
+        _require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
         batch, starts = self.learn.batch, self.train.learning_starts
         _require(
             batch <= starts,
             f"learn.batch: {batch} transitions cannot be drawn after train.learning_starts = "
             f"{starts}; raise train.learning_starts or lower learn.batch",
         )
-        _require(
-            max(self.train.scenes, batch) <= self.replay.capacity,
-            "replay.capacity: must hold train.scenes and learn.batch transitions",
-        )
-        _require(
-            self.heightmap.view == "oblique" or self.sensor.pose_noise == (0.0, 0.0),
-            "sensor.pose_noise: must be 0 where heightmap.view is ortho, which has no camera",
-        )
-        most = 2 * math.floor(0.5 * math.pi * self.heightmap.size)
-        _require(
-            self.net.rotations <= most,
-            f"net.rotations: at most {most} for heightmap.size {self.heightmap.size}",
-        )
-        self.net.check_canvas(self.heightmap.size)
+        holds = max(self.train.scenes, batch) <= self.replay.capacity
+        _require(holds, "replay.capacity: must hold train.scenes and learn.batch transitions")
+        has_camera = self.heightmap.view == "oblique" or self.sensor.pose_noise == (0.0, 0.0)
+        _require(has_camera, "sensor.pose_noise: must be 0 where heightmap.view is ortho")
+        size, rotations = self.heightmap.size, self.net.rotations
+        most = 2 * math.floor(0.5 * math.pi * size)
+        _require(rotations % 2 == 0, "net.rotations: must be even")
+        _require(rotations <= most, f"net.rotations: at most {most} for heightmap.size {size}")
+        self.net.check_canvas(size)
         if self.sim.physics == "warp":
-            meshes = set(MESH_KINDS) & set(self.scene.slots)
-            _require(
-                self.scene.size_jitter[1] == 0.0 or not meshes,
-                "scene.size_jitter: the second must be 0 where sim.physics is warp, whose meshes "
-                "have one size in all scenes",
-            )
-            _require(
-                self.train.scenes <= WARP_WORLDS,
-                f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp",
-            )
+            alike = self.scene.size_jitter[1] == 0.0 or not set(MESH_KINDS) & set(self.scene.slots)
+            _require(alike, "scene.size_jitter: the second must be 0 where sim.physics is warp")
+            few = self.train.scenes <= WARP_WORLDS
+            _require(few, f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp")
 
 
 def _changed(section: Any, value: Any) -> Any:
     """A section with the fields of a dict, maybe of another alternative; else `value` itself."""
-    if not isinstance(value, dict):
+    if not isinstance(value, dict) or not isinstance(section, Section):
         return value
     tag, _ = ALTERNATIVES.get(section.SECTION, ("", ()))
-    if value.get(tag, getattr(section, tag, None)) != getattr(section, tag, None):
-        section = alternative(section, value[tag])
-    for name in value:
-        _require(name in _names(section), f"{section.SECTION}.{name}: unknown setting")
-    return dataclasses.replace(section, **value)
+    return _replaced(alternative(section, value[tag]) if tag in value else section, value)
+
+
+def _replaced(section: Any, values: dict[str, Any]) -> Any:
+    for name in values:
+        known = name in names(section)
+        _require(known, f"{section.SECTION}.{name}: unknown setting".lstrip("."))
+    return dataclasses.replace(section, **values)
 
 
 def alternative(section: Any, choice: str) -> Any:
     """The alternative of that name, with what it shares with `section`."""
-    tag, kinds = ALTERNATIVES[section.SECTION]
-    named = {kind.__dataclass_fields__[tag].default: kind for kind in typing.cast(Any, kinds)}
-    listed = ", ".join(named)
-    _require(choice in named, f"{section.SECTION}.{tag}: {choice!r} is not one of: {listed}")
-    shared = (_names(named[choice]) & _names(section)) - {tag}
-    return named[choice](**{name: getattr(section, name) for name in shared})
+    kind = alternative_kind(section.SECTION, choice)
+    shared = names(kind) & names(section) - {ALTERNATIVES[section.SECTION][0]}
+    return kind(**{name: getattr(section, name) for name in shared})
 
 
-def _names(section: Any) -> set[str]:
+def alternative_kind(section: str, choice: Any) -> Any:
+    """Class of the alternative of that name. Raises ValueError for an unknown one."""
+    tag, kinds = ALTERNATIVES[section]
+    choices = [getattr(kind, tag) for kind in kinds]
+    _require(choice in choices, f"{section}.{tag}: {choice!r} is not one of: {', '.join(choices)}")
+    return kinds[choices.index(choice)]
+
+
+def names(section: Any) -> set[str]:
+    """Names of the settings of a section or of its class."""
     return {field.name for field in dataclasses.fields(section)}

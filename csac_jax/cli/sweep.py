@@ -134,7 +134,7 @@ def _join(options: SweepOptions) -> None:
     from csac_jax.runtime import cluster
 
     with as_bad_arguments(ValueError):
-        cluster.join(cluster.Place(*place))
+        cluster.join(*place)
 
 
 def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:

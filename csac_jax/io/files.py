@@ -8,7 +8,6 @@ RUN/checkpoints/    see `checkpoint`
 import contextlib
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,11 @@ def replace(path: Path, content: str | bytes) -> None:
     """Writes a file such that it appears all at once; its folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-    os.replace(temporary, path)
+    with temporary.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())  # else a power failure may leave it empty
+    temporary.replace(path)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -33,13 +35,11 @@ def write_json(path: Path, content: Any) -> None:
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """The lines of a metrics.jsonl by today's names, without one that was cut off in writing."""
-    return list(_complete_lines(path))
-
-
-def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
+    lines = []
     for line in path.read_text().splitlines():
         with contextlib.suppress(ValueError):
-            yield renamed(json.loads(line))
+            lines.append(renamed(json.loads(line)))
+    return lines
 
 
 def renamed(content: Any) -> Any:
@@ -51,5 +51,5 @@ def renamed(content: Any) -> Any:
 
 def truncate_log(path: Path, step: int) -> None:
     """Keeps the lines of steps up to `step`."""
-    lines = _complete_lines(path) if path.exists() else ()
+    lines = read_log(path) if path.exists() else []
     replace(path, "".join(json.dumps(line) + "\n" for line in lines if line["step"] <= step))

@@ -1,5 +1,4 @@
-"""A policy in one file: its networks' variables and the config they were trained with, as
-.safetensors.
+"""A policy in a .safetensors file: its networks' variables and the config they were trained with.
 
 Nothing in such a file is executed. `SHIPPED` comes with the package; its digest stands here, so
 that a file that was damaged or replaced is noticed.
@@ -8,7 +7,6 @@ that a file that was damaged or replaced is noticed.
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -19,7 +17,7 @@ from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
 from csac_jax.errors import FailedError
-from csac_jax.io import configs, files
+from csac_jax.io import configs, files, leaves
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
 SHIPPED_SHA256 = "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c"
@@ -31,13 +29,10 @@ class PolicyFileError(FailedError):
 
 
 def save(path: Path, params: Params, cfg: Config) -> None:
-    """Writes a policy; the file appears all at once, its folder is made. Raises OSError where it
-    cannot be written."""
+    """Writes a policy; see `files.replace`. Raises OSError where it cannot be written."""
     remarks = {_CONFIG: json.dumps(configs.to_dict(cfg))}
-    content = safetensors.numpy.save(
-        {name: np.asarray(leaf) for name, leaf in _named(params)}, remarks
-    )
-    files.replace(path, content)
+    tensors = {name: np.asarray(leaf) for name, leaf in leaves.named(params).items()}
+    files.replace(path, safetensors.numpy.save(tensors, remarks))
 
 
 def is_policy(path: Path) -> bool:
@@ -50,12 +45,10 @@ def is_policy(path: Path) -> bool:
 
 
 def load(path: Path) -> tuple[Config, Params]:
-    """Config and networks of a policy. Raises PolicyFileError where the file is none, or not one of
-    this version."""
+    """Config and networks of a policy. Raises PolicyFileError for a file that is none, is damaged
+    or another version's."""
     if path == SHIPPED and hashlib.sha256(path.read_bytes()).hexdigest() != SHIPPED_SHA256:
-        raise PolicyFileError(
-            f"{path} is not the file that this version ships; install csac-jax anew"
-        )
+        raise PolicyFileError(f"{path} is not the file that this version ships; reinstall csac-jax")
     try:
         with safetensors.safe_open(path, "numpy") as file:
             remarks = file.metadata() or {}
@@ -74,24 +67,11 @@ def load(path: Path) -> tuple[Config, Params]:
         raise PolicyFileError(
             f"{path} was made by another version of csac_jax ({error}); use that version"
         ) from None
-    return cfg, _filled(path, actor_critic.abstract_params(cfg), tensors)
-
-
-def _filled(path: Path, blank: Params, tensors: dict[str, np.ndarray]) -> Params:
-    """The variables `blank`, shapes and types, with the values of `tensors` by name."""
-    wanted = dict(_named(blank))
-    for name in sorted(wanted.keys() | tensors.keys()):
-        given, asked = (
-            f"{leaf.dtype}{list(leaf.shape)}" if leaf is not None else "nothing"
-            for leaf in (tensors.get(name), wanted.get(name))
+    blank = actor_critic.abstract_params(cfg)
+    if found := leaves.difference(leaves.layout(tensors), leaves.layout(blank)):
+        name, has, asked = found
+        raise PolicyFileError(
+            f"{path} holds {name} as {has}, its config asks for {asked}; export it anew"
         )
-        if given != asked:
-            raise PolicyFileError(
-                f"{path} holds {name} as {given}, its config asks for {asked}; export it anew"
-            )
-    return jax.tree.unflatten(jax.tree.structure(blank), [tensors[name] for name in wanted])
-
-
-def _named(params: Any) -> list[tuple[str, Any]]:
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves]
+    params = [tensors[name] for name in leaves.named(blank)]
+    return cfg, jax.tree.unflatten(jax.tree.structure(blank), params)

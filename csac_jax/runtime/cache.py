@@ -5,7 +5,7 @@ is machine code for one processor, which JAX's own key does not name. Nothing he
 damaged entry is compiled again, a folder that cannot be written is not used.
 """
 
-import contextlib
+import collections
 import functools
 import hashlib
 import os
@@ -20,12 +20,8 @@ LARGEST = 4 * 2**30  # bytes kept per kind of machine; what is unused for longes
 SHORTEST = 0.5  # s: what compiles faster is not kept
 _ASKED = "/jax/compilation_cache/compile_requests_use_cache"
 _HIT = "/jax/compilation_cache/cache_hits"
-
-
-class _Counter:
-    """Programs that this process found in the cache."""
-
-    hits = 0
+_PROCESSOR = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU part")
+_events: collections.Counter[str] = collections.Counter()  # of JAX's, in this process
 
 
 def enable() -> Path | None:
@@ -54,10 +50,8 @@ def enable() -> Path | None:
 
 
 def _date_entries(folder: Path) -> None:
-    """Gives entries without a time of last use the oldest one; JAX fails on them.
-
-    There are some where a process was killed, or where the cache had no limit.
-    """
+    """Gives entries without a time of last use, which a killed process leaves, the oldest one: JAX
+    fails on them."""
     for entry in folder.glob("*-cache"):
         last_use = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
         if not last_use.exists():
@@ -66,46 +60,34 @@ def _date_entries(folder: Path) -> None:
 
 def hits() -> int:
     """Programs found in the cache since `enable`, by this process."""
-    return _Counter.hits
+    return _events[_HIT]
 
 
 @functools.cache
 def _listen() -> None:
-    def count(event: str, **_: object) -> None:
-        _Counter.hits += event == _HIT
-        if event == _ASKED:
-            _quieten()
-
-    jax.monitoring.register_event_listener(count)
+    jax.monitoring.register_event_listener(_on_event)
 
 
-@functools.cache
-def _quieten() -> None:
-    """Silences XLA's C++ log on the CPU, unless the user has chosen a level: it logs a spurious
-    warning for each cached program. Failures still raise."""
-    if jax.default_backend() == "cpu" and "JAX_LOGGING_LEVEL" not in os.environ:
+def _on_event(event: str, **_: object) -> None:
+    """Counts JAX's events; silences XLA's C++ log when the first program is looked for on a CPU,
+    unless the user has chosen a level: it has a spurious warning for each. Failures still raise."""
+    _events[event] += 1
+    first = event == _ASKED and _events[event] == 1
+    if first and jax.default_backend() == "cpu" and "JAX_LOGGING_LEVEL" not in os.environ:
         jax.config.update("jax_logging_level", "CRITICAL")
 
 
 def _folder() -> Path:
+    """The user's folder for this kind of machine: its processor, and the threads that programs are
+    cut for."""
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return root / "csac_jax" / "xla" / _machine()
-
-
-def _machine() -> str:
-    """Name of the kind of machine: its processor and the threads that programs are cut for."""
     relevant = (platform.machine(), platform.processor(), _processor(), _guard.pool_setting()[1])
-    return hashlib.sha256(repr(relevant).encode()).hexdigest()[:16]
+    machine = hashlib.sha256(repr(relevant).encode()).hexdigest()[:16]
+    return root / "csac_jax" / "xla" / machine
 
 
 def _processor() -> tuple[str, ...]:
     """Model and abilities of the first processor, as Linux states them; none elsewhere."""
-    with contextlib.suppress(OSError):
-        first = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
-        wanted = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU part")
-        return tuple(
-            line
-            for line in first.splitlines()
-            if line.split("\t")[0].split(":")[0].strip() in wanted
-        )
-    return ()
+    stated = Path("/proc/cpuinfo")
+    first = stated.read_text().split("\n\n")[0] if stated.exists() else ""
+    return tuple(line for line in first.splitlines() if line.split("\t")[0] in _PROCESSOR)

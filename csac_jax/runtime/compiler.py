@@ -1,8 +1,7 @@
 """How a training program is traced, and which options XLA compiles it with.
 
 On a CPU, XLA has a second library for convolutions, about twice as fast as Eigen at those of the
-small net. It is not the default and differs between versions of jaxlib. It is used only where a
-test shows that it computes right.
+small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
@@ -26,11 +25,8 @@ _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float
 
 
 def lower(jitted: Any, *given: Any) -> Any:
-    """`jitted.lower(*given)` without Python's garbage collector, which saves a quarter of the time
-    or more.
-
-    Tracing makes hundreds of thousands of small objects and next to no garbage.
-    """
+    """`jitted.lower(*given)` without Python's garbage collector: a quarter faster, as tracing makes
+    hundreds of thousands of small objects and next to no garbage."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -43,8 +39,7 @@ def lower(jitted: Any, *given: Any) -> Any:
 def options(cfg: Config) -> dict[str, Any] | None:
     """Options of `jax.jit` for the config's training program, None for the defaults.
 
-    The second library is for the small net only. It is slow at kernel gradients, which `conv2d`
-    keeps from it.
+    The second library is slow at kernel gradients, which `conv2d` keeps from it.
     """
     if cfg.net.kind == "small":
         return dict(LIBRARY) if has_library() else None
@@ -67,14 +62,11 @@ def has_library() -> bool:
     if jax.default_backend() != "cpu":
         return False
     rng = np.random.default_rng(0)
-    maps, kernel = (
-        rng.normal(size=shape).astype(np.float32) for shape in ((1, 8, 8, 40), (3, 3, 40, 24))
-    )
+    shapes = ((1, 8, 8, 40), (3, 3, 40, 24))
+    maps, kernel = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
     try:
-        program = jax.jit(
-            lambda maps, kernel: conv2d(maps, kernel, 1, 1, 1), compiler_options=LIBRARY
-        )
-        got = np.asarray(program(jnp.asarray(maps), jnp.asarray(kernel)))
+        program = jax.jit(lambda m, k: conv2d(m, k, 1, 1, 1), compiler_options=LIBRARY)
+        got = np.asarray(program(maps, kernel))
     except jax.errors.JaxRuntimeError:
         return False
     padded = np.pad(maps.astype(np.float64), ((0, 0), (1, 1), (1, 1), (0, 0)))

@@ -11,8 +11,7 @@ _PLATFORMS = {"cpu": "cpu", "gpu": "cuda,cpu"}  # C physics is called back on th
 
 
 def select(name: Literal["cpu", "gpu"]) -> None:
-    """Has JAX compute on the CPU or on GPUs; call it before JAX is used. Raises DeviceError if it
-    cannot."""
+    """Chooses the CPU or GPUs, before JAX is used. Raises DeviceError if there is none."""
     jax.config.update("jax_platforms", _PLATFORMS[name])
     require(name)
 

@@ -1,5 +1,6 @@
 """Where a result comes from: versions, device, commit."""
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -8,28 +9,15 @@ from pathlib import Path
 
 import jax
 
-PACKAGES = (
-    "csac-jax",
-    "jax",
-    "jaxlib",
-    "mujoco",
-    "mujoco-mjx",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "numpy",
-)
+from csac_jax import __version__
+
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that can change a result, or "missing"."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "missing"
-    return found
+    """Versions of Python and of the packages that can change a result."""
+    installed = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version(), "csac-jax": __version__, **installed}
 
 
 def device() -> str:
@@ -46,24 +34,20 @@ def commit() -> str | None:
     if named := os.environ.get("CSAC_JAX_COMMIT"):
         return named
     folder = Path(__file__).resolve().parent
-    root = _git(folder, "rev-parse", "--show-toplevel")
-    own = Path(root or "") / "csac_jax" / "runtime" / "provenance.py"
-    if root is None or not (own.is_file() and own.samefile(__file__)):
+    if _git(folder, "ls-files", Path(__file__).name) is None:
         return None  # installed into some other project's checkout
     name = _git(folder, "rev-parse", "HEAD")
-    return name and name + (
-        "-dirty" if _git(folder, "status", "--porcelain", "--untracked-files=no") else ""
-    )
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    return f"{name}-dirty" if name and changed else name
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None
+    """What git says; None if it says nothing or fails."""
+    command = ["git", "-C", str(folder), *arguments]
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=10)
+        return done.stdout.strip() or None
+    return None
 
 
 def record() -> dict[str, object]:

@@ -34,9 +34,7 @@ def install() -> Stop:
     signal.set_wakeup_fd(writer.fileno())
     for number in SIGNALS:
         signal.signal(number, lambda *_: None)
-    threading.Thread(
-        target=_listen, args=(stop, reader, writer), daemon=True, name="signals"
-    ).start()
+    threading.Thread(target=_listen, args=(stop, reader, writer), daemon=True).start()
     return stop
 
 
@@ -50,9 +48,5 @@ def _listen(stop: Stop, reader: socket.socket, writer: socket.socket) -> None:
             if number in SIGNALS:
                 seen.add(number)
                 stop.signal = stop.signal or number
-                name = signal.Signals(number).name
-                print(
-                    f"{name}: saving after this chunk; once more to end at once",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                said = f"{signal.Signals(number).name}: saving after this chunk"
+                print(f"{said}; once more to end at once", file=sys.stderr, flush=True)

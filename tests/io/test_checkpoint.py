@@ -14,7 +14,7 @@ import pytest
 from flax import struct
 
 from csac_jax import presets
-from csac_jax.io import checkpoint, renames
+from csac_jax.io import checkpoint, leaves, renames
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.training import step as training
 
@@ -98,12 +98,6 @@ def test_state_comes_back_bit_for_bit(run_dir: Path):
     assert not _same(state, _state(4))
     assert extra == {"seconds": 4.0, "grasps": [0, 1]}
     assert jax.random.bits(state.key) == jax.random.bits(_state(8).key)
-
-
-def test_older_step_by_name(run_dir: Path):
-    """Claim: an older step is restored if it is asked for."""
-    state, _ = checkpoint.restore(run_dir, _abstract(), step=4)
-    assert _same(state, _state(4))
 
 
 def test_config_comes_back(run_dir: Path):
@@ -193,14 +187,10 @@ def test_no_sound_step_is_left(run_dir: Path):
 
 
 def test_missing_checkpoint(tmp_path: Path):
-    """Claim: a folder without a checkpoint, or without the step asked for, is an error that says
-    so."""
+    """Claim: a folder without a checkpoint is an error that says so."""
     assert checkpoint.latest_step(tmp_path) is None
     with pytest.raises(CheckpointError, match="there is no checkpoint under"):
         checkpoint.load_config(tmp_path)
-    checkpoint.save(tmp_path, 4, _state(), CFG, {})
-    with pytest.raises(CheckpointError, match="no checkpoint of step 5"):
-        checkpoint.restore(tmp_path, _abstract(), step=5)
 
 
 def test_other_dtype_or_shape_is_refused(run_dir: Path):
@@ -280,6 +270,6 @@ def test_states_leaves_have_the_names_of_today():
     """Claim: `renames.STATE` leads to leaves that a run's state has."""
     cfg = CFG.change(sensor={"dropped": 0.1})  # only with noise there is a key of noise
     program = training.make(cfg, env=training.without_physics(cfg))
-    names = {name for name, _ in checkpoint._named(training.abstract_state(program))}
+    names = leaves.named(training.abstract_state(program)).keys()
     assert set(renames.STATE.values()) <= names
     assert not set(renames.STATE) & names

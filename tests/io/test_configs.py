@@ -38,7 +38,7 @@ def test_config_survives_json(name: str):
         ("learn", 3, "learn: input should be an object"),
         ("scene.slots", ["ball"], r"scene.slots.0: input should be 'box'"),
         ("sim.grasp_phases", [1, 2], "sim.grasp_phases.2: field required"),
-        ("replay.sampler", "best", "replay.sampler: input should be"),
+        ("replay.sampler", "best", "replay.sampler: 'best' is not one of: uniform, prioritised"),
         ("replay.alpha", 0.5, "replay.alpha: unknown setting"),
         ("learn.tau", 2.0, "learn.tau: must be above 0"),
         ("format", 3, "format: 3 is unknown"),

@@ -100,7 +100,7 @@ def test_number_beyond_the_processes():
     """Claim: a process whose number is not among those that there are is refused before it waits
     for anybody."""
     with pytest.raises(ValueError, match=r"--process-id: must lie in 0 \.\. 1, not 2"):
-        cluster.join(cluster.Place("127.0.0.1:1", 2, 2))
+        cluster.join("127.0.0.1:1", 2, 2)
 
 
 def test_one_process_agrees_with_itself():

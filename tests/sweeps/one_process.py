@@ -34,7 +34,7 @@ class Reporter:
 def main(folder: str, after: str, shard: str, *place: str) -> int:
     """Exit code: 0 if the sweep is done, 15 if it was stopped."""
     if place:
-        cluster.join(cluster.Place(place[0], int(place[1]), int(place[2])))
+        cluster.join(place[0], int(place[1]), int(place[2]))
     step.init_state, step.train_step, step.make = toys.init_state, toys.train_step, toys.program
     line, stop = sharding.make(None), Stop()
     assert (line is not None) == bool(place)
