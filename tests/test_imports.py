@@ -55,7 +55,7 @@ ONLY_IN = {
     "matplotlib": ("render", "report"),
     "imageio": ("render/media.py",),
     "jinja2": ("report/page.py",),
-    "tensorboardX": ("report/tensorboard.py",),
+    "tensorboardX": ("report/progress.py",),
 }
 JIT_IN = (
     *("training", "sweeps", "evaluation"),

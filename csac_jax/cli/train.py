@@ -90,7 +90,7 @@ def _train(options: TrainOptions, cfg: Config, stop: signals.Stop) -> Any:
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")
     reporters = []
     if options.tensorboard:
-        from csac_jax.report.tensorboard import TensorBoard
+        from csac_jax.report.progress import TensorBoard
 
         reporters.append(TensorBoard(folder))
     with (

@@ -1,8 +1,9 @@
 """One episode to look at: a line per action, a picture, a video."""
 
-import dataclasses
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -34,55 +35,46 @@ class Stage:
     """The model of an episode's scene, coloured, and what draws it."""
 
     def __init__(
-        self,
-        cfg: Config,
-        first: State,
-        size: tuple[int, int],
-        opengl: str | None,
-        views: bool = False,
+        self, cfg: Config, first: State, size: tuple[int, int], opengl: str | None, views: bool
     ) -> None:
-        self._cfg, self._height = cfg, size[1]
-        self._views = views  # whether panels show what the policy saw
+        self._cfg, self._height, self._views = cfg, size[1], views
         self._world = model.build(cfg.scene, cfg.sim)
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
         self._model = model.with_blocks(self._world, self._fields)
         colours = blocks.COLOURS[first.scene.colour[self._world.parts.slot]]
         self._model.geom_rgba[self._world.block_geoms, :3] = colours
         self._data = mujoco.MjData(self._model)
-        self._every = max(round(1.0 / (media.FRAMES_PER_SECOND * cfg.sim.timestep)), 1)
-        eye = dataclasses.replace(VIEWS[cfg.sim.robot], size=size)
-        self._draw = picture.renderer(self._model, eye, opengl)
+        self._draw = picture.renderer(self._model, VIEWS[cfg.sim.robot]._replace(size=size), opengl)
 
-    def still(self, step: StepRecord, text: str = "") -> np.ndarray:
+    def still(self, step: StepRecord, text: str) -> np.ndarray:
         """The scene before an action, the robot where that action starts: [H, W, 3] uint8."""
-        return self._frame(step)(self._still(step), text)
+        return self._frame(step)(self._start(step), text)
 
-    def _still(self, step: StepRecord) -> np.ndarray:
-        scene, pose = step.before.scene, self._data.qpos
-        pose[self._world.robot_qpos] = step.joints.start
-        pose[self._world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-        return self._picture()
-
-    def motion(self, step: StepRecord, text: str = "") -> Iterator[np.ndarray]:
-        """The action as it runs in C MuJoCo; a still picture where the robot cannot do it.
-
-        With views, HOLD more pictures of the end; `text` below up to its colon, there all of it.
-        """
-        image, frame, action = self._still(step), self._frame(step), text.split(":")[0]
+    def motion(self, step: StepRecord, text: str) -> Iterator[np.ndarray]:
+        """The action as it runs in C MuJoCo; a still picture where the robot cannot do it. With
+        views, `text` up to its colon is below, and all of it in HOLD more pictures of the end."""
+        image, frame, action = self._start(step), self._frame(step), text.split(":")[0]
         yield frame(image, action)
         recorded = c_physics.trajectory(self._world, self._fields, step.before.scene, step.joints)
-        for pose in recorded.qpos[:: self._every]:
-            self._data.qpos[:] = pose
-            image = self._picture()
+        every = max(round(1.0 / (media.FRAMES_PER_SECOND * self._cfg.sim.timestep)), 1)
+        for pose in recorded.qpos[::every]:
+            image = self._picture(pose)
             yield frame(image, action)
         yield from [frame(image, text)] * (HOLD if self._views else 0)
+
+    def _start(self, step: StepRecord) -> np.ndarray:
+        scene, pose = step.before.scene, self._data.qpos.copy()
+        pose[self._world.robot_qpos] = step.joints.start
+        pose[self._world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+        return self._picture(pose)
 
     def _frame(self, step: StepRecord) -> panels.Frame:
         if self._views:
             return panels.frame(self._cfg, step, self._height)
         return lambda scene, text: scene
 
-    def _picture(self) -> np.ndarray:
+    def _picture(self, pose: np.ndarray) -> np.ndarray:
+        self._data.qpos[:] = pose
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         return self._draw(self._data)
@@ -90,7 +82,7 @@ class Stage:
 
 def line(number: int, step: StepRecord) -> str:
     """What an action did, in words."""
-    before, after, info = step.before, step.after, step.after.info
+    scene, after, info = step.before.scene, step.after, step.after.info
     x, y, yaw = step.action.pose
     where = f"at x {1e3 * x:+.0f} y {1e3 * y:+.0f} mm, yaw {np.degrees(yaw):.0f} deg"
     if step.action.primitive == Primitive.PUSH:
@@ -100,33 +92,28 @@ def line(number: int, step: StepRecord) -> str:
     if not step.joints.reachable:
         done += ", out of the robot's reach"
     if info.cleared:
-        gone = np.flatnonzero(before.scene.in_play & ~after.scene.in_play)
-        colours = (blocks.COLOUR_NAMES[before.scene.colour[slot]] for slot in gone)
-        done += f" ({', '.join(colours)})"
+        gone = scene.colour[scene.in_play & ~after.scene.in_play]
+        done += f" ({', '.join(blocks.COLOUR_NAMES[colour] for colour in gone)})"
     if info.blocks_lost:
-        done += f", {_blocks(int(info.blocks_lost))} left the workspace"
+        done += f", {_blocks(info.blocks_lost)} left the workspace"
     if info.physics_diverged:
         done += ", physics diverged"
-    left = _blocks(int(after.scene.in_play.sum()))
+    left = _blocks(after.scene.in_play.sum())
     return f"{number:3d} {done}; reward {float(step.reward):+.2f}; {left} left"
 
 
 def summary(cfg: Config, steps: list[StepRecord]) -> str:
     """How the episode ended, and what became of the blocks."""
-    actions = f"{len(steps)} action{'s' if len(steps) != 1 else ''}"
-    fate = f"{_blocks(taken(steps))} taken"
-    if lost(steps):
-        fate += f", {_blocks(lost(steps))} left the workspace"
-    return f"{_ending(cfg, steps)} after {actions}: {fate}"
-
-
-def _ending(cfg: Config, steps: list[StepRecord]) -> str:
     last = steps[-1].after
     if not last.terminated:
-        return STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
-    if last.scene.target != layout.ANY:
-        return "the target is taken" if completed(steps) else "the target is lost"
-    return "the table is clear" if completed(steps) else "no block is left within reach"
+        ending = STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
+    elif last.scene.target != layout.ANY:
+        ending = "the target is taken" if completed(steps) else "the target is lost"
+    else:
+        ending = "the table is clear" if completed(steps) else "no block is left within reach"
+    actions = f"{len(steps)} action{'s' if len(steps) != 1 else ''}"
+    fate = f", {_blocks(lost(steps))} left the workspace" if lost(steps) else ""
+    return f"{ending} after {actions}: {_blocks(taken(steps))} taken{fate}"
 
 
 def completed(steps: list[StepRecord]) -> bool:
@@ -146,7 +133,7 @@ def lost(steps: list[StepRecord]) -> int:
     return sum(int(step.after.info.blocks_lost) for step in steps)
 
 
-def _blocks(count: int) -> str:
+def _blocks(count: Any) -> str:
     return f"{count} block{'s' if count != 1 else ''}"
 
 
@@ -156,7 +143,4 @@ def record(stage: Stage, steps: list[StepRecord], png: Path | None, video: Path 
     if png is not None:
         media.write_picture(png, stage.still(steps[0], lines[0]))
     if video is not None:
-        told = zip(steps, lines, strict=True)
-        media.write_video(
-            video, (frame for step, text in told for frame in stage.motion(step, text))
-        )
+        media.write_video(video, itertools.chain.from_iterable(map(stage.motion, steps, lines)))

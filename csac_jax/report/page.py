@@ -10,24 +10,21 @@ from csac_jax.report.comparison import Report
 TEMPLATE = Path(__file__).with_name("page.html")
 
 
-def page(report: Report, figures: dict[str, str]) -> str:
-    """One HTML page that needs no other file; figures by title, each an SVG."""
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(TEMPLATE.read_text()).render(
+def write(report: Report, folder: Path) -> list[Path]:
+    """Writes a page that needs no other file, its figures and its tables; returns the files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = [(chart, charts.svg(chart.figure)) for chart in charts.draw(report)]
+    template = jinja2.Template(
+        TEMPLATE.read_text(), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    page = template.render(
         explained=tables.EXPLAINED,
-        figures=figures,
+        figures={chart.title: svg for chart, svg in drawn},
         tables=tables.tables(report),
         notes=report.notes,
     )
-
-
-def write(report: Report, folder: Path) -> list[Path]:
-    """Writes the page, its figures and its tables; returns the files."""
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = [(chart, charts.svg(chart.figure)) for chart in charts.draw(report)]
     files = {f"{chart.name}.svg": svg for chart, svg in drawn}
-    files["index.html"] = page(report, {chart.title: svg for chart, svg in drawn})
-    files["results.md"] = tables.markdown(report)
+    files |= {"index.html": page, "results.md": tables.markdown(report)}
     for name, text in files.items():
         (folder / name).write_text(text)
     return [folder / name for name in files]
