@@ -54,7 +54,7 @@ ONLY_IN = {
     "safetensors": ("io",),
     "matplotlib": ("render", "report"),
     "imageio": ("render/media.py",),
-    "jinja2": ("report/page.py",),
+    "jinja2": ("report/charts.py",),
     "tensorboardX": ("report/progress.py",),
 }
 JIT_IN = (

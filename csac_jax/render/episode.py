@@ -1,9 +1,7 @@
 """One episode to look at: a line per action, a picture, a video."""
 
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 import mujoco
@@ -95,10 +93,10 @@ def line(number: int, step: StepRecord) -> str:
         gone = scene.colour[scene.in_play & ~after.scene.in_play]
         done += f" ({', '.join(blocks.COLOUR_NAMES[colour] for colour in gone)})"
     if info.blocks_lost:
-        done += f", {_blocks(info.blocks_lost)} left the workspace"
+        done += f", {_blocks(int(info.blocks_lost))} left the workspace"
     if info.physics_diverged:
         done += ", physics diverged"
-    left = _blocks(after.scene.in_play.sum())
+    left = _blocks(int(after.scene.in_play.sum()))
     return f"{number:3d} {done}; reward {float(step.reward):+.2f}; {left} left"
 
 
@@ -112,28 +110,25 @@ def summary(cfg: Config, steps: list[StepRecord]) -> str:
     else:
         ending = "the table is clear" if completed(steps) else "no block is left within reach"
     actions = f"{len(steps)} action{'s' if len(steps) != 1 else ''}"
-    fate = f", {_blocks(lost(steps))} left the workspace" if lost(steps) else ""
-    return f"{ending} after {actions}: {_blocks(taken(steps))} taken{fate}"
+    taken, lost = totals(steps)
+    fate = f", {_blocks(lost)} left the workspace" if lost else ""
+    return f"{ending} after {actions}: {_blocks(taken)} taken{fate}"
 
 
 def completed(steps: list[StepRecord]) -> bool:
     """Whether the hand took what the task asks for."""
-    last = steps[-1].after
-    got = last.reward > 0 if last.scene.target != layout.ANY else lost(steps) == 0
+    last, (_, lost) = steps[-1].after, totals(steps)
+    got = last.reward > 0 if last.scene.target != layout.ANY else lost == 0
     return bool(last.terminated and got)
 
 
-def taken(steps: list[StepRecord]) -> int:
-    """Blocks taken from the table."""
-    return sum(int(step.after.info.cleared) for step in steps)
+def totals(steps: list[StepRecord]) -> tuple[int, int]:
+    """Blocks taken from the table, and blocks that left the workspace."""
+    infos = [step.after.info for step in steps]
+    return sum(int(info.cleared) for info in infos), sum(int(info.blocks_lost) for info in infos)
 
 
-def lost(steps: list[StepRecord]) -> int:
-    """Blocks that left the workspace."""
-    return sum(int(step.after.info.blocks_lost) for step in steps)
-
-
-def _blocks(count: Any) -> str:
+def _blocks(count: int) -> str:
     return f"{count} block{'s' if count != 1 else ''}"
 
 
@@ -143,4 +138,5 @@ def record(stage: Stage, steps: list[StepRecord], png: Path | None, video: Path 
     if png is not None:
         media.write_picture(png, stage.still(steps[0], lines[0]))
     if video is not None:
-        media.write_video(video, itertools.chain.from_iterable(map(stage.motion, steps, lines)))
+        motions = map(stage.motion, steps, lines)
+        media.write_video(video, (image for motion in motions for image in motion))

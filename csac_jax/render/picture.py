@@ -1,5 +1,6 @@
 """Pictures of a MuJoCo model: by MuJoCo's renderer with OpenGL, by our rays without."""
 
+import contextlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -31,10 +32,8 @@ def renderer(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
     Recolours the model's planes."""
     model.geom_rgba[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR
     if opengl is not None:
-        try:
+        with contextlib.suppress(Exception):  # a broken driver raises nearly anything
             return _opengl_renderer(model, view)
-        except Exception:  # a broken driver raises nearly anything
-            pass
     return _ray_renderer(model, view)
 
 
@@ -49,23 +48,18 @@ def _opengl_renderer(model: mujoco.MjModel, view: View) -> Draw:
     eye.distance = np.linalg.norm(offset)
     eye.azimuth = np.degrees(np.arctan2(offset[1], offset[0]))
     eye.elevation = np.degrees(np.arcsin(offset[2] / eye.distance))
-    options = mujoco.MjvOption()
+    options, sphere = mujoco.MjvOption(), mujoco.mjtGeom.mjGEOM_SPHERE
     options.geomgroup[:] = 1
 
     def draw(data: mujoco.MjData) -> np.ndarray:
         opengl.update_scene(data, eye, options)
-        _add_sky(opengl.scene)
+        sky = opengl.scene.geoms[opengl.scene.ngeom]  # a luminous sphere: the background is black
+        mujoco.mjv_initGeom(sky, sphere, np.full(3, 20.0), np.zeros(3), np.eye(3).ravel(), SKY)
+        sky.emission, sky.specular = 1.0, 0.0
+        opengl.scene.ngeom += 1
         return opengl.render().copy()
 
     return draw
-
-
-def _add_sky(scene: mujoco.MjvScene) -> None:
-    """Puts a luminous sphere of 20 m around the scene; MuJoCo's background is black."""
-    sky, sphere = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE
-    mujoco.mjv_initGeom(sky, sphere, np.full(3, 20.0), np.zeros(3), np.eye(3).ravel(), SKY)
-    sky.emission, sky.specular = 1.0, 0.0
-    scene.ngeom += 1
 
 
 def _ray_renderer(model: mujoco.MjModel, view: View) -> Draw:

@@ -1,4 +1,4 @@
-"""Figures of a report, with matplotlib: figures 6, 7 and 9 of the paper, and variants."""
+"""Figures 6, 7 and 9 of the paper and of variants, and the page of `csac-jax report --out`."""
 
 import functools
 import io
@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from csac_jax.evaluation.statistics import Band
+from csac_jax.report import tables
 from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped, label
 from csac_jax.report.tables import PAPER_ACTIONS, PAPER_CASES, PAPER_TRAINING
 
@@ -23,7 +24,6 @@ SAMPLERS = ("csac", "csac_per", "csac_beta")
 PALETTE = ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759")
 COLOURS = dict(zip(NAMES, PALETTE, strict=True))
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
-FOUR = ("cases", "target")  # suites whose parts are the four cases
 _short = functools.partial(label, preset=False, most=3)  # name of a variant in a legend
 LEGEND_WIDTH = 56  # characters
 INSIDE = 6  # curves whose legend has room among them
@@ -45,7 +45,7 @@ def draw(report: Report) -> Iterator[Chart]:
             if chosen:
                 title = f"Grasp success of {what}, preset {preset}"
                 yield Chart(f"{name}-{preset}", title, success(chosen))
-    four = [score for score in report.scores if score.suite in FOUR]
+    four = [score for score in report.scores if score.suite in ("cases", "target")]
     by_suite = grouped(four, lambda score: (score.suite, score.variant.preset))
     for (suite, preset), scores in by_suite.items():
         title = f"The four cases (figure 9), suite {suite}, preset {preset}"
@@ -81,12 +81,11 @@ def success(curves: Sequence[Curve]) -> Figure:
     axes.set(xlabel="actions", ylabel="success over the last 200 grasps, %", ylim=(0, 101))
     axes.set_xlim(left=0)
     axes.grid(alpha=0.3)
-    legend: dict[str, Any] = {"title": "method (runs)", "fontsize": "small"}
     if len(curves) <= INSIDE:
-        axes.legend(loc="lower right", **legend)
+        axes.legend(loc="lower right", title="method (runs)", fontsize="small")
         return figure
     figure.set_figheight(figure.get_figheight() + 0.2 * len(curves))
-    figure.legend(loc="outside lower center", ncols=2, **legend)
+    figure.legend(loc="outside lower center", ncols=2, title="method (runs)", fontsize="small")
     return figure
 
 
@@ -142,23 +141,45 @@ def _style(score: Score, index: int) -> dict[str, Any]:
     """Name and colour of a variant's marks."""
     variant = score.variant
     name = _short(variant) if score.policy == "learned" else score.policy
-    name = f"{name}, {score.physics}, {score.robot} ({score.runs})"
+    runs = max(map(len, score.parts.values()))
+    name = f"{name}, {score.physics}, {score.robot} ({runs})"
     known = variant.unchanged and variant.algo in COLOURS
     colour = COLOURS[variant.algo] if known else plt.get_cmap("tab20")(index)
     return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
 
 
-def svg(figure: Figure) -> str:
+def _svg(figure: Figure) -> str:
     """The figure as the element <svg>."""
     file = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "csac_jax"}):
         figure.savefig(file, format="svg", metadata={"Date": None})
     plt.close(figure)
-    text = file.getvalue()
-    return text[text.index("<svg") :]
+    return "<svg" + file.getvalue().partition("<svg")[2]
 
 
 def save(figure: Figure, path: Path) -> None:
     """Writes a PNG that is the same bytes for the same figure."""
     figure.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(figure)
+
+
+def write_page(report: Report, folder: Path) -> list[Path]:
+    """Writes a page that needs no other file, its figures and its tables; returns the files. Needs
+    the extra `report`."""
+    import jinja2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = [(chart, _svg(chart.figure)) for chart in draw(report)]
+    source = Path(__file__).with_name("page.html").read_text()
+    template = jinja2.Template(source, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    page = template.render(
+        explained=tables.EXPLAINED,
+        figures={chart.title: svg for chart, svg in drawn},
+        tables=tables.tables(report),
+        notes=report.notes,
+    )
+    files = {f"{chart.name}.svg": svg for chart, svg in drawn}
+    files |= {"index.html": page, "results.md": tables.markdown(report)}
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return [folder / name for name in files]

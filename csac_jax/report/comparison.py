@@ -45,11 +45,6 @@ class Curve(NamedTuple):
         """Success over the last grasps of each run, wherever it ends, [seeds]."""
         return np.array([run.success[-1] for run in self.runs])
 
-    @property
-    def final(self) -> Band:
-        """IQM of `last`."""
-        return statistics.band([self.last])
-
     def points(self) -> tuple[np.ndarray, list[Band]]:
         """Actions [m], up to where the shortest run ends, and the success there."""
         return statistics.curves([(run.actions, run.success) for run in self.runs])
@@ -71,11 +66,6 @@ class Score(NamedTuple):
     def world(self) -> str:
         """Physics, robot and seed of the evaluation."""
         return f"{self.physics}, {self.robot}, {self.seed}"
-
-    @property
-    def runs(self) -> int:
-        """Evaluations of the part that has most."""
-        return max(map(len, self.parts.values()))
 
     def only(self, *parts: str) -> "Score":
         """The score in those of these parts that it has, in their order."""

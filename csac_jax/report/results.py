@@ -19,7 +19,7 @@ from csac_jax.io import configs, files, renames
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
 SKIPPED = ("checkpoints", "tensorboard")
 NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
-HOST = ("train.chunk", "train.save_every")  # settings that no result depends on
+HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
 LENGTH = "train."  # settings of a run's length and shape do not make it another method
 
 Json = dict[str, Any]
@@ -156,22 +156,17 @@ def _without_evaluation(results: Results) -> Iterator[str]:
             yield f"{folder}: not evaluated; run: csac-jax eval {folder} --json {folder}/eval.json"
 
 
-def _settings(config: Json) -> Json:
-    """A recorded config's settings by their dotted names of today."""
-    with contextlib.suppress(ValueError):  # written by a version that knew other settings
-        config = configs.to_dict(configs.from_dict(config))
-    return {name: value for name, value in configs.flat(config).items() if name != "format"}
-
-
 def variant(config: Json) -> Variant:
     """What a recorded config is a variant of. Settings that the config lacks are passed over."""
     preset, algo = config.get("preset", ""), config.get("algo", "csac_beta")
     base: Json = {}
     with contextlib.suppress(ValueError):  # a name that is no more
         base = configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
+    with contextlib.suppress(ValueError):  # written by a version that knew other settings
+        config = configs.to_dict(configs.from_dict(config))
     changed = tuple(
         (name, " ".join(map(str, value)) if isinstance(value, list) else str(value))
-        for name, value in _settings(config).items()
+        for name, value in configs.flat(config).items()
         if value != base.get(name, value) and name not in (*NAMED, *HOST)
     )
     return Variant(preset, algo, changed)

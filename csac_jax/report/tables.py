@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from csac_jax.constants import GRASP_WINDOW
+from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import PER_ACTION
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import results as recorded
@@ -14,8 +15,7 @@ from csac_jax.report.comparison import METRICS, Curve, Report, Score, gaps, labe
 from csac_jax.report.results import Evaluation, RecordedRun, Variant
 
 PAPER_TRAINING = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
-"""Grasp success over the last 200 grasps of 2,500 actions, from the text to figures 6 and 7 (CSAC
-sec. 4.3)."""
+"""Success over the last 200 grasps of 2,500 actions, text to figures 6 and 7 (CSAC sec. 4.3)."""
 PAPER_ACTIONS = 2500
 PAPER_CASES = {
     "completion": {"vpg": 0.60, "csac_beta": 0.90},
@@ -23,7 +23,6 @@ PAPER_CASES = {
 }
 """Means of the four cases, figure 9 (sec. 4.4 and 5). The text gives no other numbers."""
 GOOD = 0.9  # grasp success whose time is reported
-
 LAST = f"success, last {GRASP_WINDOW} grasps"
 SUMMARY = ("method", "runs", LAST, "paper", "training time")  # columns of the training table
 
@@ -65,7 +64,7 @@ def _curve_json(curve: Curve, ahead: Band | None) -> recorded.Json:
         "seconds": [float(run.seconds[-1]) for run in curve.runs],
         "actions": actions.tolist(),
         "success": [band._asdict() for band in success],
-        **_plain({"final": curve.final, "ahead": ahead}),
+        **_plain({"final": statistics.band([curve.last]), "ahead": ahead}),
     }
 
 
@@ -111,7 +110,7 @@ def training(report: Report) -> Table:
                 "runs": str(len(curve.runs)),
                 "seeds": ", ".join(map(str, dict.fromkeys(_seeds(curve.runs)))),
                 "actions": _range(curve.ends, ","),
-                LAST: shown(curve.final),
+                LAST: shown(statistics.band([curve.last])),
                 "CSAC-beta ahead by": shown(ahead.get(curve.variant), "+"),
                 "paper": "-" if mark is None else f"{100 * mark:.0f} %",
                 "time to 90 %": _times([_time_to_good(run) for run in curve.runs]),
@@ -138,8 +137,8 @@ def evaluation(report: Report) -> Table:
 
 
 def _evaluation_row(score: Score) -> dict[str, str]:
-    episodes = score.episodes * sum(map(len, score.parts.values()))
-    counts = {"runs": str(score.runs), "episodes": str(episodes)}
+    runs = [len(runs) for runs in score.parts.values()]
+    counts = {"runs": str(max(runs)), "episodes": str(score.episodes * sum(runs))}
     return _first_cells(score) | counts | _metric_cells(score.band)
 
 
