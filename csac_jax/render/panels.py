@@ -35,8 +35,7 @@ Frame = Callable[[np.ndarray, str], np.ndarray]
 
 
 def frame(cfg: Config, step: StepRecord, height: int) -> Frame:
-    """Draws the panels of an action once, `height` px; the result adds them to every picture of the
-    scene."""
+    """Draws an action's panels once, `height` px; the result adds them to each of its pictures."""
     panels = _pixels(figure(cfg, step, height))
 
     def complete(scene: np.ndarray, text: str) -> np.ndarray:
@@ -55,8 +54,7 @@ def text_line(text: str, width: int, scene_height: int) -> np.ndarray:
 
 
 def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
-    """The panels of an action. A learned policy's Q maps stand above, height map and legend below;
-    any other policy has the height map alone."""
+    """An action's Q maps, height map and legend; of a policy without Q the height map alone."""
     if step.debug is None:
         fig = _figure(0.875 * height, height, height)
         _draw_height_map(cfg, fig.subplots(gridspec_kw=OTHERS), step)
@@ -76,7 +74,7 @@ def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
 
 def _figure(width: float, height: float, scene_height: int) -> Figure:
     """A blank figure of even sides, px; videos want them."""
-    dpi = DPI * max(scene_height / 480, 0.1)  # smaller letters cannot be drawn
+    dpi = DPI * max(scene_height / 480.0, 0.1)  # smaller letters cannot be drawn
     sides = [(2 * round(0.5 * side) + 0.1) / dpi for side in (width, height)]  # Agg rounds down
     return Figure((sides[0], sides[1]), dpi)
 
@@ -129,8 +127,7 @@ def _draw_map(cfg: Config, axes: Axes, title: str, values: np.ndarray, cmap: Col
 
 
 def _draw_action(cfg: Config, axes: Axes, step: StepRecord) -> None:
-    """A push as an arrow over its way; a grasp as open fingers and the line that they close
-    along."""
+    """A push as an arrow over its way; a grasp as fingers and the line that they close along."""
     x, y, yaw = np.asarray(step.action.pose, float)
     centre, along = 1e3 * np.array([x, y]), 1e3 * np.array([np.cos(yaw), np.sin(yaw)])
     outline = [patheffects.withStroke(linewidth=3.9, foreground="white")]

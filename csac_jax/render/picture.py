@@ -28,8 +28,7 @@ class View(NamedTuple):
 
 
 def renderer(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
-    """Draws this model with MuJoCo's OpenGL backend; with our rays if there is none or it fails.
-    Recolours the model's planes."""
+    """Draws by OpenGL, by our rays where that is None or fails. Recolours the model's planes."""
     model.geom_rgba[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR
     if opengl is not None:
         with contextlib.suppress(Exception):  # a broken driver raises nearly anything

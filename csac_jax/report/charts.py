@@ -131,8 +131,7 @@ def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> None:
         value, low, high = _percent(bands)
         error = np.maximum([value - low, high - value], 0.0)
         offset = (index + 0.5) * 0.8 / len(scores) - 0.4
-        style = _style(score, index)
-        panel.errorbar(places + offset, value, error, fmt="o", capsize=3, **style)
+        panel.errorbar(places + offset, value, error, fmt="o", capsize=3, **_style(score, index))
     panel.set_xticks(places, [*parts, "mean"])
     panel.set_xlim(-0.5, len(parts) + 0.5)
 
@@ -141,8 +140,7 @@ def _style(score: Score, index: int) -> dict[str, Any]:
     """Name and colour of a variant's marks."""
     variant = score.variant
     name = _short(variant) if score.policy == "learned" else score.policy
-    runs = max(map(len, score.parts.values()))
-    name = f"{name}, {score.physics}, {score.robot} ({runs})"
+    name = f"{name}, {score.physics}, {score.robot} ({max(map(len, score.parts.values()))})"
     known = variant.unchanged and variant.algo in COLOURS
     colour = COLOURS[variant.algo] if known else plt.get_cmap("tab20")(index)
     return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
@@ -164,8 +162,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def write_page(report: Report, folder: Path) -> list[Path]:
-    """Writes a page that needs no other file, its figures and its tables; returns the files. Needs
-    the extra `report`."""
+    """Writes a page that needs no other file, figures and tables. Needs the extra `report`."""
     import jinja2
 
     folder.mkdir(parents=True, exist_ok=True)

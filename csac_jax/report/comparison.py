@@ -77,11 +77,10 @@ class Score(NamedTuple):
         return [*each, self] if len(each) > 1 else each
 
     def band(self, metric: str) -> Band | None:
-        """Mean over parts of the IQM over runs, of a single value its own interval; None where a
-        part has no cases."""
+        """Mean over parts of the IQM over runs, a single value as it is; None without cases."""
         strata = self.strata(metric)
         if [len(runs) for runs in strata] == [1]:
-            return Band(*strata[0][0].tolist(), 1)
+            return Band._make((*strata[0][0], 1))
         fewest = min(map(len, strata), default=0)
         return statistics.band([runs[:, 0] for runs in strata]) if fewest else None
 
@@ -105,7 +104,7 @@ def build(results: Results) -> Report:
     """Runs and evaluations grouped over their seeds."""
     curves = [Curve(*group) for group in grouped(results.runs, lambda run: run.variant).items()]
     scores = [
-        Score(*key, grouped(group, lambda one: one.part))
+        Score._make((*key, grouped(group, lambda one: one.part)))
         for key, group in grouped(results.evaluations, _scored).items()
     ]
     notes = [note for curve in curves for note in _curve_notes(curve)]
@@ -122,8 +121,7 @@ def grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[A
 
 def _scored(one: Evaluation) -> tuple[Any, ...]:
     """Fields of the score that an evaluation counts in."""
-    # Of another policy it does not matter what its run was trained with.
-    learned = one.policy == "learned"
+    learned = one.policy == "learned"  # else it does not matter what its run was trained with
     variant = one.variant if learned else Variant(one.variant.preset, one.policy, ())
     episodes = one.metrics.get("counts", {}).get("episodes", 0)
     return variant, one.policy, one.suite, *recorded.world(one.config), one.seed, episodes

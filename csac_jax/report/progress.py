@@ -28,8 +28,7 @@ def _describe(record: Record, eta: float) -> str:
 
 
 class Terminal:
-    """A reporter with a bar on a terminal, else with a line every PLAIN_INTERVAL. Its `with` ends
-    the bar."""
+    """Shows a bar on a terminal, else a line every PLAIN_INTERVAL. Its `with` ends the bar."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -62,8 +61,7 @@ class Terminal:
 
 
 class TensorBoard:
-    """A reporter that writes every number of a record as a scalar over actions, into
-    RUN/tensorboard. Needs the extra `tensorboard`."""
+    """Writes scalars over actions into RUN/tensorboard. Needs the extra `tensorboard`."""
 
     def __init__(self, run_dir: Path) -> None:
         self._folder = run_dir / "tensorboard"

@@ -120,7 +120,7 @@ def _add_run(path: Path, results: Results) -> None:
         names = ("actions", "grasp_success", "grasps_counted", "seconds")
         columns = [np.array([line[name] for line in lines], float) for name in names]
         record = {"wall_seconds": float(columns[-1][-1]), **_record(path.parent, config)}
-        results.runs.append(RecordedRun(path, config, variant(config), *columns, record))
+        results.runs.append(RecordedRun._make((path, config, variant(config), *columns, record)))
 
 
 def _record(folder: Path, config: Json) -> Json:
@@ -137,7 +137,7 @@ def _evaluations(path: Path) -> list[Evaluation]:
     content = _read_json(path)
     if not any({"policy", "config", name} <= content.keys() for name in ("parts", "grasp_success")):
         return []
-    suite = renames.METRICS.get(content.get("suite", "own"), content.get("suite"))
+    suite = str(renames.METRICS.get(content.get("suite", "own"), content.get("suite")))
     parts = files.renamed(content.get("parts") or {Path(suite).stem: content})
     record = {name: content.get(name) for name in ("device", "versions", "commit")}
     record["wall_seconds"] = content.get("seconds")

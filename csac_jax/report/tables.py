@@ -86,10 +86,9 @@ def _plain(bands: Mapping[str, Band | None]) -> recorded.Json:
 def tables(report: Report) -> dict[str, Table]:
     """By title; those without a row are left out."""
     trained = training(report)
-    pairs = zip(report.curves, trained, strict=True)
-    unchanged = [row for curve, row in pairs if curve.variant.unchanged]
+    kept = [row for one, row in zip(report.curves, trained, strict=True) if one.variant.unchanged]
     every = {
-        "Summary": [{name: row[name] for name in SUMMARY} for row in unchanged],
+        "Summary": [{name: row[name] for name in SUMMARY} for row in kept],
         "Training": trained,
         "Evaluation": evaluation(report),
         "Differences": differences(report),
@@ -220,8 +219,7 @@ def _wall_time(record: recorded.Json) -> str:
 
 
 def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
-    """A value with its band: blocks per action as a number, any other metric in per cent; with a
-    sign, as a difference in points of per cent."""
+    """A band as blocks per action or in per cent; with a sign, as a difference in points."""
     if band is None:
         return "-"
     scale, digits, unit = (1, 3, "") if metric in PER_ACTION else (100, 1, "" if sign else " %")
