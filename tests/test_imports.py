@@ -54,8 +54,8 @@ ONLY_IN = {
     "safetensors": ("io",),
     "matplotlib": ("render", "report"),
     "imageio": ("render/media.py",),
-    "jinja2": ("report/page.py",),
-    "tensorboardX": ("report/tensorboard.py",),
+    "jinja2": ("report/charts.py",),
+    "tensorboardX": ("report/progress.py",),
 }
 JIT_IN = (
     *("training", "sweeps", "evaluation"),

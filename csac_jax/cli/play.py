@@ -55,13 +55,14 @@ def run(arguments: list[str]) -> int:
     if drawn:
         stage = episode.Stage(env.cfg, steps[0].before, options.size, opengl, options.views)
         episode.record(stage, steps, options.png, options.video)
+    taken, lost = episode.totals(steps)
     result = {
         "scene": options.scene,
         "policy": options.policy,
         "renderer": (opengl or "rays") if drawn else None,
         "actions": len(steps),
-        "cleared": episode.taken(steps),
-        "blocks_lost": episode.lost(steps),
+        "cleared": taken,
+        "blocks_lost": lost,
         "completed": episode.completed(steps),
         "seconds": round(time.time() - begun, 1),
     }

@@ -47,9 +47,9 @@ def run(arguments: list[str]) -> int:
         command = f"{PROGRAM} report {runs} --markdown {options.markdown}"
         files.replace(options.markdown, f"# Results\n\nWritten by `{command}`.\n\n{text}")
     if options.out is not None:
-        from csac_jax.report import page
+        from csac_jax.report import charts
 
-        print(*page.write(report, options.out), sep="\n")
+        print(*charts.write_page(report, options.out), sep="\n")
     if options.json is not None:
         files.write_json(options.json, tables.as_json(report))
     return 0

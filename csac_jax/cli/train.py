@@ -53,7 +53,7 @@ def run(arguments: list[str]) -> int:
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")
     reporters = []
     if options.tensorboard:
-        from csac_jax.report.tensorboard import TensorBoard
+        from csac_jax.report.progress import TensorBoard
 
         reporters.append(TensorBoard(folder))
     try:

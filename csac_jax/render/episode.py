@@ -1,6 +1,5 @@
 """One episode to look at: a line per action, a picture, a video."""
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,55 +33,46 @@ class Stage:
     """The model of an episode's scene, coloured, and what draws it."""
 
     def __init__(
-        self,
-        cfg: Config,
-        first: State,
-        size: tuple[int, int],
-        opengl: str | None,
-        views: bool = False,
+        self, cfg: Config, first: State, size: tuple[int, int], opengl: str | None, views: bool
     ) -> None:
-        self._cfg, self._height = cfg, size[1]
-        self._views = views  # whether panels show what the policy saw
+        self._cfg, self._height, self._views = cfg, size[1], views
         self._world = model.build(cfg.scene, cfg.sim)
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
         self._model = model.with_blocks(self._world, self._fields)
         colours = blocks.COLOURS[first.scene.colour[self._world.parts.slot]]
         self._model.geom_rgba[self._world.block_geoms, :3] = colours
         self._data = mujoco.MjData(self._model)
-        self._every = max(round(1.0 / (media.FRAMES_PER_SECOND * cfg.sim.timestep)), 1)
-        eye = dataclasses.replace(VIEWS[cfg.sim.robot], size=size)
-        self._draw = picture.renderer(self._model, eye, opengl)
+        self._draw = picture.renderer(self._model, VIEWS[cfg.sim.robot]._replace(size=size), opengl)
 
-    def still(self, step: StepRecord, text: str = "") -> np.ndarray:
+    def still(self, step: StepRecord, text: str) -> np.ndarray:
         """The scene before an action, the robot where that action starts: [H, W, 3] uint8."""
-        return self._frame(step)(self._still(step), text)
+        return self._frame(step)(self._start(step), text)
 
-    def _still(self, step: StepRecord) -> np.ndarray:
-        scene, pose = step.before.scene, self._data.qpos
-        pose[self._world.robot_qpos] = step.joints.start
-        pose[self._world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-        return self._picture()
-
-    def motion(self, step: StepRecord, text: str = "") -> Iterator[np.ndarray]:
-        """The action as it runs in C MuJoCo; a still picture where the robot cannot do it.
-
-        With views, HOLD more pictures of the end; `text` below up to its colon, there all of it.
-        """
-        image, frame, action = self._still(step), self._frame(step), text.split(":")[0]
+    def motion(self, step: StepRecord, text: str) -> Iterator[np.ndarray]:
+        """The action as it runs in C MuJoCo; a still picture where the robot cannot do it. With
+        views, `text` up to its colon is below, and all of it in HOLD more pictures of the end."""
+        image, frame, action = self._start(step), self._frame(step), text.split(":")[0]
         yield frame(image, action)
         recorded = c_physics.trajectory(self._world, self._fields, step.before.scene, step.joints)
-        for pose in recorded.qpos[:: self._every]:
-            self._data.qpos[:] = pose
-            image = self._picture()
+        every = max(round(1.0 / (media.FRAMES_PER_SECOND * self._cfg.sim.timestep)), 1)
+        for pose in recorded.qpos[::every]:
+            image = self._picture(pose)
             yield frame(image, action)
         yield from [frame(image, text)] * (HOLD if self._views else 0)
+
+    def _start(self, step: StepRecord) -> np.ndarray:
+        scene, pose = step.before.scene, self._data.qpos.copy()
+        pose[self._world.robot_qpos] = step.joints.start
+        pose[self._world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+        return self._picture(pose)
 
     def _frame(self, step: StepRecord) -> panels.Frame:
         if self._views:
             return panels.frame(self._cfg, step, self._height)
         return lambda scene, text: scene
 
-    def _picture(self) -> np.ndarray:
+    def _picture(self, pose: np.ndarray) -> np.ndarray:
+        self._data.qpos[:] = pose
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         return self._draw(self._data)
@@ -90,7 +80,7 @@ class Stage:
 
 def line(number: int, step: StepRecord) -> str:
     """What an action did, in words."""
-    before, after, info = step.before, step.after, step.after.info
+    scene, after, info = step.before.scene, step.after, step.after.info
     x, y, yaw = step.action.pose
     where = f"at x {1e3 * x:+.0f} y {1e3 * y:+.0f} mm, yaw {np.degrees(yaw):.0f} deg"
     if step.action.primitive == Primitive.PUSH:
@@ -100,9 +90,8 @@ def line(number: int, step: StepRecord) -> str:
     if not step.joints.reachable:
         done += ", out of the robot's reach"
     if info.cleared:
-        gone = np.flatnonzero(before.scene.in_play & ~after.scene.in_play)
-        colours = (blocks.COLOUR_NAMES[before.scene.colour[slot]] for slot in gone)
-        done += f" ({', '.join(colours)})"
+        gone = scene.colour[scene.in_play & ~after.scene.in_play]
+        done += f" ({', '.join(blocks.COLOUR_NAMES[colour] for colour in gone)})"
     if info.blocks_lost:
         done += f", {_blocks(int(info.blocks_lost))} left the workspace"
     if info.physics_diverged:
@@ -113,37 +102,30 @@ def line(number: int, step: StepRecord) -> str:
 
 def summary(cfg: Config, steps: list[StepRecord]) -> str:
     """How the episode ended, and what became of the blocks."""
-    actions = f"{len(steps)} action{'s' if len(steps) != 1 else ''}"
-    fate = f"{_blocks(taken(steps))} taken"
-    if lost(steps):
-        fate += f", {_blocks(lost(steps))} left the workspace"
-    return f"{_ending(cfg, steps)} after {actions}: {fate}"
-
-
-def _ending(cfg: Config, steps: list[StepRecord]) -> str:
     last = steps[-1].after
     if not last.terminated:
-        return STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
-    if last.scene.target != layout.ANY:
-        return "the target is taken" if completed(steps) else "the target is lost"
-    return "the table is clear" if completed(steps) else "no block is left within reach"
+        ending = STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
+    elif last.scene.target != layout.ANY:
+        ending = "the target is taken" if completed(steps) else "the target is lost"
+    else:
+        ending = "the table is clear" if completed(steps) else "no block is left within reach"
+    actions = f"{len(steps)} action{'s' if len(steps) != 1 else ''}"
+    taken, lost = totals(steps)
+    fate = f", {_blocks(lost)} left the workspace" if lost else ""
+    return f"{ending} after {actions}: {_blocks(taken)} taken{fate}"
 
 
 def completed(steps: list[StepRecord]) -> bool:
     """Whether the hand took what the task asks for."""
-    last = steps[-1].after
-    got = last.reward > 0 if last.scene.target != layout.ANY else lost(steps) == 0
+    last, (_, lost) = steps[-1].after, totals(steps)
+    got = last.reward > 0 if last.scene.target != layout.ANY else lost == 0
     return bool(last.terminated and got)
 
 
-def taken(steps: list[StepRecord]) -> int:
-    """Blocks taken from the table."""
-    return sum(int(step.after.info.cleared) for step in steps)
-
-
-def lost(steps: list[StepRecord]) -> int:
-    """Blocks that left the workspace."""
-    return sum(int(step.after.info.blocks_lost) for step in steps)
+def totals(steps: list[StepRecord]) -> tuple[int, int]:
+    """Blocks taken from the table, and blocks that left the workspace."""
+    infos = [step.after.info for step in steps]
+    return sum(int(info.cleared) for info in infos), sum(int(info.blocks_lost) for info in infos)
 
 
 def _blocks(count: int) -> str:
@@ -156,7 +138,5 @@ def record(stage: Stage, steps: list[StepRecord], png: Path | None, video: Path 
     if png is not None:
         media.write_picture(png, stage.still(steps[0], lines[0]))
     if video is not None:
-        told = zip(steps, lines, strict=True)
-        media.write_video(
-            video, (frame for step, text in told for frame in stage.motion(step, text))
-        )
+        motions = map(stage.motion, steps, lines)
+        media.write_video(video, (image for motion in motions for image in motion))

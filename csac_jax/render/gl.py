@@ -1,6 +1,6 @@
-"""Finds an OpenGL backend that MuJoCo can draw with here. MuJoCo reads the choice as it is
-imported."""
+"""Finds an OpenGL backend that MuJoCo can draw with here; MuJoCo reads the choice on import."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -18,12 +18,8 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 
 
 def choose() -> str | None:
-    """Sets MUJOCO_GL to a backend that draws and returns it; None if none draws.
-
-    The user's own MUJOCO_GL stands.
-    """
-    given = os.environ.get(VARIABLE, "").lower()
-    if given:
+    """Sets MUJOCO_GL, unless the user has, to a backend that draws; returns it, None if none."""
+    if given := os.environ.get(VARIABLE, "").lower():
         return None if given in OFF else given
     for backend in BACKENDS:
         if _draws(backend):
@@ -34,13 +30,8 @@ def choose() -> str | None:
 
 def _draws(backend: str) -> bool:
     """Tries a backend in its own process, which a broken driver may end."""
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE],
-            env=os.environ | {VARIABLE: backend},
-            capture_output=True,
-            timeout=60,
-        )
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode == 0
+    command, env = [sys.executable, "-c", _PROBE], os.environ | {VARIABLE: backend}
+    with contextlib.suppress(subprocess.SubprocessError):
+        subprocess.run(command, env=env, capture_output=True, timeout=60, check=True)
+        return True
+    return False

@@ -33,10 +33,7 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray]) -> None:
-    """Writes pictures [H, W, 3] uint8, H and W even, as FRAMES_PER_SECOND; makes the folder.
-
-    Raises OSError where ffmpeg fails.
-    """
+    """Writes pictures [H, W, 3] uint8, H and W even; makes the folder. OSError: ffmpeg failed."""
     check_suffix(path, VIDEOS)
     path.parent.mkdir(parents=True, exist_ok=True)
     settings: dict[str, Any] = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0}

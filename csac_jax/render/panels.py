@@ -2,13 +2,14 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib import patheffects
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
@@ -24,23 +25,17 @@ INVALID = "#EBEBEB"  # cells of a Q map with nothing to act on
 TALLEST = 120.0  # mm, the end of the height map's scale
 FINGER = 24.0  # mm, width of a finger as drawn
 
-# The layout is in px for a scene 480 px high; it grows with the picture.
-DPI = 100.0
-SCENE_HEIGHT = 480.0
-MAP_SIDE = 184.0
-COLUMNS = (56.0, 260.0)  # left edges of the maps
-ROWS = (274.0, 44.0)  # lower edges of the maps
-FONT = 9.0  # pt
+DPI = 90.0  # beside a scene 480 px high; it grows with the picture
+LEARNED = {"left": 0.106, "right": 0.841, "bottom": 0.092, "top": 0.954, "wspace": 0.11}
+OTHERS = {"left": 0.142, "right": 0.809, "bottom": 0.208, "top": 0.792}  # edges of the maps
+BAR = (1.04, 0.0, 0.05, 1.0)  # colour bar right of a map, in shares of it
 
 # A scene's picture [H, W, 3] uint8 and a line of text -> the whole picture
 Frame = Callable[[np.ndarray, str], np.ndarray]
 
 
 def frame(cfg: Config, step: StepRecord, height: int) -> Frame:
-    """Draws the panels of an action once; the result adds them to every picture of the scene.
-
-    Args: height of the scene's pictures, px.
-    """
+    """Draws an action's panels once, `height` px; the result adds them to each of its pictures."""
     panels = _pixels(figure(cfg, step, height))
 
     def complete(scene: np.ndarray, text: str) -> np.ndarray:
@@ -53,39 +48,33 @@ def frame(cfg: Config, step: StepRecord, height: int) -> Frame:
 @functools.lru_cache(maxsize=2)
 def text_line(text: str, width: int, scene_height: int) -> np.ndarray:
     """The text in black on white [h, width, 3] uint8; a long text takes two lines."""
-    scale = _scale(scene_height)
-    fig = _figure(width, 36.0 * scale, scale)
-    fig.text(14.0 * scale / width, 0.5, text.strip(), fontsize=1.2 * FONT, va="center", wrap=True)
+    fig = _figure(width, 0.075 * scene_height, scene_height)
+    fig.text(0.012, 0.5, text.strip(), fontsize=12.0, va="center", wrap=True)
     return _pixels(fig)
 
 
 def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
-    """The panels of an action. A learned policy's Q maps stand above, height map and legend below.
-
-    Any other policy has the height map alone.
-    """
-    scale = _scale(height)
+    """An action's Q maps, height map and legend; of a policy without Q the height map alone."""
     if step.debug is None:
-        fig = _figure(420.0 * scale, height, scale)
-        _draw_height_map(cfg, fig, step, (64.0, 100.0, 280.0))
+        fig = _figure(0.875 * height, height, height)
+        _draw_height_map(cfg, fig.subplots(gridspec_kw=OTHERS), step)
         return fig
-    fig = _figure(528.0 * scale, height, scale)
-    _draw_q_maps(cfg, fig, step)
-    axes = _draw_height_map(cfg, fig, step, (COLUMNS[0], ROWS[1], MAP_SIDE))
-    handles, _ = axes.get_legend_handles_labels()
+    fig = _figure(1.1 * height, height, height)
+    (push, grasp), (heights, legend) = fig.subplots(
+        2, 2, sharex=True, sharey=True, gridspec_kw=LEARNED
+    )
+    _draw_q_maps(cfg, (push, grasp), step)
+    _draw_height_map(cfg, heights, step)
+    handles, _ = heights.get_legend_handles_labels()
     handles.append(Patch(color=INVALID, label="nothing to act on"))
-    box = _share(fig, 340.0, ROWS[1], 180.0, MAP_SIDE)
-    fig.legend(handles=handles, loc="center", bbox_to_anchor=box, fontsize=FONT, frameon=False)
+    legend.legend(handles=handles, loc="center left", bbox_to_anchor=(0.3, 0.5), frameon=False)
+    legend.set_axis_off()
     return fig
 
 
-def _scale(scene_height: int) -> float:
-    return max(scene_height / SCENE_HEIGHT, 0.1)  # smaller letters cannot be drawn
-
-
-def _figure(width: float, height: float, scale: float) -> Figure:
+def _figure(width: float, height: float, scene_height: int) -> Figure:
     """A blank figure of even sides, px; videos want them."""
-    dpi = scale * DPI
+    dpi = DPI * max(scene_height / 480.0, 0.1)  # smaller letters cannot be drawn
     sides = [(2 * round(0.5 * side) + 0.1) / dpi for side in (width, height)]  # Agg rounds down
     return Figure((sides[0], sides[1]), dpi)
 
@@ -96,101 +85,61 @@ def _pixels(fig: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
-def _share(
-    fig: Figure, left: float, bottom: float, width: float, height: float
-) -> tuple[float, float, float, float]:
-    """A rectangle of the layout in shares of the figure."""
-    x, y = DPI * fig.get_size_inches()
-    return left / x, bottom / y, width / x, height / y
-
-
-def _draw_q_maps(cfg: Config, fig: Figure, step: StepRecord) -> None:
+def _draw_q_maps(cfg: Config, maps: tuple[Axes, Axes], step: StepRecord) -> None:
     """Q of pushes and of grasps, in the same colours."""
     assert step.debug is not None
     every = np.ma.masked_invalid(step.debug.q)
     colours = matplotlib.colormaps["viridis"].with_extremes(bad=INVALID)
-    limits = (every.min(), every.max())
-    for primitive, left in zip(Primitive, COLUMNS, strict=True):
+    for primitive, axes in zip(Primitive, maps, strict=True):
         values = every[primitive]
         best = f"best {values.max():+.2f}" if values.count() else "nowhere"
-        axes = _add_map(cfg, fig, (left, ROWS[0], MAP_SIDE), values, colours, limits)
-        axes.set_title(f"{primitive.name.title()} value, {best}", fontsize=1.1 * FONT)
+        image = _draw_map(cfg, axes, f"{primitive.name.title()} value, {best}", values, colours)
+        image.set_clim(every.min(), every.max())
         if primitive == step.action.primitive:
             _draw_action(cfg, axes, step)
-        axes.set_xlabel("")
-    axes.set(yticklabels=[], ylabel="")
-    _add_colour_bar(fig, axes.images[0], (COLUMNS[1], ROWS[0], MAP_SIDE), "Q, best over yaws")
+    axes.figure.colorbar(image, cax=axes.inset_axes(BAR), label="Q, best over yaws")
 
 
-def _draw_height_map(
-    cfg: Config, fig: Figure, step: StepRecord, place: tuple[float, float, float]
-) -> Axes:
+def _draw_height_map(cfg: Config, axes: Axes, step: StepRecord) -> None:
     """The height map with the search's candidates and the chosen action."""
     height = 1e3 * np.asarray(step.before.obs.height)
-    axes = _add_map(cfg, fig, place, height, matplotlib.colormaps["Greys"], (0.0, TALLEST))
-    axes.set_title("Height map", fontsize=1.1 * FONT)
-    _add_colour_bar(fig, axes.images[0], place, "height, mm")
+    image = _draw_map(cfg, axes, "Height map", height, matplotlib.colormaps["Greys"])
+    image.set_clim(0.0, TALLEST)
+    axes.figure.colorbar(image, cax=axes.inset_axes(BAR), label="height, mm")
     if step.debug is not None:
+        style: dict[str, Any] = {"edgecolors": "white", "linewidths": 0.4, "zorder": 3}
         for primitive, colour in CANDIDATES.items():
             x, y, _ = 1e3 * np.asarray(step.debug.candidates)[primitive].T
-            name = f"{primitive.name.lower()} candidates"
-            axes.scatter(
-                x, y, 12.0, colour, edgecolors="white", linewidths=0.4, label=name, zorder=3
-            )
+            axes.scatter(x, y, 14.0, colour, label=f"{primitive.name.lower()} candidates", **style)
     _draw_action(cfg, axes, step)
-    return axes
 
 
-def _add_map(
-    cfg: Config,
-    fig: Figure,
-    place: tuple[float, float, float],
-    values: np.ndarray,
-    colours: matplotlib.colors.Colormap,
-    limits: tuple[float, float],
-) -> Axes:
-    """A map of the workspace [H, W], axes in mm, y upwards; `place` is left edge, lower edge and
-    side."""
-    left, bottom, side = place
-    axes = fig.add_axes(_share(fig, left, bottom, side, side))
+def _draw_map(cfg: Config, axes: Axes, title: str, values: np.ndarray, cmap: Colormap) -> AxesImage:
+    """A map of the workspace [H, W], axes in mm, y upwards."""
     half = 500.0 * cfg.heightmap.extent
-    low, high = limits
-    axes.imshow(values, colours, vmin=low, vmax=high, origin="lower", extent=(-half, half) * 2)
-    axes.set(xlim=(-half, half), ylim=(-half, half), autoscale_on=False)
-    axes.set_xlabel("x, mm", fontsize=FONT, labelpad=1.0)
-    axes.set_ylabel("y, mm", fontsize=FONT, labelpad=-4.0)
+    image = axes.imshow(values, cmap, origin="lower", extent=(-half, half) * 2)
+    axes.set_title(title, fontsize="medium")
+    axes.set(xlabel="x, mm", autoscale_on=False)
+    axes.set_ylabel("y, mm", labelpad=-4.0)
     axes.locator_params(nbins=4)
-    axes.tick_params(labelsize=FONT)
-    return axes
-
-
-def _add_colour_bar(
-    fig: Figure, image: AxesImage, place: tuple[float, float, float], label: str
-) -> None:
-    """A colour bar right of the map at `place`."""
-    left, bottom, side = place
-    bar = fig.colorbar(image, cax=fig.add_axes(_share(fig, left + side + 8.0, bottom, 10.0, side)))
-    bar.set_label(label, fontsize=FONT)
-    bar.ax.tick_params(labelsize=FONT)
+    axes.label_outer()
+    return image
 
 
 def _draw_action(cfg: Config, axes: Axes, step: StepRecord) -> None:
-    """A push as an arrow over its way; a grasp as open fingers and the line that they close
-    along."""
+    """A push as an arrow over its way; a grasp as fingers and the line that they close along."""
     x, y, yaw = np.asarray(step.action.pose, float)
     centre, along = 1e3 * np.array([x, y]), 1e3 * np.array([np.cos(yaw), np.sin(yaw)])
+    outline = [patheffects.withStroke(linewidth=3.9, foreground="white")]
+    style: dict[str, Any] = {"color": CHOSEN, "path_effects": outline}
     if step.action.primitive == Primitive.PUSH:
         way = cfg.sim.push_length * along
         arrow = axes.arrow(*centre, *way, width=5.0, head_width=26.0, length_includes_head=True)
-        arrow.set(lw=0.5, label="chosen push", zorder=4)
-        parts: list[Artist] = [arrow]
-    else:
-        half = 0.5 * MAX_OPENING * along
-        across = 0.5e-3 * FINGER * np.array([-along[1], along[0]])
-        tips = np.stack([centre - half, centre + half])
-        parts = [*axes.plot(*tips.T, lw=1.2, label="chosen grasp")]
-        for tip in tips:
-            parts += axes.plot(*np.stack([tip - across, tip + across]).T, lw=3.0)
-    for part in parts:
-        outline = patheffects.withStroke(linewidth=3.5, foreground="white")
-        part.set(color=CHOSEN, path_effects=[outline])
+        arrow.set(lw=0.6, label="chosen push", zorder=4, **style)
+        return
+    half = 0.5 * MAX_OPENING * along
+    across = 0.5e-3 * FINGER * np.array([-along[1], along[0]])
+    tips = np.stack([centre - half, centre + half])
+    axes.plot(*tips.T, lw=1.3, label="chosen grasp", **style)
+    for tip in tips:
+        axes.plot(*np.stack([tip - across, tip + across]).T, lw=3.3, **style)

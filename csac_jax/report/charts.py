@@ -1,5 +1,6 @@
-"""Figures of a report, with matplotlib: figures 6, 7 and 9 of the paper, and variants."""
+"""Figures 6, 7 and 9 of the paper and of variants, and the page of `csac-jax report --out`."""
 
+import functools
 import io
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -10,22 +11,20 @@ import matplotlib
 
 matplotlib.use("Agg")  # no display
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report import comparison
-from csac_jax.report.comparison import NAMES, Curve, EvaluatedPart, Report, Score, label
-from csac_jax.report.results import Variant
+from csac_jax.report import tables
+from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped, label
 from csac_jax.report.tables import PAPER_ACTIONS, PAPER_CASES, PAPER_TRAINING
 
 SAMPLERS = ("csac", "csac_per", "csac_beta")
-COLOURS = dict(
-    zip(NAMES, ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759"), strict=True)
-)
+PALETTE = ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759")
+COLOURS = dict(zip(NAMES, PALETTE, strict=True))
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
-FOUR = ("cases", "target")  # suites whose parts are the four cases
-MOST_SETTINGS = 3  # that a legend names
+_short = functools.partial(label, preset=False, most=3)  # name of a variant in a legend
 LEGEND_WIDTH = 56  # characters
 INSIDE = 6  # curves whose legend has room among them
 PAPER_MARK: dict[str, Any] = {"marker": "D", "markeredgecolor": "black", "linestyle": ""}
@@ -41,47 +40,40 @@ class Chart(NamedTuple):
 
 def draw(report: Report) -> Iterator[Chart]:
     """Every figure that there are results for. Each preset has its own."""
-    for preset in dict.fromkeys(curve.variant.preset for curve in report.curves):
-        yield from _training([one for one in report.curves if one.variant.preset == preset])
-    four = [score for score in report.scores if score.place.suite in FOUR]
-    for suite, preset in dict.fromkeys(map(_suite, four)):
+    for preset, curves in grouped(report.curves, lambda curve: curve.variant.preset).items():
+        for name, (what, chosen) in _training(curves).items():
+            if chosen:
+                title = f"Grasp success of {what}, preset {preset}"
+                yield Chart(f"{name}-{preset}", title, success(chosen))
+    four = [score for score in report.scores if score.suite in ("cases", "target")]
+    by_suite = grouped(four, lambda score: (score.suite, score.variant.preset))
+    for (suite, preset), scores in by_suite.items():
         title = f"The four cases (figure 9), suite {suite}, preset {preset}"
-        figure = _cases([score for score in four if _suite(score) == (suite, preset)])
-        yield Chart(f"four-cases-{suite}-{preset}", title, figure)
+        yield Chart(f"four-cases-{suite}-{preset}", title, _cases(scores))
 
 
-def _suite(score: Score) -> tuple[str, str]:
-    return score.place.suite, score.place.variant.preset
-
-
-def _training(curves: Sequence[Curve]) -> Iterator[Chart]:
-    """The figures of one preset's curves."""
-    preset = curves[0].variant.preset
+def _training(curves: Sequence[Curve]) -> dict[str, tuple[str, list[Curve]]]:
+    """The figures of one preset's curves: name -> what they show, and which curves."""
     methods = [curve for curve in curves if curve.variant.unchanged]
     samplers = [curve for curve in methods if curve.variant.algo in SAMPLERS]
+    several = len({curve.variant.algo for curve in samplers}) > 1
     varied = [curve for curve in curves if not curve.variant.unchanged]
     algos = {curve.variant.algo for curve in varied}
     base = [curve for curve in methods if curve.variant.algo in algos]
-    if methods:
-        title = f"Grasp success of the methods (figure 6), preset {preset}"
-        yield Chart(f"methods-{preset}", title, success(methods))
-    if len({curve.variant.algo for curve in samplers}) > 1:
-        title = f"Grasp success of the samplers (figure 7), preset {preset}"
-        yield Chart(f"samplers-{preset}", title, success(samplers))
-    if varied:
-        title = f"Grasp success of the variants, preset {preset}"
-        yield Chart(f"variants-{preset}", title, success([*base, *varied]))
+    return {
+        "methods": ("the methods (figure 6)", methods),
+        "samplers": ("the samplers (figure 7)", samplers if several else []),
+        "variants": ("the variants", [*base, *varied]),
+    }
 
 
 def success(curves: Sequence[Curve]) -> Figure:
     """Success against actions: a line and band per variant, the paper's values as marks."""
     figure, axes = plt.subplots(figsize=(8.0, 4.2), layout="constrained")
-    drawn: set[str] = set()
-    spare = iter(plt.get_cmap("tab20").colors)
+    colours, spare = dict(COLOURS), iter(plt.get_cmap("tab20").colors)
     for curve in curves:
         algo = curve.variant.algo
-        colour = next(spare) if algo in drawn or algo not in COLOURS else COLOURS[algo]
-        drawn.add(algo)
+        colour = colours.pop(algo, None) or next(spare)
         _line(axes, curve, colour)
         if curve.variant.unchanged and algo in PAPER_TRAINING:
             axes.plot(PAPER_ACTIONS, 100 * PAPER_TRAINING[algo], color=colour, **PAPER_MARK)
@@ -89,55 +81,37 @@ def success(curves: Sequence[Curve]) -> Figure:
     axes.set(xlabel="actions", ylabel="success over the last 200 grasps, %", ylim=(0, 101))
     axes.set_xlim(left=0)
     axes.grid(alpha=0.3)
-    legend: dict[str, Any] = {"title": "method (runs)", "fontsize": "small"}
     if len(curves) <= INSIDE:
-        axes.legend(loc="lower right", **legend)
+        axes.legend(loc="lower right", title="method (runs)", fontsize="small")
         return figure
     figure.set_figheight(figure.get_figheight() + 0.2 * len(curves))
-    figure.legend(loc="outside lower center", ncols=2, **legend)
+    figure.legend(loc="outside lower center", ncols=2, title="method (runs)", fontsize="small")
     return figure
 
 
 def _line(axes: Axes, curve: Curve, colour: Any) -> None:
     actions, bands = curve.points()
+    value, low, high = _percent(bands)
     name = f"{_short(curve.variant)} ({len(curve.runs)})"
-    axes.plot(
-        actions,
-        [100 * band.value for band in bands],
-        color=colour,
-        label=textwrap.fill(name, LEGEND_WIDTH),
-    )
-    limits = [
-        (100 * b.low, 100 * b.high) for b in bands if b.low is not None and b.high is not None
-    ]
-    if len(limits) == len(actions):
-        low, high = zip(*limits, strict=True)
+    axes.plot(actions, value, color=colour, label=textwrap.fill(name, LEGEND_WIDTH))
+    if len(curve.runs) > 1:
         axes.fill_between(actions, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
-def _short(variant: Variant) -> str:
-    return label(variant, preset=False, most=MOST_SETTINGS)
+def _percent(bands: Sequence[Band | None]) -> np.ndarray:
+    """Value, low and high, [3, bands], %; NaN where there is none."""
+    rows = [(None, None, None) if band is None else band[:3] for band in bands]
+    return 100 * np.array(rows, float).reshape(-1, 3).T
 
 
 def _cases(scores: Sequence[Score]) -> Figure:
     """Completion and action efficiency by case and variant; the paper's means as lines."""
-    parts = list(dict.fromkeys(score.place.part for score in scores))
-    groups = dict(comparison.together(scores))
-    width = 0.8 / len(groups)
-    figure, panels = plt.subplots(
-        1, len(FIGURE_9), figsize=(11.0, 4.2), sharey=True, layout="constrained"
-    )
+    figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
     for panel, (metric, title) in zip(panels, FIGURE_9.items(), strict=True):
-        for index, (group, own) in enumerate(groups.items()):
-            bands = {parts.index(score.place.part): score.band(metric) for score in own}
-            if len(own) == len(parts):
-                bands[len(parts)] = comparison.mean(own, metric)
-            style = _style(group, len(own[0].evaluations), index)
-            _marks(panel, bands, (index + 0.5) * width - 0.4, style)
-        panel.set_xticks(range(len(parts) + 1), [*parts, "mean"])
-        panel.set(title=title, ylim=(0, 104), xlim=(-0.5, len(parts) + 0.5))
+        _marks(panel, metric, scores)
+        panel.set(title=title, ylim=(0, 104))
         panel.grid(alpha=0.3, axis="y")
-        paper = PAPER_CASES[metric] if scores[0].place.suite == "cases" else {}
+        paper = PAPER_CASES[metric] if scores[0].suite == "cases" else {}
         for algo, value in paper.items():
             name = f"paper, mean of the cases, {NAMES[algo]}"
             panel.axhline(100 * value, color=COLOURS[algo], linestyle="--", linewidth=1, label=name)
@@ -147,44 +121,62 @@ def _cases(scores: Sequence[Score]) -> Figure:
     return figure
 
 
-def _style(group: EvaluatedPart, runs: int, index: int) -> dict[str, Any]:
+def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> None:
+    """A mark of each variant in each case, and in the mean of all if it has all."""
+    parts = list(dict.fromkeys(part for score in scores for part in score.parts))
+    places = np.arange(len(parts) + 1)
+    for index, score in enumerate(scores):
+        bands = [score.only(part).band(metric) for part in parts]
+        bands.append(score.band(metric) if len(score.parts) == len(parts) else None)
+        value, low, high = _percent(bands)
+        error = np.maximum([value - low, high - value], 0.0)
+        offset = (index + 0.5) * 0.8 / len(scores) - 0.4
+        panel.errorbar(places + offset, value, error, fmt="o", capsize=3, **_style(score, index))
+    panel.set_xticks(places, [*parts, "mean"])
+    panel.set_xlim(-0.5, len(parts) + 0.5)
+
+
+def _style(score: Score, index: int) -> dict[str, Any]:
     """Name and colour of a variant's marks."""
-    variant = group.variant
-    name = _short(variant) if group.policy == "learned" else group.policy
-    name = textwrap.fill(f"{name}, {group.physics}, {group.robot} ({runs})", LEGEND_WIDTH)
+    variant = score.variant
+    name = _short(variant) if score.policy == "learned" else score.policy
+    name = f"{name}, {score.physics}, {score.robot} ({max(map(len, score.parts.values()))})"
     known = variant.unchanged and variant.algo in COLOURS
-    return {
-        "label": name,
-        "color": COLOURS[variant.algo] if known else plt.get_cmap("tab20")(index),
-    }
+    colour = COLOURS[variant.algo] if known else plt.get_cmap("tab20")(index)
+    return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
 
 
-def _marks(
-    panel: Axes, bands: dict[int, Band | None], offset: float, style: dict[str, Any]
-) -> None:
-    """The marks of one variant: a case each, and their mean."""
-    for place, band in bands.items():
-        if band is None:
-            continue
-        error = None
-        if band.low is not None and band.high is not None:
-            below, above = band.value - band.low, band.high - band.value
-            error = [[100 * max(below, 0.0)], [100 * max(above, 0.0)]]
-        panel.errorbar(place + offset, 100 * band.value, error, fmt="o", capsize=3, **style)
-        style = style | {"label": "_"}  # the legend names it once
-
-
-def svg(figure: Figure) -> str:
+def _svg(figure: Figure) -> str:
     """The figure as the element <svg>."""
     file = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "csac_jax"}):
         figure.savefig(file, format="svg", metadata={"Date": None})
     plt.close(figure)
-    text = file.getvalue()
-    return text[text.index("<svg") :]
+    return "<svg" + file.getvalue().partition("<svg")[2]
 
 
 def save(figure: Figure, path: Path) -> None:
     """Writes a PNG that is the same bytes for the same figure."""
     figure.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(figure)
+
+
+def write_page(report: Report, folder: Path) -> list[Path]:
+    """Writes a page that needs no other file, figures and tables. Needs the extra `report`."""
+    import jinja2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = [(chart, _svg(chart.figure)) for chart in draw(report)]
+    source = Path(__file__).with_name("page.html").read_text()
+    template = jinja2.Template(source, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    page = template.render(
+        explained=tables.EXPLAINED,
+        figures={chart.title: svg for chart, svg in drawn},
+        tables=tables.tables(report),
+        notes=report.notes,
+    )
+    files = {f"{chart.name}.svg": svg for chart, svg in drawn}
+    files |= {"index.html": page, "results.md": tables.markdown(report)}
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return [folder / name for name in files]

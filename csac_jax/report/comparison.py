@@ -1,6 +1,7 @@
 """Recorded runs and evaluations grouped over their seeds, and how variants differ."""
 
-from collections.abc import Callable, Iterable, Sequence
+import operator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,65 +45,50 @@ class Curve(NamedTuple):
         """Success over the last grasps of each run, wherever it ends, [seeds]."""
         return np.array([run.success[-1] for run in self.runs])
 
-    @property
-    def final(self) -> Band:
-        """IQM of `last`."""
-        return statistics.band([self.last])
-
     def points(self) -> tuple[np.ndarray, list[Band]]:
         """Actions [m], up to where the shortest run ends, and the success there."""
         return statistics.curves([(run.actions, run.success) for run in self.runs])
 
 
-class EvaluatedPart(NamedTuple):
-    """What the evaluations of one score have in common."""
+class Score(NamedTuple):
+    """The evaluations of a variant in some parts of a suite together."""
 
     variant: Variant
     policy: str
     suite: str
-    part: str
     physics: str
     robot: str
     seed: int  # of the evaluation
     episodes: int  # of each evaluation: they decide which scenes it draws; 0 where not recorded
+    parts: dict[str, list[Evaluation]]
 
     @property
     def world(self) -> str:
         """Physics, robot and seed of the evaluation."""
         return f"{self.physics}, {self.robot}, {self.seed}"
 
+    def only(self, *parts: str) -> "Score":
+        """The score in those of these parts that it has, in their order."""
+        return self._replace(parts={name: self.parts[name] for name in parts if name in self.parts})
 
-class Score(NamedTuple):
-    """The evaluations of a variant in one part of a suite together."""
-
-    place: EvaluatedPart
-    evaluations: list[Evaluation]
+    def split(self) -> "list[Score]":
+        """The score in each part by itself and, of several parts, in all."""
+        each = [self.only(part) for part in self.parts]
+        return [*each, self] if len(each) > 1 else each
 
     def band(self, metric: str) -> Band | None:
-        """IQM of the runs; of one run its own value and interval; None where there are no cases."""
-        entries = self._entries(metric)
-        if len(entries) == 1:
-            return Band(entries[0]["value"], entries[0]["low"], entries[0]["high"], 1)
-        return statistics.band([self.values(metric)]) if entries else None
+        """Mean over parts of the IQM over runs, a single value as it is; None without cases."""
+        strata = self.strata(metric)
+        if [len(runs) for runs in strata] == [1]:
+            return Band._make((*strata[0][0], 1))
+        fewest = min(map(len, strata), default=0)
+        return statistics.band([runs[:, 0] for runs in strata]) if fewest else None
 
-    def values(self, metric: str) -> np.ndarray:
-        """The values of the runs that have any cases."""
-        return np.array([entry["value"] for entry in self._entries(metric)])
-
-    def _entries(self, metric: str) -> list[recorded.Json]:
-        found = [one.metrics.get(metric, {}) for one in self.evaluations]
-        return [entry for entry in found if entry.get("n")]
-
-
-class Gap(NamedTuple):
-    """CSAC-beta less another variant in some parts of a suite; several seeds of both."""
-
-    ours: Variant  # CSAC-beta with the fewest settings changed
-    theirs: Variant
-    suite: str
-    parts: tuple[str, ...]
-    world: str
-    bands: dict[str, Band]  # metric -> ours less theirs
+    def strata(self, metric: str) -> list[np.ndarray]:
+        """Of each part value, low and high of the runs that have any cases, [runs, 3]."""
+        found = [[one.metrics.get(metric, {}) for one in runs] for runs in self.parts.values()]
+        rows = [[[e["value"], e["low"], e["high"]] for e in runs if e.get("n")] for runs in found]
+        return [np.array(runs, float).reshape(-1, 3) for runs in rows]
 
 
 class Report(NamedTuple):
@@ -116,32 +102,32 @@ class Report(NamedTuple):
 
 def build(results: Results) -> Report:
     """Runs and evaluations grouped over their seeds."""
-    curves = [
-        Curve(*group)
-        for group in _grouped(results.runs, lambda run: recorded.variant(run.config)).items()
+    curves = [Curve(*group) for group in grouped(results.runs, lambda run: run.variant).items()]
+    scores = [
+        Score._make((*key, grouped(group, lambda one: one.part)))
+        for key, group in grouped(results.evaluations, _scored).items()
     ]
-    scores = [Score(*group) for group in _grouped(results.evaluations, _place).items()]
     notes = [note for curve in curves for note in _curve_notes(curve)]
     return Report(curves, scores, results, [*results.notes, *notes])
 
 
-def _grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
+def grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
+    """Key -> the items that have it, both in order of appearance."""
     found: dict[Any, list[Any]] = {}
     for item in items:
         found.setdefault(key(item), []).append(item)
     return found
 
 
-def _place(one: Evaluation) -> EvaluatedPart:
-    variant = recorded.variant(one.config)
-    if one.policy != "learned":  # what its run was trained with does not matter
-        variant = Variant(variant.preset, one.policy, ())
+def _scored(one: Evaluation) -> tuple[Any, ...]:
+    """Fields of the score that an evaluation counts in."""
+    learned = one.policy == "learned"  # else it does not matter what its run was trained with
+    variant = one.variant if learned else Variant(one.variant.preset, one.policy, ())
     episodes = one.metrics.get("counts", {}).get("episodes", 0)
-    world = recorded.world(one.config)
-    return EvaluatedPart(variant, one.policy, one.suite, one.part, *world, one.seed, episodes)
+    return variant, one.policy, one.suite, *recorded.world(one.config), one.seed, episodes
 
 
-def _curve_notes(curve: Curve) -> Iterable[str]:
+def _curve_notes(curve: Curve) -> Iterator[str]:
     if len(ends := curve.ends) > 1:
         several = ", ".join(f"{end:,}" for end in ends)
         drawn = f"their curve is drawn up to {ends[0]:,}"
@@ -159,75 +145,44 @@ def label(variant: Variant, preset: bool = True, most: int | None = None) -> str
     return ", ".join([f"{name} ({variant.preset})" if preset else name, *changed])
 
 
-def together(scores: Iterable[Score]) -> Iterable[tuple[EvaluatedPart, list[Score]]]:
-    """Scores that differ in their part alone, with what they share."""
-    return _grouped(scores, lambda score: score.place._replace(part="")).items()
+def _pairs(items: Iterable[Any], alike: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
+    """CSAC-beta with the fewest settings changed, and each other item that is alike."""
+    for group in grouped(items, alike).values():
+        betas = [item for item in group if item.variant.algo == "csac_beta"]
+        ours = min(betas, key=lambda item: len(item.variant.changed), default=None)
+        yield from ((ours, item) for item in group if betas and item is not ours)
 
 
-def mean(scores: Sequence[Score], metric: str) -> Band | None:
-    """Mean over parts of the IQM over runs; None where a part has no value."""
-    strata = [score.values(metric) for score in scores]
-    return statistics.band(strata) if all(len(stratum) for stratum in strata) else None
+def gaps(report: Report) -> Iterator[tuple[Score, Score, dict[str, Band]]]:
+    """CSAC-beta, another variant measured in the same scenes, and ours less theirs by metric: in
+    each part and in all parts of which both have several seeds."""
+    learned = [score for score in report.scores if score.policy == "learned"]
+    several = [s.only(*(part for part in s.parts if len(s.parts[part]) > 1)) for s in learned]
+    alike = operator.attrgetter("variant.preset", "suite", "world", "episodes")
+    for ours, other in _pairs([score for score in several if score.parts], alike):
+        theirs = other.only(*ours.parts)
+        for a, b in zip(ours.only(*theirs.parts).split(), theirs.split(), strict=True):
+            yield a, b, _difference(a, b)
 
 
-def gaps(report: Report) -> list[Gap]:
-    """CSAC-beta less every variant measured in the same scenes, in each part and in all parts.
-
-    Only of several seeds of both.
-    """
-    several = [
-        one for one in report.scores if one.place.policy == "learned" and len(one.evaluations) > 1
-    ]
-    found: list[Gap] = []
-    for scores in _grouped(several, _scenes).values():
-        by_variant = _grouped(scores, lambda score: score.place.variant)
-        first = min(by_variant, key=lambda one: (one.algo != "csac_beta", len(one.changed)))
-        others = [one for one in by_variant if one != first and first.algo == "csac_beta"]
-        for other in others:
-            found += _gaps(first, other, by_variant[first], by_variant[other])
-    return found
-
-
-def _scenes(score: Score) -> tuple[Any, ...]:
-    """What scores must share to be compared."""
-    its = score.place
-    return its.variant.preset, its.suite, its.world, its.episodes
-
-
-def _gaps(ours: Variant, theirs: Variant, a: list[Score], b: list[Score]) -> Iterable[Gap]:
-    """The difference in each part that both were measured in, then over these parts."""
-    of = {score.place.part: score for score in b}
-    pairs = [(score, of[score.place.part]) for score in a if score.place.part in of]
-    for shared in [[pair] for pair in pairs] + ([pairs] if len(pairs) > 1 else []):
-        place = shared[0][0].place
-        parts = tuple(score.place.part for score, _ in shared)
-        yield Gap(ours, theirs, place.suite, parts, place.world, _bands(shared))
-
-
-def _bands(pairs: Sequence[tuple[Score, Score]]) -> dict[str, Band]:
-    """The difference in every metric that all evaluations have."""
+def _difference(ours: Score, theirs: Score) -> dict[str, Band]:
+    """In every metric that all evaluations have."""
     bands = {}
     for metric in METRICS:
-        ours, theirs = ([one.values(metric) for one in side] for side in zip(*pairs, strict=True))
-        if min(len(values) for values in (*ours, *theirs)) > 1:
-            bands[metric] = statistics.difference(ours, theirs)
+        a, b = ([runs[:, 0] for runs in score.strata(metric)] for score in (ours, theirs))
+        if min(map(len, (*a, *b))) > 1:
+            bands[metric] = statistics.difference(a, b)
     return bands
 
 
-def lead(report: Report, curve: Curve) -> Band | None:
-    """Final success of CSAC-beta with the fewest settings changed, less that of another variant.
-
-    Only of variants trained as long in the same scenes and task, with several seeds of both.
-    """
-    alike = [
-        one
-        for one in report.curves
-        if _trained(one) == _trained(curve) and one.variant.algo == "csac_beta"
-    ]
-    first = min(alike, key=lambda one: len(one.variant.changed), default=curve)
-    if first is curve or min(len(first.runs), len(curve.runs)) < 2:
-        return None
-    return statistics.difference([first.last], [curve.last])
+def leads(report: Report) -> dict[Variant, Band]:
+    """Final success of CSAC-beta less that of each variant trained as long in the same scenes and
+    task; only of several seeds of both."""
+    return {
+        theirs.variant: statistics.difference([ours.last], [theirs.last])
+        for ours, theirs in _pairs(report.curves, _trained)
+        if min(len(ours.runs), len(theirs.runs)) > 1
+    }
 
 
 def _trained(curve: Curve) -> tuple[Any, ...]:

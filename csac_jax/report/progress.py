@@ -1,17 +1,21 @@
-"""Progress of a run: a live bar on a terminal, plain lines in a file."""
+"""Reporters of a run: a live bar on a terminal, plain lines in a file, TensorBoard."""
 
+import dataclasses
+import datetime
 import time
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from csac_jax.training.loop import Record, Reporter
 
 PLAIN_INTERVAL = 10.0  # s between lines where there is no terminal
 
 
-def describe(record: Record, eta: float) -> str:
+def _describe(record: Record, eta: float) -> str:
     """Speed, success, losses and remaining time `eta`, s, in one line."""
     parts = [f"{record.actions_per_second:.1f}/s"]
     if record.grasp_success is not None:
@@ -20,30 +24,16 @@ def describe(record: Record, eta: float) -> str:
         parts.append(f"loss critic {record.critic_loss:.3f} actor {record.actor_loss:.3f}")
     else:
         parts.append("warming up")
-    return ", ".join([*parts, f"{_duration(eta)} left"])
-
-
-def _duration(seconds: float) -> str:
-    """As in `1:02:03` or `2:03`."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+    return ", ".join([*parts, f"{datetime.timedelta(seconds=round(eta))} left"])
 
 
 class Terminal:
-    """A reporter with a bar on a terminal, else with a line every PLAIN_INTERVAL. Its `with` ends
-    the bar."""
+    """Shows a bar on a terminal, else a line every PLAIN_INTERVAL. Its `with` ends the bar."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._bar = Progress(
-            TextColumn("actions"),
-            MofNCompleteColumn(),
-            BarColumn(20),
-            TextColumn("{task.description}"),
-            console=console,
-        )
-        self._task: TaskID | None = None
+        columns = TextColumn("actions"), MofNCompleteColumn(), BarColumn(20)
+        self._bar = Progress(*columns, TextColumn("{task.description}"), console=console)
         self._printed_at = -PLAIN_INTERVAL
 
     def __enter__(self) -> "Terminal":
@@ -58,22 +48,40 @@ class Terminal:
 
     def progress(self, record: Record, total_actions: int, eta: float) -> None:
         """Moves the bar; without a terminal, prints a line if one is due."""
-        if not self._console.is_terminal:
-            self._print_if_due(record, total_actions, eta)
-            return
-        if self._task is None:
-            self._bar.start()
-            self._task = self._bar.add_task("", total=total_actions)
-        description = describe(record, eta)
-        self._bar.update(
-            self._task, completed=record.actions, description=description, refresh=True
-        )
-
-    def _print_if_due(self, record: Record, total_actions: int, eta: float) -> None:
-        now = time.monotonic()
-        if now - self._printed_at >= PLAIN_INTERVAL or record.actions >= total_actions:
+        text, now, done = _describe(record, eta), time.monotonic(), record.actions
+        if self._console.is_terminal:
+            if not self._bar.task_ids:
+                self._bar.start()
+                self._bar.add_task("", total=total_actions)
+            task = self._bar.task_ids[0]
+            self._bar.update(task, completed=done, description=text, refresh=True)
+        elif now - self._printed_at >= PLAIN_INTERVAL or done >= total_actions:
             self._printed_at = now
-            self.say(f"{record.actions} of {total_actions} actions, {describe(record, eta)}")
+            self.say(f"{done} of {total_actions} actions, {text}")
+
+
+class TensorBoard:
+    """Writes scalars over actions into RUN/tensorboard. Needs the extra `tensorboard`."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self._folder = run_dir / "tensorboard"
+        self._writer: Any = None  # the run makes its folder before the first record
+
+    def say(self, text: str) -> None:
+        """Writes nothing."""
+
+    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+        """Writes one point per number. The first record voids later points of a killed process."""
+        if self._writer is None:
+            from tensorboardX import SummaryWriter
+
+            self._writer = SummaryWriter(str(self._folder), purge_step=record.actions)
+        numbers = dataclasses.asdict(record)
+        outcomes = {f"outcomes/{name}": count for name, count in numbers.pop("outcomes").items()}
+        for name, number in (numbers | outcomes).items():
+            if number is not None:
+                self._writer.add_scalar(name, number, record.actions)
+        self._writer.flush()
 
 
 class Reporters:
@@ -83,11 +91,9 @@ class Reporters:
         self._reporters = reporters
 
     def say(self, text: str) -> None:
-        """Passes the line on."""
         for reporter in self._reporters:
             reporter.say(text)
 
     def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        """Passes the record on."""
         for reporter in self._reporters:
             reporter.progress(record, total_actions, eta)

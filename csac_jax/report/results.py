@@ -19,7 +19,7 @@ from csac_jax.io import configs, files, renames
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
 SKIPPED = ("checkpoints", "tensorboard")
 NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
-HOST = ("train.chunk", "train.save_every")  # settings that no result depends on
+HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
 LENGTH = "train."  # settings of a run's length and shape do not make it another method
 
 Json = dict[str, Any]
@@ -43,11 +43,12 @@ class RecordedRun(NamedTuple):
 
     path: Path
     config: Json
+    variant: Variant
     actions: np.ndarray  # [n] over all scenes
     success: np.ndarray  # [n] share of the last `grasps` grasps that lifted a block
     grasps: np.ndarray  # [n] at most GRASP_WINDOW
     seconds: np.ndarray  # [n] spent training since the run began, without compilation
-    record: Json  # device, versions, commit, wall_seconds if `train` wrote them
+    record: Json  # wall_seconds; device, versions and commit if `train` wrote them
 
 
 class Evaluation(NamedTuple):
@@ -55,12 +56,13 @@ class Evaluation(NamedTuple):
 
     path: Path
     config: Json
+    variant: Variant
     policy: str
     suite: str
     part: str
     seed: int  # of the evaluation
     metrics: Json
-    record: Json  # device, versions, commit, seconds
+    record: Json  # wall_seconds, device, versions, commit; None where not recorded
 
 
 class Results(NamedTuple):
@@ -89,105 +91,83 @@ def read(paths: Sequence[Path]) -> Results:
 
 def _files(path: Path) -> Iterator[Path]:
     if not path.exists():
-        raise ValueError(
-            f"there is no file or folder {path}; give folders of runs or files of `eval --json`"
-        )
+        raise ValueError(f"there is no file or folder {path}; give folders of runs or eval results")
     if path.is_file():
         yield path
     for folder, names, contents in os.walk(path):
         names[:] = sorted(set(names) - set(SKIPPED))
         kept = (name for name in sorted(contents) if name.endswith((files.METRICS, ".json")))
-        yield from (Path(folder) / name for name in kept)
+        yield from (Path(folder, name) for name in kept)
 
 
-def read_json(path: Path) -> Json:
+def _read_json(path: Path) -> Json:
     """The object in a file; empty where it holds none."""
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
+    with contextlib.suppress(OSError, ValueError):
+        if isinstance(content := json.loads(path.read_text()), dict):
+            return content
+    return {}
 
 
 def _add_run(path: Path, results: Results) -> None:
     """Adds the run of a log; a note where it has no config or no grasp yet."""
-    config = read_json(path.parent / files.CONFIG)
+    config = _read_json(path.parent / files.CONFIG)
     lines = [line for line in files.read_log(path) if line.get("grasp_success") is not None]
     if not config:
         results.notes.append(f"{path}: no {files.CONFIG} in its folder; left out")
     elif not lines:
         results.notes.append(f"{path}: no grasp is recorded yet; left out")
     else:
-        actions, success, grasps, seconds = (
-            np.array([line[name] for line in lines], float)
-            for name in ("actions", "grasp_success", "grasps_counted", "seconds")
-        )
-        record = _record(path.parent, config)
-        results.runs.append(RecordedRun(path, config, actions, success, grasps, seconds, record))
+        names = ("actions", "grasp_success", "grasps_counted", "seconds")
+        columns = [np.array([line[name] for line in lines], float) for name in names]
+        record = {"wall_seconds": float(columns[-1][-1]), **_record(path.parent, config)}
+        results.runs.append(RecordedRun._make((path, config, variant(config), *columns, record)))
 
 
 def _record(folder: Path, config: Json) -> Json:
     """What `train` wrote in this folder, or `sweep` above a `seed-K`; empty where neither did."""
     above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
-        record = read_json(place / RECORD)
+        record = _read_json(place / RECORD)
         if record and record.get("config", config) == config:
             return record
     return {}
 
 
 def _evaluations(path: Path) -> list[Evaluation]:
-    content = read_json(path)
-    if (
-        not {"policy", "config"} <= content.keys()
-        or not {"parts", "grasp_success"} & content.keys()
-    ):
+    content = _read_json(path)
+    if not any({"policy", "config", name} <= content.keys() for name in ("parts", "grasp_success")):
         return []
-    suite: str = content.get("suite", "own")
-    suite = renames.METRICS.get(suite, suite)
+    suite = str(renames.METRICS.get(content.get("suite", "own"), content.get("suite")))
     parts = files.renamed(content.get("parts") or {Path(suite).stem: content})
-    record = {name: content.get(name) for name in ("device", "versions", "commit", "seconds")}
-    asked = content["config"], content["policy"], suite
-    return [
-        Evaluation(path, *asked, part, content.get("seed", 0), found, record)
-        for part, found in parts.items()
-    ]
+    record = {name: content.get(name) for name in ("device", "versions", "commit")}
+    record["wall_seconds"] = content.get("seconds")
+    config, policy, seed = content["config"], content["policy"], content.get("seed", 0)
+    asked = path, config, variant(config), policy, suite
+    return [Evaluation(*asked, part, seed, found, record) for part, found in parts.items()]
 
 
 def _without_evaluation(results: Results) -> Iterator[str]:
     """A line for each run that still has its networks and that nothing has measured."""
-    measured = [_identity(one.config) for one in results.evaluations if one.policy == "learned"]
+    learned = [one for one in results.evaluations if one.policy == "learned"]
+    measured = {(one.variant, one.config.get("seed")) for one in learned}
     for run in results.runs:
-        folder = run.path.parent
-        if (folder / "checkpoints").exists() and _identity(run.config) not in measured:
+        folder, own = run.path.parent, (run.variant, run.config.get("seed"))
+        if (folder / "checkpoints").exists() and own not in measured:
             yield f"{folder}: not evaluated; run: csac-jax eval {folder} --json {folder}/eval.json"
-
-
-def _identity(config: Json) -> Json:
-    """The settings that an evaluation cannot change."""
-    flat = settings(config)
-    return {name: flat[name] for name in flat if name not in ("sim.physics", "sim.robot")}
-
-
-def settings(config: Json) -> Json:
-    """A recorded config's settings by their dotted names of today."""
-    with contextlib.suppress(ValueError):  # written by a version that knew other settings
-        config = configs.to_dict(configs.from_dict(config))
-    return {name: value for name, value in configs.flat(config).items() if name != "format"}
 
 
 def variant(config: Json) -> Variant:
     """What a recorded config is a variant of. Settings that the config lacks are passed over."""
     preset, algo = config.get("preset", ""), config.get("algo", "csac_beta")
-    try:
-        base = settings(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
-    except ValueError:  # a name that is no more
-        base = {}
-    own = settings(config)
+    base: Json = {}
+    with contextlib.suppress(ValueError):  # a name that is no more
+        base = configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
+    with contextlib.suppress(ValueError):  # written by a version that knew other settings
+        config = configs.to_dict(configs.from_dict(config))
     changed = tuple(
-        (name, " ".join(map(str, own[name])) if isinstance(own[name], list) else str(own[name]))
-        for name in own
-        if name in base and own[name] != base[name] and name not in (*NAMED, *HOST)
+        (name, " ".join(map(str, value)) if isinstance(value, list) else str(value))
+        for name, value in configs.flat(config).items()
+        if value != base.get(name, value) and name not in (*NAMED, *HOST)
     )
     return Variant(preset, algo, changed)
 
@@ -205,14 +185,13 @@ def command(one: RecordedRun | Evaluation) -> str:
         episodes = one.metrics.get("counts", {}).get("episodes")
         asked = f"--policy {one.policy} --suite {one.suite} --episodes {episodes} --seed {one.seed}"
         return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}"
-    its = variant(one.config)
-    flags = "".join(f" {_flag(name, value)}" for name, value in its.changed)
+    preset, algo, changed = one.variant
+    flags = "".join(f" {_flag(name, value)}" for name, value in changed)
     seed = f"--seed {one.config['seed']} --sim.physics {physics}"
-    return f"csac-jax train {its.preset} --algo {its.algo} {seed}{flags}"
+    return f"csac-jax train {preset} --algo {algo} {seed}{flags}"
 
 
 def _flag(name: str, value: str) -> str:
     section, _, field = name.replace("_", "-").rpartition(".")
-    if value in ("True", "False"):
-        return f"--{section}.{'' if value == 'True' else 'no-'}{field}"
-    return f"--{section}.{field} {value}"
+    switch = {"True": field, "False": f"no-{field}"}.get(value)
+    return f"--{section}.{switch}" if switch else f"--{section}.{field} {value}"

@@ -2,30 +2,20 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from csac_jax.constants import GRASP_WINDOW
+from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import PER_ACTION
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report import comparison, results as recorded
-from csac_jax.report.comparison import (
-    METRICS,
-    Curve,
-    EvaluatedPart,
-    Report,
-    Score,
-    gaps,
-    label,
-    lead,
-)
+from csac_jax.report import results as recorded
+from csac_jax.report.comparison import METRICS, Curve, Report, Score, gaps, label, leads
 from csac_jax.report.results import Evaluation, RecordedRun, Variant
 
 PAPER_TRAINING = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
-"""Grasp success over the last 200 grasps of 2,500 actions, from the text to figures 6 and 7 (CSAC
-sec. 4.3)."""
+"""Success over the last 200 grasps of 2,500 actions, text to figures 6 and 7 (CSAC sec. 4.3)."""
 PAPER_ACTIONS = 2500
 PAPER_CASES = {
     "completion": {"vpg": 0.60, "csac_beta": 0.90},
@@ -33,6 +23,8 @@ PAPER_CASES = {
 }
 """Means of the four cases, figure 9 (sec. 4.4 and 5). The text gives no other numbers."""
 GOOD = 0.9  # grasp success whose time is reported
+LAST = f"success, last {GRASP_WINDOW} grasps"
+SUMMARY = ("method", "runs", LAST, "paper", "training time")  # columns of the training table
 
 Table = list[dict[str, str]]  # rows; column -> cell
 
@@ -49,38 +41,38 @@ def _time_to_good(run: RecordedRun) -> float | None:
 
 def as_json(report: Report) -> dict[str, Any]:
     """The report's numbers, plain values only."""
+    ahead = leads(report)
     return {
-        "curves": [_curve_json(report, curve) for curve in report.curves],
-        "scores": [_score_json(score) for score in report.scores],
+        "curves": [_curve_json(curve, ahead.get(curve.variant)) for curve in report.curves],
+        "scores": [_score_json(score, part) for score in report.scores for part in score.parts],
         "differences": [
-            {"ours": _named(gap.ours), "theirs": _named(gap.theirs)}
-            | {"suite": gap.suite, "parts": gap.parts, "world": gap.world}
-            | {"metrics": _plain(gap.bands)}
-            for gap in gaps(report)
+            {"ours": _named(ours.variant), "theirs": _named(theirs.variant)}
+            | {"suite": ours.suite, "parts": list(ours.parts), "world": ours.world}
+            | {"metrics": _plain(bands)}
+            for ours, theirs, bands in gaps(report)
         ],
         "provenance": provenance(report),
         "notes": report.notes,
     }
 
 
-def _curve_json(report: Report, curve: Curve) -> recorded.Json:
+def _curve_json(curve: Curve, ahead: Band | None) -> recorded.Json:
     actions, success = curve.points()
-    ends = {"final": curve.final, "ahead": lead(report, curve)}
     return _named(curve.variant) | {
         "seeds": _seeds(curve.runs),
         "seconds_to_90": [_time_to_good(run) for run in curve.runs],
         "seconds": [float(run.seconds[-1]) for run in curve.runs],
         "actions": actions.tolist(),
         "success": [band._asdict() for band in success],
-        **_plain(ends),
+        **_plain({"final": statistics.band([curve.last]), "ahead": ahead}),
     }
 
 
-def _score_json(score: Score) -> recorded.Json:
-    place = score.place._asdict()
-    metrics = _plain({name: score.band(name) for name in METRICS})
-    numbers = {"seeds": _seeds(score.evaluations), "metrics": metrics}
-    return _named(place.pop("variant")) | place | numbers
+def _score_json(score: Score, part: str) -> recorded.Json:
+    fields = score._asdict() | {"part": part, "seeds": _seeds(score.parts[part])}
+    del fields["parts"]
+    metrics = _plain({name: score.only(part).band(name) for name in METRICS})
+    return _named(fields.pop("variant")) | fields | {"metrics": metrics}
 
 
 def _named(variant: Variant) -> recorded.Json:
@@ -93,9 +85,11 @@ def _plain(bands: Mapping[str, Band | None]) -> recorded.Json:
 
 def tables(report: Report) -> dict[str, Table]:
     """By title; those without a row are left out."""
+    trained = training(report)
+    kept = [row for one, row in zip(report.curves, trained, strict=True) if one.variant.unchanged]
     every = {
-        "Summary": summary(report),
-        "Training": training(report),
+        "Summary": [{name: row[name] for name in SUMMARY} for row in kept],
+        "Training": trained,
         "Evaluation": evaluation(report),
         "Differences": differences(report),
         "Failures": failures(report),
@@ -104,89 +98,75 @@ def tables(report: Report) -> dict[str, Table]:
     return {title: table for title, table in every.items() if table}
 
 
-def summary(report: Report) -> Table:
-    """The methods as their presets have them."""
-    return [
-        {name: row[name] for name in ("method", "runs", LAST, "paper", "training time")}
-        for curve, row in zip(report.curves, training(report), strict=True)
-        if curve.variant.unchanged
-    ]
-
-
-LAST = f"success, last {GRASP_WINDOW} grasps"
-
-
 def training(report: Report) -> Table:
     """How training went, a row per variant."""
-    rows = []
+    rows, ahead = [], leads(report)
     for curve in report.curves:
         mark = PAPER_TRAINING.get(curve.variant.algo) if curve.variant.unchanged else None
-        ends = curve.ends if len(curve.ends) == 1 else [curve.ends[0], curve.ends[-1]]
         rows.append(
             {
                 "method": label(curve.variant),
                 "runs": str(len(curve.runs)),
-                "seeds": ", ".join(map(str, sorted(set(_seeds(curve.runs))))),
-                "actions": " to ".join(f"{end:,}" for end in ends),
-                LAST: percent(curve.final),
-                "CSAC-beta ahead by": percent(lead(report, curve), "+"),
+                "seeds": ", ".join(map(str, dict.fromkeys(_seeds(curve.runs)))),
+                "actions": _range(curve.ends, ","),
+                LAST: shown(statistics.band([curve.last])),
+                "CSAC-beta ahead by": shown(ahead.get(curve.variant), "+"),
                 "paper": "-" if mark is None else f"{100 * mark:.0f} %",
-                "time to 90 %": _range([_time_to_good(run) for run in curve.runs]),
-                "training time": _range([float(run.seconds[-1]) for run in curve.runs]),
+                "time to 90 %": _times([_time_to_good(run) for run in curve.runs]),
+                "training time": _times([float(run.seconds[-1]) for run in curve.runs]),
             }
         )
     return rows
+
+
+def _times(seconds: Sequence[float | None]) -> str:
+    """Least and most of some times; not every run need have one."""
+    there = [time for time in seconds if time is not None]
+    some = f" ({len(there)} of {len(seconds)} runs)" if len(there) < len(seconds) else ""
+    return f"{_range(there, '.0f')} s{some}" if there else "-"
+
+
+def _range(values: Sequence[float], spec: str) -> str:
+    return " to ".join(dict.fromkeys(format(end, spec) for end in (min(values), max(values))))
 
 
 def evaluation(report: Report) -> Table:
     """What policies reached: a row per part of a suite, and their mean."""
-    rows = []
-    for place, scores in comparison.together(report.scores):
-        rows += [_evaluation_row(score.place, [score], score.band) for score in scores]
-        if len(scores) > 1:
-            whole = place._replace(part=f"mean of {len(scores)} parts")
-            rows.append(_evaluation_row(whole, scores, partial(comparison.mean, scores)))
-    return rows
+    return [_evaluation_row(one) for score in report.scores for one in score.split()]
 
 
-def _evaluation_row(
-    place: EvaluatedPart, scores: Sequence[Score], band: Callable[[str], Band | None]
-) -> dict[str, str]:
-    runs = max(len(score.evaluations) for score in scores)
-    episodes = sum(score.place.episodes * len(score.evaluations) for score in scores)
-    counts = {"runs": str(runs), "episodes": str(episodes)}
-    cells = {title: shown(metric, band(metric)) for metric, title in METRICS.items()}
-    return _first_cells(place) | counts | cells
+def _evaluation_row(score: Score) -> dict[str, str]:
+    runs = [len(runs) for runs in score.parts.values()]
+    counts = {"runs": str(max(runs)), "episodes": str(score.episodes * sum(runs))}
+    return _first_cells(score) | counts | _metric_cells(score.band)
+
+
+def _metric_cells(band: Callable[[str], Band | None], sign: str = "") -> dict[str, str]:
+    return {title: shown(band(metric), sign, metric) for metric, title in METRICS.items()}
 
 
 def differences(report: Report) -> Table:
     """By how many points CSAC-beta is ahead, a row per other variant and part."""
-    rows = []
-    for gap in gaps(report):
-        part = gap.parts[0] if len(gap.parts) == 1 else f"mean of {len(gap.parts)} parts"
-        rows.append(
-            {
-                "ahead": label(gap.ours),
-                "of": label(gap.theirs),
-                "part": _part(gap.suite, part),
-                "physics, robot, seed": gap.world,
-            }
-            | {t: shown(metric, gap.bands.get(metric), "+") for metric, t in METRICS.items()}
-        )
-    return rows
+    return [
+        {"ahead": label(ours.variant), "of": label(theirs.variant)}
+        | _place_cells(ours)
+        | _metric_cells(bands.get, "+")
+        for ours, theirs, bands in gaps(report)
+    ]
 
 
 def failures(report: Report) -> Table:
     """Causes of failure, all runs summed: how many, and of how many."""
-    told = {
-        score.place: [one.metrics["failures"] for one in score.evaluations]
+    told = [
+        (score.only(part), [one.metrics["failures"] for one in runs])
         for score in report.scores
-        if all("failures" in one.metrics for one in score.evaluations)
-    }
-    causes = dict.fromkeys(cause for runs in told.values() for run in runs for cause in run)
+        for part, runs in score.parts.items()
+        if all("failures" in one.metrics for one in runs)
+    ]
+    causes = dict.fromkeys(cause for _, runs in told for run in runs for cause in run)
     return [
-        _first_cells(place) | {cause.replace("_", " "): _sum(runs, cause) for cause in causes}
-        for place, runs in told.items()
+        _first_cells(score) | {cause.replace("_", " "): _sum(runs, cause) for cause in causes}
+        for score, runs in told
     ]
 
 
@@ -198,14 +178,16 @@ def _sum(runs: Sequence[recorded.Json], cause: str) -> str:
     return f"{cases} / {n}" if n else "-"
 
 
-def _first_cells(its: EvaluatedPart) -> dict[str, str]:
-    name = its.policy if its.policy != "learned" else label(its.variant)
-    part = _part(its.suite, its.part)
-    return {"policy": name, "part": part, "physics, robot, seed": its.world}
+def _first_cells(score: Score) -> dict[str, str]:
+    name = label(score.variant) if score.policy == "learned" else score.policy
+    return {"policy": name, **_place_cells(score)}
 
 
-def _part(suite: str, part: str) -> str:
-    return part if part == suite else f"{suite}: {part}"
+def _place_cells(score: Score) -> dict[str, str]:
+    part, *others = score.parts
+    part = f"mean of {len(score.parts)} parts" if others else part
+    part = part if part == score.suite else f"{score.suite}: {part}"
+    return {"part": part, "physics, robot, seed": score.world}
 
 
 def provenance(report: Report) -> Table:
@@ -218,52 +200,31 @@ def provenance(report: Report) -> Table:
             "file": os.path.relpath(path, root),
             "settings as a command": recorded.command(one),
             "device": one.record.get("device") or "-",
-            "versions": _versions(one) or "-",
+            "versions": _versions(one.record) or "-",
             "commit": str(one.record.get("commit") or "-")[:10],
-            "wall time": _wall_time(one),
+            "wall time": _wall_time(one.record),
         }
         for path, one in by_path.items()
     ]
 
 
-def _versions(one: RecordedRun | Evaluation) -> str:
-    versions = one.record.get("versions") or {}
-    names = [name for name in ("python", "jax", "mujoco") if name in versions]
-    return ", ".join(f"{name} {versions[name]}" for name in names)
+def _versions(record: recorded.Json) -> str:
+    found = (record.get("versions") or {}).items()
+    return ", ".join(f"{name} {n}" for name, n in found if name in ("python", "jax", "mujoco"))
 
 
-def _wall_time(one: RecordedRun | Evaluation) -> str:
-    if isinstance(one, RecordedRun):
-        seconds = one.record.get("wall_seconds", float(one.seconds[-1]))
-    else:
-        seconds = one.record.get("seconds")
-    whole = ", whole sweep" if "settings" in one.record else ""
+def _wall_time(record: recorded.Json) -> str:
+    seconds, whole = record["wall_seconds"], ", whole sweep" * ("settings" in record)
     return "-" if seconds is None else f"{seconds:.0f} s{whole}"
 
 
-def shown(metric: str, band: Band | None, sign: str = "") -> str:
-    """A metric with its band: a share in per cent, blocks per action as a number."""
-    if metric not in PER_ACTION or band is None:
-        return percent(band, sign)
-    value, *ends = (f"{x:{sign}.3f}" for x in band[:3] if x is not None)
-    return f"{value} ({' to '.join(ends)})" if ends else value
-
-
-def percent(band: Band | None, sign: str = "") -> str:
-    """A share with its band; with a sign, a difference in points of per cent."""
+def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
+    """A band as blocks per action or in per cent; with a sign, as a difference in points."""
     if band is None:
         return "-"
-    value, *ends = (f"{100 * x:{sign}.1f}" for x in band[:3] if x is not None)
-    interval = f" ({' to '.join(ends)})" if ends else ""
-    return f"{value}{'' if sign else ' %'}{interval}"
-
-
-def _range(values: Sequence[float | None]) -> str:
-    """Least and most of some times; not every run need have one."""
-    there = sorted(value for value in values if value is not None)
-    ends = dict.fromkeys(f"{value:.0f}" for value in (*there[:1], *there[1:][-1:]))
-    some = f" ({len(there)} of {len(values)} runs)" if len(there) < len(values) else ""
-    return f"{' to '.join(ends)} s{some}" if there else "-"
+    scale, digits, unit = (1, 3, "") if metric in PER_ACTION else (100, 1, "" if sign else " %")
+    value, *ends = (f"{scale * x:{sign}.{digits}f}" for x in band[:3] if x is not None)
+    return f"{value}{unit} ({' to '.join(ends)})" if ends else f"{value}{unit}"
 
 
 EXPLAINED = (
@@ -278,9 +239,10 @@ EXPLAINED = (
 
 def markdown(report: Report) -> str:
     """All tables and notes."""
-    parts = [f"## {title}\n\n{table_text(table)}" for title, table in tables(report).items()]
-    notes = "\n".join(f"- {note}" for note in report.notes)
-    return "\n\n".join([EXPLAINED, *parts, *([f"## Notes\n\n{notes}"] if notes else [])]) + "\n"
+    sections = {title: table_text(table) for title, table in tables(report).items()}
+    if report.notes:
+        sections["Notes"] = "\n".join(f"- {note}" for note in report.notes)
+    return "\n\n".join([EXPLAINED, *(f"## {t}\n\n{text}" for t, text in sections.items())]) + "\n"
 
 
 def table_text(table: Table) -> str:

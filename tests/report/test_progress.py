@@ -63,10 +63,7 @@ def test_tensorboard_gets_every_number(monkeypatch: pytest.MonkeyPatch, tmp_path
             pass
 
     monkeypatch.setitem(sys.modules, "tensorboardX", SimpleNamespace(SummaryWriter=Writer))
-    monkeypatch.delitem(sys.modules, "csac_jax.report.tensorboard", raising=False)
-    from csac_jax.report.tensorboard import TensorBoard
-
-    board = TensorBoard(tmp_path)
+    board = progress.TensorBoard(tmp_path)
     board.progress(_record(8), 10, 1.0)
     board.progress(_record(9), 10, 1.0)
     first, *points = notes
