@@ -15,3 +15,7 @@ class FailedError(Exception):
 
 class SceneError(FailedError):
     """A scene that cannot be simulated or settled."""
+
+
+class DataWarning(UserWarning):
+    """Files that are used although something about them is doubtful."""

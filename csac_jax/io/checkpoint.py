@@ -1,31 +1,39 @@
 """Checkpoints: the whole training state, the config and a little JSON, a folder for each step.
 
+    RUN/checkpoints/run                   random name of the run, which every checkpoint repeats
     RUN/checkpoints/STEP/state/...        arrays, by Orbax
     RUN/checkpoints/STEP/config, extra    JSON, by Orbax
-    RUN/checkpoints/STEP/manifest.sha256  digest of every file above, written last
+    RUN/checkpoints/STEP/manifest.sha256  digest of every file above
+    RUN/checkpoints/set-aside/STEP        a damaged one that a resumed run has passed over
 
-Orbax makes a step's folder appear all at once, but restores flipped bits and casts other dtypes
-silently. So every file is checked against the manifest, and every leaf's shape and dtype against
-what the program expects. A step that fails is an error, never a reason to take an older one.
+A step is written under another name and renamed once its manifest is there: it appears complete or
+not at all. Orbax restores flipped bits and casts other dtypes silently. So every file is checked
+against the manifest, and every leaf's shape and dtype against what the program expects.
 """
 
 import hashlib
-import json
+import itertools
+import re
+import secrets
+import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
-from orbax.checkpoint.checkpoint_managers import LatestN
 
 from csac_jax.config import Config
-from csac_jax.errors import FailedError
+from csac_jax.errors import DataWarning, FailedError
 from csac_jax.io import configs, files, leaves, renames
-from csac_jax.runtime import cluster
+from csac_jax.runtime import cluster, provenance
 
 FOLDER = "checkpoints"
 MANIFEST = "manifest.sha256"
+SET_ASIDE = "set-aside"
 KEPT = 2
+_RUN = "run"
+_DRAFT = ".saving"
 
 
 class CheckpointError(FailedError):
@@ -36,38 +44,47 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
     """Writes `state` (a pytree of arrays and typed keys) as `step`; returns once it is complete.
     The last two are kept.
 
-    Temporary folders that a killed process left are removed. `extra` is anything that JSON can
-    hold. With several processes all must call it.
+    Removes what a killed process left; replaces a folder of that step. `extra` is anything that
+    JSON can hold. With several processes all must call it. Raises CheckpointError where it cannot
+    be written, as on a full disc; earlier checkpoints stay as they are.
     """
+    root = _root(run_dir)
+    draft, folder = root / _DRAFT, root / str(step)
     arrays = {name: _untyped(leaf) for name, leaf in leaves.named(state).items()}
-    record = {"layout": leaves.layout(state), "extra": extra}
-    folder = _root(run_dir) / str(step)
-    with _manager(run_dir, writes=True) as manager:
+    try:
+        if cluster.is_first():
+            _clean(root)
+        cluster.wait(f"cleaned {root}")
+        origin = {"step": step, "run": _run_name(root), "versions": provenance.versions()}
+        record = {"layout": leaves.layout(state), "extra": extra, **origin}
         items = ocp.args.Composite(
             state=ocp.args.StandardSave(arrays),
             config=ocp.args.JsonSave(configs.to_dict(cfg)),
-            extra=ocp.args.JsonSave(record),
+            extra=ocp.args.JsonSave(
+                {**record, "run": _run_name(root), "versions": provenance.versions()}
+            ),
         )
-        manager.save(step, args=items)
-        manager.wait_until_finished()  # a failed save raises here
+        with _checkpointer() as checkpointer:
+            checkpointer.save(draft, args=items)
+        if cluster.is_first():
+            files.write_json(draft / MANIFEST, _digests(draft))
+            _publish(draft, folder)
+    except Exception as error:  # TensorStore and Orbax raise nearly anything for a full disc
+        if cluster.is_first():
+            _clean(root)
+        raise CheckpointError(
+            f"step {step} could not be saved in {root} ({files.first_line(error)}); earlier "
+            "checkpoints are intact; make room there and go on with --resume"
+        ) from error
     cluster.wait(f"saved {folder}")
-    if cluster.is_first():
-        files.write_json(folder / MANIFEST, _digests(folder))
-    cluster.wait(f"manifest of {folder}")
     return folder
 
 
-def latest_step(run_dir: Path) -> int | None:
-    """The newest step that was saved under `run_dir`, sound or not; None if there is none."""
-    return max(_steps(run_dir), default=None)
-
-
-def load_config(run_dir: Path) -> Config:
-    """The config of the newest checkpoint."""
-    folder = _newest(run_dir)
-    stored = _read(run_dir, folder, config=ocp.args.JsonRestore())
+def load_config(run_dir: Path, step: int | None = None) -> Config:
+    """The config of a checkpoint; see `restore`."""
+    folder = sound(run_dir, step)
     try:
-        return configs.from_dict(stored["config"])
+        return configs.from_dict(_read(folder, config=ocp.args.JsonRestore())["config"])
     except ValueError as error:
         raise CheckpointError(
             f"checkpoint {folder} was made by another version of csac_jax ({error}); "
@@ -75,15 +92,17 @@ def load_config(run_dir: Path) -> Config:
         ) from error
 
 
-def restore(run_dir: Path, abstract_state: Any) -> tuple[Any, dict[str, Any]]:
-    """State and `extra` of the newest step, as they were given to `save`.
+def restore(
+    run_dir: Path, abstract_state: Any, step: int | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """State and `extra`, as they were given to `save`, of a step, by default the newest sound one.
 
     `abstract_state` has the state's structure, shapes and dtypes, as `jax.eval_shape` gives them. A
     leaf that has a sharding is laid out by it, however it was when it was saved; the others go to
-    the first device.
+    the first device. Raises CheckpointError; warns of damaged steps that it passes over.
     """
-    folder = _newest(run_dir)
-    record = _read(run_dir, folder, extra=ocp.args.JsonRestore())["extra"]
+    folder = sound(run_dir, step)
+    record = _read(folder, extra=ocp.args.JsonRestore())["extra"]
     wanted, layout = leaves.named(abstract_state), leaves.layout(abstract_state)
     old = {name: _old_name(name, record["layout"]) for name in wanted}
     found = leaves.difference(record["layout"], {old[name]: layout[name] for name in wanted})
@@ -93,34 +112,108 @@ def restore(run_dir: Path, abstract_state: Any) -> tuple[Any, dict[str, Any]]:
             f"checkpoint {folder} holds {name} as {has}, the program needs {needs}; "
             "use the version of csac_jax that saved it"
         )
+    provenance.warn_if_other(record.get("versions"), f"checkpoint {folder}")
     arrays = {old[name]: _abstract_array(leaf) for name, leaf in wanted.items()}
-    arrays = _read(run_dir, folder, state=ocp.args.StandardRestore(arrays))["state"]
+    arrays = _read(folder, state=ocp.args.StandardRestore(arrays))["state"]
+    if int(arrays.get("step", folder.name)) != int(folder.name):
+        raise CheckpointError(
+            f"checkpoint {folder} holds step {arrays['step']}; remove that folder"
+        )
     state = [_typed(arrays[old[name]], leaf) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(abstract_state), state), record["extra"]
+
+
+def sound(run_dir: Path, step: int | None = None) -> Path:
+    """Folder of a step, by default of the newest one whose files are what was saved.
+
+    Raises CheckpointError where there is none; warns of newer ones that are damaged.
+    """
+    root = _root(run_dir)
+    steps = [step] if step is not None else _steps(run_dir)[::-1]
+    faults = []
+    for number in steps:
+        folder = root / str(number)
+        if (fault := _fault(folder)) is None:
+            for said in faults:
+                warnings.warn(f"{said}; going back to step {number}", DataWarning, stacklevel=2)
+            return folder
+        faults.append(f"checkpoint {folder} {fault}")
+    if not faults:
+        raise CheckpointError(
+            f"there is no checkpoint under {root}; give the folder of a run that saved one"
+        )
+    others = [number for number in _steps(run_dir) if number not in steps]
+    remedy = f"saved are: {', '.join(map(str, others))}" if others else "train again"
+    raise CheckpointError(f"{faults[0]}; {remedy}")
+
+
+def set_aside(run_dir: Path) -> None:
+    """Moves the steps that are newer than the newest sound one out of the way."""
+    root, good = _root(run_dir), int(sound(run_dir).name)
+    for number in [number for number in _steps(run_dir) if number > good]:
+        _set_aside(root / str(number))
+
+
+def latest_step(run_dir: Path) -> int | None:
+    """The newest step that was saved under `run_dir`, sound or not; None if there is none."""
+    return max(_steps(run_dir), default=None)
+
+
+def _set_aside(folder: Path) -> None:
+    place = folder.parent / SET_ASIDE
+    place.mkdir(exist_ok=True)
+    names = itertools.chain([folder.name], (f"{folder.name}-{i}" for i in itertools.count(2)))
+    folder.rename(next(place / name for name in names if not (place / name).exists()))
+
+
+def _publish(draft: Path, folder: Path) -> None:
+    """Gives a complete step its name and drops those before the last two."""
+    if folder.exists():
+        _set_aside(folder)
+    draft.rename(folder)
+    files.sync_folder(folder.parent)
+    for number in _steps(folder.parents[1])[:-KEPT]:
+        shutil.rmtree(folder.parent / str(number))
+
+
+def _clean(root: Path) -> None:
+    """Removes what a save that did not end has left."""
+    for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _run_name(root: Path) -> str:
+    """The name of the run that saves here; a new one where there is none."""
+    path = root / _RUN
+    if cluster.is_first() and not path.exists():
+        files.replace(path, secrets.token_hex(8))
+    cluster.wait(f"named {root}")
+    return path.read_text()
 
 
 def _root(run_dir: Path) -> Path:
     return Path(run_dir).resolve() / FOLDER
 
 
-def _manager(run_dir: Path, writes: bool) -> ocp.CheckpointManager:
-    options = ocp.CheckpointManagerOptions(
-        create=writes,
-        cleanup_tmp_directories=writes,  # a reader must leave a running writer alone
-        preservation_policy=LatestN(KEPT),
-        enable_async_checkpointing=False,
-    )
-    return ocp.CheckpointManager(_root(run_dir), options=options)
+def _checkpointer() -> ocp.Checkpointer:
+    return ocp.Checkpointer(ocp.CompositeCheckpointHandler())
 
 
-def _read(run_dir: Path, folder: Path, **items: Any) -> Any:
-    with _manager(run_dir, writes=False) as manager:
-        return manager.restore(int(folder.name), args=ocp.args.Composite(**items))
+def _read(folder: Path, **items: Any) -> Any:
+    try:
+        with _checkpointer() as checkpointer:
+            return checkpointer.restore(folder, args=ocp.args.Composite(**items))
+    except Exception as error:  # its files are what was saved, so another program saved them
+        raise CheckpointError(
+            f"checkpoint {folder} cannot be read ({files.first_line(error)}); "
+            "use the version of csac_jax that saved it"
+        ) from error
 
 
 def _steps(run_dir: Path) -> list[int]:
     """Saved steps, the oldest first."""
-    return sorted(int(path.name) for path in _root(run_dir).glob("*") if path.name.isdigit())
+    names = [path.name for path in _root(run_dir).glob("*")]
+    return sorted(int(name) for name in names if re.fullmatch("0|[1-9][0-9]{0,17}", name))
 
 
 def _old_name(name: str, layout: dict[str, str]) -> str:
@@ -168,31 +261,22 @@ def _digests(folder: Path) -> dict[str, str]:
 def _fault(folder: Path) -> str | None:
     """What is wrong with the files of a step, None if nothing is."""
     try:
-        wanted = json.loads((folder / MANIFEST).read_text())
-    except FileNotFoundError:
-        return "is half-written (it has no manifest)"
-    except ValueError:
-        return "is damaged (its manifest cannot be read)"
-    found = _digests(folder)
-    for name in sorted(wanted.keys() | found.keys()):
-        if found.get(name) != wanted.get(name):
-            return f"is damaged ({name} {'has changed' if name in found else 'is missing'})"
+        wanted = files.read_object(folder / MANIFEST)
+        found = _digests(folder)
+        for name in sorted(wanted.keys() | found.keys()):
+            if found.get(name) != wanted.get(name):
+                return f"is damaged ({name} {'has changed' if name in found else 'is missing'})"
+        record = files.read_object(folder / "extra" / "metadata")
+        run = folder.parent / _RUN
+        name = run.read_text() if run.exists() else None
+    except (FileNotFoundError, NotADirectoryError):
+        return "is missing or half-written (it has no manifest)"
+    except ValueError as error:
+        return f"is damaged ({error})"
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    if str(record.get("step", folder.name)) != folder.name:
+        return f"is that of step {record['step']}"
+    if name is not None and record.get("run", name) != name:  # older ones name no run
+        return "is another run's"
     return None
-
-
-def _newest(run_dir: Path) -> Path:
-    """Folder of the newest step. Raises CheckpointError if there is none, or it is not sound."""
-    root = _root(run_dir)
-    folders = [root / str(step) for step in _steps(run_dir)]
-    if not folders:
-        raise CheckpointError(
-            f"there is no checkpoint under {root}; give the folder of a run that saved one"
-        )
-    *older, folder = folders
-    fault = _fault(folder)
-    if fault is None:
-        return folder
-    remedy = "train again"
-    if sound := [other.name for other in older if _fault(other) is None]:
-        remedy = f"to go on from step {sound[-1]}, the newest sound one, delete that folder"
-    raise CheckpointError(f"checkpoint {folder} {fault}; {remedy}")

@@ -6,26 +6,47 @@ RUN/checkpoints/    see `checkpoint`
 """
 
 import contextlib
+import errno
 import json
 import os
+import shutil
+import stat
+import warnings
 from pathlib import Path
 from typing import Any
 
+from csac_jax.errors import DataWarning
 from csac_jax.io import renames
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
+LARGEST = 2**30  # bytes of a file that is read at once
 
 
 def replace(path: Path, content: str | bytes) -> None:
-    """Writes a file such that it appears all at once; its folder is made."""
+    """Writes a file such that it appears all at once, or raises OSError and leaves nothing; its
+    folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())  # else a power failure may leave it empty
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())  # else a power failure may leave it empty
+        temporary.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+def sync_folder(folder: Path) -> None:
+    """Returns once the names in a folder would survive a power failure."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -33,13 +54,60 @@ def write_json(path: Path, content: Any) -> None:
     replace(path, json.dumps(content, indent=2) + "\n")
 
 
+def read_object(path: Path) -> dict[str, Any]:
+    """The JSON object of a file. Raises ValueError for any other content, OSError."""
+    content = parse(read_bytes(path), path.name)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path.name} holds no JSON object")
+    return content
+
+
+def parse(text: str | bytes, name: str) -> Any:
+    """The content of JSON text. Raises ValueError, also for what nests too deep for Python."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{name} is not readable JSON") from None
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a regular file. Raises OSError for a pipe or device, which may never end, and
+    for more than LARGEST."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST:
+        reason = "is a folder, a pipe or a device, or larger than 1 GiB"
+        raise OSError(errno.EINVAL, reason, str(path))
+    return path.read_bytes()
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message, without the rest of a trace."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
+
+
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl by today's names, without one that was cut off in writing."""
-    lines = []
-    for line in path.read_text().splitlines():
-        with contextlib.suppress(ValueError):
-            lines.append(renamed(json.loads(line)))
-    return lines
+    """The lines of a metrics.jsonl by today's names; warns of lines that are damaged.
+
+    The last line may have been cut off in writing, which is no damage.
+    """
+    *lines, last = read_bytes(path).split(b"\n")
+    records = [_record(line) for line in lines]
+    if damaged := records.count(None):
+        text = f"{path}: {damaged} of {len(lines)} lines are damaged and left out"
+        warnings.warn(text, DataWarning, stacklevel=2)
+    found = [*records, _record(last)]
+    return [renamed(record) for record in found if record is not None]
+
+
+def _record(line: bytes) -> dict[str, Any] | None:
+    """A line of a log; None if it is damaged."""
+    try:
+        record = parse(line, "line")
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("step"), int) else None
 
 
 def renamed(content: Any) -> Any:
@@ -50,6 +118,14 @@ def renamed(content: Any) -> Any:
 
 
 def truncate_log(path: Path, step: int) -> None:
-    """Keeps the lines of steps up to `step`."""
-    lines = read_log(path) if path.exists() else []
+    """Keeps the lines of steps up to `step`; a log with damaged lines stays as a copy."""
+    with warnings.catch_warnings(record=True) as damage:
+        warnings.simplefilter("always")
+        lines = read_log(path) if path.exists() else []
+    for warning in damage:
+        copy = path.with_suffix(".damaged.jsonl")
+        shutil.copyfile(path, copy)
+        warnings.warn(
+            f"{warning.message}; the whole file is kept as {copy.name}", DataWarning, stacklevel=2
+        )
     replace(path, "".join(json.dumps(line) + "\n" for line in lines if line["step"] <= step))

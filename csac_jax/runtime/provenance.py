@@ -5,11 +5,14 @@ import importlib.metadata
 import os
 import platform
 import subprocess
+import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from csac_jax import __version__
+from csac_jax.errors import DataWarning
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
@@ -18,6 +21,16 @@ def versions() -> dict[str, str]:
     """Versions of Python and of the packages that can change a result."""
     installed = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {"python": platform.python_version(), "csac-jax": __version__, **installed}
+
+
+def warn_if_other(stored: Any, what: str) -> None:
+    """Warns where `what` was made by versions, see `versions`, that may compute other numbers."""
+    now = versions()
+    for name in ("csac-jax", "jax", "mujoco"):
+        was = stored.get(name) if isinstance(stored, dict) else None
+        if was is not None and was != now[name]:
+            text = f"{what} was made with {name} {was}, this is {now[name]}: results may differ"
+            warnings.warn(text, DataWarning, stacklevel=3)
 
 
 def device() -> str:
