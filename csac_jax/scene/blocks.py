@@ -152,10 +152,10 @@ def scales(cfg: SceneConfig, noise: Any) -> Any:
 
     MJX shares a mesh between all slots of a kind: they take the scale of the first of them.
     """
-    of_boxes, of_meshes = np.float32(cfg.size_jitter)
-    own = 1.0 + np.where(is_mesh(cfg.slots), of_meshes, of_boxes) * noise
+    shared, jitter = is_mesh(cfg.slots), np.array(cfg.size_jitter, np.float32)
     first = [cfg.slots.index(kind) for kind in cfg.slots]
-    return own[np.where(is_mesh(cfg.slots), first, np.arange(len(first)))]
+    leader = np.where(shared, first, np.arange(len(first)))
+    return (1.0 + np.where(shared, jitter[1], jitter[0]) * noise)[leader]
 
 
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:

@@ -74,7 +74,7 @@ def seat(case: Case, slots: tuple[SlotKind, ...]) -> Scene:
     places = {kind: [i for i, own in enumerate(slots) if own == kind] for kind in case.slots}
     seats = [places[kind].pop(0) for kind in case.slots]
 
-    def put(parked: np.ndarray, placed: np.ndarray) -> np.ndarray:
+    def put(parked: np.ndarray, placed: np.ndarray) -> Any:
         if parked.ndim == 0:
             return placed if placed == layout.ANY else np.int32(seats[placed])  # the target
         leaf = parked.copy()
@@ -129,7 +129,7 @@ _BLOCK: Keys = {
         "a list of 3 numbers in metres, each from -10 to 10",
     ),
     "quaternion": (
-        lambda value: _are_numbers(value, 4) and np.linalg.norm(value) > 1e-6,
+        lambda value: _are_numbers(value, 4) and bool(np.linalg.norm(value) > 1e-6),
         "a list of 4 numbers, each from -10 to 10 and not all zero",
     ),
     "target": (lambda value: isinstance(value, bool), "true or false"),
@@ -174,10 +174,12 @@ def _parse(content: Any) -> Case:
     quaternions = [np.array(entry["quaternion"]) for entry in entries]
     slots = tuple(shape.kind for shape in shapes)
     scene = layout.parked(slots).replace(
-        position=np.float32([entry["position"] for entry in entries]),
-        quaternion=np.float32([each / np.linalg.norm(each) for each in quaternions]),
-        half_size=np.float32([shape.half_size for shape in shapes]),
-        colour=np.int32([blocks.COLOUR_NAMES.index(entry["colour"]) for entry in entries]),
+        position=np.array([entry["position"] for entry in entries], np.float32),
+        quaternion=np.array([each / np.linalg.norm(each) for each in quaternions], np.float32),
+        half_size=np.array([shape.half_size for shape in shapes], np.float32),
+        colour=np.array(
+            [blocks.COLOUR_NAMES.index(entry["colour"]) for entry in entries], np.int32
+        ),
         in_play=np.ones(len(slots), bool),
         target=np.int32(targets[0] if targets else layout.ANY),
     )

@@ -135,7 +135,8 @@ def _place_ring(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) 
     # Half extents of the middle block, in the frame of each arm.
     inner = _half_xy(jnp.broadcast_to(half[4], half.shape), crosswise)
     arm = jnp.stack([half[:, 0] - inner[:, 0], inner[:, 1] + gap + half[:, 1]], axis=1)
-    cos, sin = np.float32([np.cos(0.5 * np.pi * quarter), np.sin(0.5 * np.pi * quarter)])
+    angle = 0.5 * np.pi * quarter
+    cos, sin = np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
     x, y = cos * arm[:, 0] - sin * arm[:, 1], sin * arm[:, 0] + cos * arm[:, 1]
     mirrored = jnp.where(draws.mirrored, -1.0, 1.0)
     around = jnp.stack([mirrored * x, y], axis=1)

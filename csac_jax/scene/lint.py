@@ -12,8 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from csac_jax.errors import SceneError
-
 # Values of MuJoCo's enumerations are named without their prefix: mjINT_DISCRETE is `discrete`.
 IGNORED_OPTIONS = (
     *("noslip_iterations", "noslip_tolerance", "ccd_iterations", "ccd_tolerance"),
@@ -55,12 +53,6 @@ KINDS_LACKING = {  # field of the model: (its element, enumeration, values witho
     "eq_type": ("equality", mujoco.mjtEq, ("distance", "flex", "flexstrain", "flexvert")),
     "sensor_type": ("sensor", mujoco.mjtSensor, _SENSORS_LACKING),
 }
-
-
-def check(model: mujoco.MjModel) -> None:
-    """Raises SceneError, one line, for the first fault of the model."""
-    for fault in faults(model):
-        raise SceneError(f"MJX {fault}")
 
 
 def faults(model: mujoco.MjModel) -> Iterator[str]:
@@ -119,7 +111,7 @@ def _kinds(model: mujoco.MjModel) -> Iterator[str]:
             if (word := _word(kind, value)) in lacking:
                 label = _label(model, what, index)
                 yield f"lacks {field} {word} of {label}; choose another, or take it out"
-    for index in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT):
+    for index in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).tolist():
         ends = model.sensor_objtype[index], model.sensor_reftype[index]
         netforce = model.sensor_intprm[index, 1] == 3  # its reduction
         if netforce or CONTACT_ENDS_LACKING & {_word(mujoco.mjtObj, end) for end in ends}:
@@ -129,13 +121,13 @@ def _kinds(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _label(model: mujoco.MjModel, what: str, index: int) -> str:
-    """How an element is called: its name, else its number."""
     name = mujoco.mj_id2name(model, mujoco.mju_str2Type(what), index)
     return f"{what} '{name}'" if name else f"{what} {index}"
 
 
 def _collisions(model: mujoco.MjModel) -> Iterator[str]:
-    for *pair, margin in _meeting(model):
+    for one, two, margin in _meeting(model):
+        pair = sorted((one, two), key=lambda geom: model.geom_type[geom])
         kinds = tuple(_word(mujoco.mjtGeom, model.geom_type[geom]) for geom in pair)
         labels = " and ".join(_label(model, "geom", geom) for geom in pair)
         what = f"collisions {' x '.join(kinds)} ({labels})"
@@ -146,13 +138,8 @@ def _collisions(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _meeting(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
-    """Pairs of geoms that may collide, by rising type, and the margin of each."""
-
-    def by_type(one: int, two: int) -> list[int]:
-        return sorted((one, two), key=lambda geom: model.geom_type[geom])
-
-    for one, two, margin in zip(model.pair_geom1, model.pair_geom2, model.pair_margin, strict=True):
-        yield *by_type(one, two), margin
+    """Pairs of geoms that may collide, and the margin of each."""
+    yield from zip(model.pair_geom1, model.pair_geom2, model.pair_margin, strict=True)
     kind, affinity = model.geom_contype, model.geom_conaffinity
     weld = model.body_weldid[model.geom_bodyid]  # [geoms]
     parent = model.body_weldid[model.body_parentid[weld]]
@@ -165,4 +152,4 @@ def _meeting(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
             continue
         related = weld[one] == parent[two] or weld[two] == parent[one]
         if not (filtered and related and weld[one] != 0 and weld[two] != 0):
-            yield *by_type(one, two), model.geom_margin[one] + model.geom_margin[two]
+            yield one, two, model.geom_margin[one] + model.geom_margin[two]

@@ -93,8 +93,8 @@ def _require(file: str, kind: str, required: tuple[str, ...], elements: Iterable
     present = [element.name for element in elements if element.name]
     for name in required:
         if name not in present:
-            known = ", ".join(present) or "none"
-            raise SceneError(f"{assets() / file}: {kind} '{name}' is missing; it has: {known}")
+            has = ", ".join(present) or "none"
+            raise SceneError(f"{assets() / file}: {kind} '{name}' is missing; it has: {has}")
 
 
 def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
@@ -177,7 +177,8 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     except ValueError as error:
         raise _one_line(assets(), error) from None
     if sim.physics == "mjx":
-        lint.check(model)
+        for fault in lint.faults(model):
+            raise SceneError(f"MJX {fault}")
     _align_inertia(model)
     slots = np.arange(len(scene.slots))
     bodies = np.array([model.body(f"block{slot}").id for slot in slots])
@@ -241,7 +242,8 @@ def scene_fields(world: World, scene: Scene) -> BlockFields:
 def _box_fields(world: World, scene: Scene) -> BlockFields:
     """As if every slot were made of boxes."""
     slot = world.parts.slot
-    half, centre = (part * scene.half_size[slot] for part in (world.parts.half, world.parts.centre))
+    half_size = scene.half_size[slot]
+    half, centre = half_size * world.parts.half, half_size * world.parts.centre
     part_mass = 8.0 * scene.density[slot] * jnp.prod(half, axis=1)
 
     def add(values: jax.Array) -> jax.Array:

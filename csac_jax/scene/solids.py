@@ -55,15 +55,15 @@ def read(model: mujoco.MjModel) -> Solids:
     """
     materials = np.concatenate([model.mat_rgba, np.zeros((1, 4), np.float32)])
     own = model.geom_matid[:, None] < 0  # has no material: -1, the last row
-    rgba = np.where(own, model.geom_rgba, materials[model.geom_matid])
+    rgba: Any = np.where(own, model.geom_rgba, materials[model.geom_matid])
     geoms_of: dict[Kind, list[int]] = {}
     for geom in map(int, np.flatnonzero(rgba[:, 3] > 0.0)):
         geoms_of.setdefault(_kind(model, geom), []).append(geom)
     groups = [_group(model, kind, np.array(geoms, np.int32)) for kind, geoms in geoms_of.items()]
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    poses = np.float32(data.geom_xpos), np.float32(data.geom_xmat)
-    return place(Solids(tuple(groups), rgba[:, :3]), *poses)
+    solids = Solids(tuple(groups), rgba[:, :3])
+    return place(solids, data.geom_xpos.astype(np.float32), data.geom_xmat.astype(np.float32))
 
 
 def _kind(model: mujoco.MjModel, geom: int) -> Kind:
@@ -79,11 +79,11 @@ def _type_name(geom_type: int) -> str:
     return mjtGeom(geom_type).name.removeprefix("mjGEOM_").lower()
 
 
-def _group(model: mujoco.MjModel, kind: Kind, geoms: np.ndarray) -> GeomGroup:
-    is_mesh = kind is Kind.POLYTOPE
-    shape: Any = _half_spaces(model, geoms) if is_mesh else np.float32(model.geom_size[geoms])
-    unplaced: Any = np.zeros(0, np.float32)
-    return GeomGroup(kind, shape, unplaced, unplaced, geoms)
+def _group(model: mujoco.MjModel, kind: Kind, geoms: Any) -> GeomGroup:
+    is_mesh, unplaced = kind is Kind.POLYTOPE, np.zeros(0, np.float32)
+    shape = _half_spaces(model, geoms) if is_mesh else model.geom_size[geoms].astype(np.float32)
+    leaves: tuple[Any, ...] = (shape, unplaced, unplaced, geoms)
+    return GeomGroup(kind, *leaves)
 
 
 def _half_spaces(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
