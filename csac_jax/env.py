@@ -19,7 +19,7 @@ from flax import struct
 from csac_jax import specs
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
-from csac_jax.scene import layout, model, pool, sources
+from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, outcome, physics as simulation
 from csac_jax.sim.physics import Physics
@@ -172,7 +172,7 @@ class Env:
     def randomise_pose(self, key: jax.Array, scene: Scene) -> Scene:
         """The scene as episodes start with it: at a random yaw, with a target or none."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
-        return sources.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+        return layout.randomise_pose(key, scene, extent, self.any_yaw, has_target)
 
     def _sample_scene(self, key: jax.Array) -> Scene:
         key_index, key_pose = jax.random.split(key)
@@ -216,7 +216,7 @@ def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | Non
     """
     cfg = backend.resolve(cfg)
     world = model.build(cfg.scene, cfg.sim)
-    scenes = sources.scenes(cfg, stream, num_scenes)
+    scenes = pool.scenes(cfg, stream, num_scenes)
     return Env(cfg, simulation.make(world, cfg.sim), scenes)
 
 

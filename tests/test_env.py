@@ -17,7 +17,7 @@ from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import AutoResetEnv, Env, State, make_env
 from csac_jax.errors import SceneError
-from csac_jax.scene import blocks, layout, sources
+from csac_jax.scene import arrange, blocks, layout, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, oracle
 from csac_jax.sim.primitives import Action
@@ -108,7 +108,7 @@ def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         for share, pool in ((0.0, 6), (0.25, 8))
     )
     np.testing.assert_array_equal(mixed.position[:6], dropped.position)
-    packed = sources.arrangements(scene, CONFIG.heightmap.extent, 0, 2)
+    packed = arrange.arrangements(scene, CONFIG.heightmap.extent, 0, 2)
     np.testing.assert_array_equal(mixed.position[6:], packed.position)
     assert mixed.in_play.all()
 
@@ -117,10 +117,8 @@ def test_arrangement_without_blocks_for_it():
     """Claim: `scene.arranged` with blocks that allow no arrangement is one line that names the
     slots."""
     two = SceneConfig(slots=("box", "prism"), min_blocks=2)
-    with pytest.raises(
-        SceneError, match=r"scene\.arranged: scene\.slots: too few for an arrangement"
-    ):
-        sources.arrangements(two, CONFIG.heightmap.extent, 0, 2)
+    with pytest.raises(SceneError, match=r"scene\.slots: too few for an arrangement"):
+        arrange.arrangements(two, CONFIG.heightmap.extent, 0, 2)
 
 
 def test_scenes_stay_inside_however_turned(lab: Lab):
@@ -597,7 +595,7 @@ def test_actions_are_built_from_numbers_or_arrays():
 
 def test_make_env_chooses_physics(monkeypatch: pytest.MonkeyPatch):
     """Claim: `make_env` resolves physics `auto`: its config names the physics that it runs."""
-    monkeypatch.setattr(sources, "scenes", lambda *_: None)
+    monkeypatch.setattr(pool, "scenes", lambda *_: None)
     sim = dataclasses.replace(CONFIG.sim, physics="auto")
     env = make_env(dataclasses.replace(CONFIG, sim=sim))
     assert env.cfg.sim == backend.resolve(dataclasses.replace(CONFIG, sim=sim)).sim

@@ -63,7 +63,7 @@ JIT_IN = (
         "runtime/compiler.py",
         "runtime/selftest.py",
     ),  # small programs that show what this machine does
-    "scene/sources.py",
+    "scene/arrange.py",
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
     "render/picture.py",  # draws on machines without OpenGL
 )

@@ -29,7 +29,7 @@ from csac_jax import env as environment, presets
 from csac_jax.config import Config, SceneConfig, SimConfig, SlotKind
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
-from csac_jax.scene import cases, model, sources
+from csac_jax.scene import arrange, cases, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation
 
@@ -110,7 +110,7 @@ def _ten(cfg: Config, episodes: int, stream: int) -> Env:
 
 def _thirty(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _dropped(cfg, TEN.scene.slots * 3, THIRTY)
-    scenes = sources.settled(cfg, stream, episodes, poured=True)
+    scenes = pool.settled(cfg, stream, episodes, poured=True)
     return Env(cfg, simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim), scenes)
 
 
@@ -147,8 +147,8 @@ def _cases(cfg: Config) -> dict[str, Env]:
 
 
 def _generated(cfg: Config, episodes: int, stream: int) -> Env:
-    scene = SceneConfig(slots=PACKED, min_blocks=sources.MIN_ARRANGED)
-    scenes = sources.arrangements(scene, cfg.heightmap.extent, stream, episodes)
+    scene = SceneConfig(slots=PACKED, min_blocks=arrange.MIN_ARRANGED)
+    scenes = arrange.arrangements(scene, cfg.heightmap.extent, stream, episodes)
     return _placed(cfg, scene, scenes)
 
 

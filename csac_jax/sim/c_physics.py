@@ -189,7 +189,7 @@ def _rollout(
     own.geom_contype[:] = np.where(is_parked, 0, world.model.geom_contype)
     own.geom_conaffinity[:] = np.where(is_parked, 0, world.model.geom_conaffinity)
     # MuJoCo derives the bodies' contact masks here: the geoms' come first.
-    model.with_blocks(world, fields, simulator.data, into=own)
+    model.with_blocks(world, fields, into=(own, simulator.data))
     start, speeds = _start(world, scene, joints), 1 + own.nq + world.block_dofs[scene.in_play]
     states, sensed = _simulate(simulator, start, np.asarray(joints.control), speeds)
     qpos, qvel = np.split(states[:, 1:], [own.nq], axis=1)

@@ -45,7 +45,7 @@ class State:
 def record(bench: Bench, count: int) -> list[State]:
     """One state of each of `count` primitives, half of them pushes, in settled piles."""
     cfg, world = bench.cfg, bench.world
-    settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, STREAM, SCENES)
+    settled = pool.settled(cfg, STREAM, SCENES)
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(count) % SCENES], settled)
     height = bench.heights(scenes)
     pushes = bench.push(jax.random.split(jax.random.key(0), count), scenes)

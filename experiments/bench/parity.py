@@ -132,7 +132,7 @@ def piles(
     """Grasps and pushes in settled piles."""
     cfg = pile_config(slots, in_play, physics)
     bench = Bench(cfg)
-    settled = pool.settled(bench.world, cfg.scene, cfg.heightmap.extent, STREAM, count)
+    settled = pool.settled(cfg, STREAM, count)
     rows, engines = [], bench.engines | bench.references
     for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))

@@ -60,8 +60,7 @@ def _outcomes(
 def measure(grasps: int) -> dict[str, Any]:
     """Outcomes of both robots."""
     cfg = pile_config(TEN.scene.slots[:6], 6)
-    world = model.build(cfg.scene, cfg.sim)
-    settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, STREAM, SCENES)
+    settled = pool.settled(cfg, STREAM, SCENES)
     rng = np.random.default_rng(STREAM)
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(grasps) % SCENES], settled)
     yaws = rng.uniform(0.0, 2.0 * np.pi, grasps).astype(np.float32)

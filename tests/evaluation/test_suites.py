@@ -140,9 +140,9 @@ def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int
     the training's are."""
     asked = []
 
-    def settled(world, cfg, extent, stream, count, poured=False):
-        asked.append((cfg.slots, cfg.min_blocks, stream, count, poured))
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.slots))
+    def settled(cfg, stream, count, poured=False):
+        asked.append((cfg.scene.slots, cfg.scene.min_blocks, stream, count, poured))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
 
     monkeypatch.setattr(pool, "settled", settled)
     packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))

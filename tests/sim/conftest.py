@@ -121,9 +121,7 @@ def execute_settled(config: Config, count: int, scripted: dict[str, tuple[Scene,
     """Runs the scripted cases and grasps in `count` settled scenes of `config`, as one batch."""
     world = model.build(config.scene, config.sim)
     per_number = count // (1 + len(config.scene.slots) - config.scene.min_blocks)
-    settled = pool.settled(
-        world, config.scene, config.heightmap.extent, pool.TRAIN_STREAM, per_number
-    )
+    settled = pool.settled(config, pool.TRAIN_STREAM, per_number)
     look = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))
     plan_grasp = functools.partial(oracle.grasp, config.sim, config.heightmap, config.scene.slots)
     grasps = _noisy(jax.jit(jax.vmap(plan_grasp))(settled, look(settled)))

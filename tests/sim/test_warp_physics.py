@@ -113,7 +113,7 @@ def _end(cfg: Config, physics: Any) -> tuple[np.ndarray, np.ndarray, Trace]:
     """Outcomes [E], ends [E, N, 3] m and traces of the planner's grasps in settled scenes."""
     sim = dataclasses.replace(cfg.sim, physics=physics)
     world = model.build(cfg.scene, sim)
-    scenes = pool.settled(world, cfg.scene, cfg.heightmap.extent, 77, SCENES)
+    scenes = pool.settled(cfg, 77, SCENES)
     height = jax.vmap(lambda scene: observe.observe(cfg, scene).height)(scenes)
     action = jax.vmap(functools.partial(oracle.grasp, sim, cfg.heightmap, cfg.scene.slots))(
         scenes, height
