@@ -78,7 +78,7 @@ class LearnedPolicy:
         batch = actor_critic.dense_maps(parts, self.params, obs)
         dense_maps = jax.tree.map(lambda leaf: leaf[0], batch)
         places = geometry.cell_centres(self.cfg.heightmap)
-        q, _ = maps.best_over_yaws(parts.frames, dense_maps, places)
+        q = maps.best_over_yaws(parts.frames, dense_maps, places)
         candidates = policy.candidates(key, parts, dense_maps)
         return PolicyDebug(q, candidates, actor_critic.best_grasp(dense_maps))
 

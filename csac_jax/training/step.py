@@ -13,7 +13,8 @@ import numpy as np
 from flax import struct
 
 from csac_jax import env as environment
-from csac_jax.agent import augment, csac
+from csac_jax.agent import actor_critic, augment
+from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config
@@ -91,7 +92,7 @@ def make(
     return Program(
         cfg=cfg,
         env=environment.make_env(cfg) if env is None else env,
-        learner=csac.make(cfg, network) if learner is None else learner,
+        learner=CSAC(actor_critic.make(cfg, network)) if learner is None else learner,
         sampler=samplers.make(cfg.replay) if sampler is None else sampler,
     )
 

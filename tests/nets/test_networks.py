@@ -108,7 +108,7 @@ def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
     nets, blank = networks.make(cfg.net), jnp.zeros((1, 72, 72, 4))
     frames = maps.frames(cfg, nets)
     (q, _), _ = jax.eval_shape(nets.critic.init_with_output, jax.random.key(0), blank)
-    assert (frames.stride, frames.side, frames.cell) == (
+    assert (nets.stride, frames.side, frames.cell) == (
         cells,
         72 // cells,
         pytest.approx(0.007 * cells),
