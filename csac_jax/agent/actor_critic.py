@@ -156,7 +156,7 @@ def with_params(state: LearnerState, params: Params) -> LearnerState:
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
     """The state before the first update, every trunk of the critics being `trunk`, see
     `torchvision.variables`."""
-    critic = networks.with_trunk(state.online.critic, trunk)
+    critic = {name: {**part, "trunk": trunk[name]} for name, part in state.online.critic.items()}
     return with_params(state, state.online.replace(critic=critic))
 
 
@@ -284,9 +284,7 @@ def _value(
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
     inputs = maps.input_maps(frames, obs)
-    one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(
-        frames.tables, inputs, half
-    )
+    one = jax.vmap(rotate.rotate, (None, 0, 0))(frames.tables, inputs, half)
     flat = one.reshape(-1, *one.shape[2:])
     (q, _), statistics = _of_each_critic(
         lambda variables: networks.train(learner.critic, variables, flat), critic
@@ -298,8 +296,9 @@ def _value(
     )
 
     def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
-        position = rotate.frame_position(jnp.asarray(frames.yaws)[half], xy)
-        return rotate.bilinear(q[..., output], rotate.to_cell(frames.side, frames.cell, position))
+        yaw = jnp.asarray(frames.yaws)[half]
+        position = rotate.to_cell(frames.side, frames.cell, yaw, xy)
+        return rotate.bilinear(q[..., output], position)
 
     read = jax.vmap(jax.vmap(at, (0, 0, 0, None)))
     near = jax.vmap(read, (0, None, None, None))(q, output, half, action.pose[:, :2])  # [M, B, 2]
