@@ -111,8 +111,9 @@ def with_params(state: LearnerState, params: Params) -> LearnerState:
 
 
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
-    """The state before the first update, every trunk of the critics being `trunk`."""
-    critic = networks.with_trunk(state.online.critic, trunk)
+    """The state before the first update, every trunk of the critics being `trunk`, see
+    `torchvision.variables`."""
+    critic = {name: {**part, "trunk": trunk[name]} for name, part in state.online.critic.items()}
     return with_params(state, state.online.replace(critic=critic))
 
 
@@ -216,8 +217,8 @@ def _value(
     lower = jnp.floor(index)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
-    rotate_both = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))
-    passes = rotate_both(frames.tables, maps.input_maps(frames, obs), half)
+    inputs = maps.input_maps(frames, obs)
+    passes = jax.vmap(rotate.rotate, (None, 0, 0))(frames.tables, inputs, half)
     flat = passes.reshape(-1, *passes.shape[2:])
     (q, _), statistics = _of_each_critic(
         lambda variables: networks.train(frames.networks.critic, variables, flat), critic
@@ -228,8 +229,9 @@ def _value(
     output = jnp.where(is_grasp, dense.OUTPUTS - 1, push_output)
 
     def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
-        position = rotate.frame_position(jnp.asarray(frames.yaws)[half], xy)
-        return rotate.bilinear(q[..., output], rotate.to_cell(frames.side, frames.cell, position))
+        yaw = jnp.asarray(frames.yaws)[half]
+        position = rotate.to_cell(frames.side, frames.cell, yaw, xy)
+        return rotate.bilinear(q[..., output], position)
 
     read = jax.vmap(jax.vmap(at, (0, 0, 0, None)))
     near = jax.vmap(read, (0, None, None, None))(q, output, half, action.pose[:, :2])  # [M, B, 2]

@@ -138,8 +138,8 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
 
     def at(k: jax.Array) -> jax.Array:
         k = jnp.mod(k, num)
-        position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
-        row_col = jnp.clip(rotate.to_cell(side, frames.cell, position), 0.0, side - 1.0)
+        position = rotate.to_cell(side, frames.cell, jnp.asarray(frames.yaws)[k], pose[:2])
+        row_col = jnp.clip(position, 0.0, side - 1.0)
         first_row = ((primitive * num + k) * side).astype(jnp.float32)
         offset = jnp.stack([first_row, jnp.zeros_like(first_row)])
         return rotate.bilinear(maps.reshape(-1, side), row_col + offset)
@@ -152,9 +152,8 @@ def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.A
     """Whether the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
     num, side = frames.yaws.shape[0], frames.side
     k = jnp.mod(jnp.round(yaw_index(frames, pose[2])).astype(jnp.int32), num)
-    position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
-    cell = jnp.round(rotate.to_cell(side, frames.cell, position))
-    row, col = jnp.clip(cell, 0.0, side - 1.0).astype(jnp.int32)
+    position = rotate.to_cell(side, frames.cell, jnp.asarray(frames.yaws)[k], pose[:2])
+    row, col = jnp.clip(jnp.round(position), 0.0, side - 1.0).astype(jnp.int32)
     return valid[primitive, k, row, col]
 
 
