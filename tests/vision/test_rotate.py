@@ -139,12 +139,11 @@ def test_an_action_points_along_the_columns():
 
 
 def test_cells_of_frame_0_are_cells_of_the_map():
-    """Claim: on a canvas without margin, `to_cell` is `geometry.to_pixel`."""
-    cfg = HeightmapConfig(64)
-    xy = jnp.asarray(np.random.default_rng(0).uniform(-0.2, 0.2, (20, 2)), jnp.float32)
-    np.testing.assert_allclose(
-        rotate.to_cell(64, cfg.cell, xy), geometry.to_pixel(cfg, xy), atol=1e-5
-    )
+    """Claim: on a canvas without margin, `to_cell` of a cell's centre is its row and column."""
+    for cfg in (HeightmapConfig(64), HeightmapConfig(224), HeightmapConfig(16, 1.0)):
+        cells = rotate.to_cell(cfg.size, cfg.cell, geometry.cell_centres(cfg))
+        wanted = np.moveaxis(np.indices((cfg.size, cfg.size)), 0, -1)
+        np.testing.assert_allclose(cells, wanted, rtol=0, atol=1e-4)
 
 
 def test_bilinear_agrees_with_scipy():
