@@ -1,7 +1,6 @@
 """The environment by itself: resets, ends of episodes, failed physics."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -11,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import specs
 from csac_jax.agent import rewards
 from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
@@ -61,10 +59,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
         env = make_env(CONFIG)
     keys = jax.random.split(jax.random.key(0), SCENES)
-    plan_grasp = functools.partial(oracle.grasp, CONFIG.sim, CONFIG.heightmap, CONFIG.scene.slots)
 
     def plan_from_state(state: State) -> Action:
-        return plan_grasp(state.scene, state.obs.height)
+        return oracle.grasp(CONFIG, state.scene, state.obs.height)
 
     reset = jax.jit(jax.vmap(env.reset)).trace(keys)
     state = reset.lower().compile()(keys)
@@ -563,10 +560,9 @@ def test_actions_of_the_spec_are_accepted(lab: Lab):
 
 
 @pytest.mark.parametrize(("change", "inside"), [(0.0, True), (0.1, False), (np.nan, False)])
-def test_spec_tells_what_is_out_of_bounds(change: float, inside: bool):
+def test_spec_tells_what_is_out_of_bounds(lab: Lab, change: float, inside: bool):
     """Claim: a spec contains its bounds, and neither what lies beyond them nor NaN."""
-    cfg = CONFIG.heightmap
-    for spec in (specs.action_spec(cfg).pose, specs.observation_spec(cfg).height):
+    for spec in (lab.env.action_spec.pose, lab.env.observation_spec.height):
         for bound, sign in ((spec.minimum, -1.0), (spec.maximum, 1.0)):
             values = jnp.broadcast_to(jnp.asarray(bound, spec.dtype), spec.shape) + sign * change
             assert spec.contains(values) == inside

@@ -130,8 +130,7 @@ class OraclePolicy:
         """See `Policy`. Raises TypeError for an observation."""
         if not isinstance(scene, State):
             raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
-        cfg = self.cfg
-        return oracle.grasp(cfg.sim, cfg.heightmap, cfg.scene.slots, scene.scene, scene.obs.height)
+        return oracle.grasp(self.cfg, scene.scene, scene.obs.height)
 
 
 def _observation(scene: Observation | State) -> Observation:

@@ -17,9 +17,8 @@ from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import backend, primitives, robot as robots
-from csac_jax.sim.primitives import Action
-from csac_jax.sim.robot import JointTrajectory
+from csac_jax.sim import backend, primitives
+from csac_jax.sim.primitives import Action, JointTrajectory
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
 NO_SCENES: Any = None  # of an environment that never resets
@@ -150,7 +149,7 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     """One action in one scene."""
     action = policy(state, key)
     plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action)
-    joints = robots.joint_trajectory(env.cfg.sim.robot, plan)
+    joints = primitives.joint_trajectory(env.cfg.sim.robot, plan)
     after = env.step(state, action)
     if not isinstance(policy, LearnedPolicy):
         return StepRecord(state, action, joints, after, after.reward, None)

@@ -19,7 +19,7 @@ import numpy as np
 from csac_jax.runtime import provenance
 from csac_jax.scene import model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, primitives, robot
+from csac_jax.sim import c_physics, mjx_physics, primitives
 from csac_jax.sim.quiet_mjx import mjx
 from experiments.bench._options import read
 from experiments.bench.parity import STREAM, TEN, Bench, pile_config
@@ -57,7 +57,9 @@ def record(bench: Bench, count: int) -> list[State]:
     plan = jax.jit(jax.vmap(lambda h, a: primitives.plan(cfg.sim, cfg.heightmap, h, a)))(
         height, action
     )
-    joints = jax.device_get(jax.vmap(lambda one: robot.joint_trajectory(cfg.sim.robot, one))(plan))
+    joints = jax.device_get(
+        jax.vmap(lambda one: primitives.joint_trajectory(cfg.sim.robot, one))(plan)
+    )
     fields = jax.device_get(
         jax.jit(jax.vmap(lambda scene: model.scene_fields(world, scene)))(scenes)
     )

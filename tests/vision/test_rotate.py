@@ -138,9 +138,11 @@ def test_an_action_points_along_the_columns():
 
 def test_cells_of_frame_0_are_cells_of_the_map():
     """Claim: on a canvas without margin, `to_cell` of a cell's centre is its row and column."""
-    cfg = HeightmapConfig(64)
-    cells = rotate.to_cell(64, cfg.cell, jnp.float32(0.0), geometry.cell_centres(cfg))
-    np.testing.assert_allclose(cells, np.moveaxis(np.indices((64, 64)), 0, -1), atol=1e-4)
+    for cfg in (HeightmapConfig(64), HeightmapConfig(224), HeightmapConfig(16, 1.0)):
+        centres = geometry.cell_centres(cfg)
+        cells = rotate.to_cell(cfg.size, cfg.cell, jnp.float32(0.0), centres)
+        wanted = np.moveaxis(np.indices((cfg.size, cfg.size)), 0, -1)
+        np.testing.assert_allclose(cells, wanted, rtol=0, atol=1e-4)
 
 
 def test_bilinear_agrees_with_scipy():
