@@ -1,5 +1,6 @@
 """What acts: a policy is an object that takes one scene and a key, and returns an action."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -128,7 +129,7 @@ def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:
 def in_world(policy: Policy, cfg: Config) -> Policy:
     """The policy for an environment of this config; a policy of the user's own as it is."""
     if isinstance(policy, LearnedPolicy | LearnerPolicy | RandomPolicy | OraclePolicy):
-        return policy.replace(cfg=cfg)
+        return dataclasses.replace(policy, cfg=cfg)
     return policy
 
 

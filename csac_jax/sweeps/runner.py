@@ -6,8 +6,7 @@ SWEEP/POINT/seed-K/             a run, laid out like one of `train`; its checkpo
 SWEEP/groups/I/checkpoints/     the state of all runs of group I, until they are done
 SWEEP/groups/I/done             their checkpoints are written
 
-A run is one point with one seed. One whose loss is not finite is given up and named; it cannot
-reach the others, which go on.
+A run is one point with one seed. One whose loss is not finite is named and given up, alone.
 """
 
 import dataclasses
