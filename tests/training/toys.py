@@ -13,6 +13,7 @@ from csac_jax.agent.csac import CSAC
 from csac_jax.config import Config
 from csac_jax.nets import networks
 from csac_jax.replay import samplers
+from csac_jax.training import sharding
 from csac_jax.training.step import (
     Hyperparams,
     Program,
@@ -58,10 +59,9 @@ def train_step(
     num = cfg.train.scenes
     key = jax.random.fold_in(state.key, state.step)
     noise = jax.random.normal(key, (num,))
-    scenes = program.sharding.map_scenes(lambda scenes, noise: jnp.sin(scenes + noise))(
-        state.scenes, noise
-    )
-    batch = program.sharding.shard_batch(scenes)
+    move = sharding.map_scenes(program.mesh, lambda scenes, noise: jnp.sin(scenes + noise))
+    scenes = move(state.scenes, noise)
+    batch = sharding.shard_batch(program.mesh, scenes)
 
     def loss(params: jax.Array) -> jax.Array:
         q = params[0] * batch + params[1] * batch**2 + params[2]
