@@ -1,7 +1,6 @@
 """What the commands do, as functions; the package root exports them."""
 
 import datetime
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -219,11 +218,19 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
     """Every combination of the values."""
     for name in vary:
         _checked(grid.kind_of, name)
-    points = []
-    for combination in itertools.product(*vary.values()):
-        values = dict(zip(vary, combination, strict=True))
-        named = {name: str(value) for name, value in values.items()}
-        algo = values.pop("algo", None)
-        base = cfg if algo is None else algorithms.configure(cfg, algo)
-        points.append(SweepPoint(grid.name(named), named, step.replace_settings(base, values)))
-    return grid.with_short_names(points)
+
+    def configure(values: dict[str, Any]) -> Config:
+        settings = {name: value for name, value in values.items() if name != "algo"}
+        base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
+        return step.replace_settings(base, settings)
+
+    return grid.combine(vary, configure)
+
+
+def _first_line(folder: Path, cfg: Config) -> str:
+    """What is run, and on what."""
+    scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
+    return (
+        f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "
+        f"physics {cfg.sim.physics}, on {provenance.device()}"
+    )

@@ -14,18 +14,35 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from csac_jax import specs
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
-from csac_jax.scene import layout, model, pool, sources
+from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, outcome, physics as simulation
 from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, observe, sensor
-from csac_jax.vision.heightmap import Observation
+from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ArraySpec:
+    """Shape, dtype and inclusive bounds of an array."""
+
+    shape: tuple[int, ...]
+    dtype: Any  # NumPy's
+    minimum: float | np.ndarray  # of all entries, or [*shape] of each
+    maximum: float | np.ndarray
+
+    def contains(self, values: jax.Array) -> jax.Array:
+        """[] bool, all values [*shape] lie within the bounds; NaN does not."""
+        return jnp.all((values >= self.minimum) & (values <= self.maximum))
+
+
+_Spec: Any = ArraySpec  # stands where a pytree has an array
 
 
 @struct.dataclass
@@ -74,12 +91,22 @@ class Env:
     @property
     def observation_spec(self) -> Observation:
         """The ArraySpec of each leaf of an observation."""
-        return specs.observation_spec(self.cfg.heightmap)
+        rows = (self.cfg.heightmap.size, self.cfg.heightmap.size)
+        return Observation(
+            colour=_Spec((*rows, 3), np.float32, 0.0, 1.0),
+            height=_Spec(rows, np.float32, 0.0, VIEW_HEIGHT),
+            target=_Spec(rows, np.bool_, False, True),
+        )
 
     @property
     def action_spec(self) -> Action:
-        """The ArraySpec of each leaf of an action."""
-        return specs.action_spec(self.cfg.heightmap)
+        """The ArraySpec of each leaf of an action: x and y in the workspace, m, and yaw, rad."""
+        half = 0.5 * self.cfg.heightmap.extent
+        low, high = np.array([[-half, -half, 0.0], [half, half, 2.0 * np.pi]], np.float32)
+        return Action(
+            primitive=_Spec((), np.int32, int(min(Primitive)), int(max(Primitive))),
+            pose=_Spec((3,), np.float32, low, high),
+        )
 
     def reset(self, key: jax.Array) -> State:
         """The first state of an episode: a random scene of the pool, rotated by a random yaw."""
@@ -115,12 +142,11 @@ class Env:
         Nothing moves for an action that the robot cannot follow. Where physics diverges, the scene
         stays as it was; a scene that was invalid before becomes empty. `state.done` is not read.
         """
-        cfg, task = self.cfg, self.cfg.task
-        valid = simulation.healthy(state.scene) & specs.is_valid(cfg.heightmap, state.obs)
+        cfg, task, spec = self.cfg, self.cfg.task, self.observation_spec
+        valid = simulation.healthy(state.scene) & spec.height.contains(state.obs.height)
+        valid &= spec.colour.contains(state.obs.colour)
         before = _select(valid, state.scene, layout.parked(cfg.scene.slots))
-        after, trace, plan = simulation.execute(
-            self.physics, cfg.sim, cfg.heightmap, before, state.obs.height, action
-        )
+        after, trace, plan = simulation.execute(self.physics, cfg, before, state.obs.height, action)
         diverged = ~(valid & simulation.healthy(after))
         after = _select(diverged, before, after)
 
@@ -141,15 +167,14 @@ class Env:
         terminated = ~jnp.any(after.in_play & layout.is_target(after))
         capped = (actions >= task.max_actions) | (unchanged_steps >= task.max_steps_without_change)
         distance = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
+        wrong = jnp.any(lifted) & ~jnp.any(success)
+        best = jnp.where(wrong, jnp.int32(Outcome.TOUCHED), jnp.int32(Outcome.LIFTED))
+        best = jnp.where(is_grasp, best, jnp.int32(Outcome.NOTHING))
         by_truth = outcome.grasp_outcome(trace, plan.surface, hand_rise)
         by_gap = outcome.grasp_outcome_by_gap(trace, plan.surface, changed)
-        wrong = jnp.any(lifted) & ~jnp.any(success)
-        nothing, touched = jnp.int32(Outcome.NOTHING), jnp.int32(Outcome.TOUCHED)
-        by_truth = jnp.where(is_grasp, jnp.where(wrong, touched, by_truth), nothing)
-        by_gap = jnp.where(wrong, jnp.minimum(by_gap, touched), by_gap)
         info = Info(
-            outcome=by_truth,
-            outcome_by_gap=jnp.where(is_grasp, by_gap, nothing),
+            outcome=jnp.minimum(by_truth, best),
+            outcome_by_gap=jnp.minimum(by_gap, best),
             moved=moved,
             distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, distance, jnp.inf)), 0.0),
             cleared=jnp.sum(lifted, dtype=jnp.int32),
@@ -172,7 +197,7 @@ class Env:
     def randomise_pose(self, key: jax.Array, scene: Scene) -> Scene:
         """The scene as episodes start with it: at a random yaw, with a target or none."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
-        return sources.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+        return layout.randomise_pose(key, scene, extent, self.any_yaw, has_target)
 
     def _sample_scene(self, key: jax.Array) -> Scene:
         key_index, key_pose = jax.random.split(key)
@@ -180,10 +205,8 @@ class Env:
         scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes)
         return self.randomise_pose(key_pose, scene)
 
-    def _observe(
-        self, scene: Scene, noise_key: jax.Array | None, actions: jax.Array
-    ) -> Observation:
-        key = noise_key if noise_key is None else jax.random.fold_in(noise_key, actions)
+    def _observe(self, scene: Scene, root: jax.Array | None, actions: jax.Array) -> Observation:
+        key = None if root is None else jax.random.fold_in(root, actions)
         return observe.observe(self.cfg, scene, key)
 
 
@@ -215,9 +238,8 @@ def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | Non
     Raises SceneError for blocks that do not come to rest, and for physics that is not installed.
     """
     cfg = backend.resolve(cfg)
-    world = model.build(cfg.scene, cfg.sim)
-    scenes = sources.scenes(cfg, stream, num_scenes)
-    return Env(cfg, simulation.make(world, cfg.sim), scenes)
+    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    return Env(cfg, physics, pool.scenes(cfg, stream, num_scenes))
 
 
 def _select(condition: jax.Array, yes: Any, no: Any) -> Any:

@@ -1,8 +1,7 @@
-"""Poses, angles, and the map from heightmap cells to metres and back.
+"""Poses, angles, and the cells of heightmaps in metres.
 
 Quaternions are (w, x, y, z), of unit length. Heightmap rows run along y and columns along x. Row 0
-and column 0 lie at the lowest y and x. A whole-numbered (row, col) is the centre of a cell. Shapes
-`[..., n]` may have any leading axes.
+and column 0 lie at the lowest y and x. Shapes `[..., n]` may have any leading axes.
 """
 
 import jax
@@ -59,17 +58,7 @@ def wrap_angle(angle: jax.Array) -> jax.Array:
     return jnp.where((wrapped >= FULL_TURN) | (wrapped <= 0.0), 0.0, wrapped)
 
 
-def to_pixel(cfg: HeightmapConfig, xy: jax.Array) -> jax.Array:
-    """Heightmap position (row, col) [..., 2] of the points `xy` [..., 2] m."""
-    return xy[..., ::-1] / cfg.cell + 0.5 * (cfg.size - 1)
-
-
-def from_pixel(cfg: HeightmapConfig, row_col: jax.Array) -> jax.Array:
-    """Points xy [..., 2] m of heightmap positions: x = (col + 0.5) cell - extent / 2."""
-    return (row_col[..., ::-1] - 0.5 * (cfg.size - 1)) * cfg.cell
-
-
 def cell_centres(cfg: HeightmapConfig) -> jax.Array:
-    """Centre xy of every cell, [H, W, 2] m."""
-    index = jnp.arange(cfg.size, dtype=jnp.float32)
-    return from_pixel(cfg, jnp.stack(jnp.meshgrid(index, index, indexing="ij"), axis=-1))
+    """Centre xy of every cell, [H, W, 2] m: x = (col + 0.5) cell - extent / 2, y by the row."""
+    places = (jnp.arange(cfg.size, dtype=jnp.float32) - 0.5 * (cfg.size - 1)) * cfg.cell
+    return jnp.stack(jnp.meshgrid(places, places), axis=-1)

@@ -163,8 +163,7 @@ def _stopped() -> Stop:
 
 
 def _saved(run: api.Run) -> step.TrainState:
-    blank = step.make(run.cfg, env=step.without_physics(run.cfg))
-    state, _ = checkpoint.restore(run.run_dir, step.abstract_state(blank))
+    state, _ = checkpoint.restore(run.run_dir, step.abstract_state(run.cfg))
     return state
 
 

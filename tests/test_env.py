@@ -1,7 +1,6 @@
 """The environment by itself: resets, ends of episodes, failed physics."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -11,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import specs
 from csac_jax.agent import rewards
 from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import AutoResetEnv, Env, State, make_env
 from csac_jax.errors import SceneError
-from csac_jax.scene import blocks, layout, sources
+from csac_jax.scene import arrange, blocks, layout, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, oracle
 from csac_jax.sim.primitives import Action
@@ -61,10 +59,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
         env = make_env(CONFIG)
     keys = jax.random.split(jax.random.key(0), SCENES)
-    plan_grasp = functools.partial(oracle.grasp, CONFIG.sim, CONFIG.heightmap, CONFIG.scene.slots)
 
     def plan_from_state(state: State) -> Action:
-        return plan_grasp(state.scene, state.obs.height)
+        return oracle.grasp(CONFIG, state.scene, state.obs.height)
 
     reset = jax.jit(jax.vmap(env.reset)).trace(keys)
     state = reset.lower().compile()(keys)
@@ -108,7 +105,7 @@ def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         for share, pool in ((0.0, 6), (0.25, 8))
     )
     np.testing.assert_array_equal(mixed.position[:6], dropped.position)
-    packed = sources.arrangements(scene, CONFIG.heightmap.extent, 0, 2)
+    packed = arrange.arrangements(scene, CONFIG.heightmap.extent, 0, 2)
     np.testing.assert_array_equal(mixed.position[6:], packed.position)
     assert mixed.in_play.all()
 
@@ -117,10 +114,8 @@ def test_arrangement_without_blocks_for_it():
     """Claim: `scene.arranged` with blocks that allow no arrangement is one line that names the
     slots."""
     two = SceneConfig(slots=("box", "prism"), min_blocks=2)
-    with pytest.raises(
-        SceneError, match=r"scene\.arranged: scene\.slots: too few for an arrangement"
-    ):
-        sources.arrangements(two, CONFIG.heightmap.extent, 0, 2)
+    with pytest.raises(SceneError, match=r"scene\.slots: too few for an arrangement"):
+        arrange.arrangements(two, CONFIG.heightmap.extent, 0, 2)
 
 
 def test_scenes_stay_inside_however_turned(lab: Lab):
@@ -565,10 +560,9 @@ def test_actions_of_the_spec_are_accepted(lab: Lab):
 
 
 @pytest.mark.parametrize(("change", "inside"), [(0.0, True), (0.1, False), (np.nan, False)])
-def test_spec_tells_what_is_out_of_bounds(change: float, inside: bool):
+def test_spec_tells_what_is_out_of_bounds(lab: Lab, change: float, inside: bool):
     """Claim: a spec contains its bounds, and neither what lies beyond them nor NaN."""
-    cfg = CONFIG.heightmap
-    for spec in (specs.action_spec(cfg).pose, specs.observation_spec(cfg).height):
+    for spec in (lab.env.action_spec.pose, lab.env.observation_spec.height):
         for bound, sign in ((spec.minimum, -1.0), (spec.maximum, 1.0)):
             values = jnp.broadcast_to(jnp.asarray(bound, spec.dtype), spec.shape) + sign * change
             assert spec.contains(values) == inside
@@ -597,7 +591,7 @@ def test_actions_are_built_from_numbers_or_arrays():
 
 def test_make_env_chooses_physics(monkeypatch: pytest.MonkeyPatch):
     """Claim: `make_env` resolves physics `auto`: its config names the physics that it runs."""
-    monkeypatch.setattr(sources, "scenes", lambda *_: None)
+    monkeypatch.setattr(pool, "scenes", lambda *_: None)
     sim = dataclasses.replace(CONFIG.sim, physics="auto")
     env = make_env(dataclasses.replace(CONFIG, sim=sim))
     assert env.cfg.sim == backend.resolve(dataclasses.replace(CONFIG, sim=sim)).sim

@@ -25,7 +25,6 @@ ORDER = (
     ("io",),
     ("runtime",),
     ("env",),
-    ("specs",),
     ("replay", "agent"),
     ("nets",),
     ("vision",),
@@ -63,7 +62,7 @@ JIT_IN = (
         "runtime/compiler.py",
         "runtime/selftest.py",
     ),  # small programs that show what this machine does
-    "scene/sources.py",
+    "scene/arrange.py",
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
     "render/picture.py",  # draws on machines without OpenGL
 )
@@ -205,7 +204,7 @@ def test_checker_reads_the_package():
         ("sweeps/a.py", "from csac_jax import api", "api is imported"),
         ("report/a.py", "from csac_jax.api import train", "api is imported"),
         ("api.py", "from csac_jax.cli import settings", "cli is imported"),
-        ("agent/a.py", "from csac_jax import specs", "specs is imported"),
+        ("agent/a.py", "from csac_jax import env", "env is imported"),
         ("errors.py", "from csac_jax import constants", "constants is imported"),
         ("render/a.py", "from csac_jax.cli.failures import FailedError", "cli is imported"),
         ("cli/a.py", "from csac_jax import __main__", "__main__ is imported"),

@@ -1,7 +1,6 @@
 """The deterministic policy: one pose per primitive, a soft-argmax around the highest logit.
 
-A soft-argmax over the whole map would put the mean of two peaks between them. Around the highest
-cell it cannot. Its pose moves smoothly with the logits: the critic's gradient can shift it.
+Over the whole map it would lie between two peaks. It moves smoothly with the logits.
 """
 
 import jax
@@ -20,7 +19,7 @@ _INWARD = WINDOW + np.array([-1, -1, 0, 1, 1])  # of each row: the next one towa
 def logits(q: jax.Array, correction: jax.Array) -> jax.Array:
     """The actor's logits, any shape: the critic's map, without gradient, plus the head's output.
 
-    The deterministic policy gradient only moves a mode; the critic's map says where modes are.
+    The policy gradient only moves a mode; the critic's map says where modes are.
     """
     return jax.lax.stop_gradient(q) * SHARPNESS + correction
 
@@ -54,8 +53,7 @@ def _along_yaw(
     """Logits [3] at one place [2] m and three yaws [3]; -inf where the place is not valid.
 
     Between cells only the valid ones are mixed: sum w_i l_i / sum w_i, w_i the bilinear weight of a
-    valid cell, 0 of any other. If none of the three is valid, the middle one, the best cell's,
-    counts.
+    valid cell, 0 of any other. If none of the three is valid, the middle one counts.
     """
     valid = state.valid[primitive]
     valid |= ~jnp.any(valid)

@@ -14,13 +14,12 @@ import numpy as np
 import optax
 from flax import struct
 
-from csac_jax.agent import actor, losses, maps, rewards, softmax
+from csac_jax.agent import actor, losses, maps, rewards
 from csac_jax.agent.learner import Transition, UpdateInfo
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
-from csac_jax.nets.networks import Networks
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, rotate
 from csac_jax.vision.heightmap import Observation
@@ -28,8 +27,7 @@ from csac_jax.vision.heightmap import Observation
 
 @struct.dataclass
 class Params:
-    """Variables of the networks: theta^Q and theta^mu, each with the running statistics of its
-    batch norm, if any."""
+    """Variables of the networks theta^Q and theta^mu, with running statistics of batch norm."""
 
     critic: Any  # leaves [M, ...]
     actor: Any
@@ -57,16 +55,6 @@ class ActorCritic:
     bounds: tuple[float, float]  # smallest and largest possible return
 
     @property
-    def critic(self) -> Any:
-        """The critic, a Flax module."""
-        return self.frames.networks.critic
-
-    @property
-    def actor(self) -> Any:
-        """The actor's head, a Flax module."""
-        return self.frames.networks.head
-
-    @property
     def return_range(self) -> float:
         """Distance between the bounds."""
         return self.bounds[1] - self.bounds[0]
@@ -74,58 +62,34 @@ class ActorCritic:
 
 def make(cfg: Config, network: Any = None) -> ActorCritic:
     """Networks and optimisers of a config; `network` is a critic of your own, see `networks`."""
-    nets = networks.make(cfg.net, network)
-    bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
-    return ActorCritic(cfg, maps.frames(cfg, nets), *_optimisers(cfg, nets), bounds)
+    frames = maps.frames(cfg, networks.make(cfg.net, network))
+    return with_optimisers(cfg, frames, rewards.bounds(cfg.reward, cfg.target.gamma))
 
 
-def replace_hyperparams(learner: ActorCritic, cfg: Config, bounds: tuple[Any, Any]) -> ActorCritic:
-    """The same networks with hyper-parameters and bounds of returns that may be traced."""
-    critic_optimiser, actor_optimiser = _optimisers(cfg, learner.frames.networks)
-    return dataclasses.replace(
-        learner,
-        cfg=cfg,
-        critic_optimiser=critic_optimiser,
-        actor_optimiser=actor_optimiser,
-        bounds=bounds,
-    )
+def with_optimisers(cfg: Config, frames: Frames, bounds: tuple[Any, Any]) -> ActorCritic:
+    """With Adam on clipped gradients, its step size falling linearly; numbers may be traced."""
 
+    def adam(rate: float, updates: int) -> optax.GradientTransformation:
+        schedule = optax.linear_schedule(rate, rate * cfg.learn.lr_final_fraction, updates)
+        clip = optax.clip_by_global_norm(cfg.learn.gradient_clip)
+        optimiser = optax.chain(clip, optax.adam(schedule))
+        return optax.flatten(optimiser) if frames.networks.one_vector else optimiser
 
-def _optimisers(
-    cfg: Config, nets: Networks
-) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Of the critic and of the actor."""
-    return (
-        _optimiser(cfg, nets, cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates),
-        _optimiser(cfg, nets, cfg.learn.actor_learning_rate, cfg.train.steps),
-    )
-
-
-def _optimiser(
-    cfg: Config, nets: Networks, rate: float, updates: int
-) -> optax.GradientTransformation:
-    """Adam on clipped gradients, its step size falling linearly over the run's `updates`."""
-    schedule = optax.linear_schedule(rate, rate * cfg.learn.lr_final_fraction, updates)
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(cfg.learn.gradient_clip), optax.adam(schedule)
-    )
-    return optax.flatten(optimiser) if nets.one_vector else optimiser
+    critic_optimiser = adam(cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates)
+    actor_optimiser = adam(cfg.learn.actor_learning_rate, cfg.train.steps)
+    return ActorCritic(cfg, frames, critic_optimiser, actor_optimiser, bounds)
 
 
 def init(key: jax.Array, learner: ActorCritic) -> LearnerState:
     """Fresh networks; targets are copies (Algorithm 1 lines 1-2)."""
     key_critic, key_actor = jax.random.split(key)
-    side = learner.frames.tables.canvas
-    size = learner.cfg.heightmap.size
-    blank_obs = Observation(
-        jnp.zeros((size, size, 3)), jnp.zeros((size, size)), jnp.zeros((size, size), bool)
-    )
-    blank = jnp.zeros((1, side, side, maps.input_maps(learner.frames, blank_obs).shape[-1]))
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(
-        key_critic, jnp.arange(learner.cfg.learn.critics)
-    )
-    (_, features), critic = jax.vmap(learner.critic.init_with_output, (0, None))(keys, blank)
-    online = Params(critic, learner.actor.init(key_actor, features[0]))
+    cfg, nets = learner.cfg, learner.frames.networks
+    rows = (cfg.heightmap.size, cfg.heightmap.size)
+    obs = Observation(jnp.zeros((*rows, 3)), jnp.zeros(rows), jnp.zeros(rows, bool))
+    blank = maps.rotated_inputs(learner.frames, obs)[:1]  # [1, C, C, I]
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key_critic, jnp.arange(cfg.learn.critics))
+    (_, features), critic = jax.vmap(nets.critic.init_with_output, (0, None))(keys, blank)
+    online = Params(critic, nets.head.init(key_actor, features[0]))
     return LearnerState(
         online=online,
         target=jax.tree.map(jnp.copy, online),
@@ -141,48 +105,33 @@ def abstract_params(cfg: Config, network: Any = None) -> Params:
 
 
 def with_params(state: LearnerState, params: Params) -> LearnerState:
-    """The state before the first update with these networks, targets included.
-
-    Leaves of `state` may have more leading axes, as those of several runs.
-    """
-
-    def fill(old: jax.Array, new: Any) -> jax.Array:
-        return jnp.broadcast_to(jnp.asarray(new, old.dtype), old.shape)
-
-    online = jax.tree.map(fill, state.online, params)
+    """The state before the first update with these networks; `state` may be of several runs."""
+    online = jax.tree.map(jnp.full_like, state.online, params)
     return state.replace(online=online, target=jax.tree.map(jnp.copy, online))
 
 
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
     """The state before the first update, every trunk of the critics being `trunk`, see
     `torchvision.variables`."""
-    critic = networks.with_trunk(state.online.critic, trunk)
+    critic = {name: {**part, "trunk": trunk[name]} for name, part in state.online.critic.items()}
     return with_params(state, state.online.replace(critic=critic))
 
 
 def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
     """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
-    q, features = _critic_maps(learner, params, obs)
-    correction: Any = (
-        learner.actor.apply(params.actor, features)
-        if learner.cfg.learn.actor
-        else jnp.zeros_like(q)
-    )
+    q, features = _critic_maps(learner, params.critic, obs)
+    correction: Any = jnp.zeros_like(q)
+    if learner.cfg.learn.actor:
+        correction = learner.frames.networks.head.apply(params.actor, features)
     return _dense_maps(learner, obs, q, correction)
 
 
-def _critic_maps(
-    learner: ActorCritic, params: Params, obs: Observation
-) -> tuple[jax.Array, jax.Array]:
-    """Q [B, K / 2, h, w, OUTPUTS] and features [B, K / 2, ., ., F] of a batch, in the frames of the
-    passes.
-
-    Q is the lower of both critics in each cell, before anything is read between cells; features are
-    the first one's.
-    """
+def _critic_maps(learner: ActorCritic, critic: Any, obs: Observation) -> tuple[jax.Array, Any]:
+    """Q [B, K / 2, h, w, OUTPUTS], the lower of both critics in each cell of the passes' frames,
+    and the first one's features [B, K / 2, ., ., F]."""
     rotated = jax.vmap(maps.rotated_inputs, (None, 0))(learner.frames, obs)
     q, features = _of_each_critic(
-        lambda variables: networks.apply(learner.frames.networks, variables, rotated), params.critic
+        lambda variables: networks.apply(learner.frames.networks, variables, rotated), critic
     )
     return jnp.min(q, axis=0), features[0]
 
@@ -190,8 +139,7 @@ def _critic_maps(
 def _of_each_critic(call: Callable[[Any], Any], variables: Any) -> Any:
     """What `call` makes of the variables of each critic, leaves [M, ...] in and out.
 
-    One after another: under vmap their convolutions become grouped ones, which take longer than
-    both by themselves.
+    One after another: the grouped convolutions of a vmap take longer than both by themselves.
     """
     num = jax.tree.leaves(variables)[0].shape[0]
     each = [call(jax.tree.map(lambda leaf, m=m: leaf[m], variables)) for m in range(num)]
@@ -201,14 +149,10 @@ def _of_each_critic(call: Callable[[Any], Any], variables: Any) -> Any:
 def _dense_maps(
     learner: ActorCritic, obs: Observation, q: jax.Array, correction: jax.Array
 ) -> DenseMaps:
-    """The maps of all yaws from those of the passes; `correction` [B, K / 2, h, w, OUTPUTS] is the
-    actor's."""
+    """The maps of all yaws from Q and the actor's output in the frames of the passes."""
     unfold = jax.vmap(maps.unfold)
-    return DenseMaps(
-        q=unfold(q),
-        logits=unfold(actor.logits(q, correction)),
-        valid=jax.vmap(maps.actionable_cells, (None, 0))(learner.frames, obs),
-    )
+    valid = jax.vmap(maps.actionable_cells, (None, 0))(learner.frames, obs)
+    return DenseMaps(unfold(q), unfold(actor.logits(q, correction)), valid)
 
 
 def best_grasp(state: DenseMaps) -> jax.Array:
@@ -226,10 +170,8 @@ def next_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Ar
 def _max_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """max Q'(s', .) [] over the dense map's valid cells, eq. 9 and VPG; over all if none is valid.
 
-    The limit of the softmax over the map: samples would miss the highest cell, and a trilinear map
-    is highest in one.
+    The limit of the softmax over the map: a trilinear map is highest in a cell, which samples miss.
     """
-    del key
     chosen = np.array(maps.allowed_primitives(learner.cfg.policy))
     valid = state.valid[chosen]
     return jnp.max(jnp.where(valid | ~jnp.any(valid), state.q[chosen], -jnp.inf))
@@ -238,31 +180,25 @@ def _max_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Ar
 def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """softmax_beta(Q'(s', .)) [] over noisy target actions, Algorithm 1 line 17.
 
-    Samples above nothing do not count, unless all are; a state's two primitives count alike.
+    Samples above nothing count only if all are. beta is relative to the range of returns (ours).
     """
     cfg, frames = learner.cfg.target, learner.frames
 
     def of(primitive: Primitive) -> tuple[jax.Array, jax.Array, jax.Array]:
         mean = maps.normalise(frames, actor.pose(frames, state, primitive))
-        noisy, log_density = softmax.noisy_actions(
-            jax.random.fold_in(key, primitive), cfg, mean, cfg.samples
-        )
+        key_noise = jax.random.fold_in(key, primitive)
+        noisy, log_density = losses.noisy_actions(key_noise, cfg, mean)
         poses = jax.vmap(maps.denormalise, (None, 0))(frames, noisy)
-        which = jnp.int32(primitive)
-        q = jax.vmap(maps.read, (None, None, None, 0))(frames, state.q, which, poses)
-        return (
-            q,
-            log_density,
-            jax.vmap(maps.is_valid, (None, None, None, 0))(frames, state.valid, which, poses),
-        )
+        read = jax.vmap(maps.read_valid, (None, None, None, 0))
+        return *read(frames, state, primitive, poses), log_density
 
     sampled = map(of, maps.allowed_primitives(learner.cfg.policy))
-    q, log_density, valid = (jnp.concatenate(leaves) for leaves in zip(*sampled, strict=True))
-    low, high = learner.bounds
+    q, valid, log_density = (jnp.concatenate(leaves) for leaves in zip(*sampled, strict=True))
     shown = valid | ~jnp.any(valid)
-    inverse_temperature = softmax.scaled_inverse_temperature(cfg, high - low)
-    return softmax.expectation(
-        jnp.where(shown, q, low), jnp.where(shown, log_density, jnp.inf), inverse_temperature
+    return losses.softmax(
+        jnp.where(shown, q, learner.bounds[0]),
+        jnp.where(shown, log_density, jnp.inf),
+        cfg.inverse_temperature / learner.return_range,
     )
 
 
@@ -272,46 +208,41 @@ NEXT_VALUES = {"softmax": _softmax_value, "max": _max_value}
 def _value(
     learner: ActorCritic, critic: Any, obs: Observation, action: Action
 ) -> tuple[jax.Array, Any]:
-    """Q(s, a) of a batch by each critic [M, B], from two passes per state: the frames next to the
-    action's yaw.
+    """Q(s, a) of a batch by each critic [M, B], and the running statistics after the batch.
 
-    The nets run as in training: beside Q, the running statistics after the batch.
+    From two passes per state, in the frames next to the action's yaw; nets run as in training.
     """
-    frames = learner.frames
-    num = frames.yaws.shape[0]
-    turns = action.pose[:, 2] * (num / (2.0 * np.pi))
-    lower = jnp.floor(turns)
+    frames, num = learner.frames, learner.frames.yaws.shape[0]
+    index = maps.yaw_index(frames, action.pose[:, 2])
+    lower = jnp.floor(index)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
     inputs = maps.input_maps(frames, obs)
-    one = jax.vmap(jax.vmap(rotate.rotate_one, (None, None, 0)), (None, 0, 0))(
-        frames.tables, inputs, half
-    )
-    flat = one.reshape(-1, *one.shape[2:])
+    passes = jax.vmap(rotate.rotate, (None, 0, 0))(frames.tables, inputs, half)
+    flat = passes.reshape(-1, *passes.shape[2:])
     (q, _), statistics = _of_each_critic(
-        lambda variables: networks.train(learner.critic, variables, flat), critic
+        lambda variables: networks.train(frames.networks.critic, variables, flat), critic
     )
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
     push_output = (k >= num // 2).astype(jnp.int32)
-    output = jnp.where(
-        (action.primitive == Primitive.GRASP)[:, None], dense.OUTPUTS - 1, push_output
-    )
+    is_grasp = (action.primitive == Primitive.GRASP)[:, None]
+    output = jnp.where(is_grasp, dense.OUTPUTS - 1, push_output)
 
     def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
-        position = rotate.frame_position(jnp.asarray(frames.yaws)[half], xy)
-        return rotate.bilinear(q[..., output], rotate.to_cell(frames.side, frames.cell, position))
+        yaw = jnp.asarray(frames.yaws)[half]
+        position = rotate.to_cell(frames.side, frames.cell, yaw, xy)
+        return rotate.bilinear(q[..., output], position)
 
     read = jax.vmap(jax.vmap(at, (0, 0, 0, None)))
     near = jax.vmap(read, (0, None, None, None))(q, output, half, action.pose[:, :2])  # [M, B, 2]
-    share = (turns - lower)[None]
+    share = (index - lower)[None]
     return (1.0 - share) * near[..., 0] + share * near[..., 1], statistics
 
 
 def update_critic(
     key: jax.Array, learner: ActorCritic, state: LearnerState, batch: Transition, weights: jax.Array
 ) -> tuple[LearnerState, UpdateInfo]:
-    """One step of theta^Q on a batch, then of theta^Q' and theta^mu' after them; Algorithm 1 lines
-    17-26.
+    """One step of theta^Q on a batch, then of the targets after it; Algorithm 1 lines 17-26.
 
     L = mean_i w_i huber(y_i - Q(s_i, a_i)) with `weights` w [B], 1 but for a prioritised replay.
     """
@@ -319,55 +250,47 @@ def update_critic(
     next_maps = dense_maps(learner, state.target, heightmap.unpack(batch.next_obs))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(batch.reward.shape[0]))
     values = jax.vmap(next_value, (None, 0, 0))(learner, keys, next_maps)
-    low, high = learner.bounds
-    target = losses.td_target(
-        batch.reward, cfg.target.gamma, batch.terminated, jnp.clip(values, low, high)
-    )
+    values = jnp.clip(values, *learner.bounds)
+    y = losses.td_target(batch.reward, cfg.target.gamma, batch.terminated, values)
     obs, critic = heightmap.unpack(batch.obs), state.online.critic
 
     def loss(learned: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
         q, statistics = _value(learner, {**critic, **learned}, obs, batch.action)  # [M, B]
-        each = jnp.sum(losses.td_loss(cfg.learn, target[None] - q), axis=0)
+        each = jnp.sum(losses.td_loss(cfg.learn, y[None] - q), axis=0)
         return jnp.mean(weights * each), (jnp.mean(q, axis=0), statistics)
 
     before = networks.learned(critic)
     (critic_loss, (q, statistics)), gradient = jax.value_and_grad(loss, has_aux=True)(before)
     step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)
     online = state.online.replace(critic={**optax.apply_updates(before, step), **statistics})
-    state = state.replace(
-        online=online,
-        target=losses.update_target(cfg.learn, online, state.target, state.updates + 1),
-        critic_optimiser=optimiser,
-        updates=state.updates + 1,
-    )
-    return state, UpdateInfo(critic_loss, jnp.mean(q), target - q)
+    updates = state.updates + 1
+    target = losses.update_target(cfg.learn, online, state.target, updates)
+    state = state.replace(online=online, target=target, critic_optimiser=optimiser, updates=updates)
+    return state, UpdateInfo(critic_loss, jnp.mean(q), y - q)
 
 
 def update_actor(
     learner: ActorCritic, state: LearnerState, obs: Observation
 ) -> tuple[LearnerState, jax.Array]:
-    """One step of theta^mu up the critic, Algorithm 1 lines 22-23; returns the loss [], minus the
-    mean of Q(s, mu(s)).
+    """One step of theta^mu up the critic, Algorithm 1 lines 22-23, and the loss [].
 
     grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for each
-    primitive that the policy takes. Without an actor (`learn.actor`) nothing changes and the loss
-    is 0.
+    primitive that the policy takes; the loss is -J. Without an actor nothing changes and it is 0.
     """
     if not learner.cfg.learn.actor:
         return state, jnp.zeros(())
-    chosen = maps.allowed_primitives(learner.cfg.policy)
-    q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online, obs))
+    frames, chosen = learner.frames, maps.allowed_primitives(learner.cfg.policy)
+    q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online.critic, obs))
 
     def value(state_maps: DenseMaps, primitive: Primitive) -> jax.Array:
-        pose = actor.pose(learner.frames, state_maps, primitive)
-        return maps.read(learner.frames, state_maps.q, jnp.int32(primitive), pose)
+        pose = actor.pose(frames, state_maps, primitive)
+        return maps.read(frames, state_maps.q, jnp.int32(primitive), pose)
 
     def loss(learned: Any) -> tuple[jax.Array, Any]:
-        correction, statistics = networks.train(
-            learner.actor, {**state.online.actor, **learned}, features
-        )
+        variables = {**state.online.actor, **learned}
+        correction, statistics = networks.train(frames.networks.head, variables, features)
         batch_maps = _dense_maps(learner, obs, q, correction)
-        values = [jax.vmap(lambda one, p=p: value(one, p))(batch_maps) for p in chosen]
+        values = [jax.vmap(value, (0, None))(batch_maps, primitive) for primitive in chosen]
         return -jnp.mean(jnp.stack(values)), statistics
 
     before = networks.learned(state.online.actor)

@@ -1,7 +1,6 @@
 """Augmentation of transitions: symmetries of the square workspace and shifts by whole cells.
 
-Both are exact, cell by cell, but for the light, which does not move along: sloping faces keep their
-brightness.
+Both are exact but for the light, which does not move along: sloping faces keep their brightness.
 """
 
 import jax
@@ -49,8 +48,7 @@ def shift(cfg: Config, transition: Transition, cells: jax.Array) -> Transition:
     """The transition shifted by `cells` [2] int32 (row, col); cells that come in are bare table.
 
     The transition stays as it is where that would cut something off: a surface higher than BARE in
-    either map, the place of the action or the end of a push. It also stays if the workspace already
-    cut off the push.
+    either map, the place of the action or the end of a push; or where a push is already cut off.
     """
     pose = transition.action.pose
     step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
@@ -101,10 +99,10 @@ def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
 
 def augment(key: jax.Array, cfg: Config, transition: Transition) -> Transition:
     """The transition augmented as the config says."""
-    most, key_shift = cfg.learn.augment_shift, jax.random.fold_in(key, 1)
+    most = cfg.learn.augment_shift
     if cfg.learn.augment:
         transition = random_symmetry(key, transition)
     if most == 0:
         return transition
-    _, key_cells = jax.random.split(key_shift)
+    _, key_cells = jax.random.split(jax.random.fold_in(key, 1))
     return shift(cfg, transition, jax.random.randint(key_cells, (2,), -most, most + 1))

@@ -1,13 +1,13 @@
-"""The box [-1, 1]^A of normalised actions: some dimensions end at its walls, others wrap around.
+"""The box [-1, 1]^3 of normalised poses u: x and y over half the workspace, yaw / pi - 1.
 
-A pose (x, y, yaw) becomes u with x, y divided by half the workspace and u_yaw = yaw / pi - 1.
+x and y end at its walls, yaw wraps around.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-POSE_WRAPS = np.array([False, False, True])  # which dimensions of a pose (x, y, yaw) wrap
+POSE_WRAPS = np.array([False, False, True])  # of (x, y, yaw)
 
 
 def wrap(u: jax.Array) -> jax.Array:
@@ -18,6 +18,11 @@ def wrap(u: jax.Array) -> jax.Array:
     return jnp.mod(u + 1.0, 2.0) - 1.0
 
 
-def project(u: jax.Array, wraps: jax.Array | np.ndarray) -> jax.Array:
-    """Points `u` [..., A] in the box: dimensions of `wraps` [A] bool wrap, others are clipped."""
-    return jnp.where(jnp.broadcast_to(wraps, u.shape), wrap(u), jnp.clip(u, -1.0, 1.0))
+def wrap_yaw(u: jax.Array) -> jax.Array:
+    """Poses, or offsets between them, [..., 3] with the yaw the short way round."""
+    return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), wrap(u), u)
+
+
+def project(u: jax.Array) -> jax.Array:
+    """Points `u` [..., 3] in the box: yaw wraps, x and y are clipped."""
+    return jnp.clip(wrap_yaw(u), -1.0, 1.0)

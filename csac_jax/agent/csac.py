@@ -1,6 +1,7 @@
 """CSAC and its baselines as a learner: dense maps, search, rewards, updates of critic and actor."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -37,10 +38,7 @@ class CSAC(Learner):
         actions_taken: jax.Array | None = None,
     ) -> Action:
         """By default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13)."""
-        dense_maps = self._chunked(
-            lambda online, obs: actor_critic.dense_maps(self.parts, online, obs)
-        )
-        maps = dense_maps(state.online, obs)
+        maps = self._chunked(actor_critic.dense_maps)(state.online, obs)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(steps_without_change)))
         if actions_taken is None:
             best = jax.vmap(policy.best_action, (0, None, 0, 0))
@@ -57,8 +55,8 @@ class CSAC(Learner):
         result: ActionResult,
     ) -> tuple[jax.Array, jax.Array]:
         """Eqs. 10-16, phi by the target critic."""
-        best_grasps = self._chunked(lambda *args: _best_grasps(self.parts, *args), at_once=1)
         pushed = result.primitive == Primitive.PUSH
+        best_grasps = self._chunked(_best_grasps, at_once=1)
         before, after = best_grasps(state.target, obs, next_obs, pushed)
         return rewards.rewards_of(cfg, result._replace(phi_before=before, phi_after=after))
 
@@ -66,31 +64,27 @@ class CSAC(Learner):
         self, key: jax.Array, state: LearnerState, batch: Transition, weights: jax.Array
     ) -> tuple[LearnerState, UpdateInfo]:
         update = self._chunked(
-            lambda key, *args: actor_critic.update_critic(key, self.parts, *args)
+            lambda parts, key, *args: actor_critic.update_critic(key, parts, *args)
         )
         return update(key, state, batch, weights)
 
     def end_step(self, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
         """The actor's update (lines 22-23)."""
-        update = self._chunked(lambda *args: actor_critic.update_actor(self.parts, *args))
-        return update(state, obs)
+        return self._chunked(actor_critic.update_actor)(state, obs)
 
     def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "CSAC":
-        parts = actor_critic.replace_hyperparams(self.parts, cfg, return_bounds)
+        parts = actor_critic.with_optimisers(cfg, self.parts.frames, return_bounds)
         return dataclasses.replace(self, parts=parts)
 
     def in_chunks(self, networks_at_once: int | None) -> "CSAC":
         return dataclasses.replace(self, networks_at_once=networks_at_once)
 
     def _chunked(self, part: Callable[..., Any], at_once: int | None = None) -> Callable[..., Any]:
+        """A function of `parts` and others as one of the others, vmapped in chunks."""
+        bound = functools.partial(part, self.parts)
         if self.networks_at_once is None:
-            return part
-        return chunked_vmap.vmap_in_chunks(part, at_once or self.networks_at_once)
-
-
-def make(cfg: Config, network: Any = None) -> CSAC:
-    """The learner of a config; `network` is a critic of your own, see `networks`."""
-    return CSAC(actor_critic.make(cfg, network))
+            return bound
+        return chunked_vmap.vmap_in_chunks(bound, at_once or self.networks_at_once)
 
 
 def _best_grasps(
@@ -103,8 +97,7 @@ def _best_grasps(
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, after)
 
     def phi(obs: Observation) -> jax.Array:
-        maps = actor_critic.dense_maps(parts, target, obs)
-        return jax.vmap(actor_critic.best_grasp)(maps)
+        return jax.vmap(actor_critic.best_grasp)(actor_critic.dense_maps(parts, target, obs))
 
     return jax.lax.cond(
         jnp.any(pushed), lambda: jax.lax.map(phi, views), lambda: jnp.zeros((2, *pushed.shape))

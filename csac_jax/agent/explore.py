@@ -14,6 +14,7 @@ class Greedy(NamedTuple):
 
     primitive: jax.Array  # [] int32, Primitive
     poses: jax.Array  # [P, 3] normalised (x, y, yaw), the best pose of each primitive
+    values: jax.Array  # [P] Q of the poses
 
 
 def probability(start: float, end: float, decay: float, actions: jax.Array) -> jax.Array:
@@ -22,47 +23,36 @@ def probability(start: float, end: float, decay: float, actions: jax.Array) -> j
 
 
 def action_noise(key: jax.Array, cfg: ExploreConfig, action: jax.Array) -> jax.Array:
-    """`action` [3], a normalised pose, plus clip(N(0, delta), -c, c), Algorithm 1 line 13.
-
-    c is three delta (ours).
-    """
+    """`action` [3] in the box + clip(N(0, delta), -c, c), line 13; c = 3 delta (ours)."""
     bound = 3.0 * cfg.noise_std
     noise = cfg.noise_std * jax.random.normal(key, action.shape, action.dtype)
-    return box.project(action + jnp.clip(noise, -bound, bound), box.POSE_WRAPS)
+    return box.project(action + jnp.clip(noise, -bound, bound))
 
 
 def choose(
-    key: jax.Array,
-    cfg: ExploreConfig,
-    actions_taken: jax.Array,
-    greedy: Greedy,
-    random_places: jax.Array,
+    key: jax.Array, cfg: ExploreConfig, actions_taken: jax.Array, greedy: Greedy, places: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Primitive [] int32 and normalised pose [3] to try.
+    """Primitive [] int32 and normalised pose [3] to try, after `actions_taken` [] by the whole run.
 
     With a decaying probability the primitive is random, a push with `push_fraction` (VPG). With
-    another one the pose is the random place of that primitive. Else it is that primitive's greedy
-    pose plus noise: a forced primitive still acts where it is best.
-
-    Args: actions_taken [] int32 by the whole run; random_places [P, 3] normalised poses.
+    another one the pose is that primitive's of `places` [P, 3], which are random. Else it is that
+    primitive's greedy pose plus noise: a forced primitive still acts where it is best.
     """
     key_explore, key_push, key_place, key_noise = jax.random.split(key, 4)
-    primitive_is_random = jax.random.bernoulli(
-        key_explore, probability(*cfg.epsilon_primitive, cfg.decay, actions_taken)
-    )
+    epsilon = probability(*cfg.epsilon_primitive, cfg.decay, actions_taken)
+    primitive_is_random = jax.random.bernoulli(key_explore, epsilon)
     random_primitive = jnp.where(jax.random.bernoulli(key_push, cfg.push_fraction), 0, 1)
     primitive = jnp.where(primitive_is_random, random_primitive, greedy.primitive).astype(jnp.int32)
-    place_is_random = jax.random.bernoulli(
-        key_place, probability(*cfg.epsilon_place, cfg.decay, actions_taken)
-    )
+    epsilon_place = probability(*cfg.epsilon_place, cfg.decay, actions_taken)
+    place_is_random = jax.random.bernoulli(key_place, epsilon_place)
     noisy = action_noise(key_noise, cfg, greedy.poses[primitive])
-    return primitive, jnp.where(place_is_random, random_places[primitive], noisy)
+    return primitive, jnp.where(place_is_random, places[primitive], noisy)
 
 
 def random_cell(key: jax.Array, valid: jax.Array) -> jax.Array:
     """Index [] int32, uniform over the True entries of `valid` [n]; 0 if there is none.
 
-    One random rank among the valid ones: ties of n noises would favour low indices.
+    A random rank among the valid ones: ties of n noises would favour low indices.
     """
     count = jnp.cumsum(valid, dtype=jnp.int32)  # [n]
     rank = jax.random.randint(key, (), 0, jnp.maximum(count[-1], 1))

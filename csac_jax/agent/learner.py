@@ -54,8 +54,7 @@ class Learner(abc.ABC):
     ) -> Action:
         """An action for every observation, leaves [E, ...].
 
-        Args: steps_without_change [E] int32; actions_taken [] int32 by the whole run, which
-        exploration decays with, or None for the policy without exploration.
+        Args: steps_without_change [E] int32; actions_taken [] int32 so far, or None: no exploring.
         """
 
     @abc.abstractmethod
@@ -65,11 +64,7 @@ class Learner(abc.ABC):
         """One update on a batch, leaves [B, ...], whose losses count by `weights` [B]."""
 
     def end_step(self, state: Any, obs: Observation) -> tuple[Any, jax.Array]:
-        """What is done once after a step's updates, and its loss []; by default nothing.
-
-        Args: obs, of the last batch, leaves [B, ...].
-        """
-        del obs
+        """Ends a step with `obs` [B, ...] of its last batch: state, as it is by default, loss."""
         return state, jnp.zeros(())
 
     def reward(
@@ -84,15 +79,12 @@ class Learner(abc.ABC):
 
         By default phi is 0: take `push_effect` "change" with it.
         """
-        del state, obs, next_obs
         return rewards.rewards_of(cfg, result)
 
     def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "Learner":
         """The learner of a config whose hyper-parameters may be traced; by default itself."""
-        del cfg, return_bounds
         return self
 
     def in_chunks(self, networks_at_once: int | None) -> "Learner":
         """The learner where several runs are vmapped, for so many networks at a time."""
-        del networks_at_once
         return self

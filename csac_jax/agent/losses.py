@@ -1,13 +1,57 @@
-"""The critic's target, the loss of its error, and the update of target networks."""
+"""The critic's target from the softmax value of the next state, its loss, and target networks.
+
+softmax_beta(Q) = integral of exp(beta Q(a)) Q(a) da / integral of exp(beta Q(a)) da, estimated from
+noisy actions a_i ~ p with weights exp(beta Q(a_i)) / p(a_i): Algorithm 1 line 17, as SD3,
+arXiv:2010.09177.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
+from jax.typing import ArrayLike
 
-from csac_jax.config import LearnConfig
+from csac_jax.agent import box
+from csac_jax.config import LearnConfig, TargetConfig
+
+
+def softmax(q: jax.Array, log_density: jax.Array, inverse_temperature: ArrayLike) -> jax.Array:
+    """Self-normalised importance-sampled softmax_beta [], sum_i w_i q_i / sum_i w_i.
+
+    Only distances below the largest q are weighted: rounding cannot pass that q.
+    Args: q [N] finite values; log_density [N] log p of the samples; inverse_temperature [] beta.
+    """
+    weight = jax.nn.softmax(inverse_temperature * q - log_density)  # no overflow
+    top = jnp.max(q)
+    return top + jnp.sum(weight * (q - top))
+
+
+def noisy_actions(
+    key: jax.Array, cfg: TargetConfig, mean: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Poses around `mean` [3] in the box, and the log density of each.
+
+    a = mu + eps, eps ~ N(0, std) truncated to [-clip, clip] (Algorithm 1 line 13, SD3), x and y
+    also to the box, yaw to half a turn: no pose can be drawn in two ways. Deviation: line 13 clips
+    the normal, which has no density at its bounds. p = phi(eps / std) / (std Z),
+    Z = Phi(high / std) - Phi(low / std), of which nothing cancels as low <= 0 <= high.
+
+    Returns: actions [samples, 3]; log density [samples] per unit of the box.
+    """
+    centre = box.project(mean)
+    wall_low = jnp.where(box.POSE_WRAPS, -1.0, -1.0 - centre)
+    wall_high = jnp.where(box.POSE_WRAPS, 1.0, 1.0 - centre)
+    low = jnp.maximum(-cfg.clip, wall_low) / cfg.std  # [3], in units of std
+    high = jnp.minimum(cfg.clip, wall_high) / cfg.std
+    noise = jax.random.truncated_normal(key, low[None], high[None], (cfg.samples, 3))
+    mass = 0.5 * (jax.lax.erf(high / np.sqrt(2.0)) - jax.lax.erf(low / np.sqrt(2.0)))  # [3], Z
+    log_scale = jnp.log(mass) + np.log(cfg.std * np.sqrt(2.0 * np.pi))
+    log_density = jnp.sum(-0.5 * noise**2 - log_scale[None], axis=-1)
+    return box.project(centre[None] + cfg.std * noise), log_density
+
 
 TD_LOSSES: dict[str, Callable[[LearnConfig, jax.Array], jax.Array]] = {
     "huber": lambda cfg, error: optax.losses.huber_loss(error, delta=cfg.huber),  # CSAC sec. 4
@@ -25,8 +69,7 @@ def td_target(
 ) -> jax.Array:
     """y = r + gamma (1 - terminated) V(s'), eq. 9 and Algorithm 1 line 19; no gradient.
 
-    All of one shape. Pass `terminated`, not `done`: an episode that is cut off goes on in V(s').
-    V(s') after an end may be NaN: it is left out, not multiplied by 0.
+    An episode that is cut off is not `terminated`. V(s') after an end may be NaN: it is left out.
     """
     return jax.lax.stop_gradient(reward + gamma * jnp.where(terminated, 0.0, next_value))
 

@@ -1,8 +1,7 @@
 """Dense maps of one state: Q and actor logits for every primitive, yaw and cell.
 
-Map k lies in frame k, the workspace turned so that yaw_k points along +column. It stays there:
-turning it back would blur it. Q at a continuous action is trilinear: bilinear in the two frames
-next to its yaw, linear between them.
+Map k stays in frame k, the workspace turned so that yaw_k points along +column. Q at a continuous
+action is trilinear: bilinear in the two frames next to its yaw, linear between them.
 """
 
 import dataclasses
@@ -22,8 +21,6 @@ from csac_jax.sim.outcome import BARE
 from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation
 
-NUM_PRIMITIVES = len(Primitive)
-
 
 def allowed_primitives(cfg: PolicyConfig) -> tuple[Primitive, ...]:
     """Primitives that a policy ever takes; V(s) and the actor's loss range over them."""
@@ -37,7 +34,6 @@ class Frames:
     tables: rotate.RotationTables  # of the first K / 2 frames; the others are these upside down
     yaws: np.ndarray  # [K] rad
     networks: Networks
-    stride: int  # cells of a canvas per cell of a map, along each axis
     side: int  # h = w, cells
     cell: float  # side of a cell, m
     extent: float  # side of the workspace, m
@@ -51,8 +47,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
     """Frames of a config's heightmap and net."""
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
     tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
-    stride = networks.stride
-    side, cell = tables.canvas // stride, tables.cell * stride
+    side, cell = tables.canvas // networks.stride, tables.cell * networks.stride
     yaws = 2.0 * np.pi * np.arange(rotations) / rotations
     along = (np.arange(side) - 0.5 * (side - 1)) * cell
     x, y = along[None, None, :], along[None, :, None]
@@ -63,7 +58,6 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         tables=tables,
         yaws=yaws.astype(np.float32),
         networks=networks,
-        stride=stride,
         side=side,
         cell=cell,
         extent=extent,
@@ -97,25 +91,23 @@ def rotated_inputs(frames: Frames, obs: Observation) -> jax.Array:
 def unfold(halves: jax.Array) -> jax.Array:
     """Net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] as maps of all K, [P, K, h, w]."""
     ahead, back, grasp = (halves[..., output] for output in range(dense.OUTPUTS))
-    return jnp.stack(
-        [jnp.concatenate([ahead, _half_turn(back)]), jnp.concatenate([grasp, _half_turn(grasp)])]
-    )
+    return jnp.stack([_all_frames(ahead, back), _all_frames(grasp, grasp)])
 
 
-def _half_turn(maps: jax.Array) -> jax.Array:
-    """Maps [..., h, w] upside down: frame k as frame k + K / 2."""
-    return maps[..., ::-1, ::-1]
+def _all_frames(ahead: jax.Array, back: jax.Array) -> jax.Array:
+    """Maps [K, h, w] of two halves [K / 2, h, w]: frame k + K / 2 is frame k upside down."""
+    return jnp.concatenate([ahead, back[..., ::-1, ::-1]])
 
 
 def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells where an action can have an effect, [P, K, h, w] bool.
+    """Cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.04730.
 
     Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
-    such a surface, of any block, lies within the push's length ahead. This is SPOT's dynamic action
-    space (arXiv:1909.04730).
+    such a surface, of any block, lies within the push's length ahead.
     """
-    under = _cells_above_bare(frames, obs.height)
-    graspable = _target_cells(frames, obs) if frames.shows_target else under
+    graspable = under = _cells_above_bare(frames, obs.height)
+    if frames.shows_target:
+        graspable = _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
     reach = int(np.ceil(frames.push_length / frames.cell))
     ahead = jax.lax.reduce_window(
         under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
@@ -125,84 +117,68 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
 
 def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:
     """Cells [K, h, w] bool under which the height map [H, W] m is higher than BARE."""
-    side, stride = frames.side, frames.stride
-    rotated = rotate.rotate(frames.tables, height[..., None])[..., 0]
+    side, stride = frames.side, frames.networks.stride
+    rotated = rotate.rotate(frames.tables, height[..., None])
     blocks = rotated.reshape(-1, side, stride, side, stride)
     cells = blocks.max(axis=(2, 4)) > BARE  # [K / 2, h, w]
-    return jnp.concatenate([cells, _half_turn(cells)])
+    return _all_frames(cells, cells)
 
 
-def _target_cells(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells [K, h, w] bool above the target."""
-    return _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
-
-
-def _yaw_index(frames: Frames, yaw: jax.Array) -> jax.Array:
-    """Index of a yaw [] rad among the frames', [] float32, whole at each of theirs."""
+def yaw_index(frames: Frames, yaw: jax.Array) -> jax.Array:
+    """Index of yaws [...] rad among the frames', float32, whole at each of theirs."""
     return yaw * (frames.yaws.shape[0] / (2.0 * np.pi))
 
 
 def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
-    """Value [] of `maps` [P, K, h, w] at a pose [3] (x m, y m, yaw rad); trilinear, yaw wraps.
-
-    Differentiable in the maps and in the pose.
-    """
+    """Trilinear value [] of `maps` [P, K, h, w] at a pose [3] m, m, rad; differentiable in both."""
     num, side = frames.yaws.shape[0], frames.side
-    yaw_index = _yaw_index(frames, pose[2])
-    lower = jnp.floor(yaw_index)
-    upper_weight = yaw_index - lower
+    index = yaw_index(frames, pose[2])
+    lower = jnp.floor(index)
+    upper_weight = index - lower
 
     def at(k: jax.Array) -> jax.Array:
         k = jnp.mod(k, num)
-        position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
-        row_col = jnp.clip(rotate.to_cell(side, frames.cell, position), 0.0, side - 1.0)
+        position = rotate.to_cell(side, frames.cell, jnp.asarray(frames.yaws)[k], pose[:2])
+        row_col = jnp.clip(position, 0.0, side - 1.0)
         first_row = ((primitive * num + k) * side).astype(jnp.float32)
-        return rotate.bilinear(
-            maps.reshape(-1, side), row_col + jnp.stack([first_row, jnp.zeros_like(first_row)])
-        )
+        offset = jnp.stack([first_row, jnp.zeros_like(first_row)])
+        return rotate.bilinear(maps.reshape(-1, side), row_col + offset)
 
     k = lower.astype(jnp.int32)
     return (1.0 - upper_weight) * at(k) + upper_weight * at(k + 1)
 
 
-def best_over_yaws(
-    frames: Frames, state: DenseMaps, places: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The largest valid value over the yaws at `places` [..., 2] m, and whether any is valid.
-
-    Both [P, ...]; for pictures.
-    """
-    flat = places.reshape(-1, 2)
-
-    def at(primitive: jax.Array, place: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pose = jnp.append(place, yaw)
-        valid = is_valid(frames, state.valid, primitive, pose)
-        return read(frames, state.q, primitive, pose), valid
-
-    over_yaws = jax.vmap(at, (None, None, 0))
-    over_all = jax.vmap(jax.vmap(over_yaws, (None, 0, None)), (0, None, None))
-    primitives, yaws = jnp.arange(NUM_PRIMITIVES), jnp.asarray(frames.yaws)
-    values, valid = over_all(primitives, flat, yaws)  # [P, places, K]
-    best = jnp.max(jnp.where(valid, values, -jnp.inf), axis=-1)
-    shape = (NUM_PRIMITIVES, *places.shape[:-1])
-    return best.reshape(shape), jnp.any(valid, axis=-1).reshape(shape)
-
-
 def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
     """Whether the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
     num, side = frames.yaws.shape[0], frames.side
-    k = jnp.mod(jnp.round(_yaw_index(frames, pose[2])).astype(jnp.int32), num)
-    position = rotate.frame_position(jnp.asarray(frames.yaws)[k], pose[:2])
-    cell = jnp.round(rotate.to_cell(side, frames.cell, position))
-    row, col = jnp.clip(cell, 0.0, side - 1.0).astype(jnp.int32)
+    k = jnp.mod(jnp.round(yaw_index(frames, pose[2])).astype(jnp.int32), num)
+    position = rotate.to_cell(side, frames.cell, jnp.asarray(frames.yaws)[k], pose[:2])
+    row, col = jnp.clip(jnp.round(position), 0.0, side - 1.0).astype(jnp.int32)
     return valid[primitive, k, row, col]
 
 
-def best_cells(values: jax.Array, valid: jax.Array, num: int) -> jax.Array:
-    """Flat indices [num] int32 into [K, h, w] of the largest valid values.
+def read_valid(
+    frames: Frames, state: DenseMaps, primitive: jax.Array | int, pose: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Q [] at a pose [3], and whether there is something to act on, [] bool."""
+    which = jnp.int32(primitive)
+    return read(frames, state.q, which, pose), is_valid(frames, state.valid, which, pose)
 
-    All cells count if none is valid.
-    """
+
+def best_over_yaws(frames: Frames, state: DenseMaps, places: jax.Array) -> jax.Array:
+    """Largest valid Q over the yaws [P, H, W] at `places` [H, W, 2] m, or -inf; for pictures."""
+
+    def best(primitive: jax.Array, place: jax.Array) -> jax.Array:
+        poses = jax.vmap(jnp.append, (None, 0))(place, jnp.asarray(frames.yaws))
+        values, valid = jax.vmap(lambda pose: read_valid(frames, state, primitive, pose))(poses)
+        return jnp.max(jnp.where(valid, values, -jnp.inf))
+
+    primitives = jnp.arange(len(Primitive))[:, None, None]
+    return jnp.vectorize(best, signature="(),(n)->()")(primitives, places[None])
+
+
+def best_cells(values: jax.Array, valid: jax.Array, num: int) -> jax.Array:
+    """Flat indices [num] int32 into [K, h, w] of the largest values: of valid cells, if any."""
     masked = jnp.where(valid | ~jnp.any(valid), values, -jnp.inf)
     return jax.lax.top_k(masked.reshape(-1), num)[1].astype(jnp.int32)
 
@@ -215,9 +191,7 @@ def cell_pose(frames: Frames, index: jax.Array) -> jax.Array:
 
 def normalise(frames: Frames, pose: jax.Array) -> jax.Array:
     """Pose [3] (m, m, rad) to the box [-1, 1]^3."""
-    return box.project(
-        jnp.append(pose[:2] / (0.5 * frames.extent), pose[2] / np.pi - 1.0), box.POSE_WRAPS
-    )
+    return box.project(jnp.append(pose[:2] / (0.5 * frames.extent), pose[2] / np.pi - 1.0))
 
 
 def denormalise(frames: Frames, u: jax.Array) -> jax.Array:

@@ -23,15 +23,14 @@ class ActionResult(NamedTuple):
 
 
 GOOD_PUSH: dict[str, Callable[[RewardConfig, ActionResult], jax.Array]] = {
-    "value": lambda cfg, result: result.phi_after > result.phi_before + cfg.dead_band,
-    "change": lambda cfg, result: result.changed,
+    "value": lambda cfg, result: result.phi_after > result.phi_before + cfg.dead_band,  # eq. 16
+    "change": lambda cfg, result: result.changed,  # VPG
 }
 
 
 def scale(cfg: RewardConfig, level: float) -> float:
     """Gamma = eta0 + eta1 2^(s - s_max), eq. 13; a grasp's level is s_max."""
-    eta0, eta1 = cfg.eta
-    return eta0 + eta1 * 2.0 ** (level - cfg.grasp_level)
+    return cfg.eta[0] + cfg.eta[1] * 2.0 ** (level - cfg.grasp_level)
 
 
 def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array:
@@ -39,58 +38,44 @@ def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array
 
     Deviation: the paper adds r1, which would pay for staying away from the target.
     """
-    return jnp.where(lifted, cfg.success_bonus, 0.0) - cfg.distance_weight * jnp.minimum(
-        distance, cfg.distance_cap
-    )
+    loss = cfg.distance_weight * jnp.minimum(distance, cfg.distance_cap)
+    return jnp.where(lifted, cfg.success_bonus, 0.0) - loss
 
 
 def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
     """I_g [] of `outcome` [] int32, eq. 15."""
-    levels = jnp.asarray(cfg.grasp_levels, jnp.float32)
-    return levels.at[outcome].get(mode="clip")
+    return jnp.asarray(cfg.grasp_levels, jnp.float32).at[outcome].get(mode="clip")
 
 
 def push_effect(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """I_c []: the second of `push_levels` after a good push, else the first.
-
-    Good by `value`: phi(s') > phi(s) + dead band, eq. 16. Good by `change`: the map moved (VPG).
-    """
-    good = GOOD_PUSH[cfg.push_effect](cfg, result)
+    """I_c []: the second of `push_levels` after a good push by `push_effect`, else the first."""
     worse, better = cfg.push_levels
-    return jnp.where(good, better, worse)
+    return jnp.where(GOOD_PUSH[cfg.push_effect](cfg, result), better, worse)
 
 
 def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
     """R = r + Gamma(phi) I [], eqs. 12 and 14; a push earns no r2.
 
-    The text below eq. 12 swaps the names of its factors; the product is the same. Ours: an action
-    that loses blocks costs `lost_block_penalty` once.
+    Ours: an action that loses blocks costs `lost_block_penalty` once.
     """
     grasped = result.primitive == Primitive.GRASP
-    effect = jnp.where(
-        grasped,
-        scale(cfg, cfg.grasp_level) * grasp_effect(cfg, result.outcome),
-        scale(cfg, cfg.push_level) * push_effect(cfg, result),
-    )
-    return (
-        base(cfg, grasped & (result.outcome == Outcome.LIFTED), result.distance)
-        + effect
-        - jnp.where(result.blocks_lost > 0, cfg.lost_block_penalty, 0.0)
-    )
+    grasp = scale(cfg, cfg.grasp_level) * grasp_effect(cfg, result.outcome)
+    push = scale(cfg, cfg.push_level) * push_effect(cfg, result)
+    lifted = grasped & (result.outcome == Outcome.LIFTED)
+    penalty = jnp.where(result.blocks_lost > 0, cfg.lost_block_penalty, 0.0)
+    return base(cfg, lifted, result.distance) + jnp.where(grasped, grasp, push) - penalty
 
 
 def rewards_of(cfg: RewardConfig, results: ActionResult) -> tuple[jax.Array, jax.Array]:
     """Rewards [E] and which pushes were good [E] bool, of results with leaves [E]."""
     each = jax.vmap(reward, (None, 0))(cfg, results)
-    gained = results.phi_after > results.phi_before + cfg.dead_band
-    return each, (results.primitive == Primitive.PUSH) & gained
+    return each, (results.primitive == Primitive.PUSH) & GOOD_PUSH["value"](cfg, results)
 
 
 def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:
     """Smallest and largest discounted return of an episode of any length.
 
-    The smallest is r_min / (1 - gamma) if r_min is a loss, else r_min of an episode that ends at
-    once. The largest likewise.
+    The smallest is r_min / (1 - gamma) of a loss, else r_min of one action; the largest likewise.
     """
     grasp = [scale(cfg, cfg.grasp_level) * level for level in cfg.grasp_levels]
     grasp[Outcome.LIFTED] += cfg.success_bonus

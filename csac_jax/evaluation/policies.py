@@ -44,11 +44,8 @@ class PolicyDebug(NamedTuple):
 
 @struct.dataclass
 class LearnedPolicy:
-    """The greedy policy of trained networks, without exploration.
-
-    The rule that pushes after no visible change (`policy.primitive rule`) needs a State: a bare
-    Observation counts as one after a change.
-    """
+    """The greedy policy of trained networks, without exploration. With `policy.primitive rule`,
+    which pushes after no visible change, it needs a State."""
 
     cfg: Config = struct.field(pytree_node=False)
     params: Params
@@ -56,29 +53,25 @@ class LearnedPolicy:
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        """See `Policy`."""
         actions = self.batched(*jax.tree.map(lambda leaf: leaf[None], (scene, key)))
         return jax.tree.map(lambda leaf: leaf[0], actions)
 
     def batched(self, scenes: Observation | State, keys: jax.Array) -> Action:
-        """Actions, leaves [E], of scenes, leaves [E, ...], and keys [E].
-
-        The networks see groups of scenes that fit the memory. Under vmap they would see all.
-        """
-        parts = actor_critic.make(self.cfg, self.network)
-        dense_maps = actor_critic.dense_maps(parts, self.params, _observation(scenes))
-        best = jax.vmap(policy.best_action, (0, None, 0, 0))
-        return best(keys, parts, dense_maps, _steps_without_change(scenes, len(keys)))
+        """Actions, leaves [E], of scenes, leaves [E, ...], and keys [E]. The networks see groups of
+        scenes that fit the memory; under vmap they would see all."""
+        parts, (obs, unchanged) = actor_critic.make(self.cfg, self.network), _seen(scenes)
+        dense_maps = actor_critic.dense_maps(parts, self.params, obs)
+        return jax.vmap(policy.best_action, (0, None, 0, 0))(keys, parts, dense_maps, unchanged)
 
     @jax.jit
     def debug(self, scene: Observation | State, key: jax.Array) -> PolicyDebug:
         """What the action in this scene with this key follows from."""
         parts = actor_critic.make(self.cfg, self.network)
-        obs = jax.tree.map(lambda leaf: leaf[None], _observation(scene))
+        obs = jax.tree.map(lambda leaf: leaf[None], _seen(scene)[0])
         batch = actor_critic.dense_maps(parts, self.params, obs)
         dense_maps = jax.tree.map(lambda leaf: leaf[0], batch)
         places = geometry.cell_centres(self.cfg.heightmap)
-        q, _ = maps.best_over_yaws(parts.frames, dense_maps, places)
+        q = maps.best_over_yaws(parts.frames, dense_maps, places)
         candidates = policy.candidates(key, parts, dense_maps)
         return PolicyDebug(q, candidates, actor_critic.best_grasp(dense_maps))
 
@@ -93,11 +86,7 @@ class LearnerPolicy:
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        """See `Policy`."""
-        obs, unchanged = _observation(scene), jnp.zeros((), jnp.int32)
-        if isinstance(scene, State):
-            unchanged = scene.steps_without_change
-        obs, unchanged = jax.tree.map(lambda leaf: leaf[None], (obs, unchanged))
+        obs, unchanged = jax.tree.map(lambda leaf: leaf[None], _seen(scene))
         actions = self.learner.act(key, self.state, obs, unchanged)
         return jax.tree.map(lambda leaf: leaf[0], actions)
 
@@ -110,36 +99,30 @@ class RandomPolicy:
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        """See `Policy`."""
         frames = maps.frames(self.cfg, networks.make(self.cfg.net))
-        valid = maps.actionable_cells(frames, _observation(scene))
-        return policy.random_grasp(key, frames, valid)
+        return policy.random_grasp(key, frames, maps.actionable_cells(frames, _seen(scene)[0]))
 
 
 @struct.dataclass
 class OraclePolicy:
-    """A planner that reads the poses of the blocks: what physics allows at best.
-
-    `cfg` must be that of the environment, whose kinds of blocks it holds.
-    """
+    """A planner that reads the poses of the blocks: what physics allows at best. `cfg` must be that
+    of the environment, whose kinds of blocks it holds."""
 
     cfg: Config = struct.field(pytree_node=False)
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        """See `Policy`. Raises TypeError for an observation."""
+        """Raises TypeError for an observation."""
         if not isinstance(scene, State):
             raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
-        cfg = self.cfg
-        return oracle.grasp(cfg.sim, cfg.heightmap, cfg.scene.slots, scene.scene, scene.obs.height)
+        return oracle.grasp(self.cfg, scene.scene, scene.obs.height)
 
 
-def _observation(scene: Observation | State) -> Observation:
-    return scene.obs if isinstance(scene, State) else scene
-
-
-def _steps_without_change(scenes: Observation | State, num: int) -> jax.Array:
-    return scenes.steps_without_change if isinstance(scenes, State) else jnp.zeros(num, jnp.int32)
+def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:
+    """Observations and actions in a row without change [...], none after a bare observation."""
+    if isinstance(scenes, State):
+        return scenes.obs, scenes.steps_without_change
+    return scenes, jnp.zeros(scenes.height.shape[:-2], jnp.int32)
 
 
 def in_world(policy: Policy, cfg: Config) -> Policy:
@@ -172,9 +155,7 @@ def load(source: str | Path, network: Any = None, learner: Learner | None = None
     if path.is_file():
         return LearnedPolicy(*policy_file.load(path))
     cfg = checkpoint.load_config(path)
-    blank = step.without_physics(cfg)
-    program = step.make(cfg, env=blank, learner=learner, network=network)
-    state, _ = checkpoint.restore(path, step.abstract_state(program))
+    state, _ = checkpoint.restore(path, step.abstract_state(cfg, learner, network))
     if learner is not None:
         return LearnerPolicy(cfg, learner, state.learner)
     return LearnedPolicy(cfg, state.learner.online, network)

@@ -1,6 +1,5 @@
 """Episodes of a fixed policy, all at once in one compiled step, and what they measure."""
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -17,14 +16,14 @@ from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import backend, primitives, robot as robots
-from csac_jax.sim.primitives import Action
-from csac_jax.sim.robot import JointTrajectory
+from csac_jax.sim import backend, primitives
+from csac_jax.sim.primitives import Action, JointTrajectory
+from csac_jax.training import step as training
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
-NO_SCENES: Any = None  # of an environment that never resets
 
 Progress = Callable[[str, int, int], None]  # part of the suite, episodes finished, all episodes
+Count = Callable[[int, int], None]  # the same of one part
 
 
 def evaluate(
@@ -42,18 +41,13 @@ def evaluate(
     progress, called after every action. Returns: the metrics; of a suite with several parts
     {"parts": {name: metrics}}. Raises ValueError for a suite that is none or does not fit.
     """
-    cfg = configured(policy.cfg, physics, robot)
-    learned = isinstance(policy, LearnedPolicy)
+    cfg, learned = configured(policy.cfg, physics, robot), isinstance(policy, LearnedPolicy)
     parts = suites.environments(cfg, suite, episodes, seed, learned)
     return measure(policy, parts, episodes, seed, progress)
 
 
 def measure(
-    policy: Policy,
-    parts: dict[str, Env],
-    episodes: int,
-    seed: int,
-    progress: Progress | None = None,
+    policy: Policy, parts: dict[str, Env], episodes: int, seed: int, progress: Progress | None
 ) -> dict[str, Any]:
     """The result of `evaluate` in the parts of a suite."""
     found = {}
@@ -66,57 +60,33 @@ def measure(
 
 def configured(cfg: Config, physics: PhysicsKind, robot: RobotKind) -> Config:
     """The config with this robot and physics; `auto` is chosen for a few scenes at a time."""
-    sim = dataclasses.replace(cfg.sim, physics=physics, robot=robot)
-    few = dataclasses.replace(cfg, sim=sim, train=dataclasses.replace(cfg.train, scenes=1))
-    return dataclasses.replace(cfg, sim=backend.resolve(few).sim)
+    few = cfg.change(sim={"physics": physics, "robot": robot}, train={"scenes": 1})
+    return cfg.change(sim=backend.resolve(few).sim)
 
 
 def rollout(
-    env: Env,
-    policy: Policy,
-    episodes: int,
-    seed: int,
-    progress: Callable[[int, int], None] | None = None,
+    env: Env, policy: Policy, episodes: int, seed: int, progress: Count | None = None
 ) -> Episodes:
     """Runs episodes of a policy, their scenes spread evenly over the environment's pool.
 
     What an episode draws follows from the seed and its number, not from how many run at once. What
-    a network or MJX computes may still differ in the last bits. Episodes end as in training.
+    a network or MJX computes may still differ in the last bits.
     """
     size = -(-episodes // -(-episodes // SIDE_BY_SIDE))  # batches of one size: one compilation
-    batches = []
-    for first in range(0, episodes, size):
-        numbers = np.arange(first, first + size)
-        rows = np.minimum(numbers, episodes - 1) * env.scenes.position.shape[0] // episodes
-        scenes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], env.scenes)
-
-        def report(finished: int, first: int = first) -> None:
-            if progress is not None:
-                progress(min(first + finished, episodes), episodes)
-
-        batches.append(_run(env, policy, seed, numbers, numbers < episodes, scenes, report))
-    joined = Episodes(*(np.concatenate(leaves) for leaves in zip(*batches, strict=True)))
+    batches = [
+        _run(env, policy, episodes, seed, np.arange(first, first + size), progress)
+        for first in range(0, episodes, size)
+    ]
+    joined = Episodes(*map(np.concatenate, zip(*batches, strict=True)))
     return Episodes(*(leaf[:episodes] for leaf in joined))
 
 
-class _Program(NamedTuple):
-    """What is compiled for an environment, whatever its scenes are."""
-
-    begin: Callable[[jax.Array, jax.Array, Scene], State]  # key, numbers [E], scenes [E, ...]
-    step: Callable[..., Any]  # policy, key, numbers [E], states -> states, record
-
-
-def _program(env: Env) -> _Program:
-    """Parts of a suite that share config and physics share their compiled programs."""
-    kind: Any = type(env)
-    physics: Any = env.physics
-    return _cached(kind, env.cfg, physics, env.any_yaw)
-
-
 @functools.lru_cache(maxsize=2)
-def _cached(kind: Any, cfg: Config, physics: Any, any_yaw: bool) -> _Program:
-    env = kind(cfg, physics, NO_SCENES, any_yaw)
-    return _Program(jax.jit(functools.partial(_begin, env)), jax.jit(functools.partial(_step, env)))
+def _compiled(kind: Any, cfg: Config, physics: Any, any_yaw: bool) -> tuple[Callable, Callable]:
+    """`_begin` and `_step` of an environment, whatever its scenes are: parts of a suite that share
+    config and physics share them."""
+    env = kind(cfg, physics, None, any_yaw)  # without scenes, as it never resets
+    return jax.jit(functools.partial(_begin, env)), jax.jit(functools.partial(_step, env))
 
 
 class StepRecord(NamedTuple):
@@ -132,13 +102,12 @@ class StepRecord(NamedTuple):
 
 def episode(env: Env, policy: Policy, seed: int) -> Iterator[StepRecord]:
     """One episode of a policy in the first scene of the environment's pool, action by action."""
-    key, number = jax.random.key(seed), jnp.zeros(1, jnp.int32)
-    first = jax.tree.map(lambda leaf: leaf[:1], env.scenes)
-    states = jax.jit(functools.partial(_begin, env))(jax.random.fold_in(key, 0), number, first)
+    key, first = jax.random.key(seed), jax.tree.map(lambda leaf: leaf[:1], env.scenes)
+    begin, step = (jax.jit(functools.partial(part, env)) for part in (_begin, _recorded_step))
+    states = begin(jax.random.fold_in(key, 0), jnp.zeros(1, jnp.int32), first)
     state = jax.tree.map(lambda leaf: leaf[0], states)
-    step = jax.jit(functools.partial(_recorded_step, env))
     for action in range(1, env.cfg.task.max_actions + 1):
-        step_key = jax.random.fold_in(jax.random.fold_in(key, action), number[0])
+        step_key = jax.random.fold_in(jax.random.fold_in(key, action), 0)
         record = step(_pytree(policy), step_key, state)
         yield jax.device_get(record)
         state = record.after
@@ -150,21 +119,14 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     """One action in one scene."""
     action = policy(state, key)
     plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action)
-    joints = robots.joint_trajectory(env.cfg.sim.robot, plan)
+    joints = primitives.joint_trajectory(env.cfg.sim.robot, plan)
     after = env.step(state, action)
     if not isinstance(policy, LearnedPolicy):
         return StepRecord(state, action, joints, after, after.reward, None)
-    key, info = jax.random.clone(key), after.info  # the debug view is of the same draws
-    debug = policy.debug(state, key)
-    result = rewards.ActionResult(
-        primitive=action.primitive,
-        outcome=info.outcome,
-        distance=info.distance,
-        phi_before=debug.best_grasp,  # the acting critic's; in training it is the target critic's
-        phi_after=policy.debug(after, jax.random.clone(key)).best_grasp,
-        changed=info.moved > CHANGE_AREA,
-        blocks_lost=info.blocks_lost,
-    )
+    key = jax.random.clone(key)  # the debug view is of the same draws
+    debug, later = policy.debug(state, key), policy.debug(after, jax.random.clone(key))
+    phi = {"phi_before": debug.best_grasp, "phi_after": later.best_grasp}  # the acting critic's
+    result = training.action_result(action, after.info)._replace(**phi)
     reward = rewards.reward(policy.cfg.reward, result)
     return StepRecord(state, action, joints, after, reward, debug)
 
@@ -175,35 +137,29 @@ def _pytree(policy: Policy) -> Any:
 
 
 def _run(
-    env: Env,
-    policy: Policy,
-    seed: int,
-    numbers: np.ndarray,
-    wanted: np.ndarray,
-    scenes: Scene,
-    report: Callable[[int], None],
+    env: Env, policy: Policy, episodes: int, seed: int, numbers: np.ndarray, progress: Count | None
 ) -> Episodes:
-    """The episodes `numbers` [E] in `scenes` [E, ...]; those not `wanted` [E] bool end at once."""
-    program, task, key = _program(env), env.cfg.task, jax.random.key(seed)
-    order = jnp.asarray(numbers)
-    states = program.begin(jax.random.fold_in(key, 0), order, scenes)
+    """The episodes `numbers` [E] of a rollout; those beyond its `episodes` end at once."""
+    static: Any = (type(env), env.cfg, env.physics, env.any_yaw)
+    begin, step = _compiled(*static)
+    task, key = env.cfg.task, jax.random.key(seed)
+    rows = np.minimum(numbers, episodes - 1) * env.scenes.position.shape[0] // episodes
+    scenes = jax.tree.map(lambda leaf: leaf[rows], env.scenes)
+    states = begin(jax.random.fold_in(key, 0), numbers, scenes)
     blocks = np.asarray(states.scene.in_play.sum(axis=1))
-    states = states.replace(truncated=jnp.asarray(~wanted))
+    states = states.replace(truncated=jnp.asarray(numbers >= episodes))
     records = []
     for action in range(1, task.max_actions + 1):
-        step_key = jax.random.fold_in(key, action)
-        states, record = program.step(_pytree(policy), step_key, order, states)
+        states, record = step(_pytree(policy), jax.random.fold_in(key, action), numbers, states)
         records.append(jax.device_get(record))
-        report(int(np.sum(states.done)))
+        if progress is not None:
+            progress(min(int(numbers[0] + np.sum(states.done)), episodes), episodes)
         if np.all(states.done):
             break
     pad = ((0, 0), (0, task.max_actions - len(records)))
-    steps = {
-        name: np.pad(np.stack(leaves, axis=1), pad)
-        for name, leaves in zip(_Record._fields, zip(*records, strict=True), strict=True)
-    }
-    return Episodes(
-        **{**steps, "blocks_lost": steps["blocks_lost"].sum(axis=1)},
+    steps = jax.tree.map(lambda *leaves: np.pad(np.stack(leaves, axis=1), pad), *records)
+    return steps._replace(
+        blocks_lost=steps.blocks_lost.sum(axis=1),
         blocks=np.ones_like(blocks) if task.kind == "target" else blocks,
         completed=np.asarray(states.terminated),
         ending=endings(env.cfg, states),
@@ -212,45 +168,29 @@ def _run(
 
 def endings(cfg: Config, last: State) -> np.ndarray:
     """Why the episodes of these last states, leaves [...], ended: indices into ENDINGS [...]."""
-    last = jax.device_get(last)
-    capped = np.where(
-        last.actions >= cfg.task.max_actions,
-        ENDINGS.index("action_cap"),
-        ENDINGS.index("no_change_cap"),
-    )
-    ending = np.where(last.info.physics_diverged, ENDINGS.index("physics_diverged"), capped)
-    return np.where(last.terminated, ENDINGS.index("terminated"), ending).astype(np.int32)
-
-
-class _Record(NamedTuple):
-    """What one action did in every scene, each [E], 0 after the episode's end; see `Episodes`."""
-
-    valid: jax.Array
-    primitive: jax.Array
-    outcome: jax.Array
-    cleared: jax.Array
-    changed: jax.Array
-    wrong: jax.Array
-    blocks_lost: jax.Array
+    capped = last.actions >= cfg.task.max_actions
+    held = jax.device_get([last.terminated, last.info.physics_diverged, capped])
+    numbers = [ENDINGS.index(name) for name in ("terminated", "physics_diverged", "action_cap")]
+    return np.select(held, numbers, ENDINGS.index("no_change_cap")).astype(np.int32)
 
 
 def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: Scene) -> State:
     """The first states of the episodes `numbers` [E] in `scenes` [E, ...]."""
     keys = _keys(key, numbers)
-    scenes = jax.tree.map(jnp.asarray, scenes)
-    return jax.vmap(env.reset_to)(jax.vmap(env.randomise_pose)(keys, scenes), keys)
+    placed = jax.vmap(env.randomise_pose)(keys, jax.tree.map(jnp.asarray, scenes))
+    return jax.vmap(env.reset_to)(placed, keys)
 
 
 def _step(
     env: Env, policy: Policy, key: jax.Array, numbers: jax.Array, states: State
-) -> tuple[State, _Record]:
-    """One action in every scene; finished ones stay."""
+) -> tuple[State, Episodes]:
+    """One action in every scene and what it did, [E], 0 after the end; finished scenes stay."""
     running = ~states.done
     action = policies.act(policy, states, _keys(key, numbers))
     after = jax.vmap(env.step)(states, action)
     info, has_target = after.info, env.cfg.task.kind == "target"
     target_lost = (after.terminated & (after.reward == 0.0)).astype(jnp.int32)
-    record = _Record(
+    record = Episodes(
         valid=running,
         primitive=action.primitive,
         outcome=info.outcome,

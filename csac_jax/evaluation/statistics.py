@@ -18,17 +18,11 @@ class Band(NamedTuple):
     n: int  # seeds, the fewest of any stratum
 
 
-def iqm(values: np.ndarray) -> np.ndarray:
-    """Interquartile mean of `values` [..., n]: without a quarter, rounded down, at either end."""
-    return scipy.stats.trim_mean(values, 0.25, axis=-1)
-
-
 def band(strata: Sequence[np.ndarray], seed: int = 0) -> Band:
-    """Mean over strata (tasks) of the IQM over each one's seeds [seeds].
+    """Mean over strata (tasks) of the IQM over each one's seeds [seeds], drawn within each stratum.
 
-    The bootstrap draws seeds within each stratum. Unlike Agarwal et al. there is no IQM over all
-    strata at once: of four cases it would leave out the hardest. Raises ValueError where a stratum
-    is empty.
+    Unlike Agarwal et al. there is no IQM over all strata at once: of four cases it would leave out
+    the hardest. Raises ValueError where a stratum is empty.
     """
     fewest = min(map(len, strata), default=0)
     if fewest == 0:
@@ -40,9 +34,7 @@ def band(strata: Sequence[np.ndarray], seed: int = 0) -> Band:
 
 def difference(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], seed: int = 0) -> Band:
     """`band` of ours less `band` of theirs, seeds drawn independently; strata in the same order.
-
-    Raises ValueError where a stratum has fewer than two values.
-    """
+    Raises ValueError where one has fewer than two values."""
     if min(map(len, (*ours, *theirs)), default=0) < 2:
         raise ValueError("a difference needs two values of each")
 
@@ -53,13 +45,13 @@ def difference(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], seed: i
 
 
 def _mean_iqm(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Mean over strata of the IQM over the last axis; SciPy passes that axis by name."""
-    return np.mean([iqm(np.asarray(stratum, float)) for stratum in strata], axis=0)
+    """Mean over strata of the IQM over the last axis, which SciPy passes by name: without a quarter
+    of the values, rounded down, at either end."""
+    means = [scipy.stats.trim_mean(np.asarray(values, float), 0.25, axis=-1) for values in strata]
+    return np.mean(means, axis=0)
 
 
-def _bootstrapped(
-    strata: Sequence[np.ndarray], statistic: Callable[..., np.ndarray], seed: int
-) -> Band:
+def _bootstrapped(strata: Sequence[np.ndarray], statistic: Callable, seed: int) -> Band:
     """The statistic of strata [seeds], with its 95 % percentile bootstrap band."""
     samples = [np.asarray(stratum, float) for stratum in strata]
     low, high = scipy.stats.bootstrap(
@@ -69,12 +61,9 @@ def _bootstrapped(
 
 
 def curves(points: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, list[Band]]:
-    """IQM and band of curves, one per seed, at the first one's places x up to the shortest's end.
-
-    A curve is linear between its points, and holds its first value before them.
-
-    Args: points, for each seed x [n], rising, and y [n]. Returns: x [m] and a band for each.
-    """
+    """IQM and band of curves, one per seed, at the first one's places x [m] up to the shortest's
+    end. A curve holds its first value before its points, x [n] rising and y [n], and is linear
+    between them."""
     end = min(x[-1] for x, _ in points)
     places = points[0][0][points[0][0] <= end]
     values = np.stack([np.interp(places, x, y) for x, y in points])  # [seeds, m]

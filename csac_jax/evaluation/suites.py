@@ -9,11 +9,10 @@
 `generated`        ordered arrangements of all levels of difficulty.
 a path             the user's case file.
 
-Training draws from stream 0 of random numbers, a suite from stream 1 + seed. No case is in
-training. Sizes and materials of dropped and drawn blocks are SceneConfig's defaults, whatever a
-policy was trained with. Every scene is turned by a random yaw, or by quarters where another turn
-would take a block out of the workspace. Dropped suites allow 2.5 actions per block, or as many as
-in training if that is more.
+Training draws from stream 0 of random numbers, a suite from stream 1 + seed; no case is in
+training. Dropped and drawn blocks have SceneConfig's default sizes and materials. Every scene is
+turned by a random yaw, or by quarters where another turn would take a block out of the workspace.
+Dropped suites allow 2.5 actions per block, or as many as in training if that is more.
 """
 
 import dataclasses
@@ -29,7 +28,7 @@ from csac_jax import env as environment, presets
 from csac_jax.config import Config, SceneConfig, SimConfig, SlotKind
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
-from csac_jax.scene import cases, model, sources
+from csac_jax.scene import arrange, cases, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation
 
@@ -39,13 +38,14 @@ TARGET_ACTIONS = 5  # CSAC sec. 4.4
 THIRTY = SimConfig(geom_pairs=72, contacts=240)  # three times those for ten
 PACKED: tuple[SlotKind, ...] = ("box",) * 6 + ("arch",) * 2 + ("prism",) * 2 + ("cylinder",) * 2
 
-Build = Callable[[Config, int, int], dict[str, Env]]
+# Config of the policy, episodes, stream of random numbers -> parts by name, or the only one.
+Build = Callable[[Config, int, int], dict[str, Env] | Env]
 
 
 class Suite(NamedTuple):
     """How the parts of a suite are made."""
 
-    build: Build  # config of the policy, episodes, stream of random numbers -> parts by name
+    build: Build
     target: bool = False  # it asks for a target: a learned policy must know that task
 
 
@@ -75,33 +75,30 @@ def environments(
                 f"--suite: {suite} needs a policy trained with --task.kind target, this one was "
                 "trained to clear the table; choose another suite, or --policy oracle or random"
             )
-        return build(cfg, episodes, 1 + seed)
+        parts = build(cfg, episodes, 1 + seed)
+        return parts if isinstance(parts, dict) else {suite: parts}
     if Path(suite).is_file():
         return {Path(suite).stem: _case(cfg, Path(suite))}
     raise ValueError(f"--suite: '{suite}' is neither a case file nor one of: {', '.join(SUITES)}")
 
 
 def _target(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
-    task = dataclasses.replace(cfg.task, kind="target", max_actions=TARGET_ACTIONS)
-    cfg = dataclasses.replace(cfg, task=task)
+    cfg = cfg.change(task={"kind": "target", "max_actions": TARGET_ACTIONS})
     ten = _ten(cfg, episodes, stream)
-    ten = dataclasses.replace(ten, cfg=dataclasses.replace(ten.cfg, task=task))
-    return {**_cases(cfg), "random10": ten}
+    return {**_cases(cfg), "random10": dataclasses.replace(ten, cfg=ten.cfg.change(task=cfg.task))}
 
 
 def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN.sim) -> Config:
     """The config with other blocks, and contacts enough for them: at least those of `sim`."""
     pairs, contacts = max(cfg.sim.geom_pairs, sim.geom_pairs), max(cfg.sim.contacts, sim.contacts)
-    return dataclasses.replace(
-        cfg, scene=scene, sim=dataclasses.replace(cfg.sim, geom_pairs=pairs, contacts=contacts)
-    )
+    return cfg.change(scene=scene, sim={"geom_pairs": pairs, "contacts": contacts})
 
 
 def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config:
     """The config with these blocks in play, of default sizes, and actions enough to take them."""
+    actions = max(cfg.task.max_actions, len(slots) * 5 // 2)
     scene = SceneConfig(slots=slots, min_blocks=len(slots))
-    task = dataclasses.replace(cfg.task, max_actions=max(cfg.task.max_actions, len(slots) * 5 // 2))
-    return dataclasses.replace(_wide(cfg, scene, sim), task=task)
+    return _wide(cfg, scene, sim).change(task={"max_actions": actions})
 
 
 def _ten(cfg: Config, episodes: int, stream: int) -> Env:
@@ -110,14 +107,16 @@ def _ten(cfg: Config, episodes: int, stream: int) -> Env:
 
 def _thirty(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _dropped(cfg, TEN.scene.slots * 3, THIRTY)
-    scenes = sources.settled(cfg, stream, episodes, poured=True)
-    return Env(cfg, simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim), scenes)
+    return Env(cfg, _physics(cfg), pool.settled(cfg, stream, episodes, poured=True))
 
 
-def _placed(cfg: Config, scene: SceneConfig, scenes: Scene) -> Env:
-    """The environment of scenes [P, N, ...] that were placed, not dropped."""
-    cfg = _wide(cfg, scene)
-    return Env(cfg, simulation.make(model.build(scene, cfg.sim), cfg.sim), scenes)
+def _physics(cfg: Config) -> simulation.Physics:
+    return simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+
+
+def _pool(scene: Scene) -> Scene:
+    """The only scene of a pool, leaves [1, N, ...]."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
 
 
 def _case(cfg: Config, path: Path) -> Env:
@@ -125,44 +124,30 @@ def _case(cfg: Config, path: Path) -> Env:
     if cfg.task.kind == "target":
         cases.require_target(case)
     scene = dataclasses.replace(cfg.scene, slots=case.slots, min_blocks=len(case.slots))
-    return _placed(cfg, scene, jax.tree.map(lambda leaf: np.asarray(leaf)[None], case.scene))
+    cfg = _wide(cfg, scene)
+    return Env(cfg, _physics(cfg), _pool(case.scene))
 
 
 def _cases(cfg: Config) -> dict[str, Env]:
     """The shipped cases. All have slots for the most blocks of each kind: one compilation."""
     every = {name: cases.load(cases.shipped(name), cfg.heightmap.extent) for name in cases.names()}
-    most = {
-        kind: max(case.slots.count(kind) for case in every.values())
-        for kind in typing.get_args(SlotKind)
-    }
-    slots = tuple(kind for kind, count in most.items() for _ in range(count))
-    scene = dataclasses.replace(cfg.scene, slots=slots, min_blocks=1)
-    cfg = _wide(cfg, scene)
-    physics = simulation.make(model.build(scene, cfg.sim), cfg.sim)
-    seated = {name: cases.seat(case, slots) for name, case in every.items()}
-    return {
-        name: Env(cfg, physics, jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene))
-        for name, scene in seated.items()
-    }
+    slots: tuple[SlotKind, ...] = ()
+    for kind in typing.get_args(SlotKind):
+        slots += (kind,) * max(case.slots.count(kind) for case in every.values())
+    cfg = _wide(cfg, dataclasses.replace(cfg.scene, slots=slots, min_blocks=1))
+    physics = _physics(cfg)
+    return {name: Env(cfg, physics, _pool(cases.seat(one, slots))) for name, one in every.items()}
 
 
 def _generated(cfg: Config, episodes: int, stream: int) -> Env:
-    scene = SceneConfig(slots=PACKED, min_blocks=sources.MIN_ARRANGED)
-    scenes = sources.arrangements(scene, cfg.heightmap.extent, stream, episodes)
-    return _placed(cfg, scene, scenes)
+    cfg = _wide(cfg, SceneConfig(slots=PACKED, min_blocks=arrange.MIN_ARRANGED))
+    scenes = arrange.arrangements(cfg.scene, cfg.heightmap.extent, stream, episodes)
+    return Env(cfg, _physics(cfg), scenes)
 
 
-def _single(name: str, build: Callable[[Config, int, int], Env]) -> Build:
-    """A suite of one part, which has the suite's name."""
-    return lambda cfg, episodes, stream: {name: build(cfg, episodes, stream)}
-
-
-register(
-    IN_DISTRIBUTION,
-    _single(IN_DISTRIBUTION, lambda cfg, count, stream: environment.make_env(cfg, stream, count)),
-)
-register("random10", _single("random10", _ten))
-register("random30", _single("random30", _thirty))
+register(IN_DISTRIBUTION, lambda cfg, count, stream: environment.make_env(cfg, stream, count))
+register("random10", _ten)
+register("random30", _thirty)
 register("cases", lambda cfg, episodes, stream: _cases(cfg))
 register("target", _target, target=True)
-register("generated", _single("generated", _generated))
+register("generated", _generated)

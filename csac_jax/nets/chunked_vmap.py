@@ -19,7 +19,7 @@ def chunk_size(cfg: Config, runs: int) -> int | None:
     """How many networks work at a time, in chunks of one size; None for those of all `runs`."""
     if cfg.net.kind == "small":
         return None
-    return max(size for size in range(1, min(runs, _LARGEST) + 1) if runs % size == 0)
+    return max(size for size in range(1, _LARGEST + 1) if runs % size == 0)
 
 
 def vmap_in_chunks(function: Callable[..., Any], size: int) -> Callable[..., Any]:

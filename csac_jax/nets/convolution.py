@@ -14,7 +14,10 @@ import functools
 import jax
 import jax.numpy as jnp
 
-_LAYOUT = ("NHWC", "HWIO", "NHWC")
+# (maps, kernel, strides, padding, dilation of the maps, dilation of the kernel)
+_convolve = functools.partial(
+    jax.lax.conv_general_dilated, dimension_numbers=("NHWC", "HWIO", "NHWC")
+)
 
 
 def conv2d(
@@ -46,59 +49,22 @@ def _product_of_blocks(maps: jax.Array, kernel: jax.Array, stride: int) -> jax.A
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
-def _conv2d(
-    maps: jax.Array, kernel: jax.Array, stride: int, dilation: int, padding: int
-) -> jax.Array:
-    pad = [(padding, padding)] * 2
-    return jax.lax.conv_general_dilated(
-        maps,
-        kernel,
-        (stride, stride),
-        pad,
-        rhs_dilation=(dilation, dilation),
-        dimension_numbers=_LAYOUT,
-    )
+def _conv2d(maps, kernel, stride, dilation, padding) -> jax.Array:
+    sides = [(padding, padding)] * 2
+    return _convolve(maps, kernel, (stride, stride), sides, (1, 1), (dilation, dilation))
 
 
-def _forward(maps: jax.Array, kernel: jax.Array, stride: int, dilation: int, padding: int):
-    return _conv2d(maps, kernel, stride, dilation, padding), (maps, kernel)
-
-
-def _backward(
-    stride: int,
-    dilation: int,
-    padding: int,
-    saved: tuple[jax.Array, jax.Array],
-    gradient: jax.Array,
-):
+def _maps_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
+    """d loss / d maps: `gradient` [B, H', W', O], dilated by `stride`, times the flipped kernel."""
     maps, kernel = saved
-    return (
-        _maps_gradient(maps, kernel, gradient, stride, dilation, padding),
-        _kernel_gradient(maps, kernel, gradient, stride, dilation, padding),
-    )
-
-
-def _maps_gradient(maps, kernel, gradient, stride, dilation, padding) -> jax.Array:
-    """d loss / d maps [B, H, W, I]: the gradient [B, H', W', O], dilated by `stride`, convolved
-    with the flipped kernel."""
-    flipped = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
     low = dilation * (kernel.shape[0] - 1) - padding
-    pad = [
-        (low, size - (out - 1) * stride - 1 + padding)
-        for size, out in zip(maps.shape[1:3], gradient.shape[1:3], strict=True)
-    ]
-    return jax.lax.conv_general_dilated(
-        gradient,
-        flipped,
-        (1, 1),
-        pad,
-        lhs_dilation=(stride, stride),
-        rhs_dilation=(dilation, dilation),
-        dimension_numbers=_LAYOUT,
-    )
+    lengths = zip(maps.shape[1:3], gradient.shape[1:3], strict=True)
+    sides = [(low, length - (out - 1) * stride - 1 + padding) for length, out in lengths]
+    flipped = jnp.swapaxes(kernel[::-1, ::-1], 2, 3)
+    return _convolve(gradient, flipped, (1, 1), sides, (stride, stride), (dilation, dilation))
 
 
-def _kernel_gradient(maps, kernel, gradient, stride, dilation, padding) -> jax.Array:
+def _kernel_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
     """d loss / d kernel [k, k, I, O]: the maps, channels as batch, convolved with the gradient.
 
     If the gradient has fewer channels, a CPU convolves the other way round: fewer channels as batch
@@ -106,32 +72,31 @@ def _kernel_gradient(maps, kernel, gradient, stride, dilation, padding) -> jax.A
     them, which changes no sum: XLA's convolution library (`runtime.compiler`) leaves those to
     Eigen, two to three times as fast at so few outputs.
     """
-    size = kernel.shape[0]
-    on_cpu = jax.default_backend() == "cpu"
+    maps, kernel = saved
+    size, on_cpu = kernel.shape[0], jax.default_backend() == "cpu"
     if dilation > 1 and not on_cpu:
-        taps = _kernel_gradient_by_taps(maps, gradient, size, stride, dilation, padding)
-        return taps.astype(kernel.dtype)
+        return _kernel_gradient_by_taps(stride, dilation, padding, saved, gradient)
     swapped = on_cpu and stride == 1 and maps.shape[-1] > gradient.shape[-1]
     batch, window, pad = maps, gradient, padding
     if swapped:
         batch, window, pad = gradient, maps, dilation * (size - 1) - padding
     row_stride = 2 if on_cpu else 1
-    taps = jax.lax.conv_general_dilated(
+    taps = _convolve(
         jnp.transpose(batch, (3, 1, 2, 0)),  # [I, H, W, B]
         jnp.transpose(window, (1, 2, 0, 3)),  # [H', W', B, O]
         (row_stride * dilation, dilation),
         [(row_stride * pad, row_stride * pad), (pad, pad)],
-        lhs_dilation=(row_stride, 1),
-        rhs_dilation=(row_stride * stride, stride),
-        dimension_numbers=_LAYOUT,
+        (row_stride, 1),
+        (row_stride * stride, stride),
     )[:, :size, :size]  # [I, k, k, O]
     if swapped:
         return jnp.transpose(taps, (1, 2, 3, 0))[::-1, ::-1]
     return jnp.transpose(taps, (1, 2, 0, 3))
 
 
-def _kernel_gradient_by_taps(maps, gradient, size, stride, dilation, padding) -> jax.Array:
-    """`_kernel_gradient` as a matrix product for each of the kernel's taps; float32."""
+def _kernel_gradient_by_taps(stride, dilation, padding, saved, gradient) -> jax.Array:
+    """`_kernel_gradient` as a matrix product for each of the kernel's taps, summed in float32."""
+    maps, kernel = saved
     padded = jnp.pad(maps, ((0, 0), (padding, padding), (padding, padding), (0, 0)))
     rows, cols = (stride * (length - 1) + 1 for length in gradient.shape[1:3])
 
@@ -139,8 +104,12 @@ def _kernel_gradient_by_taps(maps, gradient, size, stride, dilation, padding) ->
         window = padded[:, row : row + rows : stride, col : col + cols : stride]
         return jnp.einsum("bhwi,bhwo->io", window, gradient, preferred_element_type=jnp.float32)
 
-    offsets = [dilation * i for i in range(size)]
-    return jnp.stack([jnp.stack([tap(row, col) for col in offsets]) for row in offsets])
+    offsets = range(0, dilation * kernel.shape[0], dilation)
+    taps = jnp.stack([tap(row, col) for row in offsets for col in offsets])
+    return taps.reshape(kernel.shape).astype(kernel.dtype)
 
 
-_conv2d.defvjp(_forward, _backward)
+_conv2d.defvjp(
+    lambda maps, kernel, *window: (_conv2d(maps, kernel, *window), (maps, kernel)),
+    lambda *args: (_maps_gradient(*args), _kernel_gradient(*args)),
+)

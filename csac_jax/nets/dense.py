@@ -18,9 +18,7 @@ from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets.convolution import conv2d
 
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
-COLOUR_MIN_HEIGHT = 0.002  # m: lower cells are bare table, of which no net sees the colour
 OUTPUT_INIT = nn.initializers.variance_scaling(0.01, "fan_in", "normal")  # maps begin near 0
-_HEIGHT_SCALE = 0.05  # m, a block's height: brings heights near 1
 _GROUP_SIZE = 8  # channels per group of the norm
 _EPSILON = 1e-6  # of the norm, Flax's
 
@@ -32,54 +30,36 @@ def compute_dtype(cfg: NetConfig) -> Any:
     return jnp.dtype(cfg.dtype)
 
 
-def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
-    """The net's input maps [..., H, W, I]; bare table is 0, like cells outside of a rotated map.
-
-    Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m; target [..., H, W] bool or
-    None. I = 1, + 3, + 1.
-    """
-    maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
-    if colour is not None:
-        maps.insert(0, jnp.where(height[..., None] > COLOUR_MIN_HEIGHT, colour - 0.5, 0.0))
-    if target is not None:
-        maps.append(target[..., None].astype(height.dtype))
-    return jnp.concatenate(maps, axis=-1)
-
-
 class Convolution(nn.Module):
-    """Convolution without bias: [B, H, W, I] -> [B, H', W', features]."""
+    """Convolution without bias, zero-padded: [B, H, W, I] -> [B, H / s, W / s, features]."""
 
     features: int
-    size: int  # cells, side of the kernel
-    padding: int  # cells of zeros around the maps
-    stride: int = 1
+    size: int  # cells, side of the kernel; size - s is even
+    dtype: Any
+    stride: int = 1  # s
     dilation: int = 1
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
         shape = (self.size, self.size, maps.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.he_normal(), shape)
         maps, kernel = maps.astype(self.dtype), kernel.astype(self.dtype)
-        return conv2d(maps, kernel, self.stride, self.dilation, self.padding)
+        padding = self.dilation * (self.size - self.stride) // 2
+        return conv2d(maps, kernel, self.stride, self.dilation, padding)
 
 
 class Trunk(nn.Module):
-    """Features of rotated maps: [B, C, C, I] -> [B, C / stride, C / stride, F].
-
-    F = stem + layers * growth.
-    """
+    """Features of maps: [B, C, C, I] -> [B, h, h, stem + layers * growth], h = C / stride."""
 
     cfg: SmallNet
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
-        cfg, stride, dtype = self.cfg, self.cfg.stride, compute_dtype(self.cfg)
-        stem = Convolution(cfg.stem, 2 * stride, stride // 2, stride, dtype=dtype)
-        features = nn.relu(GroupNorm(dtype)(stem(maps)))
+        cfg, dtype = self.cfg, compute_dtype(self.cfg)
+        stem = Convolution(cfg.stem, 2 * cfg.stride, dtype, stride=cfg.stride)(maps)
+        features = nn.relu(GroupNorm(dtype)(stem))
         for dilation in cfg.dilations:
-            layer = Convolution(cfg.growth, 3, dilation, dilation=dilation, dtype=dtype)
-            new = layer(features)
+            new = Convolution(cfg.growth, 3, dtype, dilation=dilation)(features)
             features = jnp.concatenate([features, nn.relu(GroupNorm(dtype)(new))], axis=-1)
         return features
 
@@ -91,11 +71,9 @@ class Head(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
-        del train  # group norm is the same in both
-        cfg = self.cfg
-        hidden = nn.relu(nn.Dense(cfg.head, dtype=compute_dtype(cfg))(features))
-        output = nn.Dense(OUTPUTS * cfg.subcells**2, kernel_init=OUTPUT_INIT)
-        return pixel_shuffle(output(hidden.astype(jnp.float32)), cfg.subcells)
+        hidden = nn.relu(nn.Dense(self.cfg.head, dtype=compute_dtype(self.cfg))(features))
+        output = nn.Dense(OUTPUTS * self.cfg.subcells**2, kernel_init=OUTPUT_INIT)
+        return pixel_shuffle(output(hidden.astype(jnp.float32)), self.cfg.subcells)
 
 
 def pixel_shuffle(maps: jax.Array, factor: int) -> jax.Array:
@@ -134,19 +112,14 @@ class GroupNorm(nn.Module):
 
 
 class Critic(nn.Module):
-    """Q in three maps per frame, and the features that the actor reads."""
+    """Q in three maps per frame, and the features that the actor reads; the same with `train`.
+
+    [B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s = subcells.
+    """
 
     cfg: SmallNet
 
-    def setup(self) -> None:
-        self.trunk = Trunk(self.cfg)
-        self.head = Head(self.cfg)
-
+    @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, s h, s h, OUTPUTS] and features [B, h, h, F].
-
-        h = C / stride, s = subcells.
-        """
-        del train  # group norm is the same in both
-        features = self.trunk(maps)
-        return self.head(features), features
+        features = Trunk(self.cfg, name="trunk")(maps)
+        return Head(self.cfg, name="head")(features), features

@@ -17,36 +17,17 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
 from csac_jax.config import DenseNet121
-from csac_jax.nets.dense import COLOUR_MIN_HEIGHT, OUTPUT_INIT, OUTPUTS, compute_dtype
+from csac_jax.nets.dense import OUTPUT_INIT, OUTPUTS, compute_dtype
 from csac_jax.nets.products import Stem, TapConvolution, average_pool, max_pool
 
-# Of ImageNet: torchvision's weights want colours normalised by these.
-_COLOUR_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
-_COLOUR_STD = np.array([0.229, 0.224, 0.225], np.float32)
-_HEIGHT_SCALE = 0.03  # m (VPG)
+HEIGHT_SCALE = 0.03  # m (VPG, which subtracts a mean from heights too)
+# Mean and standard deviation of ImageNet's colours, by which torchvision's weights want them.
+COLOUR_SCALE = np.array([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32)
 _BOTTLENECK = 4  # channels of a layer's 1 x 1 convolution per channel that the layer adds
 _EPSILON = 1e-5  # of both norms, torchvision's
 _MOMENTUM = 0.9  # share that running statistics keep in an update; torchvision writes 0.1
 _MAX_GROUPS = 32  # of group norm
 _SAVED = "saved"  # name of values that the backward pass does not compute again
-
-
-def inputs(colour: jax.Array | None, height: jax.Array, target: jax.Array | None) -> jax.Array:
-    """The net's input maps [..., H, W, I], I = 1, + 3 with colour, + 1 with target.
-
-    Bare table is 0, like cells outside of a rotated map; VPG subtracts a mean from heights too.
-
-    Args: colour [..., H, W, 3] in 0..1 or None; height [..., H, W] m; target [..., H, W] bool or
-    None.
-    """
-    maps = [jnp.maximum(height, 0.0)[..., None] / _HEIGHT_SCALE]
-    if colour is not None:
-        mean, std = (jnp.broadcast_to(v, colour.shape) for v in (_COLOUR_MEAN, _COLOUR_STD))
-        normalised = (colour - mean) / std
-        maps.insert(0, jnp.where(height[..., None] > COLOUR_MIN_HEIGHT, normalised, 0.0))
-    if target is not None:
-        maps.append(target[..., None].astype(height.dtype))
-    return jnp.concatenate(maps, axis=-1)
 
 
 class Piece(NamedTuple):
@@ -79,9 +60,7 @@ class BatchNorm(nn.Module):
     dtype: Any
 
     @nn.compact
-    def __call__(
-        self, maps: jax.Array, statistics: tuple[jax.Array, jax.Array] | None
-    ) -> jax.Array:
+    def __call__(self, maps: jax.Array, statistics: Sequence[jax.Array] | None) -> jax.Array:
         shape = maps.shape[-1:]
         running = [self.variable("batch_stats", "mean", jnp.zeros, shape)]
         running += [self.variable("batch_stats", "var", jnp.ones, shape)]
@@ -92,9 +71,8 @@ class BatchNorm(nn.Module):
             for variable, value in zip(running, statistics, strict=True):
                 variable.value = _MOMENTUM * variable.value + (1.0 - _MOMENTUM) * value
         factor = scale * jax.lax.rsqrt(variance + _EPSILON)
-        factor, shift = (
-            leaf.reshape((1,) * (maps.ndim - 1) + shape) for leaf in (factor, bias - mean * factor)
-        )
+        leaves = (factor, bias - mean * factor)
+        factor, shift = (leaf.reshape((1,) * (maps.ndim - 1) + shape) for leaf in leaves)
         return (maps.astype(jnp.float32) * factor + shift).astype(self.dtype)
 
 
@@ -103,15 +81,10 @@ def _norm(cfg: DenseNet121, pieces: Sequence[Piece], train: bool, name: str) -> 
     dtype = compute_dtype(cfg)
     maps, *statistics = (jnp.concatenate(leaves, axis=-1) for leaves in zip(*pieces, strict=True))
     if cfg.norm == "batch":
-        return BatchNorm(dtype, name=name)(maps, (statistics[0], statistics[1]) if train else None)
-    groups = math.gcd(_MAX_GROUPS, maps.shape[-1])
-    return nn.GroupNorm(
-        groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=(-3, -2, -1), name=name
-    )(maps)
-
-
-def _convolution(cfg: DenseNet121, features: int, size: int, name: str) -> TapConvolution:
-    return TapConvolution(features, size, compute_dtype(cfg), name=name)
+        return BatchNorm(dtype, name=name)(maps, statistics if train else None)
+    groups, axes = math.gcd(_MAX_GROUPS, maps.shape[-1]), (-3, -2, -1)
+    norm = nn.GroupNorm(groups, epsilon=_EPSILON, dtype=dtype, reduction_axes=axes, name=name)
+    return norm(maps)
 
 
 class DenseLayer(nn.Module):
@@ -121,15 +94,15 @@ class DenseLayer(nn.Module):
 
     @nn.compact
     def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
-        growth = self.cfg.block_growth
+        growth, dtype = self.cfg.block_growth, compute_dtype(self.cfg)
         hidden = nn.relu(_norm(self.cfg, pieces, train, "norm1"))
-        narrow = _piece(_convolution(self.cfg, _BOTTLENECK * growth, 1, "conv1")(hidden))
+        narrow = _piece(TapConvolution(_BOTTLENECK * growth, 1, dtype, name="conv1")(hidden))
         hidden = nn.relu(_norm(self.cfg, [narrow], train, "norm2"))
-        return _piece(_convolution(self.cfg, growth, 3, "conv2")(hidden))
+        return _piece(TapConvolution(growth, 3, dtype, name="conv2")(hidden))
 
 
 class DenseBlock(nn.Module):
-    """Dense layers, each on the pieces of all before it.
+    """Dense layers, each on all pieces before it; returns all.
 
     A norm joins the pieces that it reads. Joined after every layer, as the paper draws it, all
     channels would be written once more per layer.
@@ -139,10 +112,9 @@ class DenseBlock(nn.Module):
     layers: int
 
     @nn.compact
-    def __call__(self, maps: Piece, train: bool) -> tuple[Piece, ...]:
-        pieces: tuple[Piece, ...] = (maps,)
+    def __call__(self, pieces: list[Piece], train: bool) -> list[Piece]:
         for i in range(self.layers):
-            pieces += (DenseLayer(self.cfg, name=f"denselayer{i + 1}")(pieces, train),)
+            pieces = [*pieces, DenseLayer(self.cfg, name=f"denselayer{i + 1}")(pieces, train)]
         return pieces
 
 
@@ -155,7 +127,8 @@ class TransitionLayer(nn.Module):
     def __call__(self, pieces: Sequence[Piece], train: bool) -> Piece:
         channels = sum(piece.maps.shape[-1] for piece in pieces)
         maps = nn.relu(_norm(self.cfg, pieces, train, "norm"))
-        return _piece(average_pool(_convolution(self.cfg, channels // 2, 1, "conv")(maps)))
+        halve = TapConvolution(channels // 2, 1, compute_dtype(self.cfg), name="conv")
+        return _piece(average_pool(halve(maps)))
 
 
 class DenseNetTrunk(nn.Module):
@@ -170,12 +143,11 @@ class DenseNetTrunk(nn.Module):
     def __call__(self, maps: jax.Array, train: bool = False) -> jax.Array:
         stem = 2 * self.cfg.block_growth
         maps = Stem(stem, self.cfg.zoom > 1, compute_dtype(self.cfg), name="conv0")(maps)
-        piece = _piece(max_pool(nn.relu(_norm(self.cfg, [_piece(maps)], train, "norm0"))))
-        pieces: tuple[Piece, ...] = ()
-        for i, layers in enumerate(self.cfg.block_layers, start=1):
-            pieces = DenseBlock(self.cfg, layers, name=f"denseblock{i}")(piece, train)
-            if i < len(self.cfg.block_layers):
-                piece = TransitionLayer(self.cfg, name=f"transition{i}")(pieces, train)
+        pieces = [_piece(max_pool(nn.relu(_norm(self.cfg, [_piece(maps)], train, "norm0"))))]
+        for i, layers in enumerate(self.cfg.block_layers):
+            if i > 0:
+                pieces = [TransitionLayer(self.cfg, name=f"transition{i}")(pieces, train)]
+            pieces = DenseBlock(self.cfg, layers, name=f"denseblock{i + 1}")(pieces, train)
         return _norm(self.cfg, pieces, train, "norm5")
 
 
@@ -206,6 +178,7 @@ def _upsample(maps: jax.Array, factor: int) -> jax.Array:
 class DenseNetCritic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads.
 
+    [B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS] and features [B, h, w, F].
     The backward pass keeps outputs of convolutions and computes those of norms again.
     """
 
@@ -213,30 +186,27 @@ class DenseNetCritic(nn.Module):
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        """[B, C, C, I] -> Q [B, C / output_stride, C / output_stride, OUTPUTS] and features
-        [B, h, w, F]."""
         policy = jax.checkpoint_policies.save_only_these_names(_SAVED)
         apply = nn.vmap(
             nn.remat(lambda trunk, inputs: trunk(inputs, train), policy=policy),
             variable_axes={"params": 0, "batch_stats": 0},
             split_rngs={"params": True},
         )
-        inputs = _trunk_inputs(self.cfg, maps)
-        features = apply(DenseNetTrunk(self.cfg, name="trunk"), inputs)  # [T, B, h, w, f]
+        trunk = DenseNetTrunk(self.cfg, name="trunk")
+        features = apply(trunk, _trunk_inputs(self.cfg, maps))  # [T, B, h, w, f]
         features = jnp.concatenate(list(features), axis=-1)
         return DenseNetHead(self.cfg, name="head")(features, train), features
 
 
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
-    """Each trunk's input [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map
-    three times.
+    """Inputs [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map three times.
 
     z = zoom / 2, at least 1: a trunk doubles its cells itself. The barrier keeps XLA from rotating
     the maps once per window.
     """
-    colour, rest = (maps[..., :3], maps[..., 3:]) if cfg.colour else (maps[..., :0], maps)
-    inputs = [colour] if cfg.colour else []
-    inputs += [jnp.repeat(rest[..., i : i + 1], 3, axis=-1) for i in range(rest.shape[-1])]
+    inputs = [maps[..., :3]] if cfg.colour else []
+    others = range(3 * len(inputs), maps.shape[-1])
+    inputs += [jnp.repeat(maps[..., i : i + 1], 3, axis=-1) for i in others]
     stacked = jax.lax.optimization_barrier(jnp.stack(inputs).astype(compute_dtype(cfg)))
     zoom = max(cfg.zoom // 2, 1)
     return jnp.repeat(jnp.repeat(stacked, zoom, axis=2), zoom, axis=3)

@@ -8,17 +8,16 @@ else the running ones. A critic of your own is any Flax module of that signature
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from csac_jax.config import DenseNet121, NetConfig, SmallNet
+from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets import dense, densenet
 
-STATISTICS = "batch_stats"
+_BARE = 0.002  # m: lower cells are bare table, of which no net sees the colour
 _FULL = 640  # px, ours: side of passes of which one state is seen at a time
 
 
@@ -30,14 +29,24 @@ class Networks:
     head: nn.Module
     stride: int  # cells of the critic's input per cell of its maps, along each axis
     colour: bool  # the critic sees colours
-    stack: Callable[..., jax.Array]  # colour or None, height, target or None -> maps [..., H, W, I]
+    height_scale: float = 0.05  # m, becomes 1; a block's height
+    colour_scale: Any = (0.5, 1.0)  # mean and standard deviation, of all colours or of each [3]
     zoom: int = 0  # pixels of the input per cell of the map; 0: any number of states at a time
     one_vector: bool = False  # the optimiser sees one vector: a GPU is slow with many small arrays
 
     def inputs(self, colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:
-        """What the critic is fed [..., H, W, I], from colour [..., H, W, 3], height [..., H, W] m
-        and target [..., H, W] bool."""
-        return self.stack(colour if self.colour else None, height, target)
+        """The critic's input maps [..., H, W, I]: 3 of colour or none, 1 of height, 1 of target.
+
+        Bare table is 0, like cells outside of a rotated map. Args: colour [..., H, W, 3] in 0..1;
+        height [..., H, W] m; target [..., H, W] bool or None.
+        """
+        maps = [jnp.maximum(height, 0.0)[..., None] / self.height_scale]
+        if self.colour:
+            mean, std = (jnp.broadcast_to(leaf, colour.shape) for leaf in self.colour_scale)
+            maps.insert(0, jnp.where(height[..., None] > _BARE, (colour - mean) / std, 0.0))
+        if target is not None:
+            maps.append(target[..., None].astype(height.dtype))
+        return jnp.concatenate(maps, axis=-1)
 
     def states_at_once(self, canvas: int) -> int | None:
         """States, of passes of canvas x canvas cells, that the critic sees at a time; None for any.
@@ -48,33 +57,16 @@ class Networks:
         return max(1, round((_FULL / (self.zoom * canvas)) ** 2)) if self.zoom else None
 
 
-def _small(cfg: SmallNet) -> Networks:
-    stride = cfg.stride // cfg.subcells
-    return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour, dense.inputs)
-
-
-def _densenet(cfg: DenseNet121) -> Networks:
-    return Networks(
-        densenet.DenseNetCritic(cfg),
-        densenet.DenseNetHead(cfg),
-        cfg.output_stride,
-        cfg.colour,
-        densenet.inputs,
-        zoom=cfg.zoom,
-        one_vector=True,
-    )
-
-
-BUILDERS: dict[type, Callable[[Any], Networks]] = {SmallNet: _small, DenseNet121: _densenet}
-
-
 def make(cfg: NetConfig, critic: Any = None) -> Networks:
     """The networks of a config, or those of the Flax module `critic` with a head of `cfg.head`."""
-    if critic is None:
-        build = next(BUILDERS[kind] for kind in type(cfg).__mro__ if kind in BUILDERS)
-        return build(cfg)
-    head = dense.Head(SmallNet(head=cfg.head))
-    return Networks(critic, head, critic.stride, cfg.colour, dense.inputs)
+    if critic is not None:
+        return Networks(critic, dense.Head(SmallNet(head=cfg.head)), critic.stride, cfg.colour)
+    if isinstance(cfg, SmallNet):
+        stride = cfg.stride // cfg.subcells
+        return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour)
+    modules = densenet.DenseNetCritic(cfg), densenet.DenseNetHead(cfg)
+    scales = densenet.HEIGHT_SCALE, densenet.COLOUR_SCALE
+    return Networks(*modules, cfg.output_stride, cfg.colour, *scales, cfg.zoom, one_vector=True)
 
 
 def learned(variables: Any) -> Any:
@@ -84,8 +76,7 @@ def learned(variables: Any) -> Any:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _traced_once(net: nn.Module, variables: Any, maps: jax.Array) -> Any:
-    """What a net makes of [N, C, C, I], traced once for all looks: to trace DenseNet-121 takes
-    seconds."""
+    """What a net makes of [N, C, C, I], traced once: to trace DenseNet-121 takes seconds."""
     return net.apply(variables, maps)
 
 
@@ -93,28 +84,12 @@ def apply(networks: Networks, variables: Any, maps: jax.Array) -> tuple[jax.Arra
     """Q [B, N, ...] and features [B, N, ...] of states of N passes each [B, N, C, C, I]."""
     critic, group = networks.critic, networks.states_at_once(maps.shape[2])
     if group is not None:
-        at_once = group if group > 1 else None
-        return jax.lax.map(
-            lambda one: _traced_once(critic, variables, one), maps, batch_size=at_once
-        )
+        of_state = functools.partial(_traced_once, critic, variables)
+        return jax.lax.map(of_state, maps, batch_size=group if group > 1 else None)
     flat: Any = critic.apply(variables, maps.reshape(-1, *maps.shape[2:]))
     return jax.tree.map(lambda leaf: leaf.reshape(*maps.shape[:2], *leaf.shape[1:]), flat)
 
 
 def train(net: nn.Module, variables: Any, maps: jax.Array) -> tuple[Any, Any]:
-    """Outputs of a net by the statistics of this batch, and the running ones after it, {} without
-    batch norm."""
-    return net.apply(variables, maps, train=True, mutable=[STATISTICS])
-
-
-def with_trunk(variables: Any, trunk: Any) -> Any:
-    """A critic's variables, leaves [M, T, ...], with `trunk`'s, leaves [...], in each of its
-    trunks."""
-
-    def fill(old: jax.Array, new: Any) -> jax.Array:
-        return jnp.broadcast_to(jnp.asarray(new, old.dtype), old.shape)
-
-    return {
-        name: {**modules, "trunk": jax.tree.map(fill, modules["trunk"], trunk[name])}
-        for name, modules in variables.items()
-    }
+    """Outputs of a net by this batch's statistics, and the running ones after it ({} if none)."""
+    return net.apply(variables, maps, train=True, mutable=["batch_stats"])

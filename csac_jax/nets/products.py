@@ -5,11 +5,14 @@ also tunes each of them, which takes minutes in all (`experiments/bench`).
 """
 
 import functools
+import itertools
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+
+from csac_jax.nets.dense import pixel_shuffle
 
 _STEM = 7  # pixels, side of the first convolution's kernel
 _KAIMING = nn.initializers.variance_scaling(2.0, "fan_in", "normal")  # torchvision's
@@ -27,12 +30,10 @@ class TapConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
-        ins, taps = maps.shape[-1], self.size**2
-        shape = (self.size, self.size, ins, self.features)
+        shape = (self.size, self.size, maps.shape[-1], self.features)
         kernel = self.param("kernel", _KAIMING, shape).astype(self.dtype)
-        matrix = jnp.transpose(kernel, (2, 0, 1, 3)).reshape(ins, taps * self.features)
-        products = _times(maps, matrix)
-        return products if taps == 1 else shift_and_add(products, self.size)
+        products = _times(maps, jnp.transpose(kernel, (2, 0, 1, 3)))
+        return products if self.size == 1 else shift_and_add(products, self.size)
 
 
 class Stem(nn.Module):
@@ -52,34 +53,27 @@ class Stem(nn.Module):
         if self.doubled:  # taps on the same cell are summed: of a row, the first alone, then pairs
             side = (_STEM + 1) // 2
             padded = jnp.pad(kernel, ((1, 0), (1, 0), (0, 0), (0, 0)))
-            pairs = padded.reshape(side, 2, side, 2, *kernel.shape[2:])
-            kernel = jnp.sum(pairs, axis=(1, 3))
+            kernel = padded.reshape(side, 2, side, 2, *kernel.shape[2:]).sum((1, 3))
         taps = windows(maps, len(kernel), 1 if self.doubled else 2)
         return _times(jnp.concatenate(taps, axis=-1), kernel.astype(self.dtype))
 
 
 def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
-    """Maps [..., I] times a matrix [..., O], whose other axes have I entries together: [..., O].
+    """Maps [..., I] times a matrix of I rows, whatever its axes: [..., O].
 
     A plain product: over several axes XLA would transpose all maps for the matrix's gradient.
     """
-    matrix = matrix.reshape(maps.shape[-1], -1)
-    return (maps.reshape(-1, maps.shape[-1]) @ matrix).reshape(*maps.shape[:-1], -1)
+    rows = maps.shape[-1]
+    return (maps.reshape(-1, rows) @ matrix.reshape(rows, -1)).reshape(*maps.shape[:-1], -1)
 
 
 def windows(maps: jax.Array, size: int, stride: int = 1) -> list[jax.Array]:
-    """The window [B, H / stride, W / stride, F] of each tap of a kernel, row by row.
-
-    Maps are [B, H, W, F], zero-padded.
-    """
+    """Windows [B, H / stride, W / stride, F] of a kernel's taps, row by row, zeros around maps."""
     rows, cols = maps.shape[1:3]
     around = (size // 2, (size - 1) // 2)
     padded = jnp.pad(maps, ((0, 0), around, around, (0, 0)))
-    return [
-        padded[:, i : i + rows : stride, j : j + cols : stride]
-        for i in range(size)
-        for j in range(size)
-    ]
+    taps = itertools.product(range(size), repeat=2)
+    return [padded[:, i : i + rows : stride, j : j + cols : stride] for i, j in taps]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
@@ -96,21 +90,15 @@ def shift_and_add(products: jax.Array, size: int) -> jax.Array:
     return functools.reduce(jnp.add, shifted).astype(products.dtype)
 
 
-def _shift_and_add_forward(products: jax.Array, size: int) -> tuple[jax.Array, None]:
-    return shift_and_add(products, size), None
-
-
-def _shift_and_add_backward(size: int, _: None, gradient: jax.Array) -> tuple[jax.Array]:
-    return (jnp.concatenate(windows(gradient, size)[::-1], axis=-1),)
-
-
-shift_and_add.defvjp(_shift_and_add_forward, _shift_and_add_backward)
+shift_and_add.defvjp(
+    lambda products, size: (shift_and_add(products, size), None),
+    lambda size, _, gradient: (jnp.concatenate(windows(gradient, size)[::-1], axis=-1),),
+)
 
 
 @jax.custom_vjp
 def max_pool(maps: jax.Array) -> jax.Array:
-    """Maximum over 3 x 3 cells, stride 2: [B, H, W, F], H and W even, none below 0 -> [B, H / 2,
-    W / 2, F].
+    """Maximum over 3 x 3 cells, stride 2: [B, 2 H, 2 W, F], none below 0 -> [B, H, W, F].
 
     The gradient goes to the first of the largest. It is written out: that of XLA's own window needs
     an operation that GPUs lack in deterministic mode (flax issue 4233).
@@ -129,36 +117,26 @@ def _max_pool_forward(maps: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _max_pool_backward(which: jax.Array, gradient: jax.Array) -> tuple[jax.Array]:
-    """Cells of even row lie in the middle row of one window, those of odd row in two windows;
-    columns likewise."""
+    """Even rows lie in the middle row of one window, odd rows in two windows; columns likewise."""
     padded = [jnp.pad(leaf, ((0, 0), (0, 1), (0, 1), (0, 0))) for leaf in (which, gradient)]
     rows, cols = which.shape[1:3]
 
-    def share_of(down: int, right: int, tap: int) -> jax.Array:
+    def share_of(vertical: tuple[int, int], horizontal: tuple[int, int]) -> jax.Array:
+        (down, i), (right, j) = vertical, horizontal
         index, share = (leaf[:, down : down + rows, right : right + cols] for leaf in padded)
-        return jnp.where(index == tap, share, 0)
+        return jnp.where(index == 3 * i + j, share, 0)
 
     # By parity: (windows further on, row of the window that the cell lies in).
     offsets = (((0, 1),), ((0, 2), (1, 0)))
-    cells = [
-        sum(
-            share_of(down, right, 3 * i + j)
-            for down, i in offsets[odd_row]
-            for right, j in offsets[odd_col]
-        )
-        for odd_row in (0, 1)
-        for odd_col in (0, 1)
-    ]
-    batch, channels = which.shape[0], which.shape[-1]
-    grid = jnp.stack(cells, axis=-2).reshape(batch, rows, cols, 2, 2, channels)
-    return (jnp.transpose(grid, (0, 1, 3, 2, 4, 5)).reshape(batch, 2 * rows, 2 * cols, channels),)
+    parities = itertools.product(offsets, repeat=2)
+    cells = [sum(itertools.starmap(share_of, itertools.product(*parity))) for parity in parities]
+    return (pixel_shuffle(jnp.concatenate(cells, axis=-1), 2),)
 
 
 max_pool.defvjp(_max_pool_forward, _max_pool_backward)
 
 
 def average_pool(maps: jax.Array) -> jax.Array:
-    """Mean of 2 x 2 cells: [B, H, W, F], H and W even -> [B, H / 2, W / 2, F]."""
-    return 0.25 * (
-        maps[:, ::2, ::2] + maps[:, ::2, 1::2] + maps[:, 1::2, ::2] + maps[:, 1::2, 1::2]
-    )
+    """Mean of 2 x 2 cells: [B, 2 H, 2 W, F] -> [B, H, W, F]."""
+    quarters = (maps[:, i::2, j::2] for i in (0, 1) for j in (0, 1))
+    return 0.25 * functools.reduce(jnp.add, quarters)

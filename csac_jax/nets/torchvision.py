@@ -15,32 +15,21 @@ import numpy as np
 from csac_jax.config import DenseNet121
 from csac_jax.nets import densenet
 
-_LEAVES = {
-    "kernel": "weight",
-    "scale": "weight",
-    "bias": "bias",
-    "mean": "running_mean",
-    "var": "running_var",
-}
-
-
-def _needed(name: str) -> bool:
-    """False for the classifier and the counters of batch norm."""
-    return not name.startswith("classifier.") and not name.endswith(".num_batches_tracked")
+_NAMES = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
 
 
 def variables(cfg: DenseNet121, tensors: Mapping[str, np.ndarray]) -> Any:
     """Variables of one trunk, float32 leaves [...], from `tensors` by name.
 
-    Raises ValueError naming the first tensor that is missing, misshapen or not known.
+    The classifier and the counters of batch norm are ignored. Raises ValueError naming the first
+    tensor that is missing, misshapen or not known.
     """
     trunk, blank = densenet.DenseNetTrunk(cfg), jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
-    wanted = jax.eval_shape(trunk.init, jax.random.key(0), blank)
     names = set()
 
     def take(path: Any, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
         *modules, kind = (key.key for key in path[1:])
-        name = ".".join(["features", *modules, _LEAVES[kind]])
+        name = ".".join(["features", *modules, _NAMES.get(kind, kind)])
         names.add(name)
         if name not in tensors:
             raise ValueError(f"tensor {name} is missing")
@@ -50,7 +39,9 @@ def variables(cfg: DenseNet121, tensors: Mapping[str, np.ndarray]) -> Any:
             raise ValueError(f"tensor {name} has the shape {list(tensor.shape)}, not {list(shape)}")
         return tensor.transpose(2, 3, 1, 0) if kind == "kernel" else tensor
 
+    wanted = jax.eval_shape(trunk.init, jax.random.key(0), blank)
     taken = jax.tree_util.tree_map_with_path(take, wanted)
-    if extra := sorted(name for name in tensors if _needed(name) and name not in names):
-        raise ValueError(f"tensor {extra[0]} is none of DenseNet-121")
+    for name in sorted(tensors.keys() - names):
+        if not name.startswith("classifier.") and not name.endswith(".num_batches_tracked"):
+            raise ValueError(f"tensor {name} is none of DenseNet-121")
     return taken

@@ -1,7 +1,5 @@
 """The ring of transitions: R1 of CSAC Algorithm 1 line 14. R2, its ranked view, is a sampler's."""
 
-import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -29,31 +27,25 @@ def init(priority: jax.Array, example_item: Any) -> ReplayState:
 
 
 def bytes_needed(capacity: int, example_item: Any) -> int:
-    """Memory of a ring of `capacity` items like `example_item`, whose leaves need no more than
-    `shape` and `dtype`."""
-    item = sum(
-        math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(example_item)
-    )
+    """Memory of a ring of `capacity` items like `example_item`, of leaves or their shapes."""
+    item = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(example_item))
     return capacity * (item + jnp.dtype(jnp.float32).itemsize)  # and its priority
 
 
 def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
-    """Stores the `valid` [E] bool ones of `items` (leaves [E, ...], E <= C) in consecutive slots,
-    in their order.
+    """Stores the `valid` [E] bool ones of `items`, leaves [E, ...], in order; the oldest give way.
 
-    The oldest give way. New items take the largest priority stored, so that none is ranked above
-    them. A scatter to slots that are all different, never a copy of the ring: with the state
-    donated, XLA writes in place.
+    New items take the largest priority stored, 1 in an empty ring, so that none is ranked above
+    them. A scatter to slots that are all different: with the state donated, XLA writes in place.
     """
     capacity, num = state.priority.shape[0], valid.shape[0]
     if num > capacity:
-        raise ValueError(
-            f"replay.capacity: {capacity} slots cannot take {num} transitions at once; raise it"
-        )
+        raise ValueError(f"replay.capacity: must be at least {num}, the transitions of a step")
     position = jnp.cumsum(valid, dtype=jnp.int32)  # [E], 1 for the first valid item
     count = position[-1]
     outside = capacity + jnp.arange(num, dtype=jnp.int32)  # dropped
     slots = jnp.where(valid, (state.head + position - 1) % capacity, outside)
+    largest = jnp.where(state.size > 0, jnp.max(state.priority), 1.0)
 
     def write(ring: jax.Array, new: jax.Array) -> jax.Array:
         return ring.at[slots].set(new, mode="drop", unique_indices=True)
@@ -62,7 +54,7 @@ def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
         items=jax.tree.map(write, state.items, items),
         head=(state.head + count) % capacity,
         size=jnp.minimum(state.size + count, capacity),
-        priority=write(state.priority, jnp.full(num, largest_priority(state))),
+        priority=write(state.priority, jnp.full(num, largest)),
     )
 
 
@@ -71,22 +63,16 @@ def gather(state: ReplayState, slots: jax.Array) -> Any:
     return jax.tree.map(lambda ring: ring.at[slots].get(mode="clip"), state.items)
 
 
-def largest_priority(state: ReplayState) -> jax.Array:
-    """Largest priority stored, [] float32; 1 in an empty ring."""
-    return jnp.where(state.size > 0, jnp.max(state.priority), 1.0)
-
-
 def set_priorities(state: ReplayState, slots: jax.Array, priorities: jax.Array) -> ReplayState:
     """Replaces the priorities of `slots` [B] int32, all filled, by `priorities` [B], at least 0.
 
-    A slot that occurs twice keeps the larger one: two order-free scatters, `min` to 0 and `max`, as
-    the order of conflicting `set`s is undefined. One that is not finite counts as the largest that
-    these slots have or had: the transition is looked at again, no NaN gets into the ranking, and
-    the rest of the ring need not be searched.
+    A slot that occurs twice keeps the larger one: by `min` to 0 and `max`, as the order of
+    conflicting `set`s is undefined. One that is not finite counts as the largest that these slots
+    have or had: the transition is looked at again, and no NaN gets into the ranking.
     """
     finite = jnp.isfinite(priorities)
     known = jnp.where(finite, jnp.minimum(priorities, LARGEST), 0.0)
     largest = jnp.max(jnp.maximum(known, state.priority.at[slots].get(mode="clip")))
     new = jnp.where(finite, known, largest)
     cleared = state.priority.at[slots].min(0.0, mode="drop")
-    return dataclasses.replace(state, priority=cleared.at[slots].max(new, mode="drop"))
+    return state.replace(priority=cleared.at[slots].max(new, mode="drop"))

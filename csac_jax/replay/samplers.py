@@ -6,17 +6,17 @@ Algorithm 1 lines 15-16. A sampler of your own is any object with the methods of
 import abc
 import dataclasses
 import itertools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from csac_jax.config import BetaReplay, PrioritisedReplay, UniformReplay
 from csac_jax.replay import ring
 from csac_jax.replay.ring import ReplayState
 
-_TRIES = 8  # candidates for a gamma variate: none of them is accepted in 1 of 10^10 draws
+_TRIES = 8  # candidates for a gamma variate, accepted with 0.95 each: none in 1 of 10^10 draws
 RADIX = 8  # nodes summed into one; few enough to be added one by one
 BELOW_ONE = 1.0 - 2.0**-23  # largest uniform draw; times any float32 sum it stays below that sum
 
@@ -45,67 +45,49 @@ class Sampler(abc.ABC):
 
     def replace_hyperparams(self, cfg: Any) -> "Sampler":
         """The sampler of a replay section whose numbers may be traced; by default itself."""
-        del cfg
         return self
 
 
-def uniform_slots(key: jax.Array, size: jax.Array, num: int) -> jax.Array:
-    """Slots [num] int32, uniform below `size` [], with repetition; slot 0 if nothing is stored."""
-    return jax.random.randint(key, (num,), 0, jnp.maximum(size, 1), jnp.int32)
-
-
 def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array:
-    """Slots drawn with P(i) = m_i / sum m, independently; Schaul et al. 2016, eq. 1 with m =
-    p^alpha.
+    """Slots drawn with P(i) = m_i / sum m; Schaul et al. 2016, eq. 1 with m = p^alpha.
 
-    Every draw goes down a pyramid of sums, which is built anew from the masses: no update can leave
-    it out of step, as the differences that a sum tree is kept up by do, and in a compiled loop it
-    costs less than their upkeep. The lower half of the way has a uniform number of its own: one
-    float32 has 2^23 values, too few for 2^17 slots. Slots of no mass are never drawn. Draws are not
-    stratified (sec. B.2.1 does): they are independent.
+    Each goes down a pyramid of sums, built for every batch: unlike a sum tree it cannot drift. The
+    lower half of the way has a uniform number of its own: one float32 has 2^23 values, too few for
+    2^17 slots. Draws are independent, not stratified as in sec. B.2.1.
 
-    Args: masses [C], at least 0, and 0 where nothing is stored.
+    Args: masses [C], at least 0, and 0 where nothing is stored: such slots are never drawn.
     Returns: [num] int32 slots, with repetition; slot 0 .. C - 1 if all masses are 0.
     """
-    levels = _pyramid(masses)
     node = jnp.zeros(num, jnp.int32)
-    for half, uniform in zip(_halves(levels), jax.random.uniform(key, (2, num)), strict=True):
+    rows = jnp.arange(RADIX, dtype=jnp.int32)[:, None]
+    for half, uniform in zip(_pyramid(masses), jax.random.uniform(key, (2, num)), strict=True):
         for level in half:
             stride = level.shape[0] // RADIX
-            children = (
-                node[None] + stride * jnp.arange(RADIX, dtype=jnp.int32)[:, None]
-            )  # [RADIX, num]
-            child, uniform = _pick(level.at[children].get(mode="promise_in_bounds"), uniform)
+            children = level.at[node[None] + stride * rows].get(mode="promise_in_bounds")
+            child, uniform = _pick(children, uniform)
             node = node + stride * child
     return jnp.minimum(node, masses.shape[0] - 1)
 
 
-def _pyramid(masses: jax.Array) -> list[jax.Array]:
-    """Levels [RADIX n], top first, of which the last is `masses` [C] padded with 0; each has the
-    sums of the next one.
+def _pyramid(masses: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+    """The upper and the lower half of levels [RADIX n], each the sums of the next one, top first.
 
-    Children of node j < n are j, j + n, j + 2 n ...: neighbours belong to different sums, which is
-    what vectorises.
+    The last is `masses` [C] padded with 0. Children of node j < n are j, j + n, j + 2 n ...: sums
+    over the first axis vectorise.
     """
     levels: list[jax.Array] = []
-    while not levels or levels[-1].shape[0] > RADIX:
-        levels.append(jnp.pad(masses, (0, -masses.shape[0] % RADIX)))
-        masses = jnp.sum(levels[-1].reshape(RADIX, -1), axis=0)
-    return levels[::-1]
-
-
-def _halves(levels: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+    while not levels or levels[0].shape[0] > RADIX:
+        levels.insert(0, jnp.pad(masses, (0, -masses.shape[0] % RADIX)))
+        masses = jnp.sum(levels[0].reshape(RADIX, -1), axis=0)
     middle = (len(levels) + 1) // 2
     return levels[:middle], levels[middle:]
 
 
 def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Rows drawn in proportion to each column of `masses` [RADIX, num], and what is left of
-    `uniform` [num] in 0 .. 1.
+    """Rows drawn by the columns of `masses` [RADIX, num], and what is left of `uniform` [num].
 
-    The sums are made one after the other: then they never fall, a mass of 0 leaves them as they
-    were, and the last is the one that the goal stays below, so that a row of no mass is never the
-    first to exceed it. A parallel `cumsum` promises none of this.
+    Sums made one after the other never fall, and a mass of 0 leaves them as they were: a row of no
+    mass is never the first to exceed the goal. A parallel `cumsum` promises neither.
     """
     reached = list(itertools.accumulate(masses))  # RADIX of [num]
     goal = uniform * reached[-1]
@@ -120,38 +102,23 @@ def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
     return row, jnp.clip(left, 0.0, BELOW_ONE)
 
 
-def weights(masses: jax.Array, exponent: jax.Array | float) -> jax.Array:
-    """Importance weights [B] of draws of `masses` [B]: w_i = (n P(i))^-beta / max_j w_j; Schaul et
-    al. 2016, sec. 3.4.
+def weights(masses: jax.Array, exponent: ArrayLike) -> jax.Array:
+    """w_i = (n P(i))^-beta / max_j w_j [B] of draws of `masses` [B]; Schaul et al. 2016, sec. 3.4.
 
-    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The largest weight is the
-    batch's, not the ring's: the ring's belongs to the least likely transition, which is hardly ever
-    drawn, and would make all steps small.
+    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The maximum is the batch's:
+    by the ring's least likely transition all steps would be small.
     """
     masses = jnp.maximum(masses, jnp.finfo(jnp.float32).tiny)  # of an empty ring all are 0
     return (jnp.min(masses) / masses) ** exponent
 
 
-def weight_exponent(cfg: PrioritisedReplay, progress: jax.Array) -> jax.Array:
-    """beta [] of the weights after the share `progress` [] of all updates: linear, constant outside
-    0 .. 1."""
-    start, end = cfg.is_beta
-    return start + (end - start) * jnp.clip(progress, 0.0, 1.0)
-
-
 def beta_slots(
-    key: jax.Array,
-    values: jax.Array,
-    size: jax.Array,
-    a: jax.Array | float,
-    b: jax.Array | float,
-    num: int,
+    key: jax.Array, values: jax.Array, size: jax.Array, a: ArrayLike, b: ArrayLike, num: int
 ) -> jax.Array:
     """Slots whose rank by value follows Beta(a, b): rank 0 = largest; CSAC sec. 3.5, eq. 17.
 
     rank = floor(n x), x ~ Beta(a, b). Beta(1, 1) is uniform, Beta(1, 2) VPG's power law. Equal
     values share their ranks at random: by slot, the oldest would be preferred. NaN is ranked first.
-    Slots are sorted by value with those not filled last, whatever their values.
 
     Args: values [C], any beyond `size`; size [] filled slots.
     Returns: [num] int32 slots, with repetition, all filled; slot 0 .. C - 1 if nothing is stored.
@@ -160,30 +127,26 @@ def beta_slots(
     slots = jnp.arange(values.shape[0], dtype=jnp.int32)
     descending = -jnp.where(jnp.isnan(values), jnp.inf, values)
     ties = jax.random.bits(key_ties, values.shape)
-    _, _, order = jax.lax.sort(
-        (jnp.where(slots < size, descending, jnp.inf), ties, slots), num_keys=2
-    )
+    filled_first = jnp.where(slots < size, descending, jnp.inf)
+    _, _, order = jax.lax.sort((filled_first, ties, slots), num_keys=2)
     rank = (_beta(key_rank, a, b, num) * size.astype(jnp.float32)).astype(jnp.int32)
     return order[jnp.clip(rank, 0, jnp.maximum(size - 1, 0))]
 
 
-def _beta(key: jax.Array, a: jax.Array | float, b: jax.Array | float, num: int) -> jax.Array:
+def _beta(key: jax.Array, a: ArrayLike, b: ArrayLike, num: int) -> jax.Array:
     """Draws [num] from Beta(a, b), a and b positive, as X / (X + Y) of gamma variates.
 
-    `jax.random.beta` draws again until all are accepted, a loop that a GPU waits for the host in at
-    every turn.
+    `jax.random.beta` draws until all are accepted: a GPU waits for the host at every turn.
     """
     key_x, key_y = jax.random.split(key)
     x, y = _log_gamma(key_x, a, num), _log_gamma(key_y, b, num)
     return jnp.exp(x - jnp.logaddexp(x, y))
 
 
-def _log_gamma(key: jax.Array, shape: jax.Array | float, num: int) -> jax.Array:
-    """Logarithms [num] of draws from Gamma(shape, 1): Marsaglia and Tsang, ACM TOMS 26 (2000),
-    363-372.
+def _log_gamma(key: jax.Array, shape: ArrayLike, num: int) -> jax.Array:
+    """Logarithms [num] of draws from Gamma(shape, 1); Marsaglia and Tsang 2000, ACM TOMS 26, 363.
 
-    The first of _TRIES candidates that is accepted, each with a probability of at least 0.95; for a
-    shape below 1, one from Gamma(shape + 1, 1) times U^(1 / shape).
+    The first accepted candidate; a shape below 1 takes Gamma(shape + 1, 1) times U^(1 / shape).
     """
     key_normal, key_uniform, key_small = jax.random.split(key, 3)
     shape = jnp.asarray(shape, jnp.float32)
@@ -198,19 +161,14 @@ def _log_gamma(key: jax.Array, shape: jax.Array | float, num: int) -> jax.Array:
     return jnp.log(d) + found + jnp.where(shape < 1.0, small, 0.0)
 
 
-def beta_schedule(cfg: BetaReplay, progress: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(a, b) of the Beta law, each [], after the share `progress` [] of all updates; CSAC secs. 3.5
-    and 4.3.
+def beta_schedule(cfg: BetaReplay, progress: jax.Array) -> list[jax.Array]:
+    """a and b of the Beta law, each [], after the share `progress` of all updates; CSAC sec. 3.5.
 
-    Linear from `start` to `middle` at `middle_at`, and on to `end` at 1;
-    constant outside 0 .. 1.
+    Linear from `start` to `middle` at `middle_at`, and on to `end` at 1; constant outside 0 .. 1.
     """
     knots = jnp.asarray([0.0, cfg.middle_at, 1.0], jnp.float32)
-    a, b = (
-        jnp.interp(progress, knots, jnp.asarray(law, jnp.float32))
-        for law in zip(cfg.start, cfg.middle, cfg.end, strict=True)
-    )
-    return a, b
+    laws = zip(cfg.start, cfg.middle, cfg.end, strict=True)
+    return [jnp.interp(progress, knots, jnp.asarray(law, jnp.float32)) for law in laws]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,30 +181,29 @@ class _Configured(Sampler):
         return dataclasses.replace(self, cfg=cfg)
 
 
-@dataclasses.dataclass(frozen=True)
 class Uniform(_Configured):
     """All transitions are equally likely."""
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
-        return Sample(uniform_slots(key, state.size, num), jnp.ones(num))
+        slots = jax.random.randint(key, (num,), 0, jnp.maximum(state.size, 1), jnp.int32)
+        return Sample(slots, jnp.ones(num))
 
 
-@dataclasses.dataclass(frozen=True)
 class Prioritised(_Configured):
     """P(i) ~ (abs(TD error) + epsilon)^alpha; Schaul et al. 2016, sec. 3.3."""
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
         slots = proportional_slots(key, state.priority, num)
-        return Sample(slots, weights(state.priority[slots], weight_exponent(self.cfg, progress)))
+        start, end = self.cfg.is_beta
+        exponent = start + (end - start) * jnp.clip(progress, 0.0, 1.0)
+        return Sample(slots, weights(state.priority[slots], exponent))
 
     def update(self, state: ReplayState, slots: jax.Array, errors: jax.Array) -> ReplayState:
         """Stores the power itself: at every draw it would be taken of the whole ring."""
-        size = jnp.abs(errors).astype(jnp.float32)
-        masses = (size + self.cfg.per_epsilon) ** self.cfg.alpha
+        masses = (jnp.abs(errors).astype(jnp.float32) + self.cfg.per_epsilon) ** self.cfg.alpha
         return ring.set_priorities(state, slots, masses)
 
 
-@dataclasses.dataclass(frozen=True)
 class Beta(_Configured):
     """rank / n ~ Beta(a, b), rank 0 the largest abs(TD error) or reward; CSAC sec. 3.5."""
 
@@ -256,13 +213,10 @@ class Beta(_Configured):
         return Sample(beta_slots(key, values, state.size, a, b, num), jnp.ones(num))
 
 
-BUILDERS: dict[type, Callable[[Any], Sampler]] = {
-    UniformReplay: Uniform,
-    PrioritisedReplay: Prioritised,
-    BetaReplay: Beta,
-}
+BUILDERS = {UniformReplay: Uniform, PrioritisedReplay: Prioritised, BetaReplay: Beta}
 
 
 def make(cfg: Any) -> Sampler:
     """The sampler of a replay section."""
-    return BUILDERS[type(cfg)](cfg)
+    kind: Any = BUILDERS[type(cfg)]
+    return kind(cfg)

@@ -4,6 +4,7 @@
 joined by loose blocks. N = block slots, R = roles of a family.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -11,18 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.config import MESH_KINDS, SceneConfig, SlotKind
+from csac_jax.config import SceneConfig, SlotKind
 from csac_jax.scene import blocks, families, layout
 from csac_jax.scene.families import ROLES, Draws, Family, Role
 from csac_jax.scene.layout import Scene
 
+Rectangle = tuple[jax.Array, jax.Array, jax.Array]  # centre [2] m, yaw [] rad, half sides [2] m
+
+MIN_ARRANGED = 4  # blocks in an arrangement
 GAPS = (0.001, 0.030)  # m between packed neighbours: at level 1, and the widest at level 0
 LOOSE_GAP = 0.015  # m, least distance of a loose block from any other
 RADIUS = 0.205  # m from the middle of an arrangement: all packed blocks lie within, whatever size
 _MARGIN = 0.001  # m kept free along the border of the square
 _TRIES = 64  # random places tried for each loose block
 _MAX_LOOSE = (1, 3)  # loose blocks at level 0 and at level 1, unless `min_blocks` needs more
-_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 _ON_SIDE = np.sqrt(np.array([0.5, 0.5, 0.0, 0.0], np.float32))  # a quarter turn about x
 
 
@@ -33,14 +36,8 @@ class Blocks(NamedTuple):
     yaw: jax.Array  # [N] rad
     on_side: jax.Array  # [N] bool, rotated by a quarter turn about x before the yaw
     half_size: jax.Array  # [N, 3] m, in the block's frame
+    half_lying: jax.Array  # [N, 3] m, as the block lies, before the yaw
     placed: jax.Array  # [N] bool, False where the rest is meaningless
-
-
-class Sizes(NamedTuple):
-    """Random half sizes of the slots."""
-
-    any: jax.Array  # [N, 3] m, of any shape of the slot's kind
-    long: jax.Array  # [N, 3] m, of one of its longest shapes
 
 
 def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -> Scene:
@@ -51,12 +48,12 @@ def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -
     is the block that the others enclose. Fewer than `cfg.min_blocks` are in play where the square
     has no room left.
 
-    Raises ValueError while tracing where the slots or the square are too small.
+    Raises SceneError for slots that allow none, ValueError for a square too small, while tracing.
     """
-    if extent < 2.0 * (RADIUS + _MARGIN):
+    least = 2.0 * (RADIUS + _MARGIN)
+    if extent < least:
         raise ValueError(
-            "heightmap.extent: arrangements need a square of at least "
-            f"{2.0 * (RADIUS + _MARGIN):g} m, not {extent:g} m"
+            f"heightmap.extent: arrangements need {least:g} m at least, not {extent:g}"
         )
     possible = families.available(cfg.slots).values()
     key_sizes, key_family, key_pack, key_place, key_loose, key_looks = jax.random.split(key, 6)
@@ -71,44 +68,50 @@ def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -
     return _scene(key_looks, cfg, placed, target)
 
 
-def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> Sizes:
-    """A random shape and scale of each slot's kind; mesh blocks of one kind are alike."""
+def arrangements(cfg: SceneConfig, extent: float, stream: int, count: int) -> Scene:
+    """`count` packed arrangements, NumPy leaves [P, N, ...], easy ones first.
+
+    Where there is room, each has at least MIN_ARRANGED blocks, or `cfg.min_blocks` if that is less.
+    Raises SceneError where the slots allow no arrangement.
+    """
+    cfg = dataclasses.replace(cfg, min_blocks=min(cfg.min_blocks, MIN_ARRANGED))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(stream), jnp.arange(count))
+    draw = jax.vmap(lambda key, level: arrange(key, cfg, extent, level))
+    return jax.device_get(jax.jit(draw)(keys, jnp.linspace(0.0, 1.0, count)))
+
+
+def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> jax.Array:
+    """Random half sizes [2, N, 3] m: of any shape of each slot's kind; of one of its longest."""
     key_any, key_long, key_scale = jax.random.split(key, 3)
-    choices = [blocks.half_size_choices(kind) for kind in cfg.slots]
-    number = np.array([len(choice) for choice in choices])
-    table = [np.resize(choice, (number.max(), 3)) for choice in choices]  # N of [choices, 3]
-    longest = [choice[choice[:, 0] == choice[:, 0].max()] for choice in choices]
-    longest = [np.resize(choice, (2, 3)) for choice in longest]
-    num = len(cfg.slots)
-    scale = 1.0 + blocks.size_jitter(cfg) * jax.random.uniform(
-        key_scale, (num,), jnp.float32, -1.0, 1.0
-    )
-    shared = blocks.size_leader(cfg.slots)
+    num, shapes = len(cfg.slots), [blocks.half_size_choices(kind) for kind in cfg.slots]
+    longest = [choices[choices[:, 0] == choices[:, 0].max()] for choices in shapes]
+    scale = blocks.scales(cfg, jax.random.uniform(key_scale, (num,), jnp.float32, -1.0, 1.0))
 
-    def choose(tables: list[np.ndarray], index: jax.Array) -> jax.Array:
-        return jnp.asarray(np.stack(tables))[np.arange(num), index] * scale[shared][:, None]
+    def choose(key: jax.Array, tables: list[np.ndarray]) -> jax.Array:
+        number = np.array([len(table) for table in tables], np.int32)
+        row = jax.random.randint(key, (num,), 0, jnp.asarray(number))
+        padded = np.stack([np.resize(table, (number.max(), 3)) for table in tables])
+        return jnp.asarray(padded)[np.arange(num), row] * scale[:, None]
 
-    return Sizes(
-        any=choose(table, jax.random.randint(key_any, (num,), 0, jnp.asarray(number, jnp.int32))),
-        long=choose(longest, jax.random.randint(key_long, (num,), 0, 2)),
-    )
+    return jnp.stack([choose(key_any, shapes), choose(key_long, longest)])
 
 
 def _pack(
-    family: Family, slots: tuple[SlotKind, ...], draws: Draws, sizes: Sizes, level: jax.Array
+    family: Family, slots: tuple[SlotKind, ...], draws: Draws, sizes: jax.Array, level: jax.Array
 ) -> tuple[Blocks, jax.Array]:
     """The packed blocks of an arrangement about the origin, and the slot of the target []."""
     slot, used = _assign(draws.preference, slots, family.roles)
     optional = level * (0.5 + 0.5 * draws.optional) * (ROLES - family.needed)
     num_used = family.needed + jnp.round(optional).astype(jnp.int32)
     used = used & (np.arange(ROLES) < num_used)
-    long = np.array([role.long for role in family.roles])
-    half = family.resize(jnp.where(long[:, None], sizes.long[slot], sizes.any[slot]))
+    half = family.resize(sizes[np.array([role.long for role in family.roles], int), slot])
     on_side = draws.on_side < np.array([role.on_side for role in family.roles], np.float32)
-    on_side = on_side & ~jnp.asarray([kind in MESH_KINDS for kind in slots])[slot]
-    half_lying = jnp.where(used[:, None], _half_lying(half, on_side), 0.0)
+    on_side = on_side & ~jnp.asarray(blocks.is_mesh(slots))[slot]
+    half_lying = jnp.where(on_side[:, None], half[:, np.array([0, 2, 1])], half)
+    half_lying = jnp.where(used[:, None], half_lying, 0.0)
     gap = GAPS[0] + (GAPS[1] - GAPS[0]) * (1.0 - level) * (0.5 + 0.5 * draws.gap)
-    centre, crosswise, target = family.place(draws, half_lying, used, gap)
+    xy, crosswise, target, floor = family.place(draws, half_lying, used, gap)
+    centre = jnp.concatenate([xy, (floor + half_lying[:, 2])[:, None]], axis=1)
     row = jnp.where(used, slot, len(slots))  # dropped where not used
 
     def by_slot(values: jax.Array) -> jax.Array:
@@ -116,10 +119,11 @@ def _pack(
         return blank.at[row].set(values, mode="drop")
 
     packed = Blocks(
-        centre=by_slot(centre.at[:, 2].add(half_lying[:, 2])),
+        centre=by_slot(centre),
         yaw=by_slot(jnp.where(crosswise, np.float32(0.5 * np.pi), 0.0)),
         on_side=by_slot(on_side),
-        half_size=jnp.asarray(sizes.any).at[row].set(half, mode="drop"),
+        half_size=sizes[0].at[row].set(half, mode="drop"),
+        half_lying=sizes[0].at[row].set(half_lying, mode="drop"),
         placed=by_slot(used),
     )
     return packed, slot[target]
@@ -128,10 +132,7 @@ def _pack(
 def _assign(
     preference: jax.Array, slots: tuple[SlotKind, ...], roles: tuple[Role, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """A slot of its own for each role [R] int32, and whether one was left [R] bool.
-
-    Roles choose in order, by `preference` [N] among the slots of their kinds.
-    """
+    """A slot of its own for each role [R] int32, by `preference` [N], and whether one was left."""
     free = jnp.ones(len(slots), bool)
     chosen, found = [], []
     for role in roles:
@@ -142,23 +143,16 @@ def _assign(
     return jnp.stack(chosen), jnp.stack(found)
 
 
-def _half_lying(half: jax.Array, on_side: jax.Array) -> jax.Array:
-    """Half extents [..., 3] m of blocks as they lie, before the yaw."""
-    return jnp.where(on_side[..., None], half[..., np.array([0, 2, 1])], half)
-
-
 def _put_down(key: jax.Array, border: float, packed: Blocks) -> Blocks:
     """The packed blocks, as one, at a random yaw and a random place within `border` m of 0."""
     key_yaw, key_shift = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (), jnp.float32, 0.0, 2.0 * np.pi)
     xy = geometry.rotate2d(yaw, packed.centre[:, :2])
-    rotated = packed._replace(centre=packed.centre.at[:, :2].set(xy), yaw=packed.yaw + yaw)
-    xy = rotated.centre[:, :2]
-    half_xy = _half_aligned(rotated.yaw, _half_lying(rotated.half_size, rotated.on_side))
+    half_xy = _half_aligned(packed.yaw + yaw, packed.half_lying)
     low = jnp.min(jnp.where(packed.placed[:, None], xy - half_xy, jnp.inf), axis=0)
     high = jnp.max(jnp.where(packed.placed[:, None], xy + half_xy, -jnp.inf), axis=0)
-    shift = jax.random.uniform(key_shift, (2,), jnp.float32, -border - low, border - high)
-    return rotated._replace(centre=rotated.centre.at[:, :2].add(shift[None]))
+    xy = xy + jax.random.uniform(key_shift, (2,), jnp.float32, -border - low, border - high)[None]
+    return packed._replace(centre=packed.centre.at[:, :2].set(xy), yaw=packed.yaw + yaw)
 
 
 def _half_aligned(yaw: jax.Array, half: jax.Array) -> jax.Array:
@@ -203,38 +197,26 @@ def _free_place(
     yaw = jax.random.uniform(key_yaw, (_TRIES,), jnp.float32, 0.0, 2.0 * np.pi)
     room = border - _half_aligned(yaw, jnp.broadcast_to(half, (_TRIES, 3)))
     xy = jax.random.uniform(key_xy, (_TRIES, 2), jnp.float32, -1.0, 1.0) * room
-    half_now = _half_lying(now.half_size, now.on_side)[:, :2]
-    to_each = jax.vmap(rectangle_gap, (None, None, None, 0, 0, 0))
-    all_gaps = jax.vmap(to_each, (0, 0, None, None, None, None))
-    gap = all_gaps(xy, yaw, half[:2], now.centre[:, :2], now.yaw, half_now)
+    to_each = jax.vmap(rectangle_gap, (None, 0))
+    from_all = jax.vmap(to_each, ((0, 0, None), None))
+    gap = from_all((xy, yaw, half[:2]), (now.centre[:, :2], now.yaw, now.half_lying[:, :2]))
     free = jnp.all((gap >= LOOSE_GAP) | ~now.placed[None], axis=1)  # [tries]
     first = jnp.argmax(free)
     return jnp.any(free), xy[first], yaw[first]
 
 
-def rectangle_gap(
-    xy: jax.Array,
-    yaw: jax.Array,
-    half: jax.Array,
-    other_xy: jax.Array,
-    other_yaw: jax.Array,
-    other_half: jax.Array,
-) -> jax.Array:
-    """Gap [] m between two rectangles along the axis that separates them most.
-
-    At most their distance; negative where they overlap. Args: centres [2] m, yaws [] rad, half
-    sides [2] m.
-    """
-    # The normals of all sides:
+def rectangle_gap(one: Rectangle, two: Rectangle) -> jax.Array:
+    """Gap [] m along the axis that separates two rectangles most; negative where they overlap."""
+    (xy, yaw, half), (other_xy, other_yaw, other_half) = one, two
+    # Normals of all sides.
     angle = jnp.stack([yaw, yaw + 0.5 * np.pi, other_yaw, other_yaw + 0.5 * np.pi])
     between = jnp.cos(angle) * (other_xy - xy)[0] + jnp.sin(angle) * (other_xy - xy)[1]
-    distance = jnp.abs(between)
 
     def half_width(yaw: jax.Array, side: jax.Array) -> jax.Array:
         along = side[0] * jnp.abs(jnp.cos(angle - yaw))
         return along + side[1] * jnp.abs(jnp.sin(angle - yaw))
 
-    return jnp.max(distance - half_width(yaw, half) - half_width(other_yaw, other_half))
+    return jnp.max(jnp.abs(between) - half_width(yaw, half) - half_width(other_yaw, other_half))
 
 
 def _scene(key: jax.Array, cfg: SceneConfig, placed: Blocks, target: jax.Array) -> Scene:
@@ -242,12 +224,12 @@ def _scene(key: jax.Array, cfg: SceneConfig, placed: Blocks, target: jax.Array) 
     key_colour, key_density, key_friction = jax.random.split(key, 3)
     num, num_colours = len(cfg.slots), len(blocks.COLOURS)
     colours = jax.random.permutation(key_colour, max(num, num_colours))[:num] % num_colours
-    tilt = jnp.where(placed.on_side[:, None], _ON_SIDE[None], _UPRIGHT[None])
+    scene = layout.parked(cfg.slots)
+    tilt = jnp.where(placed.on_side[:, None], _ON_SIDE[None], scene.quaternion)
     yaws = jax.vmap(geometry.quat_from_yaw)(placed.yaw)
-    scene = Scene(
+    scene = scene.replace(
         position=placed.centre,
         quaternion=jax.vmap(geometry.quat_multiply)(yaws, tilt),
-        velocity=jnp.zeros((num, 6), jnp.float32),
         half_size=placed.half_size,
         density=jax.random.uniform(key_density, (num,), jnp.float32, *cfg.density),
         friction=jax.random.uniform(key_friction, (num,), jnp.float32, *cfg.friction),

@@ -6,7 +6,7 @@ scenes. Boxes and arches scale along each axis, the other shapes as a whole. An 
 parts, every other shape one.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,13 +54,18 @@ TABLE_COLOUR = np.array([0.35, 0.33, 0.31], np.float32)
 
 def half_size_choices(kind: SlotKind) -> np.ndarray:
     """Nominal half sizes [choices, 3] m of the shapes that a slot of this kind may hold."""
-    return np.array(
-        [shape.half_size for shape in SHAPES.values() if shape.kind == kind], np.float32
-    )
+    shapes = SHAPES.values()
+    return np.array([shape.half_size for shape in shapes if shape.kind == kind], np.float32)
 
 
-# Parts: centre and half size of every convex part, in units of the block's half size.
+def is_mesh(slots: tuple[SlotKind, ...]) -> np.ndarray:
+    """[N] bool, slots whose blocks are meshes."""
+    return np.isin(slots, MESH_KINDS)
 
+
+Faces = tuple[np.ndarray, np.ndarray]  # outward normals [F, 3], offsets [F] m, of nominal size
+
+# Centre and half size of every convex part, in units of the block's half size.
 _WHOLE = (((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),)
 _ARCH = (  # two posts and a lintel: a square tunnel, 50 x 25 mm, for the half-round of VPG
     ((-0.75, 0.0, 0.0), (0.25, 1.0, 1.0)),
@@ -79,25 +84,13 @@ class Parts(NamedTuple):
 
 def parts(slots: tuple[SlotKind, ...]) -> Parts:
     """The parts of the slots, slot by slot."""
-    each = [
-        (slot, *part)
-        for slot, kind in enumerate(slots)
-        for part in (_ARCH if kind == "arch" else _WHOLE)
-    ]
-    slot, centre, half = zip(*each, strict=True)
-    return Parts(np.array(slot), np.array(centre, np.float32), np.array(half, np.float32))
+    of_slot = [_ARCH if kind == "arch" else _WHOLE for kind in slots]
+    slot = np.repeat(np.arange(len(slots)), [len(each) for each in of_slot])
+    every = np.concatenate(of_slot, dtype=np.float32)  # [G, 2, 3]
+    return Parts(slot, every[:, 0], every[:, 1])
 
 
-# Faces: outward normals and offsets of a part of nominal size.
-
-
-def _box_faces() -> tuple[np.ndarray, np.ndarray]:
-    """Normals [6, 3]; the offset of face f is |normal_f| . half_size, which differs per scene."""
-    eye = np.eye(3)
-    return np.concatenate([eye, -eye]), np.zeros(6)
-
-
-def _prism_faces() -> tuple[np.ndarray, np.ndarray]:
+def _prism_faces() -> Faces:
     """Triangular prism: base down, two ends across y, two slopes that meet at the apex."""
     x, y, z = SHAPES["prism"].half_size
     slope = np.array([2 * z, 0.0, x]) / np.hypot(2 * z, x)
@@ -105,7 +98,7 @@ def _prism_faces() -> tuple[np.ndarray, np.ndarray]:
     return normals, np.array([z, y, y, slope[2] * z, slope[2] * z])
 
 
-def _half_cylinder_faces() -> tuple[np.ndarray, np.ndarray]:
+def _half_cylinder_faces() -> Faces:
     """Six chords of a half circle about y, its flat face down."""
     radius, y, z = SHAPES["half_cylinder"].half_size
     angle = (np.arange(6) + 0.5) * np.pi / 6
@@ -115,7 +108,7 @@ def _half_cylinder_faces() -> tuple[np.ndarray, np.ndarray]:
     return normals, np.concatenate([chord, [z, y, y]])
 
 
-def _cylinder_faces() -> tuple[np.ndarray, np.ndarray]:
+def _cylinder_faces() -> Faces:
     """Octagonal prism through a circle about z."""
     radius, _, z = SHAPES["cylinder"].half_size
     angle = (np.arange(8) + 0.5) * np.pi / 4
@@ -124,56 +117,45 @@ def _cylinder_faces() -> tuple[np.ndarray, np.ndarray]:
     return normals, np.concatenate([np.full(8, radius * np.cos(np.pi / 8)), [z, z]])
 
 
+# The offset of face f of a box is |normal_f| . half_size, which differs per scene.
+_BOX = np.concatenate([np.eye(3), -np.eye(3)]), np.zeros(6)
 _FACES = {
-    "box": _box_faces,
-    "arch": _box_faces,
-    "prism": _prism_faces,
-    "half_cylinder": _half_cylinder_faces,
-    "cylinder": _cylinder_faces,
+    "box": _BOX,
+    "arch": _BOX,
+    "prism": _prism_faces(),
+    "half_cylinder": _half_cylinder_faces(),
+    "cylinder": _cylinder_faces(),
 }
 
 
-def normals(kind: SlotKind) -> np.ndarray:
-    """Outward face normals [F, 3] of every part of a block of this kind, in the block's frame."""
-    return _FACES[kind]()[0]
-
-
 def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Faces of every part in its block's frame: a point p lies inside a part where n . p <= offset
-    for all its faces.
+    """Faces of every part in its block's frame: inside, n . p <= offset for all of them.
 
     Args: half_size [N, 3] m. Returns: normals [G, F, 3], outward unit vectors, 0 where there is no
     face; offsets [G, F] m. G as in `parts`.
     """
-    all_parts = parts(slots)
-    normals = np.zeros((len(all_parts.slot), MAX_FACES, 3), np.float32)
-    nominal = np.full((len(all_parts.slot), MAX_FACES), PADDING_OFFSET, np.float32)
-    for part, slot in enumerate(all_parts.slot):
-        normal, offset = _FACES[slots[slot]]()
+    slot, centre, half = parts(slots)
+    normals = np.zeros((len(slot), MAX_FACES, 3), np.float32)
+    nominal = np.full((len(slot), MAX_FACES), PADDING_OFFSET, np.float32)
+    for part, (normal, offset) in enumerate(_FACES[slots[i]] for i in slot):
         normals[part, : len(normal)], nominal[part, : len(offset)] = normal, offset
-    present = nominal < PADDING_OFFSET
-    is_mesh = np.array([slots[slot] in MESH_KINDS for slot in all_parts.slot])[:, None]
-    size = half_size[all_parts.slot]  # [G, 3]
-    from_centre = np.abs(normals) * (all_parts.half * size)[:, None]
-    reach = jnp.sum(from_centre + normals * (all_parts.centre * size)[:, None], axis=-1)
-    scaled = nominal * mesh_scale(slots, half_size)[all_parts.slot][:, None]
-    offsets = jnp.where(present, jnp.where(is_mesh, scaled, reach), PADDING_OFFSET)
-    return jnp.asarray(normals), offsets
+    size = half_size[slot]  # [G, 3]
+    from_centre = np.abs(normals) * (half * size)[:, None]
+    reach = jnp.sum(from_centre + normals * (centre * size)[:, None], axis=-1)
+    scaled = nominal * mesh_scale(slots, half_size)[slot][:, None]
+    offsets = jnp.where(is_mesh(slots)[slot][:, None], scaled, reach)
+    return jnp.asarray(normals), jnp.where(nominal < PADDING_OFFSET, offsets, PADDING_OFFSET)
 
 
-def size_leader(slots: tuple[SlotKind, ...]) -> np.ndarray:
-    """Slot [N] whose scale each slot takes: its own, or the first of its mesh kind.
+def scales(cfg: SceneConfig, noise: Any) -> Any:
+    """Sizes of the slots' blocks [N] relative to nominal, from noise [N] in -1 .. 1.
 
-    MJX shares a mesh between all slots of a kind.
+    MJX shares a mesh between all slots of a kind: they take the scale of the first of them.
     """
-    return np.array(
-        [slots.index(kind) if kind in MESH_KINDS else slot for slot, kind in enumerate(slots)]
-    )
-
-
-def size_jitter(cfg: SceneConfig) -> np.ndarray:
-    """Largest deviation [N] of each slot's block from its nominal size, as a share of it."""
-    return np.array([cfg.size_jitter[int(kind in MESH_KINDS)] for kind in cfg.slots], np.float32)
+    shared, jitter = is_mesh(cfg.slots), np.array(cfg.size_jitter, np.float32)
+    first = [cfg.slots.index(kind) for kind in cfg.slots]
+    leader = np.where(shared, first, np.arange(len(first)))
+    return (1.0 + np.where(shared, jitter[1], jitter[0]) * noise)[leader]
 
 
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import MESH_KINDS, SlotKind
+from csac_jax.errors import SceneError
 
 ROLES = 5  # of every family
 STACKED_GAP = 0.008  # m, widest gap that a block may bridge
@@ -32,9 +33,10 @@ class Role(NamedTuple):
 class Placed(NamedTuple):
     """Where the blocks of a family go, before the arrangement is rotated and shifted as a whole."""
 
-    centre: jax.Array  # [R, 3] m, z of the surface that carries the block
+    xy: jax.Array  # [R, 2] m
     crosswise: jax.Array  # [R] bool, rotated by a quarter turn about z
     target: jax.Array  # [] int32, role of the block that is hardest to reach
+    floor: jax.Array | float = 0.0  # [R] m, height of the surface that carries the block
 
 
 class Family(NamedTuple):
@@ -62,10 +64,10 @@ class Draws(NamedTuple):
 
 
 def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
-    """The families that these slots allow. Raises ValueError where they allow none."""
+    """The families that these slots allow. Raises SceneError where they allow none."""
     possible = {name: family for name, family in FAMILIES.items() if _is_possible(family, slots)}
     if not possible:
-        raise ValueError("scene.slots: too few for an arrangement; three boxes are enough")
+        raise SceneError("scene.slots: too few for an arrangement; three boxes are enough")
     return possible
 
 
@@ -83,17 +85,17 @@ def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
 def draw(key: jax.Array, num_slots: int) -> Draws:
     """All draws of a packing, by one call of the generator: each call is slow to compile."""
     noise = jax.random.uniform(key, (num_slots + 3 + 5 * ROLES,))
-    preference, one, roles = jnp.split(noise, [num_slots, num_slots + 3])
+    preference, (optional, gap, mirrored), roles = jnp.split(noise, [num_slots, num_slots + 3])
     roles = roles.reshape(5, ROLES)
     return Draws(
         preference=preference,
-        optional=one[0],
-        gap=one[1],
+        optional=optional,
+        gap=gap,
         on_side=roles[0],
         order=roles[1],
         crosswise=roles[2] < 0.5,
         jitter=2.0 * roles[3:].T - 1.0,
-        mirrored=one[2] < 0.5,
+        mirrored=mirrored < 0.5,
     )
 
 
@@ -123,21 +125,21 @@ def _place_row(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -
     """Long side to long side, a little off the line."""
     y, middle = _line(draws.order, half[:, 1], used, gap)
     x = ROW_OFFSET * draws.jitter[:, 0]
-    return Placed(jnp.stack([x, y, jnp.zeros_like(y)], 1), jnp.zeros_like(used), middle)
+    return Placed(jnp.stack([x, y], axis=1), jnp.zeros_like(used), middle)
 
 
 def _place_ring(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
     """Four blocks enclose the last: each ends at the side of the next, like a pinwheel's arms."""
     quarter = np.arange(5)
     crosswise = quarter % 2 == 1  # never the fifth, which is in the middle
-    # [5, 2] half extents of the middle block, in the frame of each arm
-    inner = jnp.where(crosswise[:, None], half[4, 1::-1][None], half[4, :2][None])
+    # Half extents of the middle block, in the frame of each arm.
+    inner = _half_xy(jnp.broadcast_to(half[4], half.shape), crosswise)
     arm = jnp.stack([half[:, 0] - inner[:, 0], inner[:, 1] + gap + half[:, 1]], axis=1)
-    cos = np.cos(0.5 * np.pi * quarter).astype(np.float32)
-    sin = np.sin(0.5 * np.pi * quarter).astype(np.float32)
+    angle = 0.5 * np.pi * quarter
+    cos, sin = np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
     x, y = cos * arm[:, 0] - sin * arm[:, 1], sin * arm[:, 0] + cos * arm[:, 1]
     mirrored = jnp.where(draws.mirrored, -1.0, 1.0)
-    around = jnp.stack([mirrored * x, y, jnp.zeros_like(x)], axis=1)
+    around = jnp.stack([mirrored * x, y], axis=1)
     return Placed(around.at[4].set(0.0), jnp.asarray(crosswise), jnp.int32(4))
 
 
@@ -150,7 +152,7 @@ def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) 
     side = np.where(np.arange(used.shape[0]) == 0, -1.0, 1.0).astype(np.float32)
     x = jnp.where(is_wall, side * (half_xy[:, 0] + 0.5 * gap), x)
     y = jnp.where(is_wall, -half_xy[:, 1], gap + half_xy[:, 1])
-    return Placed(jnp.stack([x, y, jnp.zeros_like(y)], axis=1), crosswise, middle)
+    return Placed(jnp.stack([x, y], axis=1), crosswise, middle)
 
 
 def _place_nest(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
@@ -163,7 +165,7 @@ def _place_nest(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) 
     x_ends = arch[0] + gap + half[3:, 0]
     x = jnp.stack([zero, zero, ROW_OFFSET * draws.jitter[2, 0], x_ends[0], -x_ends[1]])
     y = jnp.stack([zero, y_inner, front + gap + lid[1], zero, zero])
-    return Placed(jnp.stack([x, y, jnp.zeros_like(x)], axis=1), jnp.zeros_like(used), jnp.int32(1))
+    return Placed(jnp.stack([x, y], axis=1), jnp.zeros_like(used), jnp.int32(1))
 
 
 def _resize_nest(half: jax.Array) -> jax.Array:
@@ -184,7 +186,7 @@ def _place_pile(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) 
     y = jnp.stack([-aside, aside, zero, zero, zero])
     stacked = np.array([0.0, 0.0, 1.0, 1.0, 0.0], np.float32)[:, None]
     xy = jnp.stack([x, y], axis=1) + stacked * STACK_OFFSET * draws.jitter
-    return Placed(jnp.concatenate([xy, floor[:, None]], axis=1), crosswise, jnp.int32(0))
+    return Placed(xy, crosswise, jnp.int32(0), floor)
 
 
 def _resize_pile(half: jax.Array) -> jax.Array:
@@ -197,16 +199,12 @@ _ANY: tuple[SlotKind, ...] = ("arch", *_NOT_ARCH)
 _NO_ARCH, _BOX, _PRISM = Role(_NOT_ARCH, on_side=0.3), Role(("box",)), Role(("prism",))
 _BASE, _BRICK = Role(("box",), long=True), Role(("box",), long=True, on_side=0.5)
 _ARM = Role(("box", "prism"), long=True, on_side=1.0)
+_TUNNEL, _ROUND = Role(("arch",), on_side=1.0), Role(("cylinder",))
 FAMILIES = {
     "row": Family((_NO_ARCH, _NO_ARCH, Role(_ANY, on_side=0.3), _NO_ARCH, _NO_ARCH), 3, _place_row),
     "ridge": Family((_PRISM, _PRISM, Role(_ANY, on_side=0.3), _NO_ARCH, _NO_ARCH), 3, _place_row),
     "ring": Family((_ARM, _ARM, _ARM, _ARM, Role(_NOT_ARCH)), 5, _place_ring),
     "wall": Family((_BRICK, _BRICK, _NO_ARCH, _NO_ARCH, Role(_ANY)), 3, _place_wall),
-    "nest": Family(
-        (Role(("arch",), on_side=1.0), Role(("cylinder",)), _BRICK, _NO_ARCH, _NO_ARCH),
-        3,
-        _place_nest,
-        _resize_nest,
-    ),
+    "nest": Family((_TUNNEL, _ROUND, _BRICK, _NO_ARCH, _NO_ARCH), 3, _place_nest, _resize_nest),
     "pile": Family((_BASE, _BASE, _BOX, Role(_NOT_ARCH), Role(_ANY)), 3, _place_pile, _resize_pile),
 }

@@ -16,8 +16,7 @@ NOMINAL_FRICTION = 0.8
 SPEED_LIMIT = np.array([5, 5, 5, 50, 50, 50], np.float32)
 """Fastest block after a substep, m/s and rad/s (ours). A thin block squeezed from under the hand
 spins faster; the explicit gyroscopic torque would then drive it to NaN."""
-ANY = -1
-"""`Scene.target` in the clearing task."""
+ANY = -1  # `Scene.target` in the clearing task
 
 
 @struct.dataclass
@@ -44,11 +43,9 @@ def parking(num_slots: int) -> np.ndarray:
 def parked(slots: tuple[SlotKind, ...]) -> Scene:
     """A scene of NumPy arrays: every slot parked, every block nominal."""
     num = len(slots)
-    quaternion = np.zeros((num, 4), np.float32)
-    quaternion[:, 0] = 1.0
     leaves: dict[str, Any] = {
         "position": parking(num),
-        "quaternion": quaternion,
+        "quaternion": np.eye(1, 4, dtype=np.float32).repeat(num, axis=0),
         "velocity": np.zeros((num, 6), np.float32),
         "half_size": np.stack([blocks.half_size_choices(kind)[0] for kind in slots]),
         "density": np.full(num, NOMINAL_DENSITY, np.float32),
@@ -63,7 +60,7 @@ def parked(slots: tuple[SlotKind, ...]) -> Scene:
 def park(scene: Scene, keep: jax.Array) -> Scene:
     """The scene with all blocks but those in `keep` [N] bool parked."""
     keep = scene.in_play & keep
-    upright = jnp.zeros_like(scene.quaternion).at[:, 0].set(1.0)
+    upright = jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32)[None]
     return scene.replace(
         position=jnp.where(keep[:, None], scene.position, parking(keep.shape[0])),
         quaternion=jnp.where(keep[:, None], scene.quaternion, upright),
@@ -96,3 +93,23 @@ def is_target(scene: Scene) -> jax.Array:
 def inside(position: jax.Array, extent: float) -> jax.Array:
     """[N] bool, the block's centre [N, 3] m lies above the workspace square."""
     return jnp.all(jnp.abs(position[:, :2]) <= 0.5 * extent, axis=1)
+
+
+def randomise_pose(
+    key: jax.Array, scene: Scene, extent: float, any_yaw: bool, has_target: bool
+) -> Scene:
+    """The scene rotated by a random yaw; with `has_target` it keeps its target or gets one.
+
+    The yaw is a quarter turn unless `any_yaw` and every block stays within the square of side
+    `extent` m.
+    """
+    key_yaw, key_target = jax.random.split(key)
+    yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
+    near = jnp.linalg.norm(scene.position[:, :2], axis=1) <= 0.5 * extent
+    free = any_yaw & jnp.all(near | ~scene.in_play)
+    quarters = jnp.round(yaw / (0.5 * np.pi)) * (0.5 * np.pi)
+    rotated = rotate(scene, jnp.where(free, yaw, quarters))
+    if not has_target:
+        return rotated.replace(target=jnp.full_like(scene.target, ANY))
+    marked = mark_target(key_target, rotated)
+    return marked.replace(target=jnp.where(scene.target == ANY, marked.target, scene.target))

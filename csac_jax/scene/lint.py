@@ -11,84 +11,52 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco import mjtDisableBit, mjtEnableBit, mjtGeom, mjtIntegrator, mjtObj, mjtSolver
 
-from csac_jax.errors import SceneError
-
+# Values of MuJoCo's enumerations are named without their prefix: mjINT_DISCRETE is `discrete`.
 IGNORED_OPTIONS = (
-    "noslip_iterations",
-    "noslip_tolerance",
-    "ccd_iterations",
-    "ccd_tolerance",
-    "sdf_iterations",
-    "sleep_tolerance",
-    "disableactuator",
+    *("noslip_iterations", "noslip_tolerance", "ccd_iterations", "ccd_tolerance"),
+    *("sdf_iterations", "sleep_tolerance", "disableactuator"),
 )
-INTEGRATORS = {mjtIntegrator.mjINT_EULER, mjtIntegrator.mjINT_RK4, mjtIntegrator.mjINT_IMPLICITFAST}
-SOLVERS = {mjtSolver.mjSOL_NEWTON, mjtSolver.mjSOL_CG}
-# Sleep and ipc pass `put_model`, then nothing reads them.
-ENABLE_FLAGS = {mjtEnableBit.mjENBL_INVDISCRETE}
-DISABLE_FLAGS_IGNORED = {
-    mjtDisableBit.mjDSBL_MIDPHASE,
-    mjtDisableBit.mjDSBL_AUTORESET,
-    mjtDisableBit.mjDSBL_NATIVECCD,
-    mjtDisableBit.mjDSBL_ISLAND,
-    mjtDisableBit.mjDSBL_MULTICCD,
-}
+INTEGRATORS = ("euler", "rk4", "implicitfast")
+SOLVERS = ("newton", "cg")
+ENABLE_FLAGS = ("invdiscrete",)  # sleep and ipc pass `put_model`, then nothing reads them
+DISABLE_FLAGS_IGNORED = ("midphase", "autoreset", "nativeccd", "island", "multiccd")
+_GEOMS = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 COLLISIONS_LACKING = {  # by the order of mjtGeom
-    (mjtGeom.mjGEOM_HFIELD, mjtGeom.mjGEOM_ELLIPSOID),
-    (mjtGeom.mjGEOM_HFIELD, mjtGeom.mjGEOM_CYLINDER),
-    (mjtGeom.mjGEOM_ELLIPSOID, mjtGeom.mjGEOM_BOX),
-    (mjtGeom.mjGEOM_ELLIPSOID, mjtGeom.mjGEOM_MESH),
-    (mjtGeom.mjGEOM_CYLINDER, mjtGeom.mjGEOM_BOX),
-    (mjtGeom.mjGEOM_CYLINDER, mjtGeom.mjGEOM_MESH),
-    *((other, mjtGeom.mjGEOM_SDF) for other in map(mjtGeom, range(mjtGeom.mjGEOM_SDF + 1))),
+    *(("hfield", other) for other in ("ellipsoid", "cylinder")),
+    *((one, other) for one in ("ellipsoid", "cylinder") for other in ("box", "mesh")),
+    *((other, "sdf") for other in _GEOMS),
 }
-NO_MARGIN = {mjtGeom.mjGEOM_MESH, mjtGeom.mjGEOM_HFIELD}
-CONTACT_ENDS_LACKING = {mjtObj.mjOBJ_SITE, mjtObj.mjOBJ_BODY, mjtObj.mjOBJ_XBODY}
-IGNORED_FIELDS = {  # field of the model, zero unless its attribute of MJCF is used
-    "jnt_stiffnesspoly": "joint stiffness of a higher order",
-    "dof_dampingpoly": "joint damping of a higher order",
-    "tendon_stiffnesspoly": "tendon stiffness of a higher order",
-    "tendon_dampingpoly": "tendon damping of a higher order",
-    "geom_gap": "geom gap",
-    "pair_gap": "pair gap",
-    "geom_fluid": "geom fluidshape",
-    "geom_adhesion": "geom adhesion",
-    "pair_adhesion": "pair adhesion",
-    "geom_surfacevel": "geom surfacevel",
-    "actuator_actearly": "actuator actearly",
-    "actuator_armature": "actuator armature",
-    "actuator_damping": "actuator damping",
-    "actuator_dampingpoly": "actuator damping of a higher order",
-    "actuator_delay": "actuator delay",
-    "sensor_delay": "sensor delay",
-    "sensor_interval": "sensor interval",
+NO_MARGIN = {"mesh", "hfield"}
+CONTACT_ENDS_LACKING = {"site", "body", "xbody"}
+IGNORED_FIELDS = {  # by element: fields of the model, zero unless their attribute of MJCF is used
+    "joint": ("jnt_stiffnesspoly", "dof_dampingpoly"),
+    "tendon": ("tendon_stiffnesspoly", "tendon_dampingpoly"),
+    "geom": ("geom_gap", "geom_fluid", "geom_adhesion", "geom_surfacevel"),
+    "pair": ("pair_gap", "pair_adhesion"),
+    "actuator": (
+        *("actuator_actearly", "actuator_armature", "actuator_damping"),
+        *("actuator_dampingpoly", "actuator_delay"),
+    ),
+    "sensor": ("sensor_delay", "sensor_interval"),
 }
 _SENSORS_LACKING = (
-    *("E_KINETIC", "E_POTENTIAL", "GEOMDIST", "GEOMFROMTO", "GEOMNORMAL"),
-    *("INSIDESITE", "PLUGIN", "USER"),
-    *(f"{of}LIMIT{what}" for of in ("JOINT", "TENDON") for what in ("FRC", "POS", "VEL")),
+    *("e_kinetic", "e_potential", "geomdist", "geomfromto", "geomnormal"),
+    *("insidesite", "plugin", "user"),
+    *(f"{of}limit{what}" for of in ("joint", "tendon") for what in ("frc", "pos", "vel")),
 )
 KINDS_LACKING = {  # field of the model: (its element, enumeration, values without code in MJX)
-    "actuator_biastype": ("actuator", mujoco.mjtBias, ("DCMOTOR", "SO3", "USER")),
-    "actuator_dyntype": ("actuator", mujoco.mjtDyn, ("DCMOTOR", "PID", "USER")),
-    "actuator_gaintype": ("actuator", mujoco.mjtGain, ("DCMOTOR", "PID", "SO3", "USER")),
-    "actuator_trntype": ("actuator", mujoco.mjtTrn, ("BODY", "SLIDERCRANK", "SO3", "UNDEFINED")),
-    "eq_type": ("equality", mujoco.mjtEq, ("DISTANCE", "FLEX", "FLEXSTRAIN", "FLEXVERT")),
+    "actuator_biastype": ("actuator", mujoco.mjtBias, ("dcmotor", "so3", "user")),
+    "actuator_dyntype": ("actuator", mujoco.mjtDyn, ("dcmotor", "pid", "user")),
+    "actuator_gaintype": ("actuator", mujoco.mjtGain, ("dcmotor", "pid", "so3", "user")),
+    "actuator_trntype": ("actuator", mujoco.mjtTrn, ("body", "slidercrank", "so3", "undefined")),
+    "eq_type": ("equality", mujoco.mjtEq, ("distance", "flex", "flexstrain", "flexvert")),
     "sensor_type": ("sensor", mujoco.mjtSensor, _SENSORS_LACKING),
 }
 
 
-def check(model: mujoco.MjModel) -> None:
-    """Raises SceneError, one line, for the first fault of the model."""
-    for fault in faults(model):
-        raise SceneError(f"MJX {fault}")
-
-
 def faults(model: mujoco.MjModel) -> Iterator[str]:
-    """Everything that MJX lacks or would ignore, each with its remedy: "ignores option
-    noslip_iterations; ..."."""
+    """What MJX lacks or would ignore, with the remedy: "ignores option noslip_iterations; ..."."""
     yield from _options(model.opt)
     yield from _fields(model)
     yield from _kinds(model)
@@ -100,29 +68,28 @@ def _options(option: mujoco.MjOption) -> Iterator[str]:
     for name in IGNORED_OPTIONS:
         if getattr(option, name) != getattr(default, name):
             yield f"ignores option {name}; leave it at {getattr(default, name):g}"
-    if option.integrator not in INTEGRATORS:
-        yield f"lacks integrator {_name(mjtIntegrator, option.integrator)}; use implicitfast"
-    if option.solver not in SOLVERS:
-        yield f"lacks solver {_name(mjtSolver, option.solver)}; use Newton"
-    for flag in _bits(mjtEnableBit, option.enableflags):
+    integrator = _word(mujoco.mjtIntegrator, option.integrator)
+    if integrator not in INTEGRATORS:
+        yield f"lacks integrator {integrator}; use implicitfast"
+    if (solver := _word(mujoco.mjtSolver, option.solver)) not in SOLVERS:
+        yield f"lacks solver {solver}; use Newton"
+    for flag in _flags(mujoco.mjtEnableBit, option.enableflags):
         if flag not in ENABLE_FLAGS:
-            yield f"lacks flag {_name(mjtEnableBit, flag)}; do not enable it"
-    for flag in _bits(mjtDisableBit, option.disableflags):
+            yield f"lacks flag {flag}; do not enable it"
+    for flag in _flags(mujoco.mjtDisableBit, option.disableflags):
         if flag in DISABLE_FLAGS_IGNORED:
-            yield f"ignores flag {_name(mjtDisableBit, flag)}; do not disable it"
+            yield f"ignores flag {flag}; do not disable it"
     fluid = option.density > 0.0 or option.viscosity > 0.0 or np.any(option.wind)
-    if fluid and option.integrator == mjtIntegrator.mjINT_IMPLICITFAST:
-        yield (
-            "lacks fluid drag with implicitfast; "
-            "set density, viscosity and wind to 0, or integrator to Euler"
-        )
+    if fluid and integrator == "implicitfast":
+        remedy = "set density, viscosity and wind to 0, or integrator to Euler"
+        yield f"lacks fluid drag with implicitfast; {remedy}"
 
 
-def _bits(kind: Any, flags: int) -> list[Any]:
-    return [kind(1 << bit) for bit in range(flags.bit_length()) if flags >> bit & 1]
+def _flags(kind: Any, flags: int) -> list[str]:
+    return [_word(kind, 1 << bit) for bit in range(flags.bit_length()) if flags >> bit & 1]
 
 
-def _name(kind: Any, value: int) -> str:
+def _word(kind: Any, value: int) -> str:
     """`mjINT_DISCRETE` as `discrete`."""
     return str(kind(value).name).split("_", 1)[1].lower()
 
@@ -131,58 +98,52 @@ def _fields(model: mujoco.MjModel) -> Iterator[str]:
     for count, what in ((model.nflex, "flexes"), (model.nplugin, "plugins")):
         if count:
             yield f"lacks {what}; take them out of the model"
-    for name, what in IGNORED_FIELDS.items():
-        if np.any(getattr(model, name)):
-            yield f"ignores {what}; leave it at 0"
+    for element, fields in IGNORED_FIELDS.items():
+        for field in fields:
+            if np.any(getattr(model, field)):
+                what = field.split("_")[1].replace("poly", " of a higher order")
+                yield f"ignores {element} {what}; leave it at 0"
 
 
 def _kinds(model: mujoco.MjModel) -> Iterator[str]:
     for field, (what, kind, lacking) in KINDS_LACKING.items():
         for index, value in enumerate(getattr(model, field)):
-            word = kind(value).name.split("_", 1)[1]
-            if word in lacking:
-                named = f"{field} {word.lower()} of {_label(model, what, index)}"
-                yield f"lacks {named}; choose another, or take it out"
-    reduction, netforce = 1, 3  # column of sensor_intprm, its value
+            if (word := _word(kind, value)) in lacking:
+                label = _label(model, what, index)
+                yield f"lacks {field} {word} of {label}; choose another, or take it out"
     for index in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT).tolist():
-        ends = {mjtObj(int(end[index])) for end in (model.sensor_objtype, model.sensor_reftype)}
-        if ends & CONTACT_ENDS_LACKING or model.sensor_intprm[index, reduction] == netforce:
+        ends = model.sensor_objtype[index], model.sensor_reftype[index]
+        netforce = model.sensor_intprm[index, 1] == 3  # its reduction
+        if netforce or CONTACT_ENDS_LACKING & {_word(mujoco.mjtObj, end) for end in ends}:
             sensor = _label(model, "sensor", index)
-            yield (
-                f"lacks contact by site, body or subtree and netforce of {sensor}; "
-                "name geoms and another reduction"
-            )
+            remedy = "name geoms and another reduction"
+            yield f"lacks contact by site, body or subtree and netforce of {sensor}; {remedy}"
 
 
 def _label(model: mujoco.MjModel, what: str, index: int) -> str:
-    """How an element is called: its name, else its number."""
     name = mujoco.mj_id2name(model, mujoco.mju_str2Type(what), index)
     return f"{what} '{name}'" if name else f"{what} {index}"
 
 
 def _collisions(model: mujoco.MjModel) -> Iterator[str]:
     for one, two, margin in _meeting(model):
-        kinds = tuple(mjtGeom(kind) for kind in model.geom_type[[one, two]])
-        pair = " and ".join(_label(model, "geom", geom) for geom in (one, two))
-        words = " x ".join(_name(mjtGeom, kind) for kind in kinds)
+        pair = sorted((one, two), key=lambda geom: model.geom_type[geom])
+        kinds = tuple(_word(mujoco.mjtGeom, model.geom_type[geom]) for geom in pair)
+        labels = " and ".join(_label(model, "geom", geom) for geom in pair)
+        what = f"collisions {' x '.join(kinds)} ({labels})"
         if kinds in COLLISIONS_LACKING:
-            yield (
-                f"lacks collisions {words} ({pair}); "
-                "make the round one a mesh of few corners, or let them not meet"
-            )
-        elif margin and set(kinds) & NO_MARGIN:
-            yield f"lacks margins in collisions {words} ({pair}); set the margin to 0"
+            yield f"lacks {what}; make the round one a mesh of few corners, or let them not meet"
+        elif margin and NO_MARGIN.intersection(kinds):
+            yield f"lacks margins in {what}; set the margin to 0"
 
 
 def _meeting(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
-    """Pairs of geoms that may collide, by rising type, and the margin of each."""
-    for index in range(model.npair):
-        one, two = model.pair_geom1[index], model.pair_geom2[index]
-        yield *_by_type(model, one, two), model.pair_margin[index]
+    """Pairs of geoms that may collide, and the margin of each."""
+    yield from zip(model.pair_geom1, model.pair_geom2, model.pair_margin, strict=True)
     kind, affinity = model.geom_contype, model.geom_conaffinity
     weld = model.body_weldid[model.geom_bodyid]  # [geoms]
     parent = model.body_weldid[model.body_parentid[weld]]
-    filtered = not model.opt.disableflags & mjtDisableBit.mjDSBL_FILTERPARENT
+    filtered = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     excluded = set(model.exclude_signature.tolist())
     for one, two in itertools.combinations(np.flatnonzero(kind | affinity).tolist(), 2):
         mask = kind[one] & affinity[two] | kind[two] & affinity[one]
@@ -191,8 +152,4 @@ def _meeting(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
             continue
         related = weld[one] == parent[two] or weld[two] == parent[one]
         if not (filtered and related and weld[one] != 0 and weld[two] != 0):
-            yield *_by_type(model, one, two), model.geom_margin[one] + model.geom_margin[two]
-
-
-def _by_type(model: mujoco.MjModel, one: int, two: int) -> tuple[int, int]:
-    return (one, two) if model.geom_type[one] <= model.geom_type[two] else (two, one)
+            yield one, two, model.geom_margin[one] + model.geom_margin[two]

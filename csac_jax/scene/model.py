@@ -2,14 +2,16 @@
 
 import copy
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from scipy.spatial.transform import Rotation
 
 from csac_jax.config import MESH_KINDS, RobotKind, SceneConfig, SimConfig, SlotKind
 from csac_jax.errors import SceneError
@@ -67,46 +69,44 @@ class World:
 
 
 def assets() -> Path:
-    """Folder of the MJCF files: `scenes/` of a checkout, `_scenes/` of an installed package.
-
-    Raises FileNotFoundError where neither exists.
-    """
+    """Folder of the MJCF files, in a checkout or in an installed package."""
     package = Path(__file__).resolve().parent.parent
     for folder in (package.parent / "scenes", package / "_scenes"):
         if (folder / "table.xml").is_file():
             return folder
-    raise FileNotFoundError(
-        f"the MJCF files of csac_jax are missing beside {package}; install the package again"
-    )
+    raise FileNotFoundError(f"no MJCF files beside {package}; install csac_jax again")
 
 
 def _read(file: str) -> mujoco.MjSpec:
-    """A MJCF file of `assets`. Raises SceneError where MuJoCo cannot read it."""
-    path = assets() / file
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        return mujoco.MjSpec.from_file(str(assets() / file))
     except ValueError as error:
-        raise SceneError(f"{path}: {' '.join(str(error).split())}") from None
+        raise _one_line(assets() / file, error) from None
 
 
-def _require(file: str, kind: str, required: tuple[str, ...], present: list[str]) -> None:
+def _one_line(path: Path, error: ValueError) -> SceneError:
+    return SceneError(f"{path}: {' '.join(str(error).split())}")
+
+
+def _require(file: str, kind: str, required: tuple[str, ...], elements: Iterable[Any]) -> None:
     """Raises SceneError where an element that the package addresses by name is missing."""
+    present = [element.name for element in elements if element.name]
     for name in required:
         if name not in present:
-            known = ", ".join(present) or "none"
-            raise SceneError(f"{assets() / file}: {kind} '{name}' is missing; it has: {known}")
+            has = ", ".join(present) or "none"
+            raise SceneError(f"{assets() / file}: {kind} '{name}' is missing; it has: {has}")
 
 
 def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     spec = _read("table.xml")
     for part in ROBOTS[sim.robot]:
         _add_robot_part(spec, part)
-    _add_block_assets(spec, _mesh_scale(sim))
-    places = layout.parking(len(scene.slots))
-    for slot, (kind, place) in enumerate(zip(scene.slots, places, strict=True)):
+    # Warp's meshes have one size in all scenes.
+    _add_block_assets(spec, 1.0 if sim.physics == "warp" else LARGEST)
+    for slot, place in enumerate(layout.parking(len(scene.slots))):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
-        _add_parts(spec, body, kind)
+        _add_parts(spec, body, scene.slots[slot])
     if sim.physics != "mjx":  # which reads its contacts instead
         _add_touch_sensors(spec, len(scene.slots))
     spec.option.timestep = sim.timestep
@@ -119,12 +119,11 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
 
 def _add_robot_part(spec: mujoco.MjSpec, part: RobotPart) -> None:
     robot = _read(part.file)
-    _require(part.file, "joint", part.joints, [joint.name for joint in robot.joints])
-    _require(part.file, "geom", part.geoms, [geom.name for geom in robot.geoms if geom.name])
-    _require(part.file, "site", part.sites, [site.name for site in robot.sites])
-    actuators = [actuator.name for actuator in robot.actuators]
-    if tuple(actuators) != part.actuators:
-        required, present = ", ".join(part.actuators), ", ".join(actuators)
+    _require(part.file, "joint", part.joints, robot.joints)
+    _require(part.file, "geom", part.geoms, robot.geoms)
+    _require(part.file, "site", part.sites, robot.sites)
+    required, present = ", ".join(part.actuators), ", ".join(a.name for a in robot.actuators)
+    if present != required:
         raise SceneError(f"{assets() / part.file}: actuators must be {required}, not {present}")
     # `attach` silently drops an element that refers to a missing one, which this refuses.
     mujoco.MjModel.from_xml_path(str(assets() / part.file))
@@ -136,19 +135,13 @@ def _add_robot_part(spec: mujoco.MjSpec, part: RobotPart) -> None:
 
 def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
     """The block material and the meshes, at this scale."""
-    file = "blocks.xml"
-    part = _read(file)
-    _require(file, "mesh", MESH_KINDS, [mesh.name for mesh in part.meshes])
+    part = _read("blocks.xml")
+    _require("blocks.xml", "mesh", MESH_KINDS, part.meshes)
     if part.find_default("block") is None:
-        raise SceneError(f"{assets() / file}: default class 'block' is missing")
+        raise SceneError(f"{assets() / 'blocks.xml'}: default class 'block' is missing")
     for mesh in part.meshes:
         mesh.scale = [mesh_scale] * 3
     spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
-
-
-def _mesh_scale(sim: SimConfig) -> float:
-    """Size of compiled meshes relative to nominal; Warp's have one size in all scenes."""
-    return 1.0 if sim.physics == "warp" else LARGEST
 
 
 def _add_touch_sensors(spec: mujoco.MjSpec, slots: int) -> None:
@@ -158,15 +151,13 @@ def _add_touch_sensors(spec: mujoco.MjSpec, slots: int) -> None:
             sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
             sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, f"hand/{geom}"
             sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, f"block{slot}"
-            found, unreduced, one = 1, 0, 1
-            sensor.intprm[:3] = [found, unreduced, one]
+            sensor.intprm[:3] = [1, 0, 1]  # data `found`, no reduction, one contact
 
 
 def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> None:
     """The geoms of one slot, at the largest size of its kind."""
     largest = LARGEST * blocks.half_size_choices(kind).max(axis=0)
-    every = blocks.parts((kind,))
-    for centre, half in zip(every.centre, every.half, strict=True):
+    for _, centre, half in zip(*blocks.parts((kind,)), strict=True):
         geom = body.add_geom(spec.find_default("blocks/block"))
         if kind in MESH_KINDS:
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"blocks/{kind}"
@@ -184,15 +175,16 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     try:
         model = _spec(scene, sim).compile()
     except ValueError as error:
-        raise SceneError(f"{assets()}: {' '.join(str(error).split())}") from None
+        raise _one_line(assets(), error) from None
     if sim.physics == "mjx":
-        lint.check(model)
+        for fault in lint.faults(model):
+            raise SceneError(f"MJX {fault}")
     _align_inertia(model)
-    names = [f"block{slot}" for slot in range(len(scene.slots))]
-    bodies = np.array([model.body(name).id for name in names])
-    block_joints = [model.joint(name) for name in names]
+    slots = np.arange(len(scene.slots))
+    bodies = np.array([model.body(f"block{slot}").id for slot in slots])
+    free_joints = model.body_jntadr[bodies]
     slot_of_body = np.full(model.nbody, -1)
-    slot_of_body[bodies] = np.arange(len(names))
+    slot_of_body[bodies] = slots
     slot_of_geom = slot_of_body[model.geom_bodyid]
     joints = [part.prefix + name for part in ROBOTS[sim.robot] for name in part.joints]
     return World(
@@ -201,24 +193,22 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         parts=blocks.parts(scene.slots),
         block_bodies=bodies,
         block_geoms=np.flatnonzero(slot_of_geom >= 0),
-        block_qpos=np.array([joint.qposadr[0] + np.arange(7) for joint in block_joints]),
-        block_dofs=np.array([joint.dofadr[0] + np.arange(6) for joint in block_joints]),
+        block_qpos=model.jnt_qposadr[free_joints][:, None] + np.arange(7),
+        block_dofs=model.jnt_dofadr[free_joints][:, None] + np.arange(6),
         slot_of_geom=slot_of_geom,
         robot_qpos=np.array([model.joint(name).qposadr[0] for name in joints]),
         hand_geoms=np.array([model.geom(f"hand/{name}").id for name in HAND_GEOMS]),
-        mesh_scale=_mesh_scale(sim),
+        mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
     )
 
 
 def _align_inertia(model: mujoco.MjModel) -> None:
     """Undoes the compiler's swap of axes, by size, where inertial frames are body frames."""
-    for body in range(model.nbody):
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, model.body_iquat[body])
-        if np.allclose(np.abs(rotation).max(axis=0), 1.0):
-            swap = np.abs(rotation.reshape(3, 3).round())
-            model.body_inertia[body] = swap @ model.body_inertia[body]
-            model.body_iquat[body] = [1.0, 0.0, 0.0, 0.0]
+    rotation = Rotation.from_quat(model.body_iquat, scalar_first=True).as_matrix()
+    is_swap = np.isclose(np.abs(rotation).max(axis=1), 1.0).all(axis=1)
+    swapped = np.abs(rotation.round()) @ model.body_inertia[:, :, None]
+    model.body_inertia[is_swap] = swapped[is_swap, :, 0]
+    model.body_iquat[is_swap] = [1.0, 0.0, 0.0, 0.0]
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
@@ -238,38 +228,26 @@ class BlockFields:
     mesh_scale: jax.Array  # [M] relative to the compiled mesh
 
 
-def block_fields(
-    world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array
-) -> BlockFields:
-    """Fields that follow from half sizes [N, 3] m, densities [N] kg/m^3 and sliding frictions [N].
+def scene_fields(world: World, scene: Scene) -> BlockFields:
+    """Fields that follow from the sizes, densities and frictions of one scene.
 
     Closed forms of what MuJoCo's compiler derives. Boxes: m = 8 rho a b c, I_x = m (b^2 + c^2) / 3,
     parts about their common centre of mass by the parallel axis theorem. Meshes by their scale s:
     m ~ rho s^3, I ~ rho s^5. Blocks of one mesh kind in a scene share their size.
     """
-    boxes = _box_fields(world, half_size, density, friction)
-    meshes = _mesh_fields(world, half_size, density, friction)
-    is_mesh = np.array([kind in MESH_KINDS for kind in world.slots])
-
-    def choose(mesh: jax.Array, box: jax.Array) -> jax.Array:
-        which = is_mesh if len(box) == len(is_mesh) else is_mesh[world.parts.slot]  # [N] or [G]
-        return jnp.where(which.reshape(-1, *[1] * (box.ndim - 1)), mesh, box)
-
-    chosen = jax.tree.map(choose, meshes.replace(mesh_scale=None), boxes.replace(mesh_scale=None))
-    return chosen.replace(mesh_scale=meshes.mesh_scale)
+    scene = jax.tree.map(jnp.asarray, scene)
+    return _with_meshes(world, scene, _box_fields(world, scene))
 
 
-def _box_fields(
-    world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array
-) -> BlockFields:
+def _box_fields(world: World, scene: Scene) -> BlockFields:
     """As if every slot were made of boxes."""
-    slot, num = world.parts.slot, len(world.slots)
-    half = jnp.asarray(world.parts.half) * half_size[slot]
-    centre = jnp.asarray(world.parts.centre) * half_size[slot]
-    part_mass = 8.0 * density[slot] * jnp.prod(half, axis=1)
+    slot = world.parts.slot
+    half_size = scene.half_size[slot]
+    half, centre = half_size * world.parts.half, half_size * world.parts.centre
+    part_mass = 8.0 * scene.density[slot] * jnp.prod(half, axis=1)
 
     def add(values: jax.Array) -> jax.Array:
-        return jnp.zeros((num, *values.shape[1:])).at[slot].add(values)
+        return jnp.zeros((len(world.slots), *values.shape[1:])).at[slot].add(values)
 
     mass = add(part_mass)
     com = add(part_mass[:, None] * centre) / mass[:, None]
@@ -284,7 +262,7 @@ def _box_fields(
         size=half,
         centre=centre,
         rbound=jnp.sqrt(jnp.sum(half**2, axis=1)),
-        friction=friction[slot],
+        friction=scene.friction[slot],
         mass=mass,
         inertia=inertia,
         com=com,
@@ -294,69 +272,54 @@ def _box_fields(
     )
 
 
-def _mesh_fields(
-    world: World, half_size: jax.Array, density: jax.Array, friction: jax.Array
-) -> BlockFields:
-    """As if every slot held a mesh: the compiled fields, scaled."""
+def _with_meshes(world: World, scene: Scene, boxes: BlockFields) -> BlockFields:
+    """`boxes`, but where a slot holds a mesh the compiled fields, scaled."""
     model, slot = world.model, world.parts.slot
-    scale = blocks.mesh_scale(world.slots, half_size) / world.mesh_scale  # [N]
-    heavier = density / layout.NOMINAL_DENSITY  # that of scenes/blocks.xml
-    of_part, of_slot = scale[slot][:, None], scale[:, None]
-    by_mass, by_inertia = heavier[:, None] * of_slot**3, heavier[:, None] * of_slot**5
-    inverse = [jnp.repeat(1.0 / by, 3, axis=1) for by in (by_mass, by_inertia)]
-    powers = jnp.concatenate(inverse, axis=1)
+    geoms, bodies = world.block_geoms, world.block_bodies
+    is_mesh = blocks.is_mesh(world.slots)
+    scale = (blocks.mesh_scale(world.slots, scene.half_size) / world.mesh_scale)[:, None]  # [N, 1]
+    heavier = (scene.density / layout.NOMINAL_DENSITY)[:, None]  # that of scenes/blocks.xml
+    by_mass, by_inertia = heavier * scale**3, heavier * scale**5
+    by_weight = jnp.concatenate([1.0 / by_mass, 1.0 / by_inertia], axis=1)  # [N, 2]
 
-    def base(field: np.ndarray) -> jax.Array:
-        return jnp.asarray(field, jnp.float32)
+    def choose(box: jax.Array, compiled: np.ndarray, by: jax.Array) -> jax.Array:
+        which = is_mesh if len(box) == len(is_mesh) else is_mesh[slot]  # [N] or [G]
+        scaled = jnp.asarray(compiled, jnp.float32) * by
+        return jnp.where(which.reshape(-1, *[1] * (box.ndim - 1)), scaled, box)
 
-    return BlockFields(
-        size=base(model.geom_size[world.block_geoms]) * of_part,
-        centre=base(model.geom_pos[world.block_geoms]) * of_part,
-        rbound=base(model.geom_rbound[world.block_geoms]) * of_part[:, 0],
-        friction=friction[slot],
-        mass=base(model.body_mass[world.block_bodies]) * by_mass[:, 0],
-        inertia=base(model.body_inertia[world.block_bodies]) * by_inertia,
-        com=base(model.body_ipos[world.block_bodies]) * of_slot,
-        body_invweight=base(model.body_invweight0[world.block_bodies]) * powers[:, [0, 3]],
-        dof_invweight=base(model.dof_invweight0[world.block_dofs]) * powers,
-        mesh_scale=_scale_of_meshes(world, scale),
+    # The first slot that uses each mesh; -1, of boxes, is the last row.
+    meshes, first = np.unique(model.geom_dataid[geoms], return_index=True)
+    user = np.full(model.nmesh + 1, len(scale))
+    user[meshes] = slot[first]
+    by_dof = jnp.repeat(by_weight, 3, axis=1)
+    return boxes.replace(
+        size=choose(boxes.size, model.geom_size[geoms], scale[slot]),
+        centre=choose(boxes.centre, model.geom_pos[geoms], scale[slot]),
+        rbound=choose(boxes.rbound, model.geom_rbound[geoms], scale[slot, 0]),
+        mass=choose(boxes.mass, model.body_mass[bodies], by_mass[:, 0]),
+        inertia=choose(boxes.inertia, model.body_inertia[bodies], by_inertia),
+        com=choose(boxes.com, model.body_ipos[bodies], scale),
+        body_invweight=choose(boxes.body_invweight, model.body_invweight0[bodies], by_weight),
+        dof_invweight=choose(boxes.dof_invweight, model.dof_invweight0[world.block_dofs], by_dof),
+        mesh_scale=jnp.append(scale, 1.0)[user[:-1]],
     )
 
 
-def _scale_of_meshes(world: World, scale: jax.Array) -> jax.Array:
-    """Scale of every mesh of the model [M]: that of its first slot, 1 where no slot uses it."""
-    mesh_of_part, one = world.model.geom_dataid[world.block_geoms], jnp.ones(())
-    users = [np.flatnonzero(mesh_of_part == mesh) for mesh in range(world.model.nmesh)]
-    each = [scale[world.parts.slot[parts[0]]] if parts.size else one for parts in users]
-    return jnp.stack(each or [one])
-
-
 def with_blocks(
-    world: World,
-    fields: BlockFields,
-    scratch: mujoco.MjData | None = None,
-    into: mujoco.MjModel | None = None,
+    world: World, fields: BlockFields, into: tuple[mujoco.MjModel, mujoco.MjData] | None = None
 ) -> mujoco.MjModel:
-    """The world's model with blocks of these fields (NumPy): a copy, or `into`, an earlier copy.
+    """The world's model with blocks of these fields (NumPy): a copy, or the model of `into`.
 
-    MuJoCo derives the rest: C takes the mass matrix of a free body from `dof_M0`, not from its
-    mass. It works in `scratch` if given: allocation, like a copy, takes longer than all the rest.
+    `into` is an earlier copy and data of it: to allocate them takes longer than all the rest.
+    MuJoCo derives what follows: C takes a free body's mass matrix from `dof_M0`, not from its mass.
     """
-    model = into or copy.copy(world.model)
+    model, scratch = into or (copy.copy(world.model), mujoco.MjData(world.model))
     geoms, bodies = world.block_geoms, world.block_bodies
     model.geom_size[geoms], model.geom_rbound[geoms] = fields.size, fields.rbound
     model.geom_pos[geoms], model.geom_friction[geoms, 0] = fields.centre, fields.friction
     model.body_mass[bodies], model.body_inertia[bodies] = fields.mass, fields.inertia
     model.body_ipos[bodies] = fields.com
-    for mesh, scale in zip(range(model.nmesh), fields.mesh_scale, strict=False):
-        start = model.mesh_vertadr[mesh]
-        corners = slice(start, start + model.mesh_vertnum[mesh])
-        model.mesh_vert[corners] = world.model.mesh_vert[corners] * scale
-    mujoco.mj_setConst(model, scratch or mujoco.MjData(model))
+    scales = np.repeat(fields.mesh_scale, model.mesh_vertnum)  # of corners, mesh by mesh
+    model.mesh_vert[:] = world.model.mesh_vert * scales[:, None]
+    mujoco.mj_setConst(model, scratch)
     return model
-
-
-def scene_fields(world: World, scene: Scene) -> BlockFields:
-    """The fields of one scene."""
-    leaves = (scene.half_size, scene.density, scene.friction)
-    return block_fields(world, *(jnp.asarray(leaf) for leaf in leaves))

@@ -1,12 +1,11 @@
 """The physics that `sim.physics auto` stands for on this machine, chosen before a run."""
 
 import contextlib
-import dataclasses
 import importlib.util
 
 import jax
 
-from csac_jax.config import WARP_WORLDS, Config, PhysicsKind
+from csac_jax.config import WARP_WORLDS, Config
 
 WARP_SCENES = range(1024, WARP_WORLDS + 1)
 """Scenes at a time, of all runs, at which Warp was measured to be faster.
@@ -24,17 +23,11 @@ def resolve(cfg: Config, devices: int = 1, runs: int = 1) -> Config:
     """
     if cfg.sim.physics != "auto":
         return cfg
-    if devices == 1 and jax.default_backend() == "cpu":
-        return _with_physics(cfg, "c")
-    if devices == 1 and runs * cfg.train.scenes in WARP_SCENES and _warp_runs_here():
+    platform = jax.default_backend() if devices == 1 else None
+    if platform == "cpu":
+        return cfg.change(sim={"physics": "c"})
+    faster_on_warp = platform == "gpu" and runs * cfg.train.scenes in WARP_SCENES
+    if faster_on_warp and importlib.util.find_spec("warp") is not None:
         with contextlib.suppress(ValueError):  # the config refuses scenes that Warp cannot do
-            return _with_physics(cfg, "warp")
-    return _with_physics(cfg, "mjx")
-
-
-def _with_physics(cfg: Config, kind: PhysicsKind) -> Config:
-    return dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=kind))
-
-
-def _warp_runs_here() -> bool:
-    return jax.default_backend() == "gpu" and importlib.util.find_spec("warp") is not None
+            return cfg.change(sim={"physics": "warp"})
+    return cfg.change(sim={"physics": "mjx"})

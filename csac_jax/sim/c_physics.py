@@ -4,17 +4,15 @@ The compiled step calls it back, so that the same environment can use it. C MuJo
 contacts; MJX keeps a fixed number of them.
 """
 
-import contextlib
 import copy
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Iterator, Sequence
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import rollout
@@ -25,7 +23,7 @@ from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import HAND_GEOMS, BlockFields, World
 from csac_jax.sim import outcome
 from csac_jax.sim.outcome import Substep, Trace
-from csac_jax.sim.robot import JointTrajectory
+from csac_jax.sim.primitives import JointTrajectory
 
 _CALL_SUBSTEPS = 48  # per call of MuJoCo, ours: a longer call repeats more after a fast block
 
@@ -45,121 +43,66 @@ class CPhysics:
             raise ValueError("world: it has no touch sensors; build it with sim.physics c")
 
     @functools.cached_property
-    def _simulators(self) -> "SimulatorPool":
-        return SimulatorPool(self.world.model)
+    def _simulator(self) -> "Simulator":
+        return Simulator(self.world.model)
+
+    @functools.cached_property
+    def _threads(self) -> ThreadPoolExecutor:
+        """One thread per core, which concurrent calls share."""
+        return ThreadPoolExecutor(len(os.sched_getaffinity(0)))
 
     def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
         """See `physics.Physics`."""
-        num, substeps = len(self.world.slots), len(joints.control)
-        shapes = [(num, 7), (num, 6), (substeps, num), (substeps,)]
-        results = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-        touching = jax.ShapeDtypeStruct((substeps, len(HAND_GEOMS), num), bool)
-        pose, velocity, rise, gap, touch = jax.pure_callback(
-            functools.partial(_run_batch, self.world, self._simulators),
-            (*results, touching),
-            scene,
-            model.scene_fields(self.world, scene),
-            joints,
-            vmap_method="broadcast_all",
+        fields = model.scene_fields(self.world, scene)
+        result = scene, outcome.nothing_seen(len(joints.control), len(self.world.slots))
+        moved, seen = jax.pure_callback(
+            self._run_batch, result, scene, fields, joints, vmap_method="broadcast_all"
         )
-        moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
-        trace = outcome.trace_of(self.cfg, Substep(touch, rise, gap, jnp.zeros(substeps, bool)))
-        return layout.park(moved, scene.in_play), trace
+        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, seen)
+
+    def _run_batch(self, *batch: Any) -> Any:
+        """`_run` of every scene of a batch; the leading axes come back. NumPy only: JAX must not
+        run inside a callback."""
+        batch = jax.tree.map(np.asarray, batch)
+        axes = batch[-1].reachable.shape
+        rows = [jax.tree.map(lambda leaf, i=i: leaf[i], batch) for i in np.ndindex(axes)]
+        run = functools.partial(_run, self.world, self._simulator)
+        results = self._threads.map(run, *zip(*rows, strict=True))
+        return jax.tree.map(
+            lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *results
+        )
 
 
-class Simulator(NamedTuple):
-    """What one thread needs to move a scene."""
+class Simulator(threading.local):
+    """What a thread needs to move a scene: each has its own, made as it first asks for it.
 
-    model: mujoco.MjModel  # holds the blocks of the last scene
-    data: mujoco.MjData
-    engine: rollout.Rollout  # MuJoCo's own loop, run in the thread that calls it
-
-    @classmethod
-    def of(cls, world_model: mujoco.MjModel) -> "Simulator":
-        """A simulator of a copy of the model."""
-        own = copy.copy(world_model)
-        own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # no reset after a warning
-        return cls(own, mujoco.MjData(own), rollout.Rollout(nthread=0))
-
-
-class SimulatorPool:
-    """One thread per core, and a simulator for each thread at work; both outlive a call.
-
-    Making a simulator takes a sixteenth of the time of moving a scene of ten blocks.
+    That takes a sixteenth of the time of moving a scene of ten blocks.
     """
 
     def __init__(self, world_model: mujoco.MjModel) -> None:
-        self._model = world_model
-        self._threads = ThreadPoolExecutor(len(os.sched_getaffinity(0)))
-        self._idle: list[Simulator] = []
-
-    def map(self, function: Callable[[Any], Any], rows: Sequence[Any]) -> list[Any]:
-        """The function's result for every row; concurrent calls share the threads."""
-        return list(self._threads.map(function, rows))
-
-    @contextlib.contextmanager
-    def simulator(self) -> Iterator[Simulator]:
-        """A simulator that nobody else uses meanwhile."""
-        try:
-            simulator = self._idle.pop()
-        except IndexError:
-            simulator = Simulator.of(self._model)
-        try:
-            yield simulator
-        finally:
-            self._idle.append(simulator)
-
-
-def _run_batch(
-    world: World,
-    simulators: SimulatorPool,
-    scene: Scene,
-    fields: BlockFields,
-    joints: JointTrajectory,
-) -> Any:
-    """`_run` of every scene of a batch; the leading axes come back. NumPy only: JAX must not run
-    inside a callback."""
-    axes = np.shape(joints.reachable)
-    batch = jax.tree.map(
-        lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[len(axes) :]), (scene, fields, joints)
-    )
-    rows = [jax.tree.map(lambda leaf, i=i: leaf[i], batch) for i in range(len(batch[2].reachable))]
-    results = simulators.map(lambda row: _run(world, simulators, *row), rows)
-    return jax.tree.map(
-        lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *results
-    )
+        self.model = copy.copy(world_model)  # holds the blocks of the last scene
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # after a warning
+        self.data = mujoco.MjData(self.model)
+        self.engine = rollout.Rollout(nthread=0)  # MuJoCo's own loop, run in the calling thread
 
 
 def _run(
-    world: World,
-    simulators: SimulatorPool,
-    scene: Scene,
-    fields: BlockFields,
-    joints: JointTrajectory,
-) -> tuple[Any, ...]:
-    """One scene: final poses [N, 7] and velocities [N, 6]; rise [T, N], gap [T] and touching
-    [T, 3, N] as in `Substep`."""
-    num, substeps = len(world.slots), len(joints.control)
-    if not _moves(scene, joints):
-        pose = np.concatenate([scene.position, scene.quaternion], axis=1)
-        unseen = np.zeros((substeps, num), np.float32), np.zeros(substeps, np.float32)
-        return pose, scene.velocity, *unseen, np.zeros((substeps, len(HAND_GEOMS), num), bool)
-    with simulators.simulator() as simulator:
-        qpos, qvel, sensed = _rollout(world, simulator, scene, fields, joints)
-    pose, velocity = qpos[-1][world.block_qpos], qvel[-1][world.block_dofs]
-    rise = qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2]
-    gap = 2.0 * qpos[:, world.robot_qpos[-2]]
-    touching = sensed.reshape(substeps, len(HAND_GEOMS), num) > 0.0
-    return *(leaf.astype(np.float32) for leaf in (pose, velocity, rise, gap)), touching
-
-
-def _moves(scene: Scene, joints: JointTrajectory) -> bool:
-    """Whether there is anything to simulate: a block, a reachable plan, and no NaN, which would
-    make MuJoCo reset."""
-    state = (scene.position, scene.quaternion, scene.velocity)
-    return bool(
-        joints.reachable and scene.in_play.any() and all(np.isfinite(leaf).all() for leaf in state)
-    )
+    world: World, simulator: Simulator, scene: Scene, fields: BlockFields, joints: JointTrajectory
+) -> tuple[Scene, Substep]:
+    """One scene after its primitive, and what was seen, leaves [T, ...]."""
+    seen = outcome.nothing_seen(len(joints.control), len(world.slots))
+    state = scene.position, scene.quaternion, scene.velocity
+    finite = all(np.isfinite(leaf).all() for leaf in state)  # MuJoCo would reset a scene with NaN
+    if not (finite and joints.reachable and scene.in_play.any()):
+        return scene, seen
+    qpos, qvel, sensed = _rollout(world, simulator, scene, fields, joints)
+    pose = qpos[-1, world.block_qpos].astype(np.float32)
+    velocity = qvel[-1, world.block_dofs].astype(np.float32)
+    moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
+    touching = sensed.reshape(seen.touching.shape) > 0.0
+    rise = (qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2]).astype(np.float32)
+    gap = (2.0 * qpos[:, world.robot_qpos[-2]]).astype(np.float32)
+    return moved, seen.replace(touching=touching, rise=rise, gap=gap)
 
 
 class Trajectory(NamedTuple):
@@ -175,7 +118,7 @@ def trajectory(
 ) -> Trajectory:
     """Every state of one scene, of NumPy arrays; no substep where the robot cannot follow."""
     if joints.reachable:
-        return _rollout(world, Simulator.of(world.model), scene, fields, joints)
+        return _rollout(world, Simulator(world.model), scene, fields, joints)
     sizes = world.model.nq, world.model.nv, world.model.nsensordata
     return Trajectory(*(np.zeros((0, size)) for size in sizes))
 
@@ -189,22 +132,17 @@ def _rollout(
     own.geom_contype[:] = np.where(is_parked, 0, world.model.geom_contype)
     own.geom_conaffinity[:] = np.where(is_parked, 0, world.model.geom_conaffinity)
     # MuJoCo derives the bodies' contact masks here: the geoms' come first.
-    model.with_blocks(world, fields, simulator.data, into=own)
-    start, speeds = _start(world, scene, joints), 1 + own.nq + world.block_dofs[scene.in_play]
+    model.with_blocks(world, fields, into=(own, simulator.data))
+    start = np.concatenate([[0.0], world.model.qpos0, np.zeros(own.nv)])
+    start[1 + world.robot_qpos] = joints.start
+    start[1 + world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    start[1 + own.nq + world.block_dofs] = scene.velocity
+    speeds = 1 + own.nq + world.block_dofs[scene.in_play]
     states, sensed = _simulate(simulator, start, np.asarray(joints.control), speeds)
     qpos, qvel = np.split(states[:, 1:], [own.nq], axis=1)
     waiting = world.block_qpos[parked]
     qpos[:, waiting], qvel[:, world.block_dofs[parked]] = start[1 + waiting], 0.0  # they fell
     return Trajectory(qpos, qvel, sensed)
-
-
-def _start(world: World, scene: Scene, joints: JointTrajectory) -> np.ndarray:
-    """State [1 + nq + nv], MuJoCo's, of the scene's blocks and the robot at its first set-point."""
-    qpos, qvel = world.model.qpos0.copy(), np.zeros(world.model.nv)
-    qpos[world.robot_qpos] = joints.start
-    qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    qvel[world.block_dofs] = scene.velocity
-    return np.concatenate([[0.0], qpos, qvel])
 
 
 def _simulate(
@@ -217,10 +155,10 @@ def _simulate(
     after which a block is too fast. The next call starts from the limited velocities and the
     solver's warm start, which gives the same bits as a loop that never ended.
     """
-    own, data, engine = simulator
+    own, data = simulator.model, simulator.data
     parts, done, ahead, warm = [], 0, _CALL_SUBSTEPS, np.zeros(own.nv)
     while done < len(control):
-        (states,), (sensed,) = engine.rollout(
+        (states,), (sensed,) = simulator.engine.rollout(
             own, data, state, control[None, done : done + ahead], initial_warmstart=warm
         )
         too_fast = (np.abs(states[:, speeds]) > layout.SPEED_LIMIT).any(axis=(1, 2))

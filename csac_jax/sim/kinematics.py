@@ -20,7 +20,6 @@ D1, A2, A3, D4, D5, D6 = 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823
 BASE = (0.6, 0.0, 0.35)  # m, ours: see scenes/README.md
 TOOL = 0.213  # m, flange to finger tips: mean of the RG2 open and closed, see scenes/README.md
 LIMITS = np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0], np.float32)  # rad, either way
-MAX_SPEED = np.pi  # rad/s of every joint, the maker's
 # rad, ours: tips 0.2 m above the centre
 HOME = np.array([-0.183, -0.976, 1.832, -2.426, -1.571, 1.388], np.float32)
 
@@ -40,40 +39,19 @@ class Pose(NamedTuple):
     rotation: jax.Array  # [3, 3], tip to world
 
 
-class JointTargets(NamedTuple):
-    """What the actuators are told. T = set-points."""
-
-    target: jax.Array  # [T, 7] six joint angles rad, half the opening m
-    reachable: jax.Array  # [] bool, True if one branch reaches every set-point
-
-
-class _Frames(NamedTuple):
-    """Points [3] m and directions [3] along the arm, world frame."""
-
-    side: jax.Array  # axis of joints 2, 3, 4
-    shoulder: jax.Array
-    elbow: jax.Array
-    wrist1: jax.Array
-    wrist2: jax.Array
-    wrist3: jax.Array
-    closing: jax.Array  # x axis of the tip frame
-    down: jax.Array  # axis of joint 6, from the flange to the tips
-
-
-def _vector(x: jax.Array, y: jax.Array, z: jax.Array) -> jax.Array:
-    return jnp.stack([x, y, z])
-
-
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.sum(a * b, axis=-1)
 
 
-def _frames(q: jax.Array) -> _Frames:
-    """Frames of the joint angles `q` [6], by the maker's parameters."""
+def _frames(q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array, jax.Array]:
+    """The arm at the joint angles `q` [6], by the maker's parameters, world frame.
+
+    Returns: shoulder, elbow and wrists 1, 2, 3, [3] m each; the axis of joints 2 to 4 [3]; the x
+    axis of the tip frame [3]; the axis of joint 6 [3], from the flange to the tips.
+    """
     cos, sin = jnp.cos(q), jnp.sin(q)
-    zero, one = jnp.zeros_like(q[0]), jnp.ones_like(q[0])
-    ahead, side = _vector(cos[0], sin[0], zero), _vector(sin[0], -cos[0], zero)
-    up = _vector(zero, zero, one)
+    ahead, side = jnp.array([cos[0], sin[0], 0.0]), jnp.array([sin[0], -cos[0], 0.0])
+    up = jnp.array([0.0, 0.0, 1.0])
 
     def along(angle):
         return jnp.cos(angle) * ahead + jnp.sin(angle) * up
@@ -85,29 +63,22 @@ def _frames(q: jax.Array) -> _Frames:
     x4, z4 = along(bend), jnp.sin(bend) * ahead - jnp.cos(bend) * up
     wrist2 = wrist1 + D4 * side
     wrist3 = wrist2 + D5 * z4
-    down = cos[4] * side - sin[4] * x4
     closing = cos[5] * (cos[4] * x4 + sin[4] * side) - sin[5] * z4
-    return _Frames(side, shoulder, elbow, wrist1, wrist2, wrist3, closing, down)
-
-
-def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Vector product [3]."""
-    return _vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    down = cos[4] * side - sin[4] * x4
+    return [shoulder, elbow, wrist1, wrist2, wrist3], side, closing, down
 
 
 def forward(q: jax.Array) -> Pose:
     """Pose of the finger tips at the joint angles `q` [6] rad."""
-    frames = _frames(q)
-    position = frames.wrist3 + (D6 + TOOL) * frames.down
-    columns = (frames.closing, _cross(frames.closing, frames.down), -frames.down)
-    return Pose(position, jnp.stack(columns, axis=1))
+    (*_, wrist3), _, closing, down = _frames(q)
+    columns = (closing, jnp.cross(closing, down), -down)
+    return Pose(wrist3 + (D6 + TOOL) * down, jnp.stack(columns, axis=1))
 
 
 def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
     """Pose of a hand that points down, tips at `xyz` [3] m, fingers closing along `yaw` [] rad."""
-    cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
-    rows = (_vector(cos, -sin, zero), _vector(sin, cos, zero), _vector(zero, zero, zero + 1.0))
-    return Pose(xyz, jnp.stack(rows))
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return Pose(xyz, jnp.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]))
 
 
 def inverse(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -122,24 +93,20 @@ def inverse(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Ar
     the branch's reach or within SINGULAR of where two branches meet. Angles are finite but
     meaningless where it is False.
     """
-    columns = jnp.sum(rotation**2, axis=0)
-    unit = jnp.all(jnp.abs(columns - 1.0) < 0.01)
+    unit = jnp.all(jnp.abs(jnp.sum(rotation**2, axis=0) - 1.0) < 0.01)
     sane = jnp.all(jnp.abs(position) < _FAR) & unit  # False for NaN
     position, rotation = jnp.where(sane, position, 0.0), jnp.where(sane, rotation, jnp.eye(3))
     joints, valid = jax.vmap(_branch, (None, None, 0))(position, rotation, jnp.asarray(BRANCHES))
     return joints, valid & sane
 
 
-def _branch(
-    position: jax.Array, rotation: jax.Array, signs: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _branch(position: jax.Array, rotation: jax.Array, signs: jax.Array) -> tuple[jax.Array, ...]:
     """Joint angles [6] of the branch of these `signs` [3], and whether they count [] bool."""
     x6, y6, down = rotation[:, 0], -rotation[:, 1], -rotation[:, 2]
     from_base = position - jnp.array(BASE) - (D6 + TOOL) * down  # wrist 3
     pan, shoulder_ok = _shoulder(from_base[:2], signs[0])
-    zero = jnp.zeros_like(pan)
-    ahead = _vector(jnp.cos(pan), jnp.sin(pan), zero)
-    side = _vector(jnp.sin(pan), -jnp.cos(pan), zero)
+    cos, sin = jnp.cos(pan), jnp.sin(pan)
+    ahead, side = jnp.array([cos, sin, 0.0]), jnp.array([sin, -cos, 0.0])
 
     wrist2, wrist3, wrist_ok = _wrist(_dot(side, x6), _dot(side, y6), _dot(side, down), signs[2])
     x5 = jnp.cos(wrist3) * x6 - jnp.sin(wrist3) * y6
@@ -150,7 +117,7 @@ def _branch(
     wrist1 = from_base - D5 * z4 - D4 * side
     lift, elbow, elbow_ok = _elbow(_dot(wrist1, ahead), wrist1[2] - D1, signs[1])
     q = jnp.stack([pan, lift, elbow, bend - lift - elbow, wrist2, wrist3])
-    return _wrap(q), shoulder_ok & elbow_ok & wrist_ok
+    return q - FULL_TURN * jnp.round(q / FULL_TURN), shoulder_ok & elbow_ok & wrist_ok
 
 
 def _shoulder(xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -162,9 +129,7 @@ def _shoulder(xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
     return towards + 0.5 * np.pi + sign * offset, ok
 
 
-def _wrist(
-    x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _wrist(x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array) -> tuple[jax.Array, ...]:
     """Wrist 2 and 3 [] from the axis of joints 2, 3 and 4, `x` `y` `z` [] in the flange's frame."""
     square = x**2 + y**2
     ok = square > SINGULAR**2
@@ -172,9 +137,7 @@ def _wrist(
     return jnp.arctan2(sign * jnp.sqrt(square), z), jnp.arctan2(-sign * y, sign * x), ok
 
 
-def _elbow(
-    ahead: jax.Array, up: jax.Array, sign: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _elbow(ahead: jax.Array, up: jax.Array, sign: jax.Array) -> tuple[jax.Array, ...]:
     """Shoulder lift and elbow [] that put wrist 1 `ahead` and `up` [] m from the shoulder.
 
     With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3),
@@ -184,47 +147,35 @@ def _elbow(
     sin2 = ((A2 + A3) ** 2 - square) / (4.0 * A2 * A3)
     cos2 = (square - (A2 - A3) ** 2) / (4.0 * A2 * A3)
     ok = jnp.minimum(sin2, cos2) > (0.5 * SINGULAR) ** 2
-    ahead, up, sin2, cos2 = (
-        jnp.where(ok, v, w) for v, w in ((ahead, 0.5), (up, 0.0), (sin2, 0.5), (cos2, 0.5))
-    )
+    ahead, up = jnp.where(ok, ahead, 0.5), jnp.where(ok, up, 0.0)
+    sin2, cos2 = jnp.where(ok, sin2, 0.5), jnp.where(ok, cos2, 0.5)
     sin, cos = sign * 2.0 * jnp.sqrt(sin2 * cos2), cos2 - sin2
     lift = jnp.arctan2(up, ahead) - jnp.arctan2(A3 * sin, A2 + A3 * cos)
     return lift, 2.0 * sign * jnp.arctan2(jnp.sqrt(sin2), jnp.sqrt(cos2)), ok
 
 
-def _wrap(angle: jax.Array) -> jax.Array:
-    """The same directions in [-pi, pi] rad, any shape."""
-    return angle - FULL_TURN * jnp.round(angle / FULL_TURN)
-
-
 # m along `side`, of the links' middles (ur_description).
 _SHOULDER_OFFSET, _FOREARM_OFFSET = 0.13585, 0.0165
 _PALM, _FINGERS = 0.115, 0.07  # m from the tips back to the ends of the gripper's two capsules
-# m, of _capsules
+# m, of the capsules along _chain
 _RADII = np.array([0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045, 0.045, 0.07], np.float32)
-# Pairs of capsules that could meet; the shape of the links rules out all others.
-_PAIRS = np.array([
-    *itertools.product((0,), (3, 4, 5, 6, 7, 8)),
-    *itertools.product((1,), (4, 5, 6, 7, 8)),
-    *itertools.product((2,), (5, 6, 7, 8)),
-    *itertools.product((3, 4), (7, 8)),
-])  # fmt: skip
-_ABOVE_TABLE = np.array([2, 3, 4, 5, 6, 7])  # not the hand, whose height is the planner's choice
+# Capsules that could meet: i and any from `first` on. The shape of the links rules out all others.
+_PAIRS = np.array([(i, j) for i, first in enumerate((3, 4, 5, 7, 7)) for j in range(first, 9)])
+_ABOVE_TABLE = slice(2, 8)  # not the hand, whose height is the planner's choice
 
 
-def _capsules(q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends [9, 3] and [9, 3] m of the capsules about the arm.
+def _chain(q: jax.Array) -> jax.Array:
+    """Points [10, 3] m along the arm; the capsules about it run from each to the next.
 
-    Pedestal, shoulder, upper arm, elbow, forearm, wrist 1, wrist 2, wrist 3 with the gripper's
-    body, and open fingers. All but the last two are geoms of `scenes/ur5.xml`.
+    They are pedestal, shoulder, upper arm, elbow, forearm, wrist 1, wrist 2, wrist 3 with the
+    gripper's body, and open fingers. All but the last two are geoms of `scenes/ur5.xml`.
     """
-    f = _frames(q)
+    (shoulder, elbow, wrist1, wrist2, wrist3), side, _, down = _frames(q)
     foot = jnp.array([BASE[0], BASE[1], 0.0])
-    palm, tips = (f.wrist3 + (D6 + TOOL - back) * f.down for back in (_PALM, _FINGERS))
-    outer, inner = _SHOULDER_OFFSET * f.side, _FOREARM_OFFSET * f.side
-    arm = [foot, f.shoulder, f.shoulder + outer, f.elbow + outer, f.elbow + inner]
-    arm += [f.wrist1 + inner, f.wrist2]
-    return jnp.stack([*arm, f.wrist3, palm]), jnp.stack([*arm[1:], f.wrist3, palm, tips])
+    outer, inner = _SHOULDER_OFFSET * side, _FOREARM_OFFSET * side
+    palm, tips = (wrist3 + (D6 + TOOL - back) * down for back in (_PALM, _FINGERS))
+    arm = [foot, shoulder, shoulder + outer, elbow + outer, elbow + inner, wrist1 + inner]
+    return jnp.stack([*arm, wrist2, wrist3, palm, tips])
 
 
 def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array) -> jax.Array:
@@ -249,11 +200,12 @@ def clearance(q: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     The links are capsules, the fingers may touch the table. Negative: they overlap.
     """
-    start, end = _capsules(q)
-    above = jnp.minimum(start[:, 2], end[:, 2]) - jnp.asarray(_RADII)
+    chain = _chain(q)
+    start, end = chain[:-1], chain[1:]
+    above = jnp.minimum(start[:, 2], end[:, 2]) - _RADII
     first, second = _PAIRS.T
     axes = jax.vmap(_segment_distance)(start[first], end[first], start[second], end[second])
-    between = axes - jnp.asarray(_RADII[first] + _RADII[second])
+    between = axes - (_RADII[first] + _RADII[second])
     return jnp.min(above[_ABOVE_TABLE]), jnp.min(between)
 
 
@@ -263,15 +215,16 @@ def clear(q: jax.Array) -> jax.Array:
     return (to_table > _TABLE_CLEARANCE) & (between_links > _LINK_CLEARANCE)
 
 
-def joint_targets(q_start: jax.Array, control: jax.Array) -> JointTargets:
+def joint_targets(q_start: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Joint targets that lead the tips through set-points, all on one branch.
 
     It is the branch that reaches the most set-points; of several, the one with the least motion
     from `q_start` on. The only jump is the one from `q_start`. The arm stops for good at the first
     set-point that the branch does not reach, or reaches only through the table or itself.
 
-    Args: q_start [6] rad; control [T, 5] as in `primitives.Plan`: x, y, z m of the tips, yaw rad,
-    half the opening m.
+    Args: q_start [6] rad; control [T, 5] as in `primitives.Plan`.
+    Returns: [T, 7], six joint angles rad and half the opening m; [] bool, True if the branch
+    reaches every set-point.
     """
     poses = jax.vmap(top_down)(control[:, :3], control[:, 3])
     solutions, valid = jax.vmap(inverse)(*poses)  # [T, 8, 6], [T, 8]
@@ -280,12 +233,10 @@ def joint_targets(q_start: jax.Array, control: jax.Array) -> JointTargets:
     reached = jnp.sum(good, axis=1)
     branch = jnp.argmin(jnp.where(reached == jnp.max(reached), motion, jnp.inf))
     target = jnp.concatenate([joints[branch], control[:, 4:]], axis=1)
-    return JointTargets(target, jnp.all(good[branch]))
+    return target, jnp.all(good[branch])
 
 
-def _follow(
-    q_start: jax.Array, solutions: jax.Array, valid: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, ...]:
     """One branch [T, 6] rad as far as it is valid [T] bool, without jumps, and within LIMITS.
 
     Returns: [T, 6] rad, held from the first set-point that fails; [T] bool, good until then; []
@@ -295,7 +246,7 @@ def _follow(
     turns = jnp.cumsum(jnp.round(-step / FULL_TURN), axis=0)  # whole, so that no rounding adds up
     path = solutions + FULL_TURN * jnp.concatenate([jnp.zeros_like(q_start)[None], turns])
     path = path + FULL_TURN * _offset(q_start, path, valid)[None]
-    allowed = valid & jnp.all(jnp.abs(path) <= jnp.asarray(LIMITS)[None], axis=1)
+    allowed = valid & jnp.all(jnp.abs(path) <= LIMITS[None], axis=1)
     good = jnp.cumprod(allowed.astype(jnp.int32)).astype(bool)
     last = jnp.maximum(jnp.sum(good) - 1, 0)
     held = jnp.where(good[0], path[last], q_start)
@@ -308,7 +259,6 @@ def _offset(q_start: jax.Array, path: jax.Array, valid: jax.Array) -> jax.Array:
     turns = jnp.arange(-2.0, 3.0)[:, None]
     low = jnp.min(jnp.where(valid[:, None], path, jnp.inf), axis=0)[None] + FULL_TURN * turns
     high = jnp.max(jnp.where(valid[:, None], path, -jnp.inf), axis=0)[None] + FULL_TURN * turns
-    limit = jnp.asarray(LIMITS)[None]
-    excess = jnp.maximum(jnp.maximum(-limit - low, high - limit), 0.0)
+    excess = jnp.maximum(jnp.maximum(-LIMITS[None] - low, high - LIMITS[None]), 0.0)
     away = jnp.abs(path[:1] + FULL_TURN * turns - q_start[None])
     return turns[jnp.argmin(away + 100.0 * excess, axis=0), 0]

@@ -13,8 +13,8 @@ from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World, scene_fields
 from csac_jax.sim import mjx_step, outcome
 from csac_jax.sim.outcome import Substep, Trace
+from csac_jax.sim.primitives import JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
-from csac_jax.sim.robot import JointTrajectory
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,8 +32,22 @@ class MjxPhysics:
 
     def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
         """See `physics.Physics`. Matrix products keep float32: a GPU would cut them to 10 bits."""
+        world, model = self.world, scene_model(self, scene)
+        initial = initial_data(self, scene, joints)
+
+        def substep(data, control):
+            data = self.step(model, data.replace(ctrl=control))
+            data = _restrain(world, ~scene.in_play, initial, data)
+            touching, overflow = self.touch(world, data)
+            rise = data.qpos[world.block_qpos[:, 2]] - scene.position[:, 2]
+            gap = 2.0 * data.qpos[world.robot_qpos[-2]]
+            return data, Substep(touching, rise, gap, overflow)
+
         with jax.default_matmul_precision("highest"):
-            return _run(self, scene, joints)
+            data, seen = jax.lax.scan(substep, initial, joints.control)
+        pose, velocity = data.qpos[world.block_qpos], data.qvel[world.block_dofs]
+        moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
+        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, seen)
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
@@ -90,39 +104,9 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
 
 def _contact_touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
     """See `MjxPhysics.touch`; contacts may be missing once all slots are in use."""
-    contact = data._impl.contact
-    active = contact.dist < 0.0  # [C]
-    pair = contact.geom  # [C, 2]
+    active, pair = data._impl.contact.dist < 0.0, data._impl.contact.geom  # [C], [C, 2]
     is_pad = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1)
     is_hand = is_pad & active[None]  # [3, C]
     slots = jnp.asarray(world.slot_of_geom)[pair]  # [C, 2]
     is_block = jnp.any(slots[None] == np.arange(len(world.slots))[:, None, None], axis=-1)  # [N, C]
     return jnp.any(is_hand[:, None] & is_block[None], axis=-1), jnp.all(active)
-
-
-def _run(physics: MjxPhysics, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
-    """The substeps of a primitive."""
-    world, cfg = physics.world, physics.cfg
-    model = scene_model(physics, scene)
-    initial = initial_data(physics, scene, joints)
-
-    def substep(carry, indexed_control):
-        data, trace = carry
-        index, control = indexed_control
-        parked = ~scene.in_play
-        data = physics.step(model, data.replace(ctrl=control))
-        data = _restrain(world, parked, initial, data)
-        touching, overflow = physics.touch(world, data)
-        rise = data.qpos[world.block_qpos[:, 2]] - scene.position[:, 2]
-        gap = 2.0 * data.qpos[world.robot_qpos[-2]]
-        observed = Substep(touching, rise, gap, overflow)
-        return (data, outcome.extend(cfg, trace, index, observed)), None
-
-    before = (initial, outcome.blank(len(world.slots)))
-    inputs = (jnp.arange(cfg.substeps), joints.control)
-    (data, trace), _ = jax.lax.scan(substep, before, inputs)
-    pose = data.qpos[world.block_qpos]
-    moved = scene.replace(
-        position=pose[:, :3], quaternion=pose[:, 3:], velocity=data.qvel[world.block_dofs]
-    )
-    return layout.park(moved, scene.in_play), trace

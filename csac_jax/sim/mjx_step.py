@@ -1,7 +1,4 @@
-"""One step of MJX (its JAX implementation) with two departures from `mjx.step`.
-
-Each brings it nearer to C MuJoCo.
-"""
+"""A step of MJX's JAX implementation; two departures from `mjx.step` bring it nearer to C."""
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +9,7 @@ SAME_PLACE = 1e-5  # m; copies lie within 1e-7 m, other points of a pair seldom 
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """The state one timestep later. One scene; callers vmap.
-
-    For `implicitfast`, without sensors and tendons.
-    """
+    """The state of one scene a timestep later, by `implicitfast`, without sensors and tendons."""
     data = mjx.fwd_position(model, data)
     contact = data._impl.contact
     # A contact beyond its margin is inactive. The distance stays, since others read it.

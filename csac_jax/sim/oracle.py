@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.config import HeightmapConfig, SimConfig, SlotKind
+from csac_jax.config import Config, SlotKind
 from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
 from csac_jax.scene import blocks
@@ -19,49 +19,35 @@ EXACT = jax.lax.Precision.HIGHEST  # a GPU would cut products of matrices to 10 
 ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
 
-def _support(
-    normals: jax.Array, offsets: jax.Array, axis: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Of the two faces most square to `axis` [3]: the lesser cosine, and the width between, m.
-
-    Args: normals [F, 3] world frame, offsets [F] m from the block's centre.
-    """
-    cosine = jnp.matmul(normals, axis, precision=EXACT)
-    low, high = jnp.argmin(cosine), jnp.argmax(cosine)
-    return jnp.minimum(cosine[high], -cosine[low]), offsets[high] + offsets[low]
-
-
-def grasp(
-    cfg: SimConfig,
-    heightmap: HeightmapConfig,
-    slots: tuple[SlotKind, ...],
-    scene: Scene,
-    height: jax.Array,
-) -> Action:
+def grasp(cfg: Config, scene: Scene, height: jax.Array) -> Action:
     """The best grasp: room for both fingers, faces square to the pads, a high and narrow block.
 
     With a target, the best grasp is the target's, else that of the block nearest to it.
 
-    Args: slots, kinds of the block slots; height [H, W] m.
+    Args: height [H, W] m.
     """
+    sim, slots = cfg.sim, cfg.scene.slots
     hulls: tuple[SlotKind, ...] = tuple("box" if kind == "arch" else kind for kind in slots)
     normals, offsets = blocks.half_spaces(hulls, scene.half_size)
     rotation = jax.vmap(quat_to_matrix)(scene.quaternion)
     world_normals = jnp.einsum("nij,nfj->nfi", rotation, normals, precision=EXACT)
     yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
-    cells = cell_centres(heightmap)
+    cells = cell_centres(cfg.heightmap)
 
     def score(slot, yaw):
         axis = jnp.append(rotate2d(yaw, jnp.array([1.0, 0.0])), 0.0)
-        square, width = _support(world_normals[slot], offsets[slot], axis)
+        cosine = jnp.matmul(world_normals[slot], axis, precision=EXACT)
+        low, high = jnp.argmin(cosine), jnp.argmax(cosine)  # the faces most square to the pads
+        width = offsets[slot, high] + offsets[slot, low]
         centre = scene.position[slot, :2]
-        top = local_top(heightmap, height, centre, cfg.window)
-        tip = jnp.maximum(top - cfg.grasp_depth, cfg.clearance)
+        top = local_top(cfg.heightmap, height, centre, sim.window)
+        tip = jnp.maximum(top - sim.grasp_depth, sim.clearance)
         local = jnp.abs(rotate2d(-yaw, cells - centre))
         across = jnp.abs(local[..., 0] - 0.5 * MAX_OPENING - PAD_HALF_WIDTH) < FINGER_HALF[0]
         finger = across & (local[..., 1] < FINGER_HALF[1])
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
         fits = width < MAX_OPENING - 0.02
+        square = jnp.minimum(cosine[high], -cosine[low])
         askew = jnp.maximum(1.0 - square - ALIGNED, 0.0)
         cost = 4.0 * blocked + 4.0 * ~fits + 20.0 * askew + 10.0 * width
         # ANY indexes the last slot, whose distance is then unused.

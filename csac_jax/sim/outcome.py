@@ -1,7 +1,10 @@
 """What a primitive did: by ground truth, and as the robot's finger gap alone suggests."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from csac_jax.config import SimConfig
@@ -36,35 +39,25 @@ class Trace:
     contact_overflow: jax.Array  # [] int32, substeps in which contacts may be missing
 
 
-def blank(num: int) -> Trace:
-    """The trace of a primitive over `num` block slots before its first substep."""
-    no, zero, zeros = jnp.zeros((), bool), jnp.zeros(()), jnp.zeros(num)
-    return Trace(no, zeros, jnp.zeros(num, bool), zeros, zero, zero, jnp.zeros((), jnp.int32))
+def nothing_seen(substeps: int, num: int) -> Substep:
+    """The substeps of a primitive in which nothing moved, NumPy leaves [T, ...], all 0."""
+    zeros: Any = np.zeros
+    touching, rise = zeros((substeps, 3, num), bool), zeros((substeps, num), np.float32)
+    return Substep(touching, rise, zeros(substeps, np.float32), zeros(substeps, bool))
 
 
-def extend(cfg: SimConfig, trace: Trace, index: jax.Array, observed: Substep) -> Trace:
-    """The trace with substep number `index` [] int32 added."""
-    held = observed.touching[1] & observed.touching[2]
-    closes_at = sum(cfg.grasp_phases[:2]) - 1
-    return Trace(
-        touched=trace.touched | jnp.any(observed.touching),
-        held_rise=jnp.maximum(trace.held_rise, jnp.where(held, observed.rise, 0.0)),
-        held=held,
-        rise=observed.rise,
-        gap_closed=jnp.where(index == closes_at, observed.gap, trace.gap_closed),
-        gap_end=observed.gap,
-        contact_overflow=trace.contact_overflow + observed.contact_overflow.astype(jnp.int32),
-    )
-
-
-def trace_of(cfg: SimConfig, observed: Substep) -> Trace:
+def trace_of(cfg: SimConfig, seen: Substep) -> Trace:
     """The trace of all substeps of a primitive, leaves [T, ...]."""
-    substeps, num = observed.rise.shape
-
-    def add(trace: Trace, indexed: tuple[jax.Array, Substep]) -> tuple[Trace, None]:
-        return extend(cfg, trace, *indexed), None
-
-    return jax.lax.scan(add, blank(num), (jnp.arange(substeps), observed))[0]
+    held = seen.touching[:, 1] & seen.touching[:, 2]
+    return Trace(
+        touched=jnp.any(seen.touching),
+        held_rise=jnp.max(seen.rise, axis=0, initial=0.0, where=held),
+        held=held[-1],
+        rise=seen.rise[-1],
+        gap_closed=seen.gap[sum(cfg.grasp_phases[:2]) - 1],
+        gap_end=seen.gap[-1],
+        contact_overflow=jnp.sum(seen.contact_overflow, dtype=jnp.int32),
+    )
 
 
 def lifted_blocks(trace: Trace, hand_rise: jax.Array) -> jax.Array:
@@ -79,14 +72,9 @@ def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax
     BARE. `touched`: it met a block that never rose between the pads. `dropped`: a block rose and
     was lost.
     """
-    missed = _missed(surface)
-    met = jnp.where(
-        jnp.any(trace.held_rise >= GRIP_RISE),
-        jnp.int32(Outcome.DROPPED),
-        jnp.int32(Outcome.TOUCHED),
-    )
-    failed = jnp.where(trace.touched, met, missed)
-    return jnp.where(jnp.any(lifted_blocks(trace, hand_rise)), jnp.int32(Outcome.LIFTED), failed)
+    dropped = trace.touched & jnp.any(trace.held_rise >= GRIP_RISE)
+    lifted = jnp.any(lifted_blocks(trace, hand_rise))
+    return _highest(surface >= BARE, trace.touched, dropped, lifted)
 
 
 def grasp_outcome_by_gap(trace: Trace, surface: jax.Array, changed: jax.Array) -> jax.Array:
@@ -94,11 +82,11 @@ def grasp_outcome_by_gap(trace: Trace, surface: jax.Array, changed: jax.Array) -
 
     Args: changed [] bool, the height map moved.
     """
-    missed = _missed(surface)
-    open_hand = jnp.where(changed, jnp.int32(Outcome.TOUCHED), missed)
-    failed = jnp.where(trace.gap_closed > CLOSED_GAP, jnp.int32(Outcome.DROPPED), open_hand)
-    return jnp.where(trace.gap_end > CLOSED_GAP, jnp.int32(Outcome.LIFTED), failed)
+    dropped, lifted = trace.gap_closed > CLOSED_GAP, trace.gap_end > CLOSED_GAP
+    return _highest(surface >= BARE, changed, dropped, lifted)
 
 
-def _missed(surface: jax.Array) -> jax.Array:
-    return jnp.where(surface < BARE, jnp.int32(Outcome.NOTHING), jnp.int32(Outcome.EMPTY))
+def _highest(*holds: jax.Array) -> jax.Array:
+    """The highest level of a grasp that holds, [] int32; `holds` are those of EMPTY to LIFTED."""
+    levels = [jnp.int32(level) for level in Outcome]
+    return jnp.select(holds[::-1], levels[:0:-1], levels[0])

@@ -1,28 +1,19 @@
 """One primitive of one scene, whatever computes its physics."""
 
+import functools
 from collections.abc import Callable
 from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 
-from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.config import Config, SimConfig
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World
-from csac_jax.sim import c_physics, mjx_physics, outcome, primitives, robot, warp_physics
+from csac_jax.sim import c_physics, mjx_physics, primitives, warp_physics
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import Action, Plan
-from csac_jax.sim.robot import JointTrajectory
-
-# Bounds of a healthy scene.
-MAX_SPEED = 20.0  # m/s and rad/s / 10
-MAX_HEIGHT = 1.0  # m from the workspace centre, of blocks in play
-MAX_PARKED = 100.0  # m from the workspace centre, of the others
-UNIT = 0.01  # how far the square of a quaternion's length may be from 1
-MAX_HALF_SIZE = 0.5  # m, of a block's box
-MAX_DENSITY = 1e4  # kg/m^3
-MAX_FRICTION = 10.0
+from csac_jax.sim.primitives import Action, JointTrajectory, Plan
 
 
 class Physics(Protocol):
@@ -41,38 +32,31 @@ PHYSICS: dict[str, Callable[[World, SimConfig], Physics]] = {
     "warp": warp_physics.make,
     "c": c_physics.CPhysics,
 }
-"""Every physics by its name in the config. Each refuses, with SceneError, what it cannot do."""
+"""Every physics by its name in the config. Each raises an error for a world that it cannot run."""
 
 
 def make(world: World, cfg: SimConfig) -> Physics:
     """The physics that the config names. Raises ValueError for `auto`: see `sim.backend`."""
     if cfg.physics not in PHYSICS:
-        raise ValueError(
-            f"sim.physics: {cfg.physics!r} names no engine; choose one of: {', '.join(PHYSICS)}"
-        )
+        engines = ", ".join(PHYSICS)
+        raise ValueError(f"sim.physics: {cfg.physics!r} is no engine; choose one of: {engines}")
     return PHYSICS[cfg.physics](world, cfg)
 
 
 def execute(
-    physics: Physics,
-    cfg: SimConfig,
-    heightmap: HeightmapConfig,
-    scene: Scene,
-    height: jax.Array,
-    action: Action,
+    physics: Physics, cfg: Config, scene: Scene, height: jax.Array, action: Action
 ) -> tuple[Scene, Trace, Plan]:
     """Runs one primitive. Nothing moves if the robot cannot follow the whole of it.
 
     Args: height [H, W] m, the map the action was chosen from.
     """
-    plan = primitives.plan(cfg, heightmap, height, action)
-    joints = robot.joint_trajectory(cfg.robot, plan)
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+    joints = primitives.joint_trajectory(cfg.sim.robot, plan)
     after, trace = physics.run(scene, joints)
-    unmoved = (layout.park(scene, scene.in_play), outcome.blank(len(scene.colour)))
-    after, trace = jax.tree.map(
-        lambda new, old: jnp.where(joints.reachable, new, old), (after, trace), unmoved
-    )
-    return after, trace, plan.replace(surface=jnp.where(joints.reachable, plan.surface, 0.0))
+    unmoved = layout.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
+    choose = functools.partial(jnp.where, joints.reachable)
+    after, trace = jax.tree.map(choose, (after, trace), unmoved)
+    return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
 
 
 def healthy(scene: Scene) -> jax.Array:
@@ -80,18 +64,17 @@ def healthy(scene: Scene) -> jax.Array:
 
     Bounds, not `isfinite`: physics may explode and stay finite. NaN fails every comparison.
     """
-    speed = jnp.abs(scene.velocity) * jnp.array([1, 1, 1, 0.1, 0.1, 0.1])
-    reach = jnp.where(scene.in_play[:, None], MAX_HEIGHT, MAX_PARKED)
+    reach = jnp.where(scene.in_play[:, None], 1.0, 100.0)  # m from the workspace centre
+    speed = jnp.array([20.0, 20.0, 20.0, 200.0, 200.0, 200.0])  # m/s and rad/s
     length = jnp.sum(scene.quaternion**2, axis=1)
-    target, last = scene.target, len(scene.colour) - 1
     bounded = (
         jnp.all(jnp.abs(scene.position) < reach),
-        jnp.all(speed < MAX_SPEED),
-        jnp.all(jnp.abs(length - 1.0) < UNIT),
-        jnp.all((scene.half_size > 0.0) & (scene.half_size < MAX_HALF_SIZE)),
-        jnp.all((scene.density > 0.0) & (scene.density < MAX_DENSITY)),
-        jnp.all((scene.friction > 0.0) & (scene.friction < MAX_FRICTION)),
+        jnp.all(jnp.abs(scene.velocity) < speed),
+        jnp.all(jnp.abs(length - 1.0) < 0.01),
+        jnp.all((scene.half_size > 0.0) & (scene.half_size < 0.5)),  # m
+        jnp.all((scene.density > 0.0) & (scene.density < 1e4)),  # kg/m^3
+        jnp.all((scene.friction > 0.0) & (scene.friction < 10.0)),
         jnp.all((scene.colour >= 0) & (scene.colour < len(blocks.COLOURS))),
-        (target == layout.ANY) | ((target >= 0) & (target <= last)),
+        (scene.target >= layout.ANY) & (scene.target < len(scene.colour)),  # ANY is -1
     )
     return jnp.all(jnp.stack(bounded))

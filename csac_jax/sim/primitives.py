@@ -1,4 +1,4 @@
-"""Push and grasp as one fixed-length sequence of hand set-points: both run in the same scan."""
+"""Push and grasp as one fixed-length sequence of set-points: both run in the same scan."""
 
 import jax
 import jax.numpy as jnp
@@ -6,9 +6,10 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.config import HeightmapConfig, RobotKind, SimConfig
 from csac_jax.constants import Primitive
 from csac_jax.scene.model import MAX_OPENING
+from csac_jax.sim import kinematics
 
 HAND_RADIUS = 0.09  # m, circle about the tool axis that holds the open hand
 START_GAP = 0.01  # m, between the open hand's tips and what lies under them at the start
@@ -24,17 +25,17 @@ class Action:
     @classmethod
     def grasp(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
         """A grasp at (x, y) m whose fingers close along `yaw` rad; numbers or arrays [...]."""
-        return cls(*_primitive_and_pose(Primitive.GRASP, x, y, yaw))
+        return cls._at(Primitive.GRASP, x, y, yaw)
 
     @classmethod
     def push(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
         """A push from (x, y) m along `yaw` rad; numbers or arrays [...]."""
-        return cls(*_primitive_and_pose(Primitive.PUSH, x, y, yaw))
+        return cls._at(Primitive.PUSH, x, y, yaw)
 
-
-def _primitive_and_pose(kind: Primitive, *pose: jax.Array | float) -> tuple[jax.Array, jax.Array]:
-    parts = jnp.broadcast_arrays(*(jnp.asarray(value, jnp.float32) for value in pose))
-    return jnp.full(parts[0].shape, kind, jnp.int32), jnp.stack(parts, axis=-1)
+    @classmethod
+    def _at(cls, kind: Primitive, *pose: jax.Array | float) -> "Action":
+        parts = jnp.broadcast_arrays(*(jnp.asarray(value, jnp.float32) for value in pose))
+        return cls(jnp.full(parts[0].shape, kind, jnp.int32), jnp.stack(parts, axis=-1))
 
 
 @struct.dataclass
@@ -44,6 +45,15 @@ class Plan:
     control: jax.Array  # [T, 5] x m, y m, z m (finger tips), yaw rad, half the opening m
     start: jax.Array  # [5] where the hand starts, at rest; same columns
     surface: jax.Array  # [] m, highest surface in the window about the place
+
+
+@struct.dataclass
+class JointTrajectory:
+    """A plan as the robot's joints follow it. Q = joints, U = actuators, T = substeps."""
+
+    start: jax.Array  # [Q] joint positions at rest, order of `World.robot_qpos`
+    control: jax.Array  # [T, U]
+    reachable: jax.Array  # [] bool, False where the robot cannot follow the whole plan
 
 
 def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: float) -> jax.Array:
@@ -75,11 +85,8 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
     z = high + (low - high) * descend + (high - low) * lift
     place = xy[None] + act[:, None] * (end - xy)[None]
     fingers = opening * (1.0 - jnp.minimum(1.3 * act, 1.0))  # closed before the lift begins
-    control = jnp.concatenate(
-        [place, z[:, None], jnp.full_like(z, yaw)[:, None], fingers[:, None]], axis=1
-    )
-    start = jnp.concatenate([xy, high[None], yaw[None], opening[None]])
-    return Plan(control=control, start=start, surface=surface)
+    control = jnp.column_stack([place, z, jnp.full_like(z, yaw), fingers])
+    return Plan(control=control, start=jnp.hstack([xy, high, yaw, opening]), surface=surface)
 
 
 def _progress(phases: tuple[int, int, int]) -> np.ndarray:
@@ -92,3 +99,13 @@ def _progress(phases: tuple[int, int, int]) -> np.ndarray:
     linear = np.clip((times - starts) / lengths, 0, 1)
     linear[2] = linear[2] ** 2 * (3.0 - 2.0 * linear[2])
     return linear.astype(np.float32)
+
+
+def joint_trajectory(kind: RobotKind, plan: Plan) -> JointTrajectory:
+    """How a robot's joints follow a plan: the floating hand as it is, the arm by its inverse."""
+    if kind == "hand":
+        start, reachable = jnp.append(plan.start, plan.start[4]), jnp.ones((), bool)
+        return JointTrajectory(start, plan.control, reachable)
+    control = jnp.concatenate([plan.start[None], plan.control])
+    target, reachable = kinematics.joint_targets(jnp.asarray(kinematics.HOME), control)
+    return JointTrajectory(jnp.append(target[0], target[0, 6]), target[1:], reachable)

@@ -5,7 +5,6 @@ the hand touches. Meshes have one size in all scenes. Results are not repeatable
 """
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +14,6 @@ from csac_jax.errors import SceneError
 from csac_jax.scene.model import HAND_GEOMS, World
 from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.quiet_mjx import mjx
-
-_ROWS = 4  # constraint rows of a contact: the edges of its friction pyramid
-_OTHER_ROWS = 32  # of joints and limits
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
@@ -29,33 +25,24 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
             "sim.physics: warp is an extra; run: pip install 'csac-jax[warp]'"
         ) from None
     from mujoco.mjx.third_party.mujoco_warp import OverflowType
+    from mujoco.mjx.warp.types import GraphMode
 
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of its kernels
-    model = mjx.put_model(world.model, impl="warp", graph_mode=_graph_mode())
+    # On CUDA, MJX's own choice records a new graph for every set of buffers from XLA. A training
+    # step has many: 1,024 scenes took 3.7 s an action. One graph with its own buffers takes 0.52 s
+    # (H200, `experiments/bench`).
+    graph_mode = GraphMode.WARP_STAGED if jax.default_backend() == "gpu" else None
+    model = mjx.put_model(world.model, impl="warp", graph_mode=graph_mode)
     model = model.tree_replace({"opt._impl.warn_overflow": 0})
     data = mjx.make_data(
         world.model,
         impl="warp",
         naconmax=WARP_WORLDS * cfg.contacts,
-        njmax=_ROWS * cfg.contacts + _OTHER_ROWS,
+        njmax=4 * cfg.contacts + 32,  # the edges of friction pyramids; joints and limits
     )
     stopped_early = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS  # the solver, by design
     lost_contacts = int(OverflowType.ALL & ~stopped_early)
     return MjxPhysics(world, cfg, model, data, functools.partial(_sensor_touch, lost_contacts))
-
-
-def _graph_mode() -> Any:
-    """How a step becomes a CUDA graph; None, MJX's choice, on a CPU.
-
-    On CUDA, MJX's choice records a new graph for every set of buffers from XLA. A training step
-    has many: 1,024 scenes took 3.7 s an action. One graph with its own buffers takes 0.52 s
-    (H200, `experiments/bench`).
-    """
-    if jax.default_backend() != "gpu":
-        return None
-    from mujoco.mjx.warp import types
-
-    return types.GraphMode.WARP_STAGED
 
 
 def _sensor_touch(lost_contacts: int, world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:

@@ -1,20 +1,19 @@
-"""The points of a sweep: every combination of the values in `--vary NAME=A,B`.
-
-It needs no JAX, so that complaints come at once. A point's flags go through the same parser as the
-user's own.
-"""
+"""The points of a sweep: every combination of the values in `--vary NAME=A,B`. It needs no JAX, so
+that complaints come at once."""
 
 import dataclasses
 import difflib
 import itertools
+import re
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from csac_jax.config import ALTERNATIVES, Config, Section
 
 BASE = "base"  # name of the only point where nothing is varied
 LONGEST = 120  # characters of a point's name, which is a folder's
+_VALUE = re.compile(r"([^./-]|-?\.?\d|-inf)[^/]*")  # a negative number is no flag
 
 
 class SweepPoint(NamedTuple):
@@ -28,30 +27,33 @@ class SweepPoint(NamedTuple):
 def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> list[SweepPoint]:
     """Every combination of the values of `NAME=A,B,...`; the last name's values change fastest.
 
-    `configure` makes a config of a point's flags. Items of a tuple are separated by colons, as in
+    `configure` makes a config of flags. Colons separate the items of a tuple, as in
     `replay.end=1:4,1:12`. Raises ValueError for what cannot be varied.
     """
     axes = dict(map(_axis, varied))
     if len(axes) < len(varied):
         raise ValueError("--vary: a setting is given twice; name it once, with all its values")
-    combined = []
+
+    def from_flags(values: dict[str, str]) -> Config:
+        return configure([flag for name in values for flag in _flags(name, values[name])])
+
+    return combine(axes, from_flags)
+
+
+def combine(
+    axes: Mapping[str, Sequence[Any]], configure: Callable[[dict[str, Any]], Config]
+) -> list[SweepPoint]:
+    """A point for every combination, setting -> value, of which `configure` makes a config. They
+    are numbered where one has a name that is too long for a folder."""
+    found = []
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
-        flags = [flag for setting, value in values.items() for flag in _flags(setting, value)]
-        combined.append(SweepPoint(name(values), values, configure(flags)))
-    return with_short_names(combined)
-
-
-def name(values: dict[str, str]) -> str:
-    """Name of a point."""
-    return ",".join(f"{setting}={value}" for setting, value in values.items()) or BASE
-
-
-def with_short_names(found: list[SweepPoint]) -> list[SweepPoint]:
-    """The points with numbers for names if one is too long for a folder."""
-    if any(len(point.name) > LONGEST for point in found):
-        return [point._replace(name=f"setting-{i}") for i, point in enumerate(found)]
-    return found
+        name = ",".join(f"{setting}={value}" for setting, value in values.items()) or BASE
+        told = {setting: str(value) for setting, value in values.items()}
+        found.append(SweepPoint(name, told, configure(values)))
+    if all(len(point.name) <= LONGEST for point in found):
+        return found
+    return [point._replace(name=f"setting-{i}") for i, point in enumerate(found)]
 
 
 def _axis(text: str) -> tuple[str, list[str]]:
@@ -62,50 +64,26 @@ def _axis(text: str) -> tuple[str, list[str]]:
     kind_of(name)
     if len(set(values)) < len(values):
         raise ValueError(f"--vary {text}: a value is given twice")
-    if not all(map(_names_a_folder, values)):
-        raise ValueError(
-            f"--vary {text}: a value must not hold a slash nor begin with a dot or dash"
-        )
+    if not all(map(_VALUE.fullmatch, values)):
+        raise ValueError(f"--vary {text}: a value must hold no slash, nor begin with a dot or dash")
     return name, values
-
-
-def _names_a_folder(value: str) -> bool:
-    return "/" not in value and (not value.startswith((".", "-")) or _is_number(value))
-
-
-def _is_number(value: str) -> bool:
-    try:
-        float(value)
-    except ValueError:
-        return False
-    return True
-
-
-def _kinds() -> dict[str, object]:
-    """Type of everything that can be varied, by its dotted name."""
-    kinds: dict[str, object] = {"algo": str}
-    for section in dataclasses.fields(Config):
-        default = getattr(Config(), section.name)
-        if isinstance(default, Section):
-            _, alternatives = ALTERNATIVES.get(section.name, ("", (type(default),)))
-            kinds_of: Any = alternatives
-            for kind in kinds_of:
-                hints = typing.get_type_hints(kind)
-                names = [field.name for field in dataclasses.fields(kind)]
-                kinds |= {f"{section.name}.{name}": hints[name] for name in names}
-    return kinds
 
 
 def kind_of(name: str) -> object:
     """Type of a setting by its dotted name. Raises ValueError for what cannot be varied."""
-    kinds = _kinds()
     if name == "seed":
         raise ValueError("--vary: seeds are varied by --seeds")
+    kinds: dict[str, object] = {"algo": str}
+    for section, default in vars(Config()).items():
+        if isinstance(default, Section):
+            _, alternatives = ALTERNATIVES.get(section, ("", (type(default),)))
+            for kind in typing.cast(Any, alternatives):
+                hints, fields = typing.get_type_hints(kind), dataclasses.fields(kind)
+                kinds |= {f"{section}.{field.name}": hints[field.name] for field in fields}
     if name not in kinds:
         near = difflib.get_close_matches(name, kinds, 1)
-        hint = (
-            f"perhaps you meant {near[0]}" if near else "csac-jax train quick --help-all lists them"
-        )
+        listed = "csac-jax train quick --help-all lists them"
+        hint = f"perhaps you meant {near[0]}" if near else listed
         raise ValueError(f"--vary: '{name}' is no setting; {hint}")
     return kinds[name]
 

@@ -6,7 +6,9 @@ branch.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -18,9 +20,8 @@ from csac_jax.agent import rewards
 from csac_jax.config import Config
 from csac_jax.nets import chunked_vmap
 from csac_jax.runtime import compiler
-from csac_jax.sweeps import pipelined
-from csac_jax.training import step
-from csac_jax.training.sharding import AXIS, DataSharding, Shard
+from csac_jax.training import memory, step
+from csac_jax.training.sharding import AXIS, Shard
 from csac_jax.training.step import Hyperparams, Program, StepMetrics, TrainState
 
 _TRACED = {
@@ -42,6 +43,8 @@ def _prefix(replicas: Any, step: Any, scenes: Any) -> Any:
 
 
 AXES = _prefix(0, None, 0)  # of a state of replicas
+_WHOLE, _FIRST, _SECOND = PartitionSpec(), PartitionSpec(AXIS), PartitionSpec(None, AXIS)
+_SPECS = {"seeds": _prefix(_FIRST, _WHOLE, _FIRST), "scenes": _prefix(_WHOLE, _WHOLE, _SECOND)}
 
 
 class Replicas(NamedTuple):
@@ -49,15 +52,6 @@ class Replicas(NamedTuple):
 
     seed: Any  # [S] uint32
     hyperparams: Hyperparams | None  # leaves [S, ...] float32; None if only the seeds differ
-
-
-class SweepProgram(NamedTuple):
-    """What the host needs of a group's program."""
-
-    init: Callable[[], Any]  # the first state, leaves [S, ...] but `step`
-    abstract: Callable[[], Any]  # its shapes, types and places
-    chunk: Callable[[int], Any]  # steps -> jitted, state -> (state, StepMetrics [T, S, ...])
-    replica: Callable[[Any, int], Any]  # the state of one replica, as `train` has it
 
 
 class ProgramGroup(NamedTuple):
@@ -78,132 +72,189 @@ def group_configs(configs: Sequence[Config]) -> list[ProgramGroup]:
 
 
 def _differing(configs: Sequence[Config]) -> tuple[str, ...]:
-    return tuple(name for name in _traced(configs[0]) if len(set(_values(configs, name))) > 1)
+    first, *others = map(_traced, configs)
+    return tuple(name for name in first if any(other[name] != first[name] for other in others))
 
 
-def _traced(cfg: Config) -> list[str]:
-    """The TRACED_HYPERPARAMS that this config has: alternatives have settings of their own."""
-    return [name for name in TRACED_HYPERPARAMS if _has(cfg, name)]
-
-
-def _has(cfg: Config, name: str) -> bool:
-    section, field = name.split(".")
-    return field in {one.name for one in dataclasses.fields(getattr(cfg, section))}
-
-
-def _values(configs: Sequence[Config], name: str) -> list[Any]:
-    """The configs' values of a setting, by its dotted name."""
-    section, field = name.split(".")
-    return [getattr(getattr(cfg, section), field) for cfg in configs]
+def _traced(cfg: Config) -> dict[str, Any]:
+    """The values of those TRACED_HYPERPARAMS that this config has: alternatives have their own."""
+    settings = {
+        f"{section}.{name}": value
+        for section in _TRACED
+        for name, value in vars(getattr(cfg, section)).items()
+    }
+    return {name: settings[name] for name in TRACED_HYPERPARAMS if name in settings}
 
 
 def of_group(group: ProgramGroup) -> Replicas:
-    """What tells the runs of a group apart, as arrays of NumPy: every process has its own copy.
-
-    Bounds of returns are computed here, from plain numbers.
-    """
-    seed = np.array([cfg.seed for cfg in group.configs], np.uint32)
-    if not group.hyperparams:
+    """What tells the runs of a group apart, as arrays of NumPy: every process has its own copy."""
+    configs, names = group
+    seed = np.array([cfg.seed for cfg in configs], np.uint32)
+    if not names:
         return Replicas(seed, None)
-    values = {
-        name: np.array(_values(group.configs, name), np.float32) for name in group.hyperparams
-    }
-    bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in group.configs]
+    traced = [_traced(cfg) for cfg in configs]
+    values = {name: np.array([own[name] for own in traced], np.float32) for name in names}
+    bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in configs]
     low, high = np.array(bounds, np.float32).T
     return Replicas(seed, Hyperparams(values, (low, high)))
 
 
-def init(
-    program: Program, replicas: Replicas, mesh: Mesh | None = None, shard: Shard = "seeds"
-) -> TrainState:
-    """The state of all replicas before the first step, laid out over the mesh if there is one."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class SweepProgram:
+    """Replicas in one program, on one device or laid out over a mesh."""
 
-    def init_one(replica: Replicas) -> TrainState:
-        return step.init_state(program, jax.random.key(replica.seed), replica.hyperparams)
+    program: Program
+    replicas: Replicas
+    mesh: Mesh | None = None
+    shard: Shard = "seeds"  # what the mesh divides
+    parts: int = 1  # that the replicas run in, see `Pipelined`; 1 with a mesh
+    start: Callable[[Any], Any] | None = None  # changes the learners' first state [S, ...]
 
-    build = jax.vmap(init_one, out_axes=AXES)
-    return jax.jit(build, out_shardings=shardings(mesh, shard))(replicas)
+    def init(self) -> TrainState:
+        """The state of all replicas before the first step."""
+        state = self._jitted_init()(self.replicas)
+        if self.start is None:
+            return state
+        started = state.replace(learner=self.start(state.learner))
+        return jax.device_put(started, self._shardings())
 
+    def abstract(self) -> TrainState:
+        """Shapes, types and places of `init`'s state; nothing is compiled."""
+        return self._jitted_init().eval_shape(self.replicas)
 
-def shardings(mesh: Mesh | None, shard: Shard) -> Any:
-    """Where the leaves of a state of replicas lie, as a prefix of it; None without a mesh."""
-    if mesh is None:
-        return None
-    every, seeds = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
-    if shard == "seeds":
-        return _prefix(seeds, every, seeds)
-    return _prefix(every, every, NamedSharding(mesh, PartitionSpec(None, AXIS)))
+    def compile_chunk(self, num_steps: int) -> Any:
+        """A jitted function state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
 
+        The state is donated. With a mesh over seeds each device scans its own replicas; metrics end
+        up on every device. Networks work in chunks unless hyper-parameters are traced, which
+        `chunked_vmap` cannot close over, or scenes are sharded.
+        """
+        mesh, replicas, program = self.mesh, self.replicas, self.program
+        vmapped = len(replicas.seed) // (self.parts if mesh is None else mesh.size)
+        if mesh is not None and self.shard == "scenes":
+            program = dataclasses.replace(program, mesh=mesh)
+        elif replicas.hyperparams is None:
+            at_once = chunked_vmap.chunk_size(program.cfg, vmapped)
+            program = dataclasses.replace(program, learner=program.learner.in_chunks(at_once))
 
-def compile_chunk(
-    program: Program,
-    replicas: Replicas,
-    num_steps: int,
-    mesh: Mesh | None = None,
-    shard: Shard = "seeds",
-    parts: int = 1,
-) -> Any:
-    """A jitted function state -> (state, StepMetrics [T, S, ...]) of `num_steps` training steps.
-
-    The state is donated. With a mesh over seeds each device scans its own replicas; metrics end up
-    on every device. Without a mesh the replicas may run in several `parts`, see `pipelined`.
-    Networks work in chunks unless hyper-parameters are traced, which `chunked_vmap` cannot close
-    over, or scenes are sharded.
-    """
-    vmapped = len(replicas.seed) // (parts if mesh is None else mesh.size)  # in one program
-    if mesh is not None and shard == "scenes":
-        program = dataclasses.replace(program, sharding=DataSharding(mesh))
-    elif replicas.hyperparams is None:
-        at_once = chunked_vmap.chunk_size(program.cfg, vmapped)
-        program = dataclasses.replace(program, learner=program.learner.in_chunks(at_once))
-
-    def chunk(state: TrainState, replicas: Replicas) -> tuple[TrainState, StepMetrics]:
         def train_one(replica: Replicas, state: TrainState) -> tuple[TrainState, StepMetrics]:
             return step.train_step(program, state, replica.hyperparams)
 
         train_all = jax.vmap(train_one, in_axes=(0, AXES), out_axes=(AXES, 0))
-        return jax.lax.scan(lambda carry, _: train_all(replicas, carry), state, length=num_steps)
 
-    # The CPU's library for convolutions is not measured where they are vmapped or sharded.
-    measured = program.cfg.net.kind != "small" or (vmapped == 1 and mesh is None)
-    options = compiler.options(program.cfg) if measured else None
-    if mesh is None and parts > 1:
-        return _in_parts(
-            jax.jit(chunk, donate_argnums=0, compiler_options=options), replicas, parts
-        )
-    out = None
-    if mesh is not None:
-        out = (shardings(mesh, shard), NamedSharding(mesh, PartitionSpec()))
-        chunk = _each_device(mesh, chunk) if shard == "seeds" else chunk
-    return jax.jit(
-        lambda state: chunk(state, replicas),
-        donate_argnums=0,
-        out_shardings=out,
-        compiler_options=options,
-    )
+        def chunk(state: TrainState, replicas: Replicas) -> tuple[TrainState, StepMetrics]:
+            return jax.lax.scan(lambda state, _: train_all(replicas, state), state, None, num_steps)
 
+        # The CPU's library for convolutions is not measured where they are vmapped or sharded.
+        measured = program.cfg.net.kind != "small" or (vmapped == 1 and mesh is None)
+        options = compiler.options(program.cfg) if measured else None
+        jit = functools.partial(jax.jit, donate_argnums=0, compiler_options=options)
+        if self.parts > 1:
+            return Pipelined(jit(chunk), replicas, self.parts)
+        if mesh is None:
+            return jit(lambda state: chunk(state, replicas))
+        if self.shard == "seeds":  # each device on its share
+            ins, outs = (_SPECS["seeds"], _FIRST), (_SPECS["seeds"], _SECOND)
+            chunk = jax.shard_map(chunk, mesh=mesh, in_specs=ins, out_specs=outs, check_vma=False)
+        places = (self._shardings(), NamedSharding(mesh, _WHOLE))
+        return jit(lambda state: chunk(state, replicas), out_shardings=places)
 
-def _each_device(mesh: Mesh, chunk: Any) -> Any:
-    """The chunk on each device's share of the replicas."""
-    share, every, metrics = PartitionSpec(AXIS), PartitionSpec(), PartitionSpec(None, AXIS)
-    state = _prefix(share, every, share)
-    return jax.shard_map(
-        chunk, mesh=mesh, in_specs=(state, share), out_specs=(state, metrics), check_vma=False
-    )
+    def replica(self, state: TrainState, index: int) -> TrainState:
+        """The state of one replica, as `train` has it, on every device."""
+        if self.mesh is None:
+            return replica(state, index)
+        everywhere = NamedSharding(self.mesh, _WHOLE)
+        return jax.jit(replica, out_shardings=everywhere)(state, index)
 
+    def _jitted_init(self) -> Any:
+        def init_one(replica: Replicas) -> TrainState:
+            return step.init_state(self.program, jax.random.key(replica.seed), replica.hyperparams)
 
-def _in_parts(chunk: Any, replicas: Replicas, parts: int) -> pipelined.Pipelined:
-    """The jitted chunk for all replicas, an equal part of them at a time."""
-    size = len(replicas.seed) // parts
-    slices = [slice(k * size, (k + 1) * size) for k in range(parts)]
+        return jax.jit(jax.vmap(init_one, out_axes=AXES), out_shardings=self._shardings())
 
-    def split(state: TrainState) -> list[TrainState]:
-        return [jax.tree.map(jnp.copy, replica(state, part)) for part in slices]
-
-    shares = [jax.tree.map(lambda leaf, part=part: leaf[part], replicas) for part in slices]
-    return pipelined.Pipelined(chunk, shares, jax.jit(split), jax.jit(_join))
+    def _shardings(self) -> Any:
+        """Where the leaves of a state lie, as a prefix of it; None without a mesh."""
+        if self.mesh is None:
+            return None
+        return jax.tree.map(functools.partial(NamedSharding, self.mesh), _SPECS[self.shard])
 
 
+def sweep_program(
+    group: ProgramGroup, mesh: Mesh | None = None, shard: Shard = "seeds", start: Any = None
+) -> SweepProgram:
+    """The program of a group; its environment is made here."""
+    program = step.make(group.configs[0])
+    parts = num_parts(program.cfg, len(group.configs), mesh)
+    return SweepProgram(program, of_group(group), mesh, shard, parts, start)
+
+
+def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
+    """How many parts are best for so many replicas, see `Pipelined`: on a GPU at most two, ours.
+
+    One on several devices, for DenseNet-121, which keeps a device busy, and where the states do not
+    fit twice: they are taken apart and joined again.
+    """
+    on_cpu, halves = jax.default_backend() == "cpu", cfg.sim.physics == "c" and replicas % 2 == 0
+    parts = replicas if on_cpu else 2 if halves else 1
+    if parts == 1 or mesh is not None or cfg.net.kind != "small":
+        return 1
+    fits = 2 * replicas * sum(memory.state_bytes(cfg).values()) <= memory.limit()
+    return parts if fits else 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pipelined:
+    """A chunk of all replicas made of one that serves an equal part of them; the state is donated.
+    It is lowered and compiled like a jitted function, and callable once compiled.
+
+    On a GPU with C physics the device waits for the host. The host moves the scenes of one part
+    while the device is at work for another. On a CPU each replica is a part, one after the other:
+    vmapped convolutions become grouped ones, which take twice as long.
+    """
+
+    program: Any  # jitted, lowered or compiled: (state of a part, its replicas) -> (state, metrics)
+    replicas: Replicas
+    parts: int
+
+    def lower(self, state: TrainState) -> "Pipelined":
+        first = jax.eval_shape(lambda state: _split(state, self.parts)[0], state)
+        return dataclasses.replace(self, program=self.program.lower(first, self._shares()[0]))
+
+    def compile(self) -> "Pipelined":
+        return dataclasses.replace(self, program=self.program.compile())
+
+    def memory_analysis(self) -> Any:
+        return self.program.memory_analysis()
+
+    def __call__(self, state: TrainState) -> tuple[TrainState, StepMetrics]:
+        """The result of all parts, once the last one is done."""
+        states = jax.block_until_ready(_split(state, self.parts))
+        for leaf in jax.tree.leaves(state):
+            leaf.delete()
+
+        def run(state: TrainState, share: Replicas) -> Any:
+            return jax.block_until_ready(self.program(state, share))
+
+        with ThreadPoolExecutor(1 if jax.default_backend() == "cpu" else self.parts) as threads:
+            return _join(list(threads.map(run, states, self._shares())))
+
+    def _shares(self) -> list[Replicas]:
+        slices = _slices(len(self.replicas.seed), self.parts)
+        return [jax.tree.map(lambda leaf, part=part: leaf[part], self.replicas) for part in slices]
+
+
+def _slices(num: int, parts: int) -> list[slice]:
+    return [slice(first, first + num // parts) for first in range(0, num, num // parts)]
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _split(state: TrainState, parts: int) -> list[TrainState]:
+    """The states of equal parts, copied."""
+    slices = _slices(len(state.key), parts)
+    return [jax.tree.map(jnp.copy, replica(state, part)) for part in slices]
+
+
+@jax.jit
 def _join(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, StepMetrics]:
     """States [S', ...] and metrics [T, S', ...] of the parts as those of all replicas."""
     states, metrics = zip(*done, strict=True)
@@ -217,49 +268,3 @@ def replica(state: TrainState, index: int | slice) -> TrainState:
     """The state of one replica, as `train` has it, or of several."""
     own = jax.tree.map(lambda leaf: leaf[index], state.replace(step=()))
     return own.replace(step=state.step)
-
-
-def abstract(
-    program: Program, replicas: Replicas, mesh: Mesh | None = None, shard: Shard = "seeds"
-) -> TrainState:
-    """Shapes, types and places of `init`'s state; nothing is compiled."""
-    shapes = jax.eval_shape(lambda: init(program, replicas))
-    if mesh is None:
-        return shapes
-
-    def place(sharding: NamedSharding, tree: Any) -> Any:
-        return jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), tree
-        )
-
-    return jax.tree.map(place, shardings(mesh, shard), shapes)
-
-
-def sweep_program(
-    group: ProgramGroup,
-    mesh: Mesh | None = None,
-    shard: Shard = "seeds",
-    start: Callable[[Any], Any] | None = None,
-) -> SweepProgram:
-    """The program of a group; its environment is made here.
-
-    Args: start, changes the learners' first state [S, ...], as networks that they start from.
-    """
-    program, replicas = step.make(group.configs[0]), of_group(group)
-    parts = pipelined.num_parts(program.cfg, len(group.configs), mesh)
-
-    def first_state() -> TrainState:
-        state = init(program, replicas, mesh, shard)
-        if start is None:
-            return state
-        state = state.replace(learner=start(state.learner))
-        return state if mesh is None else jax.device_put(state, shardings(mesh, shard))
-
-    return SweepProgram(
-        init=first_state,
-        abstract=lambda: abstract(program, replicas, mesh, shard),
-        chunk=lambda num_steps: compile_chunk(program, replicas, num_steps, mesh, shard, parts),
-        replica=replica
-        if mesh is None
-        else jax.jit(replica, out_shardings=NamedSharding(mesh, PartitionSpec())),
-    )

@@ -6,20 +6,15 @@ SWEEP/POINT/seed-K/             a run, laid out like one of `train`; its checkpo
 SWEEP/groups/I/checkpoints/     the state of all runs of group I, until they are done
 SWEEP/groups/I/done             their checkpoints are written
 
-A run is one point with one seed. One whose loss is not finite is given up and named; it cannot
-reach the others, which go on.
+A run is one point with one seed. One whose loss is not finite is named and given up, alone.
 """
 
-import contextlib
 import dataclasses
 import json
-import math
-import os
 import shutil
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,6 +22,7 @@ import numpy as np
 from csac_jax.config import WARP_WORLDS, Config
 from csac_jax.errors import FailedError
 from csac_jax.evaluation import statistics
+from csac_jax.evaluation.metrics import NO_CASES
 from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
@@ -37,6 +33,7 @@ from csac_jax.training import loop, memory
 PLAN = "sweep.json"
 SUMMARY = "summary.json"
 DONE = "done"
+_NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
 
 
 class SweepError(FailedError):
@@ -60,13 +57,6 @@ class SweepRun(NamedTuple):
     def folder(self) -> Path:
         """Where its log and checkpoint lie, within the sweep's folder."""
         return Path(self.point) / f"seed-{self.cfg.seed}"
-
-
-class RunProgress(NamedTuple):
-    """What the host carries for a run from chunk to chunk."""
-
-    progress: loop.Progress
-    failed: int | None  # step of the chunk in which a loss was not finite
 
 
 class SweepResult(NamedTuple):
@@ -95,15 +85,17 @@ def run(
         folder.mkdir(parents=True)
         files.replace(folder / PLAN, plan_text(plan))
     sweep = _Sweep(folder, groups_of(plan), reporter, stop)
-    compiled = []
     for index, (group, _) in enumerate(sweep.groups):
-        if not sweep.stopping() and not (sweep.group_folder(index) / DONE).exists():
-            compiled += sweep.train_group(index, make_program(group))
+        own = folder / "groups" / str(index)
+        if not sweep.stopping() and not (own / DONE).exists():
+            sweep.train_group(index, own, make_program(group))
     summary = summarise(plan, folder)
     if cluster.is_first():
         files.write_json(folder / SUMMARY, summary)
-    reporter.say(_ending(folder, sweep.stopped))
-    return SweepResult(summary, compiled, sweep.stopped)
+    done = f"done; saved in {folder}, results in {folder / SUMMARY}"
+    stopped = f"stopped and saved; go on with: csac-jax sweep --resume {folder}"
+    reporter.say(done if sweep.stopped is None else stopped)
+    return SweepResult(summary, sweep.compiled, sweep.stopped)
 
 
 def read_plan(folder: Path) -> SweepPlan:
@@ -148,87 +140,73 @@ def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
 
 
 def check_room(plan: SweepPlan, devices: int) -> None:
-    """Raises ValueError where the runs of a group, divided among `devices`, exceed what a device
-    has room for: its memory, or the scenes of Warp's contacts."""
+    """Raises ValueError where a group's runs, divided among `devices`, exceed a device's memory, or
+    the scenes of Warp's contacts."""
     for group, _ in groups_of(plan._replace(seeds=1)):
         cfg, runs = group.configs[0], -(-len(group.configs) * plan.seeds // devices)
-        if cfg.sim.physics == "warp" and runs * cfg.train.scenes > WARP_WORLDS:
+        scenes = cfg.train.scenes
+        if cfg.sim.physics == "warp" and runs * scenes > WARP_WORLDS:
             raise ValueError(
-                f"--seeds: {runs} runs of {cfg.train.scenes} scenes side by side, Warp has room "
-                f"for {WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take "
-                "--sim.physics mjx"
+                f"--seeds: {runs} runs of {scenes} scenes side by side, Warp has room for "
+                f"{WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take --sim.physics mjx"
             )
         memory.check(cfg, runs)
 
 
+@dataclasses.dataclass
 class _Sweep:
     """A sweep on its way."""
 
-    def __init__(
-        self,
-        folder: Path,
-        groups: list[tuple[ProgramGroup, list[SweepRun]]],
-        reporter: loop.Reporter,
-        stop: Stop,
-    ) -> None:
-        self.folder, self.groups, self.reporter, self.stop = folder, groups, reporter, stop
-        self.stopped: int | None = None  # number of the signal that all processes know of
+    folder: Path
+    groups: list[tuple[ProgramGroup, list[SweepRun]]]
+    reporter: loop.Reporter
+    stop: Stop
+    stopped: int | None = None  # number of the signal that all processes know of
+    compiled: list[float] = dataclasses.field(default_factory=list)  # s, of each group
 
     def stopping(self) -> bool:
         """Whether a signal has come to any process. All must ask at once."""
         self.stopped = cluster.agree(self.stop.signal)
         return self.stopped is not None
 
-    def group_folder(self, index: int) -> Path:
-        return self.folder / "groups" / str(index)
-
-    def train_group(self, index: int, program: SweepProgram) -> list[float]:
-        """Trains a group to its end or to a signal; returns the time of its compilation, s, if
-        there was one."""
-        runs = self.groups[index][1]
-        training = _GroupTraining(self.folder, self.group_folder(index), runs, program)
-        self.reporter.say(self._title(index, training))
-        compiled: list[float] = []
+    def train_group(self, index: int, folder: Path, program: SweepProgram) -> None:
+        """Trains a group, whose own `folder` this is, to its end or to a signal."""
+        training = _GroupTraining(self.folder, folder, self.groups[index][1], program)
+        self.reporter.say(f"group {index + 1} of {len(self.groups)}: {training.title()}")
         chunk = None
-        with training.open_logs() as logs:
-            while not training.over() and not self.stopping():
-                if chunk is None:
-                    chunk, seconds = loop.compile_program(
-                        training.cfg, program.chunk, training.state, self.reporter
-                    )
-                    compiled.append(seconds)
-                    continue  # a signal may have come meanwhile
-                records = training.advance(chunk, logs, self.reporter)
-                if records:
-                    self._show(index, records)
+        while not training.over() and not self.stopping():
+            if chunk is None:
+                chunk, seconds = loop.compile_program(
+                    training.cfg, program.compile_chunk, training.state, self.reporter
+                )
+                self.compiled.append(seconds)
+            elif records := training.advance(chunk, self.reporter):
+                self._show(index, records)
         if checkpoint.latest_step(training.folder) != training.step:
             training.save()
         if self.stopped is None:
             training.finish()
-        return compiled
-
-    def _title(self, index: int, training: "_GroupTraining") -> str:
-        names = list(dict.fromkeys(run.point for run in training.runs))
-        shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-        since = f", resumed at step {training.step}" if training.step else ""
-        number = f"group {index + 1} of {len(self.groups)}"
-        return f"{number}: {len(training.runs)} runs, {shown}{since}"
 
     def _show(self, index: int, records: list[loop.Record]) -> None:
         """One line about all runs: their actions and speed together, means of the rest."""
-        actions = [_actions(group.configs) for group, _ in self.groups]
-        done = sum(actions[:index]) + records[0].actions * len(self.groups[index][1])
-        speed = sum(record.actions_per_second for record in records)
+
+        def mean(name: str) -> float | None:
+            values = [getattr(record, name) for record in records]
+            return loop.mean([value for value in values if value is not None])
+
+        cfgs = [[run.cfg for run in runs] for _, runs in self.groups]
+        actions = [sum(loop.total_steps(cfg) * cfg.train.scenes for cfg in group) for group in cfgs]
+        done = sum(actions[:index]) + records[0].actions * len(cfgs[index])
+        total, speed = sum(actions), sum(record.actions_per_second for record in records)
         shown = dataclasses.replace(
             records[0],
             actions=done,
             actions_per_second=speed,
-            grasp_success=_mean([record.grasp_success for record in records]),
+            grasp_success=mean("grasp_success"),
             grasps_counted=sum(record.grasps_counted for record in records),
-            critic_loss=_mean([record.critic_loss for record in records]),
-            actor_loss=_mean([record.actor_loss for record in records]),
+            critic_loss=mean("critic_loss"),
+            actor_loss=mean("actor_loss"),
         )
-        total = sum(actions)
         self.reporter.progress(shown, total, (total - done) / max(speed, 1e-9))
 
 
@@ -239,84 +217,68 @@ class _GroupTraining:
         self, sweep_folder: Path, folder: Path, runs: list[SweepRun], program: SweepProgram
     ) -> None:
         """Goes on from the newest checkpoint, if there is one; logs are cut to it."""
-        self.folder, self.runs, self.program = folder, runs, program
-        self.cfg = runs[0].cfg
+        self.folder, self.runs, self.program, self.cfg = folder, runs, program, runs[0].cfg
         self.paths = [sweep_folder / run.folder for run in runs]
+        self.progress = [loop.Progress(0.0, [])] * len(runs)
+        self.failed: list[int | None] = [None] * len(runs)  # step of a loss that is not finite
         if checkpoint.latest_step(folder) is None:
-            self.state, self.step = program.init(), 0
-            self.progress = [RunProgress(loop.Progress(0.0, []), None)] * len(runs)
+            self.state = program.init()
         else:
             self.state, extra = checkpoint.restore(folder, program.abstract())
-            self.step = int(self.state.step)
             stored = extra["runs"] if "runs" in extra else extra["members"]  # its older name
-            self.progress = [RunProgress(loop.Progress(*own), failed) for own, failed in stored]
+            self.progress = [loop.Progress(*progress) for progress, _ in stored]
+            self.failed = [failed for _, failed in stored]
+        self.step = int(self.state.step)
         if cluster.is_first():
             for run, path in zip(runs, self.paths, strict=True):
                 path.mkdir(parents=True, exist_ok=True)
                 files.write_json(path / files.CONFIG, configs.to_dict(run.cfg))
                 files.truncate_log(path / files.METRICS, self.step)
 
+    def title(self) -> str:
+        """Its runs in words, and the step that it goes on from."""
+        names = list(dict.fromkeys(run.point for run in self.runs))
+        more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+        since = f", resumed at step {self.step}" if self.step else ""
+        return f"{len(self.runs)} runs, {', '.join(names[:4])}{more}{since}"
+
     def over(self) -> bool:
         """Whether all runs are done or given up."""
-        lost = all(own.failed is not None for own in self.progress)
-        return lost or self.step >= loop.total_steps(self.cfg)
+        return None not in self.failed or self.step >= loop.total_steps(self.cfg)
 
-    @contextlib.contextmanager
-    def open_logs(self) -> Iterator[list[TextIO]]:
-        """The runs' logs, to be added to; only the first process has them."""
-        with contextlib.ExitStack() as stack:
-            names = [path / files.METRICS for path in self.paths]
-            names = names if cluster.is_first() else [Path(os.devnull)] * len(names)
-            yield [stack.enter_context(name.open("a")) for name in names]
-
-    def advance(
-        self, chunk: Callable[[Any], Any], logs: list[TextIO], reporter: loop.Reporter
-    ) -> list[loop.Record]:
-        """Runs a chunk, writes the line of every run that is not given up, and saves now and then.
-        Returns the lines."""
-        begun = time.perf_counter()
-        self.state, metrics = chunk(self.state)
-        metrics = jax.device_get(metrics)
+    def advance(self, chunk: Callable[[Any], Any], reporter: loop.Reporter) -> list[loop.Record]:
+        """Runs a chunk, saves now and then; logs and returns a line of each run that goes on."""
+        self.state, metrics, seconds = loop.timed(chunk, self.state)
         self.step += self.cfg.train.chunk
-        seconds = time.perf_counter() - begun
         records = []
-        for i, log in enumerate(logs):
-            if self.progress[i].failed is None:
-                own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
-                records += self._record(i, own, seconds, log, reporter)
+        for i, run in enumerate(self.runs):
+            own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
+            if self.failed[i] is None and loop.not_finite(own):
+                self.failed[i] = self.step
+                reason = f"given up at step {self.step}, a loss is not finite"
+                reporter.say(f"{run.point}, seed {run.cfg.seed}: {reason}")
+            if self.failed[i] is None:
+                old = self.progress[i]
+                self.progress[i], record = loop.record_chunk(run.cfg, self.step, own, old, seconds)
+                records.append(record)
+                if cluster.is_first():
+                    loop.append(self.paths[i], record)
         if self.step % (self.cfg.train.save_every * self.cfg.train.chunk) == 0:
             self.save()
         return records
 
-    def _record(
-        self, i: int, metrics: Any, seconds: float, log: TextIO, reporter: loop.Reporter
-    ) -> list[loop.Record]:
-        """Writes the line of run i, whose `metrics` are [T, ...]; none if it is given up now."""
-        run, before = self.runs[i], self.progress[i]
-        if not loop.is_finite(metrics):
-            self.progress[i] = before._replace(failed=self.step)
-            reason = f"given up at step {self.step}, a loss is not finite"
-            reporter.say(f"{run.point}, seed {run.cfg.seed}: {reason}")
-            return []
-        after, record = loop.record_chunk(run.cfg, self.step, metrics, before.progress, seconds)
-        self.progress[i] = before._replace(progress=after)
-        log.write(json.dumps(dataclasses.asdict(record)) + "\n")
-        log.flush()
-        return [record]
-
     def save(self) -> None:
         """Writes a checkpoint of the group."""
-        runs = [[list(own.progress), own.failed] for own in self.progress]
+        runs = list(zip(self.progress, self.failed, strict=True))
         checkpoint.save(self.folder, self.step, self.state, self.cfg, {"runs": runs})
 
     def finish(self) -> None:
-        """Writes a checkpoint for every run, then removes the group's own. An interrupted call is
-        repeated when the sweep is resumed."""
-        for i, (run, own) in enumerate(zip(self.runs, self.progress, strict=True)):
-            if own.failed is None:
-                _remove(self.paths[i] / checkpoint.FOLDER)
-                state, extra = self.program.replica(self.state, i), own.progress._asdict()
-                checkpoint.save(self.paths[i], self.step, state, run.cfg, extra)
+        """Writes the runs' checkpoints, then removes the group's; a resumed sweep repeats it."""
+        for i, path in enumerate(self.paths):
+            if self.failed[i] is None:
+                _remove(path / checkpoint.FOLDER)
+                state, extra = self.program.replica(self.state, i), self.progress[i]._asdict()
+                checkpoint.save(path, self.step, state, self.runs[i].cfg, extra)
         if cluster.is_first():
             files.replace(self.folder / DONE, "")
         _remove(self.folder / checkpoint.FOLDER)
@@ -329,56 +291,28 @@ def _remove(folder: Path) -> None:
     cluster.wait(f"removed {folder}")
 
 
-def _actions(configs: Sequence[Config]) -> int:
-    return sum(loop.total_steps(cfg) * cfg.train.scenes for cfg in configs)
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None
-
-
-def _ending(folder: Path, stopped: int | None) -> str:
-    if stopped is None:
-        return f"done; saved in {folder}, results in {folder / SUMMARY}"
-    return f"stopped and saved; go on with: csac-jax sweep --resume {folder}"
-
-
 def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:
-    """Grasp success over the last grasps of every run and, over the seeds of each point, its
-    interquartile mean.
-
-    Read off the logs of the runs; a run with another number of steps than the plan's does not
-    count.
-    """
+    """Grasp success over the last grasps of every run, by its log, and the interquartile mean over
+    the seeds of each point; a run with another number of steps than the plan's does not count."""
     points: list[dict[str, Any]] = []
     for point in plan.points:
         rows = [_row(folder, run) for run in runs_of(plan._replace(points=[point]))]
         done = [row["grasp_success"] for row in rows if row["complete"]]
-        success = _over_seeds([value for value in done if value is not None])
+        known = np.array([value for value in done if value is not None])
+        success = statistics.band([known])._asdict() if known.size else dict(NO_CASES)
         named = {"name": point.name, "values": point.values}
         points.append({**named, "grasp_success": success, "runs": rows})
     complete = all(row["complete"] for point in points for row in point["runs"])
     return {"seeds": plan.seeds, "complete": complete, "settings": points}
 
 
-def _over_seeds(values: Sequence[float]) -> dict[str, Any]:
-    """Interquartile mean and its band; no value of no seed."""
-    if not values:
-        return {"value": None, "low": None, "high": None, "n": 0}
-    return statistics.band([np.array(values)])._asdict()
-
-
-_NOTHING = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
-
-
 def _row(folder: Path, run: SweepRun) -> dict[str, Any]:
     log = folder / run.folder / files.METRICS
     lines = files.read_log(log) if log.exists() else []
-    last = lines[-1] if lines else _NOTHING
+    last = lines[-1] if lines else _NO_LINE
     return {
         "seed": run.cfg.seed,
         "run_dir": run.folder.as_posix(),
         "complete": last["step"] == loop.total_steps(run.cfg),
-        **{name: last[name] for name in _NOTHING},
+        **{name: last[name] for name in _NO_LINE},
     }

@@ -21,8 +21,9 @@ from csac_jax.runtime.signals import Stop
 from csac_jax.training import memory
 
 LOSSES = ("critic_loss", "actor_loss")
-# Share of a chunk's actions beyond which diverged physics is reported; 1e-5 is common.
-DIVERGED_SHARE = 1e-3
+SUMS = "cleared blocks_lost terminated truncated gap_disagrees contact_overflow physics_diverged"
+MEANS = "critic_loss actor_loss td_error q_mean"
+DIVERGED_SHARE = 1e-3  # of a chunk's actions: diverged physics beyond it is told; 1e-5 is common
 
 
 class TrainingError(FailedError):
@@ -31,17 +32,14 @@ class TrainingError(FailedError):
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One line of metrics.jsonl: what a chunk did, and how far the run is. Means are over the
-    chunk."""
+    """One line of metrics.jsonl: how far the run is, and what a chunk did, in sums and means."""
 
     step: int  # training steps done
     actions: int  # actions done, over all scenes
     seconds: float  # spent in chunks since the run began, resumed parts included, compilation not
     actions_per_second: float  # of this chunk
-    grasp_success: (
-        float | None
-    )  # share of the last `grasps_counted` grasps that lifted a block; None before the first
-    grasps_counted: int  # min(grasps so far, GRASP_WINDOW)
+    grasp_success: float | None  # share of the last `grasps_counted` grasps that lifted a block
+    grasps_counted: int  # min(grasps so far, GRASP_WINDOW); without any, success is None
     pushes: int
     grasps: int
     outcomes: dict[str, int]  # grasps by what came of them
@@ -86,14 +84,11 @@ class Progress(NamedTuple):
     """What the host carries from chunk to chunk, and the checkpoint in its JSON."""
 
     seconds: float  # spent in chunks
-    grasps: list[
-        int
-    ]  # 1 for a lift, 0 for another outcome, of the last GRASP_WINDOW grasps, oldest first
+    grasps: list[int]  # the last GRASP_WINDOW grasps, oldest first: 1 for a lift, else 0
 
 
 def total_steps(cfg: Config) -> int:
-    """Training steps of a run: those of the config, rounded up to whole chunks, so that one program
-    serves all."""
+    """Training steps of a run, rounded up to whole chunks, so that one program serves all."""
     return math.ceil(cfg.train.steps / cfg.train.chunk) * cfg.train.chunk
 
 
@@ -108,66 +103,54 @@ def run(
 ) -> Summary:
     """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
 
-    The number of steps is rounded up to whole chunks: there is one compilation only.
-
     Args: run_dir, exists if `resume`, else is made; init, gives the first state, a pytree with
     `step` [] int32; compile_chunk, takes the number of steps and gives a jitted function state ->
     (state, StepMetrics [T, ...]) that may use up its argument. Raises TrainingError on a loss that
     is not finite, CheckpointError if there is nothing sound to resume from.
     """
-    state, progress, step = _resume(cfg, run_dir, init) if resume else _begin(cfg, run_dir, init)
+    state, progress = _begin(cfg, run_dir, init, resume)
+    step, total, scenes = int(state.step), total_steps(cfg), cfg.train.scenes
     if resume:
-        reporter.say(f"resumed {run_dir} at step {step} ({step * cfg.train.scenes} actions)")
-    compile_seconds = 0.0
-    chunk, doubted = None, False
-    with (run_dir / files.METRICS).open("a") as log:
-        while step < total_steps(cfg) and stop.signal is None:
-            if chunk is None:
-                chunk, compile_seconds = compile_program(cfg, compile_chunk, state, reporter)
-                continue  # a signal may have come meanwhile
-            begun = time.perf_counter()
-            state, metrics = chunk(state)
-            metrics = jax.device_get(metrics)
-            step += cfg.train.chunk
-            _check_finite(run_dir, metrics, step)
-            progress, record = record_chunk(
-                cfg, step, metrics, progress, time.perf_counter() - begun
-            )
-            log.write(json.dumps(dataclasses.asdict(record)) + "\n")
-            log.flush()
-            reporter.progress(record, total_steps(cfg) * cfg.train.scenes, _eta(cfg, record))
-            if (
-                record.physics_diverged > max(DIVERGED_SHARE * (record.pushes + record.grasps), 1.0)
-                and not doubted
-            ):
-                doubted = True
-                reporter.say(_doubt(cfg, record))
-            if step % (cfg.train.save_every * cfg.train.chunk) == 0:
-                _save(cfg, run_dir, step, state, progress)
+        reporter.say(f"resumed {run_dir} at step {step} ({step * scenes} actions)")
+    chunk, compile_seconds, doubted = None, 0.0, False
+    while step < total and stop.signal is None:
+        if chunk is None:
+            chunk, compile_seconds = compile_program(cfg, compile_chunk, state, reporter)
+            continue  # a signal may have come meanwhile
+        state, metrics, seconds = timed(chunk, state)
+        step += cfg.train.chunk
+        if lost := not_finite(metrics):
+            raise TrainingError(_lost_loss(run_dir, lost, step))
+        progress, record = record_chunk(cfg, step, metrics, progress, seconds)
+        append(run_dir, record)
+        reporter.progress(record, total * scenes, seconds * (total - step) / cfg.train.chunk)
+        if not doubted and (doubt := _doubt(cfg, record)):
+            doubted = True
+            reporter.say(doubt)
+        if step % (cfg.train.save_every * cfg.train.chunk) == 0:
+            checkpoint.save(run_dir, step, state, cfg, progress._asdict())
     if checkpoint.latest_step(run_dir) != step:
-        _save(cfg, run_dir, step, state, progress)
-    reporter.say(_ending(run_dir, step, cfg, stop))
-    success = _share(progress.grasps)
-    actions = step * cfg.train.scenes
+        checkpoint.save(run_dir, step, state, cfg, progress._asdict())
+    stopped = f"stopped and saved at step {step}; go on with: csac-jax train --resume {run_dir}"
+    done = f"done: {step * scenes} actions; saved in {run_dir}"
+    reporter.say(done if stop.signal is None else stopped)
+    actions, grasps = step * scenes, progress.grasps
     return Summary(
-        step, actions, progress.seconds, compile_seconds, success, len(progress.grasps), stop.signal
+        step, actions, progress.seconds, compile_seconds, mean(grasps), len(grasps), stop.signal
     )
 
 
-def _begin(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
-    run_dir.mkdir(parents=True)
+def _begin(cfg: Config, run_dir: Path, init: Callable, resume: bool) -> tuple[Any, Progress]:
+    """The first state, or that of the newest checkpoint, to which the log is cut."""
+    if resume:
+        check_resumable(cfg, run_dir)
+    else:
+        run_dir.mkdir(parents=True)
     files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
-    return init(), Progress(0.0, []), 0
-
-
-def _resume(cfg: Config, run_dir: Path, init: Callable[[], Any]) -> tuple[Any, Progress, int]:
-    """State of the newest checkpoint; lines of the log that are newer than it are dropped."""
-    check_resumable(cfg, run_dir)
-    files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
-    state, extra = checkpoint.restore(run_dir, jax.eval_shape(init))
-    step = int(state.step)
-    files.truncate_log(run_dir / files.METRICS, step)
-    return state, Progress(extra["seconds"], extra["grasps"]), step
+    fresh = Progress(0.0, [])._asdict()
+    state, extra = checkpoint.restore(run_dir, jax.eval_shape(init)) if resume else (init(), fresh)
+    files.truncate_log(run_dir / files.METRICS, int(state.step))
+    return state, Progress(extra["seconds"], extra["grasps"])
 
 
 def check_resumable(cfg: Config, run_dir: Path) -> None:
@@ -184,12 +167,10 @@ def check_resumable(cfg: Config, run_dir: Path) -> None:
 def compile_program(
     cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter
 ) -> tuple[Any, float]:
-    kernels = (
-        "; then Warp builds its kernels, on a new machine for minutes"
-        if cfg.sim.physics == "warp"
-        else ""
-    )
-    reporter.say(f"compiling the training program; this takes a while, once{kernels}")
+    """The compiled chunk for such a state, and the seconds that it took."""
+    reporter.say("compiling the training program; this takes a while, once")
+    if cfg.sim.physics == "warp":
+        reporter.say("then Warp builds its kernels, on a new machine for minutes")
     begun, hits = time.perf_counter(), cache.hits()
     program = compiler.lower(compile_chunk(cfg.train.chunk), state).compile()
     seconds = time.perf_counter() - begun
@@ -198,42 +179,37 @@ def compile_program(
     return program, seconds
 
 
-def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress) -> None:
-    checkpoint.save(run_dir, step, state, cfg, progress._asdict())
+def timed(chunk: Callable[[Any], Any], state: Any) -> tuple[Any, Any, float]:
+    """What a chunk makes of a state: the next one, metrics on the host, and the seconds it took."""
+    begun = time.perf_counter()
+    state, metrics = chunk(state)
+    metrics = jax.device_get(metrics)
+    return state, metrics, time.perf_counter() - begun
 
 
-def _doubt(cfg: Config, record: Record) -> str:
+def not_finite(metrics: Any) -> str | None:
+    """The loss of a run's chunk that is not finite, if there is one; the warm-up does not count."""
+    losses = {name: getattr(metrics, name)[metrics.learned] for name in LOSSES}
+    return next((name for name, loss in losses.items() if not np.isfinite(loss).all()), None)
+
+
+def _lost_loss(run_dir: Path, name: str, step: int) -> str:
+    last = checkpoint.latest_step(run_dir)
+    kept = "no checkpoint was saved" if last is None else f"the checkpoint of step {last} is kept"
     return (
-        f"physics failed in {record.physics_diverged} of the last "
-        f"{record.pushes + record.grasps} actions, whose scenes were dropped: see "
-        f"`physics_diverged` in {files.METRICS}; try another --sim.physics than "
-        f"{cfg.sim.physics} before you trust this run"
+        f"{name} is not finite in the chunk that ended at step {step}; {kept}; "
+        "lower learn.learning_rate and train again"
     )
 
 
-def _check_finite(run_dir: Path, metrics: Any, step: int) -> None:
-    """Raises TrainingError if a loss of the chunk that ended at `step` is not finite. Nothing is
-    saved then."""
-    for name in LOSSES:
-        if not is_finite(metrics, (name,)):
-            last = checkpoint.latest_step(run_dir)
-            kept = (
-                "no checkpoint was saved before"
-                if last is None
-                else f"the checkpoint of step {last} is kept"
-            )
-            raise TrainingError(
-                f"{name} is not finite in the chunk that ended at step {step}; {kept}; "
-                "lower learn.learning_rate and train again"
-            )
-
-
-def is_finite(metrics: Any, names: Sequence[str] = LOSSES) -> bool:
-    """Whether the losses `names` of a run's chunk are all finite; those of the warm-up do not
-    count."""
-    learned = np.asarray(metrics.learned)
-    return all(
-        bool(np.all(np.isfinite(np.asarray(getattr(metrics, name))[learned]))) for name in names
+def _doubt(cfg: Config, record: Record) -> str | None:
+    """What to say of a chunk in which physics failed too often."""
+    diverged, actions = record.physics_diverged, cfg.train.chunk * cfg.train.scenes
+    if diverged <= max(DIVERGED_SHARE * actions, 1.0):
+        return None
+    return (
+        f"physics failed in {diverged} of the last {actions} actions, whose scenes were dropped; "
+        f"before you trust this run, try another --sim.physics than {cfg.sim.physics}"
     )
 
 
@@ -245,56 +221,33 @@ def record_chunk(
     outcomes = metrics.outcome[grasped]  # in order of time, then of scene
     window = collections.deque(before.grasps, maxlen=GRASP_WINDOW)
     window.extend((outcomes == Outcome.LIFTED).astype(int).tolist())
-    after = Progress(before.seconds + seconds, list(window))
     counts = np.bincount(outcomes, minlength=len(OUTCOMES)).tolist()
-    sums = (
-        "cleared",
-        "blocks_lost",
-        "terminated",
-        "truncated",
-        "gap_disagrees",
-        "contact_overflow",
-        "physics_diverged",
-    )
-    means = ("critic_loss", "actor_loss", "td_error", "q_mean")
-    totals: dict[str, Any] = {name: int(getattr(metrics, name).sum()) for name in sums}
-    averages: dict[str, Any] = {
-        name: _mean(getattr(metrics, name)[metrics.learned]) for name in means
-    }
+    sums: Any = {name: int(getattr(metrics, name).sum()) for name in SUMS.split()}
+    means: Any = {name: mean(getattr(metrics, name)[metrics.learned]) for name in MEANS.split()}
     record = Record(
         step=step,
         actions=step * cfg.train.scenes,
-        seconds=round(after.seconds, 3),
+        seconds=round(before.seconds + seconds, 3),
         actions_per_second=round(grasped.size / seconds, 3),
-        grasp_success=_share(after.grasps),
-        grasps_counted=len(after.grasps),
+        grasp_success=mean(window),
+        grasps_counted=len(window),
         pushes=int((~grasped).sum()),
         grasps=int(grasped.sum()),
         outcomes=dict(zip(OUTCOMES, counts, strict=True)),
         pushes_better=int(metrics.push_better.sum()),
         reward=float(metrics.reward.mean()),
-        **totals,
-        **averages,
+        **sums,
+        **means,
     )
-    return after, record
+    return Progress(before.seconds + seconds, list(window)), record
 
 
-def _mean(values: np.ndarray) -> float | None:
-    return float(values.mean()) if values.size else None
+def mean(values: Sequence[float] | np.ndarray) -> float | None:
+    """The mean; None of no values."""
+    return float(np.mean(values)) if len(values) else None
 
 
-def _share(values: list[int]) -> float | None:
-    return sum(values) / len(values) if values else None
-
-
-def _eta(cfg: Config, record: Record) -> float:
-    """Time that the rest of the run will take, s, at the speed of this chunk."""
-    return (
-        (total_steps(cfg) - record.step) * cfg.train.scenes / max(record.actions_per_second, 1e-9)
-    )
-
-
-def _ending(run_dir: Path, step: int, cfg: Config, stop: Stop) -> str:
-    if stop.signal is None:
-        return f"done: {step * cfg.train.scenes} actions; saved in {run_dir}"
-    return f"stopped and saved at step {step}; go on with: csac-jax train --resume {run_dir}"
+def append(run_dir: Path, record: Record) -> None:
+    """Adds a line to the log of a run."""
+    with (run_dir / files.METRICS).open("a") as log:
+        log.write(json.dumps(dataclasses.asdict(record)) + "\n")

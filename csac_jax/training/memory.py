@@ -1,8 +1,5 @@
-"""Whether a run fits into memory, by exact numbers.
-
-The bytes of its state are known before anything is compiled; the replay ring is nearly all of them.
-What the training program needs besides is known once XLA has compiled it.
-"""
+"""Whether a run fits into memory: the bytes of its state are known before anything is compiled,
+what its program needs besides once XLA has compiled it."""
 
 import math
 import os
@@ -19,22 +16,17 @@ GIB = 2**30
 
 def limit() -> int:
     """Bytes of the first device: its own limit, or this machine's memory if it states none (CPUs).
-
-    All, not what is free: the system gives up its caches for a run.
-    """
+    All, not what is free: the system gives up its caches for a run."""
     stats = jax.devices()[0].memory_stats() or {}
     return stats.get("bytes_limit") or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def state_bytes(cfg: Config) -> dict[str, int]:
     """Bytes of a run's state by part. Traces the networks, which takes seconds."""
-    state = step.abstract_state(step.make(cfg, env=step.without_physics(cfg)))
+    state = step.abstract_state(cfg)
     parts = {"replay": state.replay, "scenes": state.scenes, "networks": state.learner}
-    return {name: _bytes(part) for name, part in parts.items()}
-
-
-def _bytes(tree: Any) -> int:
-    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+    sizes = jax.tree.map(lambda leaf: math.prod(leaf.shape) * leaf.dtype.itemsize, parts)
+    return {name: sum(jax.tree.leaves(part)) for name, part in sizes.items()}
 
 
 def check(cfg: Config, runs: int = 1) -> None:

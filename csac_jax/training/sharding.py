@@ -1,11 +1,9 @@
 """A line of several devices, which divide either the seeds or the scenes of each seed.
 
 Seeds are independent: each device runs a program of its own on its share. Scenes share networks and
-replay, of which every device has a copy. Physics runs apart; transitions are gathered into every
-copy. A batch is divided among the devices and its gradients are added up.
+replay, of which every device has a copy with all transitions; gradients of a divided batch add up.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -17,51 +15,32 @@ Shard = Literal["seeds", "scenes"]
 AXIS = "devices"
 
 
-@dataclasses.dataclass(frozen=True)
-class DataSharding:
-    """How the scenes and batches of one seed are divided; without a mesh they are not."""
-
-    mesh: Mesh | None = None
-
-    def map_scenes(self, function: Callable) -> Callable:
-        """`function` of leaves [E, ...] to leaves [E, ...], each device on its own scenes."""
-        if self.mesh is None:
-            return function
-        along = PartitionSpec(AXIS)
-        return jax.shard_map(
-            function, mesh=self.mesh, in_specs=along, out_specs=along, check_vma=False
-        )
-
-    def shard_batch(self, tree: Any) -> Any:
-        """Leaves [B, ...], of which each device holds its share."""
-        if self.mesh is None:
-            return tree
-        along = NamedSharding(self.mesh, PartitionSpec(AXIS))
-        return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, along), tree)
+def map_scenes(mesh: Mesh | None, function: Callable) -> Callable:
+    """`function` of leaves [E, ...] to leaves [E, ...], each device of a mesh on its own scenes."""
+    if mesh is None:
+        return function
+    along = PartitionSpec(AXIS)
+    return jax.shard_map(function, mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
 
 
-UNSHARDED = DataSharding()
+def shard_batch(mesh: Mesh | None, tree: Any) -> Any:
+    """Leaves [B, ...], of which each device of a mesh holds its share."""
+    if mesh is None:
+        return tree
+    along = NamedSharding(mesh, PartitionSpec(AXIS))
+    return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, along), tree)
 
 
 def make(devices: int | None) -> Mesh | None:
-    """A line of the first `devices` devices of all processes; no mesh for a single one.
-
-    None stands for one device, or for all of several processes. Raises ValueError if there are
-    fewer, or if a process were left without one.
-    """
+    """A line of the first `devices` devices; no mesh for a single one. None stands for one, or for
+    all of several processes, which use no fewer. Raises ValueError if there are not so many."""
     present, alone = jax.devices(), jax.process_count() == 1
-    wanted = devices
-    if wanted is None:
-        wanted = 1 if alone else len(present)
+    wanted = (1 if alone else len(present)) if devices is None else devices
     if not alone and wanted != len(present):
-        raise ValueError(
-            f"--devices: {wanted} asked for; leave it out: several processes use all {len(present)}"
-        )
+        raise ValueError(f"--devices: leave it out, several processes use all {len(present)}")
     if not 1 <= wanted <= len(present):
-        raise ValueError(
-            f"--devices: {wanted} asked for, there are {len(present)} ({present[0].platform}); "
-            f"give 1 .. {len(present)}"
-        )
+        there = f"there are {len(present)} ({present[0].platform}); give 1 .. {len(present)}"
+        raise ValueError(f"--devices: {wanted} asked for, {there}")
     return None if wanted == 1 else Mesh(np.array(present[:wanted]), (AXIS,))
 
 
@@ -71,7 +50,5 @@ def check(mesh: Mesh | None, shard: Shard, runs: int, scenes: int, batch: int) -
     by_scenes = {"train.scenes": scenes, "learn.batch": batch}
     for name, number in ({"--seeds": runs} if shard == "seeds" else by_scenes).items():
         if number % size:
-            raise ValueError(
-                f"{name}: {number} does not divide among {size} devices; "
-                f"give a multiple of {size}, or other --devices"
-            )
+            remedy = f"give a multiple of {size}, or other --devices"
+            raise ValueError(f"{name}: {number} does not divide among {size} devices; {remedy}")

@@ -4,16 +4,17 @@ Observe, act, simulate, remember, learn, replace finished scenes. E = scenes, B 
 """
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.sharding import Mesh
 
 from csac_jax import env as environment
-from csac_jax.agent import augment, csac
+from csac_jax.agent import actor_critic, augment
+from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config
@@ -25,7 +26,7 @@ from csac_jax.replay.samplers import Sampler
 from csac_jax.runtime import compiler
 from csac_jax.scene import layout
 from csac_jax.sim.primitives import Action
-from csac_jax.training.sharding import UNSHARDED, DataSharding
+from csac_jax.training import sharding
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 
@@ -77,7 +78,7 @@ class Program:
     env: Env
     learner: Learner
     sampler: Sampler
-    sharding: DataSharding = UNSHARDED  # of scenes and batches over devices
+    mesh: Mesh | None = None  # whose devices divide scenes and batches
 
 
 def make(
@@ -88,12 +89,10 @@ def make(
     network: Any = None,
 ) -> Program:
     """The program of a config, with parts of your own in place of the config's."""
-    return Program(
-        cfg=cfg,
-        env=environment.make_env(cfg) if env is None else env,
-        learner=csac.make(cfg, network) if learner is None else learner,
-        sampler=samplers.make(cfg.replay) if sampler is None else sampler,
-    )
+    env = environment.make_env(cfg) if env is None else env
+    learner = CSAC(actor_critic.make(cfg, network)) if learner is None else learner
+    sampler = samplers.make(cfg.replay) if sampler is None else sampler
+    return Program(cfg, env, learner, sampler)
 
 
 def replace_hyperparams(program: Program, hyperparams: Hyperparams | None) -> Program:
@@ -129,26 +128,19 @@ def train_step(
     action = learner.act(key_act, state.learner, scenes.obs, scenes.steps_without_change, taken)
 
     # Simulate.
-    after = program.sharding.map_scenes(jax.vmap(env.step))(scenes, action)
+    after = sharding.map_scenes(program.mesh, jax.vmap(env.step))(scenes, action)
 
     # Reward and remember (lines 14-15).
-    info = after.info
-    result = _result(action, info)
+    info, result = after.info, action_result(action, after.info)
     reward, push_better = learner.reward(cfg.reward, state.learner, scenes.obs, after.obs, result)
-    transition = Transition(
-        obs=heightmap.pack(scenes.obs),
-        action=action,
-        reward=reward,
-        next_obs=heightmap.pack(after.obs),
-        terminated=after.terminated,
-    )
+    before, seen = heightmap.pack(scenes.obs), heightmap.pack(after.obs)
+    transition = Transition(before, action, reward, seen, after.terminated)
     replay = ring.add(state.replay, transition, ~info.physics_diverged)
 
     # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch would cost more
     # than those few updates.
     ready = taken + cfg.train.scenes >= cfg.train.learning_starts
-    done = _updates_done(cfg, state.step)
-    learned, priority, losses = _learn(program, key_learn, state.learner, replay, done)
+    learned, priority, losses = _learn(program, key_learn, state.learner, replay, state.step)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, replay.priority)
 
@@ -171,14 +163,12 @@ def train_step(
         learned=ready,
         **losses,
     )
-    state = TrainState(
-        state.key, state.step + 1, scenes, learned, replay.replace(priority=priority)
-    )
-    return state, metrics
+    replay = replay.replace(priority=priority)
+    return TrainState(state.key, state.step + 1, scenes, learned, replay), metrics
 
 
-def _result(action: Action, info: environment.Info) -> ActionResult:
-    """What the actions did, leaves [E]; phi is the learner's to fill in."""
+def action_result(action: Action, info: environment.Info) -> ActionResult:
+    """What actions did, leaves [...]; phi, here 0, is the learner's to fill in."""
     unknown = jnp.zeros_like(info.distance)
     return ActionResult(
         primitive=action.primitive,
@@ -192,29 +182,30 @@ def _result(action: Action, info: environment.Info) -> ActionResult:
 
 
 def _learn(
-    program: Program, key: jax.Array, state: Any, replay: ReplayState, done: jax.Array
+    program: Program, key: jax.Array, state: Any, replay: ReplayState, step: jax.Array
 ) -> tuple[Any, jax.Array, dict[str, jax.Array]]:
-    """The updates, each on a batch of its own, then the end of the step on (part of) the last.
-
-    `done` [] int32 updates came before.
-    """
-    cfg, learner = program.cfg, program.learner
+    """The updates of training step `step` [], each on a batch of its own, then the end of the step
+    on (part of) the last."""
+    cfg, learner, sampler = program.cfg, program.learner, program.sampler
     total = max(cfg.train.steps * cfg.learn.updates, 1)
+    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1  # step whose updates count
+    done = jnp.maximum(step - first, 0) * cfg.learn.updates
 
     def update(carry, i):
         state, priority = carry
-        *keys_draw, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
+        key_sample, key_augment, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
         progress = (done + i).astype(jnp.float32) / total
         current = replay.replace(priority=priority)
-        slots, weights, batch = _draw(program, keys_draw, current, progress)
+        slots, weights = sampler.sample(key_sample, current, progress, cfg.learn.batch)
+        batch = sharding.shard_batch(program.mesh, ring.gather(current, slots))
+        keys = _keys(key_augment, cfg.learn.batch)
+        batch = jax.vmap(augment.augment, (0, None, 0))(keys, cfg, batch)
         state, info = learner.update(key_update, state, batch, weights)
-        current = program.sampler.update(current, slots, info.error)
+        current = sampler.update(current, slots, info.error)
         return (state, current.priority), (info, batch.obs)
 
-    numbers = jnp.arange(cfg.learn.updates)
-    (state, priority), (info, observations) = jax.lax.scan(
-        update, (state, replay.priority), numbers
-    )
+    start, numbers = (state, replay.priority), jnp.arange(cfg.learn.updates)
+    (state, priority), (info, observations) = jax.lax.scan(update, start, numbers)
     last = jax.tree.map(lambda leaf: leaf[-1, : cfg.learn.actor_batch or None], observations)
     state, actor_loss = learner.end_step(state, heightmap.unpack(last))
     losses = {
@@ -224,23 +215,6 @@ def _learn(
         "q_mean": jnp.mean(info.q),
     }
     return state, priority, losses
-
-
-def _updates_done(cfg: Config, step: jax.Array) -> jax.Array:
-    """Updates [] int32 before training step `step` [] that were not dropped."""
-    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1
-    return jnp.maximum(step - first, 0) * cfg.learn.updates
-
-
-def _draw(
-    program: Program, keys: Sequence[jax.Array], replay: ReplayState, progress: jax.Array
-) -> tuple[jax.Array, jax.Array, Transition]:
-    """A batch as the sampler has it, augmented: slots [B], weights [B], leaves [B, ...]."""
-    cfg, (key_sample, key_augment) = program.cfg, keys
-    slots, weights = program.sampler.sample(key_sample, replay, progress, cfg.learn.batch)
-    batch = program.sharding.shard_batch(ring.gather(replay, slots))
-    augmented = jax.vmap(augment.augment, (0, None, 0))
-    return slots, weights, augmented(_keys(key_augment, cfg.learn.batch), cfg, batch)
 
 
 def _keys(key: jax.Array, num: int) -> jax.Array:
@@ -257,15 +231,12 @@ def init_state(
 ) -> TrainState:
     """Fresh scenes and networks, an empty ring (lines 1-4), from the run's root key; pure."""
     program = replace_hyperparams(program, hyperparams)
-    cfg, sampler = program.cfg, program.sampler
+    cfg = program.cfg
     key_scenes, key_nets = jax.random.split(jax.random.fold_in(key, np.uint32(2**32 - 1)))
-    return TrainState(
-        key=key,
-        step=jnp.int32(0),
-        scenes=jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes)),
-        learner=program.learner.init(key_nets),
-        replay=ring.init(sampler.init(cfg.replay.capacity), example(cfg)),
-    )
+    scenes = jax.vmap(program.env.reset)(_keys(key_scenes, cfg.train.scenes))
+    learner = program.learner.init(key_nets)
+    replay = ring.init(program.sampler.init(cfg.replay.capacity), example(cfg))
+    return TrainState(key, jnp.int32(0), scenes, learner, replay)
 
 
 def example(cfg: Config) -> Transition:
@@ -273,9 +244,8 @@ def example(cfg: Config) -> Transition:
 
     def build() -> Transition:
         rows = (cfg.heightmap.size, cfg.heightmap.size)
-        obs = Observation(
-            colour=jnp.zeros((*rows, 3)), height=jnp.zeros(rows), target=jnp.zeros(rows, bool)
-        )
+        colour, target = jnp.zeros((*rows, 3)), jnp.zeros(rows, bool)
+        obs = Observation(colour=colour, height=jnp.zeros(rows), target=target)
         action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
         packed = heightmap.pack(obs)
         return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool))
@@ -283,23 +253,17 @@ def example(cfg: Config) -> Transition:
     return jax.eval_shape(build)
 
 
-def abstract_state(program: Program) -> Any:
+def abstract_state(cfg: Config, learner: Learner | None = None, network: Any = None) -> Any:
     """Shapes and types of a run's state: no scene is settled, nothing is compiled."""
+    no_physics: Any = None
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+    program = make(cfg, Env(cfg, no_physics, blank), learner, network=network)
     return jax.eval_shape(lambda: init(program))
 
 
-def without_physics(cfg: Config) -> Env:
-    """An environment for shapes alone."""
-    nothing: Any = None
-    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
-    return Env(cfg, nothing, blank)
-
-
 def compile_chunk(program: Program, num_steps: int):
-    """A compiled function state -> (state, StepMetrics [T, ...]) of `num_steps` training steps.
-
-    The state is donated: what goes in is used up, and the replay is updated in place.
-    """
+    """A jitted function state -> (state, StepMetrics [T, ...]) of T = `num_steps` training steps.
+    The state is donated: what goes in is used up, and the replay is updated in place."""
 
     def chunk(state: TrainState) -> tuple[TrainState, StepMetrics]:
         return jax.lax.scan(lambda carry, _: train_step(program, carry), state, length=num_steps)

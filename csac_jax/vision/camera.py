@@ -4,7 +4,7 @@ The camera looks along its z, x is right and y down in the image; row 0 is the t
 along z. A pixel's ray has no unit length: it advances by 1 m in depth per unit of distance.
 
     eye = camera.make(CameraConfig().scaled(0.5))
-    picture = camera.render(eye, solids.read(model, data.geom_xpos, data.geom_xmat))
+    picture = camera.render(eye, solids.place(solids.read(model), data.geom_xpos, data.geom_xmat))
 """
 
 from collections.abc import Callable
@@ -17,7 +17,11 @@ from flax import struct
 
 from csac_jax.config import CameraConfig
 from csac_jax.scene.solids import Solids
-from csac_jax.vision import raycast, shade
+from csac_jax.vision import raycast
+
+LIGHT = (0.36, 0.48, 0.8)  # unit vector towards the light; oblique, so that slopes differ
+AMBIENT = 0.4  # share of the colour that a face turned away from the light keeps
+SKY = np.array([0.75, 0.8, 0.85], np.float32)  # colour of pixels that hit nothing
 
 
 @struct.dataclass
@@ -43,32 +47,21 @@ class Picture:
 
 
 def make(cfg: CameraConfig) -> Camera:
-    """The camera of a config."""
-    rotation = level_rotation(np.array(cfg.position), np.array(cfg.look_at))
-    return Camera(
-        focal=jnp.asarray(cfg.focal, jnp.float32),
-        centre=jnp.asarray(cfg.centre, jnp.float32),
-        position=jnp.asarray(cfg.position, jnp.float32),
-        rotation=jnp.asarray(rotation, jnp.float32),
-        width=cfg.size[0],
-        height=cfg.size[1],
-    )
-
-
-def level_rotation(position: np.ndarray, look_at: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3], camera to world, of a camera that looks at a point, its x horizontal."""
-    forward = (look_at - position) / np.linalg.norm(look_at - position)
-    right = np.array([forward[1], -forward[0], 0.0]) / np.hypot(forward[0], forward[1])
-    return np.stack([right, np.cross(forward, right), forward], axis=1)
+    """The camera of a config, its x horizontal."""
+    offset = np.array(cfg.look_at) - np.array(cfg.position)
+    x, y, _ = forward = offset / np.linalg.norm(offset)
+    right = np.array([y, -x, 0.0]) / np.hypot(x, y)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+    focal, centre, position = map(jnp.float32, (cfg.focal, cfg.centre, cfg.position))
+    return Camera(focal, centre, position, jnp.float32(rotation), *cfg.size)
 
 
 def directions(camera: Camera) -> jax.Array:
     """Rays [H, W, 3] of all pixels in the world frame, each 1 m long in depth."""
     x = (jnp.arange(camera.width, dtype=jnp.float32) - camera.centre[0]) / camera.focal[0]
     y = (jnp.arange(camera.height, dtype=jnp.float32) - camera.centre[1]) / camera.focal[1]
-    right, down, forward = (camera.rotation[:, axis] for axis in range(3))
-    across = x[None, :, None] * right[None, None] + y[:, None, None] * down[None, None]
-    return across + forward[None, None]
+    right, down, forward = (axis[None, None] for axis in camera.rotation.T)
+    return x[None, :, None] * right + y[:, None, None] * down + forward
 
 
 def points(camera: Camera, depth: jax.Array) -> jax.Array:
@@ -76,21 +69,24 @@ def points(camera: Camera, depth: jax.Array) -> jax.Array:
     return depth[..., None] * directions(camera) + camera.position[None, None]
 
 
-def cast_rays(camera: Camera, cast: Callable[[jax.Array, jax.Array], Any]) -> Any:
-    """`cast`, a function of one ray (origin [3] m, direction [3]), for every pixel: [H, W, ...]."""
-    hits = jax.vmap(cast, in_axes=(None, 0))(camera.position, directions(camera).reshape(-1, 3))
-    rows = (camera.height, camera.width)
-    return jax.tree.map(lambda leaf: leaf.reshape(*rows, *leaf.shape[1:]), hits)
+def cast_rays(camera: Camera, cast: Callable[..., Any], shapes: Any) -> Any:
+    """`cast` of shapes and one ray (origin [3] m, direction [3]), for every pixel: [H, W, ...]."""
+    rays, shape = directions(camera).reshape(-1, 3), (camera.height, camera.width)
+    hits = jax.vmap(cast, in_axes=(None, None, 0))(shapes, camera.position, rays)
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), hits)
+
+
+def shade(colour: jax.Array, normal: jax.Array) -> jax.Array:
+    """Flat shading: colours [S, 3], 0 .. 1, of surfaces lit by their unit normals [S, 3]."""
+    x, y, z = LIGHT
+    cosine = normal[:, 0] * x + normal[:, 1] * y + normal[:, 2] * z  # [S]
+    return (AMBIENT + (1.0 - AMBIENT) * jnp.maximum(cosine, 0.0))[:, None] * colour
 
 
 def render(camera: Camera, solids: Solids) -> Picture:
     """The picture of a scene of any geoms, flat shaded."""
-    hit = cast_rays(camera, lambda *ray: raycast.cast_solids(solids, *ray))
+    hit = cast_rays(camera, raycast.cast_solids, solids)
     own = jnp.asarray(solids.colour).at[jnp.maximum(hit.geom, 0)].get(mode="promise_in_bounds")
-    lit = shade.flat(own.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(own.shape)
-    return Picture(
-        colour=jnp.where(hit.valid[..., None], lit, shade.SKY[None, None]),
-        depth=jnp.where(hit.valid, hit.distance, 0.0),
-        geom=hit.geom,
-        valid=hit.valid,
-    )
+    lit = shade(own.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(own.shape)
+    colour = jnp.where(hit.valid[..., None], lit, SKY[None, None])
+    return Picture(colour, jnp.where(hit.valid, hit.distance, 0.0), hit.geom, hit.valid)

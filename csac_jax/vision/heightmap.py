@@ -1,4 +1,4 @@
-"""Height maps of one scene seen from above: the observation, its packed form, areas.
+"""Height maps of one scene seen from above: the observation, its packed form, an area.
 
 Rows run along y and columns along x, see `geometry`.
 """
@@ -11,11 +11,8 @@ from flax import struct
 
 from csac_jax.config import HeightmapConfig
 
-VIEW_HEIGHT = 0.5
-"""Height of the view, m: blocks in play lie below it, parked blocks wholly above."""
-
+VIEW_HEIGHT = 0.5  # m: blocks in play lie below it, parked blocks wholly above
 _HEIGHT_UNIT = 1e-4  # m per count of the packed height
-_CM2 = 1e4  # cm^2 in a m^2
 
 
 @struct.dataclass
@@ -57,12 +54,11 @@ def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Ce
     cell = jnp.where(inside, row * cfg.size + col, cfg.size**2)  # outside: dropped
     top = jnp.full(cfg.size**2, -jnp.inf).at[cell].max(points[:, 2], mode="drop")
     is_top = points[:, 2] == top.at[cell].get(mode="fill", fill_value=jnp.inf)
-    index = jnp.arange(points.shape[0], dtype=jnp.int32)
-    last = jnp.full(cfg.size**2, jnp.int32(points.shape[0] - 1))
+    index = jnp.arange(len(points), dtype=jnp.int32)
+    last = jnp.full(cfg.size**2, jnp.int32(len(points) - 1))
     source = last.at[jnp.where(is_top, cell, cfg.size**2)].min(index, mode="drop")
-    filled = top > -jnp.inf
-    height = jnp.where(filled, jnp.maximum(top, 0.0), 0.0)
-    return Cells(*(leaf.reshape(cfg.size, cfg.size) for leaf in (height, source, filled)))
+    leaves = (jnp.maximum(top, 0.0), source, top > -jnp.inf)
+    return Cells(*(leaf.reshape(cfg.size, cfg.size) for leaf in leaves))
 
 
 def pack(obs: Observation) -> PackedObservation:
@@ -74,24 +70,12 @@ def pack(obs: Observation) -> PackedObservation:
 
 def unpack(packed: PackedObservation) -> Observation:
     """The packed observation, to half a colour level and 0.05 mm."""
-    return Observation(
-        colour=packed.colour.astype(jnp.float32) / 255.0,
-        height=packed.height.astype(jnp.float32) * _HEIGHT_UNIT,
-        target=packed.target,
-    )
+    colour, height = (leaf.astype(jnp.float32) for leaf in (packed.colour, packed.height))
+    return Observation(colour / 255.0, height * _HEIGHT_UNIT, packed.target)
 
 
 def moved_area(cfg: HeightmapConfig, before: jax.Array, after: jax.Array) -> jax.Array:
     """Area [] cm^2 whose height [H, W] m changed by 1 cm to 30 cm (VPG's bounds)."""
     change = jnp.abs(after - before)
-    return _area(cfg, (change >= 0.01) & (change <= 0.3))
-
-
-def occupied_area(cfg: HeightmapConfig, height: jax.Array) -> jax.Array:
-    """Area [] cm^2 whose height [H, W] m exceeds 2 cm (VPG's bound)."""
-    return _area(cfg, height > 0.02)
-
-
-def _area(cfg: HeightmapConfig, cells: jax.Array) -> jax.Array:
-    """Area [] cm^2 of the True cells [H, W]; unlike a count, it does not depend on resolution."""
-    return cells.sum(dtype=jnp.int32).astype(jnp.float32) * (cfg.cell**2 * _CM2)
+    cells = jnp.sum((change >= 0.01) & (change <= 0.3), dtype=jnp.int32)
+    return cells.astype(jnp.float32) * (cfg.cell**2 * 1e4)

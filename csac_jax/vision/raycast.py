@@ -1,12 +1,12 @@
 """One ray against the table and convex blocks, or against geoms of any kind; callers vmap.
 
-A block is an intersection of half-spaces. A ray enters it at the last plane that it crosses inwards
-and leaves at the first that it crosses outwards (slab method, Kay and Kajiya 1986). Faces and geoms
-are folded one after another, so vmap forms no [R, G, F] array. Half-spaces in the world frame have
-no ray axis under `vmap(cast, in_axes=(None, 0, 0))`: they are computed once per scene.
+Faces and geoms are folded one after another, so vmap forms no [R, G, F] array. Half-spaces in the
+world frame have no ray axis under `vmap(cast, in_axes=(None, 0, 0))`: they are computed once per
+scene.
 """
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,8 +59,7 @@ def world_half_spaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
 def surface_normals(polytopes: Polytopes) -> jax.Array:
     """World normal [1 + G F, 3] of every surface, see `SurfaceHit`."""
     normal, _ = world_half_spaces(polytopes)
-    up = jnp.array([[0.0, 0.0, 1.0]], jnp.float32)
-    return jnp.concatenate([up, normal.reshape(-1, 3)])
+    return jnp.concatenate([jnp.array([[0.0, 0.0, 1.0]]), normal.reshape(-1, 3)])
 
 
 def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
@@ -75,14 +74,14 @@ def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array
 
     def fold_geom(nearest, geom):
         distance, surface = nearest
-        entry = shapes.enter_half_spaces(geom[0], geom[1], origin, direction)
-        closer = entry.valid & (entry.distance < distance)
-        surface = jnp.where(closer, geom[2] * faces + entry.face + 1, surface)
-        return (jnp.where(closer, entry.distance, distance), surface), None
+        enter, face, valid = shapes.enter_half_spaces(geom[0], geom[1], origin, direction)
+        closer = valid & (enter < distance)
+        surface = jnp.where(closer, geom[2] * faces + face + 1, surface)
+        return (jnp.where(closer, enter, distance), surface), None
 
     start = (jnp.where(table.valid, table.distance, jnp.inf), jnp.array(0, jnp.int32))
-    geom_rows = (normal, offset, jnp.arange(geoms, dtype=jnp.int32))
-    (distance, surface), _ = jax.lax.scan(fold_geom, start, geom_rows)
+    rows = (normal, offset, jnp.arange(geoms, dtype=jnp.int32))
+    (distance, surface), _ = jax.lax.scan(fold_geom, start, rows)
     return SurfaceHit(distance, surface, table.valid | (surface > 0))
 
 
@@ -91,35 +90,20 @@ def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:
 
     There is no table unless `solids` has one. Each kind of geom is one loop.
     """
+
+    def fold(nearest: Any, geom: GeomGroup) -> tuple[Any, None]:
+        offset = [origin[axis] - geom.position[axis] for axis in range(3)]
+        axes = geom.rotation.T
+        local = ([shapes.dot(axis, part) for axis in axes] for part in (offset, direction))
+        entry = shapes.RAY[geom.kind](geom.shape, *local)
+        normal = tuple(shapes.dot(row, entry.normal) for row in geom.rotation)
+        closer = entry.valid & (entry.distance < nearest[0])
+        entered = (entry.distance, normal, geom.geom)
+        return jax.tree.map(functools.partial(jnp.where, closer), entered, nearest), None
+
     zero = jnp.zeros((), jnp.float32)
-    distance = jnp.array(jnp.inf, jnp.float32)
-    nearest: Nearest = (distance, (zero, zero, zero), jnp.array(-1, jnp.int32))
+    nearest: Any = (jnp.array(jnp.inf, jnp.float32), (zero, zero, zero), jnp.array(-1, jnp.int32))
     for group in solids.groups:
-        nearest = _fold_group(group, origin, direction, nearest)
+        nearest, _ = jax.lax.scan(fold, nearest, group)
     distance, normal, geom = nearest
     return Hit(distance, jnp.stack(normal), geom, geom >= 0)
-
-
-Nearest = tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array], jax.Array]
-"""The nearest entry so far: distance [], world normal [] x 3, geom [] int32 or -1."""
-
-
-def _fold_group(
-    group: GeomGroup, origin: jax.Array, direction: jax.Array, nearest: Nearest
-) -> Nearest:
-    ray = shapes.RAY[group.kind]
-
-    def fold(nearest: Nearest, geom: tuple[jax.Array, ...]) -> tuple[Nearest, None]:
-        shape, position, rotation, number = geom
-        offset = [origin[axis] - position[axis] for axis in range(3)]
-        local = [
-            [shapes.dot(rotation[:, axis], vector) for axis in range(3)]
-            for vector in (offset, direction)
-        ]
-        entry = ray(shape, *local)
-        closer = entry.valid & (entry.distance < nearest[0])
-        normal = tuple(shapes.dot(rotation[axis], entry.normal) for axis in range(3))
-        found = (entry.distance, normal, number)
-        return jax.tree.map(lambda new, old: jnp.where(closer, new, old), found, nearest), None
-
-    return jax.lax.scan(fold, nearest, (group.shape, group.position, group.rotation, group.geom))[0]

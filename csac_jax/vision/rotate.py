@@ -1,9 +1,11 @@
 """Maps in frames rotated by K yaws, and interpolation between cells.
 
 Frame k is rotated by yaw_k = 2 pi k / K about the workspace centre: an action with yaw_k points
-along +column in it. Its canvas is a margin larger than the map, so that rotated corners fit; cells
-keep their size. NumPy tables say which cell goes where, so a rotation is one gather.
+along +column in it. Its canvas is larger than the map by the fraction `margin`, so that rotated
+corners fit; cells keep their size. NumPy tables say which cell goes where: one gather rotates.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry
+from csac_jax.config import canvas_size
 
 
 @struct.dataclass
@@ -24,16 +27,8 @@ class RotationTables:
 
 
 def tables(size: int, extent: float, rotations: int, count: int, margin: float) -> RotationTables:
-    """Tables that rotate maps [size, size, ch] of `extent` m to the first `count` of `rotations`.
-
-    The canvas is larger than the map by the fraction `margin`, and its side even; sqrt(2) - 1 keeps
-    the corners. Raises ValueError for more frames than rotations or a negative margin.
-    """
-    canvas = round(size * (1.0 + margin) / 2.0) * 2
-    if not 1 <= count <= rotations:
-        raise ValueError(f"count: {count} frames were asked for, but there are 1 .. {rotations}")
-    if canvas < size:
-        raise ValueError(f"margin: {margin} makes the canvas {canvas} cells, the map has {size}")
+    """Tables to rotate maps [size, size, ch] of `extent` m by the first `count` of K rotations."""
+    canvas = canvas_size(size, margin)
     along = np.arange(canvas) + 0.5 - 0.5 * canvas  # cells from the centre
     y, x = np.meshgrid(along, along, indexing="ij")
     yaw = (2.0 * np.pi / rotations * np.arange(count))[:, None, None]  # [count, 1, 1]
@@ -44,40 +39,27 @@ def tables(size: int, extent: float, rotations: int, count: int, margin: float) 
     return RotationTables(index.reshape(count, -1), valid.reshape(count, -1), canvas, extent / size)
 
 
-def _gather(canvas: int, maps: jax.Array, index: jax.Array, valid: jax.Array) -> jax.Array:
-    """Canvas [C, C, ch] of maps [H, W, ch], index [C * C] and valid [C * C]; 0 where not valid."""
-    channels = maps.shape[-1]
-    rotated = maps.reshape(-1, channels).at[index].get(mode="promise_in_bounds")
-    rotated = jnp.where(valid[:, None], rotated, jnp.zeros((), maps.dtype))
-    return rotated.reshape(canvas, canvas, channels)
+def rotate(tables: RotationTables, maps: jax.Array, k: Any = slice(None)) -> jax.Array:
+    """Maps [H, W, ch] in frames `k` [...] int32, 0 <= k < count, all by default: [..., C, C, ch].
+
+    Nearest cell; 0 outside the workspace.
+    """
+    index, valid = (jnp.asarray(table)[k] for table in (tables.index, tables.valid))
+    rotated = maps.reshape(-1, maps.shape[-1]).at[index].get(mode="promise_in_bounds")
+    rotated = jnp.where(valid[..., None], rotated, jnp.zeros((), maps.dtype))
+    return rotated.reshape(*index.shape[:-1], tables.canvas, tables.canvas, maps.shape[-1])
 
 
-def rotate(tables: RotationTables, maps: jax.Array) -> jax.Array:
-    """Maps [H, W, ch] in every frame [count, C, C, ch], nearest cell; 0 outside the workspace."""
-    gather = jax.vmap(_gather, in_axes=(None, None, 0, 0))
-    return gather(tables.canvas, maps, jnp.asarray(tables.index), jnp.asarray(tables.valid))
-
-
-def rotate_one(tables: RotationTables, maps: jax.Array, k: jax.Array) -> jax.Array:
-    """As `rotate`, in frame `k` [] int32, 0 <= k < count, alone: [C, C, ch]."""
-    return _gather(tables.canvas, maps, jnp.asarray(tables.index)[k], jnp.asarray(tables.valid)[k])
-
-
-def frame_position(yaw: jax.Array, xy: jax.Array) -> jax.Array:
-    """Workspace points `xy` [..., 2] m in the frame rotated by `yaw` [] rad, [..., 2] m."""
-    return geometry.rotate2d(-yaw, xy)
-
-
-def to_cell(canvas: int, cell_size: float, xy_frame: jax.Array) -> jax.Array:
-    """Canvas position (row, col) [..., 2] in cells of `cell_size` m of points [..., 2] m."""
-    return xy_frame[..., ::-1] / cell_size + 0.5 * (canvas - 1)
+def to_cell(canvas: int, cell_size: float, yaw: jax.Array, xy: jax.Array) -> jax.Array:
+    """Position (row, col) [..., 2], in cells of `cell_size` m, of workspace points `xy` [..., 2] m
+    in the frame rotated by `yaw` [] rad."""
+    return geometry.rotate2d(-yaw, xy)[..., ::-1] / cell_size + 0.5 * (canvas - 1)
 
 
 def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
     """Value [] of the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells.
 
-    Cell centres are whole numbers; outside, the nearest edge counts. Differentiable in both. vmap
-    turns each of the four reads into one gather.
+    Cell centres are whole numbers; outside, the nearest edge counts. Differentiable in both.
     """
     height, width = values.shape
     row = jnp.clip(row_col[0], 0.0, height - 1.0)
@@ -87,9 +69,8 @@ def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
     left = jnp.clip(jnp.floor(col).astype(jnp.int32), 0, width - 2)
     down, right = row - top.astype(row.dtype), col - left.astype(col.dtype)
 
-    def read(r: jax.Array, c: jax.Array) -> jax.Array:
-        return values.at[r, c].get(mode="promise_in_bounds")
+    def read(r: jax.Array) -> jax.Array:
+        a, b = (values.at[r, c].get(mode="promise_in_bounds") for c in (left, left + 1))
+        return (1.0 - right) * a + right * b
 
-    upper = (1.0 - right) * read(top, left) + right * read(top, left + 1)
-    lower = (1.0 - right) * read(top + 1, left) + right * read(top + 1, left + 1)
-    return (1.0 - down) * upper + down * lower
+    return (1.0 - down) * read(top) + down * read(top + 1)

@@ -8,19 +8,15 @@ from csac_jax import geometry
 from csac_jax.config import SensorConfig
 from csac_jax.vision.camera import Camera
 
-_NOISE = np.uint32(2**31)  # folded into a reset's key: distinct from its children by `split`
-
 
 def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
-    """Root key of the noise of an episode that is reset with `key`; None without noise.
-
-    Raises ValueError where there is noise but no key.
-    """
+    """Root key of the noise of an episode reset with `key`, None without noise; ValueError if there
+    is noise but no key."""
     if not cfg.active:
         return None
     if key is None:
         raise ValueError("a reset with sensor noise (config section `sensor`) needs a key")
-    return jax.random.fold_in(key, _NOISE)
+    return jax.random.fold_in(key, np.uint32(2**31))  # distinct from the key's children by `split`
 
 
 def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Array, jax.Array]:

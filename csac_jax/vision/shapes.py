@@ -6,6 +6,7 @@ vectors. Round surfaces are solved from the line's point nearest to the axis, si
 b^2 - 4ac loses all digits from afar (Haines et al., Ray Tracing Gems, 2019, chapter 7).
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -18,34 +19,25 @@ from csac_jax.scene.solids import Kind
 _PARALLEL = np.float32(1e-30)  # n . d of a plane along the ray, in place of 0
 _ON_PLANE = np.float32(1e-12)  # m, depth of an origin that lies on a plane
 
-Vector = jax.Array | Sequence[jax.Array]
-"""[3], or its three scalars []."""
+Vector = jax.Array | Sequence[jax.Array]  # [3], or its three scalars []
 
 
 class Entry(NamedTuple):
     """Where one ray enters one geom; all but `valid` are meaningless where not valid."""
 
     distance: jax.Array  # [] in lengths of the ray's direction, not negative
-    normal: tuple[jax.Array, jax.Array, jax.Array]  # outward, of unit length, in the geom's frame
-    valid: jax.Array  # [] bool, True if it enters
-
-
-class FaceEntry(NamedTuple):
-    """As `Entry`, of an intersection of half-spaces, with the face in place of its normal."""
-
-    distance: jax.Array  # [] in lengths of the ray's direction, not negative
-    face: jax.Array  # [] int32, face through which it enters
+    normal: tuple[jax.Array, ...]  # [] x 3, outward, of unit length, in the geom's frame
     valid: jax.Array  # [] bool, True if it enters
 
 
 def dot(a: Vector, b: Vector) -> jax.Array:
-    """Scalar product [] of two vectors [3], in scalars."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    """Scalar product [] of two vectors, in scalars."""
+    return functools.reduce(jnp.add, (a[axis] * b[axis] for axis in range(len(a))))
 
 
 def enter_half_spaces(
     normal: jax.Array, offset: jax.Array, origin: Vector, direction: Vector
-) -> FaceEntry:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One ray against one intersection of half-spaces (slab method, Kay and Kajiya 1986).
 
     t = (offset - n . o) / (n . d) at each plane. The ray enters at the largest t with n . d < 0 and
@@ -54,6 +46,7 @@ def enter_half_spaces(
     that share a direction share the division.
 
     Args: normal [F, 3] and offset [F] m; origin [3] m, direction [3].
+    Returns: the distance, the face int32 and whether it enters, all []; see `Entry`.
     """
     enter, leave = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32)
     face = jnp.array(0, jnp.int32)
@@ -66,7 +59,7 @@ def enter_half_spaces(
         face = jnp.where(inwards > enter, f, face)
         enter = jnp.maximum(enter, inwards)
         leave = jnp.minimum(leave, jnp.where(speed < 0.0, jnp.inf, crossing))
-    return FaceEntry(enter, face, (enter >= 0.0) & (enter <= leave))
+    return enter, face, (enter >= 0.0) & (enter <= leave)
 
 
 def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
@@ -75,102 +68,90 @@ def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     distance = -origin[2] / jnp.where(falling, direction[2], -1.0)
     inside = falling & (distance >= 0.0)
     for axis in range(2):
-        endless = size[axis] <= 0.0
         place = jnp.abs(origin[axis] + distance * direction[axis])
-        inside &= endless | (place <= size[axis])
+        inside &= (size[axis] <= 0.0) | (place <= size[axis])
     zero = jnp.zeros_like(distance)
     return Entry(distance, (zero, zero, zero + 1.0), inside)
 
 
+def _slab(half: jax.Array, origin: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where a line enters and leaves |x| <= half along one axis, all []; it enters later than it
+    leaves if it misses, and a parallel one inside does so at -+inf."""
+    parallel = ~(jnp.abs(direction) > 0.0)
+    inverse = 1.0 / jnp.where(parallel, 1.0, direction)
+    middle, reach = -origin * inverse, half * jnp.abs(inverse)
+    always = jnp.where(jnp.abs(origin) <= half, jnp.inf, -jnp.inf)
+    enter, leave = jnp.where(parallel, -always, middle - reach), middle + reach
+    return enter, jnp.where(parallel, always, leave)
+
+
+def _ball(radius: jax.Array, origin: Vector, direction: Vector) -> tuple[jax.Array, jax.Array]:
+    """As `_slab`, of the points within `radius` [] m: a sphere of three axes, or the endless
+    cylinder about z of the first two."""
+    square = dot(direction, direction)
+    parallel = ~(square > 0.0)
+    safe = jnp.where(parallel, 1.0, square)
+    nearest = -dot(origin, direction) / safe  # t at which the line passes the centre
+    miss = [a + nearest * b for a, b in zip(origin, direction, strict=True)]
+    half_chord_sq = radius * radius - dot(miss, miss)  # m^2
+    hits = half_chord_sq >= 0.0
+    half = jnp.sqrt(jnp.where(hits, half_chord_sq, 0.0) / safe)
+    half = jnp.where(hits, jnp.where(parallel, jnp.inf, half), -jnp.inf)
+    return nearest - half, nearest + half
+
+
 def ray_box(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     """The box of half sizes `size` [3]: the ray enters through the slab that it enters last."""
-    enter, leave = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32)
-    side, excluded = jnp.array(0, jnp.int32), jnp.array(False)
-    for axis in range(3):
-        parallel = ~(jnp.abs(direction[axis]) > 0.0)
-        inverse = 1.0 / jnp.where(parallel, 1.0, direction[axis])
-        middle, half = -origin[axis] * inverse, size[axis] * jnp.abs(inverse)
-        later = ~parallel & (middle - half > enter)
-        enter, side = jnp.where(later, middle - half, enter), jnp.where(later, axis, side)
-        leave = jnp.where(parallel, leave, jnp.minimum(leave, middle + half))
-        excluded |= parallel & (jnp.abs(origin[axis]) > size[axis])
-    normal = [jnp.where(side == axis, -jnp.sign(direction[axis]), 0.0) for axis in range(3)]
-    valid = ~excluded & (enter >= 0.0) & (enter <= leave)
-    return Entry(enter, (normal[0], normal[1], normal[2]), valid)
+    slabs = [_slab(size[axis], origin[axis], direction[axis]) for axis in range(3)]
+    enters, leaves = zip(*slabs, strict=True)
+    enter, leave = functools.reduce(jnp.maximum, enters), functools.reduce(jnp.minimum, leaves)
+    x = enters[0] == enter
+    y = ~x & (enters[1] == enter)
+    sides = zip((x, y, ~x & ~y), direction, strict=True)
+    normal = tuple(jnp.where(side, -jnp.sign(along), 0.0) for side, along in sides)
+    return Entry(enter, normal, (enter >= 0.0) & (enter <= leave))
 
 
 def ray_sphere(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     """The sphere of radius size[0]: |o + t d| = r."""
-    square = dot(direction, direction)
-    nearest = -dot(origin, direction) / square  # t at which the line passes the centre
-    miss = [origin[axis] + nearest * direction[axis] for axis in range(3)]
-    half_chord_sq = size[0] * size[0] - dot(miss, miss)  # m^2
-    hits = half_chord_sq >= 0.0
-    distance = nearest - jnp.sqrt(jnp.where(hits, half_chord_sq, 0.0) / square)
-    x, y, z = ((origin[axis] + distance * direction[axis]) / size[0] for axis in range(3))
-    return Entry(distance, (x, y, z), hits & (distance >= 0.0))
-
-
-def _tube(
-    radius: jax.Array, origin: Vector, direction: Vector
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Where the ray's line enters and leaves the endless cylinder about z, and whether it does.
-
-    -inf and inf for a parallel line inside.
-    """
-    square = direction[0] * direction[0] + direction[1] * direction[1]
-    parallel = ~(square > 0.0)
-    safe = jnp.where(parallel, 1.0, square)
-    nearest = -(origin[0] * direction[0] + origin[1] * direction[1]) / safe
-    x, y = (origin[axis] + nearest * direction[axis] for axis in range(2))
-    half_chord_sq = radius * radius - (x * x + y * y)
-    hits = half_chord_sq >= 0.0
-    half = jnp.sqrt(jnp.where(hits, half_chord_sq, 0.0) / safe)
-    half = jnp.where(parallel, jnp.inf, half)
-    return nearest - half, nearest + half, hits
+    distance, _ = _ball(size[0], origin, direction)
+    normal = tuple((origin[axis] + distance * direction[axis]) / size[0] for axis in range(3))
+    return Entry(distance, normal, (distance >= 0.0) & (distance < jnp.inf))
 
 
 def ray_cylinder(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     """The cylinder about z of radius size[0] and half length size[1]: tube and slab."""
-    enter_side, leave_side, hits = _tube(size[0], origin, direction)
-    parallel = ~(jnp.abs(direction[2]) > 0.0)
-    inverse = 1.0 / jnp.where(parallel, 1.0, direction[2])
-    middle, half = -origin[2] * inverse, jnp.where(parallel, jnp.inf, size[1] * jnp.abs(inverse))
-    distance = jnp.maximum(enter_side, middle - half)
-    hits &= (distance <= jnp.minimum(leave_side, middle + half)) & (distance >= 0.0)
-    hits &= ~parallel | (jnp.abs(origin[2]) <= size[1])
-    end = middle - half > enter_side  # through an end, not the side
-    x, y = (
-        jnp.where(end, 0.0, (origin[axis] + distance * direction[axis]) / size[0])
-        for axis in range(2)
-    )
-    return Entry(distance, (x, y, jnp.where(end, -jnp.sign(direction[2]), 0.0)), hits)
+    enter_side, leave_side = _ball(size[0], origin[:2], direction[:2])
+    enter_end, leave_end = _slab(size[1], origin[2], direction[2])
+    distance = jnp.maximum(enter_side, enter_end)
+    valid = (distance >= 0.0) & (distance <= jnp.minimum(leave_side, leave_end))
+    end = enter_end > enter_side  # through an end, not the side
+    x, y = ((origin[axis] + distance * direction[axis]) / size[0] for axis in range(2))
+    side, cap = (x, y, jnp.zeros_like(x)), (0.0, 0.0, -jnp.sign(direction[2]))
+    return Entry(distance, jax.tree.map(functools.partial(jnp.where, end), cap, side), valid)
 
 
 def ray_capsule(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     """The capsule about z of radius size[0], half length size[1] without its caps.
 
-    A line that enters the endless tube between the caps enters the capsule there. One that enters
-    it beyond an end can hit only the sphere at that end. A parallel ray can hit only the sphere at
-    the end beyond which it starts.
+    A line that enters the endless tube between the caps enters the capsule there. Beyond an end it
+    can hit only the sphere there; so can a parallel ray that starts beyond it.
     """
-    enter, _, hits = _tube(size[0], origin, direction)
+    enter, _ = _ball(size[0], origin[:2], direction[:2])
     z = origin[2] + jnp.where(jnp.isinf(enter), 0.0, enter) * direction[2]
     middle = jnp.abs(z) <= size[1]
     cap = ray_sphere(size, (origin[0], origin[1], origin[2] - jnp.sign(z) * size[1]), direction)
     x, y = ((origin[axis] + enter * direction[axis]) / size[0] for axis in range(2))
-    normal = tuple(
-        jnp.where(middle, a, b) for a, b in zip((x, y, jnp.zeros_like(x)), cap.normal, strict=True)
-    )
-    valid = hits & jnp.where(middle, enter >= 0.0, cap.valid)
-    return Entry(jnp.where(middle, enter, cap.distance), (normal[0], normal[1], normal[2]), valid)
+    side = Entry(enter, (x, y, jnp.zeros_like(x)), enter >= 0.0)
+    entry = jax.tree.map(functools.partial(jnp.where, middle), side, cap)
+    return entry._replace(valid=entry.valid & (enter < jnp.inf))
 
 
 def ray_polytope(faces: jax.Array, origin: Vector, direction: Vector) -> Entry:
     """The polytope of the half-spaces `faces` [F, 4]: outward unit normal and offset m."""
-    entry = enter_half_spaces(faces[:, :3], faces[:, 3], origin, direction)
-    x, y, z = (faces[:, axis].at[entry.face].get(mode="promise_in_bounds") for axis in range(3))
-    return Entry(entry.distance, (x, y, z), entry.valid)
+    distance, face, valid = enter_half_spaces(faces[:, :3], faces[:, 3], origin, direction)
+    normal = (faces[:, axis].at[face].get(mode="promise_in_bounds") for axis in range(3))
+    return Entry(distance, tuple(normal), valid)
 
 
 RAY: dict[Kind, Callable[[jax.Array, Vector, Vector], Entry]] = {
@@ -181,5 +162,4 @@ RAY: dict[Kind, Callable[[jax.Array, Vector, Vector], Entry]] = {
     Kind.CYLINDER: ray_cylinder,
     Kind.POLYTOPE: ray_polytope,
 }
-"""Per kind, a function of the shape (a row of `Group.shape`), the ray's origin [3] m and direction
-[3]."""
+"""Per kind, a function of a row of `GeomGroup.shape`, the ray's origin [3] m and direction [3]."""

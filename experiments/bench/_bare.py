@@ -11,13 +11,12 @@ import numpy as np
 from csac_jax.config import Config
 from csac_jax.scene import model
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import mjx_physics, primitives, robot
+from csac_jax.sim import mjx_physics, primitives
 from csac_jax.sim.c_physics import CPhysics
 from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.physics import Physics
-from csac_jax.sim.primitives import Action
+from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
-from csac_jax.sim.robot import JointTrajectory
 
 
 def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:
@@ -25,7 +24,7 @@ def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> Joint
 
     def joints(height: jax.Array, action: Action) -> JointTrajectory:
         plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
-        return robot.joint_trajectory(cfg.sim.robot, plan)
+        return primitives.joint_trajectory(cfg.sim.robot, plan)
 
     return jax.jit(jax.vmap(joints))(height, actions)
 

@@ -19,7 +19,7 @@ import numpy as np
 from csac_jax.runtime import provenance
 from csac_jax.scene import model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, primitives, robot
+from csac_jax.sim import c_physics, mjx_physics, primitives
 from csac_jax.sim.quiet_mjx import mjx
 from experiments.bench._options import read
 from experiments.bench.parity import STREAM, TEN, Bench, pile_config
@@ -45,7 +45,7 @@ class State:
 def record(bench: Bench, count: int) -> list[State]:
     """One state of each of `count` primitives, half of them pushes, in settled piles."""
     cfg, world = bench.cfg, bench.world
-    settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, STREAM, SCENES)
+    settled = pool.settled(cfg, STREAM, SCENES)
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(count) % SCENES], settled)
     height = bench.heights(scenes)
     pushes = bench.push(jax.random.split(jax.random.key(0), count), scenes)
@@ -57,7 +57,9 @@ def record(bench: Bench, count: int) -> list[State]:
     plan = jax.jit(jax.vmap(lambda h, a: primitives.plan(cfg.sim, cfg.heightmap, h, a)))(
         height, action
     )
-    joints = jax.device_get(jax.vmap(lambda one: robot.joint_trajectory(cfg.sim.robot, one))(plan))
+    joints = jax.device_get(
+        jax.vmap(lambda one: primitives.joint_trajectory(cfg.sim.robot, one))(plan)
+    )
     fields = jax.device_get(
         jax.jit(jax.vmap(lambda scene: model.scene_fields(world, scene)))(scenes)
     )

@@ -69,7 +69,7 @@ class Bench:
         self.cfg = cfg
         self.world = model.build(cfg.scene, cfg.sim)
         self.heights = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))
-        plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
+        plan = functools.partial(oracle.grasp, cfg)
         self.oracle = jax.jit(jax.vmap(plan))
         self.push = jax.jit(jax.vmap(_push))
         self.engines = {name: self._engine(name) for name in (cfg.sim.physics, REFERENCE)}
@@ -83,13 +83,11 @@ class Bench:
 
     def _engine(self, name: Any, disabled: int = 0) -> Engine:
         """A physics with these MuJoCo features disabled, in a world of its own."""
-        sim = dataclasses.replace(self.cfg.sim, physics=name)
-        world = model.build(self.cfg.scene, sim)
+        cfg = dataclasses.replace(self.cfg, sim=dataclasses.replace(self.cfg.sim, physics=name))
+        world = model.build(cfg.scene, cfg.sim)
         world.model.opt.disableflags |= disabled
-        engine = simulation.make(world, sim)
-        return jax.jit(
-            jax.vmap(functools.partial(simulation.execute, engine, sim, self.cfg.heightmap))
-        )
+        engine = simulation.make(world, cfg.sim)
+        return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, cfg)))
 
     def run(self, engines: dict[str, Engine], scenes: Scene, actions: Action) -> dict[str, Any]:
         """Results of each engine: ends [E, N, 3], outcomes, overflows and failures [E]."""
@@ -132,7 +130,7 @@ def piles(
     """Grasps and pushes in settled piles."""
     cfg = pile_config(slots, in_play, physics)
     bench = Bench(cfg)
-    settled = pool.settled(bench.world, cfg.scene, cfg.heightmap.extent, STREAM, count)
+    settled = pool.settled(cfg, STREAM, count)
     rows, engines = [], bench.engines | bench.references
     for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))

@@ -31,7 +31,7 @@ def measure(cfg: Config, name: PhysicsKind, scenes: int) -> dict[str, Any]:
     cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, physics=name))
     env = environment.make_env(cfg)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
-    plan_grasp = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
+    plan_grasp = functools.partial(oracle.grasp, cfg)
     actions = jax.jit(jax.vmap(plan_grasp))(states.scene, states.obs.height)
     bare = _bare.loop(
         env.physics, states.scene, _bare.joint_trajectories(cfg, states.obs.height, actions)

@@ -39,12 +39,13 @@ def _outcomes(
 ) -> np.ndarray:
     """Outcome of every grasp with this robot [n]."""
     sim = dataclasses.replace(cfg.sim, robot=kind, physics="c")
+    cfg = dataclasses.replace(cfg, sim=sim)
     engine = simulation.make(model.build(cfg.scene, sim), sim)
 
     @jax.jit
     @jax.vmap
     def grasp(scene: Scene, height: jax.Array, action: Action) -> jax.Array:
-        _, trace, plan = simulation.execute(engine, sim, cfg.heightmap, scene, height, action)
+        _, trace, plan = simulation.execute(engine, cfg, scene, height, action)
         return outcome.grasp_outcome(
             trace, plan.surface, plan.start[2] - jnp.min(plan.control[:, 2])
         )
@@ -60,14 +61,13 @@ def _outcomes(
 def measure(grasps: int) -> dict[str, Any]:
     """Outcomes of both robots."""
     cfg = pile_config(TEN.scene.slots[:6], 6)
-    world = model.build(cfg.scene, cfg.sim)
-    settled = pool.settled(world, cfg.scene, cfg.heightmap.extent, STREAM, SCENES)
+    settled = pool.settled(cfg, STREAM, SCENES)
     rng = np.random.default_rng(STREAM)
     scenes = jax.tree.map(lambda leaf: leaf[np.arange(grasps) % SCENES], settled)
     yaws = rng.uniform(0.0, 2.0 * np.pi, grasps).astype(np.float32)
     scenes = jax.jit(jax.vmap(layout.rotate))(scenes, yaws)
     height = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))(scenes)
-    plan = functools.partial(oracle.grasp, cfg.sim, cfg.heightmap, cfg.scene.slots)
+    plan = functools.partial(oracle.grasp, cfg)
     actions = jax.jit(jax.vmap(plan))(scenes, height)
     noise = rng.normal(size=(grasps, 3)) * NOISE * (np.arange(grasps) % 4 == 0)[:, None]
     actions = actions.replace(pose=jnp.asarray(actions.pose + noise.astype(np.float32)))

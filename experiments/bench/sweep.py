@@ -7,8 +7,8 @@ For every number of devices and of seeds, the compiled loop of STEPS (2) trainin
 them: its compilation and the median of REPEATS (3) rounds after one that is not timed. With --shard
 seeds, numbers of seeds that the devices do not divide are left out. Beside a row of one seed on one
 device, `train` is its program as `csac-jax train` has it. `parts` is how many parts the seeds run
-in, see csac_jax/sweeps/pipelined.py. Configurations follow one
-another, so that on a busy machine ratios are worth less than those of `bench step`.
+in, see `Pipelined` in csac_jax/sweeps/replicas.py. Configurations follow one another, so that on a
+busy machine ratios are worth less than those of `bench step`.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.runtime import compiler, provenance
 from csac_jax.sim import backend
-from csac_jax.sweeps import grid, pipelined, replicas, runner
+from csac_jax.sweeps import grid, replicas, runner
 from csac_jax.training import sharding, step
 from experiments.bench._options import Parser, config, split
 
@@ -55,10 +55,9 @@ def measure(
     cfg, mesh = program.cfg, sharding.make(devices)
     sharding.check(mesh, shard, seeds, cfg.train.scenes, cfg.learn.batch)
     (group,) = replicas.group_configs([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
-    each = replicas.of_group(group)
-    parts = pipelined.num_parts(cfg, seeds, mesh)
-    jitted = replicas.compile_chunk(program, each, steps, mesh, shard, parts)
-    row = _timed(jitted, replicas.init(program, each, mesh, shard), repeats)
+    parts = replicas.num_parts(cfg, seeds, mesh)
+    together = replicas.SweepProgram(program, replicas.of_group(group), mesh, shard, parts)
+    row = _timed(together.compile_chunk(steps), together.init(), repeats)
     rate = seeds * cfg.train.scenes * steps / row["seconds"]
     return {"seeds": seeds, "devices": devices, "parts": parts, **row, "actions_per_second": rate}
 

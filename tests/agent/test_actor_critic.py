@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from csac_jax.agent import actor, actor_critic, maps, softmax
+from csac_jax.agent import actor, actor_critic, maps
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
 from csac_jax.agent.learner import Transition
 from csac_jax.agent.maps import DenseMaps
@@ -17,6 +17,7 @@ from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
+from tests.agent.reference import exact_softmax
 from tests.sections import with_constants
 
 pytestmark = pytest.mark.optax
@@ -306,6 +307,26 @@ def test_next_value_lies_within_the_map(learner):
     assert high - means[1] < 0.05 * (high - low)
 
 
+def test_inverse_temperature_follows_the_range_of_q(learner):
+    """Claim: ten times the rewards at ten times the range give ten times the softmax value, and
+    twice the inverse temperature at twice the range gives the same."""
+    state = _smooth(learner.frames)
+    cfg = learner.cfg.target
+
+    def value(q_scale: float, beta_scale: float, bounds: tuple[float, float]) -> float:
+        beta = beta_scale * cfg.inverse_temperature
+        own = _changed(learner, target=with_constants(cfg, inverse_temperature=beta))
+        own = dataclasses.replace(own, bounds=bounds)
+        scaled = state.replace(q=q_scale * state.q)
+        run = jax.jit(lambda key: actor_critic.next_value(own, key, scaled))
+        return float(run(jax.random.key(1)))
+
+    plain = value(1.0, 1.0, (-2.0, 4.0))
+    assert abs(plain) > 0.1
+    np.testing.assert_allclose(value(10.0, 1.0, (-20.0, 40.0)), 10.0 * plain, rtol=1e-5)
+    np.testing.assert_allclose(value(1.0, 2.0, (-4.0, 8.0)), plain, rtol=1e-6)
+
+
 def test_next_value_ignores_what_is_bare(learner):
     """Claim: a primitive with nothing to act on does not count, whatever its map; if neither has,
     both do."""
@@ -354,7 +375,7 @@ def test_max_target_is_the_best_valid_cell(learner):
     own, state = _changed(learner, target=TargetConfig(value="max")), _random_maps((2, 4, 6, 6))
     best = np.asarray(state.q)[np.asarray(state.valid)].max()
     assert actor_critic.next_value(own, jax.random.key(0), state) == best
-    np.testing.assert_allclose(softmax.exact(state.q, 1e6, state.valid), best, rtol=1e-6)
+    np.testing.assert_allclose(exact_softmax(state.q, 1e6, state.valid), best, rtol=1e-6)
     assert (
         actor_critic.next_value(
             own, jax.random.key(0), state.replace(valid=jnp.zeros(state.q.shape, bool))

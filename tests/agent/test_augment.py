@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chisquare
 
-from csac_jax import geometry, presets
+from csac_jax import presets
 from csac_jax.agent import augment, maps
 from csac_jax.agent.learner import Transition
 from csac_jax.constants import Primitive
@@ -138,7 +138,8 @@ def test_reading_under_the_action_stays(transition, flags):
     before and after."""
 
     def height(transition: Transition) -> jax.Array:
-        cell = geometry.to_pixel(CFG.heightmap, transition.action.pose[:2])
+        heights = CFG.heightmap
+        cell = rotate.to_cell(heights.size, heights.cell, transition.action.pose[:2])
         return rotate.bilinear(heightmap.unpack(transition.obs).height, cell)
 
     def valid(transition: Transition) -> jax.Array:

@@ -43,9 +43,7 @@ def search(
 ):
     """Results of `num` searches, leaves [num, ...]."""
     keys = jax.random.split(jax.random.key(seed), num)
-    return jax.jit(
-        jax.vmap(lambda key: cem.maximise(key, cfg, score, mean, start, box.POSE_WRAPS))
-    )(keys)
+    return jax.jit(jax.vmap(lambda key: cem.maximise(key, cfg, score, mean, start)))(keys)
 
 
 def search_random_map(key: jax.Array, num_start: int) -> tuple[jax.Array, jax.Array]:
@@ -60,7 +58,7 @@ def search_random_map(key: jax.Array, num_start: int) -> tuple[jax.Array, jax.Ar
     )
     pixels = best_pixels(score, 8)
     mean = jax.random.uniform(key_mean, (3,), minval=-1.0)
-    result = cem.maximise(key_search, CEMConfig(), score, mean, pixels[:num_start], box.POSE_WRAPS)
+    result = cem.maximise(key_search, CEMConfig(), score, mean, pixels[:num_start])
     return result.value / jnp.max(heights), score(pixels[0]) / jnp.max(heights)
 
 
@@ -173,12 +171,7 @@ def test_start_must_fit():
     """Claim: more starting points than candidates is an error that names the setting."""
     with pytest.raises(ValueError, match=r"cem\.candidates"):
         cem.maximise(
-            jax.random.key(0),
-            CEMConfig(candidates=8),
-            jnp.sum,
-            jnp.zeros(3),
-            jnp.zeros((9, 3)),
-            box.POSE_WRAPS,
+            jax.random.key(0), CEMConfig(candidates=8), jnp.sum, jnp.zeros(3), jnp.zeros((9, 3))
         )
 
 
@@ -191,36 +184,38 @@ def test_keys_differ():
     assert first[2] != other[2]
 
 
+def _elites(*values: float) -> jax.Array:
+    """Elites [K, 3] whose x, y and yaw are these values."""
+    return jnp.tile(jnp.array(values)[:, None], 3)
+
+
 def test_fit_by_hand():
     """Claim: line 12 by hand: elites 0.1, 0.2, 0.6 have mean 0.3, deviation sqrt(0.14 / 3),
     absolute one 0.6 / 2."""
-    elites, valid, wraps = jnp.array([[0.1], [0.2], [0.6]]), jnp.ones(3, bool), jnp.zeros(1, bool)
-    mean, std = cem.fit(CEMConfig(), elites, valid, wraps)
-    _, mad = cem.fit(CEMConfig(std_estimator="mad"), elites, valid, wraps)
-    np.testing.assert_allclose([mean[0], std[0], mad[0]], [0.3, np.sqrt(0.14 / 3), 0.3], rtol=1e-6)
+    elites, valid = _elites(0.1, 0.2, 0.6), jnp.ones(3, bool)
+    mean, std = cem.fit(CEMConfig(), elites, valid)
+    _, mad = cem.fit(CEMConfig(std_estimator="mad"), elites, valid)
+    for got, want in ((mean, 0.3), (std, np.sqrt(0.14 / 3)), (mad, 0.3)):
+        np.testing.assert_allclose(got, [want] * 3, rtol=1e-6)
 
 
 def test_fit_across_the_seam():
-    """Claim: elites 0.9, -0.9, -1.0 on a circle have mean 1 = -1 and the spread of -0.1, 0.1, 0;
-    not on a line."""
-    elites, valid = jnp.array([[0.9], [-0.9], [-1.0]]), jnp.ones(3, bool)
-    mean, std = cem.fit(CEMConfig(), elites, valid, jnp.ones(1, bool))
-    np.testing.assert_allclose([abs(mean[0]), std[0]], [1.0, np.sqrt(0.02 / 3)], atol=1e-6)
-    np.testing.assert_allclose(
-        cem.fit(CEMConfig(), elites, valid, jnp.zeros(1, bool))[0], [-1.0 / 3.0], atol=1e-6
-    )
+    """Claim: yaws 0.9, -0.9, -1.0 have mean 1 = -1 and the deviation of -0.1, 0.1, 0; x and y of
+    these values do not."""
+    mean, std = cem.fit(CEMConfig(), _elites(0.9, -0.9, -1.0), jnp.ones(3, bool))
+    np.testing.assert_allclose([abs(mean[2]), std[2]], [1.0, np.sqrt(0.02 / 3)], atol=1e-6)
+    np.testing.assert_allclose(mean[:2], [-1.0 / 3.0] * 2, atol=1e-6)
 
 
 def test_fit_leaves_out_invalid_elites():
     """Claim: elites without a value do not count, and a single one has the least std."""
-    elites = jnp.array([[0.1], [0.3], [0.9]])
-    mean, _ = cem.fit(CEMConfig(), elites, jnp.array([True, True, False]), jnp.zeros(1, bool))
-    np.testing.assert_allclose(mean, [0.2], atol=1e-6)
+    elites = _elites(0.1, 0.3, 0.9)
+    mean, _ = cem.fit(CEMConfig(), elites, jnp.array([True, True, False]))
+    np.testing.assert_allclose(mean, [0.2] * 3, atol=1e-6)
     for estimator in ("std", "mad"):
         cfg = CEMConfig(std_estimator=estimator)
-        np.testing.assert_allclose(
-            cem.fit(cfg, elites, jnp.arange(3) < 1, jnp.zeros(1, bool))[1], [cfg.std_min]
-        )
+        _, std = cem.fit(cfg, elites, jnp.arange(3) < 1)
+        np.testing.assert_allclose(std, [cfg.std_min] * 3)
 
 
 def test_wrap():
@@ -246,27 +241,22 @@ def test_wrap():
 
 
 def test_last_rounds_are_what_the_search_tries():
-    """Claim: `last_round` gives the samples of the last round: the best of all rounds' is the
-    result of the search."""
+    """Claim: `candidates` are the samples of the last round: the best of all rounds' is the result
+    of the search."""
     score = functools.partial(
         peaks, jnp.array([[0.3, -0.2, 0.9]]), jnp.array([1.0]), jnp.array([0.3])
     )
     mean, start = jnp.array([-0.4, 0.5, -0.7]), jnp.array([[-0.6, 0.7, -0.4], [-0.5, 0.5, -0.5]])
-    key = jax.random.key(5)
-    cfgs = [CEMConfig(rounds=rounds, candidates=16) for rounds in (1, 2, 3)]
-    last = [
-        lambda key, cfg=cfg: cem.last_round(key, cfg, score, mean, start, box.POSE_WRAPS)
-        for cfg in cfgs
+    found = [
+        search(CEMConfig(rounds=rounds, candidates=16), score, mean, start, seed=5)
+        for rounds in (1, 2, 3)
     ]
-    tried = [jax.jit(one)(key) for one in last]
+    tried = [result.candidates[0] for result in found]
     assert all(actions.shape == (16, 3) for actions in tried)
     every = jnp.concatenate(tried)
-    found = jax.jit(lambda key: cem.maximise(key, cfgs[-1], score, mean, start, box.POSE_WRAPS))(
-        key
-    )
     values = jax.vmap(score)(every)
-    np.testing.assert_allclose(found.value, values.max(), atol=1e-6)
-    np.testing.assert_allclose(found.action, every[values.argmax()], atol=1e-6)
+    np.testing.assert_allclose(found[-1].value[0], values.max(), atol=1e-6)
+    np.testing.assert_allclose(found[-1].action[0], every[values.argmax()], atol=1e-6)
     away = [
         float(jnp.mean(jnp.linalg.norm(actions[:, :2] - jnp.array([[0.3, -0.2]]), axis=1)))
         for actions in tried

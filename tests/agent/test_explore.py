@@ -16,7 +16,7 @@ NUM = 4000
 
 def choices(cfg: ExploreConfig, taken: int, primitive: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Primitives [NUM] and poses [NUM, 3] under as many keys."""
-    greedy = explore.Greedy(jnp.int32(primitive), GREEDY_POSES)
+    greedy = explore.Greedy(jnp.int32(primitive), GREEDY_POSES, jnp.zeros(2))
     keys = jax.random.split(jax.random.key(0), NUM)
     choose = jax.jit(
         jax.vmap(lambda key: explore.choose(key, cfg, jnp.int32(taken), greedy, RANDOM_PLACES))

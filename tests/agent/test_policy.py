@@ -10,7 +10,7 @@ import pytest
 from csac_jax import algorithms
 from csac_jax.agent import box, maps, policy
 from csac_jax.agent.maps import DenseMaps
-from csac_jax.config import CEMConfig, ExploreConfig, PolicyConfig
+from csac_jax.config import CEMConfig, ExploreConfig
 from csac_jax.constants import Primitive
 from csac_jax.sim.outcome import BARE
 
@@ -131,7 +131,7 @@ def test_best_pixel(cfg, frames, learner):
     masked = np.where(state.valid, state.q, -np.inf)
     for p in Primitive:
         cell = np.unravel_index(np.argmax(masked[p]), masked[p].shape)
-        pose = jax.vmap(lambda u: maps.denormalise(frames, u))(choice.greedy.poses[:, p])
+        pose = jax.vmap(lambda u: maps.denormalise(frames, u))(choice.poses[:, p])
         np.testing.assert_allclose(pose[:, :2], np.tile(frames.xy[cell], (3, 1)), atol=1e-6)
         np.testing.assert_allclose(np.cos(pose[:, 2] - frames.yaws[cell[0]]), 1.0, atol=1e-6)
         np.testing.assert_array_equal(choice.values[:, p], masked[p].max())
@@ -152,9 +152,8 @@ def test_best_pixel(cfg, frames, learner):
 def test_choice_of_primitive(rule, values, steps_without_change, expected):
     """Claim: `argmax` takes the larger value; `rule` pushes after no change, else grasps; `grasp`
     always grasps."""
-    got = policy.choose_primitive(
-        PolicyConfig(primitive=rule), jnp.array(values), jnp.int32(steps_without_change)
-    )
+    choose = policy.PRIMITIVE_RULES[rule]
+    got = choose(jnp.array(values), jnp.int32(steps_without_change))
     assert (got, got.dtype) == (expected, jnp.int32)
 
 
@@ -204,8 +203,7 @@ def _peaked(key: jax.Array, frames) -> DenseMaps:
     cells = jax.vmap(lambda i: maps.normalise(frames, maps.cell_pose(frames, i)))(
         jnp.arange(frames.inside.size)
     )
-    offset = cells[:, None] - centres[None]
-    offset = jnp.where(box.POSE_WRAPS[None, None], box.wrap(offset), offset)
+    offset = box.wrap_yaw(cells[:, None] - centres[None])
     peaks = heights[None] * jnp.exp(
         -0.5 * jnp.sum(offset**2, axis=-1) / widths[None] ** 2
     )  # [K h w, 5]
@@ -260,7 +258,7 @@ def test_candidates_are_those_of_the_search(cfg, frames, learner):
     tried = jax.jit(lambda key: policy.candidates(key, _learner(learner, one), state))(key)
     assert tried.shape == (2, cfg.cem.candidates, 3)
     greedy = jax.jit(
-        lambda key: policy.greedy(key, _learner(learner, one), state, jnp.int32(0)).greedy.poses
+        lambda key: policy.greedy(key, _learner(learner, one), state, jnp.int32(0)).poses
     )
     for primitive, u in zip(Primitive, greedy(key), strict=True):
         pose = maps.denormalise(frames, u)

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from csac_jax.agent import box, softmax
+from csac_jax.agent import box, losses
 from csac_jax.config import TargetConfig
+from tests.agent.reference import exact_softmax
 from tests.sections import with_constants
 
-CFG = TargetConfig()
 NUM = 20_000
+CFG = TargetConfig(samples=NUM)
 
-noisy_actions = jax.jit(softmax.noisy_actions, static_argnums=(1, 3))
+noisy_actions = jax.jit(losses.noisy_actions, static_argnums=1)
 
 MEANS = [(0.0, 0.0, 0.0), (0.95, -1.0, 0.98), (-0.7, 0.6, -1.0), (1.0, 1.0, 0.3)]
 CONFIGS = [CFG, with_constants(CFG, std=5.0, clip=0.5), with_constants(CFG, std=1.0, clip=3.0)]
@@ -29,7 +30,7 @@ def reference(cfg: TargetConfig, mean: tuple[float, ...], dim: int):
 
 def sampled_noise(cfg: TargetConfig, mean: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Noise [NUM, 3] recovered from the actions, and their log density."""
-    actions, log_density = noisy_actions(jax.random.key(0), cfg, jnp.array(mean), NUM)
+    actions, log_density = noisy_actions(jax.random.key(0), cfg, jnp.array(mean))
     assert np.all(np.abs(actions) <= 1.0)
     noise = np.asarray(actions, np.float64) - np.array(mean)[None]
     noise[:, 2] = (noise[:, 2] + 1.0) % 2.0 - 1.0
@@ -73,7 +74,7 @@ def test_no_atoms_at_the_bounds():
 def test_mean_outside_the_box_is_brought_in():
     """Claim: a proposal beyond the walls counts as one on them."""
     outside, inside = (
-        noisy_actions(jax.random.key(0), CFG, jnp.array(mean), 10)
+        noisy_actions(jax.random.key(0), CFG, jnp.array(mean))
         for mean in ([1.3, 0.0, 1.5], [1.0, 0.0, -0.5])
     )
     np.testing.assert_allclose(outside[0], inside[0], atol=1e-6)
@@ -82,7 +83,7 @@ def test_mean_outside_the_box_is_brought_in():
 
 def test_keys_differ():
     """Claim: two keys give two sets of actions."""
-    first, other = (noisy_actions(jax.random.key(i), CFG, jnp.zeros(3), 10)[0] for i in range(2))
+    first, other = (noisy_actions(jax.random.key(i), CFG, jnp.zeros(3))[0] for i in range(2))
     assert np.all(first != other)
 
 
@@ -90,9 +91,9 @@ def test_expectation_by_hand():
     """Claim: q = 0, 1 at beta = ln 3 gives 3/4; with p = 1/2, 1/4 the weights are 2 and 12:
     12/14."""
     q, beta = jnp.array([0.0, 1.0]), float(np.log(3.0))
-    np.testing.assert_allclose(softmax.expectation(q, jnp.zeros(2), beta), 0.75, rtol=1e-6)
+    np.testing.assert_allclose(losses.softmax(q, jnp.zeros(2), beta), 0.75, rtol=1e-6)
     np.testing.assert_allclose(
-        softmax.expectation(q, jnp.log(jnp.array([0.5, 0.25])), beta), 12.0 / 14.0, rtol=1e-6
+        losses.softmax(q, jnp.log(jnp.array([0.5, 0.25])), beta), 12.0 / 14.0, rtol=1e-6
     )
 
 
@@ -103,7 +104,7 @@ def test_expectation_lies_between_mean_and_maximum():
     q, log_density = jax.random.normal(key_q, (50,)), jax.random.normal(key_density, (50,))
     weight = np.exp(-np.asarray(log_density, np.float64))
     betas = [0.0, 0.05, 1.0, 5.0, 20.0, 100.0, 1e5]
-    values = np.array([softmax.expectation(q, log_density, beta) for beta in betas])
+    values = np.array([losses.softmax(q, log_density, beta) for beta in betas])
     np.testing.assert_allclose(values[0], np.sum(weight * np.asarray(q)) / weight.sum(), atol=1e-5)
     np.testing.assert_allclose(values[-1], np.max(q), atol=1e-6)
     assert np.all(np.diff(values) >= 0.0)
@@ -113,14 +114,14 @@ def test_expectation_lies_between_mean_and_maximum():
 def test_expectation_does_not_overflow():
     """Claim: exponents of a million overflow nothing, up or down."""
     q = jnp.array([1e5, -1e5, 9e4])
-    assert softmax.expectation(q, jnp.zeros(3), 20.0) == 1e5
-    assert softmax.expectation(-q, jnp.zeros(3), 20.0) == 1e5
-    assert softmax.exact(q, 20.0, jnp.array([True, True, True])) == 1e5
+    assert losses.softmax(q, jnp.zeros(3), 20.0) == 1e5
+    assert losses.softmax(-q, jnp.zeros(3), 20.0) == 1e5
+    assert exact_softmax(q, 20.0, jnp.array([True, True, True])) == 1e5
 
 
 def test_exact_by_hand():
     """Claim: only valid cells count: q = 0, 1 of [0, 1, 5] at beta = ln 3 give 3/4."""
-    value = softmax.exact(
+    value = exact_softmax(
         jnp.array([[0.0, 1.0, 5.0]]), float(np.log(3.0)), jnp.array([[True, True, False]])
     )
     np.testing.assert_allclose(value, 0.75, rtol=1e-6)
@@ -130,7 +131,8 @@ def test_exact_by_hand():
 def test_expectation_is_that_of_the_continuous_softmax(beta):
     """Claim: the estimate's mean is the softmax over all actions in reach, found by summing over a
     fine grid."""
-    cfg, mean = with_constants(CFG, std=0.2, clip=0.5), (0.8, -0.3, 0.9)
+    cfg = with_constants(TargetConfig(samples=4096), std=0.2, clip=0.5)
+    mean = (0.8, -0.3, 0.9)
     key_wave, key_phase, key_sample = jax.random.split(jax.random.key(5), 3)
     waves = 6.0 * jax.random.normal(key_wave, (8, 2))
     phases = jax.random.uniform(key_phase, (8,), maxval=6.0)
@@ -146,31 +148,16 @@ def test_expectation_is_that_of_the_continuous_softmax(beta):
     grid = jnp.asarray(
         np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), jnp.float32
     )
-    true = softmax.exact(jax.vmap(q)(grid), beta, jnp.ones(48**3, bool))
+    true = exact_softmax(jax.vmap(q)(grid), beta, jnp.ones(48**3, bool))
 
     def estimate(i):
-        actions, log_density = softmax.noisy_actions(
-            jax.random.fold_in(key_sample, i), cfg, jnp.array(mean), 4096
-        )
-        return softmax.expectation(jax.vmap(q)(actions), log_density, beta)
+        key = jax.random.fold_in(key_sample, i)
+        actions, log_density = losses.noisy_actions(key, cfg, jnp.array(mean))
+        return losses.softmax(jax.vmap(q)(actions), log_density, beta)
 
     estimates = np.asarray(jax.lax.map(estimate, jnp.arange(200)))
     assert abs(estimates.mean() - true) <= 4 * estimates.std() / np.sqrt(200) + 1e-4
     assert estimates.std() < 0.02
-
-
-def test_inverse_temperature_follows_the_range_of_q():
-    """Claim: ten times the rewards at ten times the range give ten times the softmax value."""
-    q = jax.random.normal(jax.random.key(0), (50,))
-    small, large = (
-        softmax.expectation(k * q, jnp.zeros(50), softmax.scaled_inverse_temperature(CFG, 6.0 * k))
-        for k in (1.0, 10.0)
-    )
-    np.testing.assert_allclose(10.0 * small, large, rtol=1e-5)
-    assert (
-        softmax.scaled_inverse_temperature(with_constants(CFG, inverse_temperature=12.0), 6.0)
-        == 2.0
-    )
 
 
 def test_only_yaw_wraps():
@@ -194,7 +181,7 @@ def _estimates(q: jax.Array, law: jax.Array, beta: float) -> np.ndarray:
 
     def estimate(i: jax.Array) -> jax.Array:
         cells = jax.random.choice(jax.random.fold_in(jax.random.key(7), i), q.size, (DRAWS,), p=law)
-        return softmax.expectation(q[cells], jnp.log(law)[cells], beta)
+        return losses.softmax(q[cells], jnp.log(law)[cells], beta)
 
     return np.asarray(jax.lax.map(estimate, jnp.arange(REPEATS)))
 
@@ -212,7 +199,7 @@ def test_estimate_is_unbiased_on_random_maps(seed):
     everywhere = jnp.ones(q.shape, bool)
     means = []
     for beta in (0.0, 1.0, 6.0, 1e4):
-        got, true = _estimates(q, law, beta), float(softmax.exact(q, beta, everywhere))
+        got, true = _estimates(q, law, beta), float(exact_softmax(q, beta, everywhere))
         assert abs(got.mean() - true) <= 4 * got.std() / np.sqrt(REPEATS) + 4e-4
         assert got.std() < 0.05
         assert float(jnp.mean(q)) - 0.1 <= got.min()
@@ -228,5 +215,5 @@ def test_exact_tends_to_mean_and_maximum():
     q, _ = _random_map(0)
     valid = jnp.arange(400) % 3 == 0
     chosen = np.asarray(q)[::3]
-    np.testing.assert_allclose(softmax.exact(q, 0.0, valid), chosen.mean(), rtol=1e-5)
-    np.testing.assert_allclose(softmax.exact(q, 1e6, valid), chosen.max(), rtol=1e-6)
+    np.testing.assert_allclose(exact_softmax(q, 0.0, valid), chosen.mean(), rtol=1e-5)
+    np.testing.assert_allclose(exact_softmax(q, 1e6, valid), chosen.max(), rtol=1e-6)

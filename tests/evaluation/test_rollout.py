@@ -67,6 +67,11 @@ class Magnet(Env):
         )
 
 
+def _compiled(env: Env):
+    """What rollouts in this environment call, see `rollout._compiled`."""
+    return rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw)
+
+
 def learned_policy(seed: int) -> LearnedPolicy:
     """Networks as they begin."""
     parts = actor_critic.make(CFG)
@@ -153,7 +158,7 @@ def test_same_seed_same_episodes(magnet, random):
 def test_batches_do_not_matter(magnet, random, monkeypatch):
     """Claim: what an episode draws does not depend on how many run side by side, nor on one left
     over."""
-    begin, key = rollout._program(magnet).begin, jax.random.key(0)
+    (begin, _), key = _compiled(magnet), jax.random.key(0)
     rows = [
         jax.tree.map(lambda leaf, some=some: leaf[some], magnet.scenes)
         for some in (slice(0, 5), slice(3, 5))
@@ -197,9 +202,9 @@ def test_networks_are_arguments(magnet):
     """Claim: other weights of the same networks compile nothing again, and act otherwise."""
     first, other = (learned_policy(seed) for seed in (0, 1))
     one = rollout.rollout(magnet, first, EPISODES, 0)
-    compiled = rollout._program(magnet).step._cache_size()
+    compiled = _compiled(magnet)[1]._cache_size()
     two = rollout.rollout(magnet, other, EPISODES, 0)
-    assert rollout._program(magnet).step._cache_size() == compiled
+    assert _compiled(magnet)[1]._cache_size() == compiled
     assert any(not np.array_equal(a, b) for a, b in zip(one, two, strict=True))
 
 

@@ -71,10 +71,10 @@ def test_cases_share_their_compilation():
     serves all."""
     first, *others = suites.environments(CFG, "cases", EPISODES, 0).values()
     assert all(env.cfg == first.cfg and env.physics is first.physics for env in others)
-    begun = rollout._cached.cache_info().misses
+    begun = rollout._compiled.cache_info().misses
     for env in (first, *others):
-        rollout._program(env)
-    assert rollout._cached.cache_info().misses == begun + 1
+        rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw)
+    assert rollout._compiled.cache_info().misses == begun + 1
 
 
 def test_cases_are_turned_as_a_whole():
@@ -140,9 +140,9 @@ def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int
     the training's are."""
     asked = []
 
-    def settled(world, cfg, extent, stream, count, poured=False):
-        asked.append((cfg.slots, cfg.min_blocks, stream, count, poured))
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.slots))
+    def settled(cfg, stream, count, poured=False):
+        asked.append((cfg.scene.slots, cfg.scene.min_blocks, stream, count, poured))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
 
     monkeypatch.setattr(pool, "settled", settled)
     packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))

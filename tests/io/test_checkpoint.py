@@ -269,7 +269,6 @@ def test_new_names_of_leaves_are_read(tmp_path: Path):
 def test_states_leaves_have_the_names_of_today():
     """Claim: `renames.STATE` leads to leaves that a run's state has."""
     cfg = CFG.change(sensor={"dropped": 0.1})  # only with noise there is a key of noise
-    program = training.make(cfg, env=training.without_physics(cfg))
-    names = leaves.named(training.abstract_state(program)).keys()
+    names = leaves.named(training.abstract_state(cfg)).keys()
     assert set(renames.STATE.values()) <= names
     assert not set(renames.STATE) & names

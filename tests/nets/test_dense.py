@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax.config import SmallNet
-from csac_jax.nets import dense
+from csac_jax.nets import dense, networks
 from tests.sections import with_constants
 
 CFG = SmallNet(growth=8, dilations=(1, 2), stem=16, head=8)
@@ -154,7 +154,7 @@ def test_bare_table_is_zero():
     """Claim: where nothing lies the input is 0, whatever the table's colour; a block's height
     comes out near 1."""
     height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
-    net_input = np.asarray(dense.inputs(jnp.full((2, 2, 3), 0.9), height, None))
+    net_input = np.asarray(networks.make(CFG).inputs(jnp.full((2, 2, 3), 0.9), height, None))
     np.testing.assert_array_equal(net_input[0, 0], 0.0)
     np.testing.assert_array_equal(net_input[0, 1, :3], 0.0)
     np.testing.assert_allclose(net_input[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)

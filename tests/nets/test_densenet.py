@@ -14,7 +14,7 @@ import pytest
 os.environ.setdefault("KERAS_BACKEND", "jax")
 
 from csac_jax.config import DenseNet121
-from csac_jax.nets import densenet
+from csac_jax.nets import densenet, networks
 from tests.sections import with_constants
 
 TINY = with_constants(DenseNet121(block_layers=(1, 1, 1, 1), head=8), block_growth=4)
@@ -234,12 +234,13 @@ def test_inputs():
     """Claim: bare table is 0; on blocks colours are normalised as ImageNet's and 3 cm of height are
     1; without colour only the height is left."""
     height, colour = jnp.array([[0.0, 0.03]]), jnp.full((1, 2, 3), 0.5)
-    net_input = np.asarray(densenet.inputs(colour, height, jnp.array([[True, False]])))
+    sees, blind = (networks.make(DenseNet121(colour=colour)) for colour in (True, False))
+    net_input = np.asarray(sees.inputs(colour, height, jnp.array([[True, False]])))
     np.testing.assert_array_equal(net_input[0, 0], [0.0, 0.0, 0.0, 0.0, 1.0])
     np.testing.assert_allclose(
         net_input[0, 1], [0.015 / 0.229, 0.044 / 0.224, 0.094 / 0.225, 1.0, 0.0], rtol=1e-4
     )
-    np.testing.assert_allclose(densenet.inputs(None, height, None), [[[0.0], [1.0]]], rtol=1e-6)
+    np.testing.assert_allclose(blind.inputs(colour, height, None), [[[0.0], [1.0]]], rtol=1e-6)
 
 
 def test_trunks_have_weights_of_their_own():

@@ -10,7 +10,7 @@ import pytest
 
 from csac_jax import presets
 from csac_jax.agent import maps
-from csac_jax.config import Config, DenseNet121, SmallNet
+from csac_jax.config import ALTERNATIVES, Config, DenseNet121, SmallNet
 from csac_jax.nets import dense, densenet, networks
 from tests.sections import with_constants
 
@@ -108,12 +108,18 @@ def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
     nets, blank = networks.make(cfg.net), jnp.zeros((1, 72, 72, 4))
     frames = maps.frames(cfg, nets)
     (q, _), _ = jax.eval_shape(nets.critic.init_with_output, jax.random.key(0), blank)
-    assert (frames.stride, frames.side, frames.cell) == (
+    assert (nets.stride, frames.side, frames.cell) == (
         cells,
         72 // cells,
         pytest.approx(0.007 * cells),
     )
     assert q.shape == (1, frames.side, frames.side, dense.OUTPUTS)
+
+
+def test_every_kind_has_its_networks():
+    """Claim: each alternative of the config's section has networks of its own."""
+    kinds = [type(networks.make(kind()).critic) for kind in ALTERNATIVES["net"][1]]
+    assert kinds == [dense.Critic, densenet.DenseNetCritic]
 
 
 @pytest.mark.parametrize("colour", [True, False])

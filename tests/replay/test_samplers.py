@@ -134,7 +134,9 @@ def test_prioritised_draws_follow_the_priorities(law, alpha, size):
 @pytest.mark.parametrize("size", [2, 3, 7, 50, 64, 100, 400, 512, 999, 1000])
 def test_uniform_slots_are_uniform(size):
     """Claim: the uniform sampler draws each filled slot equally often, no other."""
-    slots = np.asarray(samplers.uniform_slots(jax.random.key(0), jnp.int32(size), NUM))
+    sampler = SAMPLERS["uniform"]
+    state = stored(sampler, jnp.ones(CAPACITY), size)
+    slots = np.asarray(sample(jax.random.key(0), sampler, state, jnp.float32(0.0), NUM).slots)
     assert slots.min() >= 0
     assert slots.max() < size
     assert_fits(slots, np.ones(size))
@@ -168,10 +170,8 @@ def test_large_rings_are_drawn_evenly():
     alike to 0.1 %: no slot pays for the 2^23 steps of a float32 uniform. By all 2^23 of them in the
     lower half of the way."""
     masses = jnp.ones(2**17)
-    levels = samplers._pyramid(masses)
-    below = 8 ** len(
-        samplers._halves(levels)[1]
-    )  # slots that the second uniform number decides between
+    _, lower = samplers._pyramid(masses)
+    below = 8 ** len(lower)  # slots that the second uniform number decides between
     assert below <= 8**3
     count = np.bincount(np.arange(2**23) * below >> 23)
     np.testing.assert_allclose(count / count.mean(), 1.0, atol=1e-3)
@@ -451,7 +451,7 @@ def test_as_a_sum_tree_after_a_million_updates():
     truth = np.ones(capacity)
     for these, new in zip(slots, priorities, strict=True):
         truth[these] = (new.astype(float) + 1e-9) ** sampler.cfg.alpha
-    top, ours = samplers._pyramid(state.priority)[0].sum(), np.asarray(state.priority, float)
+    top, ours = samplers._pyramid(state.priority)[0][0].sum(), np.asarray(state.priority, float)
     np.testing.assert_allclose(top, truth.sum(), rtol=1e-5)
     np.testing.assert_allclose(top, tree.nodes[0], rtol=1e-4)
     np.testing.assert_allclose(ours / float(top), truth / truth.sum(), rtol=1e-5)

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.stats
 from matplotlib.axes import Axes
 
 from csac_jax import algorithms, cli, presets
@@ -104,16 +103,6 @@ def recorded(tmp_path: Path) -> Path:
     (root / "vpg" / "checkpoints").mkdir()
     (root / "vpg" / "checkpoints" / "metrics.jsonl").write_text("not a log\n")
     return root
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8, 11])
-def test_iqm_is_scipys_trimmed_mean(n: int):
-    """Claim: the interquartile mean leaves out a quarter of the values, rounded down, at either
-    end."""
-    values = np.random.default_rng(n).normal(size=(3, n))
-    np.testing.assert_allclose(
-        statistics.iqm(values), scipy.stats.trim_mean(values, 0.25, axis=1), atol=1e-12
-    )
 
 
 def test_band_covers_the_truth():

@@ -37,3 +37,14 @@ def model_bytes(exact: mujoco.MjModel) -> bytes:
     content = np.zeros(mujoco.mj_sizeModel(exact), np.uint8)
     mujoco.mj_saveModel(exact, None, content)
     return content.tobytes()
+
+
+def corners(exact: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """Corners [V, 3] m of a geom in the world."""
+    if exact.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = exact.geom_dataid[geom]
+        start = exact.mesh_vertadr[mesh]
+        local = exact.mesh_vert[start : start + exact.mesh_vertnum[mesh]]
+    else:
+        local = exact.geom_size[geom] * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
+    return data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T

@@ -150,16 +150,10 @@ def _without(block: int, key: str) -> dict:
         ('{"name": "a", "name": "b", "blocks": []}', 'key "name" is given twice'),
         (_without(1, "colour"), 'block 2: key "colour" is missing'),
         (_changed(1, "tagret", True), 'block 2: unknown key "tagret"'),
-        (
-            _changed(1, "shape", "sphere"),
-            'block 2: unknown shape "sphere"; choose one of: cube, cuboid',
-        ),
-        (_changed(0, "shape", ["cube"]), 'block 1: unknown shape ["cube"]'),
-        (_changed(0, "colour", "x" * 500), 'block 1: unknown colour "xxx'),
-        (
-            _changed(0, "colour", [255, 0, 0]),
-            "block 1: unknown colour [255, 0, 0]; choose one of: blue",
-        ),
+        (_changed(1, "shape", "sphere"), 'block 2: "shape" must be one of: cube, cuboid'),
+        (_changed(0, "shape", ["cube"]), 'half_cylinder, cylinder, not ["cube"]'),
+        (_changed(0, "colour", "x" * 500), 'block 1: "colour" must be one of: blue'),
+        (_changed(0, "colour", [255, 0, 0]), "pink, not [255, 0, 0]"),
         (
             _changed(1, "position", [0.1, 0.1]),
             'block 2: "position" must be a list of 3 numbers in metres',
@@ -172,7 +166,10 @@ def _without(block: int, key: str) -> dict:
         (_changed(1, "position", "here"), 'block 2: "position" must be'),
         (_changed(1, "quaternion", [1, 0, 0]), 'block 2: "quaternion" must be a list of 4 numbers'),
         (_changed(1, "quaternion", None), 'block 2: "quaternion" must be'),
-        (_changed(1, "quaternion", [0, 0, 0.0, 0]), 'block 2: "quaternion" must not be zero'),
+        (
+            _changed(1, "quaternion", [0, 0, 0.0, 0]),
+            "each from -10 to 10 and not all zero, not [0, 0, 0.0, 0]",
+        ),
         (_changed(1, "target", 1), 'block 2: "target" must be true or false'),
         (_changed(1, "target", True), "block 2: block 1 is the target already"),
         (
@@ -203,7 +200,7 @@ def test_unreadable_file_is_refused_in_one_line(tmp_path: Path):
     for path, says in (
         (tmp_path / "none.json", "No such file"),
         (tmp_path, "directory"),
-        (tmp_path / "raw.json", "UTF"),
+        (tmp_path / "raw.json", "is not a JSON file: 'utf-8' codec"),
     ):
         with pytest.raises(ValueError, match=says) as error:
             cases.load(path)
@@ -280,5 +277,5 @@ def test_target_is_required_where_asked(tmp_path: Path):
     cases.require_target(_load(tmp_path, *PAIR["blocks"]))
     loose = _load(tmp_path, PAIR["blocks"][1])
     assert int(loose.scene.target) == layout.ANY
-    with pytest.raises(ValueError, match="case 'test' marks no block as the target"):
+    with pytest.raises(ValueError, match="case 'test' marks no target"):
         cases.require_target(loose)

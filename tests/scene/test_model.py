@@ -62,7 +62,7 @@ def _fields(world: model.World, scene: Scene) -> model.BlockFields:
 def test_block_fields_are_those_of_the_compiler(
     world: model.World, monkeypatch: pytest.MonkeyPatch, box: str
 ):
-    """Claim: block_fields gives what MuJoCo's compiler derives, for every shape of the set, larger
+    """Claim: scene_fields gives what MuJoCo's compiler derives, for every shape of the set, larger
     or smaller."""
     scale = 1.07
     scene = _scene(box, scale=scale)
@@ -132,7 +132,7 @@ def test_with_blocks_writes_over_an_earlier_copy(world: model.World):
     before = placed.model_bytes(earlier)
     assert (
         model.with_blocks(
-            world, _fields(world, _scene(scale=0.9)), mujoco.MjData(world.model), earlier
+            world, _fields(world, _scene(scale=0.9)), (earlier, mujoco.MjData(world.model))
         )
         is earlier
     )

@@ -1,4 +1,4 @@
-"""Depth of overlap against closed forms and against contacts of C MuJoCo."""
+"""Depth of overlap of blocks against closed forms and against contacts of C MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -6,7 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from csac_jax.config import SceneConfig, SimConfig
-from csac_jax.scene import blocks, cases, model, overlap
+from csac_jax.scene import cases, layout, model
+from tests.scene import placed
 
 CUBE = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -23,7 +24,7 @@ AXES = np.concatenate([np.eye(3), -np.eye(3)])
 )
 def test_depth_of_cubes(second: np.ndarray, expected: float):
     """Claim: the depth is the shortest shift that parts them, below 0 where they are apart."""
-    assert overlap.depth((CUBE, second), (AXES, AXES)) == pytest.approx(expected)
+    assert cases.overlap(CUBE, second) == pytest.approx(expected)
 
 
 def test_depth_of_crossed_edges():
@@ -31,7 +32,7 @@ def test_depth_of_crossed_edges():
     edge_up = Rotation.from_euler("x", 45, degrees=True).as_matrix()  # an edge along x on top
     edge_down = Rotation.from_euler("y", 45, degrees=True).as_matrix()  # an edge along y below
     second = CUBE @ edge_down.T + [0.0, 0.0, 2 * np.sqrt(2) - 0.1]
-    depth = overlap.depth((CUBE @ edge_up.T, second), (AXES @ edge_up.T, AXES @ edge_down.T))
+    depth = cases.overlap(CUBE @ edge_up.T, second)
     assert depth == pytest.approx(0.1)
     by_faces = [(CUBE @ edge_up.T @ n).max() - (second @ n).min() for n in AXES @ edge_up.T]
     assert min(by_faces) > 0.12  # faces alone would say more
@@ -44,9 +45,8 @@ def test_depth_is_that_of_contacts(kinds: tuple):
     """Claim: for two blocks that overlap by up to 10 mm, the depth is that of the deepest contact
     of C MuJoCo."""
     world = model.build(SceneConfig(slots=kinds, min_blocks=1), SimConfig())
-    half = np.array([blocks.half_size_choices(kind)[0] for kind in kinds])
-    exact = cases._nominal(world, half)
-    data, rng, compared = mujoco.MjData(exact), np.random.default_rng(0), 0
+    exact, data = placed.in_c(world, layout.parked(kinds))
+    rng, compared = np.random.default_rng(0), 0
     for turn in Rotation.random(200, rng=rng):
         data.qpos[world.block_qpos[0]] = [0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]
         data.qpos[world.block_qpos[1]] = [
@@ -56,12 +56,8 @@ def test_depth_is_that_of_contacts(kinds: tuple):
         ]
         mujoco.mj_kinematics(exact, data)
         mujoco.mj_collision(exact, data)
-        corners = [cases._corners(exact, data, geom) for geom in world.block_geoms]
-        normals = [
-            blocks.normals(kind) @ data.xmat[body].reshape(3, 3).T
-            for kind, body in zip(kinds, world.block_bodies, strict=True)
-        ]
-        depth = overlap.depth(tuple(corners), tuple(normals))
+        one, two = (placed.corners(exact, data, geom) for geom in world.block_geoms)
+        depth = cases.overlap(one, two)
         deepest = -data.contact.dist.min() if data.ncon else 0.0
         assert (depth <= 1e-6) == (deepest == 0.0)
         if 0.0 < depth < 0.01:

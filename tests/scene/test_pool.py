@@ -10,39 +10,37 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from csac_jax.config import SceneConfig, SimConfig
+from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, model, pool
 from csac_jax.scene.layout import Scene, parking
 from tests.scene import placed
 
-CONFIG = SceneConfig(slots=("box", "arch", "prism", "half_cylinder"), min_blocks=3)
-EXTENT = 0.448
+SCENE = SceneConfig(slots=("box", "arch", "prism", "half_cylinder"), min_blocks=3)
+CONFIG = Config(scene=SCENE)
+EXTENT = CONFIG.heightmap.extent
 COUNT = 24  # of 3 blocks, and as many of 4
 
 
 @pytest.fixture(scope="module")
 def world() -> model.World:
-    return model.build(CONFIG, SimConfig())
+    return model.build(SCENE, SimConfig())
 
 
 @pytest.fixture(scope="module")
-def scenes(world: model.World, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """COUNT settled scenes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        return pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
+        return pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT)
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> model.World:
-    """A world of one block, a cache of its own and small rounds, so that settling takes no time."""
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Config:
+    """One block, a cache of its own and small rounds, so that settling takes no time."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(pool, "_ROUND", 8)
-    return model.build(ONE, SimConfig())
-
-
-ONE = SceneConfig(slots=("box",), min_blocks=1)
+    return Config(scene=SceneConfig(slots=("box",), min_blocks=1))
 
 
 def _placed(world: model.World, scenes: Scene, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -89,7 +87,7 @@ def test_no_block_lies_on_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(pool, "_ROUND", 24)
     cfg = SceneConfig(slots=("box",) * 10, min_blocks=10)
-    settled = pool.settled(model.build(cfg, SimConfig()), cfg, EXTENT, pool.TRAIN_STREAM, 20)
+    settled = pool.settled(Config(scene=cfg), pool.TRAIN_STREAM, 20)
     assert settled.position[:, :, 2].max() < 0.3
 
 
@@ -101,25 +99,25 @@ def test_blocks_differ_within_their_ranges(scenes: Scene):
     shape = np.argmin(np.ptp(scale, axis=2), axis=1)  # the one that all three axes agree on
     assert set(shape) == {0, 1, 2, 3}
     by_slot = scenes.half_size[:, 1:, 2] / [
-        blocks.half_size_choices(kind)[0][2] for kind in CONFIG.slots[1:]
+        blocks.half_size_choices(kind)[0][2] for kind in SCENE.slots[1:]
     ]
     for drawn, (low, high) in (
         (by_slot, (0.9, 1.1)),
-        (scenes.density, CONFIG.density),
-        (scenes.friction, CONFIG.friction),
+        (scenes.density, SCENE.density),
+        (scenes.friction, SCENE.friction),
     ):
         assert low <= drawn.min() < low + 0.1 * (high - low)
         assert high - 0.1 * (high - low) < drawn.max() <= high
 
 
 @pytest.mark.slow
-def test_same_arguments_same_scenes(world: model.World, scenes: Scene, monkeypatch, tmp_path: Path):
+def test_same_arguments_same_scenes(scenes: Scene, monkeypatch, tmp_path: Path):
     """Claim: the same arguments give the same scenes, bit for bit, settled anew or read from the
     cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    anew = pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
+    anew = pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT)
     monkeypatch.setattr(pool, "_settle", None)  # must not be called
-    cached = pool.settled(world, CONFIG, EXTENT, pool.TRAIN_STREAM, COUNT)
+    cached = pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT)
     for other in (anew, cached):
         jax.tree.map(np.testing.assert_array_equal, scenes, other)
         assert jax.tree.map(lambda leaf: leaf.dtype, scenes) == jax.tree.map(
@@ -127,20 +125,18 @@ def test_same_arguments_same_scenes(world: model.World, scenes: Scene, monkeypat
         )
 
 
-def test_streams_share_no_scene(small: model.World):
+def test_streams_share_no_scene(small: Config):
     """Claim: training and evaluation draw from pools that have no scene in common, nor has one pool
     a scene twice."""
-    both = [
-        pool.settled(small, ONE, EXTENT, stream, 16).position for stream in (pool.TRAIN_STREAM, 1)
-    ]
+    both = [pool.settled(small, stream, 16).position for stream in (pool.TRAIN_STREAM, 1)]
     assert len({scene.tobytes() for scenes in both for scene in scenes}) == 32
 
 
 @pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
-def test_damaged_cache_is_settled_anew(small: model.World, tmp_path: Path, damage: str):
+def test_damaged_cache_is_settled_anew(small: Config, tmp_path: Path, damage: str):
     """Claim: a cache file that was cut short or changed is noticed, and its scenes are settled
     anew."""
-    good = pool.settled(small, ONE, EXTENT, 0, 4)
+    good = pool.settled(small, 0, 4)
     (path,) = tmp_path.rglob("*.npz")
     raw = path.read_bytes()
     if damage == "flipped":
@@ -157,38 +153,38 @@ def test_damaged_cache_is_settled_anew(small: model.World, tmp_path: Path, damag
         if read is not None:  # a byte that carries nothing
             jax.tree.map(np.testing.assert_array_equal, good, read)
     path.write_bytes(damaged[len(damaged) // 2])
-    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, ONE, EXTENT, 0, 4))
+    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, 0, 4))
     assert pool._read(path) is not None
 
 
-def test_replaced_content_is_noticed(small: model.World, tmp_path: Path):
+def test_replaced_content_is_noticed(small: Config, tmp_path: Path):
     """Claim: a well-formed cache file whose arrays do not belong to its checksum is not used."""
-    good = pool.settled(small, ONE, EXTENT, 0, 4)
+    good = pool.settled(small, 0, 4)
     (path,) = tmp_path.rglob("*.npz")
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
     np.savez(path, **(arrays | {"position": arrays["position"] + np.float32(0.01)}))
-    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, ONE, EXTENT, 0, 4))
+    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, 0, 4))
 
 
-def test_cache_folder_is_private(small: model.World, tmp_path: Path):
+def test_cache_folder_is_private(small: Config, tmp_path: Path):
     """Claim: the cache folder is its owner's alone."""
-    pool.settled(small, ONE, EXTENT, 0, 4)
+    pool.settled(small, 0, 4)
     (path,) = tmp_path.rglob("*.npz")
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
     assert list(path.parent.iterdir()) == [path]  # nothing half-written stays
 
 
 def test_unwritable_cache_is_no_error(
-    small: model.World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Claim: where the cache cannot be written, scenes are settled all the same."""
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert pool.settled(small, ONE, EXTENT, 0, 4).position.shape == (4, 1, 3)
+    assert pool.settled(small, 0, 4).position.shape == (4, 1, 3)
 
 
-def test_hopeless_configuration_is_one_line(small: model.World):
+def test_hopeless_configuration_is_one_line(small: Config):
     """Claim: a configuration whose blocks never come to rest ends with one line that names what to
     change."""
 
@@ -197,9 +193,9 @@ def test_hopeless_configuration_is_one_line(small: model.World):
 
         drop_height: ClassVar[float] = 1.0
 
-    falling = HighDrop(slots=ONE.slots, min_blocks=ONE.min_blocks, settle_time=0.5)
+    falling = HighDrop(slots=("box",), min_blocks=1, settle_time=0.5)
     with pytest.raises(SceneError, match=r"scene\.settle_time") as error:
-        pool.settled(small, falling, EXTENT, 0, 4)
+        pool.settled(Config(scene=falling), 0, 4)
     assert "\n" not in str(error.value)
 
 
@@ -225,7 +221,7 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     scenes differ, and the same stream gives the same ones."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     world = model.build(PILE, SimConfig())
-    scenes = pool.settled(world, PILE, EXTENT, 1, 3, poured=True)
+    scenes = pool.settled(Config(scene=PILE), 1, 3, poured=True)
     assert scenes.in_play.shape == (3, 12)
     assert scenes.in_play.all()
     assert (np.linalg.norm(scenes.position[..., :2], axis=-1) <= 0.5 * EXTENT).all()
@@ -237,7 +233,7 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
         assert moved.max() < 0.5 * pool._STILL, f"scene {index}: {moved}"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
-    again = pool.settled(world, PILE, EXTENT, 1, 3, poured=True)
+    again = pool.settled(Config(scene=PILE), 1, 3, poured=True)
     np.testing.assert_array_equal(again.position, scenes.position)
 
 

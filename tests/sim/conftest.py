@@ -13,7 +13,7 @@ from csac_jax.config import Config, SceneConfig
 from csac_jax.constants import Primitive
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, robot
+from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, primitives
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, Plan
 from csac_jax.vision import observe
@@ -121,11 +121,9 @@ def execute_settled(config: Config, count: int, scripted: dict[str, tuple[Scene,
     """Runs the scripted cases and grasps in `count` settled scenes of `config`, as one batch."""
     world = model.build(config.scene, config.sim)
     per_number = count // (1 + len(config.scene.slots) - config.scene.min_blocks)
-    settled = pool.settled(
-        world, config.scene, config.heightmap.extent, pool.TRAIN_STREAM, per_number
-    )
+    settled = pool.settled(config, pool.TRAIN_STREAM, per_number)
     look = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))
-    plan_grasp = functools.partial(oracle.grasp, config.sim, config.heightmap, config.scene.slots)
+    plan_grasp = functools.partial(oracle.grasp, config)
     grasps = _noisy(jax.jit(jax.vmap(plan_grasp))(settled, look(settled)))
     scenes, actions = settled, grasps
     if scripted:
@@ -138,9 +136,7 @@ def execute_settled(config: Config, count: int, scripted: dict[str, tuple[Scene,
         )
     height = look(scenes)
     physics = mjx_physics.make(world, config.sim)
-    run = jax.jit(
-        jax.vmap(functools.partial(simulation.execute, physics, config.sim, config.heightmap))
-    )
+    run = jax.jit(jax.vmap(functools.partial(simulation.execute, physics, config)))
     return jax.tree.map(np.asarray, Run(scenes, height, actions, *run(scenes, height, actions)))
 
 
@@ -179,7 +175,7 @@ def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]
     engine = c_physics.CPhysics(c_world, CONFIG.sim)
 
     def one(scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
-        return engine.run(scene, robot.joint_trajectory("hand", plan))
+        return engine.run(scene, primitives.joint_trajectory("hand", plan))
 
     run = jax.jit(jax.vmap(one))
     after, trace = jax.tree.map(np.asarray, run(grasped.scene, grasped.plan))

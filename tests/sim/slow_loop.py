@@ -9,7 +9,7 @@ from csac_jax.scene import layout, model
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World
 from csac_jax.sim.c_physics import Trajectory
-from csac_jax.sim.robot import JointTrajectory
+from csac_jax.sim.primitives import JointTrajectory
 
 
 def substeps(

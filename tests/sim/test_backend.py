@@ -1,16 +1,20 @@
 """`sim.physics auto`: what it stands for, whatever this machine has."""
 
 import dataclasses
+import functools
 import subprocess
 import sys
 import typing
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 from csac_jax import presets
 from csac_jax.config import Config, PhysicsKind, RobotKind
 from csac_jax.scene import model
-from csac_jax.sim import backend, physics, robot
+from csac_jax.sim import backend, physics, primitives
+from csac_jax.sim.primitives import Action
 
 
 def _config(kind: PhysicsKind, mesh_jitter: float = 0.0, scenes: int = 256) -> Config:
@@ -82,7 +86,20 @@ def test_tables_are_those_of_the_config():
     """Claim: every physics and robot that the config allows has its entry, and there are no
     others."""
     assert {*physics.PHYSICS, "auto"} == {*typing.get_args(PhysicsKind)}
-    assert {*robot.ROBOTS} == {*model.ROBOTS} == {*typing.get_args(RobotKind)}
+    assert {*model.ROBOTS} == {*typing.get_args(RobotKind)}
+
+
+@pytest.mark.parametrize("kind", typing.get_args(RobotKind))
+def test_plans_move_every_robot_of_the_config(kind: RobotKind):
+    """Claim: a plan becomes a start of every joint and a set-point of every actuator, in the order
+    of the robot's table, for every robot that the config allows."""
+    cfg, parts = Config(), model.ROBOTS[kind]
+    height = jnp.zeros((cfg.heightmap.size,) * 2)
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, Action.grasp(0.05, 0.1, 0.3))
+    joints = jax.jit(functools.partial(primitives.joint_trajectory, kind))(plan)
+    assert joints.start.shape == (sum(len(part.joints) for part in parts),)
+    assert joints.control.shape == (cfg.sim.substeps, sum(len(part.actuators) for part in parts))
+    assert joints.reachable
 
 
 def test_choice_needs_no_mujoco():

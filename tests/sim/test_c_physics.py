@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from csac_jax.scene import layout, model
-from csac_jax.sim import c_physics, primitives, robot
-from csac_jax.sim.c_physics import SimulatorPool, Trajectory
-from csac_jax.sim.robot import JointTrajectory
+from csac_jax.sim import c_physics, primitives
+from csac_jax.sim.c_physics import CPhysics, Simulator, Trajectory
+from csac_jax.sim.primitives import JointTrajectory
 from tests.scene import placed
 from tests.sim import conftest, slow_loop
 
@@ -27,7 +27,7 @@ def pushed(c_world: model.World) -> tuple:
     action = jax.tree.map(jnp.asarray, conftest.push(0.0, 0.0))
     plan = primitives.plan(cfg.sim, cfg.heightmap, jnp.zeros((cfg.heightmap.size,) * 2), action)
     fields = jax.device_get(model.scene_fields(c_world, scene))
-    return scene, fields, jax.device_get(robot.joint_trajectory("hand", plan))
+    return scene, fields, jax.device_get(primitives.joint_trajectory("hand", plan))
 
 
 def _assert_equal(ours: Trajectory, theirs: Trajectory) -> None:
@@ -40,7 +40,7 @@ def test_trajectory_goes_the_way_of_the_run(c_world: model.World, pushed: tuple)
     for bit."""
     scene, fields, joints = pushed
     recorded = c_physics.trajectory(c_world, fields, scene, joints)
-    after, trace = jax.jit(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run)(scene, joints)
+    after, trace = jax.jit(CPhysics(c_world, conftest.CONFIG.sim).run)(scene, joints)
     assert recorded.qpos.shape == (len(joints.control), c_world.model.nq)
     np.testing.assert_array_equal(
         recorded.qpos[-1][c_world.block_qpos[:, :3]].astype(np.float32)[0], after.position[0]
@@ -110,7 +110,7 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     )
     scenes = jax.tree.map(lambda *leaves: np.stack(leaves), scene, large, spun, broken, scene)
     batch = jax.tree.map(lambda leaf: np.stack([leaf] * 5), joints)
-    run = jax.jit(jax.vmap(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run))
+    run = jax.jit(jax.vmap(CPhysics(c_world, conftest.CONFIG.sim).run))
     after, _ = run(scenes, batch)
     ends = []
     for i, one in {0: scene, 1: large, 2: spun, 4: scene}.items():
@@ -140,14 +140,13 @@ def test_limit_of_speed_is_held_after_every_substep(
     _assert_equal(c_physics.trajectory(c_world, fields, scene, joints), wanted)
 
 
-def _rollouts(world: model.World, pool: SimulatorPool, rows: list[tuple]) -> list[Trajectory]:
-    """The trajectories of scenes, each in a simulator of the pool."""
+def _rollouts(physics: CPhysics, rows: list[tuple]) -> list[Trajectory]:
+    """The trajectories of scenes, each in the simulator of a thread."""
 
     def one(row: tuple) -> Trajectory:
-        with pool.simulator() as simulator:
-            return c_physics._rollout(world, simulator, *row)
+        return c_physics._rollout(physics.world, physics._simulator, *row)
 
-    return pool.map(one, rows)
+    return list(physics._threads.map(one, rows))
 
 
 def test_simulators_are_used_again(
@@ -166,7 +165,7 @@ def test_simulators_are_used_again(
     rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in larger]
     wanted = [slow_loop.trajectory(c_world, fields, one, joints) for one, fields, _ in rows]
     monkeypatch.setattr(c_physics.os, "sched_getaffinity", lambda _: range(3))
-    rollouts = functools.partial(_rollouts, c_world, SimulatorPool(c_world.model))
+    rollouts = functools.partial(_rollouts, CPhysics(c_world, conftest.CONFIG.sim))
 
     def check(chosen: list[int]) -> None:
         for i, recorded in zip(chosen, rollouts([rows[i] for i in chosen]), strict=True):
@@ -191,14 +190,13 @@ def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed
     scenes.append(dataclasses.replace(scenes[2], half_size=1.1 * np.asarray(scenes[2].half_size)))
     rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in scenes]
 
-    def after(pool: SimulatorPool, row: tuple) -> bytes:
-        with pool.simulator() as simulator:
-            c_physics._rollout(c_world, simulator, *row)
-            return placed.model_bytes(simulator.model)
+    def after(simulator: Simulator, row: tuple) -> bytes:
+        c_physics._rollout(c_world, simulator, *row)
+        return placed.model_bytes(simulator.model)
 
-    wanted = [after(SimulatorPool(c_world.model), row) for row in rows]
+    wanted = [after(Simulator(c_world.model), row) for row in rows]
     assert len(set(wanted)) == len(rows)
-    used = SimulatorPool(c_world.model)
+    used = Simulator(c_world.model)
     for i in (0, 1, 2, 3, 2, 1, 3, 0, 2, 0):
         assert after(used, rows[i]) == wanted[i]
 
@@ -206,7 +204,7 @@ def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed
 def test_world_of_mjx_is_refused(world: model.World):
     """Claim: a world without touch sensors is one line that says how to build another."""
     with pytest.raises(ValueError, match=r"no touch sensors; build it with sim\.physics c"):
-        c_physics.CPhysics(world, conftest.CONFIG.sim)
+        CPhysics(world, conftest.CONFIG.sim)
 
 
 def test_nothing_to_move(c_world: model.World, pushed: tuple):
@@ -215,14 +213,11 @@ def test_nothing_to_move(c_world: model.World, pushed: tuple):
     scene, fields, joints = pushed
     cleared = dataclasses.replace(scene, in_play=np.zeros(len(c_world.slots), bool))
     unreachable = dataclasses.replace(joints, reachable=np.array(False))
+    physics = CPhysics(c_world, conftest.CONFIG.sim)
     for its, way in ((cleared, joints), (scene, unreachable)):
         row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (its, fields, way))
-        pool = SimulatorPool(c_world.model)
-        pose, velocity, *seen = c_physics._run_batch(c_world, pool, *row)
-        np.testing.assert_array_equal(
-            pose[0], np.concatenate([scene.position, scene.quaternion], axis=1)
-        )
-        np.testing.assert_array_equal(velocity[0], scene.velocity)
-        assert not any(leaf.any() for leaf in seen)
-        _, trace = jax.jit(c_physics.CPhysics(c_world, conftest.CONFIG.sim).run)(its, way)
+        after, seen = physics._run_batch(*row)
+        jax.tree.map(np.testing.assert_array_equal, after, row[0])
+        assert not any(leaf.any() for leaf in jax.tree.leaves(seen))
+        _, trace = jax.jit(physics.run)(its, way)
         assert not any(np.any(leaf) for leaf in jax.tree.leaves(trace))

@@ -8,7 +8,7 @@ from mujoco import mjx
 
 from csac_jax import env, presets
 from csac_jax.constants import Primitive
-from csac_jax.sim import mjx_physics, primitives, robot
+from csac_jax.sim import mjx_physics, primitives
 from csac_jax.sim.primitives import Action
 
 pytestmark = [pytest.mark.slow, pytest.mark.mjx]
@@ -27,7 +27,7 @@ def _pushes(program: env.Env):
     def push(pose: jax.Array):
         action = Action(primitive=jnp.int32(Primitive.PUSH), pose=pose)
         plan = primitives.plan(cfg.sim, cfg.heightmap, bare, action)
-        return robot.joint_trajectory(cfg.sim.robot, plan)
+        return primitives.joint_trajectory(cfg.sim.robot, plan)
 
     joints = jax.vmap(push)(pose)
     begin = jax.vmap(lambda scene, one: mjx_physics.initial_data(program.physics, scene, one))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from csac_jax.config import MESH_KINDS, Config, SceneConfig
 from csac_jax.constants import Outcome
 from csac_jax.scene import layout, model
-from csac_jax.sim import c_physics, mjx_physics, oracle, outcome, physics as simulation, robot
+from csac_jax.sim import c_physics, mjx_physics, oracle, outcome, physics as simulation, primitives
 
 pytestmark = pytest.mark.mjx
 
@@ -112,8 +112,8 @@ def test_products_keep_their_precision(config, world):
     engine = simulation.make(world, config.sim)
 
     def act(scene, height):
-        action = oracle.grasp(config.sim, config.heightmap, config.scene.slots, scene, height)
-        return simulation.execute(engine, config.sim, config.heightmap, scene, height, action)
+        action = oracle.grasp(config, scene, height)
+        return simulation.execute(engine, config, scene, height, action)
 
     text = str(jax.make_jaxpr(act)(scene, height))
     products = re.findall(r"dot_general\[(.*?)\n *\] ", text, re.DOTALL)
@@ -125,7 +125,7 @@ def test_fast_spin_does_not_blow_up(executed, c_world):
     """Claim: a thin block that comes in spinning at 250 rad/s is held to the speed limit, in MJX
     and in C."""
     run = executed.case("spinning")
-    joints = robot.joint_trajectory("hand", run.plan)
+    joints = primitives.joint_trajectory("hand", run.plan)
     end, _ = c_physics.CPhysics(c_world, CONFIG.sim).run(run.scene, joints)
     for after in (run.after, end):
         assert simulation.healthy(after)
@@ -153,8 +153,8 @@ def test_fast_spin_does_not_blow_up(executed, c_world):
     ],
 )
 def test_healthy_bounds(field: str, value: float, slot: int, good: bool):
-    """Claim: healthy = finite, slower than MAX_SPEED, within MAX_HEIGHT of the origin if in play,
-    of unit quaternion and of a block's size."""
+    """Claim: healthy = finite, slower than 20 m/s, within 1 m of the origin if in play, of unit
+    quaternion and of a block's size."""
     scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
     scene = scene.replace(position=jnp.zeros((2, 3)), in_play=jnp.array([True, False]))
     assert simulation.healthy(scene)

@@ -55,15 +55,19 @@ def test_trace_by_hand():
     assert trace.contact_overflow == 2
 
 
-def test_trace_is_the_same_substep_by_substep():
-    """Claim: a trace extended one substep at a time, as in MJX, is that of all at once, as in C."""
-    seen = jax.tree.map(jnp.asarray, _substeps())
-    trace = outcome.blank(3)
-    for index in range(4):
-        one = jax.tree.map(lambda leaf, index=index: leaf[index], seen)
-        trace = outcome.extend(CLOSES_AT_1, trace, jnp.int32(index), one)
-    whole = outcome.trace_of(CLOSES_AT_1, seen)
-    jax.tree.map(np.testing.assert_array_equal, trace, whole)
+def test_trace_is_that_of_substeps_seen_one_by_one():
+    """Claim: a trace is what one who sees the substeps in turn remembers: of random ones too."""
+    rng = np.random.default_rng(0)
+    rise, gap = rng.normal(size=(6, 3)).astype(np.float32), rng.random(6).astype(np.float32)
+    seen = Substep(rng.random((6, 3, 3)) < 0.4, rise, gap, rng.random(6) < 0.5)
+    highest, touched, overflows = np.zeros(3, np.float32), False, 0
+    for touching, height, overflow in zip(seen.touching, rise, seen.contact_overflow, strict=True):
+        held = touching[1] & touching[2]
+        highest = np.where(held, np.maximum(highest, height), highest)
+        touched, overflows = touched or touching.any(), overflows + int(overflow)
+    wanted = Trace(touched, highest, held, height, gap[1], gap[-1], np.int32(overflows))
+    trace = outcome.trace_of(CLOSES_AT_1, jax.tree.map(jnp.asarray, seen))
+    jax.tree.map(np.testing.assert_array_equal, trace, wanted)
 
 
 @pytest.mark.parametrize(

@@ -111,14 +111,12 @@ def test_spinning_block_goes_as_in_c():
 
 def _end(cfg: Config, physics: Any) -> tuple[np.ndarray, np.ndarray, Trace]:
     """Outcomes [E], ends [E, N, 3] m and traces of the planner's grasps in settled scenes."""
-    sim = dataclasses.replace(cfg.sim, physics=physics)
-    world = model.build(cfg.scene, sim)
-    scenes = pool.settled(world, cfg.scene, cfg.heightmap.extent, 77, SCENES)
+    cfg = cfg.change(sim={"physics": physics})
+    world = model.build(cfg.scene, cfg.sim)
+    scenes = pool.settled(cfg, 77, SCENES)
     height = jax.vmap(lambda scene: observe.observe(cfg, scene).height)(scenes)
-    action = jax.vmap(functools.partial(oracle.grasp, sim, cfg.heightmap, cfg.scene.slots))(
-        scenes, height
-    )
-    run = functools.partial(simulation.execute, simulation.make(world, sim), sim, cfg.heightmap)
+    action = jax.vmap(functools.partial(oracle.grasp, cfg))(scenes, height)
+    run = functools.partial(simulation.execute, simulation.make(world, cfg.sim), cfg)
     after, trace, plan = jax.jit(jax.vmap(run))(scenes, height, action)
     rise = plan.start[:, 2] - jnp.min(plan.control[:, :, 2], axis=1)
     outcome = jax.vmap(grasp_outcome)(trace, plan.surface, rise)

@@ -31,15 +31,17 @@ def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
     (group,) = replicas.group_configs(
         [dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])]
     )
-    program, each, line = toys.program(cfg), replicas.of_group(group), sharding.make(devices)
-    state = replicas.init(program, each, line, shard)
+    program = replicas.SweepProgram(
+        toys.program(cfg), replicas.of_group(group), sharding.make(devices), shard
+    )
+    state = program.init()
     places = jax.tree.map(lambda leaf: leaf.sharding, state)
-    chunk = replicas.compile_chunk(program, each, STEPS, line, shard).lower(state).compile()
+    chunk = program.compile_chunk(STEPS).lower(state).compile()
     state, first = chunk(state)
     assert jax.tree.map(lambda leaf: leaf.sharding, state) == places
     checkpoint.save(folder, STEPS, state, cfg, {})
     state, second = chunk(state)
-    restored, _ = checkpoint.restore(folder, replicas.abstract(program, each, line, shard))
+    restored, _ = checkpoint.restore(folder, program.abstract())
     assert jax.tree.map(lambda leaf: leaf.sharding, restored) == places
     again, _ = chunk(restored)
     return state, jax.device_get([first, second]), again

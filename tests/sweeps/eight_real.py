@@ -39,9 +39,9 @@ def config() -> Config:
 def run(program: step.Program, devices: int) -> tuple[Any, Any]:
     """State and metrics [T, 1, ...] after STEPS steps."""
     (group,) = replicas.group_configs([program.cfg])
-    each, line = replicas.of_group(group), sharding.make(devices)
-    state = replicas.init(program, each, line, "scenes")
-    return jax.device_get(replicas.compile_chunk(program, each, STEPS, line, "scenes")(state))
+    line = sharding.make(devices)
+    together = replicas.SweepProgram(program, replicas.of_group(group), line, "scenes")
+    return jax.device_get(together.compile_chunk(STEPS)(together.init()))
 
 
 def compare(one: tuple[Any, Any], other: tuple[Any, Any]) -> dict[str, Any]:

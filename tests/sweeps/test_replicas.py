@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from csac_jax import algorithms, presets
-from csac_jax.sweeps import pipelined, replicas
-from csac_jax.sweeps.replicas import Replicas
+from csac_jax.sweeps import replicas
+from csac_jax.sweeps.replicas import Replicas, SweepProgram
 from csac_jax.training import sharding, step
 from tests.training import toys
 
@@ -52,10 +52,13 @@ def _seeds(num: int, cfg=toys.CFG) -> replicas.ProgramGroup:
     return group
 
 
+def _program(group: replicas.ProgramGroup, parts: int = 1) -> SweepProgram:
+    return SweepProgram(toys.program(group.configs[0]), replicas.of_group(group), parts=parts)
+
+
 def _run(group: replicas.ProgramGroup, chunks: int = 2) -> tuple[Any, list[Any]]:
-    program, each = toys.program(group.configs[0]), replicas.of_group(group)
-    chunk = replicas.compile_chunk(program, each, 4)
-    state, seen = replicas.init(program, each), []
+    program = _program(group)
+    chunk, state, seen = program.compile_chunk(4), program.init(), []
     for _ in range(chunks):
         state, metrics = chunk(state)
         seen.append(jax.device_get(metrics))
@@ -100,11 +103,10 @@ def test_seeds_differ_and_share_the_counter():
     """Claim: replicas of two seeds differ in every scene and network; they share the step counter,
     so that a schedule by it stays a branch, a `cond`; a chunk gives their state back in its own
     memory."""
-    group = _seeds(2)
-    program, each = toys.program(), replicas.of_group(group)
-    state = replicas.init(program, each)
+    program = _program(_seeds(2))
+    state = program.init()
     assert state.scenes.shape == (2, toys.SCENES)
-    traced = replicas.compile_chunk(program, each, 4).trace(state)
+    traced = program.compile_chunk(4).trace(state)
     assert "cond[" in str(traced.jaxpr)
     chunk = traced.lower().compile()
     assert chunk.memory_analysis().alias_size_in_bytes >= sum(
@@ -125,9 +127,9 @@ def test_parts_are_the_same_runs(differ: bool):
         configs[3:] = [step.replace_settings(cfg, {"target.gamma": 0.1}) for cfg in configs[3:]]
     (group,) = replicas.group_configs(configs)
     wanted, seen = _run(group)
-    program, each = toys.program(group.configs[0]), replicas.of_group(group)
-    begun = state = replicas.init(program, each)
-    chunk = replicas.compile_chunk(program, each, 4, parts=3).lower(state).compile()
+    program = _program(group, parts=3)
+    begun = state = program.init()
+    chunk = program.compile_chunk(4).lower(state).compile()
     for one in seen:
         state, metrics = chunk(state)
         assert_close(metrics, one, 1e-5)
@@ -151,10 +153,9 @@ def test_parts_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
         return state.replace(scenes=state.scenes.at[0].set(met)), metrics
 
     monkeypatch.setattr(step, "train_step", train_step)
-    group = _seeds(2)
-    program, each = toys.program(), replicas.of_group(group)
-    state = replicas.init(program, each)
-    chunk = replicas.compile_chunk(program, each, 2, parts=2).lower(state).compile()
+    program = _program(_seeds(2), parts=2)
+    state = program.init()
+    chunk = program.compile_chunk(2).lower(state).compile()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     state, _ = chunk(state)
     assert int(state.step) == 2
@@ -164,16 +165,16 @@ def test_number_of_parts(monkeypatch: pytest.MonkeyPatch):
     """Claim: on a CPU a part for each; on a GPU two where host and device take turns. One where
     states do not fit twice, for networks that fill a device, and on several devices."""
     small, large, mjx = presets.paper_small(), presets.paper(), presets.smoke()
-    state = sum(pipelined.memory.state_bytes(small).values())
-    monkeypatch.setattr(pipelined.memory, "limit", lambda: 8 * state)
-    assert [pipelined.num_parts(small, runs) for runs in (1, 3, 4, 5)] == [1, 3, 4, 1]
-    assert [pipelined.num_parts(cfg, 2) for cfg in (mjx, large)] == [2, 1]
+    state = sum(replicas.memory.state_bytes(small).values())
+    monkeypatch.setattr(replicas.memory, "limit", lambda: 8 * state)
+    assert [replicas.num_parts(small, runs) for runs in (1, 3, 4, 5)] == [1, 3, 4, 1]
+    assert [replicas.num_parts(cfg, 2) for cfg in (mjx, large)] == [2, 1]
     assert (
-        pipelined.num_parts(small, 4, sharding.Mesh(np.array(jax.devices()), (sharding.AXIS,))) == 1
+        replicas.num_parts(small, 4, sharding.Mesh(np.array(jax.devices()), (sharding.AXIS,))) == 1
     )
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert [pipelined.num_parts(small, runs) for runs in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
-    assert pipelined.num_parts(large, 2) == pipelined.num_parts(mjx, 2) == 1
+    assert [replicas.num_parts(small, runs) for runs in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
+    assert replicas.num_parts(large, 2) == replicas.num_parts(mjx, 2) == 1
 
 
 def test_settings_that_are_numbers_share_a_program():

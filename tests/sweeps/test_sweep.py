@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from csac_jax.replay import ring
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram
+from csac_jax.sweeps.replicas import ProgramGroup
 from csac_jax.sweeps.runner import SweepError, SweepPlan
 from csac_jax.training import step
 from tests.training import test_loop
@@ -43,7 +44,8 @@ class Programs:
         self.compiled = 0
         self._nan_run = nan_run
 
-    def __call__(self, group: ProgramGroup) -> SweepProgram:
+    def __call__(self, group: ProgramGroup) -> SimpleNamespace:
+        """What the host needs of a `SweepProgram`."""
         self.groups.append(group)
         uniform = 200 * (group.configs[0].replay.sampler == "uniform")
         seeds = [cfg.seed + 100 * (cfg.learn.tau == 0.5) + uniform for cfg in group.configs]
@@ -74,7 +76,8 @@ class Programs:
         def replica(state: State, index: int) -> State:
             return State(state.key[index], state.step, state.total[index])
 
-        return SweepProgram(init, lambda: jax.eval_shape(init), chunk, replica)
+        parts = {"init": init, "compile_chunk": chunk, "replica": replica}
+        return SimpleNamespace(**parts, abstract=lambda: jax.eval_shape(init))
 
 
 class Listener(test_loop.Listener):

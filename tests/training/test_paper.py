@@ -46,7 +46,7 @@ def test_paper_has_densenet_121_twice():
     """Claim: the state of the preset `paper` can be made: a trunk each for colour and height,
     online and target, and a ring that holds all 2,500 actions."""
     cfg = presets.paper()
-    state = step.abstract_state(step.make(cfg, env=step.without_physics(cfg)))
+    state = step.abstract_state(cfg)
     for params in (state.learner.online, state.learner.target):
         trunks = [params.critic[kind]["trunk"] for kind in ("params", "batch_stats")]
         assert sum(leaf.size for leaf in jax.tree.leaves(trunks)) == 2 * TRUNK
@@ -60,7 +60,7 @@ def test_paper_can_be_traced():
     """Claim: the whole training step of `paper` can be traced, and gives back a state of the same
     shapes and types."""
     program = step.make(presets.paper().change(scene={"pool": 1}))
-    state = step.abstract_state(program)
+    state = jax.eval_shape(lambda: step.init(program))
     after, metrics = jax.eval_shape(step.compile_chunk(program, 1), state)
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), state
@@ -113,9 +113,9 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
 
     def lowered(configs):
         (group,) = replicas.group_configs(configs)
-        each = replicas.of_group(group)
-        begun = replicas.init(program, each)
-        return begun, replicas.compile_chunk(program, each, 6).lower(begun)
+        together = replicas.SweepProgram(program, replicas.of_group(group))
+        begun = together.init()
+        return begun, together.compile_chunk(6).lower(begun)
 
     with jax.debug_key_reuse(False):  # it takes a vmapped transpose of keys for a second use
         begun, chunk = lowered(configs)

@@ -440,7 +440,7 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(actor_critic, "update_actor", update)
     for actor_batch in (0, 3):
         cfg = CFG.change(learn={"actor_batch": actor_batch})
-        program = step.make(cfg, env=step.without_physics(cfg))
+        program = step.make(cfg, env=object())
         state = jax.eval_shape(program.learner.init, jax.random.key(0))
         replay = jax.eval_shape(lambda: ring.init(jnp.zeros(64), step.example(CFG)))
         learn = functools.partial(step._learn, program)

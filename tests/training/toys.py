@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, explore, losses, rewards, softmax
-from csac_jax.agent.actor_critic import ActorCritic
+from csac_jax.agent import actor_critic, explore, losses, rewards
 from csac_jax.agent.csac import CSAC
 from csac_jax.config import Config
 from csac_jax.nets import networks
 from csac_jax.replay import samplers
+from csac_jax.training import sharding
 from csac_jax.training.step import (
     Hyperparams,
     Program,
@@ -28,11 +28,9 @@ CFG = presets.smoke().change(train={"scenes": SCENES, "actions": 12 * SCENES})  
 
 def program(cfg: Config = CFG, env: Any = None) -> Program:
     """In place of `step.make`: without environment and networks."""
-    nothing: Any = None
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
     frames: Any = SimpleNamespace(networks=networks.make(cfg.net))
-    parts = ActorCritic(cfg, frames, nothing, nothing, bounds)
-    learner = CSAC(actor_critic.replace_hyperparams(parts, cfg, bounds))
+    learner = CSAC(actor_critic.with_optimisers(cfg, frames, bounds))
     return Program(cfg, env, learner, samplers.make(cfg.replay))
 
 
@@ -61,10 +59,9 @@ def train_step(
     num = cfg.train.scenes
     key = jax.random.fold_in(state.key, state.step)
     noise = jax.random.normal(key, (num,))
-    scenes = program.sharding.map_scenes(lambda scenes, noise: jnp.sin(scenes + noise))(
-        state.scenes, noise
-    )
-    batch = program.sharding.shard_batch(scenes)
+    move = sharding.map_scenes(program.mesh, lambda scenes, noise: jnp.sin(scenes + noise))
+    scenes = move(state.scenes, noise)
+    batch = sharding.shard_batch(program.mesh, scenes)
 
     def loss(params: jax.Array) -> jax.Array:
         q = params[0] * batch + params[1] * batch**2 + params[2]
@@ -139,5 +136,5 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     pushed = jax.random.bernoulli(key_push, ex.push_fraction, (32,)).astype(jnp.float32).mean()
     a, b = samplers.beta_schedule(cfg.replay, share)
     scalars = [*pushes, *chances, pushed, a, b]
-    scalars += [softmax.scaled_inverse_temperature(cfg.target, high - low) * jnp.float32(1.0)]
+    scalars += [cfg.target.inverse_temperature / (high - low) * jnp.float32(1.0)]
     return jnp.concatenate([jnp.stack(scalars), grasps, noisy])

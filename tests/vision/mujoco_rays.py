@@ -83,7 +83,8 @@ def every_type(rng: np.random.Generator) -> Placed:
 
 def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
     """The model at the pose of its data."""
-    return solids.read(model, data.geom_xpos, data.geom_xmat)
+    poses = np.float32(data.geom_xpos), np.float32(data.geom_xmat)
+    return solids.place(solids.read(model), *poses)
 
 
 def cast(

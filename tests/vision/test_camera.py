@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from csac_jax.config import CameraConfig
-from csac_jax.vision import camera, shade
+from csac_jax.vision import camera
 from tests.vision import mujoco_rays, render_depth
 
 _render = jax.jit(camera.render)
@@ -111,7 +111,7 @@ def test_colours_are_flat_shaded():
     picture = _render(camera.make(CameraConfig().scaled(0.1)), mujoco_rays.read(model, data))
     colour, valid = np.asarray(picture.colour), np.asarray(picture.valid)
     assert colour.shape == (48, 64, 3)
-    np.testing.assert_allclose(colour[~valid], np.broadcast_to(shade.SKY, colour[~valid].shape))
+    np.testing.assert_allclose(colour[~valid], np.broadcast_to(camera.SKY, colour[~valid].shape))
     np.testing.assert_array_equal(np.asarray(picture.depth)[~valid], 0.0)
     levels = np.unique((colour[valid] / [0.2, 0.4, 0.8]).round(3))
     expected = [

@@ -1,4 +1,4 @@
-"""The top view against C MuJoCo, its packed form, and areas against hand counts."""
+"""The top view against C MuJoCo, its packed form, and moved areas against hand counts."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from csac_jax import geometry, presets
 from csac_jax.config import Config, HeightmapConfig
 from csac_jax.scene import blocks, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.vision import heightmap, observe, raycast, shade
+from csac_jax.vision import camera, heightmap, observe, raycast
 from tests.vision import mujoco_rays
 from tests.vision.mujoco_rays import Placed
 
@@ -22,7 +22,8 @@ _TABLE = blocks.TABLE_COLOUR
 
 def _look(cfg: HeightmapConfig, polytopes: raycast.Polytopes, is_target: jax.Array | None = None):
     every = jnp.ones(polytopes.offset.shape[0], bool)
-    return observe.ortho(cfg, polytopes, every if is_target is None else is_target)
+    tables = observe.surface_tables(polytopes, every if is_target is None else is_target)
+    return observe.ortho(cfg, polytopes, tables)
 
 
 def test_heights_agree_with_mujoco(reference):
@@ -43,7 +44,7 @@ def test_heights_agree_with_mujoco(reference):
     albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[
         geom
     ]  # -1 is the last row
-    brightness = 0.4 + 0.6 * np.maximum(normal @ shade.LIGHT, 0.0)
+    brightness = 0.4 + 0.6 * np.maximum(normal @ camera.LIGHT, 0.0)
     colour = np.asarray(obs.colour).reshape(-1, 3)
     np.testing.assert_allclose(colour[clear], (albedo * brightness[:, None])[clear], atol=1e-3)
     assert obs.height.dtype == obs.colour.dtype == jnp.float32
@@ -109,10 +110,8 @@ def test_target_mask_shows_the_target(reference):
     np.testing.assert_array_equal(
         masks.sum(0), np.asarray(clearing.height) > 0.0
     )  # each raised cell is one block's
-    row, col = np.argwhere(masks[4]).mean(0)  # the octagon that stands at x = 0.11, y = -0.07
-    np.testing.assert_allclose(
-        geometry.from_pixel(cfg, jnp.array([row, col])), [0.11, -0.07], atol=0.003
-    )
+    middle = np.asarray(geometry.cell_centres(cfg))[masks[4]].mean(0)
+    np.testing.assert_allclose(middle, [0.11, -0.07], atol=0.003)  # where the octagon stands
 
 
 def test_blocks_above_the_view_are_not_seen(reference):
@@ -165,8 +164,7 @@ def test_packing_cuts_off():
 
 @pytest.mark.parametrize("size", [64, 224])
 def test_areas_survive_another_resolution(size):
-    """Claim: a block 6 cm square that moves by its own length occupies 36 cm^2 and moves 72 cm^2 at
-    any resolution."""
+    """Claim: a block 6 cm square that moves by its own length moves 72 cm^2 at any resolution."""
     cfg = HeightmapConfig(size)
     x, y = np.moveaxis(np.asarray(geometry.cell_centres(cfg)), -1, 0)
     before = jnp.asarray(np.where((np.abs(x) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32)
@@ -174,19 +172,13 @@ def test_areas_survive_another_resolution(size):
         np.where((np.abs(x - 0.06) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32
     )
     edge = 4 * 6 * cfg.cell * 100 / 2  # half a cell along the outline, cm^2
-    assert abs(float(heightmap.occupied_area(cfg, before)) - 36.0) <= edge
     assert abs(float(heightmap.moved_area(cfg, before, after)) - 72.0) <= 2 * edge
 
 
 def test_area_bounds():
-    """Claim: changes count from 1 cm to 30 cm either way, and cells are occupied above 2 cm."""
+    """Claim: changes count from 1 cm to 30 cm either way."""
     cfg = HeightmapConfig(16)
     change = np.zeros((16, 16), np.float32)
     change[0, :6] = [0.009, 0.011, -0.011, 0.299, 0.301, -0.301]
     area = heightmap.moved_area(cfg, jnp.full((16, 16), 0.4), jnp.asarray(0.4 + change))
     np.testing.assert_allclose(area, 3 * 2.8**2, rtol=1e-5)
-    height = np.zeros((16, 16), np.float32)
-    height[0, :3] = [0.019, 0.021, 0.05]
-    np.testing.assert_allclose(
-        heightmap.occupied_area(cfg, jnp.asarray(height)), 2 * 2.8**2, rtol=1e-5
-    )

@@ -9,6 +9,7 @@ from hypothesis import given, settings, strategies as st
 from csac_jax import geometry
 from csac_jax.config import CameraConfig, HeightmapConfig
 from csac_jax.vision import camera, heightmap, observe, raycast
+from csac_jax.vision.heightmap import Observation
 
 CFG = HeightmapConfig(64, view="oblique")
 _EYE, _FINE = (camera.make(CameraConfig().scaled(share)) for share in (0.25, 0.5))
@@ -58,10 +59,10 @@ def test_the_view_agrees_with_numpy(reference):
 
     Not compiled as a whole: a fused multiply-add may move a point across the border of a cell.
     """
-    seen = observe.pixel_hits(reference.polytopes, _EYE)
+    seen = camera.cast_rays(_EYE, raycast.cast_polytopes, reference.polytopes)
     is_target = jnp.arange(6) == 4
     tables = observe.surface_tables(reference.polytopes, is_target)
-    obs = observe.from_depth(CFG, _EYE, seen.distance, seen.valid, seen.surface, tables)
+    obs = observe.from_pixels(CFG, _EYE, seen, tables)
     depth, valid, surface = (np.asarray(leaf) for leaf in (seen.distance, seen.valid, seen.surface))
     points = depth[..., None] * np.asarray(camera.directions(_EYE)) + np.asarray(_EYE.position)
     height, source = _by_hand(CFG, points.reshape(-1, 3), valid.reshape(-1))
@@ -76,18 +77,18 @@ def test_the_view_agrees_with_numpy(reference):
     assert np.asarray(obs.target).any()
 
 
-_views = jax.jit(
-    lambda polytopes: (
-        observe.ortho(CFG, polytopes, jnp.ones(6, bool)),
-        observe.oblique(CFG, polytopes, jnp.ones(6, bool), _EYE),
-    )
-)
+@jax.jit
+def _views(polytopes: raycast.Polytopes, eye: camera.Camera) -> tuple[Observation, Observation]:
+    """From above, and by a camera; any block will do."""
+    tables = observe.surface_tables(polytopes, jnp.ones(len(polytopes.offset), bool))
+    hits = camera.cast_rays(eye, raycast.cast_polytopes, polytopes)
+    return observe.ortho(CFG, polytopes, tables), observe.from_pixels(CFG, eye, hits, tables)
 
 
 def test_both_views_agree_where_the_camera_sees(reference):
     """Claim: away from edges, cells that the camera sees are as high as from above, to the slope
     within a cell; the rest is empty, and in the clearing task the target mask is all ones."""
-    above, beside = jax.device_get(_views(reference.polytopes))
+    above, beside = jax.device_get(_views(reference.polytopes, _EYE))
     filled = beside.colour.sum(-1) > 0.0
     flat = np.abs(
         above.height[1:-1, 1:-1, None, None]
@@ -112,7 +113,7 @@ def test_a_block_casts_a_shadow():
         rotation=jnp.eye(3)[None],
         colour=jnp.ones((1, 3)),
     )
-    obs = jax.jit(lambda: observe.oblique(CFG, cube, jnp.ones(1, bool), _FINE))()
+    _, obs = _views(cube, _FINE)
     height, filled = np.asarray(obs.height), np.asarray(obs.colour).sum(-1) > 0.0
     x = np.asarray(geometry.cell_centres(CFG))[0, :, 0]
     middle = slice(30, 34)  # rows at y = 0

@@ -75,7 +75,8 @@ class Still:
     """Physics in which nothing moves."""
 
     def run(self, scene, joints):
-        return layout.park(scene, scene.in_play), outcome.blank(len(scene.colour))
+        seen = outcome.nothing_seen(len(joints.control), len(scene.colour))
+        return layout.park(scene, scene.in_play), outcome.trace_of(presets.smoke().sim, seen)
 
 
 def _env(**changes) -> Env:
