@@ -50,6 +50,7 @@ def train(
     run_dir: str | Path | None = None,
     *,
     resume: bool = False,
+    at: int | None = None,
     init: str | Path | None = None,
     sampler: Sampler | None = None,
     network: Any = None,
@@ -62,18 +63,19 @@ def train(
     """Trains until the config's actions are done, or until `stop`; logs and saves in `run_dir`.
 
     Args: run_dir, a folder that does not exist, by default runs/PRESET-SEED-TIME. resume, goes on
-    with the run in `run_dir`; only `train.actions` may differ, and be larger. init, networks to
-    start from: "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121
+    with the run in `run_dir`; only `train.actions` may differ, and be larger. at, step of the
+    checkpoint to resume from, by default the newest sound one. init, networks to start from: "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121
     as .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of
     your own, which a resumed run needs again. callbacks, called with the `Record` of each chunk.
     Raises SettingsError for settings that do not fit, FileExistsError for a folder that exists,
-    TrainingError for a loss that is not finite, CheckpointError for nothing sound to resume.
+    TrainingError for a loss or parameter that is not finite, CheckpointError for nothing sound to
+    resume or a disc that is full, LockedError for a run that another process trains.
     """
     cfg = backend.resolve(cfg)
     _checked(memory.check, cfg)
     folder = new_folder(f"{cfg.preset}-{cfg.seed}") if run_dir is None else Path(run_dir)
     if resume:
-        loop.check_resumable(cfg, folder)
+        loop.check_resumable(cfg, folder, at)
     start = starting(cfg, init)
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
@@ -96,6 +98,7 @@ def train(
             Reporters([terminal, *reporters, *map(_Callback, callbacks)]),
             stop or signals.Stop(),
             resume=resume,
+            at=at,
         )
     return Run(folder, cfg, summary, {"network": network, "learner": learner})
 

@@ -69,6 +69,8 @@ def _fault(field: Any, value: Any) -> str | None:
     if typing.get_origin(kind) is Literal and value not in choices:
         return f"{value!r} is not one of: {', '.join(map(str, choices))}"
     low, high, above = field.metadata.get("bounds", (None, None, None))
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"must be finite, not {value}"
     if low is None or ((low < value if above else low <= value) and value <= high):
         return None
     span = f"must lie in {low:g} .. {high:.10g}"

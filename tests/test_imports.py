@@ -34,7 +34,7 @@ ORDER = (
     ("presets",),
     ("algorithms",),
     ("config",),
-    ("constants", "errors"),
+    ("constants", "errors", "cache_folder"),
     ("__init__",),
     ("_guard",),
 )

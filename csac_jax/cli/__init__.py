@@ -7,13 +7,26 @@ once the arguments are known to be good, so that help and complaints come at onc
 
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import csac_jax
 from csac_jax import algorithms, presets
-from csac_jax.cli import bench, doctor, evaluation, export, parsing, play, report, sweep, train
+from csac_jax.cli import (
+    bench,
+    doctor,
+    evaluation,
+    export,
+    output,
+    parsing,
+    play,
+    report,
+    sweep,
+    train,
+)
 from csac_jax.cli.failures import PROGRAM, BadArgumentsError, complain
-from csac_jax.errors import DeviceError, FailedError, SettingsError
+from csac_jax.errors import DataWarning, DeviceError, FailedError, SettingsError
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
@@ -48,13 +61,25 @@ A robot learns to push and grasp in clutter.
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command in `argv`, by default the process's arguments; returns the exit code."""
+    if os.environ.get("COLUMNS") == "0":
+        del os.environ["COLUMNS"]  # rich would print nothing
+    with output.unbroken(), warnings.catch_warnings():
+        warnings.simplefilter("default", DataWarning)
+        warnings.showwarning = _warn
+        return _guarded(list(sys.argv[1:] if argv is None else argv))
+
+
+def _warn(message: object, category: type[Warning], *place: Any, **more: Any) -> None:
+    """Prints a warning in one line, as errors are."""
+    print(f"{PROGRAM}: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def _guarded(arguments: list[str]) -> int:
+    """The exit code of a command; what the user can mend is one line."""
     try:
-        return _dispatch(list(sys.argv[1:] if argv is None else argv))
+        return _dispatch(arguments)
     except (BadArgumentsError, SettingsError, DeviceError) as error:
         return complain(2, error)
-    except BrokenPipeError:  # whoever read the output, such as `head`, has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except (FailedError, OSError) as error:
         return complain(1, error)
     except KeyboardInterrupt:

@@ -20,6 +20,8 @@ class EvalOptions:
 
     source: tyro.conf.Positional[str]
     """A run's folder, a policy file, or shipped for the policy that comes with the package."""
+    step: int | None = None
+    """Checkpoint of the run, by its step; the newest sound one if not given."""
     policy: Literal["learned", "random", "oracle"] = "learned"
     """What acts: the networks; grasps at random places above blocks; or a planner that reads the
     blocks' poses."""
@@ -46,7 +48,7 @@ def run(arguments: list[str]) -> int:
     check_seed(options.seed)
     from csac_jax.evaluation import policies
 
-    policy = policies.POLICIES[options.policy](options.source)
+    policy = policies.POLICIES[options.policy](options.source, options.step)
     begun = time.time()
     cfg, result = _evaluate(options, policy)
     seconds = round(time.time() - begun, 1)

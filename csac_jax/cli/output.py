@@ -1,10 +1,49 @@
-"""What commands write: JSON with its provenance."""
+"""What commands write: lines that a closed pipe cannot stop, JSON with its provenance."""
 
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from csac_jax.config import Config
 from csac_jax.io import files
+
+
+class _Unbroken:
+    """A stream that falls silent once whoever read it, such as `head`, has had enough."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        return self._tried(lambda: self._stream.write(text)) or len(text)
+
+    def flush(self) -> None:
+        self._tried(self._stream.flush)
+
+    def _tried(self, call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def unbroken() -> Iterator[None]:
+    """In the block a closed pipe silences stdout or stderr, and the work goes on."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = map(_Unbroken, before)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = before
 
 
 def write_result(path: Path | None, result: dict[str, Any], cfg: Config | None = None) -> None:

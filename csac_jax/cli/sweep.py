@@ -92,7 +92,7 @@ def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) ->
         print(f"{point['name']}: grasp success {success}, interquartile mean of {band.n} seeds")
     times = {"compile_seconds": result.compile_seconds, "wall_seconds": seconds}
     written = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
-    for path in (options.json, folder / "train.json"):  # `report` reads the second
+    for path in (folder / "train.json", options.json):  # `report` reads the first
         output.write_result(path, written)
 
 

@@ -28,6 +28,8 @@ class TrainOptions:
     """Folder of the run, which must not exist; runs/PRESET-SEED-TIME if not given."""
     resume: Path | None = None
     """Folder of a run to go on with; more --train.actions make it longer."""
+    step: int | None = None
+    """Checkpoint to resume from, by its step; the newest sound one if not given."""
     init: str | None = None
     """Start from the networks of a run, a policy file or `shipped`; brings its net settings."""
     tensorboard: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -58,13 +60,19 @@ def run(arguments: list[str]) -> int:
         reporters.append(TensorBoard(folder))
     try:
         done = api.train(
-            cfg, folder, resume=resume, init=options.init, reporters=reporters, stop=stop
+            cfg,
+            folder,
+            resume=resume,
+            at=options.step,
+            init=options.init,
+            reporters=reporters,
+            stop=stop,
         )
     except FileExistsError:  # somebody has made it meanwhile
         raise failures.exists(folder) from None
     seconds = round(time.time() - begun, 1)
     result = {"run_dir": str(folder), **done.summary._asdict(), "wall_seconds": seconds}
-    for path in (options.json, folder / "train.json"):  # `report` reads the second
+    for path in (folder / "train.json", options.json):  # `report` reads the first
         output.write_result(path, result, done.cfg)
     return stop.exit_code
 
@@ -81,6 +89,8 @@ def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
         base = checkpoint.load_config(Path(resumed))
         base = dataclasses.replace(base, preset=preset or base.preset)
     options, cfg = settings.parse(TrainOptions, f"train {preset or 'PRESET'}", base, flags)
+    if options.step is not None and options.resume is None:
+        raise BadArgumentsError("--step: give it with --resume RUN")
     if options.resume is None:
         settings.check_new("train", preset, options.run_dir)
     elif options.run_dir is not None or options.init is not None:

@@ -19,7 +19,7 @@ from csac_jax.io import checkpoint, policy_file
 from csac_jax.nets import networks
 from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step
+from csac_jax.training import step as training
 from csac_jax.vision.heightmap import Observation
 
 
@@ -139,25 +139,29 @@ def act(policy: Policy, states: State, keys: jax.Array) -> Action:
     return jax.vmap(policy)(states, keys)
 
 
-def load_config(source: str | Path) -> Config:
+def load_config(source: str | Path, step: int | None = None) -> Config:
     """The config of a policy, see `load`."""
     path = _path(source)
-    return policy_file.load(path)[0] if path.is_file() else checkpoint.load_config(path)
+    return policy_file.load(path)[0] if path.is_file() else checkpoint.load_config(path, step)
 
 
-def load(source: str | Path, network: Any = None, learner: Learner | None = None) -> Policy:
-    """The policy `shipped`, of a policy file, or of the newest checkpoint in a run's folder.
+def load(
+    source: str | Path, network: Any = None, learner: Learner | None = None, step: int | None = None
+) -> Policy:
+    """The policy `shipped`, of a policy file, or of a checkpoint in a run's folder.
 
-    Args: network and learner of one's own, where the run was trained with them.
+    Args: network and learner of one's own, where the run was trained with them; step, whose
+    checkpoint, by default the newest sound one.
     Raises FileNotFoundError, PolicyFileError or CheckpointError, with the remedy.
     """
     path = _path(source)
     if path.is_file():
         return LearnedPolicy(*policy_file.load(path))
-    cfg = checkpoint.load_config(path)
-    state, _ = checkpoint.restore(path, step.abstract_state(cfg, learner, network))
+    cfg = checkpoint.load_config(path, step)
+    state, _ = checkpoint.restore(path, training.abstract_state(cfg, learner, network), step)
     if learner is not None:
         return LearnerPolicy(cfg, learner, state.learner)
+    policy_file.check_finite(path, state.learner.online)
     return LearnedPolicy(cfg, state.learner.online, network)
 
 
@@ -170,9 +174,9 @@ def _path(source: str | Path) -> Path:
     return path
 
 
-POLICIES: dict[str, Callable[[str], Policy]] = {
-    "learned": load,
-    "random": lambda source: RandomPolicy(load_config(source)),
-    "oracle": lambda source: OraclePolicy(load_config(source)),
+POLICIES: dict[str, Callable[..., Policy]] = {
+    "learned": lambda source, step=None: load(source, step=step),
+    "random": lambda source, step=None: RandomPolicy(load_config(source, step)),
+    "oracle": lambda source, step=None: OraclePolicy(load_config(source, step)),
 }
 """Kinds of policy by name: each made from a source, whose config it takes, see `load`."""

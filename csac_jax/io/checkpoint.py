@@ -1,6 +1,6 @@
 """Checkpoints: the whole training state, the config and a little JSON, a folder for each step.
 
-    RUN/checkpoints/run                   random name of the run, which every checkpoint repeats
+    RUN/checkpoints/run                   random name of the run, which its checkpoints repeat
     RUN/checkpoints/STEP/state/...        arrays, by Orbax
     RUN/checkpoints/STEP/config, extra    JSON, by Orbax
     RUN/checkpoints/STEP/manifest.sha256  digest of every file above
@@ -33,7 +33,7 @@ MANIFEST = "manifest.sha256"
 SET_ASIDE = "set-aside"
 KEPT = 2
 _RUN = "run"
-_DRAFT = ".saving"
+_DRAFT, _OLD = ".saving", ".replaced"
 
 
 class CheckpointError(FailedError):
@@ -55,7 +55,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
         if cluster.is_first():
             _clean(root)
         cluster.wait(f"cleaned {root}")
-        origin = {"step": step, "run": _run_name(root), "versions": provenance.versions()}
+        origin = {"step": step, "run": _name_run(root), "versions": provenance.versions()}
         record = {"layout": leaves.layout(state), "extra": extra, **origin}
         items = ocp.args.Composite(
             state=ocp.args.StandardSave(arrays),
@@ -130,7 +130,7 @@ def sound(run_dir: Path, step: int | None = None) -> Path:
     """
     root = _root(run_dir)
     steps = [step] if step is not None else _steps(run_dir)[::-1]
-    faults = []
+    faults: list[str] = []
     for number in steps:
         folder = root / str(number)
         if (fault := _fault(folder)) is None:
@@ -147,9 +147,10 @@ def sound(run_dir: Path, step: int | None = None) -> Path:
     raise CheckpointError(f"{faults[0]}; {remedy}")
 
 
-def set_aside(run_dir: Path) -> None:
-    """Moves the steps that are newer than the newest sound one out of the way."""
-    root, good = _root(run_dir), int(sound(run_dir).name)
+def set_aside(run_dir: Path, step: int | None = None) -> None:
+    """Moves the steps that are newer than `step`, by default the newest sound one, out of the
+    way."""
+    root, good = _root(run_dir), int(sound(run_dir, step).name)
     for number in [number for number in _steps(run_dir) if number > good]:
         _set_aside(root / str(number))
 
@@ -168,8 +169,10 @@ def _set_aside(folder: Path) -> None:
 
 def _publish(draft: Path, folder: Path) -> None:
     """Gives a complete step its name and drops those before the last two."""
-    if folder.exists():
+    if folder.exists() and _fault(folder) is not None:
         _set_aside(folder)
+    elif folder.exists():
+        folder.rename(folder.parent / _OLD)
     draft.rename(folder)
     files.sync_folder(folder.parent)
     for number in _steps(folder.parents[1])[:-KEPT]:
@@ -178,17 +181,27 @@ def _publish(draft: Path, folder: Path) -> None:
 
 def _clean(root: Path) -> None:
     """Removes what a save that did not end has left."""
-    for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
+    for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT, root / _OLD]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def _run_name(root: Path) -> str:
+def _name_run(root: Path) -> str:
     """The name of the run that saves here; a new one where there is none."""
-    path = root / _RUN
-    if cluster.is_first() and not path.exists():
-        files.replace(path, secrets.token_hex(8))
+    if cluster.is_first() and _run_name(root) is None:
+        steps = _steps(root.parent)
+        saved = files.read_object(root / str(steps[-1]) / "extra" / "metadata") if steps else {}
+        name = saved.get("run") or secrets.token_hex(8)
+        files.replace(root / _RUN, f"{name} {hashlib.sha256(name.encode()).hexdigest()}")
     cluster.wait(f"named {root}")
-    return path.read_text()
+    return _run_name(root) or ""
+
+
+def _run_name(root: Path) -> str | None:
+    """The name of the run whose checkpoints these are; None without one, or a damaged one."""
+    if not (root / _RUN).is_file():
+        return None
+    name, _, digest = (root / _RUN).read_bytes().partition(b" ")
+    return name.decode() if hashlib.sha256(name).hexdigest().encode() == digest else None
 
 
 def _root(run_dir: Path) -> Path:
@@ -267,8 +280,7 @@ def _fault(folder: Path) -> str | None:
             if found.get(name) != wanted.get(name):
                 return f"is damaged ({name} {'has changed' if name in found else 'is missing'})"
         record = files.read_object(folder / "extra" / "metadata")
-        run = folder.parent / _RUN
-        name = run.read_text() if run.exists() else None
+        run = _run_name(folder.parent)
     except (FileNotFoundError, NotADirectoryError):
         return "is missing or half-written (it has no manifest)"
     except ValueError as error:
@@ -277,6 +289,6 @@ def _fault(folder: Path) -> str | None:
         return f"cannot be read ({error.strerror})"
     if str(record.get("step", folder.name)) != folder.name:
         return f"is that of step {record['step']}"
-    if name is not None and record.get("run", name) != name:  # older ones name no run
+    if run is not None and record.get("run", run) != run:  # older ones name no run
         return "is another run's"
     return None

@@ -1,12 +1,14 @@
 """A policy in a .safetensors file: its networks' variables and the config they were trained with.
 
-Nothing in such a file is executed. `SHIPPED` comes with the package; its digest stands here, so
-that a file that was damaged or replaced is noticed.
+Nothing in such a file is executed. It holds a digest of all its content, and the versions that made
+it. `SHIPPED` comes with the package; its digest stands here, so that a replaced file is noticed.
 """
 
 import hashlib
 import json
+import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,12 +18,13 @@ import safetensors.numpy
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
-from csac_jax.errors import FailedError
+from csac_jax.errors import DataWarning, FailedError
 from csac_jax.io import configs, files, leaves
+from csac_jax.runtime import provenance
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
 SHIPPED_SHA256 = "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c"
-_CONFIG = "config"  # the config's name among the file's remarks
+_CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
 
 
 class PolicyFileError(FailedError):
@@ -29,10 +32,32 @@ class PolicyFileError(FailedError):
 
 
 def save(path: Path, params: Params, cfg: Config) -> None:
-    """Writes a policy; see `files.replace`. Raises OSError where it cannot be written."""
-    remarks = {_CONFIG: json.dumps(configs.to_dict(cfg))}
+    """Writes a policy; see `files.replace`. Raises OSError where it cannot be written, and
+    PolicyFileError for networks that are not finite."""
     tensors = {name: np.asarray(leaf) for name, leaf in leaves.named(params).items()}
+    check_finite(path, tensors)
+    versions = json.dumps(provenance.versions())
+    remarks = {_CONFIG: json.dumps(configs.to_dict(cfg)), _VERSIONS: versions}
+    remarks[_DIGEST] = _digest(remarks, tensors)
     files.replace(path, safetensors.numpy.save(tensors, remarks))
+
+
+def check_finite(source: Any, params: Any) -> None:
+    """Raises PolicyFileError for networks with a number that is not finite."""
+    for name, leaf in leaves.named(params).items():
+        if not np.isfinite(np.asarray(leaf, np.float32)).all():
+            raise PolicyFileError(f"{source}: {name} is not finite; take an earlier policy")
+
+
+def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
+    """SHA-256 of a policy's content but the digest itself."""
+    content = hashlib.sha256()
+    for name in sorted(remarks.keys() - {_DIGEST}):
+        content.update(f"{name}={remarks[name]}\n".encode())
+    for name, tensor in sorted(tensors.items()):
+        content.update(f"{name}={tensor.dtype}{list(tensor.shape)}\n".encode())
+        content.update(tensor.tobytes())
+    return content.hexdigest()
 
 
 def is_policy(path: Path) -> bool:
@@ -46,23 +71,29 @@ def is_policy(path: Path) -> bool:
 
 def load(path: Path) -> tuple[Config, Params]:
     """Config and networks of a policy. Raises PolicyFileError for a file that is none, is damaged
-    or another version's."""
+    or another version's. Warns of one without a digest, and of one by other versions."""
     if path == SHIPPED and hashlib.sha256(path.read_bytes()).hexdigest() != SHIPPED_SHA256:
         raise PolicyFileError(f"{path} is not the file that this version ships; reinstall csac-jax")
     try:
         with safetensors.safe_open(path, "numpy") as file:
             remarks = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no dict
-    except (OSError, safetensors.SafetensorError) as error:
+    except Exception as error:  # a damaged header raises nearly anything
         raise PolicyFileError(
-            f"{path} cannot be read as .safetensors ({error}); give another file"
+            f"{path} cannot be read as .safetensors ({files.first_line(error)}); give another file"
         ) from None
     if _CONFIG not in remarks:
         raise PolicyFileError(
             f"{path} holds no config: it is no policy; csac-jax export writes one"
         )
+    if _DIGEST not in remarks and path != SHIPPED:
+        text = f"{path} has no digest, so damage goes unseen; csac-jax export writes one"
+        warnings.warn(text, DataWarning, stacklevel=2)
+    elif remarks.get(_DIGEST, SHIPPED_SHA256) not in (_digest(remarks, tensors), SHIPPED_SHA256):
+        raise PolicyFileError(f"{path} is damaged: its digest differs; give another file")
     try:
-        cfg = configs.from_dict(json.loads(remarks[_CONFIG]))
+        cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG))
+        provenance.warn_if_other(files.parse(remarks.get(_VERSIONS, "{}"), _VERSIONS), str(path))
     except ValueError as error:
         raise PolicyFileError(
             f"{path} was made by another version of csac_jax ({error}); use that version"
@@ -73,5 +104,6 @@ def load(path: Path) -> tuple[Config, Params]:
         raise PolicyFileError(
             f"{path} holds {name} as {has}, its config asks for {asked}; export it anew"
         )
+    check_finite(path, tensors)
     params = [tensors[name] for name in leaves.named(blank)]
     return cfg, jax.tree.unflatten(jax.tree.structure(blank), params)

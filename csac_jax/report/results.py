@@ -5,7 +5,6 @@ A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSO
 """
 
 import contextlib
-import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -79,10 +78,13 @@ def read(paths: Sequence[Path]) -> Results:
     for path in paths:
         before = len(results.runs) + len(results.evaluations)
         for file in _files(path):
-            if file.name == files.METRICS:
-                _add_run(file, results)
-            else:
-                results.evaluations.extend(_evaluations(file))
+            try:
+                if file.name == files.METRICS:
+                    _add_run(file, results)
+                else:
+                    results.evaluations.extend(_evaluations(file))
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+                results.notes.append(f"{file}: damaged ({error}); left out")
         if len(results.runs) + len(results.evaluations) == before:
             results.notes.append(f"{path}: holds no {files.METRICS} and no result of `eval --json`")
     results.notes.extend(_without_evaluation(results))
@@ -103,8 +105,7 @@ def _files(path: Path) -> Iterator[Path]:
 def _read_json(path: Path) -> Json:
     """The object in a file; empty where it holds none."""
     with contextlib.suppress(OSError, ValueError):
-        if isinstance(content := json.loads(path.read_text()), dict):
-            return content
+        return files.read_object(path)
     return {}
 
 
@@ -113,7 +114,7 @@ def _add_run(path: Path, results: Results) -> None:
     config = _read_json(path.parent / files.CONFIG)
     lines = [line for line in files.read_log(path) if line.get("grasp_success") is not None]
     if not config:
-        results.notes.append(f"{path}: no {files.CONFIG} in its folder; left out")
+        results.notes.append(f"{path}: no readable {files.CONFIG} in its folder; left out")
     elif not lines:
         results.notes.append(f"{path}: no grasp is recorded yet; left out")
     else:
@@ -134,8 +135,9 @@ def _record(folder: Path, config: Json) -> Json:
 
 
 def _evaluations(path: Path) -> list[Evaluation]:
-    content = _read_json(path)
-    if not any({"policy", "config", name} <= content.keys() for name in ("parts", "grasp_success")):
+    content = files.parse(files.read_bytes(path), "the file")
+    kinds = [{"policy", "config", name} for name in ("parts", "grasp_success")]
+    if not isinstance(content, dict) or not any(kind <= content.keys() for kind in kinds):
         return []
     suite = str(renames.METRICS.get(content.get("suite", "own"), content.get("suite")))
     parts = files.renamed(content.get("parts") or {Path(suite).stem: content})

@@ -2,7 +2,7 @@
 
 The folder is the user's cache directory, with a part for each kind of machine: on the CPU an entry
 is machine code for one processor, which JAX's own key does not name. Nothing here can stop a run: a
-damaged entry is compiled again, a folder that cannot be written is not used.
+damaged entry is compiled again, a folder that others can write is not used.
 """
 
 import collections
@@ -13,8 +13,9 @@ import platform
 from pathlib import Path
 
 import jax
+from jax._src import compilation_cache
 
-from csac_jax import _guard
+from csac_jax import _guard, cache_folder
 
 LARGEST = 4 * 2**30  # bytes kept per kind of machine; what is unused for longest goes first
 SHORTEST = 0.5  # s: what compiles faster is not kept
@@ -25,7 +26,7 @@ _events: collections.Counter[str] = collections.Counter()  # of JAX's, in this p
 
 
 def enable() -> Path | None:
-    """Switches the cache on and returns its folder; None if it is off or cannot be written.
+    """Switches the cache on and returns its folder; None if it is off or not private.
 
     JAX_COMPILATION_CACHE_DIR chooses the folder, JAX_ENABLE_COMPILATION_CACHE=0 switches it off.
     """
@@ -34,15 +35,10 @@ def enable() -> Path | None:
     _listen()
     if chosen := jax.config.jax_compilation_cache_dir:
         return Path(chosen)
-    folder = _folder()
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.parent.chmod(0o700)
-        _date_entries(folder)
-    except OSError:
+    if (folder := _folder()) is None:
         return None
-    if not os.access(folder, os.W_OK | os.X_OK):
-        return None
+    _date_entries(folder)
+    _compress_with_checksum()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", LARGEST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
@@ -56,6 +52,16 @@ def _date_entries(folder: Path) -> None:
         last_use = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
         if not last_use.exists():
             last_use.write_bytes(bytes(8))
+
+
+def _compress_with_checksum() -> None:
+    """Has JAX compress by zlib, which notices flipped bits. JAX prefers zstandard, without them.
+
+    JAX has no public choice; `tests/runtime/test_cache.py` shows that this one is heeded.
+    """
+    for name in ("zstd", "zstandard"):
+        if hasattr(compilation_cache, name):
+            setattr(compilation_cache, name, None)
 
 
 def hits() -> int:
@@ -77,13 +83,12 @@ def _on_event(event: str, **_: object) -> None:
         jax.config.update("jax_logging_level", "CRITICAL")
 
 
-def _folder() -> Path:
+def _folder() -> Path | None:
     """The user's folder for this kind of machine: its processor, and the threads that programs are
     cut for."""
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     relevant = (platform.machine(), platform.processor(), _processor(), _guard.pool_setting()[1])
-    machine = hashlib.sha256(repr(relevant).encode()).hexdigest()[:16]
-    return root / "csac_jax" / "xla" / machine
+    machine = hashlib.sha256(repr((*relevant, "zlib")).encode()).hexdigest()[:16]
+    return cache_folder.private("xla", machine)
 
 
 def _processor() -> tuple[str, ...]:

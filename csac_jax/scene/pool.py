@@ -18,6 +18,7 @@ import jax
 import mujoco
 import numpy as np
 
+from csac_jax import cache_folder
 from csac_jax.config import Config, SceneConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import arrange, blocks, layout, model
@@ -63,9 +64,9 @@ def settled(cfg: Config, stream: int, count: int, poured: bool = False) -> Scene
     Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "csac_jax" / "pools"
-    path = cache / f"{_digest(cfg, scene, stream, count, poured)}.npz"
-    if (cached := _read(path)) is not None:
+    cache = cache_folder.private("pools")
+    path = cache and cache / f"{_digest(cfg, scene, stream, count, poured)}.npz"
+    if path and (cached := _read(path)) is not None:
         return cached
     world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand"))
     fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
@@ -74,7 +75,8 @@ def settled(cfg: Config, stream: int, count: int, poured: bool = False) -> Scene
     drops = [functools.partial(_drop, scene, rng, num) for num in block_counts]
     parts = [_settle(world, drop, fall, count, poured) for drop in drops]
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    _write(path, scenes)
+    if path:
+        _write(path, scenes)
     return scenes
 
 
@@ -209,7 +211,10 @@ def _digest(cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bo
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
-    return hashlib.sha256(b"".join(arrays[name].tobytes() for name in sorted(arrays))).hexdigest()
+    content = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        content.update(f"{name}={array.dtype}{list(array.shape)}\n".encode() + array.tobytes())
+    return content.hexdigest()
 
 
 def _read(path: Path) -> Scene | None:
@@ -226,7 +231,6 @@ def _write(path: Path, scenes: Scene) -> None:
     """Saves the scenes for the next run; a cache that cannot be written is no error."""
     arrays: dict[str, Any] = vars(scenes)
     try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
             np.savez(file, sha256=_checksum(arrays), **arrays)
         os.replace(file.name, path)

@@ -9,7 +9,9 @@ SWEEP/groups/I/done             their checkpoints are written
 A run is one point with one seed. One whose loss is not finite is named and given up, alone.
 """
 
+import contextlib
 import dataclasses
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -23,7 +25,7 @@ from csac_jax.config import WARP_WORLDS, Config
 from csac_jax.errors import FailedError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import NO_CASES
-from csac_jax.io import checkpoint, configs, files
+from csac_jax.io import checkpoint, configs, files, lock
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.grid import SweepPoint
@@ -33,6 +35,8 @@ from csac_jax.training import loop, memory
 PLAN = "sweep.json"
 SUMMARY = "summary.json"
 DONE = "done"
+DIGEST = "sha256"  # key of the plan's own digest
+MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
 _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
 
 
@@ -84,6 +88,18 @@ def run(
     if not resume and cluster.is_first():
         folder.mkdir(parents=True)
         files.replace(folder / PLAN, plan_text(plan))
+    with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
+        return _run(plan, folder, make_program, reporter, stop)
+
+
+def _run(
+    plan: SweepPlan,
+    folder: Path,
+    make_program: Callable[[ProgramGroup], SweepProgram],
+    reporter: loop.Reporter,
+    stop: Stop,
+) -> SweepResult:
+    """See `run`; nobody else writes in the folder."""
     sweep = _Sweep(folder, groups_of(plan), reporter, stop)
     for index, (group, _) in enumerate(sweep.groups):
         own = folder / "groups" / str(index)
@@ -101,12 +117,17 @@ def run(
 def read_plan(folder: Path) -> SweepPlan:
     """The plan of a sweep's folder. Raises SweepError if there is none that can be read."""
     try:
-        stored = json.loads((folder / PLAN).read_text())
+        stored = files.read_object(folder / PLAN)
+        if stored.pop(DIGEST, None) not in (None, _digest(stored)):
+            raise ValueError("it was changed after it had been written")
         points = [
             SweepPoint(point["name"], point["values"], configs.from_dict(point["config"]))
             for point in stored["settings"]
         ]
-        return SweepPlan(stored["seeds"], points)
+        plan = SweepPlan(stored["seeds"], points)
+        check_plan(plan)
+        _check_unchanged(plan, folder)
+        return plan
     except FileNotFoundError:
         raise SweepError(f"there is no {PLAN} in {folder}; give the folder of a sweep") from None
     except (ValueError, KeyError, TypeError) as error:
@@ -119,7 +140,31 @@ def plan_text(plan: SweepPlan) -> str:
         {"name": point.name, "values": point.values, "config": configs.to_dict(point.cfg)}
         for point in plan.points
     ]
-    return json.dumps({"seeds": plan.seeds, "settings": points}, indent=2) + "\n"
+    content = {"seeds": plan.seeds, "settings": points}
+    return json.dumps({**content, DIGEST: _digest(content)}, indent=2) + "\n"
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def check_plan(plan: SweepPlan) -> None:
+    """Raises ValueError for a number of runs, or a name of a folder, that cannot be meant."""
+    if not isinstance(plan.seeds, int) or not 1 <= plan.seeds * len(plan.points) <= MOST_RUNS:
+        raise ValueError(f"--seeds: 1 to {MOST_RUNS} runs in all, seeds times settings")
+    for name in [point.name for point in plan.points]:
+        if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0"):
+            raise ValueError(f"{name!r} is no name of a folder")
+
+
+def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
+    """Raises ValueError where a run has begun with another config than the plan's."""
+    for run in runs_of(plan):
+        path = folder / run.folder / files.CONFIG
+        if path.exists():
+            names = configs.differences(configs.from_dict(files.read_object(path)), run.cfg)
+            if names:
+                raise ValueError(f"{run.folder} has other values of {', '.join(names)}")
 
 
 def runs_of(plan: SweepPlan) -> list[SweepRun]:
@@ -182,7 +227,7 @@ class _Sweep:
                 self.compiled.append(seconds)
             elif records := training.advance(chunk, self.reporter):
                 self._show(index, records)
-        if checkpoint.latest_step(training.folder) != training.step:
+        if training.saved != training.step:
             training.save()
         if self.stopped is None:
             training.finish()
@@ -228,7 +273,10 @@ class _GroupTraining:
             stored = extra["runs"] if "runs" in extra else extra["members"]  # its older name
             self.progress = [loop.Progress(*progress) for progress, _ in stored]
             self.failed = [failed for _, failed in stored]
+            if cluster.is_first():
+                checkpoint.set_aside(folder)
         self.step = int(self.state.step)
+        self.saved = self.step if self.step else None
         if cluster.is_first():
             for run, path in zip(runs, self.paths, strict=True):
                 path.mkdir(parents=True, exist_ok=True)
@@ -253,9 +301,9 @@ class _GroupTraining:
         records = []
         for i, run in enumerate(self.runs):
             own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
-            if self.failed[i] is None and loop.not_finite(own):
+            if self.failed[i] is None and (lost := loop.not_finite(own)):
                 self.failed[i] = self.step
-                reason = f"given up at step {self.step}, a loss is not finite"
+                reason = f"given up at step {self.step}, {lost} is not finite"
                 reporter.say(f"{run.point}, seed {run.cfg.seed}: {reason}")
             if self.failed[i] is None:
                 old = self.progress[i]
@@ -271,24 +319,18 @@ class _GroupTraining:
         """Writes a checkpoint of the group."""
         runs = list(zip(self.progress, self.failed, strict=True))
         checkpoint.save(self.folder, self.step, self.state, self.cfg, {"runs": runs})
+        self.saved = self.step
 
     def finish(self) -> None:
         """Writes the runs' checkpoints, then removes the group's; a resumed sweep repeats it."""
         for i, path in enumerate(self.paths):
             if self.failed[i] is None:
-                _remove(path / checkpoint.FOLDER)
                 state, extra = self.program.replica(self.state, i), self.progress[i]._asdict()
                 checkpoint.save(path, self.step, state, self.runs[i].cfg, extra)
         if cluster.is_first():
             files.replace(self.folder / DONE, "")
-        _remove(self.folder / checkpoint.FOLDER)
-
-
-def _remove(folder: Path) -> None:
-    """Removes a folder, once, and returns when it is gone for all processes."""
-    if cluster.is_first():
-        shutil.rmtree(folder, ignore_errors=True)
-    cluster.wait(f"removed {folder}")
+            shutil.rmtree(self.folder / checkpoint.FOLDER, ignore_errors=True)
+        cluster.wait(f"finished {self.folder}")
 
 
 def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from csac_jax.config import Config
 from csac_jax.constants import GRASP_WINDOW, OUTCOMES, Outcome, Primitive
 from csac_jax.errors import FailedError, SettingsError
-from csac_jax.io import checkpoint, configs, files
+from csac_jax.io import checkpoint, configs, files, lock
 from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import memory
@@ -100,19 +100,39 @@ def run(
     reporter: Reporter,
     stop: Stop,
     resume: bool = False,
+    at: int | None = None,
 ) -> Summary:
     """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
 
-    Args: run_dir, exists if `resume`, else is made; init, gives the first state, a pytree with
+    Args: run_dir, exists if `resume`, else is made; at, the step to resume from, by default the
+    newest sound one; init, gives the first state, a pytree with
     `step` [] int32; compile_chunk, takes the number of steps and gives a jitted function state ->
-    (state, StepMetrics [T, ...]) that may use up its argument. Raises TrainingError on a loss that
-    is not finite, CheckpointError if there is nothing sound to resume from.
+    (state, StepMetrics [T, ...]) that may use up its argument. Raises TrainingError on a loss
+    or parameter that is not finite, CheckpointError if there is nothing sound to resume from,
+    LockedError if another process trains in `run_dir`.
     """
-    state, progress = _begin(cfg, run_dir, init, resume)
+    if not resume:
+        run_dir.mkdir(parents=True)
+    with lock.exclusive(run_dir):
+        return _run(cfg, run_dir, init, compile_chunk, reporter, stop, resume, at)
+
+
+def _run(
+    cfg: Config,
+    run_dir: Path,
+    init: Callable[[], Any],
+    compile_chunk: Callable[[int], Any],
+    reporter: Reporter,
+    stop: Stop,
+    resume: bool,
+    at: int | None,
+) -> Summary:
+    """See `run`; nobody else writes in the folder."""
+    state, progress = _begin(cfg, run_dir, init, resume, at)
     step, total, scenes = int(state.step), total_steps(cfg), cfg.train.scenes
     if resume:
         reporter.say(f"resumed {run_dir} at step {step} ({step * scenes} actions)")
-    chunk, compile_seconds, doubted = None, 0.0, False
+    chunk, compile_seconds, doubted, saved = None, 0.0, False, step if resume else None
     while step < total and stop.signal is None:
         if chunk is None:
             chunk, compile_seconds = compile_program(cfg, compile_chunk, state, reporter)
@@ -128,9 +148,9 @@ def run(
             doubted = True
             reporter.say(doubt)
         if step % (cfg.train.save_every * cfg.train.chunk) == 0:
-            checkpoint.save(run_dir, step, state, cfg, progress._asdict())
-    if checkpoint.latest_step(run_dir) != step:
-        checkpoint.save(run_dir, step, state, cfg, progress._asdict())
+            saved = _save(cfg, run_dir, step, state, progress)
+    if saved != step:
+        _save(cfg, run_dir, step, state, progress)
     stopped = f"stopped and saved at step {step}; go on with: csac-jax train --resume {run_dir}"
     done = f"done: {step * scenes} actions; saved in {run_dir}"
     reporter.say(done if stop.signal is None else stopped)
@@ -140,22 +160,30 @@ def run(
     )
 
 
-def _begin(cfg: Config, run_dir: Path, init: Callable, resume: bool) -> tuple[Any, Progress]:
-    """The first state, or that of the newest checkpoint, to which the log is cut."""
+def _begin(
+    cfg: Config, run_dir: Path, init: Callable, resume: bool, at: int | None
+) -> tuple[Any, Progress]:
+    """The first state, or that of a checkpoint, to which the log is cut."""
     if resume:
-        check_resumable(cfg, run_dir)
-    else:
-        run_dir.mkdir(parents=True)
+        check_resumable(cfg, run_dir, at)
     files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
-    fresh = Progress(0.0, [])._asdict()
-    state, extra = checkpoint.restore(run_dir, jax.eval_shape(init)) if resume else (init(), fresh)
+    if resume:
+        state, extra = checkpoint.restore(run_dir, jax.eval_shape(init), at)
+        checkpoint.set_aside(run_dir, at)
+    else:
+        state, extra = init(), Progress(0.0, [])._asdict()
     files.truncate_log(run_dir / files.METRICS, int(state.step))
     return state, Progress(extra["seconds"], extra["grasps"])
 
 
-def check_resumable(cfg: Config, run_dir: Path) -> None:
+def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress) -> int:
+    checkpoint.save(run_dir, step, state, cfg, progress._asdict())
+    return step
+
+
+def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
     """Raises SettingsError where the run has other settings, CheckpointError where it is none."""
-    stored = checkpoint.load_config(run_dir)
+    stored = checkpoint.load_config(run_dir, at)
     longer = stored.change(train={"actions": max(stored.train.actions, cfg.train.actions)})
     if names := configs.differences(longer, cfg):
         raise SettingsError(
@@ -188,9 +216,10 @@ def timed(chunk: Callable[[Any], Any], state: Any) -> tuple[Any, Any, float]:
 
 
 def not_finite(metrics: Any) -> str | None:
-    """The loss of a run's chunk that is not finite, if there is one; the warm-up does not count."""
+    """What of a run's chunk is not finite, if anything; losses of the warm-up do not count."""
     losses = {name: getattr(metrics, name)[metrics.learned] for name in LOSSES}
-    return next((name for name, loss in losses.items() if not np.isfinite(loss).all()), None)
+    lost = next((name for name, loss in losses.items() if not np.isfinite(loss).all()), None)
+    return lost or (None if metrics.finite.all() else "a parameter")
 
 
 def _lost_loss(run_dir: Path, name: str, step: int) -> str:

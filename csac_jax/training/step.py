@@ -61,6 +61,7 @@ class StepMetrics(NamedTuple):
     actor_loss: jax.Array  # [] float32
     td_error: jax.Array  # [] float32, mean of abs(y - Q)
     q_mean: jax.Array  # [] float32
+    finite: jax.Array  # [] bool, every number of the learner's state is finite
 
 
 class Hyperparams(NamedTuple):
@@ -161,6 +162,7 @@ def train_step(
         contact_overflow=info.contact_overflow,
         physics_diverged=info.physics_diverged,
         learned=ready,
+        finite=_is_finite(learned),
         **losses,
     )
     replay = replay.replace(priority=priority)
@@ -215,6 +217,12 @@ def _learn(
         "q_mean": jnp.mean(info.q),
     }
     return state, priority, losses
+
+
+def _is_finite(tree: Any) -> jax.Array:
+    """Whether every floating number of a pytree is finite, [] bool."""
+    floats = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))
 
 
 def _keys(key: jax.Array, num: int) -> jax.Array:

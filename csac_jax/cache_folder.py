@@ -1,0 +1,27 @@
+"""Where files are cached that this user's programs make and trust. Needs no JAX."""
+
+import os
+import stat
+from pathlib import Path
+
+
+def private(*parts: str) -> Path | None:
+    """The folder CACHE/csac_jax/PARTS of this user, made with mode 0700.
+
+    CACHE is XDG_CACHE_HOME or ~/.cache. None where there is no home, the folder cannot be written,
+    or another user owns it or can write into it.
+    """
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home, "csac_jax", *parts)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        own = [Path(home, "csac_jax", *parts[:number]) for number in range(len(parts) + 1)]
+        return folder if all(map(_is_private, own)) and os.access(folder, os.W_OK) else None
+    except (OSError, RuntimeError):  # RuntimeError: there is no home
+        return None
+
+
+def _is_private(folder: Path) -> bool:
+    status = folder.lstat()
+    open_to_others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not open_to_others
