@@ -64,9 +64,10 @@ def train(
 
     Args: run_dir, a folder that does not exist, by default runs/PRESET-SEED-TIME. resume, goes on
     with the run in `run_dir`; only `train.actions` may differ, and be larger. at, step of the
-    checkpoint to resume from, by default the newest sound one. init, networks to start from: "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121
-    as .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of
-    your own, which a resumed run needs again. callbacks, called with the `Record` of each chunk.
+    checkpoint to resume from, by default the newest sound one. init, networks to start from:
+    "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121 as
+    .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of your
+    own, which a resumed run needs again. callbacks, called with the `Record` of each chunk.
     Raises SettingsError for settings that do not fit, FileExistsError for a folder that exists,
     TrainingError for a loss or parameter that is not finite, CheckpointError for nothing sound to
     resume or a disc that is full, LockedError for a run that another process trains.
