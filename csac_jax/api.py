@@ -124,6 +124,7 @@ def sweep(
     success of every combination over its seeds with 95 % intervals. Raises as `train`.
     """
     points = _points(cfg, dict(vary or {}))
+    _checked(runner.check_plan, SweepPlan(seeds, points))
     runs = seeds * len(points)
     points = [one._replace(cfg=backend.resolve(one.cfg, devices or 1, runs)) for one in points]
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
@@ -228,7 +229,8 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
         base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
         return step.replace_settings(base, settings)
 
-    return grid.combine(vary, configure)
+    found: list[SweepPoint] = _checked(grid.combine, vary, configure)
+    return found
 
 
 def _first_line(folder: Path, cfg: Config) -> str:

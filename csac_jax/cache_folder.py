@@ -13,10 +13,13 @@ def private(*parts: str) -> Path | None:
     """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(home, "csac_jax", *parts)
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        own = [Path(home, "csac_jax", *parts[:number]) for number in range(len(parts) + 1)]
-        return folder if all(map(_is_private, own)) and os.access(folder, os.W_OK) else None
+        Path(home).mkdir(parents=True, exist_ok=True)
+        for number in range(len(parts) + 1):
+            folder = Path(home, "csac_jax", *parts[:number])
+            folder.mkdir(mode=0o700, exist_ok=True)  # its parents would get the usual mode
+            if not _is_private(folder):
+                return None
+        return folder if os.access(folder, os.W_OK | os.X_OK) else None
     except (OSError, RuntimeError):  # RuntimeError: there is no home
         return None
 

@@ -16,7 +16,11 @@ SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 RobotKind = Literal["hand", "ur5"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
+MOST_ITEMS = 64  # of a setting that is a list (ours: networks and scenes end far below)
 WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
+
+
+_LARGEST = 2**53  # integers up to here are floats too
 
 
 def _bounded(default: Any, low: float, high: float = math.inf, above: bool = False) -> Any:
@@ -46,7 +50,12 @@ class Section:
             return
         for field in dataclasses.fields(typing.cast(Any, self)):
             value = getattr(self, field.name)
-            for item in value if isinstance(value, tuple) else (value,):
+            items = value if isinstance(value, tuple) else (value,)
+            _require(
+                len(items) <= MOST_ITEMS,
+                f"{self.SECTION}.{field.name}: at most {MOST_ITEMS} items, not {len(items)}",
+            )
+            for item in items:
                 if fault := _fault(field, item):
                     raise ValueError(f"{self.SECTION}.{field.name}: {fault}".lstrip("."))
         self.check()
@@ -67,17 +76,24 @@ def _fault(field: Any, value: Any) -> str | None:
     kind = typing.get_args(field.type)[0] if typing.get_origin(field.type) is tuple else field.type
     choices = typing.get_args(kind)
     if typing.get_origin(kind) is Literal and value not in choices:
-        return f"{value!r} is not one of: {', '.join(map(str, choices))}"
+        return f"{shown(value)} is not one of: {', '.join(map(str, choices))}"
     low, high, above = field.metadata.get("bounds", (None, None, None))
     if isinstance(value, float) and not math.isfinite(value):
         return f"must be finite, not {value}"
     if low is None or ((low < value if above else low <= value) and value <= high):
-        return None
+        too_large = isinstance(value, int) and abs(value) > _LARGEST
+        return f"must be at most {_LARGEST}, not {shown(value)}" if too_large else None
     span = f"must lie in {low:g} .. {high:.10g}"
     if above or high == math.inf:
         most = f", at most {high:.10g}" if high < math.inf else ""
         span = f"must be {'above' if above else 'at least'} {low:g}{most}"
-    return f"{span}, not {value}"
+    return f"{span}, not {shown(value)}"
+
+
+def shown(value: Any) -> str:
+    """A value in a message, however long it is."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 class SceneConfig(Section, section="scene"):
@@ -244,7 +260,8 @@ class SmallNet(Section, section="net"):
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
     head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
     growth: int = _bounded(24, 4)  # Channels that each dense layer adds.
-    dilations: tuple[int, ...] = _bounded((1, 2, 4, 1), 1)  # Dilation of each dense layer, 3 x 3.
+    dilations: tuple[int, ...] = _bounded((1, 2, 4, 1), 1, 64)
+    """Dilation of each dense layer, 3 x 3."""
     stem: int = _bounded(16, 4)  # Channels of the first convolution.
     stride: Literal[2, 4] = 2  # Input cells per feature cell, each axis; 4: a quarter of the work.
     subcells: Literal[1, 2, 4] = 1  # Map cells per feature cell, along each axis; at most `stride`.

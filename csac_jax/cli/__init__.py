@@ -61,7 +61,7 @@ A robot learns to push and grasp in clutter.
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command in `argv`, by default the process's arguments; returns the exit code."""
-    if os.environ.get("COLUMNS") == "0":
+    if set(os.environ.get("COLUMNS", "")) == {"0"}:
         del os.environ["COLUMNS"]  # rich would print nothing
     with output.unbroken(), warnings.catch_warnings():
         warnings.simplefilter("default", DataWarning)

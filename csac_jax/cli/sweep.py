@@ -148,7 +148,8 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     for point in points:
         failures.check_physics(point.cfg, devices)
     plan = runner.SweepPlan(options.seeds, points)
-    with as_bad_arguments(runner.SweepError):
+    with as_bad_arguments(runner.SweepError, ValueError):
+        runner.check_plan(plan)
         runner.groups_of(plan._replace(seeds=1))
     return plan
 

@@ -22,15 +22,18 @@ def to_dict(cfg: Config) -> dict[str, Any]:
 def from_dict(values: Any) -> Config:
     """The inverse of `to_dict`, for every format written so far. Raises ValueError."""
     if not isinstance(values, dict):
-        raise ValueError(f"config: must be an object, not {values!r}")
+        raise ValueError(f"config: must be an object, not {config.shown(values)}")
     values = dict(values)
     number = values.pop("format", 1)
     if number not in (1, renames.FORMAT):
         raise ValueError(
-            f"format: {number!r} is unknown, this version reads up to {renames.FORMAT}; "
-            "update csac-jax"
+            f"format: {config.shown(number)} is unknown, "
+            f"this version reads up to {renames.FORMAT}; update csac-jax"
         )
-    values = _from_format_1(values) if number == 1 else values
+    try:
+        values = _from_format_1(values) if number == 1 else values
+    except (TypeError, KeyError, IndexError, AttributeError, OverflowError):
+        raise ValueError("a setting of the old format has a value of another kind") from None
     return Config(**{name: _validated(name, value) for name, value in values.items()})
 
 
@@ -63,7 +66,11 @@ def _kind(name: str, stored: Any) -> Any:
 def _validated(name: str, stored: Any) -> Any:
     adapter = _adapter(_kind(name, stored))
     try:
-        return adapter.validate_json(json.dumps(stored), strict=True)
+        text = json.dumps(stored)
+    except RecursionError:
+        raise ValueError(f"{name}: is nested too deeply") from None
+    try:
+        return adapter.validate_json(text, strict=True)
     except ValueError as error:
         first = error.errors(include_url=False)[0]
     if first["type"] == "value_error":
@@ -71,7 +78,7 @@ def _validated(name: str, stored: Any) -> Any:
     place, what = ".".join(map(str, (name, *first["loc"]))), first["msg"]
     if first["type"] == "unexpected_keyword_argument":
         raise ValueError(f"{place}: unknown setting")
-    raise ValueError(f"{place}: {what[0].lower()}{what[1:]}, not {first['input']!r}")
+    raise ValueError(f"{place}: {what[0].lower()}{what[1:]}, not {config.shown(first['input'])}")
 
 
 @functools.cache

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import stat
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -97,17 +98,24 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     if damaged := records.count(None):
         text = f"{path}: {damaged} of {len(lines)} lines are damaged and left out"
         warnings.warn(text, DataWarning, stacklevel=2)
-    found = [*records, _record(last)]
-    return [renamed(record) for record in found if record is not None]
+    return [record for record in [*records, _record(last)] if record is not None]
 
 
 def _record(line: bytes) -> dict[str, Any] | None:
-    """A line of a log; None if it is damaged."""
+    """A line of a log; None if it is damaged, or lacks what every line has."""
     try:
-        record = parse(line, "line")
+        record = renamed(parse(line, "line"))
     except ValueError:
         return None
-    return record if isinstance(record, dict) and isinstance(record.get("step"), int) else None
+    if not isinstance(record, dict):
+        return None
+    numbers = {name: record.get(name) for name in ("step", "actions", "grasps_counted", "seconds")}
+    numbers["grasp_success"] = record.get("grasp_success") or 0.0  # None: no grasp yet
+    return record if all(map(_is_number, numbers.values())) else None
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
 def renamed(content: Any) -> Any:

@@ -65,7 +65,7 @@ def is_policy(path: Path) -> bool:
     try:
         with safetensors.safe_open(path, "numpy") as file:
             return _CONFIG in (file.metadata() or {})
-    except (OSError, safetensors.SafetensorError):
+    except Exception:  # a damaged header raises nearly anything
         return False
 
 
@@ -98,7 +98,12 @@ def load(path: Path) -> tuple[Config, Params]:
         raise PolicyFileError(
             f"{path} was made by another version of csac_jax ({error}); use that version"
         ) from None
-    blank = actor_critic.abstract_params(cfg)
+    try:
+        blank = actor_critic.abstract_params(cfg)
+    except Exception as error:  # sizes that no network can have
+        raise PolicyFileError(
+            f"{path} has a config without networks ({files.first_line(error)}); give another file"
+        ) from None
     if found := leaves.difference(leaves.layout(tensors), leaves.layout(blank)):
         name, has, asked = found
         raise PolicyFileError(

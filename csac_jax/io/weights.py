@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import safetensors
 import safetensors.numpy
 
 from csac_jax.config import DenseNet121
+from csac_jax.io import files
 from csac_jax.nets import torchvision
 
 
@@ -17,11 +17,10 @@ def read(cfg: DenseNet121, path: Path) -> Any:
     """
     try:
         tensors = safetensors.numpy.load_file(path)
-    # KeyError: a type that NumPy lacks
-    except (OSError, KeyError, safetensors.SafetensorError) as error:
+    except Exception as error:  # KeyError for a type that NumPy lacks, others for a damaged header
         raise ValueError(
-            f"{path} cannot be read as .safetensors ({error}); give another file"
-        ) from error
+            f"{path} cannot be read as .safetensors ({files.first_line(error)}); give another file"
+        ) from None
     try:
         return torchvision.variables(cfg, tensors)
     except ValueError as error:

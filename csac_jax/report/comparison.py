@@ -19,14 +19,6 @@ NAMES = {
     "csac_per": "CSAC-PER",
     "csac_beta": "CSAC-beta",
 }
-METRICS = {
-    "grasp_success": "grasp success",
-    "completion": "completion",
-    "completion_reachable": "completion, reachable blocks",
-    "action_efficiency": "blocks / actions",
-    "action_efficiency_completed": "blocks / actions, completed episodes",
-}
-"""Metric -> its title in tables; `evaluation.metrics` defines them."""
 
 
 class Curve(NamedTuple):
@@ -168,7 +160,7 @@ def gaps(report: Report) -> Iterator[tuple[Score, Score, dict[str, Band]]]:
 def _difference(ours: Score, theirs: Score) -> dict[str, Band]:
     """In every metric that all evaluations have."""
     bands = {}
-    for metric in METRICS:
+    for metric in recorded.METRICS:
         a, b = ([runs[:, 0] for runs in score.strata(metric)] for score in (ours, theirs))
         if min(map(len, (*a, *b))) > 1:
             bands[metric] = statistics.difference(a, b)

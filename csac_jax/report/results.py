@@ -6,6 +6,7 @@ A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSO
 
 import contextlib
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax import algorithms, presets
+from csac_jax.config import shown
 from csac_jax.io import configs, files, renames
 
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
@@ -20,8 +22,24 @@ SKIPPED = ("checkpoints", "tensorboard")
 NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
 HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
 LENGTH = "train."  # settings of a run's length and shape do not make it another method
+METRICS = {
+    "grasp_success": "grasp success",
+    "completion": "completion",
+    "completion_reachable": "completion, reachable blocks",
+    "action_efficiency": "blocks / actions",
+    "action_efficiency_completed": "blocks / actions, completed episodes",
+}
+"""Metric -> its title in tables; `evaluation.metrics` defines them."""
 
 Json = dict[str, Any]
+
+_TEXT, _NUMBER = (str, type(None)), (int, float, type(None))
+_SHARE = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int}
+_CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "robot": str}}
+_RECORD = {"device": _TEXT, "versions": (dict, type(None)), "commit": _TEXT}
+_RECORD |= {"wall_seconds": _NUMBER}
+_METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": {"episodes": int}, "failures": {}}
+_EVALUATION = {"policy": str, "suite": str, "seed": int, "seconds": _NUMBER, "parts": {}}
 
 
 class Variant(NamedTuple):
@@ -83,8 +101,8 @@ def read(paths: Sequence[Path]) -> Results:
                     _add_run(file, results)
                 else:
                     results.evaluations.extend(_evaluations(file))
-            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-                results.notes.append(f"{file}: damaged ({error}); left out")
+            except (OSError, ValueError) as error:
+                results.notes.append(f"{file}: damaged ({files.first_line(error)}); left out")
         if len(results.runs) + len(results.evaluations) == before:
             results.notes.append(f"{path}: holds no {files.METRICS} and no result of `eval --json`")
     results.notes.extend(_without_evaluation(results))
@@ -109,10 +127,30 @@ def _read_json(path: Path) -> Json:
     return {}
 
 
+def _check(content: Any, shape: Json, name: str) -> None:
+    """Raises ValueError where an object has these items, but of other kinds."""
+    if not isinstance(content, dict):
+        raise ValueError(f"{name} is no object")
+    for key, kind in shape.items():
+        if isinstance(kind, dict):
+            _check(content.get(key, {}), kind, key)
+        elif key in content and not (isinstance(content[key], kind) and _is_small(content[key])):
+            raise ValueError(f"{key} is {shown(content[key])}")
+
+
+def _is_small(value: Any) -> bool:
+    return not isinstance(value, int) or abs(value) < 2**53  # beyond, it may be no float
+
+
 def _add_run(path: Path, results: Results) -> None:
     """Adds the run of a log; a note where it has no config or no grasp yet."""
     config = _read_json(path.parent / files.CONFIG)
-    lines = [line for line in files.read_log(path) if line.get("grasp_success") is not None]
+    _check(config, _CONFIG, files.CONFIG)
+    with warnings.catch_warnings(record=True) as damage:
+        warnings.simplefilter("always")
+        every = files.read_log(path)
+    results.notes.extend(str(warning.message) for warning in damage)
+    lines = [line for line in every if line.get("grasp_success") is not None]
     if not config:
         results.notes.append(f"{path}: no readable {files.CONFIG} in its folder; left out")
     elif not lines:
@@ -129,6 +167,7 @@ def _record(folder: Path, config: Json) -> Json:
     above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
         record = _read_json(place / RECORD)
+        _check(record, _RECORD, RECORD)
         if record and record.get("config", config) == config:
             return record
     return {}
@@ -139,10 +178,17 @@ def _evaluations(path: Path) -> list[Evaluation]:
     kinds = [{"policy", "config", name} for name in ("parts", "grasp_success")]
     if not isinstance(content, dict) or not any(kind <= content.keys() for kind in kinds):
         return []
+    _check(content, _EVALUATION, "the file")
     suite = str(renames.METRICS.get(content.get("suite", "own"), content.get("suite")))
     parts = files.renamed(content.get("parts") or {Path(suite).stem: content})
     record = {name: content.get(name) for name in ("device", "versions", "commit")}
     record["wall_seconds"] = content.get("seconds")
+    _check(content["config"], _CONFIG, "config")
+    _check(record, _RECORD, "the file")
+    for one in parts.values():
+        _check(one, _METRICS, "a part")
+        for share in one.get("failures", {}).values():
+            _check(share, _SHARE, "a share")
     config, policy, seed = content["config"], content["policy"], content.get("seed", 0)
     asked = path, config, variant(config), policy, suite
     return [Evaluation(*asked, part, seed, found, record) for part, found in parts.items()]

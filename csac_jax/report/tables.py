@@ -11,7 +11,7 @@ from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import PER_ACTION
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import results as recorded
-from csac_jax.report.comparison import METRICS, Curve, Report, Score, gaps, label, leads
+from csac_jax.report.comparison import Curve, Report, Score, gaps, label, leads
 from csac_jax.report.results import Evaluation, RecordedRun, Variant
 
 PAPER_TRAINING = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
@@ -71,7 +71,7 @@ def _curve_json(curve: Curve, ahead: Band | None) -> recorded.Json:
 def _score_json(score: Score, part: str) -> recorded.Json:
     fields = score._asdict() | {"part": part, "seeds": _seeds(score.parts[part])}
     del fields["parts"]
-    metrics = _plain({name: score.only(part).band(name) for name in METRICS})
+    metrics = _plain({name: score.only(part).band(name) for name in recorded.METRICS})
     return _named(fields.pop("variant")) | fields | {"metrics": metrics}
 
 
@@ -142,7 +142,8 @@ def _evaluation_row(score: Score) -> dict[str, str]:
 
 
 def _metric_cells(band: Callable[[str], Band | None], sign: str = "") -> dict[str, str]:
-    return {title: shown(band(metric), sign, metric) for metric, title in METRICS.items()}
+    titles = recorded.METRICS.items()
+    return {title: shown(band(metric), sign, metric) for metric, title in titles}
 
 
 def differences(report: Report) -> Table:

@@ -60,6 +60,8 @@ def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
         _check_places(case, extent)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    except RecursionError:
+        raise ValueError(f"{path}: is nested too deeply for a case file") from None
     return case
 
 
@@ -91,17 +93,16 @@ def _read(path: Path) -> Any:
         raise ValueError(f"cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"is not a JSON file: {error}") from None
-    except RecursionError:
-        raise ValueError("is not a case file: it is nested too deeply") from None
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """The object of these keys and values. Raises ValueError for a key given twice."""
-    keys = [key for key, _ in pairs]
-    for key in keys:
-        if keys.count(key) > 1:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
             raise ValueError(f"key {_short(key)} is given twice in one object; remove one")
-    return dict(pairs)
+        found[key] = value
+    return found
 
 
 def _are_numbers(value: Any, count: int) -> bool:

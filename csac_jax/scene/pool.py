@@ -4,11 +4,11 @@ C MuJoCo settles those on all cores, bit-identical for any number of threads. Th
 disk. `stream` numbers the stream of random numbers: training takes 0, evaluation others.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
 import os
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -230,9 +230,11 @@ def _read(path: Path) -> Scene | None:
 def _write(path: Path, scenes: Scene) -> None:
     """Saves the scenes for the next run; a cache that cannot be written is no error."""
     arrays: dict[str, Any] = vars(scenes)
+    temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp")
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+        with temporary.open("wb") as file:
             np.savez(file, sha256=_checksum(arrays), **arrays)
-        os.replace(file.name, path)
+        temporary.replace(path)
     except OSError:
-        return
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)

@@ -4,6 +4,7 @@ that complaints come at once."""
 import dataclasses
 import difflib
 import itertools
+import math
 import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +14,7 @@ from csac_jax.config import ALTERNATIVES, Config, Section
 
 BASE = "base"  # name of the only point where nothing is varied
 LONGEST = 120  # characters of a point's name, which is a folder's
+MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
 _VALUE = re.compile(r"([^./-]|-?\.?\d|-inf)[^/]*")  # a negative number is no flag
 
 
@@ -44,8 +46,11 @@ def combine(
     axes: Mapping[str, Sequence[Any]], configure: Callable[[dict[str, Any]], Config]
 ) -> list[SweepPoint]:
     """A point for every combination, setting -> value, of which `configure` makes a config. They
-    are numbered where one has a name that is too long for a folder."""
-    found = []
+    are numbered where one has a name that is too long for a folder. Raises ValueError for too many.
+    """
+    found: list[SweepPoint] = []
+    if math.prod(map(len, axes.values())) > MOST_RUNS:
+        raise ValueError(f"--vary: more than {MOST_RUNS} combinations; leave some values out")
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
         name = ",".join(f"{setting}={value}" for setting, value in values.items()) or BASE

@@ -13,6 +13,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -21,13 +22,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from csac_jax.config import WARP_WORLDS, Config
+from csac_jax.config import WARP_WORLDS, Config, shown
 from csac_jax.errors import FailedError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import NO_CASES
 from csac_jax.io import checkpoint, configs, files, lock
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
+from csac_jax.sweeps import grid
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
@@ -36,7 +38,7 @@ PLAN = "sweep.json"
 SUMMARY = "summary.json"
 DONE = "done"
 DIGEST = "sha256"  # key of the plan's own digest
-MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
+_NAME = re.compile(rf"[^./\\][^/\\]{{0,{grid.LONGEST - 1}}}")  # of a folder inside the sweep
 _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
 
 
@@ -118,8 +120,10 @@ def read_plan(folder: Path) -> SweepPlan:
     """The plan of a sweep's folder. Raises SweepError if there is none that can be read."""
     try:
         stored = files.read_object(folder / PLAN)
-        if stored.pop(DIGEST, None) not in (None, _digest(stored)):
+        if stored.pop(DIGEST, None) not in (None, _digest(stored)):  # old ones have none
             raise ValueError("it was changed after it had been written")
+        if stored.keys() != {"seeds", "settings"}:
+            raise ValueError("it is no plan of a sweep")
         points = [
             SweepPoint(point["name"], point["values"], configs.from_dict(point["config"]))
             for point in stored["settings"]
@@ -130,8 +134,9 @@ def read_plan(folder: Path) -> SweepPlan:
         return plan
     except FileNotFoundError:
         raise SweepError(f"there is no {PLAN} in {folder}; give the folder of a sweep") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise SweepError(f"{folder / PLAN} cannot be read ({error}); begin a new sweep") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = files.first_line(error)
+        raise SweepError(f"{folder / PLAN} cannot be read ({reason}); begin a new sweep") from None
 
 
 def plan_text(plan: SweepPlan) -> str:
@@ -150,11 +155,16 @@ def _digest(content: dict[str, Any]) -> str:
 
 def check_plan(plan: SweepPlan) -> None:
     """Raises ValueError for a number of runs, or a name of a folder, that cannot be meant."""
-    if not isinstance(plan.seeds, int) or not 1 <= plan.seeds * len(plan.points) <= MOST_RUNS:
-        raise ValueError(f"--seeds: 1 to {MOST_RUNS} runs in all, seeds times settings")
-    for name in [point.name for point in plan.points]:
-        if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0"):
-            raise ValueError(f"{name!r} is no name of a folder")
+    if type(plan.seeds) is not int or not 1 <= plan.seeds * len(plan.points) <= grid.MOST_RUNS:
+        raise ValueError(f"--seeds: 1 to {grid.MOST_RUNS} runs in all, seeds times settings")
+    names = [point.name for point in plan.points]
+    for name in names:
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.isprintable():
+            raise ValueError(f"{shown(name)} is no name of a folder")
+        if name == "groups":
+            raise ValueError("the name 'groups' is taken by the sweep's own folder")
+    if len(set(names)) < len(names):
+        raise ValueError("two settings have the same name")
 
 
 def _check_unchanged(plan: SweepPlan, folder: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from flax import struct
 
 from csac_jax import presets
+from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint, leaves, renames
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.training import step as training
@@ -43,7 +44,7 @@ def _state(seed: int = 0) -> State:
     return State(
         key=key,
         keys=jax.random.split(jax.random.fold_in(key, 1), 3),
-        step=jnp.int32(7),
+        step=jnp.int32(seed),
         moments=(Moments(jnp.asarray(drawn.normal(size=(3, 5)), jnp.float32), jnp.uint8(200)), ()),
         params={
             "w.x": jnp.asarray(drawn.normal(size=4), jnp.bfloat16),
@@ -113,7 +114,7 @@ def test_relative_folder(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_last_two_are_kept(run_dir: Path):
     """Claim: the last two steps are kept."""
-    checkpoint.save(run_dir, 12, _state(), CFG, {})
+    checkpoint.save(run_dir, 12, _state(12), CFG, {})
     assert sorted(
         path.name for path in (run_dir / "checkpoints").iterdir() if path.name.isdigit()
     ) == ["12", "8"]
@@ -127,55 +128,99 @@ def test_temporary_folders_are_removed(run_dir: Path):
     assert checkpoint.latest_step(run_dir) == 8
     assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(8))
     assert left.exists()  # a reader leaves a running writer alone
-    checkpoint.save(run_dir, 12, _state(), CFG, {})
+    checkpoint.save(run_dir, 12, _state(12), CFG, {})
     assert not left.exists()
 
 
+def _falls_back(run_dir: Path, message: str) -> None:
+    """Step 8 is passed over with a warning; asked for by itself, it is refused in one line."""
+    with pytest.warns(DataWarning, match=rf"8 is {message}.*; going back to step 4"):
+        state, _ = checkpoint.restore(run_dir, _abstract())
+    assert _same(state, _state(4))
+    with pytest.raises(CheckpointError, match=rf"8 is {message}.*saved are: 4$") as caught:
+        checkpoint.restore(run_dir, _abstract(), 8)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("position", [0.0, 0.5, 0.99])
-def test_flipped_bit_is_refused(run_dir: Path, position: float):
-    """Claim: a flipped bit is an error of one line that names the file and the newest sound
-    step."""
+def test_flipped_bit_is_noticed(run_dir: Path, position: float):
+    """Claim: a step with a flipped bit is passed over for the one before, with a warning that names
+    the file."""
     file = _data_file(run_dir, 8)
     data = bytearray(file.read_bytes())
     data[int(position * len(data))] ^= 1
     file.write_bytes(data)
-    with pytest.raises(
-        CheckpointError, match=rf"8 is damaged.*{file.name} has changed.*from step 4"
-    ) as caught:
-        checkpoint.restore(run_dir, _abstract())
-    assert "\n" not in str(caught.value)
+    _falls_back(run_dir, rf"damaged .*{file.name} has changed")
     with pytest.raises(CheckpointError, match="damaged"):
-        checkpoint.load_config(run_dir)
+        checkpoint.load_config(run_dir, 8)
 
 
-def test_truncated_file_is_refused(run_dir: Path):
-    """Claim: a cut-off file is an error."""
+def test_truncated_file_is_noticed(run_dir: Path):
+    """Claim: a step with a cut-off file is passed over."""
     file = _data_file(run_dir, 8)
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match="has changed"):
-        checkpoint.restore(run_dir, _abstract())
+    _falls_back(run_dir, "damaged .*has changed")
 
 
-def test_deleted_file_is_refused(run_dir: Path):
-    """Claim: a missing file is an error that names it."""
+def test_deleted_file_is_noticed(run_dir: Path):
+    """Claim: a step with a missing file is passed over; the warning names the file."""
     file = _data_file(run_dir, 8)
     file.unlink()
-    with pytest.raises(CheckpointError, match=f"{file.name} is missing"):
-        checkpoint.restore(run_dir, _abstract())
+    _falls_back(run_dir, f"damaged .*{file.name} is missing")
 
 
-def test_half_written_step_is_refused(run_dir: Path):
-    """Claim: a step without its manifest is half-written; no older one is taken in its place."""
+def test_half_written_step_is_noticed(run_dir: Path):
+    """Claim: a step without its manifest is half-written, and passed over."""
     (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).unlink()
-    with pytest.raises(CheckpointError, match=r"half-written.*from step 4.*delete"):
-        checkpoint.restore(run_dir, _abstract())
+    _falls_back(run_dir, "missing or half-written")
 
 
-def test_remedy_works(run_dir: Path):
-    """Claim: deleting the folder that the message names makes the run go on from the older step."""
+@pytest.mark.parametrize("content", ["[]", "3", "{", "[" * 100_000, '{"a": {}}', "\0", ""])
+def test_manifest_that_is_none_is_noticed(run_dir: Path, content: str):
+    """Claim: a manifest that is no JSON object, or none that can be read, is damage."""
+    (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).write_text(content)
+    _falls_back(run_dir, "damaged")
+
+
+@pytest.mark.parametrize("name", ["8\u00b2", "\u0669", "09", "-9"])
+def test_folder_of_another_name_is_no_step(run_dir: Path, name: str):
+    """Claim: only a plain number names a step; other folders are left alone."""
+    other = run_dir / "checkpoints" / name
+    other.mkdir()
+    assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(8))
+    checkpoint.save(run_dir, 12, _state(12), CFG, {})
+    assert checkpoint.latest_step(run_dir) == 12
+    assert other.exists()
+
+
+def test_earlier_step_is_chosen(run_dir: Path):
+    """Claim: an earlier step is restored where it is asked for; one that was not saved is refused
+    with those that were."""
+    assert _same(checkpoint.restore(run_dir, _abstract(), 4)[0], _state(4))
+    with pytest.raises(CheckpointError, match=r"5 is missing.*saved are: 4, 8"):
+        checkpoint.restore(run_dir, _abstract(), 5)
+
+
+def test_damaged_step_is_set_aside(run_dir: Path):
+    """Claim: a run that goes on from an older step moves the damaged one out of the way, whole."""
     _data_file(run_dir, 8).unlink()
-    (run_dir / "checkpoints" / "8").rename(run_dir / "elsewhere")
+    with pytest.warns(DataWarning, match="going back to step 4"):
+        checkpoint.set_aside(run_dir)
+    assert (run_dir / "checkpoints" / checkpoint.SET_ASIDE / "8" / checkpoint.MANIFEST).is_file()
     assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(4))
+
+
+def test_other_versions_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a checkpoint of another version of the package, JAX or MuJoCo comes back with a
+    warning that names both versions."""
+    here = checkpoint.provenance.versions()
+    for name in ("csac-jax", "jax", "mujoco"):
+        old = {**here, name: "0.0.1"}
+        monkeypatch.setattr(checkpoint.provenance, "versions", lambda old=old: old)
+        checkpoint.save(tmp_path, 4, _state(4), CFG, {})
+        monkeypatch.undo()
+        with pytest.warns(DataWarning, match=rf"with {name} 0\.0\.1, this is {here[name]}"):
+            assert _same(checkpoint.restore(tmp_path, _abstract())[0], _state(4))
 
 
 def test_no_sound_step_is_left(run_dir: Path):
@@ -217,7 +262,7 @@ def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """Claim: a config with a setting that this version does not know is an error that names it."""
     good = checkpoint.configs.to_dict
     monkeypatch.setattr(checkpoint.configs, "to_dict", lambda cfg: {**good(cfg), "sweep": 1})
-    folder = checkpoint.save(tmp_path, 4, _state(), CFG, {})
+    folder = checkpoint.save(tmp_path, 4, _state(4), CFG, {})
     assert json.loads((folder / checkpoint.MANIFEST).read_text())
     with pytest.raises(CheckpointError, match=r"another version.*sweep: unknown setting"):
         checkpoint.load_config(tmp_path)
@@ -233,10 +278,10 @@ def _tree(leaves: dict[str, jax.Array]) -> dict[str, Any]:
 
 
 def _leaves(names: Iterable[str]) -> dict[str, jax.Array]:
-    """A leaf for each name, all different, the first a key."""
+    """A leaf for each name, all different, the first a key; that of the step is 4."""
     first, *others = names
     plain = {name: jnp.arange(3.0) + i for i, name in enumerate(others)}
-    return {first: jax.random.key(5), **plain}
+    return {first: jax.random.key(5), **plain, "step": jnp.int32(4)}
 
 
 def _same_leaves(a: dict[str, Any], b: dict[str, Any]) -> bool:
@@ -261,7 +306,8 @@ def test_new_names_of_leaves_are_read(tmp_path: Path):
     checkpoint.save(tmp_path, 4, _tree(new), CFG, {})
     state, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
     assert _same_leaves(state, _tree(new))
-    checkpoint.save(tmp_path, 8, _tree({**new, "scenes.idle": jnp.int32(0)}), CFG, {})
+    more = {**new, "step": jnp.int32(8), "scenes.idle": jnp.int32(0)}
+    checkpoint.save(tmp_path, 8, _tree(more), CFG, {})
     with pytest.raises(CheckpointError, match=r"scenes\.idle as int32\[\], the program needs noth"):
         checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
 

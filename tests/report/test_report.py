@@ -41,6 +41,7 @@ def _run(
         )
     lines = [
         {
+            "step": i + 1,
             "actions": 100 * (i + 1),
             "seconds": 10.0 * (i + 1),
             "grasp_success": value,
@@ -63,7 +64,7 @@ def _evaluation(
 ) -> None:
     """What `eval --json` writes: 10 grasps in each case, so many of them lifts."""
     share = metrics.wilson(lifted, 10)
-    part = dict.fromkeys(comparison.METRICS, share) | {"counts": {"episodes": episodes}}
+    part = dict.fromkeys(results.METRICS, share) | {"counts": {"episodes": episodes}}
     part["failures"] = {"grasp_dropped": metrics.wilson(10 - lifted, 10)}
     asked = {
         "policy": policy,
@@ -302,10 +303,10 @@ def test_old_names_are_read_as_todays(tmp_path: Path):
     (tmp_path / "eval.json").write_text(json.dumps(content))
     _run(tmp_path / "run", old, [0.5])
     log = tmp_path / "run" / "metrics.jsonl"
-    log.write_text('{"step": 1, "actions": 8, "ill": 1, "left": 2, "saturated": 3}\n')
-    assert files.read_log(log) == [
-        {"step": 1, "actions": 8, "physics_diverged": 1, "blocks_lost": 2, "contact_overflow": 3}
-    ]
+    line = {"step": 1, "actions": 8, "grasps_counted": 0, "seconds": 1.0}
+    log.write_text(json.dumps({**line, "ill": 1, "left": 2, "saturated": 3}) + "\n")
+    new = {"physics_diverged": 1, "blocks_lost": 2, "contact_overflow": 3}
+    assert files.read_log(log) == [{**line, **new}]
     one = results.read([tmp_path / "eval.json"]).evaluations[0]
     assert (one.suite, one.part) == ("in_distribution", "in_distribution")
     assert set(one.metrics["failures"]) == {"block_lost", "episode_physics_diverged"}
@@ -333,12 +334,13 @@ def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.
     each."""
     (tmp_path / "empty").mkdir()
     (tmp_path / "bare").mkdir()
-    (tmp_path / "bare" / "metrics.jsonl").write_text('{"actions": 1, "grasp_success": 1.0}\n')
+    line = {"step": 1, "actions": 8, "grasps_counted": 1, "seconds": 1.0, "grasp_success": 1.0}
+    (tmp_path / "bare" / "metrics.jsonl").write_text(json.dumps(line) + "\n")
     assert cli.main(["report", str(recorded), str(tmp_path / "empty"), str(tmp_path / "bare")]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("- ")]
     wanted = (
         "empty: holds no metrics.jsonl",
-        "bare/metrics.jsonl: no config",
+        "bare/metrics.jsonl: no readable config",
         "bare: holds no metrics.jsonl",
         "max: not evaluated; run: csac-jax eval",
         "CSAC-beta (paper): runs end at 300, 400 actions; their curve is drawn up to 300",

@@ -52,6 +52,7 @@ class StepMetrics(NamedTuple):
     actor_loss: jax.Array
     td_error: jax.Array
     q_mean: jax.Array
+    finite: jax.Array
 
 
 def _init() -> State:
@@ -59,12 +60,14 @@ def _init() -> State:
 
 
 class Fake:
-    """A program that draws its metrics at random, counts compilations, and can lose its loss or its
-    physics."""
+    """A program that draws its metrics at random, counts compilations, and can lose its loss, a
+    parameter or its physics."""
 
-    def __init__(self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99) -> None:
+    def __init__(
+        self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99, lost_at: int = -1
+    ) -> None:
         self.compiled: list[int] = []
-        self._nan_at, self._ill = nan_at, (ill_from, ill_to)
+        self._nan_at, self._ill, self._lost_at = nan_at, (ill_from, ill_to), lost_at
 
     def compile_chunk(self, num_steps: int):
         """As `csac_jax.training.step.compile_chunk`, with the program bound."""
@@ -97,6 +100,7 @@ class Fake:
             actor_loss=loss,
             td_error=loss,
             q_mean=loss,
+            finite=state.step != self._lost_at,
         )
         total = state.total + jax.random.normal(keys[3], (4,))
         return State(state.key, state.step + 1, total), metrics
@@ -203,9 +207,8 @@ def test_lines_newer_than_the_checkpoint_are_dropped(tmp_path: Path, whole: Path
     written anew."""
     _run(tmp_path / "run", Listener(2), Fake())
     log = tmp_path / "run/metrics.jsonl"
-    log.write_text(
-        log.read_text() + json.dumps({"step": 12, "actions": -1}) + '\n{"step": 16, "act'
-    )
+    newer = {**_log(tmp_path / "run")[-1], "step": 12, "actions": -1, "seconds": 9.0}
+    log.write_text(log.read_text() + json.dumps(newer) + '\n{"step": 16, "act')
     _run(tmp_path / "run", Listener(), Fake(), resume=True)
     assert _log(tmp_path / "run") == _log(whole)
 
@@ -241,6 +244,17 @@ def test_loss_that_is_not_finite_stops_the_run(tmp_path: Path, step: int):
     assert "\n" not in str(caught.value)
     assert checkpoint.latest_step(tmp_path / "run") == good
     assert all(math.isfinite(line["reward"]) for line in _log(tmp_path / "run"))
+
+
+@pytest.mark.parametrize("step", [2, 21])
+def test_parameter_that_is_not_finite_stops_the_run(tmp_path: Path, step: int):
+    """Claim: a parameter that is not finite ends the run, in the warm-up too, though the losses
+    are; no checkpoint holds it."""
+    with pytest.raises(TrainingError, match="a parameter is not finite") as caught:
+        _run(tmp_path / "run", Listener(), Fake(lost_at=step))
+    assert "\n" not in str(caught.value)
+    good = (step // 8) * 8
+    assert checkpoint.latest_step(tmp_path / "run") == (good or None)
 
 
 def test_loss_of_the_warm_up_is_not_looked_at(tmp_path: Path):
@@ -336,6 +350,7 @@ def _metrics(primitive: list[int], outcome: list[int]) -> StepMetrics:
         *[zeros] * 9,
         np.ones(steps, bool),
         *[losses] * 4,
+        np.ones(steps, bool),
     )
 
 
