@@ -1,0 +1,1 @@
+"""Faults of running trainings and of their folders."""
