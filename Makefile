@@ -13,10 +13,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup train eval test test-slow lint format bench pictures figures doctor clean
+.PHONY: help setup train eval test test-slow test-faults lint format bench pictures figures doctor clean
 
 help:  ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -37,6 +37,9 @@ test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run 
 
 test-slow: $(STAMP)  ## slow tests
 	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)
+
+test-faults: $(STAMP)  ## inject every fault (20 minutes); ARGS=NAME for those of that name
+	$(BIN)/python -m tests.faults $(ARGS)
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .

@@ -1,0 +1,473 @@
+"""Faults of running trainings and of their folders."""
+
+import contextlib
+import functools
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from csac_jax.errors import DataWarning
+from csac_jax.io import checkpoint
+from csac_jax.training.loop import TrainingError
+from tests.faults import harness, toy
+from tests.faults.harness import MissingToolError, Tally, fault
+
+WORK = 60.0  # s: what starting a process and its saves may take on a busy machine
+CALLS = "openat,mkdir,rename,unlink,unlinkat,rmdir,write,pwrite64,fsync,ftruncate"
+
+
+class _Run:
+    """A run that processes resume again and again, and what is known of it."""
+
+    def __init__(self, folder: Path, tally: Tally, seed: int = 5) -> None:
+        self.folder, self.tally, self.seed, self.saved = folder, tally, seed, 0
+        self._reference = toy.Reference(seed)
+
+    def order(self, **more: object) -> toy.Order:
+        """An order to go on."""
+        begun = checkpoint.latest_step(self.folder) is not None
+        if not begun:  # killed before its first save: there is nothing to lose
+            shutil.rmtree(self.folder, ignore_errors=True)
+        return toy.Order(self.folder, begun, self.seed, **more)
+
+    def judge(
+        self, child: toy.Child, about: str, refused: bool = False, killed: bool = False
+    ) -> None:
+        """Counts what came of a process that has ended; whether it may have refused, was killed."""
+        self.tally.tries += 1
+        self.saved = max(self.saved, child.saved)
+        if problem := child.problem(refused, killed):
+            self.tally.tracebacks += 1
+            self.tally.remarks.append(f"{about}: {problem}")
+        if found := toy.fault_of(self.folder, self._reference, self.saved):
+            self.tally.lost += 1
+            self.tally.remarks.append(f"{about}: {found}")
+
+    def left_over(self, about: str) -> None:
+        """Counts what a save that failed has left."""
+        drafts = re.compile(r"\.tmp$|\.saving|orbax-checkpoint-tmp")
+        for path in self.folder.rglob("*"):
+            if drafts.search(path.name):
+                self.tally.lost += 1
+                self.tally.remarks.append(f"{about}: left {path}")
+
+
+@fault("SIGKILL at a random time", tries=100)
+def sigkill(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """Runs of ten processes, each killed within its first second or so; the next one resumes."""
+    tally = Tally()
+    for number in range(-(-tries // 10)):
+        run = _Run(folder / str(number), tally)
+        for _ in range(min(10, tries - tally.tries)):
+            child = toy.Child(run.order())
+            about = f"try {tally.tries}"
+            if rng.random() < 0.8:
+                child.listen(WORK, saves=int(rng.integers(1, 4)))
+            child.listen(float(rng.uniform(0.0, 0.4)))
+            child.kill()
+            run.judge(child, about, killed=True)
+    return tally
+
+
+@fault("SIGTERM", tries=20)
+def sigterm(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """A run that is told to stop saves and ends, complete to the step that its log ends with."""
+    tally = Tally()
+    run = _Run(folder / "run", tally)
+    for number in range(tries):
+        child = toy.Child(run.order())
+        child.listen(WORK, saves=1)
+        child.listen(float(rng.uniform(0.0, 0.3)))
+        child.process.terminate()
+        if not child.end(harness.HANG):
+            tally.hangs += 1
+            tally.remarks.append(f"try {number}: did not end")
+        run.judge(child, f"try {number}")
+        steps = len((run.folder / "metrics.jsonl").read_text().splitlines())
+        if steps != run.saved or not child.done:
+            tally.lost += 1
+            tally.remarks.append(f"try {number}: ends at step {steps}, saved {run.saved}")
+    return tally
+
+
+def _calls(folder: Path) -> list[tuple[str, int]]:
+    """The system calls that write, of a chunk and its save: (name, number of it in a thread)."""
+    log = folder / "calls"
+    child = toy.Child(toy.Order(folder / "counted", steps=2, held=True))
+    child.listen(WORK, saves=1)
+    with _strace(child.process.pid, "-o", str(log), "-e", f"trace={CALLS}"):
+        child.go()
+        child.end(WORK)
+    counts: dict[tuple[str, str], int] = {}
+    calls: set[tuple[str, int]] = set()
+    for thread, name, rest in re.findall(r"^(\d+) +(\w+)\((.*)$", log.read_text(), re.MULTILINE):
+        counts[thread, name] = counts.get((thread, name), 0) + 1
+        if name != "openat" or "O_CREAT" in rest:
+            calls.add((name, counts[thread, name]))
+    return sorted(calls)
+
+
+@contextlib.contextmanager
+def _strace(process: int, *arguments: str):
+    """In the block all threads of a process are traced."""
+    if shutil.which("strace") is None:
+        raise MissingToolError("strace is not installed")
+    command = ["strace", "-f", "-p", str(process), *arguments]
+    tracer = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    try:
+        assert tracer.stderr is not None
+        said = tracer.stderr.readline()
+        if "attached" not in said:
+            raise MissingToolError(f"strace cannot trace: {said.strip()}")
+        yield
+    finally:
+        tracer.terminate()
+        tracer.communicate()
+
+
+def _chosen(rng: np.random.Generator, calls: list, tries: int) -> list:
+    """All of them, in turn, or as many as there are tries, at random."""
+    if tries >= len(calls):
+        return calls
+    return [calls[i] for i in sorted(rng.choice(len(calls), tries, replace=False))]
+
+
+@fault("SIGKILL at a system call of a save", tries=400)
+def sigkill_in_save(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """Every call that writes, of a chunk, its log and its save."""
+    tally = Tally()
+    run = _Run(folder / "run", tally)
+    for name, number in _chosen(rng, _calls(folder), tries):
+        child = toy.Child(run.order(held=True, steps=2))
+        child.listen(WORK, saves=1)
+        inject = f"inject={name}:signal=KILL:when={number}"
+        with _strace(child.process.pid, "-o", "/dev/null", "-e", f"trace={name}", "-e", inject):
+            child.go()
+            child.end(WORK)
+        run.judge(child, f"{name} {number}", killed=True)
+    return tally
+
+
+@fault("disc full from a system call on", tries=200)
+def disc_full(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """ENOSPC from every call on that could need room, in turn; see `file_too_large` for `write`."""
+    tally = Tally()
+    run = _Run(folder / "run", tally)
+    needs = ("mkdir", "openat", "pwrite64", "fsync", "ftruncate", "rename")
+    calls = [call for call in _calls(folder) if call[0] in needs]
+    for name, number in _chosen(rng, calls, tries):
+        child = toy.Child(run.order(held=True, steps=2))
+        child.listen(WORK, saves=1)
+        inject = f"inject={name}:error=ENOSPC:when={number}+"
+        with _strace(child.process.pid, "-o", "/dev/null", "-e", f"trace={name}", "-e", inject):
+            child.go()
+            ended = child.end(WORK)
+        _judge_full(run, child, ended, f"{name} {number}")
+    return tally
+
+
+@fault("disc full in the middle of a file", tries=60)
+def file_too_large(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """Writes beyond some size fail (RLIMIT_FSIZE), whatever the file."""
+    tally = Tally()
+    run = _Run(folder / "run", tally)
+    for _ in range(tries):
+        largest = int(10 ** rng.uniform(0.0, 4.0)) - 1
+        child = toy.Child(run.order(largest=largest, steps=2))
+        ended = child.end(WORK)
+        _judge_full(run, child, ended, f"files up to {largest} bytes")
+    return tally
+
+
+def _judge_full(run: _Run, child: toy.Child, ended: bool, about: str) -> None:
+    """A run on a disc that is full says so in one line, and leaves no drafts."""
+    if not ended:
+        run.tally.hangs += 1
+        run.tally.remarks.append(f"{about}: hung")
+    run.judge(child, about, refused=True)
+    run.left_over(about)
+
+
+def _damaged(kind: str):
+    """The fault of damage to one file among all under a run's checkpoints."""
+
+    def inject(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+        tally = Tally()
+        sound, copy = folder / "sound", folder / "copy"
+        toy.train(sound, 3)
+        reference = toy.Reference()
+        names = [path for path in sorted(sound.rglob("checkpoints/**/*")) if path.is_file()]
+        names = [path.relative_to(sound) for path in names if path.stat().st_size]
+        for _ in range(tries):
+            shutil.rmtree(copy, ignore_errors=True)
+            shutil.copytree(sound, copy)
+            about = harness.damage(rng, kind, copy / names[int(rng.integers(len(names)))])
+            tally.tries += 1
+            _judge_restored(tally, copy, reference, at_least=2, about=about)
+        return tally
+
+    fault(f"{kind} in a checkpoint", tries=200)(inject)
+
+
+def _judge_restored(
+    tally: Tally, run_dir: Path, reference: toy.Reference, at_least: int, about: str
+) -> None:
+    """Counts a run whose newest sound state is not right, or lies before step `at_least`."""
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            cfg = checkpoint.load_config(run_dir)
+            state, extra = checkpoint.restore(run_dir, toy.abstract_state())
+    except Exception as error:
+        tally.lost += 1
+        tally.remarks.append(f"{about}: {type(error).__name__}: {error}")
+        return
+    step = int(state.step)
+    right = toy.bits(state) == reference.state(step) and len(extra["grasps"]) == toy.E * step
+    if not right or cfg != toy.config():
+        tally.silent += 1
+        tally.remarks.append(f"{about}: step {step} is restored with other numbers")
+    if step < at_least:
+        tally.lost += 1
+        tally.remarks.append(f"{about}: step {step} is restored")
+    newest = checkpoint.latest_step(run_dir)
+    if step != newest and not any(issubclass(one.category, DataWarning) for one in caught):
+        tally.silent += 1
+        tally.remarks.append(f"{about}: went back from step {newest} to {step} without a word")
+
+
+for _kind in harness.DAMAGES:
+    _damaged(_kind)
+
+
+def _swapped(steps: Path, other: Path) -> dict[str, Callable[[], object]]:
+    """What can happen to the folders of two runs, with steps 2 and 3."""
+
+    def turn_round() -> None:
+        (steps / "2").rename(steps / "x")
+        (steps / "3").rename(steps / "2")
+        (steps / "x").rename(steps / "3")
+
+    def replace_newest() -> None:
+        shutil.rmtree(steps / "3")
+        shutil.copytree(other / "3", steps / "3")
+
+    return {
+        "newest one is another run's": replace_newest,
+        "newer one is another run's": lambda: shutil.copytree(other / "3", steps / "4"),
+        "newer one is a link to another run's": lambda: (steps / "4").symlink_to(other / "3"),
+        "steps have each other's names": turn_round,
+        "newest one has a newer name": lambda: (steps / "3").rename(steps / "9"),
+        "older one has a newer name": lambda: (steps / "2").rename(steps / "9"),
+        "newest one is missing": lambda: shutil.rmtree(steps / "3"),
+        "state is missing": lambda: shutil.rmtree(steps / "3" / "state"),
+        "extra is missing": lambda: shutil.rmtree(steps / "3" / "extra"),
+        "manifest is missing": lambda: (steps / "3" / checkpoint.MANIFEST).unlink(),
+        "file too many": lambda: (steps / "3" / "state" / "more").write_text("x"),
+        "empty folder with a newer name": lambda: (steps / "9").mkdir(),
+        "file with a newer name": lambda: (steps / "9").write_text("x"),
+        "superscript digit": lambda: (steps / "\u00b2").mkdir(),
+        "leading zero": lambda: shutil.copytree(other / "3", steps / "007"),
+        "many digits": lambda: (steps / ("9" * 30)).mkdir(),
+        "name of the run is missing": lambda: (steps / "run").unlink(),
+        "name of the run is empty": lambda: (steps / "run").write_text(""),
+        "log is a folder of the draft's name": lambda: (steps / ".saving").mkdir(),
+    }
+
+
+@fault("swapped, missing and foreign step folders", tries=19)
+def swapped(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """The right steps remain, or those before them; the run goes on from there."""
+    tally = Tally()
+    for name, seed in (("sound", 5), ("other", 6)):
+        toy.train(folder / name, 3, seed=seed)
+    other, reference = folder / "other", toy.Reference()
+    before = _content(other)
+    cases = list(_swapped(folder, folder))
+    for name in _chosen(rng, cases, tries):
+        run_dir = folder / f"{tally.tries}"
+        shutil.copytree(folder / "sound", run_dir)
+        _swapped(run_dir / "checkpoints", other / "checkpoints")[name]()
+        tally.tries += 1
+        _judge_restored(tally, run_dir, reference, at_least=2, about=name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            _judge_resumed(tally, run_dir, reference, name)
+    if _content(other) != before:
+        tally.lost += 1
+        tally.remarks.append("the other run has changed")
+    return tally
+
+
+def _judge_resumed(tally: Tally, run_dir: Path, reference: toy.Reference, about: str) -> None:
+    """Counts a run that does not go on, or not to the right numbers."""
+    try:
+        summary = toy.train(run_dir, 2, resume=True)
+    except Exception as error:
+        tally.lost += 1
+        tally.remarks.append(f"{about}: resumed, {type(error).__name__}: {error}")
+        return
+    if found := toy.fault_of(run_dir, reference, summary.step):
+        tally.lost += 1
+        tally.remarks.append(f"{about}: resumed, {found}")
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder."""
+    paths = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+@fault("two resumes at once", tries=10)
+def two_at_once(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """The second is refused; once the first is killed, another one goes on."""
+    tally = Tally()
+    run = _Run(folder / "run", tally)
+    for number in range(tries):
+        first = toy.Child(run.order(held=True))
+        first.listen(WORK, saves=1)
+        second = toy.Child(run.order(steps=1))
+        about = f"try {number}"
+        if not second.end(WORK):
+            tally.hangs += 1
+            tally.remarks.append(f"{about}: the second hung")
+        if second.error is None or "in use by process" not in second.error:
+            tally.silent += 1
+            tally.remarks.append(f"{about}: the second said {second.error!r}")
+        if rng.random() < 0.5:
+            first.go()
+        first.kill()
+        run.judge(first, about, killed=True)
+    return tally
+
+
+@fault("a loss or parameter that is not finite", tries=20)
+def not_finite(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """Training stops; the last good checkpoint stays the newest, and is what is restored."""
+    tally = Tally()
+    reference = toy.Reference()
+    for number in range(tries):
+        run_dir, step = folder / str(number), int(rng.integers(1, 4))
+        kind = ("loss", "parameter")[number % 2]
+        bad = toy.Losses(**{kind: step})
+        about = f"{kind} of step {step}"
+        tally.tries += 1
+        train = functools.partial(toy.train, run_dir, 6, bad=bad)
+        harness.refused(tally, about, train, TrainingError)
+        if found := toy.fault_of(run_dir, reference, step):
+            tally.lost += 1
+            tally.remarks.append(f"{about}: {found}")
+        if (newest := checkpoint.latest_step(run_dir)) != step:
+            tally.silent += 1
+            tally.remarks.append(f"{about}: step {newest} was saved")
+    return tally
+
+
+@fault("clock that goes backwards", tries=10)
+def clock(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """The wall clock and the counters jump; the run neither stops nor logs less than no time."""
+    tally = Tally()
+    reference = toy.Reference()
+    for number in range(tries):
+        run_dir, about = folder / str(number), f"try {number}"
+
+        def jumping() -> float:
+            return float(rng.uniform(-1e9, 2e9))
+
+        tally.tries += 1
+        with contextlib.ExitStack() as stack:
+            for name in ("time", "perf_counter", "monotonic") if number % 2 else ("time",):
+                stack.enter_context(mock.patch.object(time, name, jumping))
+            try:
+                toy.train(run_dir, 2)
+                toy.train(run_dir, 2, resume=True)
+            except Exception as error:
+                tally.tracebacks += 1
+                tally.remarks.append(f"{about}: {type(error).__name__}: {error}")
+        if found := toy.fault_of(run_dir, reference, 4):
+            tally.lost += 1
+            tally.remarks.append(f"{about}: {found}")
+    return tally
+
+
+@fault("read-only folders", tries=12)
+def read_only(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """A run that may not write says so in one line, and changes nothing."""
+    tally = Tally()
+    with tempfile.TemporaryDirectory() as name:  # pytest's own are closed to other users
+        base = Path(name)
+        base.chmod(0o755)
+        toy.train(base / "run", 2)
+        places = [base / "run", base / "run" / "checkpoints", base / "new"]
+        user = 65534 if os.geteuid() == 0 else None  # root writes anywhere
+        before = _content(base)
+        for number in range(tries):
+            place = places[number % len(places)]
+            run_dir = place if place.name == "new" else base / "run"
+            closed = base if place.name == "new" else place
+            mode = closed.stat().st_mode
+            closed.chmod(0o555)
+            child = toy.Child(toy.Order(run_dir, place.name != "new", steps=1, user=user))
+            ended = child.end(WORK)
+            closed.chmod(mode)
+            tally.tries += 1
+            _judge_refusal(tally, child, ended, f"{place.name} is read-only")
+        if _content(base) != before:
+            tally.lost += 1
+            tally.remarks.append("a file has changed")
+    return tally
+
+
+def _judge_refusal(tally: Tally, child: toy.Child, ended: bool, about: str) -> None:
+    if not ended:
+        tally.hangs += 1
+        tally.remarks.append(f"{about}: hung")
+    elif problem := child.problem(refused=True):
+        tally.tracebacks += 1
+        tally.remarks.append(f"{about}: {problem}")
+    elif child.error is None:
+        tally.silent += 1
+        tally.remarks.append(f"{about}: was not refused")
+
+
+NAMES = (
+    "a b",
+    "it's",
+    'say "so"',
+    "\u5b66\u4e60",
+    "\u00fcb\u00e9r",
+    "\U0001f916",
+    "$HOME;`x`",
+    "[a-z]*?",
+    "-rf",
+    "a#b%20&c",
+    "back\\slash",
+    "x" * 200,
+)
+
+
+@fault("paths with spaces, quotes and non-Latin letters", tries=len(NAMES))
+def odd_paths(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """A run in such a folder is trained, saved, resumed and restored as any other."""
+    tally = Tally()
+    reference = toy.Reference()
+    for name in _chosen(rng, list(NAMES), tries):
+        run_dir = folder / name / "run"
+        tally.tries += 1
+        try:
+            toy.train(run_dir, 1)
+        except Exception as error:
+            tally.tracebacks += 1
+            tally.remarks.append(f"{name}: {type(error).__name__}: {error}")
+            continue
+        _judge_resumed(tally, run_dir, reference, name)
+    return tally

@@ -1,0 +1,28 @@
+"""A tenth of the fault-injection suite; `make test-faults` injects all of it."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.faults import harness
+
+FAULTS = harness.load()
+
+
+@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.mjx
+def test_nothing_is_lost(name: str, tmp_path: Path):
+    """Claim: no fault loses data, is taken for good data, ends in a traceback or hangs."""
+    one = FAULTS[name]
+    try:
+        tally = harness.run(one, max(1, one.tries // harness.SHARE), tmp_path)
+    except harness.MissingToolError as error:
+        pytest.skip(str(error))
+    assert tally.tries
+    assert not tally.bad, tally.remarks
+
+
+def test_every_kind_of_failure_is_counted():
+    """Claim: the sum of a fault's failures has each of its four columns."""
+    for name in ("lost", "silent", "tracebacks", "hangs"):
+        assert harness.Tally(tries=3, **{name: 1}).bad == 1

@@ -1,0 +1,323 @@
+"""A training that compiles in a moment, and processes that run it.
+
+They are forked from one that has imported JAX but not started it: that saves the seconds of
+imports.
+"""
+
+import contextlib
+import dataclasses
+import json
+import multiprocessing
+import os
+import resource
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
+
+import jax  # isort: skip
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from csac_jax import presets
+from csac_jax.config import Config, TrainConfig
+from csac_jax.errors import FailedError, SettingsError
+from csac_jax.io import checkpoint
+from csac_jax.runtime import signals
+from csac_jax.training import loop
+from csac_jax.training.step import StepMetrics
+
+E = 3  # scenes
+LONG = 10_000 * E  # actions that no try comes to the end of
+
+
+@struct.dataclass
+class State:
+    """What a training has: keys, counters, numbers."""
+
+    key: jax.Array
+    step: jax.Array
+    total: jax.Array  # [4] float32
+    packed: jax.Array  # [64, 64] uint16
+
+
+def config(actions: int = LONG, seed: int = 5) -> Config:
+    """Chunks of one step, each of them saved."""
+    train = TrainConfig(scenes=E, actions=actions, learning_starts=4 * E, chunk=1, save_every=1)
+    return presets.smoke().change(train=dataclasses.asdict(train), seed=seed)
+
+
+def first_state(seed: int = 5) -> State:
+    """The state of step 0."""
+    zeros = jnp.zeros(4, jnp.float32), jnp.zeros((64, 64), jnp.uint16)
+    return State(jax.random.key(seed), jnp.int32(0), *zeros)
+
+
+def abstract_state() -> Any:
+    """What `checkpoint.restore` expects."""
+    return jax.eval_shape(first_state)
+
+
+class Losses(NamedTuple):
+    """Where numbers that are not finite enter, by step."""
+
+    loss: int = -1
+    parameter: int = -1
+
+
+SOUND = Losses()
+
+
+def compile_chunk(num_steps: int, bad: Losses = SOUND) -> Any:
+    """In place of `step.compile_chunk`."""
+
+    def step(state: State, _: None) -> tuple[State, StepMetrics]:
+        outcome = (jnp.arange(E, dtype=jnp.int32) + state.step) % 5
+        no, none = jnp.zeros(E, bool), jnp.zeros(E, jnp.int32)
+        loss = jnp.where(state.step == bad.loss, jnp.nan, 1.0).astype(jnp.float32)
+        total = state.total + state.step.astype(jnp.float32)
+        total = jnp.where(state.step == bad.parameter, jnp.nan, total)
+        packed = 3 * state.packed + jnp.arange(64, dtype=jnp.uint16)[None]
+        metrics = StepMetrics(
+            primitive=jnp.ones(E, jnp.int32),
+            outcome=outcome,
+            push_better=no,
+            cleared=none,
+            blocks_lost=none,
+            terminated=no,
+            truncated=no,
+            reward=outcome.astype(jnp.float32),
+            gap_disagrees=no,
+            contact_overflow=none,
+            physics_diverged=no,
+            learned=jnp.array(True),
+            critic_loss=loss,
+            actor_loss=loss,
+            td_error=loss,
+            q_mean=loss,
+            finite=jnp.isfinite(total).all(),
+        )
+        return State(state.key, state.step + 1, total, packed), metrics
+
+    return jax.jit(lambda state: jax.lax.scan(step, state, length=num_steps), donate_argnums=0)
+
+
+class Quiet:
+    """A reporter that keeps what is said; sets the stop flag after `stop_after` chunks."""
+
+    def __init__(self, stop: signals.Stop | None = None, stop_after: int | None = None) -> None:
+        self.stop, self.said, self.chunks = stop or signals.Stop(), [], 0
+        self._stop_after = stop_after
+
+    def say(self, text: str) -> None:
+        """Reporter."""
+        self.said.append(text)
+
+    def progress(self, record: loop.Record, total_actions: int, eta: float) -> None:
+        """Reporter."""
+        self.chunks += 1
+        if self.chunks == self._stop_after:
+            self.stop.signal = 15
+
+
+def train(
+    run_dir: Path,
+    steps: int,
+    resume: bool = False,
+    seed: int = 5,
+    bad: Losses = SOUND,
+    at: int | None = None,
+    init: Callable[[], Any] | None = None,
+) -> loop.Summary:
+    """Trains in this process for `steps` more steps, of a run that has no end."""
+    reporter = Quiet(stop_after=steps)
+    return loop.run(
+        config(seed=seed),
+        run_dir,
+        init or (lambda: first_state(seed)),
+        lambda num_steps: compile_chunk(num_steps, bad),
+        reporter,
+        reporter.stop,
+        resume,
+        at,
+    )
+
+
+def bits(state: State) -> bytes:
+    """All numbers of a state."""
+    leaves = jax.random.key_data(state.key), state.step, state.total, state.packed
+    return b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
+
+
+class Reference:
+    """The states and records of an uninterrupted run, by step."""
+
+    def __init__(self, seed: int = 5) -> None:
+        self._chunk, self._state = compile_chunk(1), first_state(seed)
+        self.states = [bits(self._state)]
+        self.outcomes: list[dict[str, int]] = []
+
+    def state(self, step: int) -> bytes:
+        """The numbers of the state of a step."""
+        while len(self.states) <= step:
+            self._state, metrics = self._chunk(self._state)
+            self.states.append(bits(self._state))
+            progress = loop.Progress(0.0, [])
+            record = loop.record_chunk(config(), len(self.states), metrics, progress, 1.0)[1]
+            self.outcomes.append(record.outcomes)
+        return self.states[step]
+
+
+def fault_of(run_dir: Path, reference: Reference, saved: int) -> str | None:
+    """What is wrong with a run of which `saved` was the last step whose save returned, if anything:
+    its newest sound checkpoint is that or a newer one, and has its state bit for bit; its log
+    reaches as far and has the right lines."""
+    if saved == 0 and checkpoint.latest_step(run_dir) is None:
+        return None
+    try:
+        state, _ = checkpoint.restore(run_dir, abstract_state())
+    except checkpoint.CheckpointError as error:
+        return f"step {saved} cannot be restored: {error}"
+    step = int(state.step)
+    if step < saved:
+        return f"step {saved} was saved, {step} is restored"
+    if bits(state) != reference.state(step):
+        return f"the state of step {step} differs"
+    return _log_fault(run_dir / "metrics.jsonl", reference, step)
+
+
+def _log_fault(log: Path, reference: Reference, step: int) -> str | None:
+    lines = [json.loads(line) for line in log.read_text().splitlines()[:step]]
+    wanted = [(i + 1, outcomes) for i, outcomes in enumerate(reference.outcomes[:step])]
+    return None if [(r["step"], r["outcomes"]) for r in lines] == wanted else "the log differs"
+
+
+@dataclasses.dataclass(frozen=True)
+class Order:
+    """What a process of its own is to do: train without end, or `steps` steps."""
+
+    run_dir: Path
+    resume: bool = False
+    seed: int = 5
+    steps: int = LONG
+    held: bool = False  # waits after its first save until it is told to go on
+    user: int | None = None  # whose rights it has
+    largest: int | None = None  # bytes of a file, from the second save on
+
+
+class Child:
+    """A process that carries out an order, and what it has said."""
+
+    def __init__(self, order: Order) -> None:
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([__name__])
+        self._pipe, theirs = context.Pipe()
+        self._stderr, their_stderr = context.Pipe()
+        arguments = (theirs, their_stderr, order)
+        self.process: Any = context.Process(target=_obey, args=arguments, daemon=True)
+        self.process.start()
+        theirs.close()
+        their_stderr.close()
+        self._errors = b""
+        self._reader = threading.Thread(target=self._drain, daemon=True)
+        self._reader.start()
+        self.saved = 0  # the last step whose save has returned
+        self.error: str | None = None  # the message of one that the command line shows in one line
+        self.traceback: str | None = None
+        self.done = False
+
+    def listen(self, until: float, saves: int | None = None) -> None:
+        """Takes what it says for `until` s, or until it has ended or saved so many times more."""
+        end = time.monotonic() + until
+        with contextlib.suppress(EOFError, ConnectionResetError):
+            while (left := end - time.monotonic()) > 0 and saves != 0:
+                if not self._pipe.poll(left):
+                    return
+                kind, value = self._pipe.recv()
+                setattr(self, kind, value)
+                if kind == "saved" and saves is not None:
+                    saves -= 1
+
+    def _drain(self) -> None:
+        with contextlib.suppress(OSError):
+            while part := os.read(self._stderr.fileno(), 65536):
+                self._errors += part
+
+    def problem(self, refused: bool, killed: bool = False) -> str | None:
+        """What is wrong with its answer, if anything: a traceback, an error where none may be, or
+        one of several lines, or silence."""
+        if self.traceback is not None:
+            return self.traceback
+        if self.error is not None and ("\n" in self.error or not refused):
+            return repr(self.error)
+        self._reader.join(5.0)
+        if b"Traceback" in self._errors:
+            return self._errors.decode(errors="replace").strip().splitlines()[-1]
+        said = self.done or self.error is not None or killed
+        return None if said else f"ended with {self.process.exitcode} and said nothing"
+
+    def go(self) -> None:
+        """Lets it go on that holds."""
+        self._pipe.send(None)
+
+    def end(self, limit: float) -> bool:
+        """Takes the rest of what it says; whether it ended within `limit` s. It is dead then."""
+        self.listen(limit)
+        self.process.join(max(limit / 10, 1.0))
+        hung = self.process.is_alive()
+        self.process.kill()
+        self.process.join()
+        self.listen(0.1)
+        return not hung
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        self.process.kill()
+        self.process.join()
+        self.listen(0.1)
+
+
+def _obey(pipe: Any, stderr: Any, order: Order) -> None:
+    """The main function of such a process."""
+    os.dup2(stderr.fileno(), 2)
+    stderr.close()
+    jax.config.update("jax_platforms", "cpu")
+    stop = signals.install()
+    if order.user is not None:
+        os.setresuid(order.user, order.user, order.user)
+    save = checkpoint.save
+
+    def saving(run_dir: Path, step: int, *rest: Any) -> Path:
+        folder = save(run_dir, step, *rest)
+        pipe.send(("saved", step))
+        if order.held and saving.first:  # type: ignore[attr-defined]
+            pipe.recv()
+        if order.largest is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (order.largest, resource.RLIM_INFINITY))
+        saving.first = False  # type: ignore[attr-defined]
+        return folder
+
+    saving.first = True  # type: ignore[attr-defined]
+    checkpoint.save = saving
+    warnings.simplefilter("ignore")
+    reporter = Quiet(stop, order.steps)
+    try:
+        loop.run(
+            config(seed=order.seed),
+            order.run_dir,
+            lambda: first_state(order.seed),
+            compile_chunk,
+            reporter,
+            stop,
+            order.resume,
+        )
+        pipe.send(("done", True))
+    except (SettingsError, FailedError, OSError) as error:
+        pipe.send(("error", str(error)))
+    except BaseException as error:
+        pipe.send(("traceback", f"{type(error).__name__}: {error}"))
