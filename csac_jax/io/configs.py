@@ -58,7 +58,7 @@ def _kind(name: str, stored: Any) -> Any:
     if name not in config.names(Config):
         raise ValueError(f"{name}: unknown setting")
     tag, _ = config.ALTERNATIVES.get(name, ("", ()))
-    if isinstance(stored, dict) and tag in stored:
+    if tag and isinstance(stored, dict) and tag in stored:
         return config.alternative_kind(name, stored[tag])
     return type(getattr(Config, name))
 

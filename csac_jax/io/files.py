@@ -109,9 +109,10 @@ def _record(line: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(record, dict):
         return None
-    numbers = {name: record.get(name) for name in ("step", "actions", "grasps_counted", "seconds")}
-    numbers["grasp_success"] = record.get("grasp_success") or 0.0  # None: no grasp yet
-    return record if all(map(_is_number, numbers.values())) else None
+    numbers = [record.get(name) for name in ("step", "actions", "grasps_counted", "seconds")]
+    success = record.get("grasp_success")
+    numbers += [] if success is None else [success]  # None: no grasp yet
+    return record if all(map(_is_number, numbers)) else None
 
 
 def _is_number(value: Any) -> bool:

@@ -187,8 +187,11 @@ def _evaluations(path: Path) -> list[Evaluation]:
     _check(record, _RECORD, "the file")
     for one in parts.values():
         _check(one, _METRICS, "a part")
-        for share in one.get("failures", {}).values():
+        shares = [one[name] for name in METRICS if one.get(name)]
+        for share in [*shares, *one.get("failures", {}).values()]:
             _check(share, _SHARE, "a share")
+            if not _SHARE.keys() <= share.keys():
+                raise ValueError("a share lacks its interval")
     config, policy, seed = content["config"], content["policy"], content.get("seed", 0)
     asked = path, config, variant(config), policy, suite
     return [Evaluation(*asked, part, seed, found, record) for part, found in parts.items()]
@@ -235,7 +238,7 @@ def command(one: RecordedRun | Evaluation) -> str:
         return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}"
     preset, algo, changed = one.variant
     flags = "".join(f" {_flag(name, value)}" for name, value in changed)
-    seed = f"--seed {one.config['seed']} --sim.physics {physics}"
+    seed = f"--seed {one.config.get('seed', 0)} --sim.physics {physics}"
     return f"csac-jax train {preset} --algo {algo} {seed}{flags}"
 
 

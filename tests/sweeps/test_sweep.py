@@ -228,7 +228,7 @@ def test_run_without_a_finite_loss_is_given_up(uninterrupted, tmp_path: Path):
     others are as they would be without it."""
     folder, listener = tmp_path / "run", Listener()
     result = _run(folder, listener, Programs(nan_run=1))
-    assert "a, seed 6: given up at step 12, a loss is not finite" in listener.said
+    assert "a, seed 6: given up at step 12, critic_loss is not finite" in listener.said
     assert [line["step"] for line in test_loop._log(folder / "a" / "seed-6")] == [4, 8]
     assert not (folder / "a" / "seed-6" / "checkpoints").exists()
     first = result.summary["settings"][0]
