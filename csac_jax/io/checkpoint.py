@@ -11,12 +11,17 @@ not at all. Orbax restores flipped bits and casts other dtypes silently. So ever
 against the manifest, and every leaf's shape and dtype against what the program expects.
 """
 
+import contextlib
+import functools
 import hashlib
 import itertools
+import logging
 import re
 import secrets
 import shutil
+import sys
 import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -208,8 +213,30 @@ def _root(run_dir: Path) -> Path:
     return Path(run_dir).resolve() / FOLDER
 
 
-def _checkpointer() -> ocp.Checkpointer:
-    return ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+@contextlib.contextmanager
+def _checkpointer() -> Iterator[ocp.Checkpointer]:
+    """Orbax's; it may raise, but not print tracebacks of what it raises as well.
+
+    Folders are made at once: where that fails in a thread of Orbax's, it waits for 5 minutes.
+    """
+    at_once = ocp.AsyncOptions(create_directories_asynchronously=False)
+    options = ocp.CompositeOptions(async_options=at_once)
+    logger, hook = logging.getLogger("absl"), sys.unraisablehook
+    was, logger.disabled = logger.disabled, True
+    sys.unraisablehook = functools.partial(_unraisable, hook)
+    try:
+        handler = ocp.CompositeCheckpointHandler(composite_options=options)
+        with ocp.Checkpointer(handler) as checkpointer:
+            yield checkpointer
+        sys.unraisablehook = hook  # not after an error: writes may still be on their way
+    finally:
+        logger.disabled = was
+
+
+def _unraisable(hook: Callable[[Any], object], unraisable: Any) -> None:
+    """Passes on what cannot be raised, but for writes that end after another one has failed."""
+    if "Event loop is closed" not in str(unraisable.exc_value):
+        hook(unraisable)
 
 
 def _read(folder: Path, **items: Any) -> Any:

@@ -35,6 +35,7 @@ from csac_jax.training import loop, memory
 PLAN = "sweep.json"
 SUMMARY = "summary.json"
 DONE = "done"
+RESERVED = ("", ".", "..", "groups", PLAN, SUMMARY, "train.json", lock.LOCK, lock.HOLDER)
 DIGEST = "sha256"  # key of the plan's own digest
 MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
 _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
@@ -153,13 +154,15 @@ def check_plan(plan: SweepPlan) -> None:
     if not isinstance(plan.seeds, int) or not 1 <= plan.seeds * len(plan.points) <= MOST_RUNS:
         raise ValueError(f"--seeds: 1 to {MOST_RUNS} runs in all, seeds times settings")
     for name in [point.name for point in plan.points]:
-        if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0"):
+        if not isinstance(name, str) or name in RESERVED or set(name) & set("/\\\0"):
             raise ValueError(f"{name!r} is no name of a folder")
 
 
 def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
-    """Raises ValueError where a run has begun with another config than the plan's."""
+    """Raises ValueError where a run has begun with another config than the plan's, or elsewhere."""
     for run in runs_of(plan):
+        if not (folder / run.folder).resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"{run.folder} is a link out of the sweep's folder")
         path = folder / run.folder / files.CONFIG
         if path.exists():
             names = configs.differences(configs.from_dict(files.read_object(path)), run.cfg)
