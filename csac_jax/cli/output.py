@@ -12,7 +12,7 @@ from csac_jax.io import files
 
 
 class _Unbroken:
-    """A stream that falls silent once it cannot be written: `head` has had enough, a disc is full."""
+    """A stream that falls silent once `head`, which reads it, has had enough, or a disc is full."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream

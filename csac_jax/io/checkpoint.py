@@ -224,13 +224,11 @@ def _checkpointer() -> Iterator[ocp.Checkpointer]:
     logger, hook = logging.getLogger("absl"), sys.unraisablehook
     was, logger.disabled = logger.disabled, True
     sys.unraisablehook = functools.partial(_unraisable, hook)
-    try:
-        handler = ocp.CompositeCheckpointHandler(composite_options=options)
-        with ocp.Checkpointer(handler) as checkpointer:
-            yield checkpointer
-        sys.unraisablehook = hook  # not after an error: writes may still be on their way
-    finally:
-        logger.disabled = was
+    handler = ocp.CompositeCheckpointHandler(composite_options=options)
+    with ocp.Checkpointer(handler) as checkpointer:
+        yield checkpointer
+    # Not after an error: its threads may still be on their way.
+    logger.disabled, sys.unraisablehook = was, hook
 
 
 def _unraisable(hook: Callable[[Any], object], unraisable: Any) -> None:
