@@ -119,7 +119,7 @@ def _cylinder_faces() -> Faces:
 
 # The offset of face f of a box is |normal_f| . half_size, which differs per scene.
 _BOX = np.concatenate([np.eye(3), -np.eye(3)]), np.zeros(6)
-_FACES = {
+FACES = {
     "box": _BOX,
     "arch": _BOX,
     "prism": _prism_faces(),
@@ -137,7 +137,7 @@ def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.
     slot, centre, half = parts(slots)
     normals = np.zeros((len(slot), MAX_FACES, 3), np.float32)
     nominal = np.full((len(slot), MAX_FACES), PADDING_OFFSET, np.float32)
-    for part, (normal, offset) in enumerate(_FACES[slots[i]] for i in slot):
+    for part, (normal, offset) in enumerate(FACES[slots[i]] for i in slot):
         normals[part, : len(normal)], nominal[part, : len(offset)] = normal, offset
     size = half_size[slot]  # [G, 3]
     from_centre = np.abs(normals) * (half * size)[:, None]

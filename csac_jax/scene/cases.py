@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
-from csac_jax.config import HeightmapConfig, SlotKind
+from csac_jax.config import MESH_KINDS, HeightmapConfig, SlotKind
 from csac_jax.scene import blocks, layout, model
 from csac_jax.scene.layout import Scene
 
@@ -200,16 +200,16 @@ def _check_places(case: Case, extent: float) -> None:
 
 def _corners(case: Case) -> list[list[np.ndarray]]:
     """Corners [V, 3] m of every part of every block in the world."""
-    scene, parts = case.scene, blocks.parts(case.slots)
-    normals, offsets = map(np.asarray, blocks.half_spaces(case.slots, scene.half_size))
+    scene, cube = case.scene, np.array([*itertools.product((-1.0, 1.0), repeat=3)])
     rotations = Rotation.from_quat(scene.quaternion, scalar_first=True)
     corners: list[list[np.ndarray]] = [[] for _ in case.slots]
-    for part, slot in enumerate(parts.slot):
-        faces = np.column_stack([normals[part], -offsets[part]])[
-            offsets[part] < blocks.PADDING_OFFSET
-        ]
-        inside = parts.centre[part] * scene.half_size[slot]
-        local = HalfspaceIntersection(faces, inside).intersections
+    for slot, centre, half in zip(*blocks.parts(case.slots), strict=True):
+        if case.slots[slot] in MESH_KINDS:
+            normals, offsets = blocks.FACES[case.slots[slot]]
+            faces = np.column_stack([normals, -offsets])
+            local = HalfspaceIntersection(faces, np.zeros(3)).intersections
+        else:
+            local = scene.half_size[slot] * (centre + half * cube)
         corners[slot].append(rotations[slot].apply(local) + scene.position[slot])
     return corners
 

@@ -149,9 +149,8 @@ def test_rays_along_the_axes_agree_with_mujoco(kind):
     """Claim: rays parallel to a geom's axis or faces, where a slab gives 0 / 0, are told apart
     rightly too."""
     rng = np.random.default_rng(2)
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><worldbody><geom type="{kind.value}" size="0.05 0.03 0.02"/></worldbody></mujoco>'
-    )
+    geom = f'<geom type="{kind.name.lower()}" size="0.05 0.03 0.02"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geom}</worldbody></mujoco>")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     direction = np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 100, axis=0).astype(np.float32)
