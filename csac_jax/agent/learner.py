@@ -54,7 +54,8 @@ class Learner(abc.ABC):
     ) -> Action:
         """An action for every observation, leaves [E, ...].
 
-        Args: steps_without_change [E] int32; actions_taken [] int32 so far, or None: no exploring.
+        Args: steps_without_change [E] int32; actions_taken [] int32 by the whole run, which
+        exploration decays with, or None for the policy without exploration.
         """
 
     @abc.abstractmethod
@@ -64,7 +65,7 @@ class Learner(abc.ABC):
         """One update on a batch, leaves [B, ...], whose losses count by `weights` [B]."""
 
     def end_step(self, state: Any, obs: Observation) -> tuple[Any, jax.Array]:
-        """Ends a step with `obs` [B, ...] of its last batch: state, as it is by default, loss."""
+        """After a step's updates, with `obs` [B, ...] of the last batch: new state and loss."""
         return state, jnp.zeros(())
 
     def reward(
