@@ -137,8 +137,7 @@ def train_step(
     transition = Transition(before, action, reward, seen, after.terminated)
     replay = ring.add(state.replay, transition, ~info.physics_diverged)
 
-    # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch would cost more
-    # than those few updates.
+    # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch costs more.
     ready = taken + cfg.train.scenes >= cfg.train.learning_starts
     done = _updates_done(cfg, state.step)
     learned, priority, losses = _learn(program, key_learn, state.learner, replay, done)
