@@ -5,14 +5,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from csac_jax.config import Config
 from csac_jax.io import files
 
 
 class _Unbroken:
-    """A stream that falls silent once whoever read it, such as `head`, has had enough."""
+    """A stream that falls silent once `head`, which reads it, has had enough, or a disc is full."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -26,16 +26,24 @@ class _Unbroken:
     def _tried(self, call: Callable[[], Any]) -> Any:
         try:
             return call()
-        except BrokenPipeError:
+        except OSError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
 
+def _nowhere(number: int) -> TextIO:
+    """A stream in place of stdout or stderr that the process began without. It takes their number,
+    else the next file that is opened would get what libraries print."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+    return open(number, "w", closefd=False)
+
+
 @contextlib.contextmanager
 def unbroken() -> Iterator[None]:
     """In the block a closed pipe silences stdout or stderr, and the work goes on."""
+    sys.stdout, sys.stderr = sys.stdout or _nowhere(1), sys.stderr or _nowhere(2)
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = map(_Unbroken, before)
     try:

@@ -14,8 +14,7 @@ target task only the target counts as a block.
 `action_efficiency_completed`  mean of blocks at the start / actions over the episodes of
                                `completion`: VPG's "action efficiency" (Zeng et al. 2018, sec. VI).
 
-The efficiencies are blocks per action and no shares: a grasp that lifts two blocks at once takes
-both, so they can exceed 1.
+The efficiencies are no shares: a grasp that lifts two blocks takes both, so they can exceed 1.
 
 `failures` are shares too, see `_failures`. `outcomes` counts grasps by outcome. `counts` holds
 episodes, blocks, pushes, grasps, and blocks taken and lost.

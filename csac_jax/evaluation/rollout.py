@@ -176,7 +176,7 @@ def endings(cfg: Config, last: State) -> np.ndarray:
 
 def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: Scene) -> State:
     """The first states of the episodes `numbers` [E] in `scenes` [E, ...]."""
-    keys = _keys(key, numbers)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
     placed = jax.vmap(env.randomise_pose)(keys, jax.tree.map(jnp.asarray, scenes))
     return jax.vmap(env.reset_to)(placed, keys)
 
@@ -186,7 +186,8 @@ def _step(
 ) -> tuple[State, Episodes]:
     """One action in every scene and what it did, [E], 0 after the end; finished scenes stay."""
     running = ~states.done
-    action = policies.act(policy, states, _keys(key, numbers))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
+    action = policies.act(policy, states, keys)
     after = jax.vmap(env.step)(states, action)
     info, has_target = after.info, env.cfg.task.kind == "target"
     target_lost = (after.terminated & (after.reward == 0.0)).astype(jnp.int32)
@@ -202,8 +203,3 @@ def _step(
     record = jax.tree.map(lambda leaf: jnp.where(running, leaf, jnp.zeros_like(leaf)), record)
     keep = jax.vmap(jnp.where)
     return jax.tree.map(lambda new, old: keep(running, new, old), after, states), record
-
-
-def _keys(key: jax.Array, numbers: jax.Array) -> jax.Array:
-    """A key for each episode of these numbers [E]."""
-    return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)

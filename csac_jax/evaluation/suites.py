@@ -12,7 +12,6 @@ a path             the user's case file.
 Training draws from stream 0 of random numbers, a suite from stream 1 + seed; no case is in
 training. Dropped and drawn blocks have SceneConfig's default sizes and materials. Every scene is
 turned by a random yaw, or by quarters where another turn would take a block out of the workspace.
-Dropped suites allow 2.5 actions per block, or as many as in training if that is more.
 """
 
 import dataclasses
@@ -95,7 +94,7 @@ def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN.sim) -> Config:
 
 
 def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config:
-    """The config with these blocks in play, of default sizes, and actions enough to take them."""
+    """The config with these blocks in play, of default sizes, and 2.5 actions for each or more."""
     actions = max(cfg.task.max_actions, len(slots) * 5 // 2)
     scene = SceneConfig(slots=slots, min_blocks=len(slots))
     return _wide(cfg, scene, sim).change(task={"max_actions": actions})

@@ -11,12 +11,17 @@ not at all. Orbax restores flipped bits and casts other dtypes silently. So ever
 against the manifest, and every leaf's shape and dtype against what the program expects.
 """
 
+import contextlib
+import functools
 import hashlib
 import itertools
+import logging
 import re
 import secrets
 import shutil
+import sys
 import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +65,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
         items = ocp.args.Composite(
             state=ocp.args.StandardSave(arrays),
             config=ocp.args.JsonSave(configs.to_dict(cfg)),
-            extra=ocp.args.JsonSave(
-                {**record, "run": _run_name(root), "versions": provenance.versions()}
-            ),
+            extra=ocp.args.JsonSave(record),
         )
         with _checkpointer() as checkpointer:
             checkpointer.save(draft, args=items)
@@ -188,9 +191,9 @@ def _clean(root: Path) -> None:
 def _name_run(root: Path) -> str:
     """The name of the run that saves here; a new one where there is none."""
     if cluster.is_first() and _run_name(root) is None:
-        steps = _steps(root.parent)
-        saved = files.read_object(root / str(steps[-1]) / "extra" / "metadata") if steps else {}
-        name = saved.get("run") or secrets.token_hex(8)
+        sound = (root / str(step) for step in _steps(root.parent)[::-1])
+        saved = next((_record(folder) for folder in sound if _fault(folder) is None), {})
+        name = str(saved.get("run") or secrets.token_hex(8))
         files.replace(root / _RUN, f"{name} {hashlib.sha256(name.encode()).hexdigest()}")
     cluster.wait(f"named {root}")
     return _run_name(root) or ""
@@ -208,8 +211,28 @@ def _root(run_dir: Path) -> Path:
     return Path(run_dir).resolve() / FOLDER
 
 
-def _checkpointer() -> ocp.Checkpointer:
-    return ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+@contextlib.contextmanager
+def _checkpointer() -> Iterator[ocp.Checkpointer]:
+    """Orbax's; it may raise, but not print tracebacks of what it raises as well.
+
+    Folders are made at once: where that fails in a thread of Orbax's, it waits for 5 minutes.
+    """
+    at_once = ocp.AsyncOptions(create_directories_asynchronously=False)
+    options = ocp.CompositeOptions(async_options=at_once)
+    logger, hook = logging.getLogger("absl"), sys.unraisablehook
+    was, logger.disabled = logger.disabled, True
+    sys.unraisablehook = functools.partial(_unraisable, hook)
+    handler = ocp.CompositeCheckpointHandler(composite_options=options)
+    with ocp.Checkpointer(handler) as checkpointer:
+        yield checkpointer
+    # Not after an error: its threads may still be on their way.
+    logger.disabled, sys.unraisablehook = was, hook
+
+
+def _unraisable(hook: Callable[[Any], object], unraisable: Any) -> None:
+    """Passes on what cannot be raised, but for writes that end after another one has failed."""
+    if "Event loop is closed" not in str(unraisable.exc_value):
+        hook(unraisable)
 
 
 def _read(folder: Path, **items: Any) -> Any:
@@ -260,6 +283,14 @@ def _typed(array: Any, leaf: Any) -> Any:
     return jax.random.wrap_key_data(array, impl=impl)
 
 
+def _record(folder: Path) -> dict[str, Any]:
+    """What a step says of itself. Raises ValueError where that is not what `save` writes, OSError."""
+    record = files.read_object(folder / "extra" / "metadata")
+    if not all(isinstance(record.get(name), dict) for name in ("layout", "extra")):
+        raise ValueError("it is no checkpoint of csac_jax")
+    return record
+
+
 def _digests(folder: Path) -> dict[str, str]:
     """SHA-256 of each file of a step but the manifest."""
     digests = {}
@@ -279,7 +310,7 @@ def _fault(folder: Path) -> str | None:
         for name in sorted(wanted.keys() | found.keys()):
             if found.get(name) != wanted.get(name):
                 return f"is damaged ({name} {'has changed' if name in found else 'is missing'})"
-        record = files.read_object(folder / "extra" / "metadata")
+        record = _record(folder)
         run = _run_name(folder.parent)
     except (FileNotFoundError, NotADirectoryError):
         return "is missing or half-written (it has no manifest)"

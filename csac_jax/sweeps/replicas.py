@@ -163,8 +163,7 @@ class SweepProgram:
         """The state of one replica, as `train` has it, on every device."""
         if self.mesh is None:
             return replica(state, index)
-        everywhere = NamedSharding(self.mesh, _WHOLE)
-        return jax.jit(replica, out_shardings=everywhere)(state, index)
+        return jax.jit(replica, out_shardings=NamedSharding(self.mesh, _WHOLE))(state, index)
 
     def _jitted_init(self) -> Any:
         def init_one(replica: Replicas) -> TrainState:
@@ -218,7 +217,8 @@ class Pipelined:
 
     def lower(self, state: TrainState) -> "Pipelined":
         first = jax.eval_shape(lambda state: _split(state, self.parts)[0], state)
-        return dataclasses.replace(self, program=self.program.lower(first, self._shares()[0]))
+        share, *_ = _in_parts(self.replicas, self.parts)
+        return dataclasses.replace(self, program=self.program.lower(first, share))
 
     def compile(self) -> "Pipelined":
         return dataclasses.replace(self, program=self.program.compile())
@@ -236,22 +236,20 @@ class Pipelined:
             return jax.block_until_ready(self.program(state, share))
 
         with ThreadPoolExecutor(1 if jax.default_backend() == "cpu" else self.parts) as threads:
-            return _join(list(threads.map(run, states, self._shares())))
-
-    def _shares(self) -> list[Replicas]:
-        slices = _slices(len(self.replicas.seed), self.parts)
-        return [jax.tree.map(lambda leaf, part=part: leaf[part], self.replicas) for part in slices]
+            return _join(list(threads.map(run, states, _in_parts(self.replicas, self.parts))))
 
 
-def _slices(num: int, parts: int) -> list[slice]:
-    return [slice(first, first + num // parts) for first in range(0, num, num // parts)]
+def _in_parts(tree: Any, parts: int) -> list[Any]:
+    """Equal parts of leaves [S, ...]."""
+    split = jax.tree.map(lambda leaf: leaf.reshape(parts, -1, *leaf.shape[1:]), tree)
+    return [jax.tree.map(lambda leaf, k=k: leaf[k], split) for k in range(parts)]
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _split(state: TrainState, parts: int) -> list[TrainState]:
     """The states of equal parts, copied."""
-    slices = _slices(len(state.key), parts)
-    return [jax.tree.map(jnp.copy, replica(state, part)) for part in slices]
+    split = _in_parts(state.replace(step=()), parts)
+    return [jax.tree.map(jnp.copy, part.replace(step=state.step)) for part in split]
 
 
 @jax.jit
@@ -264,7 +262,7 @@ def _join(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, S
     return joined.replace(step=states[0].step), all_metrics
 
 
-def replica(state: TrainState, index: int | slice) -> TrainState:
-    """The state of one replica, as `train` has it, or of several."""
+def replica(state: TrainState, index: int) -> TrainState:
+    """The state of one replica, as `train` has it."""
     own = jax.tree.map(lambda leaf: leaf[index], state.replace(step=()))
     return own.replace(step=state.step)

@@ -37,6 +37,7 @@ from csac_jax.training import loop, memory
 PLAN = "sweep.json"
 SUMMARY = "summary.json"
 DONE = "done"
+RESERVED = ("groups", PLAN, SUMMARY, "train.json")  # in the sweep's folder
 DIGEST = "sha256"  # key of the plan's own digest
 _NAME = re.compile(rf"[^./\\][^/\\]{{0,{grid.LONGEST - 1}}}")  # of a folder inside the sweep
 _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
@@ -161,15 +162,17 @@ def check_plan(plan: SweepPlan) -> None:
     for name in names:
         if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.isprintable():
             raise ValueError(f"{shown(name)} is no name of a folder")
-        if name == "groups":
-            raise ValueError("the name 'groups' is taken by the sweep's own folder")
+        if name in RESERVED:
+            raise ValueError(f"the name '{name}' is taken by the sweep's own files")
     if len(set(names)) < len(names):
         raise ValueError("two settings have the same name")
 
 
 def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
-    """Raises ValueError where a run has begun with another config than the plan's."""
+    """Raises ValueError where a run has begun with another config than the plan's, or elsewhere."""
     for run in runs_of(plan):
+        if not (folder / run.folder).resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"{run.folder} is a link out of the sweep's folder")
         path = folder / run.folder / files.CONFIG
         if path.exists():
             names = configs.differences(configs.from_dict(files.read_object(path)), run.cfg)

@@ -232,7 +232,6 @@ def _lost_loss(run_dir: Path, name: str, step: int) -> str:
 
 
 def _doubt(cfg: Config, record: Record) -> str | None:
-    """What to say of a chunk in which physics failed too often."""
     diverged, actions = record.physics_diverged, cfg.train.chunk * cfg.train.scenes
     if diverged <= max(DIVERGED_SHARE * actions, 1.0):
         return None

@@ -138,12 +138,12 @@ def train_step(
     transition = Transition(before, action, reward, seen, after.terminated)
     replay = ring.add(state.replay, transition, ~info.physics_diverged)
 
-    # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch would cost more
-    # than those few updates.
+    # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch costs more.
     ready = taken + cfg.train.scenes >= cfg.train.learning_starts
-    learned, priority, losses = _learn(program, key_learn, state.learner, replay, state.step)
+    done = _updates_done(cfg, state.step)
+    learned, priority, losses = _learn(program, key_learn, state.learner, replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
-    priority = jnp.where(ready, priority, replay.priority)
+    replay = replay.replace(priority=jnp.where(ready, priority, replay.priority))
 
     # Replace finished scenes.
     fresh = jax.vmap(env.auto_reset)(_keys(key_reset, cfg.train.scenes), after)
@@ -165,7 +165,6 @@ def train_step(
         finite=_is_finite(learned),
         **losses,
     )
-    replay = replay.replace(priority=priority)
     return TrainState(state.key, state.step + 1, scenes, learned, replay), metrics
 
 
@@ -184,26 +183,21 @@ def action_result(action: Action, info: environment.Info) -> ActionResult:
 
 
 def _learn(
-    program: Program, key: jax.Array, state: Any, replay: ReplayState, step: jax.Array
+    program: Program, key: jax.Array, state: Any, replay: ReplayState, done: jax.Array
 ) -> tuple[Any, jax.Array, dict[str, jax.Array]]:
-    """The updates of training step `step` [], each on a batch of its own, then the end of the step
-    on (part of) the last."""
-    cfg, learner, sampler = program.cfg, program.learner, program.sampler
+    """The updates after `done` [] others, each on a batch of its own, then the end of the step on
+    (part of) the last."""
+    cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
-    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1  # step whose updates count
-    done = jnp.maximum(step - first, 0) * cfg.learn.updates
 
     def update(carry, i):
         state, priority = carry
-        key_sample, key_augment, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
+        *keys_draw, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
         progress = (done + i).astype(jnp.float32) / total
         current = replay.replace(priority=priority)
-        slots, weights = sampler.sample(key_sample, current, progress, cfg.learn.batch)
-        batch = sharding.shard_batch(program.mesh, ring.gather(current, slots))
-        keys = _keys(key_augment, cfg.learn.batch)
-        batch = jax.vmap(augment.augment, (0, None, 0))(keys, cfg, batch)
+        slots, weights, batch = _draw(program, keys_draw, current, progress)
         state, info = learner.update(key_update, state, batch, weights)
-        current = sampler.update(current, slots, info.error)
+        current = program.sampler.update(current, slots, info.error)
         return (state, current.priority), (info, batch.obs)
 
     start, numbers = (state, replay.priority), jnp.arange(cfg.learn.updates)
@@ -223,6 +217,21 @@ def _is_finite(tree: Any) -> jax.Array:
     """Whether every floating number of a pytree is finite, [] bool."""
     floats = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))
+
+
+def _updates_done(cfg: Config, step: jax.Array) -> jax.Array:
+    """Updates [] int32 before training step `step` [] that were not dropped."""
+    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1
+    return jnp.maximum(step - first, 0) * cfg.learn.updates
+
+
+def _draw(program: Program, keys: Any, replay: ReplayState, progress: jax.Array) -> tuple[Any, ...]:
+    """A batch as the sampler has it, augmented: slots [B], weights [B], leaves [B, ...]."""
+    cfg, (key_sample, key_augment) = program.cfg, keys
+    slots, weights = program.sampler.sample(key_sample, replay, progress, cfg.learn.batch)
+    batch = sharding.shard_batch(program.mesh, ring.gather(replay, slots))
+    augmented = jax.vmap(augment.augment, (0, None, 0))
+    return slots, weights, augmented(_keys(key_augment, cfg.learn.batch), cfg, batch)
 
 
 def _keys(key: jax.Array, num: int) -> jax.Array:

@@ -47,6 +47,7 @@ class Fault:
     name: str
     tries: int  # of the whole suite
     inject: Callable[[np.random.Generator, int, Path], Tally]
+    slow: bool = False  # compiles the real training: no part of it is in `make test`
 
 
 FAULTS: dict[str, Fault] = {}
@@ -69,11 +70,11 @@ def run(one: Fault, tries: int, folder: Path) -> Tally:
     return one.inject(np.random.default_rng(zlib.crc32(one.name.encode())), tries, folder)
 
 
-def fault(name: str, tries: int) -> Callable[..., Callable[..., Tally]]:
+def fault(name: str, tries: int, slow: bool = False) -> Callable[..., Callable[..., Tally]]:
     """Registers a function as the fault `name`, which the whole suite injects `tries` times."""
 
     def register(inject: Callable[..., Tally]) -> Callable[..., Tally]:
-        FAULTS[name] = Fault(name, tries, inject)
+        FAULTS[name] = Fault(name, tries, inject, slow)
         return inject
 
     return register

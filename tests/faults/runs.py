@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import os
 import re
 import shutil
@@ -11,14 +12,21 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from csac_jax import presets
 from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint
+from csac_jax.sweeps import runner
+from csac_jax.sweeps.grid import SweepPoint
+from csac_jax.training import loop, step
 from csac_jax.training.loop import TrainingError
-from tests.faults import harness, toy
+from tests.faults import harness, toy, toy_cli
 from tests.faults.harness import MissingToolError, Tally, fault
 
 WORK = 60.0  # s: what starting a process and its saves may take on a busy machine
@@ -167,7 +175,8 @@ def disc_full(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
     for name, number in _chosen(rng, calls, tries):
         child = toy.Child(run.order(held=True, steps=2))
         child.listen(WORK, saves=1)
-        inject = f"inject={name}:error=ENOSPC:when={number}+"
+        since = "" if name == "openat" else "+"  # to clean up is to open folders
+        inject = f"inject={name}:error=ENOSPC:when={number}{since}"
         with _strace(child.process.pid, "-o", "/dev/null", "-e", f"trace={name}", "-e", inject):
             child.go()
             ended = child.end(WORK)
@@ -374,19 +383,15 @@ def not_finite(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
 
 @fault("clock that goes backwards", tries=10)
 def clock(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """The wall clock and the counters jump; the run neither stops nor logs less than no time."""
+    """At each look the wall clock shows an earlier time; the run goes on and its log is whole."""
     tally = Tally()
     reference = toy.Reference()
     for number in range(tries):
         run_dir, about = folder / str(number), f"try {number}"
 
-        def jumping() -> float:
-            return float(rng.uniform(-1e9, 2e9))
-
+        now = itertools.accumulate(rng.exponential(600.0, 100_000), lambda a, b: a - b, initial=2e9)
         tally.tries += 1
-        with contextlib.ExitStack() as stack:
-            for name in ("time", "perf_counter", "monotonic") if number % 2 else ("time",):
-                stack.enter_context(mock.patch.object(time, name, jumping))
+        with mock.patch.object(time, "time", functools.partial(next, now)):
             try:
                 toy.train(run_dir, 2)
                 toy.train(run_dir, 2, resume=True)
@@ -471,3 +476,244 @@ def odd_paths(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
             continue
         _judge_resumed(tally, run_dir, reference, name)
     return tally
+
+
+@fault("closed pipe, full or missing stdout", tries=12)
+def closed_pipe(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """`train ... | head -1` and the like: the run goes on, is saved and its result is written."""
+    tally = Tally()
+    reference = toy.Reference()
+    steps = 6
+    ends = ["head", "true", "/dev/full", ">&-", "2>&-", "2>/dev/full"]
+    for number in range(tries):
+        end, run_dir = ends[number % len(ends)], folder / f"run {number}"
+        tally.tries += 1
+        answer = _with_stdout(end, run_dir, folder / f"{number}.json", steps)
+        about = f"stdout is {end}"
+        harness.judge(tally, answer, about)
+        found = toy.fault_of(run_dir, reference, steps)
+        written = (run_dir / "train.json", folder / f"{number}.json")
+        if found is None and not all(path.is_file() for path in written):
+            found = "there is no result"
+        if found:
+            tally.lost += 1
+            tally.remarks.append(f"{about}: {found}; {answer.code} {answer.errors[-300:]!r}")
+    return tally
+
+
+def _with_stdout(end: str, run_dir: Path, result: Path, steps: int) -> harness.Answer:
+    """The command line's answer where its output ends so."""
+    options = ["smoke", "--run-dir", str(run_dir), "--json", str(result), "--seed", "5"]
+    options += ["--train.actions", str(steps * toy.E), *toy_cli.OPTIONS]
+    arguments = ["-m", "tests.faults.toy_cli", "train", *options]
+    if ">" in end:  # a shell closes it
+        shell = ["sh", "-c", f'exec "$@" {end}', "sh"]
+        return harness.command(arguments, WORK, prefix=shell)
+    if end == "/dev/full":
+        return harness.command(arguments, WORK, prefix=["sh", "-c", 'exec "$@" >/dev/full', "sh"])
+    process = harness.start(arguments)
+    assert process.stdout is not None
+    if end == "head":
+        process.stdout.readline()
+    process.stdout.close()
+    process.stdout = None
+    return harness.wait(process, WORK)
+
+
+IMPORT_IN_THREAD = """
+import threading, warnings
+found = []
+def work():
+    import csac_jax
+    from tests.faults import toy
+    from pathlib import Path
+    found.append(toy.train(Path({run!r}), 2).step)
+thread = threading.Thread(target=work)
+thread.start()
+thread.join()
+print(found)
+"""
+FORK_BEFORE = """
+import os
+import csac_jax
+from pathlib import Path
+from tests.faults import toy
+if os.fork() == 0:
+    toy.train(Path({run!r}), 2)
+    os._exit(0)
+print([2] if os.wait()[1] == 0 else os.wait())
+"""
+FORK_AFTER = """
+import os, sys
+import csac_jax
+from pathlib import Path
+from tests.faults import toy
+step = toy.train(Path({run!r}), 2).step
+sys.stdout.flush()
+if os.fork() == 0:
+    os._exit(0)
+assert os.wait()[1] == 0
+toy.train(Path({run!r}), 1, resume=True)
+print([step])
+"""
+
+
+@fault("fork, and import in a thread", tries=6)
+def fork_and_thread(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """Training works in a thread that imports the package, and in a child forked before JAX has
+    started; a child forked later, that leaves JAX alone, does no harm."""
+    tally = Tally()
+    sources = [IMPORT_IN_THREAD, FORK_BEFORE, FORK_AFTER]
+    for number in range(tries):
+        run_dir = folder / str(number)
+        source = sources[number % len(sources)].format(run=str(run_dir))
+        tally.tries += 1
+        answer = harness.command(["-c", source], WORK)
+        about = ("import in a thread", "fork before", "fork after")[number % len(sources)]
+        harness.judge(tally, answer, about)
+        if answer.code != 0 or "[2]" not in answer.output:
+            tally.lost += 1
+            tally.remarks.append(f"{about}: {answer.code} {answer.errors[-300:]!r}")
+        elif found := toy.fault_of(run_dir, toy.Reference(), 2):
+            tally.lost += 1
+            tally.remarks.append(f"{about}: {found}")
+    return tally
+
+
+VICTIMS = (
+    "../victim",
+    "..",
+    ".",
+    "",
+    "/",
+    "../victim/",
+    "a/../../victim",
+    "{root}/victim",
+    "a\0b",
+    None,
+    7,
+    ["a"],
+    "groups",
+    "sweep.json",
+    "link",
+    "..\\victim",
+)
+
+
+@fault("names of sweeps that lead elsewhere", tries=len(VICTIMS))
+def sweep_names(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """`sweep --resume` refuses a sweep.json with such a name, whatever its digest, or stays within
+    its own folder."""
+    tally = Tally()
+    for name in _chosen(rng, list(VICTIMS), tries):
+        own = folder / str(tally.tries)
+        victim, sweep = own / "victim", own / "sweep"
+        for seed in (5, 6):
+            toy.train(victim / f"seed-{seed}", 3, seed=seed)
+        sweep.mkdir()
+        (sweep / "link").symlink_to(victim)
+        before = _content(victim)
+        shown = name.format(root=own) if isinstance(name, str) else name
+        point = SweepPoint(shown, {}, toy.config())  # type: ignore[arg-type]
+        (sweep / "sweep.json").write_text(runner.plan_text(runner.SweepPlan(2, [point])))
+        tally.tries += 1
+        about = f"name {name!r}"
+
+        def resume(sweep: Path = sweep) -> None:
+            plan = runner.read_plan(sweep)
+            reporter = toy.Quiet(stop_after=2)
+            runner.run(plan, sweep, _sweep_program, reporter, reporter.stop, resume=True)
+
+        harness.refused(tally, about, resume, runner.SweepError)
+        if _content(victim) != before:
+            tally.lost += 1
+            tally.remarks.append(f"{about}: the victim has changed")
+    return tally
+
+
+def _sweep_program(group: object) -> SimpleNamespace:
+    """In place of a `SweepProgram`, of two seeds."""
+
+    def init() -> toy.State:
+        states = [toy.first_state(seed) for seed in (5, 6)]
+        both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        return both.replace(step=jnp.int32(0))
+
+    axes = toy.State(key=0, step=None, total=0, packed=0)  # type: ignore[arg-type]
+
+    def compile_chunk(num_steps: int) -> object:
+        one = toy.compile_chunk(num_steps)
+        return jax.jit(jax.vmap(one, in_axes=(axes,), out_axes=(axes, 1)))
+
+    def replica(state: toy.State, index: int) -> toy.State:
+        return toy.State(state.key[index], state.step, state.total[index], state.packed[index])
+
+    return SimpleNamespace(
+        init=init,
+        compile_chunk=compile_chunk,
+        replica=replica,
+        abstract=lambda: jax.eval_shape(init),
+    )
+
+
+@fault("NaN in one of 64 scenes, in a reward, in a weight", tries=18, slow=True)
+def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
+    """The real training step. A scene's NaN stays there and is counted; NaN that reaches the
+    networks is told at once."""
+    tally = Tally()
+    cfg = presets.smoke().change(
+        sim={"physics": "c"},
+        replay={"capacity": 128},
+        train={"scenes": 64, "learning_starts": 64, "actions": 6400},
+    )
+    program = step.make(cfg)
+    compiled = step.compile_chunk(program, 1).lower(start := step.init(program)).compile()
+
+    def run(state: step.TrainState) -> tuple[step.TrainState, step.StepMetrics]:
+        state, metrics = compiled(jax.tree.map(jnp.copy, state))
+        return state, jax.device_get(metrics)
+
+    start, _ = run(start)
+    for number in range(tries):
+        kind = ("scene", "reward", "weight")[number % 3]
+        tally.tries += 1
+        state, told = _poisoned(rng, start, kind), None
+        for _ in range(20 if kind == "reward" else 1):  # until it is drawn
+            state, metrics = run(state)
+            if told := loop.not_finite(metrics):
+                break
+        sound = _finite(state.learner) and _finite(state.scenes)
+        expected = told is None if kind == "scene" else told is not None
+        diverged = int(metrics.physics_diverged.sum())
+        if sound != (told is None) or not expected or (kind == "scene" and diverged != 1):
+            tally.silent += 1
+            tally.remarks.append(f"NaN in a {kind}: told {told}, sound {sound}, {diverged} scenes")
+    return tally
+
+
+def _poisoned(rng: np.random.Generator, state: step.TrainState, kind: str) -> step.TrainState:
+    """The state with one NaN more."""
+
+    def spoilt(leaf: jax.Array) -> jax.Array:
+        flat = np.array(leaf)
+        flat.reshape(-1)[rng.integers(flat.size)] = np.nan
+        return jnp.asarray(flat)
+
+    if kind == "scene":
+        scene = state.scenes.scene
+        spoilt_scene = scene.replace(velocity=spoilt(scene.velocity))
+        return state.replace(scenes=state.scenes.replace(scene=spoilt_scene))
+    if kind == "reward":
+        items = state.replay.items
+        items = items._replace(reward=items.reward.at[int(rng.integers(64))].set(jnp.nan))
+        return state.replace(replay=state.replay.replace(items=items))
+    leaves, structure = jax.tree.flatten(state.learner)
+    floats = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    chosen = int(rng.choice(floats))
+    leaves[chosen] = spoilt(leaves[chosen])
+    return state.replace(learner=jax.tree.unflatten(structure, leaves))
+
+
+def _finite(tree: object) -> bool:
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)

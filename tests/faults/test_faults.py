@@ -9,7 +9,7 @@ from tests.faults import harness
 FAULTS = harness.load()
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", [name for name, one in FAULTS.items() if not one.slow])
 @pytest.mark.mjx
 def test_nothing_is_lost(name: str, tmp_path: Path):
     """Claim: no fault loses data, is taken for good data, ends in a traceback or hangs."""

@@ -141,10 +141,11 @@ def test_limit_of_speed_is_held_after_every_substep(
 
 
 def _rollouts(physics: CPhysics, rows: list[tuple]) -> list[Trajectory]:
-    """The trajectories of scenes, each in the simulator of a thread."""
+    """The trajectories of scenes, each in a simulator of its own meanwhile."""
 
     def one(row: tuple) -> Trajectory:
-        return c_physics._rollout(physics.world, physics._simulator, *row)
+        with physics._simulator() as simulator:
+            return c_physics._rollout(physics.world, simulator, *row)
 
     return list(physics._threads.map(one, rows))
 

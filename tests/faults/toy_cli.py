@@ -1,0 +1,33 @@
+"""The command line with the toy's training in place of the real one.
+
+python -m tests.faults.toy_cli train smoke ...
+"""
+
+import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
+
+import sys  # isort: skip
+
+from csac_jax import cli
+from csac_jax.config import Config
+from csac_jax.training import memory, step
+from tests.faults import toy
+
+OPTIONS = ("--train.scenes", f"{toy.E}", "--train.chunk", "1", "--train.save-every", "1")
+
+
+def _make(cfg: Config, **_: object) -> Config:
+    return cfg
+
+
+def _init(cfg: Config) -> toy.State:
+    return toy.first_state(cfg.seed)
+
+
+def _compile_chunk(cfg: Config, num_steps: int) -> object:
+    return toy.compile_chunk(num_steps)
+
+
+if __name__ == "__main__":
+    step.make, step.init, step.compile_chunk = _make, _init, _compile_chunk  # type: ignore
+    memory.check = lambda *_: None  # type: ignore
+    sys.exit(cli.main(sys.argv[1:]))
