@@ -23,10 +23,21 @@ def _config(settings: dict) -> Config:
     return presets.quick().change(**own, **sections)
 
 
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), 10**400])
+@pytest.mark.parametrize(
+    "name", ["learn.actor_learning_rate", "learn.learning_rate", "reward.success_bonus"]
+)
+def test_number_that_is_not_finite_is_refused(name: str, value: float):
+    """Claim: no setting is infinite, or larger than a float can be."""
+    with pytest.raises(ValueError, match=re.escape(name)) as caught:
+        _config({name: value})
+    assert len(str(caught.value)) < 150
+
+
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("scene.slots", [("box", "ball", "box", "box", "box")]),
+        ("scene.slots", [("box", "ball", "box", "box", "box"), ("box",) * 65]),
         ("scene.min_blocks", [0, 6]),
         ("scene.pool", [0]),
         ("scene.arranged", [-0.1, 1.1]),

@@ -274,3 +274,52 @@ def test_checker_lets_the_rest_pass(tmp_path: Path, file: str, source: str):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(source)
     assert violations(tmp_path) == []
+
+
+FORBIDDEN = ("pickle", "marshal", "shelve", "dill", "yaml", "eval", "exec", "os.system", "os.popen")
+
+
+def dangers(source: str) -> list[str]:
+    """What a source uses that could run what a file holds, or a shell."""
+    tree, aliases = ast.parse(source), {}
+    for node in ast.walk(tree):
+        aliases |= _aliases(node)
+    found = []
+    for node in ast.walk(tree):
+        names = _imported(node)
+        if isinstance(node, ast.Name | ast.Attribute):
+            names = [_full_name(node, aliases).removeprefix("builtins.")]
+        found += [name for name in names if any(_within(name, bad) for bad in FORBIDDEN)]
+        if isinstance(node, ast.keyword) and node.arg in ("shell", "allow_pickle"):
+            harmless = isinstance(node.value, ast.Constant) and node.value.value is False
+            found += [] if harmless else [f"{node.arg}="]
+    return found
+
+
+def test_nothing_is_executed():
+    """Claim: the package has no pickle, no eval, no exec, no YAML and no shell."""
+    every = {path: dangers(path.read_text()) for path in PACKAGE.rglob("*.py")}
+    assert len(every) > 100
+    assert not {path: found for path, found in every.items() if found}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "import yaml as y\ny.load(f)",
+        "eval('1')",
+        "x = exec",
+        "import os\nos.system('ls')",
+        "from os import system\nsystem('ls')",
+        "import builtins\nbuiltins.eval('1')",
+        "import subprocess\nsubprocess.run('ls', shell=True)",
+        "import subprocess\nsubprocess.run('ls', shell=x)",
+        "import numpy as np\nnp.load(f, allow_pickle=True)",
+    ],
+)
+def test_dangers_are_found(source: str):
+    """Claim: the test above can fail."""
+    assert dangers(source)
+    assert not dangers("import subprocess, re\nsubprocess.run(['ls'], shell=False)\nre.compile('')")

@@ -284,7 +284,7 @@ def _typed(array: Any, leaf: Any) -> Any:
 
 
 def _record(folder: Path) -> dict[str, Any]:
-    """What a step says of itself. Raises ValueError where that is not what `save` writes, OSError."""
+    """What a step says of itself. Raises OSError, and ValueError for what `save` never wrote."""
     record = files.read_object(folder / "extra" / "metadata")
     if not all(isinstance(record.get(name), dict) for name in ("layout", "extra")):
         raise ValueError("it is no checkpoint of csac_jax")

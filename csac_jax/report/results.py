@@ -33,7 +33,8 @@ METRICS = {
 
 Json = dict[str, Any]
 
-_TEXT, _NUMBER = (str, type(None)), (int, float, type(None))
+_TEXT: Any = (str, type(None))
+_NUMBER: Any = (int, float, type(None))
 _SHARE = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int}
 _CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "robot": str}}
 _RECORD = {"device": _TEXT, "versions": (dict, type(None)), "commit": _TEXT}

@@ -5,6 +5,7 @@ import io
 import os
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -213,3 +214,50 @@ def test_watchdog_barks(capsys: pytest.CaptureFixture, monkeypatch: pytest.Monke
         assert barked.wait(30.0)
     assert codes == [1]
     assert capsys.readouterr().err == "csac-jax: it hangs\n"
+
+
+@pytest.mark.parametrize("columns", ["0", "00", "-5", "x", ""])
+def test_help_is_printed_on_any_terminal(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, columns: str
+):
+    """Claim: a terminal that says it has no columns, or none that are a number, shows the help."""
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["train", "smoke", "--help-all"])
+    shown = capsys.readouterr().out
+    assert ended.value.code in (0, None)
+    assert "--learn.tau" in shown
+
+
+def test_learning_rate_must_be_finite(capsys: pytest.CaptureFixture):
+    """Claim: an infinite step size is one line that names the setting."""
+    for name in ("learn.actor-learning-rate", "learn.learning-rate"):
+        assert cli.main(["train", "smoke", f"--{name}", "inf"]) == 2
+        line = capsys.readouterr().err
+        assert line.count("\n") == 1
+        assert f"{name.replace('-', '_')}: must be finite, not inf" in line
+
+
+def test_hundred_thousand_dilations_are_refused(capsys: pytest.CaptureFixture):
+    """Claim: a list of 100,000 items is one short line, at once."""
+    begun = time.monotonic()
+    assert cli.main(["train", "smoke", "--net.dilations", *["1"] * 100_000]) == 2
+    line = capsys.readouterr().err
+    assert "net.dilations: at most 64 items, not 100000" in line
+    assert (line.count("\n"), len(line) < 200) == (1, True)
+    assert time.monotonic() - begun < 20.0
+
+
+def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the folder of `--json` is made; where it cannot be, train.json is there all the same,
+    and there is one line."""
+    monkeypatch.setattr(cache, "enable", lambda: None)
+    monkeypatch.setattr(step, "make", lambda cfg, **_: None)
+    summary = loop.Summary(*[0] * len(loop.Summary._fields))
+    monkeypatch.setattr(loop, "run", lambda *_, **__: summary)
+    assert cli.main(["train", "smoke", "--run-dir", "a", "--json", "new/folder/out.json"]) == 0
+    assert Path("new/folder/out.json").is_file()
+    assert Path("a/train.json").is_file()
+    Path("file").touch()
+    assert cli.main(["train", "smoke", "--run-dir", "b", "--json", "file/out.json"]) == 1
+    assert Path("b/train.json").is_file()

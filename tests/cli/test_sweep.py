@@ -16,6 +16,7 @@ from csac_jax.training import loop, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
+TAUS = ",".join(f"0.{i:03d}" for i in range(100, 125))
 RUN = runner.run
 
 
@@ -65,7 +66,14 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
             "smoke --sim.physics c --devices 2",
             "--sim.physics: c computes on the host's cores, for one device",
         ),
-        ("smoke --seeds 100000", "lower --seeds or raise --devices"),
+        ("smoke --seeds 9999", "lower --seeds or raise --devices"),
+        ("smoke --seeds -1", "--seeds: at least 1"),
+        ("smoke --seeds 1000000", "--seeds: 1 to 10000 runs in all"),
+        ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "--seeds: 1 to 10000 runs in all"),
+        (
+            f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary explore.decay={TAUS}",
+            "--vary: more than 10000 combinations",
+        ),
         ("smoke --cluster", "several processes need --run-dir"),
         (
             "smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2",

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -134,3 +136,64 @@ def test_format_1_with_what_is_gone_is_refused(name: str, value: Any):
     values[section][field] = value
     with pytest.raises(ValueError, match=rf"^{name}: "):
         configs.from_dict(values)
+
+
+def _refused(values: Any, message: str) -> None:
+    begun = time.monotonic()
+    with pytest.raises(ValueError, match=message) as caught:
+        configs.from_dict(values)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200
+    assert time.monotonic() - begun < 5.0
+
+
+def _nested(depth: int) -> Any:
+    value: Any = 0
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "message"),
+    [
+        ("learn", {"tau": 10**400}, r"learn\.tau: must be finite, not inf"),
+        ("learn", {"learning_rate": math.nan}, r"learn\.learning_rate: must be finite|not nan"),
+        ("train", {"actions": 10**400}, r"train\.actions: must be at most 9007199254740992"),
+        ("net", {"dilations": [1] * 100_000}, r"net\.dilations: at most 64 items, not 100000"),
+        ("scene", {"slots": ["box"] * 100_000}, r"scene\.slots: at most 64 items, not 100000"),
+        ("learn", {"tau": _nested(500)}, r"learn: "),
+        ("learn", {"tau": _nested(100_000)}, "learn: is nested too deeply"),
+        ("learn", {f"k{i}": i for i in range(20_000)}, r"learn\.k0: unknown setting"),
+        ("net", {"kind": ["small"]}, "net.kind: "),
+        ("net", {"kind": "small", "": 1}, "net.: unknown setting"),
+        ("learn", {"": "csac"}, "learn.: unknown setting"),
+    ],
+)
+def test_hostile_values_are_one_line(section: str, values: dict[str, Any], message: str):
+    """Claim: numbers beyond floats, lists without end, deep nesting and thousands of keys are
+    refused at once, in one short line."""
+    _refused({"format": renames.FORMAT, section: values}, message)
+
+
+@pytest.mark.parametrize("number", [1, renames.FORMAT])
+def test_thousands_of_sections_are_one_line(number: int):
+    """Claim: 20,000 sections are refused as fast as one."""
+    _refused(
+        {"format": number, **{f"k{i}": {"a": 1} for i in range(20_000)}}, "k0.*: unknown setting"
+    )
+
+
+@pytest.mark.parametrize(
+    ("section", "values"),
+    [
+        ("sim", {"grasp_phases": 5}),
+        ("sim", {"push_phases": None}),
+        ("explore", {"noise_std": "a", "noise_clip": 1.0}),
+        ("camera", {"scale": "a"}),
+        ("camera", {"scale": 0.5, "size": 3}),
+    ],
+)
+def test_old_format_with_other_kinds_of_values(section: str, values: dict[str, Any]):
+    """Claim: a file of the old format whose values are of other kinds is one line."""
+    _refused({section: values}, "old format has a value of another kind")

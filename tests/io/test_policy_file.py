@@ -1,6 +1,7 @@
 """Policies as files."""
 
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ import safetensors.numpy
 from csac_jax import presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
-from csac_jax.io import configs, policy_file
+from csac_jax.config import DenseNet121
+from csac_jax.errors import DataWarning
+from csac_jax.io import configs, policy_file, weights
 
 CFG = presets.get("smoke")
 
@@ -113,3 +116,97 @@ def test_shipped_policy():
     cfg, params = policy_file.load(policy_file.SHIPPED)
     assert (cfg.preset, cfg.task.kind, cfg.net.kind) == ("fast", "clear", "small")
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+def test_old_file_without_digest_loads_with_a_warning(tmp_path: Path, params: Params):
+    """Claim: a file of a version that wrote no digest is read, with a warning that says so."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, params, CFG)
+    _rewrite(path, lambda tensors, remarks: None)
+    with pytest.warns(DataWarning, match="has no digest"):
+        assert policy_file.load(path)[0] == CFG
+
+
+def test_damage_is_noticed(tmp_path: Path, params: Params):
+    """Claim: a flipped bit of a network is an error of one line."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, params, CFG)
+    content = bytearray(path.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(policy_file.PolicyFileError, match="is damaged: its digest differs"):
+        policy_file.load(path)
+
+
+@pytest.mark.parametrize("name", ["csac-jax", "jax", "mujoco"])
+def test_other_versions_are_named(
+    tmp_path: Path, params: Params, monkeypatch: pytest.MonkeyPatch, name: str
+):
+    """Claim: a policy of another version of the package, JAX or MuJoCo loads with a warning that
+    names both versions."""
+    here, path = policy_file.provenance.versions(), tmp_path / "policy.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(policy_file.provenance, "versions", lambda: {**here, name: "0.0.1"})
+        policy_file.save(path, params, CFG)
+    with pytest.warns(DataWarning, match=rf"with {name} 0\.0\.1, this is {here[name]}") as told:
+        policy_file.load(path)
+    assert len(told) == 1
+    policy_file.save(path, params, CFG)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        policy_file.load(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_refused(tmp_path: Path, params: Params, value: float):
+    """Claim: networks that are not finite are neither written nor read."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, params, CFG)
+
+    def lose(tensors: dict[str, Any], remarks: dict[str, str]) -> None:
+        name = min(tensors)
+        tensors[name] = np.full_like(tensors[name], value)
+
+    _rewrite(path, lose)
+    with (
+        pytest.warns(DataWarning),
+        pytest.raises(policy_file.PolicyFileError, match="is not finite"),
+    ):
+        policy_file.load(path)
+    lost = jax.tree.map(lambda leaf: np.full_like(leaf, value), params)
+    with pytest.raises(policy_file.PolicyFileError, match="is not finite"):
+        policy_file.save(tmp_path / "new.safetensors", lost, CFG)
+    assert not (tmp_path / "new.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    "config", ["[]", "[" * 100_000, "3", '{"format": 2, "learn": {"tau": 1' + "0" * 400 + "}}"]
+)
+def test_hostile_config_is_one_line(tmp_path: Path, params: Params, config: str):
+    """Claim: whatever stands for a policy's config, the answer is one line."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, params, CFG)
+    _rewrite(path, lambda tensors, remarks: remarks.update(config=config))
+    with pytest.warns(DataWarning), pytest.raises(policy_file.PolicyFileError) as caught:
+        policy_file.load(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 300
+
+
+def _file_with(dtype: str) -> bytes:
+    """A .safetensors file of one tensor of this type."""
+    header = json.dumps({"a": {"dtype": dtype, "shape": [8], "data_offsets": [0, 8]}}).encode()
+    return len(header).to_bytes(8, "little") + header + bytes(8)
+
+
+@pytest.mark.parametrize("dtype", ["F8", "F8_E4M3", "F8_E5M2"])
+def test_small_dtypes_are_one_line(tmp_path: Path, dtype: str):
+    """Claim: a tensor of a type that NumPy lacks is one line."""
+    path = tmp_path / "policy.safetensors"
+    path.write_bytes(_file_with(dtype))
+    with pytest.raises(policy_file.PolicyFileError) as caught:
+        policy_file.load(path)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=path.name) as caught:
+        weights.read(DenseNet121(), path)
+    assert "\n" not in str(caught.value)

@@ -1,8 +1,10 @@
 """`csac-jax report` from recorded files to tables, figures and page."""
 
 import json
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -478,3 +480,54 @@ def test_reads_without_jax(recorded: Path):
         [sys.executable, "-c", code, str(recorded)], capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_damaged_lines_are_counted(recorded: Path, capsys: pytest.CaptureFixture):
+    """Claim: a log with damaged lines is used without them, and a note counts them."""
+    log = recorded / "max" / "metrics.jsonl"
+    lines = log.read_bytes().splitlines()
+    log.write_bytes(b"\n".join([b"\xff\xfe", b"[]", b'{"step": "x"}', *lines]))
+    assert cli.main(["report", str(recorded)]) == 0
+    shown, complaint = capsys.readouterr()
+    notes = [line for line in shown.splitlines() if "max/metrics.jsonl: 3 of" in line]
+    assert len(notes) == 1
+    assert "lines are damaged and left out" in notes[0]
+    assert complaint == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("eval.json", "{"),
+        ("eval.json", "[" * 100_000),
+        ("eval.json", '{"policy": [], "config": {}, "parts": {}}'),
+        ("eval.json", '{"policy": "learned", "config": {"seed": "x"}, "parts": {"a": {}}}'),
+        ("eval.json", '{"policy": "learned", "config": {}, "parts": {"a": {"completion": 3}}}'),
+        ("train.json", '{"versions": 3}'),
+        ("config.json", '{"preset": ["paper"]}'),
+    ],
+)
+def test_damaged_record_is_left_out_with_a_note(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture, name: str, content: str
+):
+    """Claim: a record with damage of any kind is left out with a note, and the others are shown."""
+    bad = tmp_path / "bad"
+    _run(bad, _config("csac_beta", 9), [0.5])
+    (bad / name).write_text(content)
+    assert cli.main(["report", str(recorded), str(bad)]) == 0
+    shown, complaint = capsys.readouterr()
+    assert any(line.startswith(f"- {bad}") and "damaged" in line for line in shown.splitlines())
+    assert "| CSAC-beta" in shown
+    assert complaint == ""
+
+
+def test_pipes_and_devices_are_not_read(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: a named pipe or a device, which never ends, is passed over at once."""
+    for name in ("metrics.jsonl", "eval.json", "config.json"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "zero.json").symlink_to("/dev/zero")
+    begun = time.monotonic()
+    for path in (tmp_path, tmp_path / "eval.json", Path("/dev/zero")):
+        assert cli.main(["report", str(path)]) == 1
+        assert capsys.readouterr().err.count("\n") == 1
+    assert time.monotonic() - begun < 10.0

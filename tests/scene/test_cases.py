@@ -3,6 +3,7 @@
 import copy
 import json
 import re
+import time
 from pathlib import Path
 from typing import Any
 
@@ -279,3 +280,28 @@ def test_target_is_required_where_asked(tmp_path: Path):
     assert int(loose.scene.target) == layout.ANY
     with pytest.raises(ValueError, match="case 'test' marks no target"):
         cases.require_target(loose)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 100_000, "nested too deeply"),
+        ('{"name": ' + "[" * 300 + "]" * 300 + ', "blocks": []}', '"name" must be'),
+        ('{"name": "a", "blocks": [' + "1, " * 100_000 + "1]}", '"blocks" must be a list'),
+        ("{" + ", ".join(f'"k{i}": {i}' for i in range(20_000)) + "}", 'unknown key "k0"'),
+        ("{" + ", ".join('"k": 1' for _ in range(20_000)) + "}", 'key "k" is given twice'),
+        ('{"name": "a", "blocks": 1' + "0" * 400 + "}", '"blocks" must be'),
+        ('{"name": "a", "blocks": 1' + "0" * 5000 + "}", "."),
+        ('{"name": "\\ud800", "blocks": []}', '"name" must be'),
+    ],
+)
+def test_hostile_file_is_one_line(tmp_path: Path, text: str, message: str):
+    """Claim: deep nesting, long lists, huge numbers and thousands of keys are refused at once, in
+    one line."""
+    path, begun = tmp_path / "case.json", time.monotonic()
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        cases.load(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 300
+    assert time.monotonic() - begun < 2.0

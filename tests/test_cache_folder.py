@@ -1,0 +1,69 @@
+"""Where this user's programs cache what they trust."""
+
+import os
+import pathlib
+import stat
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from csac_jax import cache_folder
+from csac_jax.runtime import cache
+
+
+@pytest.fixture(autouse=True)
+def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The user's cache directory."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def _nobody(*_: object) -> NoReturn:
+    raise RuntimeError("Could not determine home directory.")
+
+
+def test_only_the_user_can_read_it(home: Path):
+    """Claim: every folder below the cache directory is made with mode 0700."""
+    folder = cache_folder.private("xla", "a")
+    assert folder == home / "csac_jax" / "xla" / "a"
+    for each in (folder, folder.parent, folder.parent.parent):
+        assert stat.S_IMODE(each.stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("level", range(3))
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o777])
+def test_folder_that_others_can_write_is_not_used(level: int, mode: int):
+    """Claim: where others can write into the folder, or one above it, nothing is cached."""
+    folder = cache_folder.private("xla", "a")
+    assert folder is not None
+    [folder, *folder.parents][level].chmod(mode)
+    assert cache_folder.private("xla", "a") is None
+    assert level == 0 or cache._folder() is None  # its folder is another machine's
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
+@pytest.mark.parametrize("level", range(3))
+def test_folder_of_another_user_is_not_used(level: int):
+    """Claim: where another user owns the folder, or one above it, nothing is cached."""
+    folder = cache_folder.private("xla", "a")
+    assert folder is not None
+    os.chown([folder, *folder.parents][level], 12345, 12345)
+    assert cache_folder.private("xla", "a") is None
+
+
+def test_user_without_a_home_caches_nothing(monkeypatch: pytest.MonkeyPatch):
+    """Claim: without HOME and without an entry in the system's list of users nothing is cached, and
+    nothing fails."""
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr(pathlib.Path, "home", _nobody)
+    assert cache_folder.private("pools") is None
+    assert cache._folder() is None
+
+
+def test_file_in_the_way(home: Path):
+    """Claim: a file in the place of the folder switches the cache off."""
+    home.mkdir()
+    (home / "csac_jax").touch()
+    assert cache_folder.private("pools") is None
