@@ -66,7 +66,7 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
             "smoke --sim.physics c --devices 2",
             "--sim.physics: c computes on the host's cores, for one device",
         ),
-        ("smoke --seeds 9999", "lower --seeds or raise --devices"),
+        ("smoke --replay.capacity 65536 --seeds 9999", "lower --seeds or raise --devices"),
         ("smoke --seeds -1", "--seeds: at least 1"),
         ("smoke --seeds 1000000", "--seeds: 1 to 10000 runs in all"),
         ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "--seeds: 1 to 10000 runs in all"),
@@ -160,7 +160,7 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     resumed, it ends with 0 and its results. A small step stands in for the learner's."""
     monkeypatch.setattr(runner, "run", RUN)
     for name, toy in (
-        ("make", lambda cfg, **_: toys.program(cfg)),
+        ("make", lambda cfg, *_, **__: toys.program(cfg)),
         ("init_state", toys.init_state),
         ("train_step", toys.train_step),
     ):
@@ -217,7 +217,7 @@ def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatc
     """Claim: `bench sweep` prints a row for each number of seeds, and the run of one seed by
     itself, with where they come from. A small step stands in for the learner's."""
     for name, toy in (
-        ("make", toys.program),
+        ("make", lambda cfg, *_, **__: toys.program(cfg)),
         ("init_state", toys.init_state),
         ("train_step", toys.train_step),
     ):

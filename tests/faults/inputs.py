@@ -341,7 +341,7 @@ def _not_finite(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
 _DEEP: Any = json.loads("[" * 400 + "]" * 400)
 _VALUES: list[Any] = [
     *(None, True, False, "", "..", "../../victim", "/etc", "a\0b", "a\nb", "\ud800", "x" * 5000),
-    *(0, -1, 1.5, 10**400, -(10**18), 2**31, 1e308, math.inf, -math.inf, math.nan),
+    *(0, -1, 1.5, 0.3, -0.3, 9.0, 10**400, -(10**18), 2**31, 1e308, math.inf, -math.inf, math.nan),
     *([], {}, [[]], _DEEP, ["box"] * 5000, {"a": _DEEP}, {str(i): i for i in range(5000)}),
 ]
 _ODD = st.sampled_from([*map(json.dumps, _VALUES)]).map(json.loads)  # each time a new object
