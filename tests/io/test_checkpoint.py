@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import pytest
 from flax import struct
 
 from csac_jax import presets
+from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint, leaves, renames
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.training import step as training
@@ -43,7 +45,7 @@ def _state(seed: int = 0) -> State:
     return State(
         key=key,
         keys=jax.random.split(jax.random.fold_in(key, 1), 3),
-        step=jnp.int32(7),
+        step=jnp.int32(seed),
         moments=(Moments(jnp.asarray(drawn.normal(size=(3, 5)), jnp.float32), jnp.uint8(200)), ()),
         params={
             "w.x": jnp.asarray(drawn.normal(size=4), jnp.bfloat16),
@@ -113,7 +115,7 @@ def test_relative_folder(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_last_two_are_kept(run_dir: Path):
     """Claim: the last two steps are kept."""
-    checkpoint.save(run_dir, 12, _state(), CFG, {})
+    checkpoint.save(run_dir, 12, _state(12), CFG, {})
     assert sorted(
         path.name for path in (run_dir / "checkpoints").iterdir() if path.name.isdigit()
     ) == ["12", "8"]
@@ -127,52 +129,82 @@ def test_temporary_folders_are_removed(run_dir: Path):
     assert checkpoint.latest_step(run_dir) == 8
     assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(8))
     assert left.exists()  # a reader leaves a running writer alone
-    checkpoint.save(run_dir, 12, _state(), CFG, {})
+    checkpoint.save(run_dir, 12, _state(12), CFG, {})
     assert not left.exists()
 
 
+def _falls_back(run_dir: Path, message: str) -> None:
+    """Step 8 is refused, with this message; without a step asked for, step 4 is taken, and said."""
+    with pytest.raises(CheckpointError, match=rf"8 {message}.*; saved are: 4") as caught:
+        checkpoint.restore(run_dir, _abstract(), 8)
+    assert "\n" not in str(caught.value)
+    with pytest.warns(DataWarning, match=rf"8 {message}.*; going back to step 4"):
+        state, _ = checkpoint.restore(run_dir, _abstract())
+    assert _same(state, _state(4))
+    with pytest.warns(DataWarning, match="going back to step 4"):
+        assert checkpoint.load_config(run_dir) == CFG
+
+
 @pytest.mark.parametrize("position", [0.0, 0.5, 0.99])
-def test_flipped_bit_is_refused(run_dir: Path, position: float):
-    """Claim: a flipped bit is an error of one line that names the file and the newest sound
-    step."""
+def test_flipped_bit_is_seen(run_dir: Path, position: float):
+    """Claim: a step with a flipped bit is not restored; the newest sound one is, with a warning
+    that names the file."""
     file = _data_file(run_dir, 8)
     data = bytearray(file.read_bytes())
     data[int(position * len(data))] ^= 1
     file.write_bytes(data)
-    with pytest.raises(
-        CheckpointError, match=rf"8 is damaged.*{file.name} has changed.*from step 4"
-    ) as caught:
-        checkpoint.restore(run_dir, _abstract())
-    assert "\n" not in str(caught.value)
-    with pytest.raises(CheckpointError, match="damaged"):
-        checkpoint.load_config(run_dir)
+    _falls_back(run_dir, rf"is damaged.*{file.name} has changed")
 
 
-def test_truncated_file_is_refused(run_dir: Path):
-    """Claim: a cut-off file is an error."""
+def test_truncated_file_is_seen(run_dir: Path):
+    """Claim: so is a step with a cut-off file."""
     file = _data_file(run_dir, 8)
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match="has changed"):
-        checkpoint.restore(run_dir, _abstract())
+    _falls_back(run_dir, rf"is damaged.*{file.name} has changed")
 
 
-def test_deleted_file_is_refused(run_dir: Path):
-    """Claim: a missing file is an error that names it."""
+def test_deleted_file_is_seen(run_dir: Path):
+    """Claim: so is a step without one of its files."""
     file = _data_file(run_dir, 8)
     file.unlink()
-    with pytest.raises(CheckpointError, match=f"{file.name} is missing"):
-        checkpoint.restore(run_dir, _abstract())
+    _falls_back(run_dir, f"is damaged.*{file.name} is missing")
 
 
-def test_half_written_step_is_refused(run_dir: Path):
-    """Claim: a step without its manifest is half-written; no older one is taken in its place."""
+def test_half_written_step_is_seen(run_dir: Path):
+    """Claim: a step without its manifest is half-written."""
     (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).unlink()
-    with pytest.raises(CheckpointError, match=r"half-written.*from step 4.*delete"):
-        checkpoint.restore(run_dir, _abstract())
+    _falls_back(run_dir, "is missing or half-written")
+
+
+def test_steps_of_others_are_seen(run_dir: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Claim: the whole folder of another run's step, or of another step, is not restored."""
+    other = tmp_path_factory.mktemp("other")
+    checkpoint.save(other, 8, _state(8), CFG, {})
+    steps = run_dir / "checkpoints"
+    (steps / "8").rename(steps / "12")
+    shutil.copytree(other / "checkpoints" / "8", steps / "8")
+    _falls_back(run_dir, "is another run's")
+    with pytest.raises(CheckpointError, match="12 is that of step 8"):
+        checkpoint.restore(run_dir, _abstract(), 12)
+
+
+def test_state_of_another_step_is_not_saved(run_dir: Path):
+    """Claim: a state is saved as its own step only."""
+    with pytest.raises(ValueError, match="a state of step 8 cannot be saved as step 12"):
+        checkpoint.save(run_dir, 12, _state(8), CFG, {})
+    assert checkpoint.latest_step(run_dir) == 8
+
+
+def test_damaged_step_is_saved_anew(run_dir: Path):
+    """Claim: saving over a damaged step sets that aside and ends in one that restores."""
+    _data_file(run_dir, 8).unlink()
+    checkpoint.save(run_dir, 8, _state(8), CFG, {})
+    assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(8))
+    assert (run_dir / "checkpoints" / checkpoint.SET_ASIDE / "8").is_dir()
 
 
 def test_remedy_works(run_dir: Path):
-    """Claim: deleting the folder that the message names makes the run go on from the older step."""
+    """Claim: without the folder that the message names the older step is the newest."""
     _data_file(run_dir, 8).unlink()
     (run_dir / "checkpoints" / "8").rename(run_dir / "elsewhere")
     assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(4))
@@ -217,7 +249,7 @@ def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """Claim: a config with a setting that this version does not know is an error that names it."""
     good = checkpoint.configs.to_dict
     monkeypatch.setattr(checkpoint.configs, "to_dict", lambda cfg: {**good(cfg), "sweep": 1})
-    folder = checkpoint.save(tmp_path, 4, _state(), CFG, {})
+    folder = checkpoint.save(tmp_path, 4, _state(4), CFG, {})
     assert json.loads((folder / checkpoint.MANIFEST).read_text())
     with pytest.raises(CheckpointError, match=r"another version.*sweep: unknown setting"):
         checkpoint.load_config(tmp_path)

@@ -52,6 +52,7 @@ class StepMetrics(NamedTuple):
     actor_loss: jax.Array
     td_error: jax.Array
     q_mean: jax.Array
+    finite: jax.Array
 
 
 def _init() -> State:
@@ -59,12 +60,14 @@ def _init() -> State:
 
 
 class Fake:
-    """A program that draws its metrics at random, counts compilations, and can lose its loss or its
-    physics."""
+    """A program that draws its metrics at random, counts compilations, and can lose its loss, its
+    parameters or its physics."""
 
-    def __init__(self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99) -> None:
+    def __init__(
+        self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99, lost_at: int = -1
+    ) -> None:
         self.compiled: list[int] = []
-        self._nan_at, self._ill = nan_at, (ill_from, ill_to)
+        self._nan_at, self._ill, self._lost_at = nan_at, (ill_from, ill_to), lost_at
 
     def compile_chunk(self, num_steps: int):
         """As `csac_jax.training.step.compile_chunk`, with the program bound."""
@@ -97,6 +100,7 @@ class Fake:
             actor_loss=loss,
             td_error=loss,
             q_mean=loss,
+            finite=state.step != self._lost_at,
         )
         total = state.total + jax.random.normal(keys[3], (4,))
         return State(state.key, state.step + 1, total), metrics
@@ -243,6 +247,13 @@ def test_loss_that_is_not_finite_stops_the_run(tmp_path: Path, step: int):
     assert all(math.isfinite(line["reward"]) for line in _log(tmp_path / "run"))
 
 
+def test_parameter_that_is_not_finite_stops_the_run(tmp_path: Path):
+    """Claim: a parameter that is not finite ends the run too, though every loss is finite."""
+    with pytest.raises(TrainingError, match=r"a parameter is not finite.*step 8 is kept"):
+        _run(tmp_path / "run", Listener(), Fake(lost_at=13))
+    assert checkpoint.latest_step(tmp_path / "run") == 8
+
+
 def test_loss_of_the_warm_up_is_not_looked_at(tmp_path: Path):
     """Claim: before the first update there is no loss: none is judged, none is logged."""
     listener = Listener(2)
@@ -336,6 +347,7 @@ def _metrics(primitive: list[int], outcome: list[int]) -> StepMetrics:
         *[zeros] * 9,
         np.ones(steps, bool),
         *[losses] * 4,
+        np.ones(steps, bool),
     )
 
 
