@@ -38,11 +38,22 @@ MANIFEST = "manifest.sha256"
 SET_ASIDE = "set-aside"
 KEPT = 2
 _RUN = "run"
+_PATTERNS = "*?[\\"  # Orbax globs; TensorStore takes a backslash for a slash
 _DRAFT, _OLD = ".saving", ".replaced"
 
 
 class CheckpointError(FailedError):
     """A checkpoint that is missing, damaged or another program's; the message has the remedy."""
+
+
+def check_path(run_dir: Path) -> None:
+    """Raises CheckpointError where Orbax would read or write other folders than the run's."""
+    path = str(_root(run_dir))
+    bad = [sign for sign in path if sign in _PATTERNS or "\ud800" <= sign <= "\udfff"]
+    if bad:
+        raise CheckpointError(
+            f"{run_dir!a}: no checkpoint can be saved in a path with {bad[0]!a}; name another one"
+        )
 
 
 def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any]) -> Path:
@@ -56,6 +67,8 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
     root = _root(run_dir)
     draft, folder = root / _DRAFT, root / str(step)
     arrays = {name: _untyped(leaf) for name, leaf in leaves.named(state).items()}
+    if _own_step(arrays) not in (None, step):
+        raise ValueError(f"a state of step {_own_step(arrays)} cannot be saved as step {step}")
     try:
         if cluster.is_first():
             _clean(root)
@@ -118,10 +131,8 @@ def restore(
     provenance.warn_if_other(record.get("versions"), f"checkpoint {folder}")
     arrays = {old[name]: _abstract_array(leaf) for name, leaf in wanted.items()}
     arrays = _read(folder, state=ocp.args.StandardRestore(arrays))["state"]
-    if int(arrays.get("step", folder.name)) != int(folder.name):
-        raise CheckpointError(
-            f"checkpoint {folder} holds step {arrays['step']}; remove that folder"
-        )
+    if (found_step := _own_step(arrays)) not in (None, int(folder.name)):
+        raise CheckpointError(f"checkpoint {folder} holds step {found_step}; remove that folder")
     state = [_typed(arrays[old[name]], leaf) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(abstract_state), state), record["extra"]
 
@@ -289,6 +300,12 @@ def _record(folder: Path) -> dict[str, Any]:
     if not all(isinstance(record.get(name), dict) for name in ("layout", "extra")):
         raise ValueError("it is no checkpoint of csac_jax")
     return record
+
+
+def _own_step(arrays: dict[str, Any]) -> int | None:
+    """The step that a state says it is of; None if it does not say."""
+    step = arrays.get("step")
+    return int(step) if step is not None and step.shape == () else None
 
 
 def _digests(folder: Path) -> dict[str, str]:

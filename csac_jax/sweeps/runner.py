@@ -87,6 +87,7 @@ def run(
     Args: folder, made unless `resume`; make_program, called once for each group that is not done.
     Raises CheckpointError if a checkpoint is damaged.
     """
+    checkpoint.check_path(folder)
     cluster.wait("sweep")  # all have looked whether there is such a folder
     if not resume and cluster.is_first():
         folder.mkdir(parents=True)

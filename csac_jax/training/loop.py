@@ -111,6 +111,7 @@ def run(
     or parameter that is not finite, CheckpointError if there is nothing sound to resume from,
     LockedError if another process trains in `run_dir`.
     """
+    checkpoint.check_path(run_dir)
     if not resume:
         run_dir.mkdir(parents=True)
     with lock.exclusive(run_dir):

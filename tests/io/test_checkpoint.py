@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -133,53 +134,80 @@ def test_temporary_folders_are_removed(run_dir: Path):
 
 
 def _falls_back(run_dir: Path, message: str) -> None:
-    """Step 8 is passed over with a warning; asked for by itself, it is refused in one line."""
-    with pytest.warns(DataWarning, match=rf"8 is {message}.*; going back to step 4"):
-        state, _ = checkpoint.restore(run_dir, _abstract())
-    assert _same(state, _state(4))
-    with pytest.raises(CheckpointError, match=rf"8 is {message}.*saved are: 4$") as caught:
+    """Step 8 is refused, with this message; without a step asked for, step 4 is taken, and said."""
+    with pytest.raises(CheckpointError, match=rf"8 {message}.*; saved are: 4") as caught:
         checkpoint.restore(run_dir, _abstract(), 8)
     assert "\n" not in str(caught.value)
+    with pytest.warns(DataWarning, match=rf"8 {message}.*; going back to step 4"):
+        state, _ = checkpoint.restore(run_dir, _abstract())
+    assert _same(state, _state(4))
+    with pytest.warns(DataWarning, match="going back to step 4"):
+        assert checkpoint.load_config(run_dir) == CFG
 
 
 @pytest.mark.parametrize("position", [0.0, 0.5, 0.99])
-def test_flipped_bit_is_noticed(run_dir: Path, position: float):
-    """Claim: a step with a flipped bit is passed over for the one before, with a warning that names
-    the file."""
+def test_flipped_bit_is_seen(run_dir: Path, position: float):
+    """Claim: a step with a flipped bit is not restored; the newest sound one is, with a warning
+    that names the file."""
     file = _data_file(run_dir, 8)
     data = bytearray(file.read_bytes())
     data[int(position * len(data))] ^= 1
     file.write_bytes(data)
-    _falls_back(run_dir, rf"damaged .*{file.name} has changed")
-    with pytest.raises(CheckpointError, match="damaged"):
-        checkpoint.load_config(run_dir, 8)
+    _falls_back(run_dir, rf"is damaged.*{file.name} has changed")
 
 
-def test_truncated_file_is_noticed(run_dir: Path):
-    """Claim: a step with a cut-off file is passed over."""
+def test_truncated_file_is_seen(run_dir: Path):
+    """Claim: so is a step with a cut-off file."""
     file = _data_file(run_dir, 8)
     file.write_bytes(file.read_bytes()[:-1])
-    _falls_back(run_dir, "damaged .*has changed")
+    _falls_back(run_dir, rf"is damaged.*{file.name} has changed")
 
 
-def test_deleted_file_is_noticed(run_dir: Path):
-    """Claim: a step with a missing file is passed over; the warning names the file."""
+def test_deleted_file_is_seen(run_dir: Path):
+    """Claim: so is a step without one of its files."""
     file = _data_file(run_dir, 8)
     file.unlink()
-    _falls_back(run_dir, f"damaged .*{file.name} is missing")
+    _falls_back(run_dir, f"is damaged.*{file.name} is missing")
 
 
-def test_half_written_step_is_noticed(run_dir: Path):
-    """Claim: a step without its manifest is half-written, and passed over."""
+def test_half_written_step_is_seen(run_dir: Path):
+    """Claim: a step without its manifest is half-written."""
     (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).unlink()
-    _falls_back(run_dir, "missing or half-written")
+    _falls_back(run_dir, "is missing or half-written")
+
+
+def test_steps_of_others_are_seen(run_dir: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Claim: the whole folder of another run's step, or of another step, is not restored."""
+    other = tmp_path_factory.mktemp("other")
+    checkpoint.save(other, 8, _state(8), CFG, {})
+    steps = run_dir / "checkpoints"
+    (steps / "8").rename(steps / "12")
+    shutil.copytree(other / "checkpoints" / "8", steps / "8")
+    _falls_back(run_dir, "is another run's")
+    with pytest.raises(CheckpointError, match="12 is that of step 8"):
+        checkpoint.restore(run_dir, _abstract(), 12)
+
+
+def test_state_of_another_step_is_not_saved(run_dir: Path):
+    """Claim: a state is saved as its own step only."""
+    with pytest.raises(ValueError, match="a state of step 8 cannot be saved as step 12"):
+        checkpoint.save(run_dir, 12, _state(8), CFG, {})
+    assert checkpoint.latest_step(run_dir) == 8
+
+
+def test_damaged_step_is_saved_anew(run_dir: Path):
+    """Claim: saving over a damaged step sets that aside and ends in one that restores."""
+    _data_file(run_dir, 8).unlink()
+    checkpoint.save(run_dir, 8, _state(8), CFG, {})
+    assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(8))
+    assert (run_dir / "checkpoints" / checkpoint.SET_ASIDE / "8").is_dir()
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "{", "[" * 100_000, '{"a": {}}', "\0", ""])
 def test_manifest_that_is_none_is_noticed(run_dir: Path, content: str):
     """Claim: a manifest that is no JSON object, or none that can be read, is damage."""
     (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).write_text(content)
-    _falls_back(run_dir, "damaged")
+    _falls_back(run_dir, "is damaged")
 
 
 @pytest.mark.parametrize("name", ["8\u00b2", "\u0669", "09", "-9"])

@@ -60,8 +60,8 @@ def _init() -> State:
 
 
 class Fake:
-    """A program that draws its metrics at random, counts compilations, and can lose its loss, a
-    parameter or its physics."""
+    """A program that draws its metrics at random, counts compilations, and can lose its loss, its
+    parameters or its physics."""
 
     def __init__(
         self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99, lost_at: int = -1

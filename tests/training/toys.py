@@ -99,7 +99,7 @@ def train_step(
         actor_loss=jnp.sum(target),
         td_error=jnp.sum(online),
         q_mean=seen,
-        finite=jnp.all(jnp.isfinite(online)),
+        finite=jnp.isfinite(online).all(),
     )
     learner_state = {"online": online, "target": target, "optimiser": optimiser, "actor": actor}
     return TrainState(state.key, state.step + 1, scenes, learner_state, replay), metrics
