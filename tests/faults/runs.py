@@ -134,7 +134,7 @@ def _strace(process: int, *arguments: str):
     try:
         assert tracer.stderr is not None
         said = tracer.stderr.readline()
-        if "attached" not in said:
+        if "not permitted" in said:  # else it has ended already, and is judged
             raise MissingToolError(f"strace cannot trace: {said.strip()}")
         yield
     finally:
@@ -219,9 +219,13 @@ def _damaged(kind: str):
         for _ in range(tries):
             shutil.rmtree(copy, ignore_errors=True)
             shutil.copytree(sound, copy)
-            about = harness.damage(rng, kind, copy / names[int(rng.integers(len(names)))])
+            name = names[int(rng.integers(len(names)))]
+            about = harness.damage(rng, kind, copy / name)
             tally.tries += 1
-            _judge_restored(tally, copy, reference, at_least=2, about=about)
+            step = _judge_restored(tally, copy, reference, at_least=2, about=about)
+            if step == 3 and name.parts[1] == "3" and name.name != checkpoint.MANIFEST:
+                tally.silent += 1
+                tally.remarks.append(f"{about}: unnoticed")
         return tally
 
     fault(f"{kind} in a checkpoint", tries=200)(inject)
@@ -229,8 +233,9 @@ def _damaged(kind: str):
 
 def _judge_restored(
     tally: Tally, run_dir: Path, reference: toy.Reference, at_least: int, about: str
-) -> None:
-    """Counts a run whose newest sound state is not right, or lies before step `at_least`."""
+) -> int | None:
+    """Counts a run whose newest sound state is not right, or lies before step `at_least`; returns
+    its step."""
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -239,7 +244,7 @@ def _judge_restored(
     except Exception as error:
         tally.lost += 1
         tally.remarks.append(f"{about}: {type(error).__name__}: {error}")
-        return
+        return None
     step = int(state.step)
     right = toy.bits(state) == reference.state(step) and len(extra["grasps"]) == toy.E * step
     if not right or cfg != toy.config():
@@ -252,6 +257,7 @@ def _judge_restored(
     if step != newest and not any(issubclass(one.category, DataWarning) for one in caught):
         tally.silent += 1
         tally.remarks.append(f"{about}: went back from step {newest} to {step} without a word")
+    return step
 
 
 for _kind in harness.DAMAGES:

@@ -192,7 +192,10 @@ def fault_of(run_dir: Path, reference: Reference, saved: int) -> str | None:
 
 
 def _log_fault(log: Path, reference: Reference, step: int) -> str | None:
-    lines = [json.loads(line) for line in log.read_text().splitlines()[:step]]
+    try:
+        lines = [json.loads(line) for line in log.read_text().splitlines()[:step]]
+    except ValueError:
+        return "the log is damaged"
     wanted = [(i + 1, outcomes) for i, outcomes in enumerate(reference.outcomes[:step])]
     return None if [(r["step"], r["outcomes"]) for r in lines] == wanted else "the log differs"
 
