@@ -9,12 +9,14 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import csac_jax
 from csac_jax import cli, presets
 from csac_jax.cli import doctor, failures
 from csac_jax.errors import FailedError, SceneError
 from csac_jax.io import checkpoint, policy_file
+from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, signals
 from csac_jax.training import loop, step
 
@@ -217,16 +219,26 @@ def test_watchdog_barks(capsys: pytest.CaptureFixture, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("columns", ["0", "00", "-5", "x", ""])
-def test_help_is_printed_on_any_terminal(
+def test_lines_are_printed_on_any_terminal(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, columns: str
 ):
-    """Claim: a terminal that says it has no columns, or none that are a number, shows the help."""
+    """Claim: a terminal that says it has no columns, or none that are a number, shows the help and
+    the progress."""
+
+    def say(arguments: list[str]) -> int:
+        with Terminal(Console()) as terminal:
+            terminal.say("compiled")
+        return 0
+
+    monkeypatch.setitem(cli.COMMANDS, "doctor", say)
+    monkeypatch.setenv("COLUMNS", columns)
+    assert cli.main(["doctor"]) == 0
+    assert "compiled" in capsys.readouterr().out
     monkeypatch.setenv("COLUMNS", columns)
     with pytest.raises(SystemExit) as ended:
         cli.main(["train", "smoke", "--help-all"])
-    shown = capsys.readouterr().out
     assert ended.value.code in (0, None)
-    assert "--learn.tau" in shown
+    assert "--learn.tau" in capsys.readouterr().out
 
 
 def test_learning_rate_must_be_finite(capsys: pytest.CaptureFixture):
