@@ -33,12 +33,12 @@ def enable() -> Path | None:
     if not jax.config.jax_enable_compilation_cache:
         return None
     _listen()
+    _compress_with_checksum()
     if chosen := jax.config.jax_compilation_cache_dir:
         return Path(chosen)
     if (folder := _folder()) is None:
         return None
     _date_entries(folder)
-    _compress_with_checksum()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", LARGEST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
