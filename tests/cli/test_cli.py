@@ -217,7 +217,7 @@ def test_scenes_that_never_settle(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(pool, "_ROUND", 8)
     monkeypatch.setattr(
-        policies, "load_config", lambda _: dataclasses.replace(SMOKE, scene=falling)
+        policies, "load_config", lambda *_: dataclasses.replace(SMOKE, scene=falling)
     )
     code, line = _fails(capsys, "eval", str(run_dir), "--policy", "random")
     assert code == 1
