@@ -25,4 +25,4 @@ def wrap_yaw(u: jax.Array) -> jax.Array:
 
 def project(u: jax.Array) -> jax.Array:
     """Points `u` [..., 3] in the box: yaw wraps, x and y are clipped."""
-    return jnp.clip(wrap_yaw(u), -1.0, 1.0)
+    return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), wrap(u), jnp.clip(u, -1.0, 1.0))

@@ -46,7 +46,8 @@ def noisy_actions(
     wall_high = jnp.where(box.POSE_WRAPS, 1.0, 1.0 - centre)
     low = jnp.maximum(-cfg.clip, wall_low) / cfg.std  # [3], in units of std
     high = jnp.minimum(cfg.clip, wall_high) / cfg.std
-    noise = jax.random.truncated_normal(key, low[None], high[None], (cfg.samples, 3))
+    lows, highs = (jnp.broadcast_to(bound, (cfg.samples, 3)) for bound in (low, high))
+    noise = jax.random.truncated_normal(key, lows, highs)
     mass = 0.5 * (jax.lax.erf(high / np.sqrt(2.0)) - jax.lax.erf(low / np.sqrt(2.0)))  # [3], Z
     log_scale = jnp.log(mass) + np.log(cfg.std * np.sqrt(2.0 * np.pi))
     log_density = jnp.sum(-0.5 * noise**2 - log_scale[None], axis=-1)
