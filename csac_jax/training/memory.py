@@ -25,8 +25,11 @@ def state_bytes(cfg: Config) -> dict[str, int]:
     """Bytes of a run's state by part. Traces the networks, which takes seconds."""
     state = step.abstract_state(cfg)
     parts = {"replay": state.replay, "scenes": state.scenes, "networks": state.learner}
-    sizes = jax.tree.map(lambda leaf: math.prod(leaf.shape) * leaf.dtype.itemsize, parts)
-    return {name: sum(jax.tree.leaves(part)) for name, part in sizes.items()}
+
+    def size(part: Any) -> int:
+        return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(part))
+
+    return {name: size(part) for name, part in parts.items()}
 
 
 def check(cfg: Config, runs: int = 1) -> None:

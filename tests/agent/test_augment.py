@@ -139,7 +139,9 @@ def test_reading_under_the_action_stays(transition, flags):
 
     def height(transition: Transition) -> jax.Array:
         heights = CFG.heightmap
-        cell = rotate.to_cell(heights.size, heights.cell, transition.action.pose[:2])
+        cell = rotate.to_cell(
+            heights.size, heights.cell, jnp.float32(0.0), transition.action.pose[:2]
+        )
         return rotate.bilinear(heightmap.unpack(transition.obs).height, cell)
 
     def valid(transition: Transition) -> jax.Array:
