@@ -336,7 +336,7 @@ def _fault(folder: Path) -> str | None:
     except OSError as error:
         return f"cannot be read ({error.strerror})"
     if str(record.get("step", folder.name)) != folder.name:
-        return f"is that of step {record['step']}"
+        return f"is that of step {record['step']}, so rename it to {record['step']}"
     if run is not None and record.get("run", run) != run:  # older ones name no run
         return "is another run's"
     return None

@@ -17,6 +17,7 @@ from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
+from experiments.warp.physics import WarpPhysics
 
 
 def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:
@@ -36,6 +37,8 @@ def loop(physics: Physics, scenes: Scene, joints: JointTrajectory) -> Callable[[
     """
     if isinstance(physics, MjxPhysics):
         return _mjx(physics, scenes, joints)
+    if isinstance(physics, WarpPhysics):
+        return _warp(physics, scenes, joints)
     assert isinstance(physics, CPhysics)
     return _c(physics, scenes, joints)
 
@@ -54,6 +57,22 @@ def _mjx(physics: MjxPhysics, scenes: Scene, joints: JointTrajectory) -> Callabl
 
     compiled = jax.jit(jax.vmap(one))
     return lambda: compiled(scenes, joints)
+
+
+def _warp(physics: WarpPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
+    import warp as wp
+
+    jax.block_until_ready(jax.jit(jax.vmap(physics.run))(scenes, joints))  # copies them in
+    batches = physics.simulator.batches.values()
+    (batch,) = (each for each in batches if each.data.nworld == len(joints.reachable))
+    steps = batch.recorded(batch.step)
+
+    def call() -> None:
+        batch.restart()
+        steps()
+        wp.synchronize()
+
+    return call
 
 
 def _c(physics: CPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:

@@ -313,6 +313,8 @@ def swapped(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         shutil.copytree(folder / "sound", run_dir)
         _swapped(run_dir / "checkpoints", other / "checkpoints")[name]()
         tally.tries += 1
+        if name == "steps have each other's names":
+            _put_names_right(tally, run_dir, name)
         _judge_restored(tally, run_dir, reference, at_least=2, about=name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -321,6 +323,20 @@ def swapped(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         tally.lost += 1
         tally.remarks.append("the other run has changed")
     return tally
+
+
+def _put_names_right(tally: Tally, run_dir: Path, about: str) -> None:
+    """Follows the message that refuses steps with each other's names."""
+    try:
+        checkpoint.sound(run_dir)
+        tally.silent += 1
+        tally.remarks.append(f"{about}: taken")
+    except checkpoint.CheckpointError as error:
+        if "rename it to 2" not in str(error):
+            tally.lost += 1
+            tally.remarks.append(f"{about}: {error}")
+    steps = run_dir / "checkpoints"
+    _swapped(steps, steps)["steps have each other's names"]()
 
 
 def _judge_resumed(tally: Tally, run_dir: Path, reference: toy.Reference, about: str) -> None:

@@ -1,0 +1,377 @@
+"""All substeps of a primitive in many scenes, as one call on MuJoCo Warp's own arrays.
+
+Model and data of E scenes stay on the device. A call copies in what an action changes: the fields
+of the blocks, the state and the set-points. After every substep, kernels of our own hold parked
+blocks, limit speeds and extend the trace. On CUDA several substeps are one recorded graph, which is
+launched until the primitive is over.
+"""
+
+import contextlib
+import copy
+import functools
+import gc
+import inspect
+import os
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+from unittest import mock
+
+import jax
+import mujoco
+import numpy as np
+import warp as wp
+from mujoco.mjx.third_party import mujoco_warp as mjw
+
+from csac_jax.config import SimConfig
+from csac_jax.scene import layout
+from csac_jax.scene.model import World
+
+# A benchmark may set these before a physics has its first action.
+GRAPH_SUBSTEPS = 10  # most substeps in one recorded graph
+SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
+CONVEX_PAIRS = 1.0  # workspaces of convex collision, for each contact that has room
+SOLVER_EXITS_EARLY = True  # a conditional node ends the solver once every scene has converged
+BOXES_AS_PRIMITIVES = False  # a box-box function in place of the convex one
+BLOCK_DIM: dict[str, int] = {}  # threads in a block, where not those of `mujoco_warp.BlockDim`
+
+FIELDS = {
+    "geom_size": wp.array2d[wp.vec3],
+    "geom_pos": wp.array2d[wp.vec3],
+    "geom_aabb": wp.array3d[wp.vec3],
+    "geom_rbound": wp.array2d[float],
+    "geom_friction": wp.array2d[wp.vec3],
+    "body_mass": wp.array2d[float],
+    "body_subtreemass": wp.array2d[float],
+    "body_inertia": wp.array2d[wp.vec3],
+    "body_ipos": wp.array2d[wp.vec3],
+    "body_invweight0": wp.array2d[wp.vec2],
+    "dof_invweight0": wp.array2d[float],
+}
+"""Fields of MuJoCo's model that differ per scene, [E, ...]."""
+_STATE = {"qpos": wp.array2d[float], "qvel": wp.array2d[float]}
+_COMMAND = {
+    "control": wp.array3d[float],  # [E, T, nu]
+    "in_play": wp.array2d[wp.bool],  # [E, N]
+}
+_TRACE = {  # leaves of `outcome.Trace`
+    "touched": wp.array[wp.bool],
+    "held_rise": wp.array2d[float],
+    "held": wp.array2d[wp.bool],
+    "rise": wp.array2d[float],
+    "gap_closed": wp.array[float],
+    "gap_end": wp.array[float],
+    "contact_overflow": wp.array[int],
+}
+
+_STOPPED_EARLY = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS  # by design
+_LOST_CONTACTS = int(mjw.OverflowType.ALL & ~_STOPPED_EARLY)
+
+wp.config.log_level = wp.LOG_WARNING  # not a line for each kernel
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _command(done: wp.array[int], control: wp.array3d[float], ctrl: wp.array2d[float]):
+    """The set-points of the next substep, which from here on counts as done."""
+    scene = wp.tid()
+    for actuator in range(ctrl.shape[1]):
+        ctrl[scene, actuator] = control[scene, done[scene], actuator]
+    done[scene] = done[scene] + 1
+
+
+@wp.kernel
+def _mark_touch(
+    room: int,
+    contacts: wp.array[int],  # [1], all scenes together; more than `room` if some were lost
+    scenes: wp.array[int],
+    geoms: wp.array[wp.vec2i],
+    distance: wp.array[float],
+    margin: wp.array[float],
+    slot_of_geom: wp.array[int],  # [G], -1: no block
+    part_of_geom: wp.array[int],  # [G] row of HAND_GEOMS, -1: not of the hand
+    touching: wp.array3d[int],  # [E, 3, N]
+):
+    """Which part of the hand touches which block, from the contacts of the last step."""
+    contact = wp.tid()
+    if contact >= wp.min(contacts[0], room) or distance[contact] >= margin[contact]:
+        return
+    pair = geoms[contact]
+    for side in range(2):
+        part = part_of_geom[pair[side]]
+        slot = slot_of_geom[pair[1 - side]]
+        if part >= 0 and slot >= 0:
+            touching[scenes[contact], part, slot] = 1  # other threads write the same
+
+
+@wp.func
+def _limited(value: float, limit: float):
+    """NaN stays NaN, which `wp.clamp` would hide."""
+    if value > limit:
+        return limit
+    if value < -limit:
+        return -limit
+    return value
+
+
+@wp.kernel
+def _observe(
+    closed_after: int,
+    lost_contacts: int,
+    finger: int,
+    position: wp.array[int],  # [N] first address of a block in qpos
+    velocity: wp.array[int],  # [N] and in qvel
+    limit: wp.array[float],  # [6]
+    start: wp.array2d[float],  # [E, nq] qpos when the primitive began
+    in_play: wp.array2d[wp.bool],  # [E, N]
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    touching: wp.array3d[int],
+    overflow: wp.array[int],
+    done: wp.array[int],
+    touched: wp.array[wp.bool],
+    held_rise: wp.array2d[float],
+    held: wp.array2d[wp.bool],
+    rise: wp.array2d[float],
+    gap_closed: wp.array[float],
+    gap_end: wp.array[float],
+    contact_overflow: wp.array[int],
+):
+    """Holds parked blocks, limits speeds, extends the trace (`outcome.Trace`)."""
+    scene, slot = wp.tid()
+    first = position[slot]
+    dof = velocity[slot]
+    for i in range(6):
+        if in_play[scene, slot]:
+            qvel[scene, dof + i] = _limited(qvel[scene, dof + i], limit[i])
+        else:
+            qvel[scene, dof + i] = 0.0
+    if not in_play[scene, slot]:
+        for i in range(7):
+            qpos[scene, first + i] = start[scene, first + i]
+
+    gained = qpos[scene, first + 2] - start[scene, first + 2]
+    palm = touching[scene, 0, slot]
+    low = touching[scene, 1, slot]
+    high = touching[scene, 2, slot]
+    between = low + high == 2
+    if palm + low + high > 0:
+        touched[scene] = True  # other threads write the same
+    held[scene, slot] = between
+    rise[scene, slot] = gained
+    if between and gained > held_rise[scene, slot]:
+        held_rise[scene, slot] = gained
+    for part in range(3):
+        touching[scene, part, slot] = 0
+
+    if slot == 0:
+        gap = 2.0 * qpos[scene, finger]
+        if done[scene] == closed_after:
+            gap_closed[scene] = gap
+        gap_end[scene] = gap
+        if (overflow[scene] & lost_contacts) != 0:
+            contact_overflow[scene] = contact_overflow[scene] + 1
+        overflow[scene] = 0
+
+
+class Batch:
+    """Model, data and trace of E scenes on the current device, and the recorded substeps."""
+
+    def __init__(self, world: World, cfg: SimConfig, scenes: int, substeps: int) -> None:
+        self.substeps = substeps
+        self.model, self.data = _put(world.model, cfg, scenes)
+        slots, parts = len(world.slots), len(world.hand_geoms)
+        part_of_geom = np.full(world.model.ngeom, -1)
+        part_of_geom[world.hand_geoms] = np.arange(parts)
+        self._hand_and_blocks = [
+            wp.array(each, dtype=int) for each in (world.slot_of_geom, part_of_geom)
+        ]
+        self._constants = [
+            sum(cfg.grasp_phases[:2]),
+            _LOST_CONTACTS,
+            int(world.robot_qpos[-2]),
+            wp.array(world.block_qpos[:, 0], dtype=int),
+            wp.array(world.block_dofs[:, 0], dtype=int),
+            wp.array(layout.SPEED_LIMIT, dtype=float),
+        ]
+        self._qpos = wp.zeros((scenes, world.model.nq), dtype=float)
+        self._qvel = wp.zeros((scenes, world.model.nv), dtype=float)
+        self._control = wp.zeros((scenes, substeps, world.model.nu), dtype=float)
+        self._in_play = wp.zeros((scenes, slots), dtype=wp.bool)
+        state = [self._qpos, self._qvel, self._control, self._in_play]
+        self._given = [*(getattr(self.model, name) for name in FIELDS), *state]
+        self._touching = wp.zeros((scenes, parts, slots), dtype=int)
+        self._done = wp.zeros(scenes, dtype=int)
+        self._trace = [
+            wp.zeros((scenes, slots)[: kind.ndim], dtype=kind.dtype) for kind in _TRACE.values()
+        ]
+        self._advance = self.recorded(self.substep)
+
+    def run(self, inputs: Sequence[wp.array], outputs: Sequence[wp.array]) -> None:
+        """One primitive; arrays in the order of a simulator's arguments and results."""
+        for target, given in zip(self._given, inputs, strict=True):
+            wp.copy(target, given)
+        self.restart()
+        self._advance()
+        results = [self.data.qpos, self.data.qvel, *self._trace]
+        for target, result in zip(outputs, results, strict=True):
+            wp.copy(target, result)
+
+    def restart(self) -> None:
+        """Goes back to where the last primitive began."""
+        data = self.data
+        wp.copy(data.qpos, self._qpos)
+        wp.copy(data.qvel, self._qvel)
+        for blank in (data.time, data.qacc_warmstart, data.overflow, self._done, *self._trace):
+            blank.zero_()
+        self._touching.zero_()
+
+    def recorded(self, substep: Callable[[], None]) -> Callable[[], None]:
+        """A function that runs `substep` as often as a primitive does, on CUDA as graphs."""
+        if not wp.get_device().is_cuda:
+            return functools.partial(_repeat, substep, self.substeps)
+        load_kernels(substep)  # which a recording must not
+        self.restart()
+        substep()
+        each = max(n for n in range(1, GRAPH_SUBSTEPS + 1) if self.substeps % n == 0)
+        with _no_garbage_collection(), wp.ScopedCapture() as capture:
+            _repeat(substep, each)
+        launch = functools.partial(wp.capture_launch, capture.graph)
+        return functools.partial(_repeat, launch, self.substeps // each)
+
+    def step(self) -> None:
+        """One physics step with the set-points of the substep."""
+        given = [self._done, self._control, self.data.ctrl]
+        wp.launch(_command, self.data.nworld, given)
+        mjw.step(self.model, self.data)
+
+    def substep(self) -> None:
+        """One physics step, and what follows it."""
+        self.step()
+        data, contact = self.data, self.data.contact
+        contacts = [data.nacon, contact.worldid, contact.geom, contact.dist, contact.includemargin]
+        wp.launch(
+            _mark_touch,
+            data.naconmax,
+            [data.naconmax, *contacts, *self._hand_and_blocks, self._touching],
+        )
+        state = [data.qpos, data.qvel, self._touching, data.overflow, self._done]
+        wp.launch(
+            _observe,
+            self._in_play.shape,
+            [*self._constants, self._qpos, self._in_play, *state, *self._trace],
+        )
+
+
+def _repeat(call: Callable[[], None], times: int) -> None:
+    for _ in range(times):
+        call()
+
+
+def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int) -> tuple[Any, Any]:
+    """Warp's model, whose FIELDS every scene has its own of, and its data."""
+    own = copy.copy(model)
+    if BOXES_AS_PRIMITIVES:
+        own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+    put = mjw.put_model(own, batch_sizes=dict.fromkeys(FIELDS, scenes))
+    put.opt.warn_overflow = 0  # the trace counts
+    put.opt.graph_conditional = SOLVER_EXITS_EARLY
+    for kernel, threads in BLOCK_DIM.items():
+        setattr(put.block_dim, kernel, threads)
+    room = (scenes + SPARE_SCENES) * cfg.contacts
+    data = mjw.make_data(
+        own,
+        nworld=scenes,
+        nconmax=cfg.contacts,
+        naconmax=room,
+        naccdmax=round(room * CONVEX_PAIRS),
+        njmax=4 * cfg.contacts + 32,  # the edges of friction pyramids; joints and limits
+    )
+    return put, data
+
+
+def load_kernels(substep: Callable[[], None]) -> None:
+    """Builds and loads what `substep` launches, on all cores.
+
+    Launches load kernels one by one; the first time, when they are built, that takes minutes.
+    """
+    modules: dict[int, dict[Any, None]] = {}
+
+    def note(kernel: Any, *_: Any, block_dim: int = 256, **__: Any) -> None:  # Warp's default
+        modules.setdefault(block_dim, {})[kernel.module] = None
+
+    def once(_: Any, while_body: Callable[..., None], **given: Any) -> None:
+        while_body(**given)
+
+    with mock.patch.multiple(wp, launch=note, launch_tiled=note, capture_while=once):
+        substep()
+    for block_dim, used in modules.items():
+        wp.force_load(wp.get_device(), list(used), block_dim, max_workers=os.cpu_count())
+
+
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """CUDA ends the process where a program is freed while a graph is recorded."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+class Simulator:
+    """A function of the arrays of E scenes, for JAX to call.
+
+    It takes FIELDS, qpos [E, nq], qvel [E, nv], control [E, T, nu] and in_play [E, N] by these
+    names. It returns qpos, qvel and the leaves of `outcome.Trace`.
+    """
+
+    def __init__(self, world: World, cfg: SimConfig) -> None:
+        self.batches: dict[tuple[Any, int, int], Batch] = {}
+        """By device, scenes and substeps; made by the first action of so many scenes."""
+        self._world, self._cfg = world, cfg
+        self._arguments = {**FIELDS, **_STATE, **_COMMAND}
+        self._results = {**_STATE, **_TRACE}
+        self._callable = wp.jax_callable(
+            _annotated(self._run, list(self._arguments.items()), list(self._results.items())),
+            num_outputs=len(self._results),
+            graph_mode=wp.JaxCallableGraphMode.NONE,  # `Batch` records, without buffers of XLA
+        )
+
+    def __call__(self, **arrays: jax.Array) -> dict[str, jax.Array]:
+        """The results by name."""
+        model, (scenes, slots) = self._world.model, arrays["in_play"].shape
+        shapes = {name: (scenes, slots)[: kind.ndim] for name, kind in _TRACE.items()}
+        shapes |= {"qpos": (scenes, model.nq), "qvel": (scenes, model.nv)}
+        dims = {f"{name}_out": shape for name, shape in shapes.items()}
+        results = self._callable(*(arrays[name] for name in self._arguments), output_dims=dims)
+        return dict(zip(self._results, results, strict=True))
+
+    def _run(self, *arrays: wp.array) -> None:
+        inputs, outputs = arrays[: len(self._arguments)], arrays[len(self._arguments) :]
+        control = inputs[list(self._arguments).index("control")]
+        device, (scenes, substeps, _) = control.device, control.shape
+        with wp.ScopedDevice(device):
+            batch = self.batches.get((device.alias, scenes, substeps))
+            if batch is None:
+                batch = Batch(self._world, self._cfg, scenes, substeps)
+                self.batches[device.alias, scenes, substeps] = batch
+            batch.run(inputs, outputs)
+
+
+def _annotated(
+    run: Callable[..., None], arguments: list[tuple[str, Any]], results: list[tuple[str, Any]]
+) -> Callable[..., None]:
+    """`run` with a signature, from which Warp reads the types of arguments and results."""
+    kinds = dict(arguments) | {f"{name}_out": kind for name, kind in results}
+
+    def function(*arrays: wp.array) -> None:
+        run(*arrays)
+
+    function.__annotations__ = kinds
+    some = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    function.__signature__ = inspect.Signature(
+        [inspect.Parameter(name, some, annotation=kind) for name, kind in kinds.items()]
+    )
+    return function

@@ -1,0 +1,117 @@
+"""Primitives on MuJoCo Warp as one call: a faster `sim.physics warp`, not in the package yet.
+
+All substeps of many scenes are one call (`action`), where the package makes one for each substep.
+An action of the environment takes 0.67 to 0.69 of the time on an H200, 2,048 to 8,192 scenes. But a
+whole training of `fast` made 1,985 actions a second, which is no faster than before: a training
+step takes 1.03 s, its parts 0.37 s (physics) and 0.31 s (the rest). The cause is not known.
+
+Meshes have one size in all scenes. Results are not repeatable bit for bit.
+"""
+
+import dataclasses
+import functools
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax.config import MESH_KINDS, SimConfig
+from csac_jax.errors import SceneError
+from csac_jax.scene import layout
+from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import World, scene_fields
+from csac_jax.sim.outcome import Trace
+from csac_jax.sim.primitives import JointTrajectory
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WarpPhysics:
+    """A world on Warp; every batch of scenes lies on the device once it has been used."""
+
+    world: World
+    simulator: Any
+    """`action.Simulator`"""
+
+    @functools.cached_property
+    def _simulate(self) -> Callable[[dict[str, jax.Array]], dict[str, jax.Array]]:
+        return _flat_vmap(lambda inputs: self.simulator(**inputs))
+
+    def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+        """See `physics.Physics`."""
+        world = self.world
+        scene = layout.park(scene, scene.in_play)  # where nothing meets them
+        inputs = {**_model_fields(world, scene), **_start(world, scene, joints)}
+        inputs |= {"control": joints.control, "in_play": scene.in_play}
+        results = self._simulate(jax.tree.map(lambda leaf: leaf[None], inputs))
+        results = jax.tree.map(lambda leaf: leaf[0], results)
+        pose, velocity = results.pop("qpos")[world.block_qpos], results.pop("qvel")
+        moved = scene.replace(
+            position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity[world.block_dofs]
+        )
+        return moved, Trace(**results)
+
+
+def make(world: World, cfg: SimConfig) -> WarpPhysics:
+    """Physics of a world on Warp. Raises SceneError where Warp is not installed."""
+    if importlib.util.find_spec("warp") is None:
+        raise SceneError("sim.physics: warp is an extra; run: pip install 'csac-jax[warp]'")
+    from experiments.warp import action
+
+    return WarpPhysics(world, action.Simulator(world, cfg))
+
+
+def _flat_vmap(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A function of leaves [E, ...], whose vmap gives it leaves [S * E, ...]."""
+    flat = jax.custom_batching.custom_vmap(function)
+
+    @flat.def_vmap
+    def _(size: int, batched: Any, inputs: Any) -> tuple[Any, Any]:
+        def join(leaf: jax.Array, is_batched: bool) -> jax.Array:
+            every = leaf if is_batched else jnp.broadcast_to(leaf[None], (size, *leaf.shape))
+            return every.reshape(-1, *every.shape[2:])
+
+        results = flat(jax.tree.map(join, inputs, *batched))
+        split = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), results)
+        return split, jax.tree.map(lambda _: True, split)
+
+    return flat
+
+
+def _model_fields(world: World, scene: Scene) -> dict[str, jax.Array]:
+    """The model's fields with this scene's block sizes, masses and frictions."""
+    model, fields = world.model, scene_fields(world, scene)
+    geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
+    is_mesh = np.array([kind in MESH_KINDS for kind in world.slots])[world.parts.slot]
+    bounds = jnp.stack([jnp.zeros_like(fields.size), fields.size], axis=1)  # centre, half size
+    bounds = jnp.where(is_mesh[:, None, None], model.geom_aabb[geoms].reshape(-1, 2, 3), bounds)
+    mass = jnp.asarray(model.body_mass, jnp.float32)
+    added_mass = jnp.sum(fields.mass - mass[bodies])
+    subtree = jnp.asarray(model.body_subtreemass, jnp.float32).at[0].add(added_mass)
+
+    def base(name: str) -> jax.Array:
+        return jnp.asarray(getattr(model, name), jnp.float32)
+
+    return {
+        "geom_size": base("geom_size").at[geoms].set(fields.size),
+        "geom_pos": base("geom_pos").at[geoms].set(fields.centre),
+        "geom_aabb": base("geom_aabb").reshape(-1, 2, 3).at[geoms].set(bounds),
+        "geom_rbound": base("geom_rbound").at[geoms].set(fields.rbound),
+        "geom_friction": base("geom_friction").at[geoms, 0].set(fields.friction),
+        "body_mass": mass.at[bodies].set(fields.mass),
+        "body_subtreemass": subtree.at[bodies].set(fields.mass),
+        "body_inertia": base("body_inertia").at[bodies].set(fields.inertia),
+        "body_ipos": base("body_ipos").at[bodies].set(fields.com),
+        "body_invweight0": base("body_invweight0").at[bodies].set(fields.body_invweight),
+        "dof_invweight0": base("dof_invweight0").at[dofs].set(fields.dof_invweight),
+    }
+
+
+def _start(world: World, scene: Scene, joints: JointTrajectory) -> dict[str, jax.Array]:
+    """The blocks of the scene, and the robot at rest at its first set-point."""
+    poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
+    qpos = jnp.asarray(world.model.qpos0, jnp.float32).at[world.robot_qpos].set(joints.start)
+    qvel = jnp.zeros(world.model.nv).at[world.block_dofs].set(scene.velocity)
+    return {"qpos": qpos.at[world.block_qpos].set(poses), "qvel": qvel}
