@@ -104,36 +104,36 @@ def run(
 ) -> Summary:
     """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
 
-    Args: run_dir, exists if `resume`, else is made; at, the step to resume from, by default the
-    newest sound one; init, gives the first state, a pytree with
+    Args: run_dir, exists if `resume`, else is made; init, gives the first state, a pytree with
     `step` [] int32; compile_chunk, takes the number of steps and gives a jitted function state ->
-    (state, StepMetrics [T, ...]) that may use up its argument. Raises TrainingError on a loss
-    or parameter that is not finite, CheckpointError if there is nothing sound to resume from,
-    LockedError if another process trains in `run_dir`.
+    (state, StepMetrics [T, ...]) that may use up its argument; at, the step to resume from, by
+    default the newest sound one. Raises TrainingError on a loss or parameter that is not finite,
+    CheckpointError if there is nothing sound to resume from or the disc is full, LockedError if
+    another process trains in `run_dir`.
     """
     checkpoint.check_path(run_dir)
     if not resume:
         run_dir.mkdir(parents=True)
     with lock.exclusive(run_dir):
-        return _run(cfg, run_dir, init, compile_chunk, reporter, stop, resume, at)
+        state, progress = _begin(cfg, run_dir, init, resume, at)
+        return _go_on(cfg, run_dir, state, progress, compile_chunk, reporter, stop, resume)
 
 
-def _run(
+def _go_on(
     cfg: Config,
     run_dir: Path,
-    init: Callable[[], Any],
+    state: Any,
+    progress: Progress,
     compile_chunk: Callable[[int], Any],
     reporter: Reporter,
     stop: Stop,
-    resume: bool,
-    at: int | None,
+    resumed: bool,
 ) -> Summary:
-    """See `run`; nobody else writes in the folder."""
-    state, progress = _begin(cfg, run_dir, init, resume, at)
+    """Trains from this state on, see `run`; nobody else writes in the folder."""
     step, total, scenes = int(state.step), total_steps(cfg), cfg.train.scenes
-    if resume:
+    if resumed:
         reporter.say(f"resumed {run_dir} at step {step} ({step * scenes} actions)")
-    chunk, compile_seconds, doubted, saved = None, 0.0, False, step if resume else None
+    chunk, compile_seconds, doubted, saved = None, 0.0, False, step if resumed else None
     while step < total and stop.signal is None:
         if chunk is None:
             chunk, compile_seconds = compile_program(cfg, compile_chunk, state, reporter)

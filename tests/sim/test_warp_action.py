@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import importlib.util
 from typing import Any, NamedTuple
 
 import jax
@@ -21,18 +20,10 @@ from csac_jax.sim.primitives import JointTrajectory
 from csac_jax.vision import observe
 from experiments.warp import physics
 from tests.sim.conftest import CASES, CONFIG
+from tests.sim.test_warp_physics import needs_warp
 
 SCENES = 4
 SLOTS = ("box", "arch", "prism", "cylinder")
-
-
-def needs_warp(test: Any) -> Any:
-    """Marks of a test that runs Warp."""
-    skip = pytest.mark.skipif(
-        importlib.util.find_spec("warp") is None,
-        reason="Warp is an extra: pip install 'csac-jax[warp]'",
-    )
-    return pytest.mark.mjx(pytest.mark.slow(skip(test)))
 
 
 def _config(slots: tuple[SlotKind, ...] = CONFIG.scene.slots) -> Config:

@@ -26,6 +26,15 @@ SCENES = 4
 SLOTS = ("box", "arch", "prism", "cylinder")
 
 
+def needs_warp(test: Any) -> Any:
+    """Marks of a test that runs Warp."""
+    skip = pytest.mark.skipif(
+        importlib.util.find_spec("warp") is None,
+        reason="Warp is an extra: pip install 'csac-jax[warp]'",
+    )
+    return pytest.mark.mjx(pytest.mark.slow(skip(test)))
+
+
 def _config() -> Config:
     quick = presets.get("quick")
     scene = dataclasses.replace(
@@ -54,12 +63,7 @@ def test_meshes_of_two_sizes_are_refused():
     assert cfg.change(scene=boxes).sim.physics == "warp"
 
 
-@pytest.mark.mjx
-@pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("warp") is None,
-    reason="Warp is an extra: pip install 'csac-jax[warp]'",
-)
+@needs_warp
 def test_grasps_go_as_in_c():
     """Claim: the planner's grasps of blocks of four kinds end on Warp as they do in C MuJoCo."""
     outcome, position, trace = _end(_config(), "warp")
@@ -70,12 +74,7 @@ def test_grasps_go_as_in_c():
     assert np.median(np.linalg.norm(position - position_c, axis=2)) < 1e-3
 
 
-@pytest.mark.mjx
-@pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("warp") is None,
-    reason="Warp is an extra: pip install 'csac-jax[warp]'",
-)
+@needs_warp
 def test_spinning_block_goes_as_in_c():
     """Claim: blocks that spin in the air, lighter than the model has them, are after a step as fast
     as in C."""
