@@ -4,7 +4,7 @@
     RUN/checkpoints/STEP/state/...        arrays, by Orbax
     RUN/checkpoints/STEP/config, extra    JSON, by Orbax
     RUN/checkpoints/STEP/manifest.sha256  digest of every file above
-    RUN/checkpoints/set-aside/STEP        a damaged one that a resumed run has passed over
+    RUN/checkpoints/set-aside/STEP        one that was passed over on resuming, or saved once more
 
 A step is written under another name and renamed once its manifest is there: it appears complete or
 not at all. Orbax restores flipped bits and casts other dtypes silently. So every file is checked
@@ -39,7 +39,7 @@ SET_ASIDE = "set-aside"
 KEPT = 2
 _RUN = "run"
 _PATTERNS = "*?[\\"  # Orbax globs; TensorStore takes a backslash for a slash
-_DRAFT, _OLD = ".saving", ".replaced"
+_DRAFT = ".saving"
 
 
 class CheckpointError(FailedError):
@@ -60,7 +60,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
     """Writes `state` (a pytree of arrays and typed keys) as `step`; returns once it is complete.
     The last two are kept.
 
-    Removes what a killed process left; replaces a folder of that step. `extra` is anything that
+    Removes what a killed process left; sets a folder of that step aside. `extra` is anything that
     JSON can hold. With several processes all must call it. Raises CheckpointError where it cannot
     be written, as on a full disc; earlier checkpoints stay as they are.
     """
@@ -183,10 +183,8 @@ def _set_aside(folder: Path) -> None:
 
 def _publish(draft: Path, folder: Path) -> None:
     """Gives a complete step its name and drops those before the last two."""
-    if folder.exists() and _fault(folder) is not None:
-        _set_aside(folder)
-    elif folder.exists():
-        folder.rename(folder.parent / _OLD)
+    if folder.exists():
+        _set_aside(folder)  # not removed: a kill may come before the next line has run
     draft.rename(folder)
     files.sync_folder(folder.parent)
     for number in _steps(folder.parents[1])[:-KEPT]:
@@ -195,7 +193,7 @@ def _publish(draft: Path, folder: Path) -> None:
 
 def _clean(root: Path) -> None:
     """Removes what a save that did not end has left."""
-    for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT, root / _OLD]:
+    for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
         shutil.rmtree(path, ignore_errors=True)
 
 

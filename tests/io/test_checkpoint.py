@@ -145,6 +145,25 @@ def _falls_back(run_dir: Path, message: str) -> None:
         assert checkpoint.load_config(run_dir) == CFG
 
 
+def test_a_step_that_is_saved_again_is_never_away(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a save of a step that exists removes no sound copy of it, even where it fails."""
+
+    def fail(_: Path, __: Path) -> None:
+        raise OSError("no space")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", _failing_from(".saving", Path.rename, fail))
+        with pytest.raises(CheckpointError, match="could not be saved"):
+            checkpoint.save(run_dir, 8, _state(8), CFG, {})
+    checkpoint.save(run_dir, 12, _state(12), CFG, {})  # which clears what a save has left
+    assert (run_dir / "checkpoints" / checkpoint.SET_ASIDE / "8" / checkpoint.MANIFEST).exists()
+
+
+def _failing_from(name: str, call: Any, fail: Any) -> Any:
+    """`call`, or `fail` where its first argument has this name."""
+    return lambda path, target: (fail if path.name == name else call)(path, target)
+
+
 @pytest.mark.parametrize("position", [0.0, 0.5, 0.99])
 def test_flipped_bit_is_seen(run_dir: Path, position: float):
     """Claim: a step with a flipped bit is not restored; the newest sound one is, with a warning
