@@ -5,35 +5,23 @@ import functools
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import presets
-from csac_jax.config import Config, PhysicsKind, SlotKind
-from csac_jax.constants import Outcome
-from csac_jax.scene import layout, model, pool
+from csac_jax.config import Config, PhysicsKind
+from csac_jax.scene import layout, model
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import oracle, physics as simulation, primitives
-from csac_jax.sim.outcome import Trace, grasp_outcome
+from csac_jax.sim import physics as simulation, primitives
+from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import JointTrajectory
 from csac_jax.vision import observe
 from experiments.warp import physics
+from tests.sim import on_warp
 from tests.sim.conftest import CASES, CONFIG
-from tests.sim.test_warp_physics import needs_warp
-
-SCENES = 4
-SLOTS = ("box", "arch", "prism", "cylinder")
 
 
-def _config(slots: tuple[SlotKind, ...] = CONFIG.scene.slots) -> Config:
-    quick = presets.get("quick")
-    scene = dataclasses.replace(
-        quick.scene, slots=slots, min_blocks=len(slots), size_jitter=(0.1, 0.0)
-    )
-    return dataclasses.replace(
-        quick, scene=scene, sim=dataclasses.replace(quick.sim, physics="warp")
-    )
+def _config() -> Config:
+    return on_warp.config(CONFIG.scene.slots)
 
 
 class Ran(NamedTuple):
@@ -65,7 +53,7 @@ def ran(run_on_warp: Any) -> Ran:
     return jax.tree.map(np.asarray, Ran(scenes, joints, *runs))
 
 
-@needs_warp
+@on_warp.needs_warp
 def test_scripted_primitives_go_as_in_c(ran: Ran):
     """Claim: after an action, blocks lie where C MuJoCo leaves them, within a tenth of a
     millimetre where no block was pressed aside, and every trace says the same."""
@@ -86,7 +74,7 @@ def test_scripted_primitives_go_as_in_c(ran: Ran):
     assert not trace.contact_overflow.any()
 
 
-@needs_warp
+@on_warp.needs_warp
 def test_parked_blocks_stay(ran: Ran):
     """Claim: blocks out of play end parked, at rest and unmoved, wherever a scene says they are."""
     after, trace = ran.warp
@@ -97,7 +85,7 @@ def test_parked_blocks_stay(ran: Ran):
     assert not trace.rise[parked].any()
 
 
-@needs_warp
+@on_warp.needs_warp
 def test_nested_vmap_is_a_loop(ran: Ran, run_on_warp: Any):
     """Claim: seeds of scenes are one batch, whose results are those of scenes one by one; what
     seeds share may be given once."""
@@ -111,7 +99,7 @@ def test_nested_vmap_is_a_loop(ran: Ran, run_on_warp: Any):
             jax.tree.map(close, _at(nested, (seed, row)), alone)
 
 
-@needs_warp
+@on_warp.needs_warp
 def test_scenes_have_their_own_blocks(ran: Ran, run_on_warp: Any):
     """Claim: sizes, masses and frictions are those of each scene."""
     rows = [0, 0, 4, 4]  # a cube that slides while nothing is grasped, a cube that is lifted
@@ -130,7 +118,7 @@ def test_scenes_have_their_own_blocks(ran: Ran, run_on_warp: Any):
     assert trace_c.gap_end[3] - trace_c.gap_end[2] > 5e-3
 
 
-@needs_warp
+@on_warp.needs_warp
 def test_nothing_is_left_from_another_action(ran: Ran, run_on_warp: Any):
     """Claim: a compiled program gives what its arguments say, whatever ran before it."""
     run = jax.jit(jax.vmap(run_on_warp))
@@ -145,30 +133,18 @@ def test_nothing_is_left_from_another_action(ran: Ran, run_on_warp: Any):
     jax.tree.map(close, results[1], _at(ran.warp, second))
 
 
-@needs_warp
+@on_warp.needs_warp
 def test_grasps_go_as_in_c():
     """Claim: the planner's grasps of blocks of four kinds end on Warp as they do in C MuJoCo."""
-    outcome, position, trace = _end(_config(SLOTS), "warp")
-    outcome_c, position_c, _ = _end(_config(SLOTS), "c")
-    assert (outcome_c == Outcome.LIFTED).all()
-    np.testing.assert_array_equal(outcome, outcome_c)
-    assert not trace.contact_overflow.any()
-    assert np.median(np.linalg.norm(position - position_c, axis=2)) < 1e-3
+    on_warp.compare_grasps(physics.make)
 
 
-@needs_warp
+@on_warp.needs_warp
 def test_spinning_block_goes_as_in_c():
     """Claim: blocks that spin in the air, lighter than the model has them, are after some substeps
     as fast as in C."""
-    cfg = _config(SLOTS).change(sim={"grasp_phases": (2, 1, 2)})
-    scene = layout.parked(SLOTS)
-    rng = np.random.default_rng(0)
-    scene = scene.replace(
-        position=scene.position + np.float32([0.0, 0.0, 0.5]),
-        velocity=rng.normal(0.0, [1, 1, 1, 20, 20, 20], (len(SLOTS), 6)).astype(np.float32),
-        density=rng.uniform(450.0, 900.0, len(SLOTS)).astype(np.float32),
-        in_play=np.ones(len(SLOTS), bool),
-    )
+    cfg = on_warp.config().change(sim={"grasp_phases": (2, 1, 2)})
+    scene = on_warp.spinning()
     start = np.float32([0.0, 0.0, 0.3, 0.0, 0.05, 0.05])
     joints = JointTrajectory(start, np.tile(start[:5], (cfg.sim.substeps, 1)), np.ones((), bool))
     after, _ = jax.jit(_physics("warp", cfg).run)(scene, joints)
@@ -189,16 +165,3 @@ def _at(tree: Any, index: Any) -> Any:
 
 def _stack(*trees: Any) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
-
-
-def _end(cfg: Config, kind: PhysicsKind) -> tuple[np.ndarray, np.ndarray, Trace]:
-    """Outcomes [E], ends [E, N, 3] m and traces of the planner's grasps in settled scenes."""
-    cfg = cfg.change(sim={"physics": kind})
-    scenes = pool.settled(cfg, 77, SCENES)
-    height = jax.vmap(lambda scene: observe.observe(cfg, scene).height)(scenes)
-    action = jax.vmap(functools.partial(oracle.grasp, cfg))(scenes, height)
-    run = functools.partial(simulation.execute, _physics(kind, cfg), cfg)
-    after, trace, plan = jax.jit(jax.vmap(run))(scenes, height, action)
-    rise = plan.start[:, 2] - jnp.min(plan.control[:, :, 2], axis=1)
-    outcome = jax.vmap(grasp_outcome)(trace, plan.surface, rise)
-    return np.asarray(outcome), np.asarray(after.position), jax.tree.map(np.asarray, trace)
