@@ -4,6 +4,8 @@ Imports point back along the data path: a module imports from its own stage and 
 """
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -182,6 +184,15 @@ def _use_fault(name: str, stage: str, node: ast.AST, aliases: dict[str, str]) ->
 def test_package_keeps_the_contract():
     """Claim: imports point back along the data path, and each library is used in its stage only."""
     assert violations(PACKAGE) == []
+
+
+@pytest.mark.parametrize(
+    "module", ["agent.policy", "io.policy_file", "nets.networks", "vision.camera", "vision.observe"]
+)
+def test_policies_need_no_mujoco(module: str):
+    """Claim: what sees, thinks and reads policies is imported without MuJoCo installed."""
+    code = f"import sys; sys.modules['mujoco'] = None; import csac_jax.{module}"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_checker_reads_the_package():

@@ -15,9 +15,8 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 
 from csac_jax.config import Config
-from csac_jax.constants import Primitive
+from csac_jax.constants import MAX_OPENING, Primitive
 from csac_jax.evaluation.rollout import StepRecord
-from csac_jax.scene.model import MAX_OPENING
 
 CANDIDATES = {Primitive.PUSH: "#0072B2", Primitive.GRASP: "#CC79A7"}  # palette of Okabe and Ito
 CHOSEN = "#D55E00"

@@ -11,9 +11,8 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from csac_jax import presets
-from csac_jax.constants import Primitive
+from csac_jax.constants import MAX_OPENING, Primitive
 from csac_jax.render import panels
-from csac_jax.scene.model import MAX_OPENING
 
 CFG = presets.smoke()
 SIZE = CFG.heightmap.size
