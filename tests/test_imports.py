@@ -21,7 +21,7 @@ ORDER = (
     ("cli",),
     ("api",),
     ("render", "report"),
-    ("sweeps",),
+    ("sweeps", "deploy"),
     ("evaluation",),
     ("training",),
     ("io",),
@@ -59,7 +59,7 @@ ONLY_IN = {
     "tensorboardX": ("report/progress.py",),
 }
 JIT_IN = (
-    *("training", "sweeps", "evaluation"),
+    *("training", "sweeps", "evaluation", "deploy"),
     *(
         "runtime/compiler.py",
         "runtime/selftest.py",
@@ -187,7 +187,15 @@ def test_package_keeps_the_contract():
 
 
 @pytest.mark.parametrize(
-    "module", ["agent.policy", "io.policy_file", "nets.networks", "vision.camera", "vision.observe"]
+    "module",
+    [
+        "agent.policy",
+        "deploy",
+        "io.policy_file",
+        "nets.networks",
+        "vision.camera",
+        "vision.observe",
+    ],
 )
 def test_policies_need_no_mujoco(module: str):
     """Claim: what sees, thinks and reads policies is imported without MuJoCo installed."""
