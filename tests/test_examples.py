@@ -9,6 +9,7 @@ import pytest
 import csac_jax
 
 FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
+BY_PAGE = ("camera_image",)  # run by docs/robot.md, see test_docs
 TRAINERS = ("own_sampler", "own_network", "own_learner")
 
 
@@ -23,7 +24,7 @@ def _module(name: str) -> ModuleType:
 
 def test_every_example_is_tested():
     """Claim: the tests below run all of them."""
-    assert {path.stem for path in FOLDER.glob("*.py")} == {*TRAINERS, "random_agent"}
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*TRAINERS, *BY_PAGE, "random_agent"}
 
 
 @pytest.mark.parametrize("path", FOLDER.glob("*.py"), ids=lambda path: path.stem)

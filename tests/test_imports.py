@@ -54,7 +54,7 @@ ONLY_IN = {
     "pydantic": ("io",),
     "safetensors": ("io",),
     "matplotlib": ("render", "report"),
-    "imageio": ("render/media.py",),
+    "imageio": ("render/media.py", "deploy/files.py"),
     "jinja2": ("report/charts.py",),
     "tensorboardX": ("report/progress.py",),
 }

@@ -18,6 +18,7 @@ from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
 from csac_jax.deploy import checks, decision, images, program
+from csac_jax.deploy.checks import Report
 from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.images import View
 from csac_jax.errors import SettingsError
@@ -32,17 +33,6 @@ _observe = jax.jit(program.observe, static_argnums=0)
 _dense_maps = jax.jit(program.dense_maps, static_argnums=(0, 3))
 _choose = jax.jit(program.choose, static_argnums=0)
 _best_over_yaws = jax.jit(program.best_over_yaws, static_argnums=0)
-
-
-class Report(NamedTuple):
-    """What an image of the empty table says of the camera's pose and intrinsics."""
-
-    height_mm: float  # of the table above z = 0, at the workspace's centre
-    tilt_deg: float  # of the table
-    worst_mm: float  # largest distance of the table from z = 0 in the workspace
-    noise_mm: float  # standard deviation of the depth image's points on the table
-    seen: float  # share of the workspace
-    covered_cm2: float  # area higher than 1 cm, which an empty table has none of
 
 
 class Maps(NamedTuple):

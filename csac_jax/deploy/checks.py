@@ -5,11 +5,13 @@ Each function raises ViewError, one line that says what is wrong by how much, or
 
 import dataclasses
 import warnings
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from csac_jax.config import HeightmapConfig
+from csac_jax.constants import CHANGE_AREA
 from csac_jax.deploy import images
 from csac_jax.deploy.images import View
 from csac_jax.errors import DataWarning, ViewError
@@ -52,6 +54,29 @@ class Table:
     def worst(self, extent: float) -> float:
         """Largest distance from z = 0 over the square of side `extent` m, m."""
         return float(abs(self.height) + 0.5 * extent * np.abs(self.slope).sum())
+
+
+class Report(NamedTuple):
+    """What an image of the empty table says of the camera's pose and intrinsics."""
+
+    height_mm: float  # of the table above z = 0, at the workspace's centre
+    tilt_deg: float  # of the table
+    worst_mm: float  # largest distance of the table from z = 0 in the workspace
+    noise_mm: float  # standard deviation of the points on the table
+    seen: float  # share of the workspace
+    covered_cm2: float  # area higher than 1 cm, which an empty table has none of
+
+
+def faults(report: Report) -> list[str]:
+    """What must be mended before decisions are taken, one line each."""
+    found = {
+        "the table is not at z = 0: measure the pose again": (
+            report.worst_mm > 1e3 * TABLE_TOLERANCE
+        ),
+        "too little of the workspace is seen: move the camera": report.seen < SEEN_SHARE,
+        "the table is not empty, or its depth too noisy": report.covered_cm2 > CHANGE_AREA,
+    }
+    return [fault for fault, holds in found.items() if holds]
 
 
 def pose(view: View) -> None:
