@@ -654,7 +654,7 @@ def _sweep_program(group: object) -> SimpleNamespace:
     )
 
 
-@fault("NaN in one of 64 scenes, in a reward, in a weight", tries=18, slow=True)
+@fault("NaN in one of 64 scenes, a reward, a gradient, a weight", tries=20, slow=True)
 def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
     """The real training step. A scene's NaN stays there and is counted; NaN that reaches the
     networks is told at once."""
@@ -673,11 +673,11 @@ def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally
 
     start, _ = run(start)
     for number in range(tries):
-        kind = ("scene", "reward", "weight")[number % 3]
+        kind = ("scene", "reward", "gradient", "weight")[number % 4]
         tally.tries += 1
-        state, told = _poisoned(rng, start, kind), None
-        for _ in range(20 if kind == "reward" else 1):  # until it is drawn
-            state, metrics = run(state)
+        state, told = start, None
+        for _ in range(100 if kind == "reward" else 1):  # until it is drawn
+            state, metrics = run(_poisoned(rng, state, kind))
             if told := loop.not_finite(metrics):
                 break
         sound = _finite(state.learner) and _finite(state.scenes)
@@ -702,13 +702,16 @@ def _poisoned(rng: np.random.Generator, state: step.TrainState, kind: str) -> st
         return state.replace(scenes=state.scenes.replace(scene=spoilt_scene))
     if kind == "reward":
         items = state.replay.items
-        items = items._replace(reward=items.reward.at[int(rng.integers(64))].set(jnp.nan))
+        items = items.replace(reward=items.reward.at[int(rng.integers(128))].set(jnp.nan))
         return state.replace(replay=state.replay.replace(items=items))
-    leaves, structure = jax.tree.flatten(state.learner)
+    # Adam's moments keep what a gradient was
+    part = "critic_optimiser" if kind == "gradient" else str(rng.choice(["online", "target"]))
+    leaves, structure = jax.tree.flatten(getattr(state.learner, part))
     floats = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     chosen = int(rng.choice(floats))
     leaves[chosen] = spoilt(leaves[chosen])
-    return state.replace(learner=jax.tree.unflatten(structure, leaves))
+    poisoned = {part: jax.tree.unflatten(structure, leaves)}
+    return state.replace(learner=state.learner.replace(**poisoned))
 
 
 def _finite(tree: object) -> bool:
