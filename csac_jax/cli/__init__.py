@@ -23,6 +23,7 @@ from csac_jax.cli import (
     parsing,
     play,
     report,
+    serve,
     sweep,
     train,
 )
@@ -35,6 +36,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "eval": evaluation.run,
     "play": play.run,
     "act": act.run,
+    "serve": serve.run,
     "report": report.run,
     "export": export.run,
     "doctor": doctor.run,
@@ -52,6 +54,7 @@ A robot learns to push and grasp in clutter.
   eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
   act POLICY         decide where to grasp or push in a camera's image
+  serve POLICY       answer images by decisions over HTTP
   report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
   doctor             versions, devices and a self-test of this machine

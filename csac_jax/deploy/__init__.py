@@ -115,6 +115,16 @@ class Policy:
             covered_cm2=float(np.sum(height > BARE) * 1e4 * self.cfg.heightmap.cell**2),
         )
 
+    def warm_up(self, width: int, height: int) -> None:
+        """Compiles what decisions about images of this size need, px."""
+        n, rows = width * height, (self.cfg.heightmap.size,) * 2
+        pixels = np.zeros((n, 3), np.float32), np.zeros(n, bool), np.zeros((n, 3), np.uint8)
+        target = np.zeros(n, bool) if self.cfg.task.kind == "target" else None
+        cache.enable()
+        obs = _observe(self.cfg, *pixels, target)
+        state = _dense_maps(self.cfg, self.params, obs, target is not None)
+        jax.block_until_ready(_choose(self.cfg, state, jax.numpy.zeros(rows)))
+
     def _see(self, *given: Any) -> tuple[Observation, DenseMaps]:
         """The observation and the dense maps of an image that decisions may be taken from."""
         view = self._checked_view(*given)

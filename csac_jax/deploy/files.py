@@ -25,10 +25,7 @@ def read_depth(path: Path) -> np.ndarray:
         if depth.dtype.kind != "f":
             raise SettingsError(f"{path}: is {depth.dtype}; an .npy file holds metres as float32")
         return depth
-    depth = _image(path)
-    if depth.dtype.itemsize < 2 or depth.dtype.kind not in "iu":
-        raise SettingsError(f"{path}: is {depth.dtype}; give a PNG of 16 bits, in mm, or an .npy")
-    return (1e-3 * depth).astype(np.float32)
+    return metres(_image(path), str(path))
 
 
 def read_mask(path: Path) -> np.ndarray:
@@ -55,8 +52,23 @@ def read_pose(path: Path) -> np.ndarray:
     return _of(path, matrix, files.read_object)
 
 
+def metres(depth: np.ndarray, name: str) -> np.ndarray:
+    """Depth of an image of 16 bits, in mm, as float32 m."""
+    if depth.dtype.itemsize < 2 or depth.dtype.kind not in "iu":
+        raise SettingsError(f"{name}: is {depth.dtype}; give a PNG of 16 bits, in mm, or metres")
+    return (1e-3 * depth).astype(np.float32)
+
+
+def decode(content: bytes) -> np.ndarray:
+    """The pixels of an image file's content. Raises SettingsError."""
+    try:
+        return imageio.imread(content)
+    except Exception as error:  # damaged images raise nearly anything
+        raise SettingsError(f"the image is damaged: {files.first_line(error)}") from None
+
+
 def _image(path: Path) -> np.ndarray:
-    return _of(path, imageio.imread, files.read_bytes)
+    return _of(path, decode, files.read_bytes)
 
 
 def _array(path: Path) -> np.ndarray:
