@@ -52,6 +52,7 @@ ONLY_IN = {
     "tyro": ("cli",),
     "rich": ("report", "cli", "api"),
     "pydantic": ("io", "deploy/service.py"),
+    "onnx": ("deploy/onnx_graph.py",),
     "fastapi": ("deploy/service.py",),
     "uvicorn": ("cli/serve.py",),
     "safetensors": ("io",),
