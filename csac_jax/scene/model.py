@@ -20,7 +20,6 @@ from csac_jax.scene.blocks import Parts
 from csac_jax.scene.layout import Scene
 
 HAND_GEOMS = ("palm", "pad_low", "pad_high")
-MAX_OPENING = 0.110  # m, RG2 data sheet
 LARGEST = 1.25  # compiled over nominal block size: C culls pairs by the bounds it was compiled with
 HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above the highest drop
 
