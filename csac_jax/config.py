@@ -364,6 +364,9 @@ class TargetConfig(Section, section="target"):
     """V(s'): softmax over noisy target actions (line 17), or the dense map's maximum (eq. 9)."""
     gamma: float = _bounded(0.5, 0.0, 1.0)  # Discount (VPG).
     samples: int = _bounded(50, 1)  # Noisy target actions per primitive in the softmax (SD3).
+    bootstrap: Literal["episodic", "continuing"] = "episodic"
+    """Where V(s') is 0: after the end of an episode; or, as in VPG's code, where an action neither
+    changed nor lifted anything, and an episode's end bootstraps from the next one's first state."""
 
     def check(self) -> None:
         _require(self.gamma < 1.0, "target.gamma: must be below 1")
@@ -376,11 +379,11 @@ class RewardConfig(Section, section="reward"):
     dead_band = 0.1  # gain in the best grasp's value that a good push must exceed (ours)
     push_level = 0.0  # s_c of eq. 13, the push's level
     grasp_level = 1.0  # s_g of eq. 13, the grasp's level, which is s_max
+    eta = (0.0, 1.0)  # eta_0 and eta_1 of eq. 13, for which no numbers are given
 
     success_bonus: float = 1.0  # r2 of eq. 11: the hand comes back with a block.
     distance_weight: float = _bounded(0.0, 0.0)
     """w: penalty per metre between the place and where the tips acted (eq. 10, sign turned)."""
-    eta: tuple[float, float] = (0.0, 1.0)  # eta_0 and eta_1 of eq. 13.
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
     push_effect: Literal["value", "change"] = "value"
@@ -444,7 +447,7 @@ class UniformReplay(Section, section="replay"):
     """CSAC's replay: all transitions are equally likely."""
 
     sampler: Literal["uniform"] = "uniform"
-    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
@@ -457,7 +460,7 @@ class PrioritisedReplay(Section, section="replay"):
     per_epsilon = 0.01  # added to abs(TD error), so that no transition is out of reach (ours)
 
     sampler: Literal["prioritised"] = "prioritised"
-    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
@@ -470,7 +473,7 @@ class BetaReplay(Section, section="replay"):
     middle_at = 0.4  # share of all updates after which (a, b) is `middle` (ours)
 
     sampler: Literal["beta"] = "beta"
-    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
     rank_by: Literal["error", "reward"] = "error"
     """Rank 0: the largest abs(TD error) (sec. 3.5) or reward (Algorithm 1 line 15)."""
@@ -482,7 +485,18 @@ class BetaReplay(Section, section="replay"):
     """(a, b) in the end (CSAC sec. 4.3)."""
 
 
-ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay
+class OppositeReplay(Section, section="replay"):
+    """VPG's replay: with each of the newest transitions one of the same primitive whose outcome was
+    the opposite; its rank by abs(TD error) follows Beta(1, 2) (Zeng et al., code, `trainer.py`)."""
+
+    law = (1.0, 2.0)  # (a, b) of the ranks: a power law of exponent 2 (Zeng et al., code)
+
+    sampler: Literal["opposite"] = "opposite"
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
+
+
+ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay | OppositeReplay
 
 
 class TrainConfig(Section, section="train"):
@@ -502,7 +516,7 @@ class TrainConfig(Section, section="train"):
 
 ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
     "net": ("kind", (SmallNet, DenseNet121)),
-    "replay": ("sampler", (UniformReplay, PrioritisedReplay, BetaReplay)),
+    "replay": ("sampler", (UniformReplay, PrioritisedReplay, BetaReplay, OppositeReplay)),
 }
 """Sections that are unions: the field that names the alternative, and the alternatives."""
 
