@@ -386,11 +386,17 @@ class RewardConfig(Section, section="reward"):
     """w: penalty per metre between the place and where the tips acted (eq. 10, sign turned)."""
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
-    push_effect: Literal["value", "change"] = "value"
-    """What makes a push good: the best grasp gains value (eq. 16), or the map has changed (VPG)."""
+    push_effect: Literal["value", "renewed", "change"] = "value"
+    """What makes a push good: the best grasp gains value (eq. 16), judged once as it is made, or
+    judged anew by the target critic at each replay; or the map has changed (VPG)."""
     push_levels: tuple[float, float] = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = _bounded(0.0, 0.0)
     """Cost of an action after which a block has left the workspace for good (ours)."""
+
+    @property
+    def renewed(self) -> bool:
+        """The label of a push is that of the critic of now."""
+        return self.push_effect == "renewed"
 
     def check(self) -> None:
         rising = list(self.grasp_levels) == sorted(self.grasp_levels)
@@ -556,6 +562,11 @@ class Config(Section):
         """Raises ValueError for sections that do not fit one another."""
         may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
         _require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
+        _require(
+            not self.reward.renewed or self.target.bootstrap == "episodic",
+            "reward.push_effect: renewed needs target.bootstrap episodic, by which a transition "
+            "ends in the scene that the push left",
+        )
         batch, starts = self.learn.batch, self.train.learning_starts
         _require(
             batch <= starts,

@@ -140,7 +140,8 @@ def train_step(
     reward, push_better = learner.reward(cfg.reward, state.learner, scenes.obs, after.obs, result)
     next_obs, terminated = BOOTSTRAPS[cfg.target.bootstrap](after, scenes_next)
     before, seen = heightmap.pack(scenes.obs), heightmap.pack(next_obs)
-    transition = Transition(before, action, reward, seen, terminated)
+    label = push_better if cfg.reward.renewed else None
+    transition = Transition(before, action, reward, seen, terminated, label)
     replay = ring.add(state.replay, transition, ~info.physics_diverged)
 
     # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch costs more.
@@ -293,7 +294,8 @@ def example(cfg: Config) -> Transition:
         obs = Observation(colour=colour, height=jnp.zeros(rows), target=target)
         action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
         packed = heightmap.pack(obs)
-        return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool))
+        label = jnp.zeros((), bool) if cfg.reward.renewed else None
+        return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool), label)
 
     return jax.eval_shape(build)
 
