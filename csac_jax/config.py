@@ -132,7 +132,8 @@ class TaskConfig(Section, section="task"):
     max_steps_without_change = 10  # actions in a row without visible change that cut it off (VPG)
 
     kind: Literal["clear", "target"] = "clear"
-    """`clear`: take every block. `target`: get one marked block, then the next (CSAC sec. 4.4)."""
+    """`clear`: take every block (CSAC sec. 4.2). `target`: get one block, marked at random, then
+    the next, and another scene where none is left (sec. 4.3)."""
     max_actions: int = _bounded(15, 1)  # Actions after which an episode is cut off.
 
 
