@@ -21,7 +21,7 @@ RUNS = {
     "paper_small/csac_per-2": COPIES,
     "paper_small/csac": "CSAC likewise; the four cases",
     "paper_small/csac-2": COPIES,
-    "paper_small/vpg": "VPG likewise; the four cases",
+    "paper_small/vpg": "VPG likewise, in its first variant; the four cases",
     "paper_small/vpg-2": COPIES,
     "paper_small/reactive": "P+G reactive likewise; the four cases",
     "paper_small/reactive-2": COPIES,

@@ -72,6 +72,7 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("cem.rounds", [0]),
         ("target.gamma", [-0.1]),
         ("target.samples", [0]),
+        ("target.bootstrap", ["always"]),
         ("reward.grasp_levels", [(-0.4, -0.5, -0.25, 0.0, 1.0), (-1.0, -0.5, -0.25, 0.0, -0.1)]),
         ("explore.epsilon_primitive", [(-0.1, 0.1), (0.5, 1.1)]),
         ("explore.epsilon_place", [(-0.1, 0.0), (1.1, 0.0)]),
@@ -133,6 +134,10 @@ def test_values_out_of_range(name: str, values: list):
         ({"net.kind": "densenet121", "net.zoom": 3, "net.margin": 0.0}, "net.zoom: must divide 8"),
         ({"learn.actor_batch": 33}, "learn.actor_batch: must not exceed learn.batch"),
         ({"policy.primitive": "grasp"}, "explore.push_fraction: must be 0"),
+        (
+            {"reward.push_effect": "renewed", "target.bootstrap": "continuing"},
+            "reward.push_effect: renewed needs target.bootstrap episodic",
+        ),
         ({"learn.bath": 3}, "learn.bath: unknown setting"),
         ({"net.zoom": 2}, "net.zoom: unknown setting"),
         ({"bath": 3}, "bath: unknown setting"),
