@@ -97,14 +97,14 @@ def success(curves: Sequence[Curve]) -> Figure:
 
 def _line(axes: Axes, curve: Curve, colour: Any) -> None:
     actions, bands = curve.points()
-    value, low, high = _percent(bands)
+    value, low, high = percent(bands)
     name = f"{_short(curve.variant)} ({len(curve.runs)})"
     axes.plot(actions, value, color=colour, label=textwrap.fill(name, LEGEND_WIDTH))
     if len(curve.runs) > 1:
         axes.fill_between(actions, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
-def _percent(bands: Sequence[Band | None]) -> np.ndarray:
+def percent(bands: Sequence[Band | None]) -> np.ndarray:
     """Value, low and high, [3, bands], %; NaN where there is none."""
     rows = [(None, None, None) if band is None else band[:3] for band in bands]
     return 100 * np.array(rows, float).reshape(-1, 3).T
@@ -134,7 +134,7 @@ def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> None:
     for index, score in enumerate(scores):
         bands = [score.only(part).band(metric) for part in parts]
         bands.append(score.band(metric) if len(score.parts) == len(parts) else None)
-        value, low, high = _percent(bands)
+        value, low, high = percent(bands)
         error = np.maximum([value - low, high - value], 0.0)
         offset = (index + 0.5) * 0.8 / len(scores) - 0.4
         panel.errorbar(places + offset, value, error, fmt="o", capsize=3, **_style(score, index))
@@ -147,7 +147,7 @@ def _profiles(scores: Sequence[Score]) -> Figure:
     figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
     for panel, (metric, title) in zip(panels, FIGURE_9.items(), strict=True):
         for index, score in enumerate(scores):
-            value, low, high = _percent(statistics.profile(score.strata(metric), PROFILED))
+            value, low, high = percent(statistics.profile(score.strata(metric), PROFILED))
             style = _style(score, index)
             panel.plot(100 * PROFILED, value, **style)
             panel.fill_between(100 * PROFILED, low, high, color=style["color"], alpha=0.15)
