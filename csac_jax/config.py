@@ -17,7 +17,6 @@ RobotKind = Literal["hand", "ur5"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 MOST_ITEMS = 64  # of a setting that is a list (ours: networks and scenes end far below)
-WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 
 
 _LARGEST = 2**53  # integers up to here are floats too
@@ -596,8 +595,6 @@ class Config(Section):
         if self.sim.physics == "warp":
             alike = self.scene.size_jitter[1] == 0.0 or not set(MESH_KINDS) & set(self.scene.slots)
             _require(alike, "scene.size_jitter: the second must be 0 where sim.physics is warp")
-            few = self.train.scenes <= WARP_WORLDS
-            _require(few, f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp")
 
 
 def _changed(section: Any, value: Any) -> Any:

@@ -85,8 +85,8 @@ class CPhysics:
         """One scene after its primitive, and what was seen, leaves [T, ...]."""
         world = self.world
         seen = outcome.nothing_seen(len(joints.control), len(world.slots))
-        state = scene.position, scene.quaternion, scene.velocity
-        finite = all(np.isfinite(leaf).all() for leaf in state)  # MuJoCo resets one with NaN
+        given = scene.position, scene.quaternion, scene.velocity, joints.start, joints.control
+        finite = all(np.isfinite(leaf).all() for leaf in given)  # MuJoCo resets one with NaN
         if not (finite and joints.reachable and scene.in_play.any()):
             return scene, seen
         with self._simulator() as simulator:

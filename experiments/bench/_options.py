@@ -2,12 +2,15 @@
 
 import argparse
 import dataclasses
-from collections.abc import Sequence
-from typing import NoReturn
+import json
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 from csac_jax.cli import settings
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
+from csac_jax.runtime import provenance
 
 
 class Parser(argparse.ArgumentParser):
@@ -31,6 +34,15 @@ def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
         if value < 1 and value is not False:
             parser.error(f"--{option}: must be at least 1")
     return options
+
+
+def timed(name: str, arguments: list[str], measure: Callable[..., Any], **defaults: int) -> None:
+    """Prints what `measure` finds with these numbers, and how long it took."""
+    options = read(name, arguments, **defaults)
+    begun = time.perf_counter()
+    result = measure(**options)
+    result["seconds"] = time.perf_counter() - begun
+    print(json.dumps(result | provenance.record(), indent=2))
 
 
 @dataclasses.dataclass(frozen=True)

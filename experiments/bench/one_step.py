@@ -7,8 +7,6 @@ contacts is repeated with a solver that converges: what then differs is not the 
 """
 
 import dataclasses
-import json
-import time
 from typing import Any
 
 import jax
@@ -16,12 +14,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from csac_jax.runtime import provenance
 from csac_jax.scene import model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, primitives
+from csac_jax.sim import c_physics, mjx_physics, mjx_step, primitives
 from csac_jax.sim.quiet_mjx import mjx
-from experiments.bench._options import read
+from experiments.bench._options import timed
 from experiments.bench.parity import STREAM, TEN, Bench, pile_config
 
 BATCH = 50
@@ -88,7 +85,7 @@ def _by_mjx(
     def one(scene: Scene, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> jax.Array:
         its = mjx_physics.scene_model(physics, scene)
         data = physics.data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl)
-        after = physics.step(its, data)
+        after = mjx_step.step(its, data)
         return jnp.stack([mjx.kinematics(its, data).xpos, mjx.kinematics(its, after).xpos])
 
     every = jax.jit(jax.vmap(one))
@@ -133,17 +130,17 @@ def _errors(bench: Bench, ours: np.ndarray, theirs: np.ndarray) -> dict[str, dic
     }
 
 
-def measure(count: int) -> dict[str, Any]:
-    """All of it over `count` states."""
+def measure(states: int) -> dict[str, Any]:
+    """All of it over so many states."""
     bench = Bench(pile_config(TEN.scene.slots, len(TEN.scene.slots)))
-    states = record(bench, count)
-    result: dict[str, Any] = {"states": count}
-    free, free_c = (by(bench, states, False, EFFORT["as_configured"]) for by in (_by_mjx, _by_c))
+    recorded = record(bench, states)
+    result: dict[str, Any] = {"states": states}
+    free, free_c = (by(bench, recorded, False, EFFORT["as_configured"]) for by in (_by_mjx, _by_c))
     result["kinematics_m"] = _errors(bench, free[0], free_c[0][0])
     result["step_without_contacts_m"] = _errors(bench, free[1], free_c[0][1])
     for name, effort in EFFORT.items():
-        after = _by_mjx(bench, states, True, effort)
-        after_c, touching = _by_c(bench, states, True, effort)
+        after = _by_mjx(bench, recorded, True, effort)
+        after_c, touching = _by_c(bench, recorded, True, effort)
         result[f"step_with_contacts_{name}_m"] = _errors(bench, after[1], after_c[1])
     result["contacts_median"] = float(np.median(touching))
     return result
@@ -151,8 +148,4 @@ def measure(count: int) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = read("one_step", arguments, states=1000)
-    begun = time.perf_counter()
-    result = measure(options["states"])
-    result["seconds"] = time.perf_counter() - begun
-    print(json.dumps(result | provenance.record(), indent=2))
+    timed("one_step", arguments, measure, states=1000)

@@ -9,8 +9,6 @@ so that outcomes differ.
 import collections
 import dataclasses
 import functools
-import json
-import time
 from typing import Any
 
 import jax
@@ -19,13 +17,12 @@ import numpy as np
 
 from csac_jax.config import Config, RobotKind
 from csac_jax.constants import Outcome
-from csac_jax.runtime import provenance
 from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import observe
-from experiments.bench._options import read
+from experiments.bench._options import timed
 from experiments.bench.parity import STREAM, TEN, pile_config
 
 BATCH = 50
@@ -87,8 +84,4 @@ def measure(grasps: int) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = read("robots", arguments, grasps=500)
-    begun = time.perf_counter()
-    result = measure(options["grasps"])
-    result["seconds"] = time.perf_counter() - begun
-    print(json.dumps(result | provenance.record(), indent=2))
+    timed("robots", arguments, measure, grasps=500)

@@ -35,6 +35,11 @@ class Tally:
     hangs: int = 0
     remarks: list[str] = dataclasses.field(default_factory=list)  # of each try that went wrong
 
+    def count(self, kind: str, remark: str) -> None:
+        """A try that went wrong; `kind` is one of the names above."""
+        setattr(self, kind, getattr(self, kind) + 1)
+        self.remarks.append(remark)
+
     @property
     def bad(self) -> int:
         return self.lost + self.silent + self.tracebacks + self.hangs
@@ -140,11 +145,9 @@ def wait(process: subprocess.Popen[str], limit: float) -> Answer:
 def judge(tally: Tally, answer: Answer, about: str) -> None:
     """Counts an answer that hung or has a traceback."""
     if answer.code is None:
-        tally.hangs += 1
-        tally.remarks.append(f"{about}: hung")
+        tally.count("hangs", f"{about}: hung")
     elif "Traceback (most recent call last)" in answer.errors:
-        tally.tracebacks += 1
-        tally.remarks.append(f"{about}: {answer.errors.strip().splitlines()[-1]}")
+        tally.count("tracebacks", f"{about}: {answer.errors.strip().splitlines()[-1]}")
 
 
 def refused(
@@ -154,18 +157,14 @@ def refused(
     begun = time.monotonic()
     try:
         call()
-        tally.silent += 1
-        tally.remarks.append(f"{about}: taken")
+        tally.count("silent", f"{about}: taken")
     except expected as error:
         if "\n" in str(error):
-            tally.tracebacks += 1
-            tally.remarks.append(f"{about}: more than one line: {str(error)!r}")
+            tally.count("tracebacks", f"{about}: more than one line: {str(error)!r}")
     except Exception as error:
-        tally.tracebacks += 1
-        tally.remarks.append(f"{about}: {type(error).__name__}: {error}")
+        tally.count("tracebacks", f"{about}: {type(error).__name__}: {error}")
     if time.monotonic() - begun > HANG:
-        tally.hangs += 1
-        tally.remarks.append(f"{about}: took more than {HANG:.0f} s")
+        tally.count("hangs", f"{about}: took more than {HANG:.0f} s")
 
 
 DAMAGES = ("bit flips", "truncations", "zeroed blocks")

@@ -54,19 +54,16 @@ class _Run:
         self.tally.tries += 1
         self.saved = max(self.saved, child.saved)
         if problem := child.problem(refused, killed):
-            self.tally.tracebacks += 1
-            self.tally.remarks.append(f"{about}: {problem}")
+            self.tally.count("tracebacks", f"{about}: {problem}")
         if found := toy.fault_of(self.folder, self._reference, self.saved):
-            self.tally.lost += 1
-            self.tally.remarks.append(f"{about}: {found}")
+            self.tally.count("lost", f"{about}: {found}")
 
     def left_over(self, about: str) -> None:
         """Counts what a save that failed has left."""
         drafts = re.compile(r"\.tmp$|\.saving|orbax-checkpoint-tmp")
         for path in self.folder.rglob("*"):
             if drafts.search(path.name):
-                self.tally.lost += 1
-                self.tally.remarks.append(f"{about}: left {path}")
+                self.tally.count("lost", f"{about}: left {path}")
 
 
 @fault("SIGKILL at a random time", tries=100)
@@ -97,13 +94,11 @@ def sigterm(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         child.listen(float(rng.uniform(0.0, 0.3)))
         child.process.terminate()
         if not child.end(harness.HANG):
-            tally.hangs += 1
-            tally.remarks.append(f"try {number}: did not end")
+            tally.count("hangs", f"try {number}: did not end")
         run.judge(child, f"try {number}")
         steps = len((run.folder / "metrics.jsonl").read_text().splitlines())
         if steps != run.saved or not child.done:
-            tally.lost += 1
-            tally.remarks.append(f"try {number}: ends at step {steps}, saved {run.saved}")
+            tally.count("lost", f"try {number}: ends at step {steps}, saved {run.saved}")
     return tally
 
 
@@ -200,8 +195,7 @@ def file_too_large(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
 def _judge_full(run: _Run, child: toy.Child, ended: bool, about: str) -> None:
     """A run on a disc that is full says so in one line, and leaves no drafts."""
     if not ended:
-        run.tally.hangs += 1
-        run.tally.remarks.append(f"{about}: hung")
+        run.tally.count("hangs", f"{about}: hung")
     run.judge(child, about, refused=True)
     run.left_over(about)
 
@@ -224,8 +218,7 @@ def _damaged(kind: str):
             tally.tries += 1
             step = _judge_restored(tally, copy, reference, at_least=2, about=about)
             if step == 3 and name.parts[1] == "3" and name.name != checkpoint.MANIFEST:
-                tally.silent += 1
-                tally.remarks.append(f"{about}: unnoticed")
+                tally.count("silent", f"{about}: unnoticed")
         return tally
 
     fault(f"{kind} in a checkpoint", tries=200)(inject)
@@ -242,21 +235,17 @@ def _judge_restored(
             cfg = checkpoint.load_config(run_dir)
             state, extra = checkpoint.restore(run_dir, toy.abstract_state())
     except Exception as error:
-        tally.lost += 1
-        tally.remarks.append(f"{about}: {type(error).__name__}: {error}")
+        tally.count("lost", f"{about}: {type(error).__name__}: {error}")
         return None
     step = int(state.step)
     right = toy.bits(state) == reference.state(step) and len(extra["grasps"]) == toy.E * step
     if not right or cfg != toy.config():
-        tally.silent += 1
-        tally.remarks.append(f"{about}: step {step} is restored with other numbers")
+        tally.count("silent", f"{about}: step {step} is restored with other numbers")
     if step < at_least:
-        tally.lost += 1
-        tally.remarks.append(f"{about}: step {step} is restored")
+        tally.count("lost", f"{about}: step {step} is restored")
     newest = checkpoint.latest_step(run_dir)
     if step != newest and not any(issubclass(one.category, DataWarning) for one in caught):
-        tally.silent += 1
-        tally.remarks.append(f"{about}: went back from step {newest} to {step} without a word")
+        tally.count("silent", f"{about}: went back from step {newest} to {step} without a word")
     return step
 
 
@@ -320,8 +309,7 @@ def swapped(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
             warnings.simplefilter("ignore")
             _judge_resumed(tally, run_dir, reference, name)
     if _content(other) != before:
-        tally.lost += 1
-        tally.remarks.append("the other run has changed")
+        tally.count("lost", "the other run has changed")
     return tally
 
 
@@ -329,12 +317,10 @@ def _put_names_right(tally: Tally, run_dir: Path, about: str) -> None:
     """Follows the message that refuses steps with each other's names."""
     try:
         checkpoint.sound(run_dir)
-        tally.silent += 1
-        tally.remarks.append(f"{about}: taken")
+        tally.count("silent", f"{about}: taken")
     except checkpoint.CheckpointError as error:
         if "rename it to 2" not in str(error):
-            tally.lost += 1
-            tally.remarks.append(f"{about}: {error}")
+            tally.count("lost", f"{about}: {error}")
     steps = run_dir / "checkpoints"
     _swapped(steps, steps)["steps have each other's names"]()
 
@@ -344,12 +330,10 @@ def _judge_resumed(tally: Tally, run_dir: Path, reference: toy.Reference, about:
     try:
         summary = toy.train(run_dir, 2, resume=True)
     except Exception as error:
-        tally.lost += 1
-        tally.remarks.append(f"{about}: resumed, {type(error).__name__}: {error}")
+        tally.count("lost", f"{about}: resumed, {type(error).__name__}: {error}")
         return
     if found := toy.fault_of(run_dir, reference, summary.step):
-        tally.lost += 1
-        tally.remarks.append(f"{about}: resumed, {found}")
+        tally.count("lost", f"{about}: resumed, {found}")
 
 
 def _content(folder: Path) -> dict[str, bytes]:
@@ -369,11 +353,9 @@ def two_at_once(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         second = toy.Child(run.order(steps=1))
         about = f"try {number}"
         if not second.end(WORK):
-            tally.hangs += 1
-            tally.remarks.append(f"{about}: the second hung")
+            tally.count("hangs", f"{about}: the second hung")
         if second.error is None or "in use by process" not in second.error:
-            tally.silent += 1
-            tally.remarks.append(f"{about}: the second said {second.error!r}")
+            tally.count("silent", f"{about}: the second said {second.error!r}")
         if rng.random() < 0.5:
             first.go()
         first.kill()
@@ -395,11 +377,9 @@ def not_finite(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         train = functools.partial(toy.train, run_dir, 6, bad=bad)
         harness.refused(tally, about, train, TrainingError)
         if found := toy.fault_of(run_dir, reference, step):
-            tally.lost += 1
-            tally.remarks.append(f"{about}: {found}")
+            tally.count("lost", f"{about}: {found}")
         if (newest := checkpoint.latest_step(run_dir)) != step:
-            tally.silent += 1
-            tally.remarks.append(f"{about}: step {newest} was saved")
+            tally.count("silent", f"{about}: step {newest} was saved")
     return tally
 
 
@@ -418,11 +398,9 @@ def clock(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
                 toy.train(run_dir, 2)
                 toy.train(run_dir, 2, resume=True)
             except Exception as error:
-                tally.tracebacks += 1
-                tally.remarks.append(f"{about}: {type(error).__name__}: {error}")
+                tally.count("tracebacks", f"{about}: {type(error).__name__}: {error}")
         if found := toy.fault_of(run_dir, reference, 4):
-            tally.lost += 1
-            tally.remarks.append(f"{about}: {found}")
+            tally.count("lost", f"{about}: {found}")
     return tally
 
 
@@ -449,21 +427,17 @@ def read_only(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
             tally.tries += 1
             _judge_refusal(tally, child, ended, f"{place.name} is read-only")
         if _content(base) != before:
-            tally.lost += 1
-            tally.remarks.append("a file has changed")
+            tally.count("lost", "a file has changed")
     return tally
 
 
 def _judge_refusal(tally: Tally, child: toy.Child, ended: bool, about: str) -> None:
     if not ended:
-        tally.hangs += 1
-        tally.remarks.append(f"{about}: hung")
+        tally.count("hangs", f"{about}: hung")
     elif problem := child.problem(refused=True):
-        tally.tracebacks += 1
-        tally.remarks.append(f"{about}: {problem}")
+        tally.count("tracebacks", f"{about}: {problem}")
     elif child.error is None:
-        tally.silent += 1
-        tally.remarks.append(f"{about}: was not refused")
+        tally.count("silent", f"{about}: was not refused")
 
 
 NAMES = (
@@ -500,8 +474,7 @@ def odd_paths(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         try:
             toy.train(run_dir, 1)
         except Exception as error:
-            tally.tracebacks += 1
-            tally.remarks.append(f"{name}: {type(error).__name__}: {error}")
+            tally.count("tracebacks", f"{name}: {type(error).__name__}: {error}")
             continue
         _judge_resumed(tally, run_dir, reference, name)
     return tally
@@ -525,8 +498,7 @@ def closed_pipe(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         if found is None and not all(path.is_file() for path in written):
             found = "there is no result"
         if found:
-            tally.lost += 1
-            tally.remarks.append(f"{about}: {found}; {answer.code} {answer.errors[-300:]!r}")
+            tally.count("lost", f"{about}: {found}; {answer.code} {answer.errors[-300:]!r}")
     return tally
 
 
@@ -601,11 +573,9 @@ def fork_and_thread(rng: np.random.Generator, tries: int, folder: Path) -> Tally
         about = ("import in a thread", "fork before", "fork after")[number % len(sources)]
         harness.judge(tally, answer, about)
         if answer.code != 0 or "[2]" not in answer.output:
-            tally.lost += 1
-            tally.remarks.append(f"{about}: {answer.code} {answer.errors[-300:]!r}")
+            tally.count("lost", f"{about}: {answer.code} {answer.errors[-300:]!r}")
         elif found := toy.fault_of(run_dir, toy.Reference(), 2):
-            tally.lost += 1
-            tally.remarks.append(f"{about}: {found}")
+            tally.count("lost", f"{about}: {found}")
     return tally
 
 
@@ -655,8 +625,7 @@ def sweep_names(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
 
         harness.refused(tally, about, resume, runner.SweepError)
         if _content(victim) != before:
-            tally.lost += 1
-            tally.remarks.append(f"{about}: the victim has changed")
+            tally.count("lost", f"{about}: the victim has changed")
     return tally
 
 
@@ -685,7 +654,7 @@ def _sweep_program(group: object) -> SimpleNamespace:
     )
 
 
-@fault("NaN in one of 64 scenes, in a reward, in a weight", tries=18, slow=True)
+@fault("NaN in one of 64 scenes, a reward, a gradient, a weight", tries=20, slow=True)
 def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
     """The real training step. A scene's NaN stays there and is counted; NaN that reaches the
     networks is told at once."""
@@ -704,19 +673,18 @@ def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally
 
     start, _ = run(start)
     for number in range(tries):
-        kind = ("scene", "reward", "weight")[number % 3]
+        kind = ("scene", "reward", "gradient", "weight")[number % 4]
         tally.tries += 1
-        state, told = _poisoned(rng, start, kind), None
-        for _ in range(20 if kind == "reward" else 1):  # until it is drawn
-            state, metrics = run(state)
+        state, told = start, None
+        for _ in range(100 if kind == "reward" else 1):  # until it is drawn
+            state, metrics = run(_poisoned(rng, state, kind))
             if told := loop.not_finite(metrics):
                 break
         sound = _finite(state.learner) and _finite(state.scenes)
         expected = told is None if kind == "scene" else told is not None
         diverged = int(metrics.physics_diverged.sum())
         if sound != (told is None) or not expected or (kind == "scene" and diverged != 1):
-            tally.silent += 1
-            tally.remarks.append(f"NaN in a {kind}: told {told}, sound {sound}, {diverged} scenes")
+            tally.count("silent", f"NaN in a {kind}: told {told}, sound {sound}, {diverged} scenes")
     return tally
 
 
@@ -734,13 +702,16 @@ def _poisoned(rng: np.random.Generator, state: step.TrainState, kind: str) -> st
         return state.replace(scenes=state.scenes.replace(scene=spoilt_scene))
     if kind == "reward":
         items = state.replay.items
-        items = items._replace(reward=items.reward.at[int(rng.integers(64))].set(jnp.nan))
+        items = items.replace(reward=items.reward.at[int(rng.integers(128))].set(jnp.nan))
         return state.replace(replay=state.replay.replace(items=items))
-    leaves, structure = jax.tree.flatten(state.learner)
+    # Adam's moments keep what a gradient was
+    part = "critic_optimiser" if kind == "gradient" else str(rng.choice(["online", "target"]))
+    leaves, structure = jax.tree.flatten(getattr(state.learner, part))
     floats = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     chosen = int(rng.choice(floats))
     leaves[chosen] = spoilt(leaves[chosen])
-    return state.replace(learner=jax.tree.unflatten(structure, leaves))
+    poisoned = {part: jax.tree.unflatten(structure, leaves)}
+    return state.replace(learner=state.learner.replace(**poisoned))
 
 
 def _finite(tree: object) -> bool:

@@ -31,6 +31,7 @@ from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
 from csac_jax.training import loop
 from csac_jax.training.step import StepMetrics
+from tests.metrics import step_metrics
 
 E = 3  # scenes
 LONG = 10_000 * E  # actions that no try comes to the end of
@@ -78,28 +79,16 @@ def compile_chunk(num_steps: int, bad: Losses = SOUND) -> Any:
 
     def step(state: State, _: None) -> tuple[State, StepMetrics]:
         outcome = (jnp.arange(E, dtype=jnp.int32) + state.step) % 5
-        no, none = jnp.zeros(E, bool), jnp.zeros(E, jnp.int32)
         loss = jnp.where(state.step == bad.loss, jnp.nan, 1.0).astype(jnp.float32)
         total = state.total + state.step.astype(jnp.float32)
         total = jnp.where(state.step == bad.parameter, jnp.nan, total)
         packed = 3 * state.packed + jnp.arange(64, dtype=jnp.uint16)[None]
-        metrics = StepMetrics(
+        metrics = step_metrics(
+            E,
+            loss=loss,
             primitive=jnp.ones(E, jnp.int32),
             outcome=outcome,
-            push_better=no,
-            cleared=none,
-            blocks_lost=none,
-            terminated=no,
-            truncated=no,
             reward=outcome.astype(jnp.float32),
-            gap_disagrees=no,
-            contact_overflow=none,
-            physics_diverged=no,
-            learned=jnp.array(True),
-            critic_loss=loss,
-            actor_loss=loss,
-            td_error=loss,
-            q_mean=loss,
             finite=jnp.isfinite(total).all(),
         )
         return State(state.key, state.step + 1, total, packed), metrics

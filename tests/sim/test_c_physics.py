@@ -124,6 +124,17 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     np.testing.assert_array_equal(after.position[3, 0], broken.position[0])
 
 
+def test_set_points_with_nan_move_nothing(
+    c_world: model.World, pushed: tuple, capfd: pytest.CaptureFixture
+):
+    """Claim: set-points of NaN, as networks of NaN plan them, move nothing, without a word."""
+    scene, _, joints = pushed
+    lost = dataclasses.replace(joints, control=np.full_like(joints.control, np.nan))
+    after, _ = jax.jit(CPhysics(c_world, conftest.CONFIG.sim).run)(scene, lost)
+    np.testing.assert_array_equal(after.position[0], scene.position[0])
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("metres", [0.02, 0.1, 0.3])
 def test_limit_of_speed_is_held_after_every_substep(
     c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch, metres: float

@@ -21,6 +21,7 @@ from csac_jax.training.step import (
     TrainState,
     replace_hyperparams,
 )
+from tests.metrics import step_metrics
 
 SCENES = 8
 CFG = presets.smoke().change(train={"scenes": SCENES, "actions": 12 * SCENES})  # 3 chunks of 4
@@ -81,19 +82,11 @@ def train_step(
     seen = numbers(program, jax.random.fold_in(key, 1), state.step)
     primitive = (noise > -1.0).astype(jnp.int32)
     outcome = jnp.clip(jnp.floor(5.0 * jnp.abs(scenes)), 0.0, 4.0).astype(jnp.int32)
-    no, none = jnp.zeros(num, bool), jnp.zeros(num, jnp.int32)
-    metrics = StepMetrics(
+    metrics = step_metrics(
+        num,
         primitive=primitive,
         outcome=outcome,
-        push_better=no,
-        cleared=none,
-        blocks_lost=none,
-        terminated=no,
-        truncated=no,
         reward=scenes + jnp.mean(seen),
-        gap_disagrees=no,
-        contact_overflow=none,
-        physics_diverged=no,
         learned=state.step >= 1,
         critic_loss=critic_loss,
         actor_loss=jnp.sum(target),
