@@ -253,7 +253,8 @@ class SmallNet(Section, section="net"):
 
     dtype = "auto"  # bfloat16 on accelerators, float32 on a CPU; parameters are float32
 
-    kind: Literal["small"] = "small"  # `small`, or `densenet121`: the paper's, 100 times the work.
+    kind: Literal["small"] = "small"
+    """`small`; `offset`: Q varies inside cells; `densenet121`: the paper's, 100 times the work."""
     rotations: int = _bounded(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
     colour: bool = True  # Whether the net sees colours, or heights alone.
     margin: float = _bounded(0.125, 0.0, 0.5)
@@ -274,6 +275,15 @@ class SmallNet(Section, section="net"):
         """Raises ValueError if the strides do not divide the rotated maps of `size` cells."""
         side = canvas_size(size, self.margin)
         _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4")
+
+
+class OffsetNet(SmallNet, section="net"):
+    """The small net with Q continuous in the action: beside a value, each cell has slopes and
+    curvatures along x, y and yaw, by which Q goes on inside it (ours; `agent/offsets.py`)."""
+
+    # mypy has no word for the tag of a union that a subclass takes its own of.
+    kind: Literal["offset"] = "offset"  # type: ignore[assignment]
+    """`small`; `offset`: Q varies inside cells; `densenet121`: the paper's, 100 times the work."""
 
 
 class DenseNet121(Section, section="net"):
@@ -315,7 +325,7 @@ class DenseNet121(Section, section="net"):
             )
 
 
-NetConfig = SmallNet | DenseNet121
+NetConfig = SmallNet | DenseNet121 | OffsetNet
 
 
 def canvas_size(size: int, margin: float) -> int:
@@ -521,7 +531,7 @@ class TrainConfig(Section, section="train"):
 
 
 ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
-    "net": ("kind", (SmallNet, DenseNet121)),
+    "net": ("kind", (SmallNet, DenseNet121, OffsetNet)),
     "replay": ("sampler", (UniformReplay, PrioritisedReplay, BetaReplay, OppositeReplay)),
 }
 """Sections that are unions: the field that names the alternative, and the alternatives."""

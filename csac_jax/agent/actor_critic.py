@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from flax import struct
 
-from csac_jax.agent import actor, losses, maps, rewards
+from csac_jax.agent import actor, losses, maps, offsets, rewards
 from csac_jax.agent.learner import Transition, UpdateInfo
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.config import Config
@@ -122,7 +122,7 @@ def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
 def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
     """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
     q, features = _critic_maps(learner, params.critic, obs)
-    correction: Any = jnp.zeros_like(q)
+    correction: Any = jnp.zeros_like(q[..., : dense.OUTPUTS])
     if learner.cfg.learn.actor:
         correction = learner.frames.networks.head.apply(params.actor, features)
     return _dense_maps(learner, obs, q, correction)
@@ -135,6 +135,8 @@ def _critic_maps(learner: ActorCritic, critic: Any, obs: Observation) -> tuple[j
     q, features = _of_each_critic(
         lambda variables: networks.apply(learner.frames.networks, variables, rotated), critic
     )
+    if learner.frames.networks.terms > 1:
+        return offsets.lower(q, dense.OUTPUTS), features[0]
     return jnp.min(q, axis=0), features[0]
 
 
@@ -154,7 +156,9 @@ def _dense_maps(
     """The maps of all yaws from Q and the actor's output in the frames of the passes."""
     unfold = jax.vmap(maps.unfold)
     valid = jax.vmap(maps.actionable_cells, (None, 0))(learner.frames, obs)
-    return DenseMaps(unfold(q), unfold(actor.logits(q, correction)), valid)
+    values = q[..., : dense.OUTPUTS]
+    terms = None if q.shape == values.shape else jax.vmap(maps.unfold_terms)(q)
+    return DenseMaps(unfold(values), unfold(actor.logits(values, correction)), valid, terms)
 
 
 def best_grasp(state: DenseMaps) -> jax.Array:
@@ -266,18 +270,26 @@ def _value(
     (q, _), statistics = _of_each_critic(
         lambda variables: networks.train(frames.networks.critic, variables, flat), critic
     )
-    q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
+    q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS T]
     push_output = (k >= num // 2).astype(jnp.int32)
     is_grasp = (action.primitive == Primitive.GRASP)[:, None]
     output = jnp.where(is_grasp, dense.OUTPUTS - 1, push_output)
 
-    def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
+    def at(
+        q: jax.Array, output: jax.Array, half: jax.Array, turn: jax.Array, xy: jax.Array
+    ) -> jax.Array:
         yaw = jnp.asarray(frames.yaws)[half]
         position = rotate.to_cell(frames.side, frames.cell, yaw, xy)
-        return rotate.bilinear(q[..., output], position)
+        if frames.networks.terms == 1:
+            return rotate.bilinear(q[..., output], position)
+        terms = q.reshape(*q.shape[:2], -1, dense.OUTPUTS)[..., output]
+        return offsets.blend(terms, position, turn)
 
-    read = jax.vmap(jax.vmap(at, (0, 0, 0, None)))
-    near = jax.vmap(read, (0, None, None, None))(q, output, half, action.pose[:, :2])  # [M, B, 2]
+    read = jax.vmap(jax.vmap(at, (0, 0, 0, 0, None)))
+    turn = (index - lower)[:, None] - np.array([[0.0, 1.0]], np.float32)  # [B, 2] yaws
+    near = jax.vmap(read, (0, None, None, None, None))(
+        q, output, half, turn, action.pose[:, :2]
+    )  # [M, B, 2]
     share = (index - lower)[None]
     return (1.0 - share) * near[..., 0] + share * near[..., 1], statistics
 
@@ -328,7 +340,7 @@ def update_actor(
 
     def value(state_maps: DenseMaps, primitive: Primitive) -> jax.Array:
         pose = actor.pose(frames, state_maps, primitive)
-        return maps.read(frames, state_maps.q, jnp.int32(primitive), pose)
+        return maps.read_q(frames, state_maps, jnp.int32(primitive), pose)
 
     def loss(learned: Any) -> tuple[jax.Array, Any]:
         variables = {**state.online.actor, **learned}

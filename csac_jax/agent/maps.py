@@ -1,7 +1,8 @@
 """Dense maps of one state: Q and actor logits for every primitive, yaw and cell.
 
 Map k stays in frame k, the workspace turned so that yaw_k points along +column. Q at a continuous
-action is trilinear: bilinear in the two frames next to its yaw, linear between them.
+action is trilinear: bilinear in the two frames next to its yaw, linear between them. With
+`net.kind offset` cells say how Q goes on inside them, see `offsets`.
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.agent import box
+from csac_jax.agent import box, offsets
 from csac_jax.config import Config, PolicyConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
@@ -75,6 +76,7 @@ class DenseMaps:
     q: jax.Array  # [P, K, h, w] float32, the critic's value
     logits: jax.Array  # [P, K, h, w] float32, the actor's
     valid: jax.Array  # [P, K, h, w] bool, there is something to act on
+    terms: jax.Array | None = None  # [P, K, h, w, T] float32, see `offsets`; None: Q is trilinear
 
 
 def input_maps(frames: Frames, obs: Observation) -> jax.Array:
@@ -92,6 +94,14 @@ def unfold(halves: jax.Array) -> jax.Array:
     """Net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] as maps of all K, [P, K, h, w]."""
     ahead, back, grasp = (halves[..., output] for output in range(dense.OUTPUTS))
     return jnp.stack([_all_frames(ahead, back), _all_frames(grasp, grasp)])
+
+
+def unfold_terms(halves: jax.Array) -> jax.Array:
+    """The same of OUTPUTS T channels: polynomials [P, K, h, w, T]."""
+    split = halves.reshape(*halves.shape[:-1], -1, dense.OUTPUTS)
+    num = halves.shape[0]
+    all_frames = jax.vmap(unfold, -2, -1)(split)
+    return all_frames.at[:, num:].set(offsets.turn_around(all_frames[:, num:]))
 
 
 def _all_frames(ahead: jax.Array, back: jax.Array) -> jax.Array:
@@ -148,6 +158,13 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
     return (1.0 - upper_weight) * at(k) + upper_weight * at(k + 1)
 
 
+def read_q(frames: Frames, state: DenseMaps, primitive: jax.Array, pose: jax.Array) -> jax.Array:
+    """Q [] at a pose [3] m, m, rad; differentiable in maps and pose."""
+    if state.terms is None:
+        return read(frames, state.q, primitive, pose)
+    return offsets.read(state.terms, frames.cell, frames.yaws, primitive, pose)
+
+
 def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
     """Whether the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
     num, side = frames.yaws.shape[0], frames.side
@@ -162,7 +179,7 @@ def read_valid(
 ) -> tuple[jax.Array, jax.Array]:
     """Q [] at a pose [3], and whether there is something to act on, [] bool."""
     which = jnp.int32(primitive)
-    return read(frames, state.q, which, pose), is_valid(frames, state.valid, which, pose)
+    return read_q(frames, state, which, pose), is_valid(frames, state.valid, which, pose)
 
 
 def best_over_yaws(frames: Frames, state: DenseMaps, places: jax.Array) -> jax.Array:

@@ -4,7 +4,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from csac_jax import geometry
 from csac_jax.agent import actor, cem, explore, maps
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.cem import CEMResult
@@ -78,12 +80,25 @@ PRIMITIVE_RULES: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 }
 
 
+def _random_offset(key: jax.Array, frames: Frames, pose: jax.Array) -> jax.Array:
+    """From a cell's pose [3] to one inside the cell and its share of yaws, [3] m, m, rad."""
+    along, across, turn = jax.random.uniform(key, (3,), minval=-0.5, maxval=0.5)
+    xy = geometry.rotate2d(pose[2], frames.cell * jnp.stack([along, across]))
+    return jnp.append(xy, turn * (2.0 * np.pi / frames.yaws.shape[0]))
+
+
 def random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array:
-    """One random valid cell per primitive as a point of the box [P, 3]; `valid` [P, K, h, w]."""
+    """One random valid cell per primitive as a point of the box [P, 3]; `valid` [P, K, h, w].
+
+    Where Q varies inside cells, a random pose nearest to that cell: else no offset is ever seen.
+    """
 
     def place(p: Primitive) -> jax.Array:
         cell = explore.random_cell(jax.random.fold_in(key, p), valid[p].reshape(-1))
-        return maps.normalise(frames, maps.cell_pose(frames, cell))
+        pose = maps.cell_pose(frames, cell)
+        if frames.networks.terms > 1:
+            pose = pose + _random_offset(jax.random.fold_in(key, len(Primitive) + p), frames, pose)
+        return maps.normalise(frames, pose)
 
     return jnp.stack([place(primitive) for primitive in Primitive])
 

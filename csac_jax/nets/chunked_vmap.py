@@ -10,14 +10,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from csac_jax.config import Config
+from csac_jax.config import Config, SmallNet
 
 _LARGEST = 5  # networks of DenseNet-121 in a chunk, ours: five seeds are one, 16 are four
 
 
 def chunk_size(cfg: Config, runs: int) -> int | None:
     """How many networks work at a time, in chunks of one size; None for those of all `runs`."""
-    if cfg.net.kind == "small":
+    if isinstance(cfg.net, SmallNet):
         return None
     return max(size for size in range(1, _LARGEST + 1) if runs % size == 0)
 

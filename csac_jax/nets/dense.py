@@ -14,13 +14,19 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from csac_jax.config import NetConfig, SmallNet
+from csac_jax.config import NetConfig, OffsetNet, SmallNet
 from csac_jax.nets.convolution import conv2d
 
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 OUTPUT_INIT = nn.initializers.variance_scaling(0.01, "fan_in", "normal")  # maps begin near 0
+TERMS = 7  # of an `OffsetNet` in each cell: value, three slopes, three curvatures
 _GROUP_SIZE = 8  # channels per group of the norm
 EPSILON = 1e-6  # of the norm, Flax's
+
+
+def terms(cfg: SmallNet) -> int:
+    """Numbers of each output in a cell."""
+    return TERMS if isinstance(cfg, OffsetNet) else 1
 
 
 def compute_dtype(cfg: NetConfig) -> Any:
@@ -65,14 +71,15 @@ class Trunk(nn.Module):
 
 
 class Head(nn.Module):
-    """Two 1 x 1 convolutions: [..., h, w, F] -> [..., s h, s w, OUTPUTS], s = subcells."""
+    """Two 1 x 1 convolutions: [..., h, w, F] -> [..., s h, s w, outputs], s = subcells."""
 
     cfg: SmallNet
+    outputs: int = OUTPUTS
 
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
         hidden = nn.relu(nn.Dense(self.cfg.head, dtype=compute_dtype(self.cfg))(features))
-        output = nn.Dense(OUTPUTS * self.cfg.subcells**2, kernel_init=OUTPUT_INIT)
+        output = nn.Dense(self.outputs * self.cfg.subcells**2, kernel_init=OUTPUT_INIT)
         return pixel_shuffle(output(hidden.astype(jnp.float32)), self.cfg.subcells)
 
 
@@ -120,6 +127,7 @@ class Critic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads; the same with `train`.
 
     [B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s = subcells.
+    Of an `OffsetNet` Q has OUTPUTS TERMS channels, all values first, then term by term.
     """
 
     cfg: SmallNet
@@ -127,4 +135,4 @@ class Critic(nn.Module):
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
         features = Trunk(self.cfg, name="trunk")(maps)
-        return Head(self.cfg, name="head")(features), features
+        return Head(self.cfg, OUTPUTS * terms(self.cfg), name="head")(features), features

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import _guard
-from csac_jax.config import Config
+from csac_jax.config import Config, SmallNet
 from csac_jax.nets.convolution import conv2d
 
 LIBRARY = {_guard.FUSION_FLAG.lstrip("-"): "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"}
@@ -41,7 +41,7 @@ def options(cfg: Config) -> dict[str, Any] | None:
 
     The second library is slow at kernel gradients, which `conv2d` keeps from it.
     """
-    if cfg.net.kind == "small":
+    if isinstance(cfg.net, SmallNet):
         return dict(LIBRARY) if has_library() else None
     return dict(VENDOR) if jax.default_backend() == "gpu" and _knows_vendor() else None
 

@@ -17,7 +17,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from csac_jax.agent import rewards
-from csac_jax.config import Config
+from csac_jax.config import Config, SmallNet
 from csac_jax.nets import chunked_vmap
 from csac_jax.runtime import compiler
 from csac_jax.training import memory, step
@@ -146,7 +146,7 @@ class SweepProgram:
             return jax.lax.scan(lambda state, _: train_all(replicas, state), state, None, num_steps)
 
         # The CPU's library for convolutions is not measured where they are vmapped or sharded.
-        measured = program.cfg.net.kind != "small" or (vmapped == 1 and mesh is None)
+        measured = not isinstance(program.cfg.net, SmallNet) or (vmapped == 1 and mesh is None)
         options = compiler.options(program.cfg) if measured else None
         jit = functools.partial(jax.jit, donate_argnums=0, compiler_options=options)
         if self.parts > 1:
@@ -195,7 +195,7 @@ def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
     """
     on_cpu, halves = jax.default_backend() == "cpu", cfg.sim.physics == "c" and replicas % 2 == 0
     parts = replicas if on_cpu else 2 if halves else 1
-    if parts == 1 or mesh is not None or cfg.net.kind != "small":
+    if parts == 1 or mesh is not None or not isinstance(cfg.net, SmallNet):
         return 1
     fits = 2 * replicas * sum(memory.state_bytes(cfg).values()) <= memory.limit()
     return parts if fits else 1

@@ -16,7 +16,6 @@ from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
 from csac_jax.training import step
 from csac_jax.vision import heightmap
-from csac_jax.vision.heightmap import Observation
 from tests.agent import toys
 
 pytestmark = pytest.mark.optax
@@ -138,25 +137,3 @@ def test_relabelling_is_the_difference_of_two_rewards():
     )
     assert rewards.relabel(cfg, worse, no, ~no) == better != worse
     assert rewards.relabel(cfg, better, ~no, no) == worse
-
-
-@pytest.mark.slow
-def test_pushes_are_relabelled_as_the_critic_learns():
-    """Claim: where a push alone makes a grasp possible, the first such pushes are labelled worse,
-    and the critic that has learned labels them better, other pushes worse."""
-    cfg = toys.config("csac", actions=1600, max_actions=4)
-    cfg = cfg.change(reward={"push_effect": "renewed"}, replay={"capacity": 2048})
-    program = step.make(cfg, env=toys.two_step(cfg))
-    state, _ = step.compile_chunk(program, cfg.train.steps)(step.init(program))
-    early = jax.tree.map(lambda leaf: leaf[:200], state.replay.items)
-    opened = np.any(np.asarray(early.obs.colour != early.next_obs.colour), axis=(1, 2, 3))
-    pushed = np.asarray(early.action.primitive) == Primitive.PUSH
-    opened &= pushed
-    learner, target = program.learner.parts, state.learner.target
-    seen: Observation = heightmap.unpack(early.next_obs)
-    next_maps = actor_critic.dense_maps(learner, target, seen)
-    now = np.asarray(actor_critic.renewed_reward(learner, target, early, next_maps))
-    assert opened.sum() >= 10
-    assert np.mean(np.asarray(early.push_better)[opened]) < 0.5
-    assert np.mean(now[opened] > 0.0) > 0.9
-    assert np.mean(now[pushed & ~opened] < 0.0) > 0.9

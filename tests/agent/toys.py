@@ -55,6 +55,7 @@ class Toy:
 
     cfg: Config
     kinds: tuple[int, ...]  # of the blocks of a fresh scene
+    reach: float = 1.0  # m from its middle, within which a block can be lifted
 
     def reset(self, key: jax.Array) -> State:
         """Blocks in places of their own, each as likely as any other."""
@@ -93,7 +94,9 @@ class Toy:
         hit = layout.place == row * GRID + col  # [N]
         kind = jnp.where(hit, layout.kind, -1)
         grasped = action.primitive == Primitive.GRASP
-        lifted = grasped & jnp.any(kind == GOOD)
+        middle = (jnp.stack([col, row]).astype(jnp.float32) + 0.5) * (extent / GRID) - 0.5 * extent
+        near = jnp.linalg.norm(action.pose[:2] - middle) <= self.reach
+        lifted = grasped & near & jnp.any(kind == GOOD)
         outcome = jnp.where(jnp.any(hit), jnp.int32(Outcome.TOUCHED), jnp.int32(Outcome.EMPTY))
         outcome = jnp.where(lifted, jnp.int32(Outcome.LIFTED), outcome)
         opened = ~grasped & jnp.any(kind == LATCH) & jnp.any(layout.kind == LOCKED)
@@ -126,6 +129,12 @@ def two_step(cfg: Config) -> Toy:
     """A block that can be grasped only after a push of another: without a push nothing is ever
     lifted."""
     return Toy(cfg, (LOCKED, LATCH, DUD))
+
+
+def precise(cfg: Config) -> Toy:
+    """One good block among duds, which can be lifted near its middle alone: where four cells of the
+    maps meet, and further from their middles than it may be."""
+    return Toy(cfg, (GOOD, DUD, DUD), reach=0.025)
 
 
 def config(algo: str, actions: int, max_actions: int, push: float | None = None) -> Config:
