@@ -26,6 +26,7 @@ Map, in the direction of data; imports point only backwards along it:
     io          checkpoints, policy files, configs
     training    the training step and its host loop
     evaluation  policies, suites, metrics, statistics
+    deploy      a policy at a real camera: images in, actions out; runs without MuJoCo
     sweeps      many runs in one program, over devices and hosts
     render      pictures and videos; report: tables, charts, pages
     api         the functions of the public API; cli: the command `csac-jax`
@@ -48,7 +49,7 @@ from typing import TYPE_CHECKING, Any
 from csac_jax import _guard
 
 if TYPE_CHECKING:
-    from csac_jax import algorithms, presets
+    from csac_jax import algorithms, deploy, presets
     from csac_jax.agent.learner import Learner, Transition, UpdateInfo
     from csac_jax.api import Run, evaluate, load_policy, sweep, train
     from csac_jax.config import Config
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "csac_jax": ("algorithms", "presets"),
+    "csac_jax": ("algorithms", "deploy", "presets"),
     "csac_jax.agent.learner": ("Learner", "Transition", "UpdateInfo"),
     "csac_jax.api": ("Run", "evaluate", "load_policy", "sweep", "train"),
     "csac_jax.config": ("Config",),
@@ -87,6 +88,7 @@ __all__ = [
     "Transition",
     "UpdateInfo",
     "algorithms",
+    "deploy",
     "evaluate",
     "load_policy",
     "make_env",

@@ -13,6 +13,10 @@ class FailedError(Exception):
     """What was asked for has failed; the kind of errors of checkpoints, policies and runs."""
 
 
+class ViewError(FailedError):
+    """A camera image that no action may be taken from."""
+
+
 class SceneError(FailedError):
     """A scene that cannot be simulated or settled."""
 

@@ -1,18 +1,21 @@
 """Every Python block of README and docs runs."""
 
 import re
+import runpy
+import shlex
 from pathlib import Path
 
 import pytest
 
 import csac_jax
-from csac_jax import presets
+from csac_jax import cli, presets
 
 ROOT = Path(csac_jax.__file__).parents[1]
+ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
 PAGES = [
     page
     for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
-    if "```python" in page.read_text()
+    if "```python" in page.read_text() and page != ROBOT
 ]
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 
@@ -40,3 +43,29 @@ def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     for block in blocks(page):
         small = NUMBERS.sub(r"\1=2", block)
         exec(compile(small, page.name, "exec"), namespace)
+
+
+def _run_command(line: str) -> None:
+    """Runs a line of a page: a file of examples/, or csac-jax."""
+    program, *arguments = shlex.split(line, comments=True)
+    if program == "python":
+        runpy.run_path(str(ROOT / arguments[0]))["main"](*arguments[1:])
+    else:
+        assert program == "csac-jax"
+        assert cli.main(arguments) == 0, line
+
+
+def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the commands and Python blocks of docs/robot.md run in their order, but those that
+    need hardware, which are marked `py`."""
+    monkeypatch.chdir(tmp_path)
+    step = r"(?ms)^```python\n(.*?)^```|^    ((?:python|csac-jax) [^\n]*)"
+    steps = re.findall(step, re.sub(r"(?ms)^```py\n.*?^```", "", ROBOT.read_text()))
+    namespace = {"__name__": "robot"}
+    for block, command in steps:
+        if command:
+            _run_command(command)
+        else:
+            exec(compile(block, "robot.md", "exec"), namespace)
+    assert len(steps) >= 6
+    assert Path("demo/decision.png").exists()

@@ -4,6 +4,8 @@ Imports point back along the data path: a module imports from its own stage and 
 """
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +21,7 @@ ORDER = (
     ("cli",),
     ("api",),
     ("render", "report"),
-    ("sweeps",),
+    ("sweeps", "deploy"),
     ("evaluation",),
     ("training",),
     ("io",),
@@ -49,15 +51,18 @@ ONLY_IN = {
     "orbax": ("io/checkpoint.py",),
     "tyro": ("cli",),
     "rich": ("report", "cli", "api"),
-    "pydantic": ("io",),
+    "pydantic": ("io", "deploy/service.py"),
+    "onnx": ("deploy/onnx_graph.py",),
+    "fastapi": ("deploy/service.py",),
+    "uvicorn": ("cli/serve.py",),
     "safetensors": ("io",),
     "matplotlib": ("render", "report"),
-    "imageio": ("render/media.py",),
+    "imageio": ("render/media.py", "deploy/files.py"),
     "jinja2": ("report/charts.py",),
     "tensorboardX": ("report/progress.py",),
 }
 JIT_IN = (
-    *("training", "sweeps", "evaluation"),
+    *("training", "sweeps", "evaluation", "deploy"),
     *(
         "runtime/compiler.py",
         "runtime/selftest.py",
@@ -182,6 +187,23 @@ def _use_fault(name: str, stage: str, node: ast.AST, aliases: dict[str, str]) ->
 def test_package_keeps_the_contract():
     """Claim: imports point back along the data path, and each library is used in its stage only."""
     assert violations(PACKAGE) == []
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "agent.policy",
+        "deploy",
+        "io.policy_file",
+        "nets.networks",
+        "vision.camera",
+        "vision.observe",
+    ],
+)
+def test_policies_need_no_mujoco(module: str):
+    """Claim: what sees, thinks and reads policies is imported without MuJoCo installed."""
+    code = f"import sys; sys.modules['mujoco'] = None; import csac_jax.{module}"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_checker_reads_the_package():

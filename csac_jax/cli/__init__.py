@@ -14,6 +14,7 @@ from typing import Any
 import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.cli import (
+    act,
     bench,
     doctor,
     evaluation,
@@ -22,6 +23,7 @@ from csac_jax.cli import (
     parsing,
     play,
     report,
+    serve,
     sweep,
     train,
 )
@@ -33,6 +35,8 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "sweep": sweep.run,
     "eval": evaluation.run,
     "play": play.run,
+    "act": act.run,
+    "serve": serve.run,
     "report": report.run,
     "export": export.run,
     "doctor": doctor.run,
@@ -49,6 +53,8 @@ A robot learns to push and grasp in clutter.
                      --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
+  act POLICY         decide where to grasp or push in a camera's image
+  serve POLICY       answer images by decisions over HTTP
   report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
   doctor             versions, devices and a self-test of this machine

@@ -1,35 +1,77 @@
-"""`csac-jax export`: a run's policy as one small file."""
+"""`csac-jax export`: a policy as one file."""
 
 import dataclasses
 from pathlib import Path
+from typing import Any, Literal
 
 import tyro
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError
+from csac_jax.cli.failures import BadArgumentsError, check_extra
+
+NEEDS = {"stablehlo": "flatbuffers", "onnx": "onnx"}  # modules of the extra `export`
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """Writes a run's policy, networks and config, into one file for `eval` and `play`."""
+    """Writes a policy, networks and config, into one file."""
 
-    run_dir: tyro.conf.Positional[Path]
-    """Folder of the run."""
+    policy: tyro.conf.Positional[str]
+    """Folder of a run, a policy file, or shipped for the policy that comes with the package."""
     file: tyro.conf.Positional[Path]
     """File to write, which must not exist, such as policy.safetensors."""
+    format: Literal["safetensors", "stablehlo", "onnx"] = "safetensors"
+    """safetensors: a policy file for the other commands. stablehlo: a program that jax runs alone.
+    onnx: one that onnxruntime runs alone, of the small net; it takes the best cell."""
+    input: Literal["maps", "image"] = "maps"
+    """What a program takes: colour and height map, or (stablehlo) a camera's image and pose."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height of that image, px."""
 
 
 def run(arguments: list[str]) -> int:
     """Writes the file; returns the exit code."""
     options = parsing.parse(ExportOptions, arguments, "export")
-    if options.file.suffix != ".safetensors":
-        raise BadArgumentsError(f"{options.file}: the name of a policy file ends in .safetensors")
-    if options.file.exists():
-        raise BadArgumentsError(f"{options.file} exists; give another name")
-    from csac_jax.evaluation import policies
-    from csac_jax.io import policy_file
+    _check(options)
+    from csac_jax import deploy
+    from csac_jax.io import files, policy_file
 
-    policy = policies.load(options.run_dir)
-    policy_file.save(options.file, policy.params, policy.cfg)
+    policy = deploy.Policy.load(options.policy)
+    if options.format == "safetensors":
+        policy_file.save(options.file, policy.params, policy.cfg)
+    else:
+        files.replace(options.file, _program(options, policy))
     print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
     return 0
+
+
+def _check(options: ExportOptions) -> None:
+    if options.file.suffix != f".{options.format}":
+        kind = "policy file" if options.format == "safetensors" else "program"
+        raise BadArgumentsError(
+            f"{options.file}: the name of a {kind} ends in .{options.format}, see --format"
+        )
+    if options.file.exists():
+        raise BadArgumentsError(f"{options.file} exists; give another name")
+    if options.input == "image" and options.format != "stablehlo":
+        raise BadArgumentsError("--input image: needs --format stablehlo")
+    if not all(16 <= side <= 4096 for side in options.size):
+        raise BadArgumentsError("--size: both numbers must lie in 16 .. 4096 px")
+    if options.format in NEEDS:
+        check_extra(f"--format {options.format}", NEEDS[options.format], "export")
+
+
+def _program(options: ExportOptions, policy: Any) -> bytes:
+    """The content of a file that holds a program."""
+    import jax
+
+    from csac_jax.deploy import export
+
+    params = jax.device_get(policy.params)
+    if options.format == "onnx":
+        from csac_jax.deploy import onnx_graph
+
+        return onnx_graph.make(policy.cfg, params)
+    if options.input == "image":
+        return export.stablehlo(*export.from_image(policy.cfg, params, options.size))
+    return export.stablehlo(*export.from_maps(policy.cfg, params))

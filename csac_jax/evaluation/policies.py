@@ -141,7 +141,7 @@ def act(policy: Policy, states: State, keys: jax.Array) -> Action:
 
 def load_config(source: str | Path, step: int | None = None) -> Config:
     """The config of a policy, see `load`."""
-    path = _path(source)
+    path = policy_file.find(source)
     return policy_file.load(path)[0] if path.is_file() else checkpoint.load_config(path, step)
 
 
@@ -154,7 +154,7 @@ def load(
     checkpoint, by default the newest sound one.
     Raises FileNotFoundError, PolicyFileError or CheckpointError, with the remedy.
     """
-    path = _path(source)
+    path = policy_file.find(source)
     if path.is_file():
         return LearnedPolicy(*policy_file.load(path))
     cfg = checkpoint.load_config(path, step)
@@ -163,15 +163,6 @@ def load(
         return LearnerPolicy(cfg, learner, state.learner)
     policy_file.check_finite(path, state.learner.online)
     return LearnedPolicy(cfg, state.learner.online, network)
-
-
-def _path(source: str | Path) -> Path:
-    path = policy_file.SHIPPED if source == "shipped" else Path(source)
-    if not path.exists():
-        raise FileNotFoundError(
-            f"there is no folder {path}; give the folder of a run, a policy file, or shipped"
-        )
-    return path
 
 
 POLICIES: dict[str, Callable[..., Policy]] = {

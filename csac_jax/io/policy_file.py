@@ -60,6 +60,16 @@ def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
     return content.hexdigest()
 
 
+def find(source: str | Path) -> Path:
+    """The policy file or run's folder that `source` names. Raises FileNotFoundError."""
+    path = SHIPPED if source == "shipped" else Path(source)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"there is no folder {path}; give the folder of a run, a policy file, or shipped"
+        )
+    return path
+
+
 def is_policy(path: Path) -> bool:
     """Whether a .safetensors file holds a config."""
     try:

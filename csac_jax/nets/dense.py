@@ -20,7 +20,7 @@ from csac_jax.nets.convolution import conv2d
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 OUTPUT_INIT = nn.initializers.variance_scaling(0.01, "fan_in", "normal")  # maps begin near 0
 _GROUP_SIZE = 8  # channels per group of the norm
-_EPSILON = 1e-6  # of the norm, Flax's
+EPSILON = 1e-6  # of the norm, Flax's
 
 
 def compute_dtype(cfg: NetConfig) -> Any:
@@ -83,6 +83,11 @@ def pixel_shuffle(maps: jax.Array, factor: int) -> jax.Array:
     return jnp.swapaxes(parts, -4, -3).reshape(*batch, factor * rows, factor * cols, -1)
 
 
+def num_groups(channels: int) -> int:
+    """Groups of a group norm over so many channels."""
+    return max(channels // _GROUP_SIZE, 1)
+
+
 class GroupNorm(nn.Module):
     """Group norm of maps [B, H, W, F], `_GROUP_SIZE` channels a group.
 
@@ -97,7 +102,7 @@ class GroupNorm(nn.Module):
         channels = maps.shape[-1]
         scale = self.param("scale", nn.initializers.ones, (channels,))
         bias = self.param("bias", nn.initializers.zeros, (channels,))
-        groups = max(channels // _GROUP_SIZE, 1)
+        groups = num_groups(channels)
         exact = maps.astype(jnp.float32)
 
         def group_mean(values: jax.Array) -> jax.Array:
@@ -107,7 +112,7 @@ class GroupNorm(nn.Module):
 
         mean = group_mean(exact)
         variance = jnp.maximum(group_mean(exact**2) - mean**2, 0.0)
-        factor = jax.lax.rsqrt(variance + _EPSILON) * scale[None, None, None]
+        factor = jax.lax.rsqrt(variance + EPSILON) * scale[None, None, None]
         return ((exact - mean) * factor + bias[None, None, None]).astype(self.dtype)
 
 

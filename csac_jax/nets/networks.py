@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets import dense, densenet
 
-_BARE = 0.002  # m: lower cells are bare table, of which no net sees the colour
+BARE = 0.002  # m: lower cells are bare table, of which no net sees the colour
 _FULL = 640  # px, ours: side of passes of which one state is seen at a time
 
 
@@ -43,7 +43,7 @@ class Networks:
         maps = [jnp.maximum(height, 0.0)[..., None] / self.height_scale]
         if self.colour:
             mean, std = (jnp.broadcast_to(leaf, colour.shape) for leaf in self.colour_scale)
-            maps.insert(0, jnp.where(height[..., None] > _BARE, (colour - mean) / std, 0.0))
+            maps.insert(0, jnp.where(height[..., None] > BARE, (colour - mean) / std, 0.0))
         if target is not None:
             maps.append(target[..., None].astype(height.dtype))
         return jnp.concatenate(maps, axis=-1)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from csac_jax.config import CameraConfig
-from csac_jax.scene import solids
+from csac_jax.scene import geoms, solids
 from csac_jax.vision import camera
 
 FLOOR = (0.75, 0.76, 0.78, 1.0)
@@ -66,8 +66,8 @@ def _ray_renderer(model: mujoco.MjModel, view: View) -> Draw:
     focal = 0.5 * height / np.tan(np.radians(0.5 * FOVY))
     centre = 0.5 * (width - 1), 0.5 * (height - 1)
     eye = camera.make(CameraConfig(view.size, (focal, focal), centre, view.position, view.look_at))
-    geoms = solids.read(model)
-    render = jax.jit(lambda *placed: camera.render(eye, solids.place(geoms, *placed)))
+    scene = geoms.read(model)
+    render = jax.jit(lambda *placed: camera.render(eye, solids.place(scene, *placed)))
 
     def draw(data: mujoco.MjData) -> np.ndarray:
         placed = data.geom_xpos.astype(np.float32), data.geom_xmat.astype(np.float32)

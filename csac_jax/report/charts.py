@@ -22,7 +22,7 @@ from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped, lab
 from csac_jax.report.tables import PAPER_ACTIONS, PAPER_CASES, PAPER_TRAINING
 
 SAMPLERS = ("csac", "csac_per", "csac_beta")
-PALETTE = ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759")
+PALETTE = ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#b07aa1")
 COLOURS = dict(zip(NAMES, PALETTE, strict=True))
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
 _short = functools.partial(label, preset=False, most=3)  # name of a variant in a legend

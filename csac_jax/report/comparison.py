@@ -18,6 +18,7 @@ NAMES = {
     "csac": "CSAC",
     "csac_per": "CSAC-PER",
     "csac_beta": "CSAC-beta",
+    "vpg_episodic": "VPG, episodic",
 }
 
 

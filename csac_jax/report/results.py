@@ -239,7 +239,7 @@ def _without_evaluation(results: Results) -> Iterator[str]:
 
 def variant(config: Json) -> Variant:
     """What a recorded config is a variant of. Settings that the config lacks are passed over."""
-    preset, algo = config.get("preset", ""), config.get("algo", "csac_beta")
+    preset, algo = config.get("preset", ""), configs.algorithm(config)
     base: Json = {}
     with contextlib.suppress(ValueError):  # a name that is no more
         base = configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))

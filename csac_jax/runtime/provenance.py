@@ -18,9 +18,12 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-che
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that can change a result."""
-    installed = {name: importlib.metadata.version(name) for name in PACKAGES}
-    return {"python": platform.python_version(), "csac-jax": __version__, **installed}
+    """Versions of Python and of the installed packages that can change a result."""
+    found = {"python": platform.python_version(), "csac-jax": __version__}
+    for name in PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)  # policies act without MuJoCo
+    return found
 
 
 def warn_if_other(stored: Any, what: str) -> None:
@@ -28,7 +31,7 @@ def warn_if_other(stored: Any, what: str) -> None:
     now = versions()
     for name in ("csac-jax", "jax", "mujoco"):
         was = stored.get(name) if isinstance(stored, dict) else None
-        if was is not None and was != now[name]:
+        if was is not None and was != now.get(name, was):
             text = f"{what} was made with {name} {was}, this is {now[name]}: results may differ"
             warnings.warn(text, DataWarning, stacklevel=3)
 

@@ -20,7 +20,6 @@ from csac_jax.scene.blocks import Parts
 from csac_jax.scene.layout import Scene
 
 HAND_GEOMS = ("palm", "pad_low", "pad_high")
-MAX_OPENING = 0.110  # m, RG2 data sheet
 LARGEST = 1.25  # compiled over nominal block size: C culls pairs by the bounds it was compiled with
 HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above the highest drop
 
@@ -107,7 +106,7 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
         _add_parts(spec, body, scene.slots[slot])
-    if sim.physics != "mjx":  # which reads its contacts instead
+    if sim.physics == "c":  # the others read their contacts instead
         _add_touch_sensors(spec, len(scene.slots))
     spec.option.timestep = sim.timestep
     spec.option.iterations = sim.iterations

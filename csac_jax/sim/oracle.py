@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import Config, SlotKind
-from csac_jax.constants import Primitive
+from csac_jax.constants import MAX_OPENING, Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
 from csac_jax.scene import blocks
 from csac_jax.scene.layout import ANY, Scene
-from csac_jax.scene.model import MAX_OPENING
 from csac_jax.sim.primitives import Action, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric

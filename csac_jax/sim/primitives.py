@@ -7,8 +7,7 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.config import HeightmapConfig, RobotKind, SimConfig
-from csac_jax.constants import Primitive
-from csac_jax.scene.model import MAX_OPENING
+from csac_jax.constants import MAX_OPENING, Primitive
 from csac_jax.sim import kinematics
 
 HAND_RADIUS = 0.09  # m, circle about the tool axis that holds the open hand

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from csac_jax.config import WARP_WORLDS, Config, shown
+from csac_jax.config import Config, shown
 from csac_jax.errors import FailedError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import NO_CASES
@@ -204,16 +204,9 @@ def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
 
 
 def check_room(plan: SweepPlan, devices: int) -> None:
-    """Raises ValueError where a group's runs, divided among `devices`, exceed a device's memory, or
-    the scenes of Warp's contacts."""
+    """Raises ValueError where a group's runs, divided among `devices`, exceed a device's memory."""
     for group, _ in groups_of(plan._replace(seeds=1)):
         cfg, runs = group.configs[0], -(-len(group.configs) * plan.seeds // devices)
-        scenes = cfg.train.scenes
-        if cfg.sim.physics == "warp" and runs * scenes > WARP_WORLDS:
-            raise ValueError(
-                f"--seeds: {runs} runs of {scenes} scenes side by side, Warp has room for "
-                f"{WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take --sim.physics mjx"
-            )
         memory.check(cfg, runs)
 
 

@@ -4,7 +4,7 @@ The camera looks along its z, x is right and y down in the image; row 0 is the t
 along z. A pixel's ray has no unit length: it advances by 1 m in depth per unit of distance.
 
     eye = camera.make(CameraConfig().scaled(0.5))
-    picture = camera.render(eye, solids.place(solids.read(model), data.geom_xpos, data.geom_xmat))
+    picture = camera.render(eye, solids.place(geoms.read(model), data.geom_xpos, data.geom_xmat))
 """
 
 from collections.abc import Callable

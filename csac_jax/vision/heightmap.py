@@ -61,6 +61,21 @@ def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Ce
     return Cells(*(leaf.reshape(cfg.size, cfg.size) for leaf in leaves))
 
 
+def observation(
+    cells: Cells, colour: jax.Array, target: jax.Array, elsewhere: jax.Array
+) -> Observation:
+    """The observation of the points that are highest; cells without one have height, colour 0.
+
+    Args: colour [H, W, 3] and target [H, W] bool of each cell's point, see `Cells.source`;
+    elsewhere [] bool, the target flag of cells without one.
+    """
+    return Observation(
+        colour=jnp.where(cells.filled[..., None], colour, 0.0),
+        height=cells.height,
+        target=jnp.where(cells.filled, target, elsewhere),
+    )
+
+
 def pack(obs: Observation) -> PackedObservation:
     """Rounds to a colour level and to 0.1 mm; clips heights to 0 .. 6.5535 m."""
     counts = jnp.clip(jnp.round(obs.height / _HEIGHT_UNIT), 0.0, 65535.0)

@@ -101,11 +101,7 @@ def from_pixels(
     cells = heightmap.from_points(cfg, points, hits.valid.reshape(-1))
     row = hits.surface.reshape(-1).at[cells.source].get(mode="promise_in_bounds")
     colour, target = (table.at[row].get(mode="promise_in_bounds") for table in tables)
-    return Observation(
-        colour=jnp.where(cells.filled[..., None], colour, 0.0),
-        height=cells.height,
-        target=jnp.where(cells.filled, target, tables.is_target[0]),
-    )
+    return heightmap.observation(cells, colour, target, tables.is_target[0])
 
 
 def oblique_noisy(

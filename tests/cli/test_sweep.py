@@ -280,10 +280,6 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
             "--learn.batch 8000 --train.learning_starts 8000",
             "bench sweep: replay.capacity: must hold",
         ),
-        (
-            "fast --physics warp --seeds 2 4",
-            "--seeds: 4 runs of 2048 scenes side by side, Warp has room for",
-        ),
         ("smoke --train.scene 4", "bench sweep: Unrecognized options: --train.scene"),
     ],
 )

@@ -21,7 +21,7 @@ import numpy as np
 
 from csac_jax import presets
 from csac_jax.errors import DataWarning
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, files
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.training import loop, step
@@ -401,6 +401,9 @@ def clock(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
                 tally.count("tracebacks", f"{about}: {type(error).__name__}: {error}")
         if found := toy.fault_of(run_dir, reference, 4):
             tally.count("lost", f"{about}: {found}")
+        seconds = [line["seconds"] for line in files.read_log(run_dir / "metrics.jsonl")]
+        if min(seconds) < 0.0 or seconds != sorted(seconds):
+            tally.count("silent", f"{about}: the log's seconds are {seconds}")
     return tally
 
 

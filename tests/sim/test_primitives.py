@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from csac_jax.config import HeightmapConfig, SimConfig
-from csac_jax.constants import Primitive
+from csac_jax.constants import MAX_OPENING, Primitive
 from csac_jax.geometry import cell_centres
-from csac_jax.scene.model import MAX_OPENING
 from csac_jax.sim import primitives
 from csac_jax.sim.primitives import Action, Plan
 

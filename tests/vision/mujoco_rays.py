@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax.config import SceneConfig, SimConfig, SlotKind
-from csac_jax.scene import blocks, layout, model as models, solids
+from csac_jax.scene import blocks, geoms, layout, model as models, solids
 
 SHAPES = tuple(blocks.SHAPES)
 SLOTS: tuple[SlotKind, ...] = tuple(blocks.SHAPES[name].kind for name in SHAPES)
@@ -84,7 +84,7 @@ def every_type(rng: np.random.Generator) -> Placed:
 def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
     """The model at the pose of its data."""
     poses = np.float32(data.geom_xpos), np.float32(data.geom_xmat)
-    return solids.place(solids.read(model), *poses)
+    return solids.place(geoms.read(model), *poses)
 
 
 def cast(

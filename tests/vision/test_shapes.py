@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from csac_jax.scene import solids
+from csac_jax.scene import geoms, solids
 from csac_jax.scene.solids import GeomGroup, Kind, Solids
 from csac_jax.vision import raycast, shapes
 from tests.vision import mujoco_rays
@@ -188,7 +188,7 @@ def test_unknown_type_is_refused_by_name():
         "</worldbody></mujoco>"
     )
     with pytest.raises(ValueError, match=r"geom egg: .*ellipsoid.*cylinder"):
-        solids.read(model)
+        geoms.read(model)
 
 
 def test_invisible_geoms_are_left_out():
@@ -200,7 +200,7 @@ def test_invisible_geoms_are_left_out():
         <geom type="sphere" size="0.1" pos="0 0 0.5" rgba="0.25 0.5 0.75 1"/>
         <geom type="sphere" size="0.1" pos="1 0 0.5" material="red"/></worldbody></mujoco>"""
     )
-    scene = solids.read(model)
+    scene = geoms.read(model)
     hit = _cast_from(
         scene, jnp.array([[0.0, 0, 2], [1, 0, 2]]), jnp.tile(jnp.array([[0.0, 0, -1]]), (2, 1))
     )
@@ -212,7 +212,7 @@ def test_solids_follow_their_poses():
     """Claim: `place` moves what `read` read to other poses, also inside a compiled function."""
     rng = np.random.default_rng(4)
     model, data = mujoco_rays.every_type(rng)
-    rest = solids.read(model)
+    rest = geoms.read(model)
     data.geom_xpos += [0.01, -0.02, 0.03]
     moved = jax.jit(solids.place)(
         rest, jnp.asarray(data.geom_xpos, jnp.float32), jnp.asarray(data.geom_xmat)

@@ -1,0 +1,218 @@
+"""What a depth camera gives: colour, depth, intrinsics and a pose, checked; and their points.
+
+The camera's axes are OpenCV's: x right, y down, z forward. Pixel centres are whole numbers, depth
+is along z. A pose `T_workspace_camera` maps camera to workspace. h, w = rows and columns, px.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+from csac_jax.errors import SettingsError
+
+MOST_PIXELS = 4096  # of a side
+_ROUNDS = 20  # of the iteration that removes distortion, as in OpenCV's undistortPoints
+_RIGID = 1e-3  # largest error of a rotation matrix's products
+
+
+@dataclasses.dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera; raises SettingsError for one that cannot be."""
+
+    width: int  # px
+    height: int  # px
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px, from the left
+    cy: float  # px, from the top
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 k3, OpenCV's; none: no distortion
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            side = getattr(self, name)
+            if type(side) is not int or not 16 <= side <= MOST_PIXELS:
+                raise SettingsError(f"intrinsics.{name}: a number of pixels, 16 to {MOST_PIXELS}")
+        object.__setattr__(self, "distortion", tuple(np.ravel(self.distortion).tolist()))
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(isinstance(value, int | float) and np.isfinite(value) for value in numbers):
+            raise SettingsError("intrinsics: fx, fy, cx, cy and distortion must be finite numbers")
+        if min(self.fx, self.fy) <= 0.0:
+            raise SettingsError("intrinsics: fx and fy must be above 0, in pixels")
+        if not (0.0 <= self.cx <= self.width and 0.0 <= self.cy <= self.height):
+            raise SettingsError("intrinsics: cx and cy must lie in the image, in pixels")
+        if len(self.distortion) not in (0, 4, 5):
+            raise SettingsError("intrinsics.distortion: 4 or 5 numbers, k1 k2 p1 p2 k3")
+
+    @classmethod
+    def of(cls, values: Any) -> "Intrinsics":
+        """Intrinsics as such, or of a mapping with the names above. Raises SettingsError."""
+        if isinstance(values, cls):
+            return values
+        known = {field.name for field in dataclasses.fields(cls)}
+        needed = known - {"distortion"}
+        if not isinstance(values, dict) or not needed <= set(values) <= known:
+            raise SettingsError(
+                f"intrinsics: give {', '.join(sorted(needed))}, and maybe distortion"
+            )
+        try:
+            return cls(**{**values, "distortion": values.get("distortion") or ()})
+        except (TypeError, ValueError) as error:
+            raise SettingsError(str(error)) from None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the image."""
+        return self.height, self.width
+
+
+def distort(intrinsics: Intrinsics, xy: np.ndarray) -> np.ndarray:
+    """Where a lens puts ideal image points `xy` [..., 2] at depth 1 (Brown's model, OpenCV)."""
+    k1, k2, p1, p2, k3 = np.pad(np.array(intrinsics.distortion), (0, 5))[:5]
+    x, y = xy[..., 0], xy[..., 1]
+    square = x * x + y * y
+    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    along = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+    down = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([along, down], axis=-1)
+
+
+@functools.lru_cache(maxsize=4)
+def rays(intrinsics: Intrinsics) -> np.ndarray:
+    """Ideal directions [h, w, 3] float32 of all pixels in the camera's frame, 1 m long in depth.
+
+    Raises SettingsError for a distortion that has no inverse over the image.
+    """
+    u, v = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
+    seen = np.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy], -1)
+    ideal = seen
+    if any(intrinsics.distortion):
+        with np.errstate(all="ignore"):  # it may diverge
+            for _ in range(_ROUNDS):
+                ideal = ideal + seen - distort(intrinsics, ideal)
+            error = np.abs(distort(intrinsics, ideal) - seen).max() * intrinsics.fx
+        if not error < 0.1:
+            raise SettingsError("intrinsics.distortion: has no inverse over the image; rectify it")
+    return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1).astype(np.float32)
+
+
+def rigid(matrix: Any, name: str) -> np.ndarray:
+    """A pose [4, 4] float64. Raises SettingsError for what is none."""
+    try:
+        pose = np.array(matrix, np.float64)
+    except (TypeError, ValueError):
+        raise SettingsError(f"{name}: must be a 4 x 4 matrix of numbers") from None
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise SettingsError(f"{name}: must be a 4 x 4 matrix of finite numbers")
+    rotation = pose[:3, :3]
+    square = np.abs(rotation @ rotation.T - np.eye(3)).max() < _RIGID
+    if not square or np.linalg.det(rotation) < 0.0 or np.any(pose[3] != [0.0, 0.0, 0.0, 1.0]):
+        raise SettingsError(
+            f"{name}: must be a rotation and a translation in m, last row 0 0 0 1; it may be "
+            "transposed, scaled or mirrored"
+        )
+    return pose
+
+
+@functools.lru_cache(maxsize=4)
+def _turned(intrinsics: Intrinsics, rotation: bytes) -> np.ndarray:
+    """`rays` rotated by a matrix [3, 3] float64; cameras seldom move."""
+    right, down, forward = np.frombuffer(rotation).reshape(3, 3).T.astype(np.float32)
+    ideal = rays(intrinsics)
+    return ideal[..., :1] * right + ideal[..., 1:2] * down + forward
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class View:
+    """One image of a scene; see `make`."""
+
+    colour: np.ndarray  # [h, w, 3] uint8, red green blue
+    depth: np.ndarray  # [h, w] float32 m; 0 where not valid
+    valid: np.ndarray  # [h, w] bool, there is a depth
+    target: np.ndarray | None  # [h, w] bool, pixels of the object to get
+    intrinsics: Intrinsics
+    pose: np.ndarray  # [4, 4] T_workspace_camera
+
+    @functools.cached_property
+    def directions(self) -> np.ndarray:
+        """Rays [h, w, 3] float32 of the pixels in the workspace's frame, 1 m long in depth."""
+        return _turned(self.intrinsics, self.pose[:3, :3].tobytes())
+
+    @functools.cached_property
+    def points(self) -> np.ndarray:
+        """Points [h, w, 3] float32 m of the pixels in the workspace's frame."""
+        return self.depth[..., None] * self.directions + self.pose[:3, 3].astype(np.float32)
+
+    @property
+    def sparse(self) -> tuple[slice, slice]:
+        """Rows and columns of some 20,000 pixels all over the image, for measurements."""
+        step = max(1, int(np.sqrt(self.depth.size / 20_000)))
+        return slice(None, None, step), slice(None, None, step)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points [n, 3] m of the workspace lie in the image: column and row [n, 2] px, and
+        which are in it [n] bool."""
+        return project(self.intrinsics, self.pose, points)
+
+
+def project(
+    intrinsics: Intrinsics, pose: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """See `View.project`."""
+    x, y, depth = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+    ahead = depth > 1e-3
+    ideal = np.stack([x, y], axis=1) / np.where(ahead, depth, 1.0)[:, None]
+    edge = rays(intrinsics)[[0, 0, -1, -1], [0, -1, 0, -1], :2]  # distortion folds beyond the image
+    near = np.sum(ideal**2, axis=1) <= 1.1 * np.max(np.sum(edge**2, axis=1))
+    scale, centre = (intrinsics.fx, intrinsics.fy), (intrinsics.cx, intrinsics.cy)
+    pixel = distort(intrinsics, ideal) * scale + centre
+    size = np.array([intrinsics.width, intrinsics.height])
+    inside = np.all((pixel >= -0.5) & (pixel < size - 0.5), axis=1)
+    return pixel, ahead & near & inside
+
+
+def make(rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None) -> View:
+    """A view of the arrays that `Policy.decide` takes. Raises SettingsError for a wrong form."""
+    camera, pose = Intrinsics.of(intrinsics), rigid(camera_pose, "camera_pose")
+    colour, metres = _colour(np.asarray(rgb)), _depth(np.asarray(depth))
+    target = None if target_mask is None else _mask(np.asarray(target_mask))
+    arrays = {"rgb": colour, "depth": metres, "target_mask": target}
+    sizes = {name: array.shape[:2] for name, array in arrays.items() if array is not None}
+    if set(sizes.values()) != {camera.shape}:
+        found = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
+        wanted = f"{camera.width} x {camera.height}"
+        raise SettingsError(f"{found}, intrinsics {wanted}: align them to one camera and one size")
+    valid = np.isfinite(metres) & (metres > 0.0)
+    return View(
+        colour, np.where(valid, metres, 0.0).astype(np.float32), valid, target, camera, pose
+    )
+
+
+def _colour(rgb: np.ndarray) -> np.ndarray:
+    if rgb.ndim != 3 or rgb.shape[2] != 3:
+        hint = "; leave out its alpha: rgb[..., :3]" if rgb.ndim == 3 and rgb.shape[2] == 4 else ""
+        raise SettingsError(f"rgb: must have shape [rows, columns, 3], not {list(rgb.shape)}{hint}")
+    if rgb.dtype != np.uint8:
+        scale = "rgb * 255 as uint8" if rgb.dtype.kind == "f" else "values 0 to 255 as uint8"
+        raise SettingsError(f"rgb: is {rgb.dtype}; give {scale}, red first")
+    return rgb
+
+
+def _depth(depth: np.ndarray) -> np.ndarray:
+    if depth.ndim != 2:
+        raise SettingsError(f"depth: must have shape [rows, columns], not {list(depth.shape)}")
+    if depth.dtype.kind != "f":
+        raise SettingsError(
+            f"depth: is {depth.dtype}, which has no unit; give metres as float: "
+            "depth * 0.001 for millimetres"
+        )
+    return depth
+
+
+def _mask(mask: np.ndarray) -> np.ndarray:
+    if mask.ndim != 2 or mask.dtype.kind not in "bu":
+        raise SettingsError("target_mask: must be bool or whole numbers [rows, columns]")
+    if not mask.any():
+        raise SettingsError("target_mask: marks no pixel; mark the object, or leave the mask out")
+    return mask != 0

@@ -1,0 +1,92 @@
+"""From points and colours to actions: the compiled part of a policy that is deployed."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax import geometry
+from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent.actor_critic import ActorCritic, Params
+from csac_jax.agent.maps import DenseMaps
+from csac_jax.config import Config
+from csac_jax.constants import Primitive
+from csac_jax.sim import primitives
+from csac_jax.sim.primitives import Action
+from csac_jax.vision import heightmap
+from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
+
+APART = 0.03  # m (ours), between alternatives of one primitive: more than a finger's width
+
+
+class Choice(NamedTuple):
+    """One action."""
+
+    action: Action
+    score: jax.Array  # [] Q
+    valid: jax.Array  # [] bool, there is something to act on
+    stations: jax.Array  # [4, 5] x m, y m, z m, yaw rad, half the opening m; `decision.STATIONS`
+
+
+def observe(cfg: Config, points: Any, valid: Any, colour: Any, target: Any) -> Observation:
+    """The view from above of an image's pixels.
+
+    Args: points [n, 3] m, workspace frame; valid [n] bool; colour [n, 3] uint8; target [n] bool, or
+    None if any object will do. Points above VIEW_HEIGHT are left out.
+    """
+    cells = heightmap.from_points(cfg.heightmap, points, valid & (points[:, 2] < VIEW_HEIGHT))
+    seen = colour.at[cells.source].get(mode="promise_in_bounds").astype(jnp.float32) / 255.0
+    marked = jnp.ones(cells.source.shape, bool)
+    if target is not None:
+        marked = target.at[cells.source].get(mode="promise_in_bounds")
+    return heightmap.observation(cells, seen, marked, jnp.array(target is None))
+
+
+def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool) -> DenseMaps:
+    """Dense maps of one state. With `only_target` a policy of the task `clear`, whose networks see
+    no target, may only grasp, and only the target."""
+    learner = actor_critic.make(cfg)
+    batch = actor_critic.dense_maps(learner, params, jax.tree.map(lambda leaf: leaf[None], obs))
+    state = jax.tree.map(lambda leaf: leaf[0], batch)
+    if not only_target or learner.frames.shows_target:
+        return state
+    frames = dataclasses.replace(learner.frames, shows_target=True)
+    valid = maps.actionable_cells(frames, obs).at[int(Primitive.PUSH)].set(False)
+    return state.replace(valid=valid)
+
+
+def choose(cfg: Config, state: DenseMaps, height: jax.Array) -> tuple[Choice, DenseMaps]:
+    """What the policy does in a state of height map [H, W] m, and the state without the cells near
+    that action."""
+    learner = actor_critic.make(cfg)
+    best = policy.greedy(jax.random.key(0), learner, state, jnp.int32(0))
+    pose = maps.denormalise(learner.frames, best.poses[best.primitive])
+    action = Action(primitive=best.primitive, pose=pose)
+    valid = maps.is_valid(learner.frames, state.valid, best.primitive, pose)
+    choice = Choice(action, best.values[best.primitive], valid, stations(cfg, height, action))
+    return choice, _without(learner, state, action)
+
+
+def stations(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
+    """Set-points [4, 5] of the hand where the phases of the simulated primitive begin and end."""
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+    is_grasp = action.primitive == Primitive.GRASP
+    ends = [np.cumsum(phases) - 1 for phases in (cfg.sim.push_phases, cfg.sim.grasp_phases)]
+    last = jnp.where(is_grasp, ends[1], ends[0])
+    return jnp.concatenate([plan.start[None], plan.control[last]])
+
+
+def _without(learner: ActorCritic, state: DenseMaps, action: Action) -> DenseMaps:
+    """The state without the cells of this primitive within APART of the action."""
+    offset = learner.frames.xy - action.pose[:2][None, None, None]
+    far = jnp.sum(offset**2, axis=-1) >= APART**2  # [K, h, w]
+    other = jnp.arange(len(Primitive)) != action.primitive
+    return state.replace(valid=state.valid & (far[None] | other[:, None, None, None]))
+
+
+def best_over_yaws(cfg: Config, state: DenseMaps) -> jax.Array:
+    """Largest Q over the yaws [P, H, W], -inf where there is nothing to act on; for pictures."""
+    places = geometry.cell_centres(cfg.heightmap)
+    return maps.best_over_yaws(actor_critic.make(cfg).frames, state, places)

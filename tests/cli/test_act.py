@@ -1,0 +1,210 @@
+"""`csac-jax act`: files in, decisions out as text, JSON and picture; bad files are one line."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from csac_jax import cli
+from csac_jax.config import CameraConfig
+from csac_jax.deploy import Policy
+from tests.deploy import image_files, scenes
+
+POSES = np.array([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])
+IMAGE = image_files.rounded(scenes.take(scenes.blocks_at(POSES)))
+EMPTY = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]))
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> list[str]:
+    """Policy and files of an image of two blocks."""
+    return ["shipped", *image_files.write(tmp_path, IMAGE)]
+
+
+def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: the command prints and writes what `Policy.decide` returns, and draws it."""
+    files = ["--json", str(tmp_path / "out.json"), "--png", str(tmp_path / "out.png")]
+    assert cli.main(["act", *given, "--top", "2", *files]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    result = json.loads((tmp_path / "out.json").read_text())
+    wanted = Policy.load("shipped").decide(*IMAGE, top=2)
+    assert len(lines) == len(result["decisions"]) == 2
+    for line, found, decision in zip(lines, result["decisions"], wanted, strict=True):
+        assert f"{decision.primitive} at x {found['position'][0]:+.3f}" in line
+        np.testing.assert_allclose(found["position"], decision.position, atol=1e-4)
+        assert found["primitive"] == decision.primitive
+        assert [w["name"] for w in found["waypoints"]] == ["approach", "descend", "act", "retreat"]
+    assert {"device", "versions", "commit", "config"} <= set(result)
+    assert imageio.imread(tmp_path / "out.png").shape == (640, 1248, 3)
+
+
+def test_depth_in_metres(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: an .npy of metres does as a PNG of millimetres, to the millimetre's rounding."""
+    lines = []
+    for name in ("depth.png", "depth.npy"):
+        assert cli.main(["act", *given, "--depth", str(tmp_path / name)]) == 0
+        lines.append(capsys.readouterr().out)
+    x, y = (np.array(re.findall(r"[xy] ([-+.\d]+)", line), float) for line in lines)
+    np.testing.assert_allclose(x, y, atol=0.02)
+
+
+def test_mask(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: --mask chooses the object: each half of the image has its own block."""
+    for block, keep in enumerate((np.s_[:, :320], np.s_[:, 320:])):
+        mask = np.zeros((480, 640), np.uint8)
+        mask[keep] = 255
+        imageio.imwrite(tmp_path / "mask.png", mask)
+        assert cli.main(["act", *given, "--mask", str(tmp_path / "mask.png")]) == 0
+        x, y = re.findall(r"[xy] ([-+.\d]+)", capsys.readouterr().out)
+        near = np.linalg.norm(POSES[:, :2] - [float(x), float(y)], axis=1).argmin()
+        assert near == block
+
+
+def test_workspace_moves_the_tool(given: list[str], tmp_path: Path):
+    """Claim: --workspace is where the tool's poses are counted from; positions stay."""
+    found = []
+    for height in (0.0, 0.3):
+        pose = np.eye(4)
+        pose[2, 3] = height
+        (tmp_path / "w.json").write_text(json.dumps({"matrix": pose.tolist()}))
+        files = ["--workspace", str(tmp_path / "w.json"), "--json", str(tmp_path / "o.json")]
+        assert cli.main(["act", *given, *files]) == 0
+        found.append(json.loads((tmp_path / "o.json").read_text())["decisions"][0])
+    low, high = (np.array(one["waypoints"][0]["tool"]) for one in found)
+    np.testing.assert_allclose(high - low, [[0] * 4, [0] * 4, [0, 0, 0, 0.3], [0] * 4], atol=1e-9)
+    assert found[0]["position"] == found[1]["position"]
+
+
+def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: --check accepts a right pose; it refuses one that is 2 cm off, a table with blocks,
+    and a camera that sees too little, each by one line."""
+    cases = {"fit": (EMPTY, 0, "pose and intrinsics fit")}
+    pose = EMPTY.pose.copy()
+    pose[2, 3] += 0.02
+    cases["low"] = (EMPTY._replace(pose=pose), 1, "the table is not at z = 0")
+    cases["full"] = (IMAGE, 1, "the table is not empty")
+    aside = CameraConfig(focal=(900.0, 900.0), look_at=(0.0, 0.15, 0.0))
+    beside = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]), aside)
+    cases["aside"] = (beside, 1, "too little of the workspace is seen")
+    for name, (image, code, line) in cases.items():
+        options = image_files.write(tmp_path / name, image)
+        json_file = tmp_path / f"{name}.json"
+        assert cli.main(["act", "shipped", *options, "--check", "--json", str(json_file)]) == code
+        captured = capsys.readouterr()
+        assert line in captured.out + captured.err
+        assert re.search(r"^table +[-+]\d+\.\d mm from z = 0, tilted by", captured.out)
+        assert bool(json.loads(json_file.read_text())["faults"]) == bool(code)
+
+
+def _no_file(folder: Path) -> None:
+    (folder / "rgb.png").unlink()
+
+
+def _cut(folder: Path) -> None:
+    (folder / "rgb.png").write_bytes((folder / "rgb.png").read_bytes()[:2000])
+
+
+def _eight_bits(folder: Path) -> None:
+    imageio.imwrite(folder / "depth.png", np.zeros((480, 640), np.uint8))
+
+
+def _small(folder: Path) -> None:
+    imageio.imwrite(folder / "rgb.png", IMAGE.rgb[::2, ::2])
+
+
+def _no_json(folder: Path) -> None:
+    (folder / "pose.json").write_text("1 0 0 0")
+
+
+def _other_names(folder: Path) -> None:
+    (folder / "pose.json").write_text(json.dumps({"pose": np.eye(4).tolist()}))
+
+
+def _no_matrix(folder: Path) -> None:
+    (folder / "pose.json").write_text(json.dumps({"matrix": [[1, 2], [3]]}))
+
+
+def _no_focal(folder: Path) -> None:
+    (folder / "intrinsics.json").write_text(json.dumps({"width": 640, "height": 480}))
+
+
+def _ten_times(folder: Path) -> None:
+    depth = imageio.imread(folder / "depth.png")
+    imageio.imwrite(folder / "depth.png", (10 * depth.clip(0, 6000)).astype(np.uint16))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code", "message"),
+    [
+        (_no_file, 2, "there is no file"),
+        (_cut, 2, "rgb.png: "),
+        (_eight_bits, 2, "depth.png: is uint8; give a PNG of 16 bits, in mm"),
+        (_small, 2, "rgb 320 x 240, depth 640 x 480"),
+        (_no_json, 2, "pose.json is not readable JSON"),
+        (_other_names, 2, 'pose.json: give {"matrix": '),
+        (_no_matrix, 2, "matrix: must be a 4 x 4 matrix of numbers"),
+        (_no_focal, 2, "intrinsics.json: intrinsics: give cx, cy, fx, fy"),
+        (_ten_times, 1, "counts in 0.1 mm; multiply it by 0.1"),
+    ],
+)
+def test_bad_files_are_one_line(
+    given: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    spoil: Callable[[Path], None],
+    code: int,
+    message: str,
+):
+    """Claim: what is wrong with a file is one line that names it."""
+    spoil(tmp_path)
+    assert cli.main(["act", *given]) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert message in captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--top", "0"], "top: must lie in 1 .. 64, not 0"),
+        (["--png", "out.bmp"], "its name must end in one of: .png"),
+    ],
+)
+def test_bad_options(
+    given: list[str], capsys: pytest.CaptureFixture, arguments: list[str], message: str
+):
+    """Claim: options out of range are refused with exit code 2."""
+    assert cli.main(["act", *given, *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_no_policy(given: list[str], capsys: pytest.CaptureFixture):
+    """Claim: a policy that is not there is one line."""
+    assert cli.main(["act", "nowhere", *given[1:]]) == 1
+    assert "there is no folder nowhere" in capsys.readouterr().err
+
+
+def test_nothing_to_act_on(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: an empty table is no failure: no decision, and a picture that says so."""
+    options = image_files.write(tmp_path, EMPTY)
+    assert cli.main(["act", "shipped", *options, "--png", str(tmp_path / "o.png")]) == 0
+    assert capsys.readouterr().out == "nothing to act on\n"
+    assert (tmp_path / "o.png").stat().st_size > 10_000
+
+
+def test_command_needs_no_mujoco(given: list[str], tmp_path: Path):
+    """Claim: the command decides, draws and writes without MuJoCo installed."""
+    start = "import sys; sys.modules['mujoco'] = None; from csac_jax import cli; "
+    files = ["--json", str(tmp_path / "o.json"), "--png", str(tmp_path / "o.png")]
+    command = [sys.executable, "-c", f"{start}sys.exit(cli.main())", "act", *given, *files]
+    done = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ))
+    assert done.returncode == 0, done.stderr
+    assert " 1 grasp at x " in done.stdout

@@ -1,0 +1,172 @@
+"""Images that do not fit the camera's pose, the table or the workspace."""
+
+import dataclasses
+import re
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from csac_jax.config import CameraConfig, HeightmapConfig
+from csac_jax.deploy import checks, images
+from csac_jax.deploy.images import View
+from csac_jax.errors import DataWarning, ViewError
+from tests.deploy import scenes
+from tests.deploy.scenes import Image
+
+MAP = HeightmapConfig(64)
+EXTENT = MAP.extent
+IMAGE = scenes.take(scenes.blocks_at([[0.1, 0.1, 0.4], [-0.1, 0.0, 1.0], [0.05, -0.1, 2.0]]))
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _view(image: Image = IMAGE, **changes: Any) -> View:
+    return images.make(*image._replace(**changes))
+
+
+def _check(view: View) -> None:
+    """What `Policy.decide` asks of a view."""
+    checks.pose(view)
+    checks.depth_unit(view, EXTENT)
+    checks.table_height(checks.table(view, EXTENT), EXTENT)
+    checks.coverage(view, MAP)
+
+
+def _moved(shift: Any = (0, 0, 0), turn_deg: Any = (0, 0, 0)) -> np.ndarray:
+    """The camera's pose as believed where the table really is shifted, m, and turned."""
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
+    motion[:3, 3] = shift
+    return motion @ IMAGE.pose
+
+
+def test_sound_image_passes():
+    """Claim: an image with objects and a fifth of its depth missing is accepted."""
+    depth = IMAGE.depth.copy()
+    depth[np.random.default_rng(0).uniform(size=depth.shape) < 0.2] = 0.0
+    _check(_view(depth=depth))
+
+
+@pytest.mark.parametrize(
+    ("factor", "remedy"),
+    [
+        (1000.0, "millimetres; multiply it by 0.001"),
+        (100.0, "centimetres; multiply it by 0.01"),
+        (10.0, "counts in 0.1 mm; multiply it by 0.1"),
+        (0.1, "counts in 1 mm; multiply it by 10"),
+        (0.001, "scaled twice; multiply it by 1000"),
+    ],
+)
+def test_unit_of_depth_is_named(factor: float, remedy: str):
+    """Claim: depth in another unit is refused with the factor that mends it, which does."""
+    wrong = IMAGE.depth * np.float32(factor)
+    with pytest.raises(ViewError, match=re.escape(remedy)):
+        _check(_view(depth=wrong))
+    mend = float(remedy.split()[-1])
+    _check(_view(depth=(wrong * mend).astype(np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("pose", "hint"),
+    [
+        (np.linalg.inv(IMAGE.pose), "give its inverse"),
+        (IMAGE.pose @ FLIP, "its axes seem to be OpenGL's; turn y and z round"),
+        (_moved(shift=(1.5, 0, 0)), "check it, x right, y down, z forward"),
+    ],
+)
+def test_pose_that_sees_no_workspace(pose: np.ndarray, hint: str):
+    """Claim: a pose that looks elsewhere is refused, with what would mend it where that is seen."""
+    with pytest.raises(ViewError, match=re.escape(hint)):
+        _check(_view(pose=pose))
+
+
+def test_pose_in_millimetres():
+    """Claim: a translation in mm is refused as such."""
+    pose = IMAGE.pose.copy()
+    pose[:3, 3] *= 1000.0
+    with pytest.raises(ViewError, match="the camera is 707 m away; its unit is m"):
+        _check(_view(pose=pose))
+
+
+@pytest.mark.parametrize(
+    ("shift_mm", "turn_deg"), [(20.0, 0.0), (-15.0, 0.0), (0.0, 3.0), (10.0, -2.0), (30.0, 5.0)]
+)
+def test_table_is_measured(shift_mm: float, turn_deg: float):
+    """Claim: height and tilt of a table that is not at z = 0 are told, to 0.5 mm and 0.1 degrees,
+    objects and depth noise notwithstanding."""
+    noise = np.random.default_rng(0).normal(0.0, 0.001, IMAGE.depth.shape).astype(np.float32)
+    pose = _moved((0, 0, 1e-3 * shift_mm), (turn_deg, 0, 0))
+    view = _view(pose=pose, depth=IMAGE.depth + noise)
+    found = checks.table(view, EXTENT)
+    assert 1e3 * found.height == pytest.approx(shift_mm, abs=0.5)
+    assert found.tilt_deg == pytest.approx(abs(turn_deg), abs=0.1)
+    worst = abs(shift_mm) + 1e3 * 0.5 * EXTENT * np.tan(np.radians(abs(turn_deg)))
+    assert 1e3 * found.worst(EXTENT) == pytest.approx(worst, abs=1.0)
+    assert found.noise == pytest.approx(0.001 * np.cos(np.pi / 4), rel=0.2)
+    line = f"the table lies {shift_mm:+.0f} mm from z = 0, tilted by"
+    with pytest.raises(ViewError, match=re.escape(line)):
+        _check(view)
+
+
+def test_table_nearly_level_passes():
+    """Claim: 2 mm and 0.5 degrees are allowed."""
+    _check(_view(pose=_moved((0, 0, 0.002), (0.5, 0, 0))))
+
+
+def test_no_table():
+    """Claim: where points of the workspace form no plane, no table is found, and it is said how
+    far the depth is from a table's."""
+    rng = np.random.default_rng(0)
+    rough = (IMAGE.depth * rng.uniform(0.7, 1.0, IMAGE.depth.shape)).astype(np.float32)
+    with pytest.raises(ViewError, match=r"no table found .* is 0\.8\d times that of a table"):
+        _check(_view(depth=rough))
+
+
+def test_no_depth():
+    """Claim: an image without any depth is refused."""
+    with pytest.raises(ViewError, match="there is none in the workspace, all 0 or NaN"):
+        _check(_view(depth=np.zeros_like(IMAGE.depth)))
+
+
+def test_missing_part_is_named():
+    """Claim: less than four fifths of the workspace is refused, with the part and the cause."""
+    view = _view()
+    y = np.where(view.valid, view.points[..., 1], 0.0)
+    depth = np.where(y > 0.08, np.nan, IMAGE.depth)
+    with pytest.raises(ViewError) as caught:
+        _check(_view(depth=depth))
+    share, x0, x1, y0, y1 = map(
+        float, re.findall(r"[-+]?\d+(?:\.\d+)?(?=% of| to | m[ ,])", str(caught.value))
+    )
+    assert share == pytest.approx(100 * (0.08 + 0.224) / 0.448, abs=4)
+    np.testing.assert_allclose([x0, x1, y0, y1], [-0.22, 0.22, 0.08, 0.22], atol=0.02)
+    assert "has no depth" in str(caught.value)
+
+
+def test_workspace_outside_of_the_image():
+    """Claim: a camera that sees too little of the workspace is told so."""
+    narrow = dataclasses.replace(CameraConfig(), focal=(900.0, 900.0), look_at=(0.0, 0.15, 0.0))
+    with pytest.raises(ViewError, match=r"of the workspace is seen.* is outside of the image"):
+        _check(_view(scenes.take(scenes.blocks_at([[0.1, 0.1, 0.0]]), narrow)))
+
+
+def test_shadows_are_seen():
+    """Claim: what objects hide does not count as unseen."""
+    wall = scenes.blocks_at([[-0.1, 0.0, 0.0]], [0.01, 0.2, 0.06])
+    assert checks.coverage(_view(scenes.take(wall)), MAP) == 1.0
+
+
+def test_swapped_colours_are_noticed():
+    """Claim: of ten images with red and blue swapped all are warned of, and none as they are."""
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        num = int(rng.integers(1, 5))
+        shapes = scenes.blocks_at(scenes.random_poses(rng, num), colours=rng.integers(10, size=num))
+        image = scenes.take(shapes)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            checks.colours(_view(image), EXTENT)
+        with pytest.warns(DataWarning, match="red and blue seem to be swapped"):
+            checks.colours(_view(image, rgb=image.rgb[..., ::-1]), EXTENT)

@@ -1,0 +1,110 @@
+"""Images, intrinsics and poses as they are given: their geometry, and what is refused."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from csac_jax.deploy import images
+from csac_jax.deploy.images import Intrinsics
+from csac_jax.errors import SettingsError
+from tests.deploy import scenes
+
+IDEAL = {"width": 64, "height": 48, "fx": 60.0, "fy": 62.0, "cx": 31.0, "cy": 24.5}
+LENS = (0.12, -0.25, 0.001, -0.002, 0.09)  # k1 k2 p1 p2 k3, as strong as a colour camera's
+POSE = scenes.pose_of()
+RGB, DEPTH = np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("lens", "wanted"),
+    [
+        ((0.1, 0.0, 0.0, 0.0), (0.5 * 1.029, 0.2 * 1.029)),  # r^2 = 0.29
+        ((0.0, 0.1, 0.0, 0.0), (0.5 * 1.00841, 0.2 * 1.00841)),
+        ((0.0, 0.0, 0.1, 0.0), (0.5 + 0.02, 0.2 + 0.1 * (0.29 + 0.08))),
+        ((0.0, 0.0, 0.0, 0.1), (0.5 + 0.1 * (0.29 + 0.5), 0.2 + 0.02)),
+        ((0.0, 0.0, 0.0, 0.0, 1.0), (0.5 * 1.024389, 0.2 * 1.024389)),
+    ],
+)
+def test_distortion_is_opencv_s(lens: tuple[float, ...], wanted: tuple[float, float]):
+    """Claim: each coefficient moves (0.5, 0.2) as OpenCV's formula does, worked out by hand."""
+    camera = Intrinsics(**IDEAL, distortion=lens)
+    np.testing.assert_allclose(images.distort(camera, np.array([0.5, 0.2])), wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [(), LENS])
+def test_points_project_to_their_pixels(lens: tuple[float, ...]):
+    """Claim: each pixel's point lies in that pixel again, with and without distortion."""
+    camera = Intrinsics(**IDEAL, distortion=lens)
+    depth = np.random.default_rng(0).uniform(0.3, 2.0, camera.shape).astype(np.float32)
+    view = images.make(RGB, depth, camera, POSE)
+    pixel, inside = view.project(view.points.reshape(-1, 3))
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    assert inside.all()
+    np.testing.assert_allclose(pixel, np.stack([u, v], -1).reshape(-1, 2), atol=2e-3)
+
+
+def test_points_are_the_scene_s():
+    """Claim: the points of a rendered cube lie on its five visible planes, to 0.1 mm."""
+    image = scenes.take(scenes.blocks_at([[0.0, 0.0, 0.0]], 0.025))
+    view = images.make(*image)
+    x, y, z = view.points[view.valid].T
+    near = (np.abs(x) < 0.1) & (np.abs(y) < 0.1)
+    faces = (z, z - 0.05, x - 0.025, x + 0.025, y - 0.025, y + 0.025)
+    assert np.min(np.abs(faces), axis=0)[near].max() < 1e-4
+    assert (z[near] > 0.049).sum() > 500
+
+
+def test_missing_depth_is_missing():
+    """Claim: zero, NaN, infinite and negative depths are pixels without one."""
+    depth = DEPTH.copy()
+    depth[0, :5] = 0.0, np.nan, np.inf, -np.inf, -0.5
+    view = images.make(RGB, depth, IDEAL, POSE)
+    assert not view.valid[0, :5].any()
+    assert view.valid.sum() == view.valid.size - 5
+    assert np.isfinite(view.points).all()
+
+
+def _given(**changes: Any) -> dict[str, Any]:
+    given = {"rgb": RGB, "depth": DEPTH, "intrinsics": IDEAL, "camera_pose": POSE}
+    return given | changes
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rgb": RGB / 255.0}, "rgb: is float64; give rgb * 255 as uint8"),
+        ({"rgb": RGB.astype(np.int32)}, "rgb: is int32; give values 0 to 255 as uint8"),
+        ({"rgb": np.zeros((48, 64, 4), np.uint8)}, "leave out its alpha: rgb[..., :3]"),
+        ({"rgb": np.zeros((3, 48, 64), np.uint8)}, "must have shape [rows, columns, 3], not [3, 4"),
+        ({"depth": (1000 * DEPTH).astype(np.uint16)}, "depth * 0.001 for millimetres"),
+        ({"depth": DEPTH[..., None]}, "depth: must have shape [rows, columns], not [48, 64, 1]"),
+        ({"depth": DEPTH[::2]}, "rgb 64 x 48, depth 64 x 24, intrinsics 64 x 48: align them"),
+        ({"rgb": RGB[:, ::2]}, "rgb 32 x 48, depth 64 x 48, intrinsics 64 x 48: align them"),
+        ({"intrinsics": {**IDEAL, "width": 128}}, "intrinsics 128 x 48: align them"),
+        ({"target_mask": DEPTH}, "target_mask: must be bool or whole numbers"),
+        ({"target_mask": RGB[:, :, 0]}, "target_mask: marks no pixel"),
+        ({"target_mask": np.ones((24, 64), bool)}, "target_mask 64 x 24, intrinsics 64 x 48"),
+        ({"intrinsics": {"fx": 600.0}}, "intrinsics: give cx, cy, fx, fy, height, width"),
+        ({"intrinsics": {**IDEAL, "skew": 0.0}}, "intrinsics: give cx, cy"),
+        ({"intrinsics": {**IDEAL, "fx": 0.0}}, "intrinsics: fx and fy must be above 0"),
+        ({"intrinsics": {**IDEAL, "fx": "600"}}, "must be finite numbers"),
+        ({"intrinsics": {**IDEAL, "fy": np.nan}}, "must be finite numbers"),
+        ({"intrinsics": {**IDEAL, "cx": 500.0}}, "cx and cy must lie in the image"),
+        ({"intrinsics": {**IDEAL, "width": 0}}, "intrinsics.width: a number of pixels, 16 to"),
+        ({"intrinsics": {**IDEAL, "distortion": [0.1, 0.2]}}, "4 or 5 numbers, k1 k2 p1 p2 k3"),
+        ({"intrinsics": {**IDEAL, "distortion": [-4.0, 0, 0, 0]}}, "has no inverse over the image"),
+        ({"camera_pose": POSE[:3]}, "camera_pose: must be a 4 x 4 matrix"),
+        ({"camera_pose": "pose"}, "camera_pose: must be a 4 x 4 matrix of numbers"),
+        ({"camera_pose": POSE.T}, "it may be transposed, scaled or mirrored"),
+        ({"camera_pose": POSE * 1000.0}, "it may be transposed, scaled or mirrored"),
+        ({"camera_pose": POSE @ np.diag([1, 1, -1, 1])}, "transposed, scaled or mirrored"),
+        ({"camera_pose": POSE * np.nan}, "must be a 4 x 4 matrix of finite numbers"),
+    ],
+)
+def test_wrong_form_is_refused(changes: dict[str, Any], message: str):
+    """Claim: arrays of a wrong form give one line that says what to change."""
+    with pytest.raises(SettingsError, match=re.escape(message)) as caught:
+        images.make(**_given(**changes)).points  # noqa: B018, the rays are made here
+    assert "\n" not in str(caught.value)

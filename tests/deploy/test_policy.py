@@ -1,0 +1,204 @@
+"""From an image to decisions, and without MuJoCo."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import csac_jax
+from csac_jax import presets
+from csac_jax.agent import actor_critic
+from csac_jax.config import CameraConfig
+from csac_jax.deploy import Decision, Policy, program
+from csac_jax.errors import SettingsError, ViewError
+from csac_jax.vision import camera, observe, raycast
+from tests.deploy import scenes
+
+POSES = np.array([[0.1, 0.09, 0.4], [-0.1, 0.0, 1.0], [0.06, -0.1, 2.0]])
+SHAPES = scenes.blocks_at(POSES)
+IMAGE = scenes.take(SHAPES)
+BARE_TABLE = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]))
+WORKSPACE = np.array([[0, -1, 0, 0.4], [1, 0, 0, -0.2], [0, 0, 1, 0.05], [0, 0, 0, 1]], float)
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    return csac_jax.deploy.Policy.load("shipped", WORKSPACE)
+
+
+@pytest.fixture(scope="module")
+def decisions(policy: Policy) -> list[Decision]:
+    return policy.decide(*IMAGE, top=4)
+
+
+def _block_under(decision: Decision) -> int | None:
+    """The block whose top holds the place of a decision, worked out in the block's own frame."""
+    for number, (x, y, yaw) in enumerate(POSES):
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        dx, dy = decision.position[0] - x, decision.position[1] - y
+        if abs(cos * dx + sin * dy) < 0.055 and abs(cos * dy - sin * dx) < 0.03:
+            return number
+    return None
+
+
+def test_decides_on_the_blocks(decisions: list[Decision]):
+    """Claim: each of four decisions is a grasp on a block, tips 3.5 cm below its top, and two on
+    different places."""
+    assert len(decisions) == 4
+    assert {decision.primitive for decision in decisions} == {"grasp"}
+    assert None not in map(_block_under, decisions)
+    for decision in decisions:
+        assert decision.position[2] == pytest.approx(0.05 - 0.035, abs=1e-3)
+        assert decision.width == pytest.approx(0.11)
+    places = np.array([decision.position[:2] for decision in decisions])
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)[np.triu_indices(4, 1)]
+    assert apart.min() >= program.APART - 1e-6
+    assert decisions[0].score == max(decision.score for decision in decisions)
+
+
+def test_decides_as_in_simulation(decisions: list[Decision]):
+    """Claim: the first decision is the simulated policy's in the observation of the same camera."""
+    eye = camera.make(CameraConfig())
+    trained = csac_jax.load_policy("shipped")
+    marks = np.ones(len(POSES), bool)
+
+    @jax.jit
+    def observed() -> Any:
+        tables = observe.surface_tables(SHAPES, marks)
+        hits = camera.cast_rays(eye, raycast.cast_polytopes, SHAPES)
+        return observe.from_pixels(trained.cfg.heightmap, eye, hits, tables)
+
+    action = trained(observed(), jax.random.key(0))
+    np.testing.assert_allclose(decisions[0].position[:2], action.pose[:2], atol=1e-3)
+    assert np.cos(2 * (decisions[0].yaw - float(action.pose[2]))) > 0.999
+    assert decisions[0].primitive == "grasp"
+
+
+def test_waypoints_are_a_grasp(decisions: list[Decision]):
+    """Claim: the tool goes straight down with open fingers, closes, and goes up again, 10 cm."""
+    approach, descend, act, retreat = decisions[0].waypoints
+    names = [waypoint.name for waypoint in decisions[0].waypoints]
+    assert names == ["approach", "descend", "act", "retreat"]
+    for waypoint in decisions[0].waypoints:
+        assert waypoint.position[:2] == approach.position[:2]
+        assert waypoint.yaw == approach.yaw
+    heights = [waypoint.position[2] for waypoint in decisions[0].waypoints]
+    low = decisions[0].position[2]
+    np.testing.assert_allclose(heights, [low + 0.1, low, low, low + 0.1], atol=1e-5)
+    openings = [waypoint.opening for waypoint in (approach, descend, act, retreat)]
+    np.testing.assert_allclose(openings, [0.11, 0.11, 0.0, 0.0], atol=1e-6)
+
+
+def test_tool_is_in_the_robot_s_frame(decisions: list[Decision]):
+    """Claim: a tool's pose is the workspace's pose times the place: z down, x along the yaw."""
+    for waypoint in decisions[0].waypoints:
+        tool, (x, y, z) = np.array(waypoint.tool), waypoint.position
+        np.testing.assert_allclose(tool[:3, 3], [0.4 - y, -0.2 + x, 0.05 + z], atol=1e-6)
+        np.testing.assert_allclose(tool[:3, :3].T @ tool[:3, :3], np.eye(3), atol=1e-6)
+        assert np.linalg.det(tool[:3, :3]) == pytest.approx(1.0)
+        np.testing.assert_allclose(tool[:3, 2], [0.0, 0.0, -1.0], atol=1e-6)
+        yaw = waypoint.yaw + 0.5 * np.pi  # the workspace's own turn
+        np.testing.assert_allclose(tool[:2, 0], [np.cos(yaw), np.sin(yaw)], atol=1e-6)
+
+
+def test_push_waypoints(policy: Policy):
+    """Claim: a push goes 10 cm along its yaw with closed fingers, 2 cm below the top, and ends at
+    the workspace's edge."""
+    height = np.full((64, 64), 0.05, np.float32)
+    for x, length in ((0.0, 0.1), (0.2, 0.024)):
+        action = csac_jax.Action.push(x, 0.0, 0.0)
+        stations = np.asarray(program.stations(policy.cfg, height, action))
+        np.testing.assert_allclose(stations[:, 0], [x, x, x + length, x + length], atol=1e-5)
+        np.testing.assert_allclose(stations[:, 2], [0.13, 0.03, 0.03, 0.13], atol=1e-5)
+        np.testing.assert_allclose(stations[:, 4], 0.0)
+
+
+def test_empty_table_has_no_decision(policy: Policy):
+    """Claim: where there is nothing to act on, there is no decision."""
+    assert policy.decide(*BARE_TABLE, top=3) == []
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_target_is_grasped(policy: Policy, number: int):
+    """Claim: with a mask, the policy grasps the marked block alone, whichever it is."""
+    x, y = POSES[number, :2]
+    points = np.nan_to_num(IMAGE.depth)[..., None] * camera.directions(camera.make(scenes.CAMERA))
+    place = np.asarray(points) + IMAGE.pose[:3, 3]
+    mask = (np.hypot(place[..., 0] - x, place[..., 1] - y) < 0.06) & (place[..., 2] > 0.005)
+    found = policy.decide(*IMAGE, target_mask=mask, top=2)
+    assert found
+    assert {_block_under(decision) for decision in found} == {number}
+
+
+def test_policy_of_the_target_task_needs_a_mask():
+    """Claim: a policy that was trained to get one block asks for its mask."""
+    cfg = presets.smoke().change(task={"kind": "target"})
+    params = jax.jit(lambda: actor_critic.init(jax.random.key(0), actor_critic.make(cfg)).online)()
+    with pytest.raises(SettingsError, match="target_mask: this policy gets a marked object"):
+        Policy(cfg, params).decide(*IMAGE)
+    mask = np.asarray(IMAGE.depth > 0)
+    assert Policy(cfg, params).decide(*IMAGE, target_mask=mask)
+
+
+@pytest.mark.parametrize("top", [0, 65])
+def test_top_has_bounds(policy: Policy, top: int):
+    """Claim: a number of decisions out of range is refused."""
+    with pytest.raises(SettingsError, match=r"top: must lie in 1 \.\. 64"):
+        policy.decide(*IMAGE, top=top)
+
+
+def test_misfit_is_refused(policy: Policy):
+    """Claim: the checks come before a decision."""
+    with pytest.raises(ViewError, match="millimetres"):
+        policy.decide(IMAGE.rgb, 1000 * IMAGE.depth, *IMAGE[2:])
+
+
+def test_report_of_the_empty_table(policy: Policy):
+    """Claim: the check measures the table's height and what lies on it; two blocks of 10 x 5 cm
+    cover at least their 100 cm^2."""
+    pose = IMAGE.pose.copy()
+    pose[2, 3] += 0.006
+    empty = policy.check(*BARE_TABLE._replace(pose=pose))
+    assert empty.height_mm == pytest.approx(6.0, abs=0.1)
+    assert empty.tilt_deg < 0.05
+    assert empty.seen == 1.0
+    assert empty.covered_cm2 == 0.0
+    two = policy.check(*scenes.take(scenes.blocks_at(POSES[:2])))
+    assert 100.0 <= two.covered_cm2 < 200.0
+
+
+_ALONE = """
+import sys
+sys.modules["mujoco"] = None
+import json
+import numpy as np
+from csac_jax import deploy
+image = np.load(sys.argv[1])
+given = json.loads(sys.argv[2])
+policy = deploy.Policy.load("shipped")
+print(json.dumps(policy.decide(image["rgb"], image["depth"], given, image["pose"])[0].to_dict()))
+try:
+    deploy.Policy.load(sys.argv[3])
+except deploy.SettingsError as error:
+    print(error)
+"""
+
+
+def test_decides_without_mujoco(decisions: list[Decision], tmp_path: Path):
+    """Claim: a process without MuJoCo decides alike; a run's folder gets one line."""
+    arrays = {name: getattr(IMAGE, name) for name in ("rgb", "depth", "pose")}
+    np.savez(tmp_path / "image.npz", **arrays)
+    given = json.dumps(IMAGE.intrinsics)
+    command = [sys.executable, "-c", _ALONE, tmp_path / "image.npz", given, tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    first, complaint = done.stdout.splitlines()
+    found = json.loads(first)
+    assert found["primitive"] == decisions[0].primitive
+    np.testing.assert_allclose(found["position"], decisions[0].position, atol=1e-5)
+    assert "needs mujoco" in complaint
+    assert "csac-jax export" in complaint

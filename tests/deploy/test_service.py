@@ -1,0 +1,215 @@
+"""The HTTP service, on a real socket: decisions, refusals, many clients."""
+
+import base64
+import concurrent.futures
+import contextlib
+import http.client
+import io
+import json
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from csac_jax.cli import main
+from csac_jax.deploy import Policy
+from tests.deploy import image_files, scenes
+
+uvicorn = pytest.importorskip("uvicorn")
+pytest.importorskip("fastapi")
+
+TOKEN = "correct horse battery"
+IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])))
+CLIENTS = 50
+
+
+def _png(array: np.ndarray) -> str:
+    buffer = io.BytesIO()
+    imageio.imwrite(buffer, array, format="png")
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+BODY: dict[str, Any] = {
+    "rgb": _png(IMAGE.rgb),
+    "depth": _png(np.round(1000 * IMAGE.depth).astype(np.uint16)),
+    "intrinsics": IMAGE.intrinsics,
+    "pose": {"matrix": IMAGE.pose.tolist()},
+}
+
+
+class Server:
+    """A service in a thread."""
+
+    def __init__(self, app: Any) -> None:
+        self._server = uvicorn.Server(
+            uvicorn.Config(app, port=0, log_level="error", lifespan="off")
+        )
+        self._thread = threading.Thread(target=self._server.run, daemon=True)
+        self._thread.start()
+        while not self._server.started:
+            time.sleep(0.01)
+        self.port = self._server.servers[0].sockets[0].getsockname()[1]
+
+    def ask(self, method: str, path: str, body: Any = None, token: str = TOKEN) -> tuple[int, Any]:
+        """Status and JSON of a request."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
+        headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
+        content = body if isinstance(body, bytes | None) else json.dumps(body).encode()
+        connection.request(method, path, content, headers)
+        answer = connection.getresponse()
+        found = answer.status, json.loads(answer.read())
+        connection.close()
+        return found
+
+    def stop(self) -> None:
+        self._server.should_exit = True
+        self._thread.join(10)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    from csac_jax.deploy import service
+
+    policy = Policy.load("shipped")
+    policy.warm_up(640, 480)
+    running = Server(service.make(policy, "shipped", TOKEN))
+    yield running
+    running.stop()
+
+
+def test_decides_as_the_library(server: Server):
+    """Claim: /decide answers what `Policy.decide` returns."""
+    status, answer = server.ask("POST", "/decide", {**BODY, "top": 2})
+    wanted = json.loads(json.dumps([d.to_dict() for d in Policy.load().decide(*IMAGE, top=2)]))
+    assert status == 200
+    assert [d["primitive"] for d in answer["decisions"]] == [d["primitive"] for d in wanted]
+    for found, decision in zip(answer["decisions"], wanted, strict=True):
+        np.testing.assert_allclose(found["position"], decision["position"], atol=1e-4)
+    assert answer["warnings"] == []
+    assert answer["milliseconds"] > 0
+
+
+def test_mask_and_warning(server: Server):
+    """Claim: a mask chooses the object; colours that seem to be swapped are warned of."""
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, 320:] = 255  # the block at y = -0.09
+    status, answer = server.ask("POST", "/decide", {**BODY, "mask": _png(mask)})
+    assert status == 200
+    assert answer["decisions"][0]["position"][1] < -0.03
+    status, answer = server.ask("POST", "/decide", {**BODY, "rgb": _png(IMAGE.rgb[..., ::-1])})
+    assert status == 200
+    assert "red and blue seem to be swapped" in answer["warnings"][0]
+
+
+def test_health_and_version(server: Server):
+    """Claim: /health needs no token; /version names policy and versions."""
+    assert server.ask("GET", "/health", token="") == (200, {"status": "ok"})
+    status, answer = server.ask("GET", "/version")
+    assert status == 200
+    assert answer["policy"] == "shipped"
+    assert {"python", "jax", "csac-jax"} <= set(answer["versions"])
+
+
+@pytest.mark.parametrize("token", ["", "wrong", TOKEN[:-1], TOKEN + "x"])
+@pytest.mark.parametrize("path", ["/decide", "/version"])
+def test_token_is_asked_for(server: Server, path: str, token: str):
+    """Claim: without the token nothing is decided or told."""
+    status, answer = server.ask("POST" if path == "/decide" else "GET", path, BODY, token)
+    assert status == 401
+    assert "Authorization" in answer["detail"]
+
+
+def _huge_png() -> str:
+    """A PNG that claims 60,000 x 60,000 px in its header."""
+    content = bytearray(base64.b64decode(BODY["rgb"]))
+    content[16:24] = (60000).to_bytes(4, "big") * 2
+    return base64.b64encode(bytes(content)).decode()
+
+
+def _cut_png() -> str:
+    return base64.b64encode(base64.b64decode(BODY["rgb"])[:3000]).decode()
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "detail"),
+    [
+        (b"", 422, "body: "),
+        (b"{", 422, "body.1: JSON decode error"),
+        (b"[1, 2]", 422, "body: "),
+        (b"\xff\xfe\x00", 400, ""),
+        ({}, 422, "body.rgb: Field required"),
+        ({**BODY, "speed": 1}, 422, "body.speed: Extra inputs are not permitted"),
+        ({**BODY, "top": "many"}, 422, "body.top: Input should be a valid integer"),
+        ({**BODY, "top": 1000}, 400, "top: must lie in 1 .. 64, not 1000"),
+        ({**BODY, "rgb": "%%%"}, 400, "rgb: must be a PNG in base64"),
+        ({**BODY, "rgb": base64.b64encode(b"GIF89a" * 9).decode()}, 400, "rgb: must be a PNG"),
+        ({**BODY, "rgb": _huge_png()}, 400, "rgb: at most 4096 px a side"),
+        ({**BODY, "rgb": _cut_png()}, 400, "the image is damaged"),
+        ({**BODY, "depth": BODY["rgb"]}, 400, "depth: is uint8; give a PNG of 16 bits"),
+        ({**BODY, "intrinsics": {"fx": 1}}, 400, "intrinsics: give cx, cy"),
+        ({**BODY, "pose": {"matrix": [[1.0]]}}, 400, "camera_pose: must be a 4 x 4 matrix"),
+        ({**BODY, "pose": {"matrix": np.eye(4).tolist()}}, 422, "camera_pose: the workspace's cen"),
+        (b'{"rgb": ' + b"[" * 100_000, 400, ""),
+        (b" " * (16 * 2**20 + 1), 413, "the body is larger than 16 MiB"),
+    ],
+    ids=lambda value: value if isinstance(value, int) else "",
+)
+def test_bad_requests_are_refused(server: Server, body: Any, status: int, detail: str):
+    """Claim: a malformed or oversized request gets a status of 400 to 499 and one line, and the
+    service goes on."""
+    found, answer = server.ask("POST", "/decide", body)
+    assert found == status, answer
+    assert detail in answer["detail"]
+    assert len(answer["detail"]) < 400
+    assert server.ask("GET", "/health") == (200, {"status": "ok"})
+
+
+def test_body_without_a_length_is_limited(server: Server):
+    """Claim: a chunked body that never ends is cut off."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection.putrequest("POST", "/decide")
+    connection.putheader("Authorization", f"Bearer {TOKEN}")
+    connection.putheader("Transfer-Encoding", "chunked")
+    connection.endheaders()
+    piece = b"%x\r\n" % 2**20 + b" " * 2**20 + b"\r\n"
+    sent = 0
+    with contextlib.suppress(OSError):  # it hangs up
+        while sent < 300:
+            connection.send(piece)
+            sent += 1
+    assert sent < 300
+    assert server.ask("GET", "/health") == (200, {"status": "ok"})
+
+
+def test_many_clients_lose_nothing(server: Server):
+    """Claim: 50 clients at once, each with its own `top`, all get their own answer."""
+    tops = [1 + number % 3 for number in range(CLIENTS)]
+    with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
+        asked = [pool.submit(server.ask, "POST", "/decide", {**BODY, "top": n}) for n in tops]
+        answers = [future.result() for future in asked]
+    assert [status for status, _ in answers] == [200] * CLIENTS
+    assert [len(answer["decisions"]) for _, answer in answers] == tops
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--host 0.0.0.0", "--host 0.0.0.0: others could use the service; give --token-file too"),
+        ("--token-file nowhere", "--token-file: there is no file nowhere"),
+        ("--token-file short", "its first line must have 16 printable characters or more"),
+        ("--port 70000", "--port: must lie in 0 .. 65535"),
+        ("--size 8 8", "--size: both numbers must lie in 16 .. 4096 px"),
+    ],
+)
+def test_bad_options_of_serve(
+    capsys: pytest.CaptureFixture, tmp_path: Any, monkeypatch: Any, arguments: str, message: str
+):
+    """Claim: what cannot be served, or not safely, is refused with exit code 2."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "short").write_text("secret\n")
+    assert main(["serve", "shipped", *arguments.split()]) == 2
+    assert message in capsys.readouterr().err

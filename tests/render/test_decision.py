@@ -1,0 +1,60 @@
+"""The picture of a decision."""
+
+import numpy as np
+from matplotlib.colors import to_rgb
+
+import csac_jax
+from csac_jax import presets
+from csac_jax.deploy import Maps, decision, images, program
+from csac_jax.render import decision as drawn, maps
+from tests.deploy import scenes
+
+CFG = presets.smoke()
+IMAGE = scenes.take(scenes.blocks_at([[0.0, 0.1, 0.0]]))
+VIEW = images.make(*IMAGE)
+HEIGHT = np.full((CFG.heightmap.size,) * 2, 0.05, np.float32)
+
+
+def _decision(action: csac_jax.Action) -> decision.Decision:
+    stations = program.stations(CFG, HEIGHT, action)
+    choice = program.Choice(action, np.float32(1.0), np.bool_(True), stations)
+    return decision.of(choice, np.eye(4))
+
+
+def _coloured(picture: np.ndarray) -> np.ndarray:
+    """Places (column, row) [n, 2] of the chosen action's colour left of the maps."""
+    off = np.abs(picture[:, :800] - 255 * np.array(to_rgb(maps.CHOSEN))).max(axis=2)
+    return np.argwhere(off <= 1.0)[:, ::-1]
+
+
+def _picture(action: csac_jax.Action) -> np.ndarray:
+    q = np.zeros((2, *HEIGHT.shape), np.float32)
+    return drawn.picture(CFG, VIEW, [_decision(action)], Maps(HEIGHT, q))
+
+
+def test_grasp_is_drawn_where_it_is():
+    """Claim: a grasp at y = +0.1 m lies left of the image's middle, one at y = -0.1 m right of it,
+    since the camera looks along x; in pixels at their projections, 70 px either side."""
+    middle = [_coloured(_picture(csac_jax.Action.grasp(0.0, y, 0.0)))[:, 0] for y in (0.1, -0.1)]
+    left, right = (np.median(columns) for columns in middle)
+    pixel, _ = VIEW.project(np.array([[0.0, 0.1, 0.015], [0.0, -0.1, 0.015]]))
+    scale = (right - left) / (pixel[1, 0] - pixel[0, 0])
+    assert 1.0 < scale < 1.5  # the image is drawn larger than it is
+    assert abs(pixel[0, 0] - 232) < 10
+
+
+def test_push_is_a_path():
+    """Claim: a push's path goes down and 10 cm along its yaw; a grasp's fingers are 11 cm apart."""
+    (path,) = drawn.paths(_decision(csac_jax.Action.push(0.0, 0.0, 0.5 * np.pi)))
+    np.testing.assert_allclose(path[:, :2], [[0, 0], [0, 0], [0, 0.1]], atol=1e-6)
+    _, tips, *fingers = drawn.paths(_decision(csac_jax.Action.grasp(0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(tips[:, 0], [-0.055, 0.055], atol=1e-6)
+    assert len(fingers) == 2
+
+
+def test_line_of_text():
+    """Claim: the line has place, yaw in degrees, opening and score."""
+    text = drawn.line(_decision(csac_jax.Action.grasp(0.02, -0.05, 0.5 * np.pi)))
+    assert text == (
+        "grasp at x +0.020, y -0.050, z 0.015 m, yaw 90 degrees, 110 mm open, score +1.00"
+    )

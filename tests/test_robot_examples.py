@@ -1,0 +1,167 @@
+"""The examples that drive a robot, as far as they go without one."""
+
+import json
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import csac_jax
+
+FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
+UR = runpy.run_path(str(FOLDER / "ur_rtde.py"))
+ROS = runpy.run_path(str(FOLDER / "ros2_node.py"))
+ARGS = SimpleNamespace(speed=0.05, acceleration=0.2, force=15.0, reach=0.85, lowest=0.0)
+HEIGHTS = {"approach": 0.2, "descend": 0.1, "act": 0.1, "retreat": 0.2}
+
+
+def _decision(x: float = 0.4) -> dict[str, Any]:
+    """A grasp with the tool pointing down, its x along the robot's y."""
+    waypoints = []
+    for name, z in HEIGHTS.items():
+        tool = [[0, 1, 0, x], [1, 0, 0, 0.1], [0, 0, -1, z], [0, 0, 0, 1]]
+        opening = 0.11 if name in ("approach", "descend") else 0.0
+        waypoints.append({"name": name, "opening": opening, "tool": tool})
+    return {"waypoints": waypoints}
+
+
+class FakeArm:
+    """Both interfaces of an arm. A move begins late: its progress is at first that of the one
+    before, then 0, then another negative number. `contact` numbers a move at which force jumps."""
+
+    def __init__(self, contact: int | None = None) -> None:
+        self.log: list[Any] = []
+        self._contact, self._moves, self._polls = contact, 0, 9
+
+    def gripper(self, opening: float) -> None:
+        self.log.append(("gripper", opening))
+
+    def isPoseWithinSafetyLimits(self, point: list[float]) -> bool:  # noqa: N802
+        return point[2] < 0.5
+
+    def moveL(self, point: list[float], *limits: Any) -> None:  # noqa: N802
+        assert limits == (0.05, 0.2, True)
+        self.log.append(("move", tuple(np.round(point[:3], 6))))
+        self._moves, self._polls = self._moves + 1, 0
+
+    def getAsyncOperationProgress(self) -> int:  # noqa: N802
+        self._polls += 1
+        idle = -1 - (self._moves % 2)
+        return (-3 - idle, 0, 0, idle)[min(self._polls, 4) - 1]
+
+    def getActualTCPForce(self) -> list[float]:  # noqa: N802
+        touching = self._moves - 1 == self._contact and self._polls == 2
+        return [0.0, 0.0, 20.0 if touching else 3.0, 0.0, 0.0, 0.0]
+
+    def stopL(self, deceleration: float) -> None:  # noqa: N802
+        self.log.append(("stop",))
+
+    def getActualTCPPose(self) -> list[float]:  # noqa: N802
+        return [0.41, 0.1, 0.15, 0.0, 3.1, 0.0]
+
+
+def test_set_points_are_the_tool_s_poses():
+    """Claim: a set-point's rotation vector turns as the tool's matrix does."""
+    points = UR["set_points"](_decision(), 0.85, 0.0)
+    for point, waypoint in zip(points, _decision()["waypoints"], strict=True):
+        tool = np.array(waypoint["tool"])
+        np.testing.assert_allclose(point[:3], tool[:3, 3])
+        turned = Rotation.from_rotvec(point[3:]).as_matrix()
+        np.testing.assert_allclose(turned, tool[:3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("x", [2.0, float("nan")])
+def test_pose_out_of_reach_is_refused(x: float):
+    """Claim: nothing moves if one set-point is out of reach or no number."""
+    arm = FakeArm()
+    with pytest.raises(ValueError, match="out of reach, or lower than"):
+        UR["execute"](arm, arm, arm.gripper, _decision(x), ARGS)
+    assert arm.log == []
+
+
+def test_low_or_unsafe_pose_is_refused():
+    """Claim: so it is below the lowest height, and outside of the controller's limits."""
+    arm = FakeArm()
+    low = SimpleNamespace(**{**vars(ARGS), "lowest": 0.15})
+    with pytest.raises(ValueError, match=r"lower than 0\.15 m"):
+        UR["execute"](arm, arm, arm.gripper, _decision(), low)
+    high = _decision()
+    high["waypoints"][0]["tool"][2][3] = 0.6
+    with pytest.raises(ValueError, match="safety limits"):
+        UR["execute"](arm, arm, arm.gripper, high, ARGS)
+    assert arm.log == []
+
+
+def test_arm_goes_through_the_waypoints():
+    """Claim: fingers open before the approach and close before `act`; the arm visits all four."""
+    arm = FakeArm()
+    assert UR["execute"](arm, arm, arm.gripper, _decision(), ARGS)
+    openings = [0.11, 0.11, 0.0, 0.0]
+    wanted: list[Any] = []
+    for opening, z in zip(openings, HEIGHTS.values(), strict=True):
+        wanted += [("gripper", opening), ("move", (0.4, 0.1, z))]
+    assert arm.log == wanted
+
+
+def test_contact_ends_the_descent():
+    """Claim: a force above the limit stops the arm, which goes straight up and does not act."""
+    arm = FakeArm(contact=1)
+    assert not UR["execute"](arm, arm, arm.gripper, _decision(), ARGS)
+    assert arm.log[-2:] == [("stop",), ("move", (0.41, 0.1, 0.2))]
+    assert ("gripper", 0.0) not in arm.log
+
+
+def test_dry_run_prints(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: without --host the set-points are printed, and nothing is connected."""
+    (tmp_path / "d.json").write_text(json.dumps({"decisions": [_decision()]}))
+    UR["main"](str(tmp_path / "d.json"))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4
+    assert lines[1].startswith("+0.4000 +0.1000 +0.1000 ")
+
+
+def _message(pixels: np.ndarray, encoding: str, padding: int = 5, big: bool = False) -> Any:
+    """A sensor_msgs/Image whose rows end in unused bytes."""
+    flat = pixels.astype(pixels.dtype.newbyteorder(">")) if big else pixels
+    rows = flat.reshape(len(pixels), -1).view(np.uint8)
+    padded = np.pad(rows, ((0, 0), (0, padding)))
+    height, width = pixels.shape[:2]
+    kept = {"height": height, "width": width, "encoding": encoding, "is_bigendian": big}
+    return SimpleNamespace(**kept, step=padded.shape[1], data=padded.tobytes())
+
+
+def test_ros_images():
+    """Claim: colours become RGB, depth metres, whatever order and padding the message has."""
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (6, 7, 3), np.uint8)
+    depth = rng.integers(1, 5000, (6, 7), np.uint16)
+    np.testing.assert_array_equal(ROS["image"](_message(rgb, "rgb8")), rgb)
+    np.testing.assert_array_equal(ROS["image"](_message(rgb, "bgr8")), rgb[..., ::-1])
+    for big in (False, True):
+        found = ROS["image"](_message(depth, "16UC1", big=big))
+        np.testing.assert_allclose(found, depth / 1000, rtol=1e-6)
+        assert found.dtype == np.float32
+    metres = (depth / 1000).astype(np.float32)
+    np.testing.assert_array_equal(ROS["image"](_message(metres, "32FC1")), metres)
+    with pytest.raises(ValueError, match="encoding mono8 is not one of"):
+        ROS["image"](_message(rgb[..., 0].copy(), "mono8"))
+
+
+def test_ros_camera_and_transform():
+    """Claim: camera_info and transform become what `Policy.decide` takes."""
+    info = SimpleNamespace(
+        k=[600, 0, 320, 0, 610, 240, 0, 0, 1], d=[0.1] * 5, width=640, height=480
+    )
+    camera = csac_jax.deploy.images.Intrinsics.of(ROS["intrinsics"](info))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (600, 610, 320, 240)
+    assert camera.distortion == (0.1,) * 5
+    half = float(np.sqrt(0.5))
+    turn = SimpleNamespace(x=0.0, y=0.0, z=half, w=half)  # 90 degrees about z
+    pose = ROS["matrix"](
+        SimpleNamespace(rotation=turn, translation=SimpleNamespace(x=1.0, y=2.0, z=3.0))
+    )
+    np.testing.assert_allclose(pose @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-9)
