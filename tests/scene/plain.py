@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from csac_jax.config import SimConfig
-from csac_jax.scene.model import MAX_OPENING
+from csac_jax.constants import MAX_OPENING
 from csac_jax.sim.oracle import FINGER_HALF, PAD_HALF_WIDTH, YAWS
 
 PARALLEL = 0.1  # rad, of a closing direction to the normals of two faces
