@@ -20,7 +20,7 @@ from csac_jax.scene.layout import Scene
 Rectangle = tuple[jax.Array, jax.Array, jax.Array]  # centre [2] m, yaw [] rad, half sides [2] m
 
 MIN_ARRANGED = 4  # blocks in an arrangement
-GAPS = (0.001, 0.030)  # m between packed neighbours: at level 1, and the widest at level 0
+GAPS = (0.001, 0.040)  # m between packed neighbours: at level 1, and the widest at level 0
 LOOSE_GAP = 0.015  # m, least distance of a loose block from any other
 RADIUS = 0.205  # m from the middle of an arrangement: all packed blocks lie within, whatever size
 _MARGIN = 0.001  # m kept free along the border of the square
@@ -43,7 +43,7 @@ class Blocks(NamedTuple):
 def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -> Scene:
     """A random arrangement at rest inside the square of side `extent` m; vmap for a batch.
 
-    A higher `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 30 mm
+    A higher `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 40 mm
     to 1 mm, and adds loose blocks. Sizes, densities and frictions vary as in the pool. The target
     is the block that the others enclose. Fewer than `cfg.min_blocks` are in play where the square
     has no room left.
@@ -57,10 +57,10 @@ def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -
         )
     possible = families.available(cfg.slots).values()
     key_sizes, key_family, key_pack, key_place, key_loose, key_looks = jax.random.split(key, 6)
-    sizes = _draw_sizes(key_sizes, cfg)
+    sizes = draw_sizes(key_sizes, cfg)
     draws = families.draw(key_pack, len(cfg.slots))
     # All families, then a choice: under vmap lax.switch would compute all of them, too.
-    each = [_pack(family, cfg.slots, draws, sizes, level) for family in possible]
+    each = [pack(family, cfg.slots, draws, sizes, level) for family in possible]
     chosen = jax.random.randint(key_family, (), 0, len(each))
     packed, target = jax.tree.map(lambda *leaves: jnp.stack(leaves)[chosen], *each)
     border = 0.5 * extent - _MARGIN
@@ -80,7 +80,7 @@ def arrangements(cfg: SceneConfig, extent: float, stream: int, count: int) -> Sc
     return jax.device_get(jax.jit(draw)(keys, jnp.linspace(0.0, 1.0, count)))
 
 
-def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> jax.Array:
+def draw_sizes(key: jax.Array, cfg: SceneConfig) -> jax.Array:
     """Random half sizes [2, N, 3] m: of any shape of each slot's kind; of one of its longest."""
     key_any, key_long, key_scale = jax.random.split(key, 3)
     num, shapes = len(cfg.slots), [blocks.half_size_choices(kind) for kind in cfg.slots]
@@ -96,7 +96,7 @@ def _draw_sizes(key: jax.Array, cfg: SceneConfig) -> jax.Array:
     return jnp.stack([choose(key_any, shapes), choose(key_long, longest)])
 
 
-def _pack(
+def pack(
     family: Family, slots: tuple[SlotKind, ...], draws: Draws, sizes: jax.Array, level: jax.Array
 ) -> tuple[Blocks, jax.Array]:
     """The packed blocks of an arrangement about the origin, and the slot of the target []."""
@@ -110,7 +110,7 @@ def _pack(
     half_lying = jnp.where(on_side[:, None], half[:, np.array([0, 2, 1])], half)
     half_lying = jnp.where(used[:, None], half_lying, 0.0)
     gap = GAPS[0] + (GAPS[1] - GAPS[0]) * (1.0 - level) * (0.5 + 0.5 * draws.gap)
-    xy, crosswise, target, floor = family.place(draws, half_lying, used, gap)
+    xy, crosswise, target, floor, yaw = family.place(draws, half_lying, used, gap)
     centre = jnp.concatenate([xy, (floor + half_lying[:, 2])[:, None]], axis=1)
     row = jnp.where(used, slot, len(slots))  # dropped where not used
 
@@ -120,7 +120,7 @@ def _pack(
 
     packed = Blocks(
         centre=by_slot(centre),
-        yaw=by_slot(jnp.where(crosswise, np.float32(0.5 * np.pi), 0.0)),
+        yaw=by_slot(jnp.where(crosswise, np.float32(0.5 * np.pi), 0.0) + yaw),
         on_side=by_slot(on_side),
         half_size=sizes[0].at[row].set(half, mode="drop"),
         half_lying=sizes[0].at[row].set(half_lying, mode="drop"),

@@ -1,8 +1,8 @@
 """Families of packed arrangements: each is an ordered list of roles and their places.
 
-Each role takes a random free slot of its kinds. The shipped cases are held out by construction. The
-cases `row`, `pinwheel` and `hole` pack two arches together, which no family does; `ridge` packs two
-prisms alone, to which every family adds a third block. R = the 5 roles, N = block slots.
+Each role takes a random free slot of its kinds. The shipped cases are held out by construction: a
+family packs at most one arch, `row`, `pinwheel` and `hole` two; at most one prism, `ridge` two. No
+family is a row, a ridge, a ring or a nest. R = the 5 roles, N = block slots.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,11 @@ from csac_jax.errors import SceneError
 
 ROLES = 5  # of every family
 STACKED_GAP = 0.008  # m, widest gap that a block may bridge
-MOUTH_GAP = (0.001, 0.005)  # m, least and widest gap between an arch and the block in its mouth
 STACK_OFFSET = 0.003  # m, how far off the middle a stacked block may lie
-ROW_OFFSET = 0.008  # m, how far off the line a block in a row may lie
+SUPPORT = 0.015  # m, how far a bridge's deck reaches onto its piers
+SLANT = 0.7  # of stairs: how much farther along a block begins, for each metre sideways
+FAN_ANGLE = np.deg2rad(70.0)  # between the ribs of a fan
+WEDGE_ANGLE = np.deg2rad(40.0)  # between an arm of a wedge and its middle
 
 
 class Role(NamedTuple):
@@ -37,6 +39,7 @@ class Placed(NamedTuple):
     crosswise: jax.Array  # [R] bool, rotated by a quarter turn about z
     target: jax.Array  # [] int32, role of the block that is hardest to reach
     floor: jax.Array | float = 0.0  # [R] m, height of the surface that carries the block
+    yaw: jax.Array | float = 0.0  # [R] rad, besides the quarter turn
 
 
 class Family(NamedTuple):
@@ -60,7 +63,6 @@ class Draws(NamedTuple):
     order: jax.Array  # [R] 0..1, along a line
     crosswise: jax.Array  # [R] bool
     jitter: jax.Array  # [R, 2] -1..1
-    mirrored: jax.Array  # [] bool
 
 
 def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
@@ -84,8 +86,8 @@ def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
 
 def draw(key: jax.Array, num_slots: int) -> Draws:
     """All draws of a packing, by one call of the generator: each call is slow to compile."""
-    noise = jax.random.uniform(key, (num_slots + 3 + 5 * ROLES,))
-    preference, (optional, gap, mirrored), roles = jnp.split(noise, [num_slots, num_slots + 3])
+    noise = jax.random.uniform(key, (num_slots + 2 + 5 * ROLES,))
+    preference, (optional, gap), roles = jnp.split(noise, [num_slots, num_slots + 2])
     roles = roles.reshape(5, ROLES)
     return Draws(
         preference=preference,
@@ -95,7 +97,6 @@ def draw(key: jax.Array, num_slots: int) -> Draws:
         order=roles[1],
         crosswise=roles[2] < 0.5,
         jitter=2.0 * roles[3:].T - 1.0,
-        mirrored=mirrored < 0.5,
     )
 
 
@@ -121,90 +122,137 @@ def _line(
     return start + 0.5 * (step - jnp.sum(step)), jnp.argmax(is_middle).astype(jnp.int32)
 
 
-def _place_row(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Long side to long side, a little off the line."""
-    y, middle = _line(draws.order, half[:, 1], used, gap)
-    x = ROW_OFFSET * draws.jitter[:, 0]
-    return Placed(jnp.stack([x, y], axis=1), jnp.zeros_like(used), middle)
-
-
-def _place_ring(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Four blocks enclose the last: each ends at the side of the next, like a pinwheel's arms."""
-    quarter = np.arange(5)
-    crosswise = quarter % 2 == 1  # never the fifth, which is in the middle
-    # Half extents of the middle block, in the frame of each arm.
-    inner = _half_xy(jnp.broadcast_to(half[4], half.shape), crosswise)
-    arm = jnp.stack([half[:, 0] - inner[:, 0], inner[:, 1] + gap + half[:, 1]], axis=1)
-    angle = 0.5 * np.pi * quarter
-    cos, sin = np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
-    x, y = cos * arm[:, 0] - sin * arm[:, 1], sin * arm[:, 0] + cos * arm[:, 1]
-    mirrored = jnp.where(draws.mirrored, -1.0, 1.0)
-    around = jnp.stack([mirrored * x, y], axis=1)
-    return Placed(around.at[4].set(0.0), jnp.asarray(crosswise), jnp.int32(4))
-
-
 def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """The first two end to end; the others side by side along their faces, which are flush."""
-    is_wall = np.arange(used.shape[0]) < 2
-    crosswise = draws.crosswise & ~is_wall
-    half_xy = _half_xy(half, crosswise)
-    x, middle = _line(draws.order, half_xy[:, 0], used & ~is_wall, gap)
-    side = np.where(np.arange(used.shape[0]) == 0, -1.0, 1.0).astype(np.float32)
-    x = jnp.where(is_wall, side * (half_xy[:, 0] + 0.5 * gap), x)
-    y = jnp.where(is_wall, -half_xy[:, 1], gap + half_xy[:, 1])
-    return Placed(jnp.stack([x, y], axis=1), crosswise, middle)
-
-
-def _place_nest(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """An arch on its side, its mouth towards +y; a block in it, one before it, two at its ends."""
-    arch, inner, lid = half[0], half[1], half[2]
-    # The mouth is half as deep as the arch is high.
-    y_inner = jnp.minimum(gap, MOUTH_GAP[1]) + inner[1]
-    front = jnp.maximum(y_inner + inner[1], jnp.max(half[np.array([0, 3, 4]), 1]))
+    """Two like bricks end to end, a block across their joint, one along each face."""
+    crosswise = draws.crosswise & _is_role(3, 4)
+    half_xy, joint = _half_xy(half, crosswise), jnp.minimum(gap, STACKED_GAP)
+    face = jnp.maximum(half[0, 1], half[2, 1] + STACK_OFFSET) + gap
     zero = jnp.zeros_like(gap)
-    x_ends = arch[0] + gap + half[3:, 0]
-    x = jnp.stack([zero, zero, ROW_OFFSET * draws.jitter[2, 0], x_ends[0], -x_ends[1]])
-    y = jnp.stack([zero, y_inner, front + gap + lid[1], zero, zero])
-    return Placed(jnp.stack([x, y], axis=1), jnp.zeros_like(used), jnp.int32(1))
+    end = half[0, 0] + 0.5 * joint
+    x = jnp.stack([-end, end, zero, zero, zero])
+    y = jnp.stack([zero, zero, zero, face + half_xy[3, 1], -face - half_xy[4, 1]])
+    return _stacked(x, y, crosswise, draws, {2: 2.0 * half[0, 2]}, target=0)
 
 
-def _resize_nest(half: jax.Array) -> jax.Array:
-    """An arch whose mouth, half as wide as the arch, holds the inner block."""
-    return half.at[0].multiply(jnp.maximum(1.0, 2.0 * (half[1, 0] + MOUTH_GAP[0]) / half[0, 0]))
+def _place_stairs(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Two flights side by side: each block begins farther along than the one nearer the middle."""
+    y, middle = _line(draws.order, half[:, 1], used, gap)
+    return Placed(jnp.stack([SLANT * jnp.abs(y), y], axis=1), jnp.zeros_like(used), middle)
 
 
-def _place_pile(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Two like blocks side by side, one across both, one on top of that, one at their ends."""
-    crosswise = draws.crosswise & ~np.array([True, True, False, False, False])
-    half_xy, base_gap = _half_xy(half, crosswise), jnp.minimum(gap, STACKED_GAP)
+def _place_fan(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Like the ribs of a fan: each points away from one place, as near as its neighbours allow."""
+    sin, cos = np.float32(np.sin(0.5 * FAN_ANGLE)), np.float32(np.cos(0.5 * FAN_ANGLE))
+    away = (0.5 * gap + half[:, 1] * cos) / sin + half[:, 0]
+    number = jnp.sum(used)
+    rib = np.arange(ROLES, dtype=np.float32)
+    angle = np.float32(FAN_ANGLE) * (rib - 0.5 * (number.astype(jnp.float32) - 1.0))
+    xy = away[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    middle = ((number - 1) // 2).astype(jnp.int32)
+    return Placed(xy, jnp.zeros_like(used), middle, yaw=jnp.asarray(angle))
+
+
+def _place_bridge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Two like piers, a deck from one to the other, a block along each side."""
+    crosswise = _is_role(0, 1)
+    half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
+    pier = half[2, 0] - SUPPORT + half_xy[0, 0]
+    side = jnp.maximum(half_xy[0, 1], half[2, 1] + STACK_OFFSET) + gap
+    x = jnp.stack([-pier, pier, zero, zero, zero])
+    y = jnp.stack([zero, zero, zero, side + half_xy[3, 1], -side - half_xy[4, 1]])
+    return _stacked(x, y, crosswise, draws, {2: 2.0 * half[0, 2]}, target=2)
+
+
+def _place_tower(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Three blocks on top of one another, crosswise in turn, and one at either end."""
+    crosswise = _is_role(1)
+    half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
+    end = jnp.max(half_xy[:3, 0]) + STACK_OFFSET + gap  # what is on top may reach farther
+    x = jnp.stack([zero, zero, zero, end + half_xy[3, 0], -end - half_xy[4, 0]])
+    floors = {1: 2.0 * half[0, 2], 2: 2.0 * (half[0, 2] + half[1, 2])}
+    return _stacked(x, jnp.zeros_like(x), crosswise, draws, floors, target=1)
+
+
+def _place_wedge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Two blocks in a V, one between them, one behind the tip, one along the outside."""
+    sin, cos = np.float32(np.sin(WEDGE_ANGLE)), np.float32(np.cos(WEDGE_ANGLE))
+    along, out = np.array([cos, sin]), np.array([-sin, cos])
+    mirror = np.array([1.0, -1.0], np.float32)
+
+    def arm(role: int, beyond: jax.Array) -> jax.Array:
+        return (0.5 * gap / sin + half[role, 0]) * along + (beyond + half[role, 1]) * out
+
     zero = jnp.zeros_like(gap)
-    aside = half_xy[0, 1] + 0.5 * base_gap
-    # What is stacked may reach farther than the base.
-    end = jnp.maximum(half_xy[0, 0], jnp.maximum(half_xy[2, 0], half_xy[3, 0]) + STACK_OFFSET)
-    floor = jnp.stack([zero, zero, 2.0 * half[0, 2], 2.0 * (half[0, 2] + half[2, 2]), zero])
-    x = jnp.stack([zero, zero, zero, zero, end + gap + half_xy[4, 0]])
-    y = jnp.stack([-aside, aside, zero, zero, zero])
-    stacked = np.array([0.0, 0.0, 1.0, 1.0, 0.0], np.float32)[:, None]
-    xy = jnp.stack([x, y], axis=1) + stacked * STACK_OFFSET * draws.jitter
-    return Placed(xy, crosswise, jnp.int32(0), floor)
+    inside = (gap + half[2, 1] * cos) / sin + half[2, 0]
+    tip = 0.5 * gap / sin * cos - 2.0 * sin * jnp.max(half[:2, 1])  # where the outsides begin
+    between = jnp.stack([inside, zero])
+    behind = jnp.stack([jnp.minimum(tip, 0.0) - gap - half[3, 0], zero])
+    outside = arm(4, 2.0 * half[0, 1] + gap)
+    xy = jnp.stack([arm(0, zero), mirror * arm(1, zero), between, behind, outside])
+    yaw = np.array([1.0, -1.0, 0.0, 0.0, 1.0], np.float32) * np.float32(WEDGE_ANGLE)
+    return Placed(xy, jnp.zeros_like(used), jnp.int32(2), yaw=jnp.asarray(yaw))
 
 
-def _resize_pile(half: jax.Array) -> jax.Array:
-    """The second base block like the first, so that what lies across them lies flat."""
+def _place_corner(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """Two blocks in an L, one in its corner, one beyond that along either leg."""
+    crosswise = _is_role(1)
+    leg, high = _half_xy(half, crosswise)[1], jnp.maximum(half[2, 1], half[3, 1])
+    x = jnp.stack(
+        [half[0, 0], -gap - leg[0], half[2, 0], 2.0 * half[2, 0] + gap + half[3, 0], half[4, 0]]
+    )
+    y = jnp.stack(
+        [-half[0, 1], leg[1], gap + half[2, 1], gap + half[3, 1], 2.0 * (gap + high) + half[4, 1]]
+    )
+    return Placed(jnp.stack([x, y], axis=1), crosswise, jnp.int32(2))
+
+
+def _place_bin(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+    """A back and two sides, open in front, with a block inside, and one behind the back."""
+    crosswise = _is_role(1, 2)
+    half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
+    side = half[3, 0] + gap + half_xy[1:3, 0]
+    x = jnp.stack([zero, side[0], -side[1], zero, zero])
+    back = -2.0 * half[0, 1] - gap - half[4, 1]
+    y = jnp.stack([-half[0, 1], half_xy[1, 1], half_xy[2, 1], gap + half[3, 1], back])
+    return Placed(jnp.stack([x, y], axis=1), crosswise, jnp.int32(3))
+
+
+def _is_role(*numbers: int) -> jax.Array:
+    """[R] bool, True at these roles."""
+    return jnp.asarray(np.isin(np.arange(ROLES), numbers))
+
+
+def _stacked(
+    x: jax.Array,
+    y: jax.Array,
+    crosswise: jax.Array,
+    draws: Draws,
+    floors: dict[int, jax.Array],
+    target: int,
+) -> Placed:
+    """Blocks at x, y [R] m, those with a floor [] m above the table a little off their places."""
+    floor = jnp.stack([floors.get(role, jnp.zeros_like(x[0])) for role in range(ROLES)])
+    offset = jnp.where(_is_role(*floors)[:, None], STACK_OFFSET * draws.jitter, 0.0)
+    return Placed(jnp.stack([x, y], axis=1) + offset, crosswise, jnp.int32(target), floor)
+
+
+def _second_like_first(half: jax.Array) -> jax.Array:
+    """The second block like the first, so that what lies across them lies flat."""
     return half.at[1].set(half[0])
 
 
+_NO_PRISM: tuple[SlotKind, ...] = ("box", "half_cylinder", "cylinder")
 _NOT_ARCH: tuple[SlotKind, ...] = ("box", *MESH_KINDS)
-_ANY: tuple[SlotKind, ...] = ("arch", *_NOT_ARCH)
-_NO_ARCH, _BOX, _PRISM = Role(_NOT_ARCH, on_side=0.3), Role(("box",)), Role(("prism",))
-_BASE, _BRICK = Role(("box",), long=True), Role(("box",), long=True, on_side=0.5)
-_ARM = Role(("box", "prism"), long=True, on_side=1.0)
-_TUNNEL, _ROUND = Role(("arch",), on_side=1.0), Role(("cylinder",))
+_BOX, _LONG = Role(("box",)), Role(("box",), long=True)
+_BRICK, _ROUND = Role(("box",), long=True, on_side=0.5), Role(_NO_PRISM)
+_SOLID, _ANY = Role(_NOT_ARCH), Role(("arch", *_NOT_ARCH), on_side=0.3)
 FAMILIES = {
-    "row": Family((_NO_ARCH, _NO_ARCH, Role(_ANY, on_side=0.3), _NO_ARCH, _NO_ARCH), 3, _place_row),
-    "ridge": Family((_PRISM, _PRISM, Role(_ANY, on_side=0.3), _NO_ARCH, _NO_ARCH), 3, _place_row),
-    "ring": Family((_ARM, _ARM, _ARM, _ARM, Role(_NOT_ARCH)), 5, _place_ring),
-    "wall": Family((_BRICK, _BRICK, _NO_ARCH, _NO_ARCH, Role(_ANY)), 3, _place_wall),
-    "nest": Family((_TUNNEL, _ROUND, _BRICK, _NO_ARCH, _NO_ARCH), 3, _place_nest, _resize_nest),
-    "pile": Family((_BASE, _BASE, _BOX, Role(_NOT_ARCH), Role(_ANY)), 3, _place_pile, _resize_pile),
+    "wall": Family((_LONG, _LONG, _SOLID, _ROUND, _ROUND), 3, _place_wall, _second_like_first),
+    "stairs": Family((_BRICK, _BRICK, _ANY, _ROUND, _ROUND), 3, _place_stairs),
+    "fan": Family((_LONG, _LONG, Role(_ANY.kinds), _ROUND, _ROUND), 3, _place_fan),
+    "bridge": Family((_BOX, _BOX, _LONG, _ROUND, _SOLID), 3, _place_bridge, _second_like_first),
+    "tower": Family((_LONG, _BOX, _SOLID, _ROUND, _ROUND), 3, _place_tower),
+    "wedge": Family((_BRICK, _BRICK, _SOLID, _ROUND, _ROUND), 3, _place_wedge),
+    "corner": Family((_BRICK, _BRICK, _ANY, _ROUND, _ROUND), 3, _place_corner),
+    "bin": Family((_BRICK, _BRICK, _BRICK, _SOLID, _ROUND), 4, _place_bin),
 }

@@ -15,7 +15,7 @@ from csac_jax.config import MESH_KINDS, HeightmapConfig, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import arrange, blocks, cases, families, layout, model
 from csac_jax.scene.layout import Scene
-from tests.scene import placed
+from tests.scene import placed, plain
 
 COUNT = 200  # keys per level
 LEVELS = (0.0, 0.5, 1.0)
@@ -41,7 +41,9 @@ EXTENT = {
     MANY: HeightmapConfig().extent,
     BOXES: 2.0 * (arrange.RADIUS + 0.001),
 }  # the usual square, the smallest
-FAR = 0.05  # m, distances are measured up to here
+FAR = 0.08  # m, distances are measured up to here
+STACKED = ("wall", "bridge", "tower")  # families with blocks on top of others
+APART = 0.005  # m, that every arrangement is from every case
 TOGETHER = 0.012  # m, blocks closer than this make a cluster; loose ones keep 15 mm
 
 
@@ -49,6 +51,7 @@ class Drawn(NamedTuple):
     """Arrangements, COUNT for each level in turn, and what C MuJoCo says of them. P = 3 COUNT."""
 
     cfg: SceneConfig
+    family: np.ndarray  # [P] str
     scenes: Scene  # leaves [P, N, ...], NumPy
     reach: np.ndarray  # [P] m, largest |x| or |y| of a corner
     lowest: np.ndarray  # [P] m, of a corner
@@ -95,7 +98,7 @@ def _distances(exact: mujoco.MjModel, data: mujoco.MjData, geoms: list, num: int
     return distance
 
 
-def _examined(cfg: SceneConfig, scenes: Scene) -> Drawn:
+def _examined(cfg: SceneConfig, scenes: Scene, family: np.ndarray) -> Drawn:
     world = model.build(cfg, SimConfig())
     fields = jax.device_get(jax.jit(jax.vmap(functools.partial(model.scene_fields, world)))(scenes))
     rows = [
@@ -103,6 +106,7 @@ def _examined(cfg: SceneConfig, scenes: Scene) -> Drawn:
     ]
     return Drawn(
         cfg,
+        family,
         scenes,
         *(
             np.stack(column)
@@ -117,7 +121,12 @@ def drawn(request: pytest.FixtureRequest) -> Drawn:
     the smallest."""
     cfg = MANY if request.param == "many" else BOXES
     keys = jax.random.split(jax.random.key(0), len(LEVELS) * COUNT)
-    return _examined(cfg, _many(cfg, EXTENT[cfg], keys, jnp.repeat(jnp.float32(LEVELS), COUNT)))
+    names = np.array(list(families.available(cfg.slots)))
+    number = jax.vmap(
+        lambda key: jax.random.randint(jax.random.split(key, 6)[1], (), 0, len(names))
+    )
+    scenes = _many(cfg, EXTENT[cfg], keys, jnp.repeat(jnp.float32(LEVELS), COUNT))
+    return _examined(cfg, scenes, names[np.asarray(number(keys))])
 
 
 def test_blocks_do_not_overlap(drawn: Drawn):
@@ -143,21 +152,93 @@ def test_blocks_are_at_rest(drawn: Drawn, level: float):
     assert share >= 0.97, share
 
 
+@pytest.mark.parametrize("name", families.FAMILIES)
+def test_every_family_settles(drawn: Drawn, name: str):
+    """Claim: in every family no two blocks overlap, all lie inside the square, and none moves by
+    5 mm in half a second."""
+    own = drawn.family == name
+    assert own.sum() > 0.6 * len(own) / len(families.FAMILIES)
+    assert drawn.overlap[own].max() < 0.001
+    assert drawn.reach[own].max() <= 0.5 * EXTENT[drawn.cfg]
+    assert drawn.moved[own].max() < 0.005
+
+
+def _open_shares(family: families.Family) -> np.ndarray:
+    """Mean share of open grasps, by level, of the blocks that a draw packs at every level."""
+
+    def pack(key: jax.Array, level: jax.Array) -> arrange.Blocks:
+        key_draws, key_sizes = jax.random.split(key)
+        draws = families.draw(key_draws, len(MANY.slots))
+        sizes = arrange.draw_sizes(key_sizes, MANY)
+        return arrange.pack(family, MANY.slots, draws, sizes, level)[0]
+
+    keys, levels = jax.random.split(jax.random.key(1), 40), jnp.float32(LEVELS)
+    packed = jax.device_get(jax.jit(jax.vmap(jax.vmap(pack, (0, None)), (None, 0)))(keys, levels))
+    shares = np.zeros((len(LEVELS), len(keys)))
+    for level, draw in np.ndindex(shares.shape):
+        one = jax.tree.map(lambda leaf, at=(level, draw): leaf[at], packed)
+        blocks_of = (one.centre, one.yaw, one.half_lying)
+        grasps = plain.open_grasps(*(leaf[one.placed] for leaf in blocks_of), SimConfig())
+        shares[level, draw] = grasps[packed.placed[0, draw][one.placed]].mean()
+    return shares.mean(axis=1)
+
+
+def test_each_level_is_harder():
+    """Claim: of the blocks that every level has, fewer antipodal grasps are open at each higher
+    level, over all families, and in each family fewer at the highest than at the lowest."""
+    shares = np.array([_open_shares(family) for family in families.FAMILIES.values()])
+    easy, middle, hard = shares.mean(axis=0)
+    assert easy > 1.2 * middle > 1.3 * hard
+    assert (shares[:, 0] > shares[:, -1]).all(), dict(zip(families.FAMILIES, shares, strict=True))
+
+
+def test_open_grasps_by_hand():
+    """Claim: a lone cube is open at the yaws of its two pairs of faces; a block 10 mm from one face
+    leaves the other pair; a long block is open across alone."""
+    cube, place = np.full((1, 3), 0.025), np.array([[0.0, 0.0, 0.025]])
+    sim, yaw = SimConfig(), np.zeros(1)
+    lone = plain.open_grasps(place, yaw, cube, sim)
+    assert np.flatnonzero(lone[0]).tolist() == [0, 1, 15, 16, 17, 31]  # 32 yaws over pi
+    two = plain.open_grasps(
+        np.array([[0.0, 0.0, 0.025], [0.06, 0.0, 0.025]]), np.zeros(2), np.repeat(cube, 2, 0), sim
+    )
+    assert np.flatnonzero(two[0]).tolist() == [15, 16, 17]
+    long = plain.open_grasps(place, yaw, np.array([[0.05, 0.025, 0.025]]), sim)
+    assert np.flatnonzero(long[0]).tolist() == [15, 16, 17]
+
+
+def test_no_arrangement_is_a_case(drawn: Drawn):
+    """Claim: however turned, shifted, mirrored and matched, and whatever the kinds, the centres of
+    an arrangement's blocks are 5 mm (RMS) at least from those that `row`, `pinwheel` and `hole`
+    pack. Of `ridge`, two prisms, no arrangement packs as many."""
+    rng = np.random.default_rng(0)
+    for name, packed in (("row", 4), ("pinwheel", 5), ("hole", 3)):
+        case = cases.load(cases.shipped(name)).scene.position[:packed]
+        cos, sin = np.cos(1.0), np.sin(1.0)
+        moved = case @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        shuffled = rng.permutation(np.concatenate([moved + 0.1 * np.eye(3)[0], np.ones((1, 3))]))
+        assert plain.distance(case, shuffled) < 1e-5
+        scenes = zip(drawn.scenes.position, drawn.scenes.in_play, strict=True)
+        least = min(plain.distance(case, position[there]) for position, there in scenes)
+        assert least > APART, (name, least)
+
+
 def test_level_packs_more_and_closer(drawn: Drawn):
-    """Claim: the level closes the gaps from at most 30 mm to 1 mm, and adds blocks where there are
+    """Claim: the level closes the gaps from at most 40 mm to 1 mm, and adds blocks where there are
     more."""
     nearest = drawn.distance[np.arange(len(drawn.reach)), drawn.scenes.target].min(axis=1)
-    for level, low, high in ((0.0, 0.014, 0.031), (0.5, 0.007, 0.017), (1.0, 0.0, 0.004)):
-        assert low < np.median(nearest[drawn.at(level)]) < high, level
+    nearest[np.isin(drawn.family, STACKED)] = np.nan  # their blocks touch at every level
+    for level, low, high in ((0.0, 0.019, 0.042), (0.5, 0.009, 0.022), (1.0, 0.0, 0.004)):
+        assert low < np.nanmedian(nearest[drawn.at(level)]) < high, level
     number = [drawn.scenes.in_play[drawn.at(level)].sum(axis=1).mean() for level in LEVELS]
     assert drawn.cfg is BOXES or number[0] + 0.2 < number[1] < number[2] - 0.2, number
 
 
 def test_target_has_neighbours_on_two_sides(drawn: Drawn):
-    """Claim: the target is in play, and two other blocks at least are within 35 mm of it."""
+    """Claim: the target is in play, and two other blocks at least are within 55 mm of it."""
     rows = np.arange(len(drawn.reach))
     assert drawn.scenes.in_play[rows, drawn.scenes.target].all()
-    assert ((drawn.distance[rows, drawn.scenes.target] < 0.035).sum(axis=1) >= 2).all()
+    assert ((drawn.distance[rows, drawn.scenes.target] < 0.055).sum(axis=1) >= 2).all()
 
 
 def test_no_fewer_blocks_than_asked_for(drawn: Drawn):
@@ -166,11 +247,11 @@ def test_no_fewer_blocks_than_asked_for(drawn: Drawn):
 
 
 def test_every_family_is_drawn_as_often(drawn: Drawn):
-    """Claim: families are equally likely; seen on piles, the only ones with a block well above the
-    table."""
+    """Claim: families are equally likely; seen on those that stack, the only ones with a block well
+    above the table."""
     low = drawn.scenes.position[..., 2] - np.linalg.norm(drawn.scenes.half_size, axis=2)
     stacked = np.any((low > 0.0) & drawn.scenes.in_play, axis=1)
-    share = 1.0 / len(families.available(drawn.cfg.slots))
+    share = len(STACKED) / len(families.available(drawn.cfg.slots))
     assert np.mean(stacked) <= share + 0.06  # 0.06: three sigma of 600 draws
     assert np.mean(stacked) > 0.3 * share  # a flat block on flat ones does not stand out
 
@@ -245,7 +326,9 @@ def test_shipped_cases_are_held_out(drawn: Drawn):
     held_out = []
     for case in map(cases.load, map(cases.shipped, cases.names())):
         alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], case.scene)
-        (row,) = _examined(SceneConfig(slots=case.slots, min_blocks=1), alone).distance
+        (row,) = _examined(
+            SceneConfig(slots=case.slots, min_blocks=1), alone, np.array([""])
+        ).distance
         held_out.append(max(_clusters(case.slots, row), key=Counter.total))
     assert sorted(cluster.total() for cluster in held_out) == [2, 3, 4, 5]
     found = [cluster for row in drawn.distance for cluster in _clusters(slots, row)]
@@ -254,16 +337,18 @@ def test_shipped_cases_are_held_out(drawn: Drawn):
     assert max(cluster["arch"] for cluster in found) == 1
 
 
+ALL = {"wall", "stairs", "fan", "bridge", "tower", "wedge", "corner", "bin"}
+
+
 @pytest.mark.parametrize(
     ("slots", "names"),
     [
-        (("box", "box", "box"), {"row", "wall", "pile"}),
-        (("box",) * 5, {"row", "wall", "pile", "ring"}),
-        (("box", "box", "prism", "box", "cylinder"), {"row", "wall", "pile", "ring"}),
-        (("prism", "prism", "arch"), {"row", "ridge"}),
-        (("arch", "box", "cylinder"), {"row", "nest"}),
-        (("box", "box", "half_cylinder"), {"row", "wall"}),
-        (("box",) * 6 + ("arch", "prism", "prism", "cylinder"), set(families.FAMILIES)),
+        (("box", "box", "box"), ALL - {"bin"}),
+        (("box",) * 4, ALL),
+        (("box", "box", "prism", "box", "cylinder"), ALL),
+        (("box", "box", "prism"), ALL - {"bridge", "bin"}),
+        (("box", "box", "arch"), {"stairs", "fan", "corner"}),
+        (("box",) * 6 + ("arch", "prism", "prism", "cylinder"), ALL),
     ],
 )
 def test_families_follow_from_the_slots(slots: tuple, names: set):
@@ -272,7 +357,7 @@ def test_families_follow_from_the_slots(slots: tuple, names: set):
 
 
 @pytest.mark.parametrize(
-    "slots", [("box",), ("box", "box"), ("arch", "arch", "arch"), ("arch", "arch", "box")]
+    "slots", [("box",), ("box", "box"), ("prism", "prism", "arch"), ("arch", "arch", "box")]
 )
 def test_too_few_slots_are_an_error(slots: tuple):
     """Claim: slots that allow no family are an error that names the field."""
@@ -289,7 +374,7 @@ def test_too_small_a_square_is_an_error():
 @pytest.mark.slow
 def test_key_decides():
     """Claim: the same key gives the same scene, alone or in a batch; another key, another scene."""
-    cfg = SceneConfig(slots=("box", "arch", "cylinder"), min_blocks=3)
+    cfg = SceneConfig(slots=("box", "box", "arch"), min_blocks=3)
     levels = jnp.linspace(0.0, 1.0, 8)
     batch, again = (
         _many(cfg, 0.448, jax.random.split(jax.random.key(1), 8), levels) for _ in range(2)

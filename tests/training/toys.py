@@ -128,7 +128,8 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     ]
     noisy = explore.action_noise(key_noise, ex, jnp.zeros(3))
     pushed = jax.random.bernoulli(key_push, ex.push_fraction, (32,)).astype(jnp.float32).mean()
-    a, b = samplers.beta_schedule(cfg.replay, share)
+    ranked = cfg.replay.sampler == "beta"
+    a, b = samplers.beta_schedule(cfg.replay, share) if ranked else (share, share)
     scalars = [*pushes, *chances, pushed, a, b]
     scalars += [cfg.target.inverse_temperature / (high - low) * jnp.float32(1.0)]
     return jnp.concatenate([jnp.stack(scalars), grasps, noisy])

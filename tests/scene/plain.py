@@ -1,0 +1,67 @@
+"""Plain geometry of arrangements, for tests: open grasps, and distances between arrangements."""
+
+import itertools
+
+import numpy as np
+
+from csac_jax.config import SimConfig
+from csac_jax.constants import MAX_OPENING
+from csac_jax.sim.oracle import FINGER_HALF, PAD_HALF_WIDTH, YAWS
+
+PARALLEL = 0.1  # rad, of a closing direction to the normals of two faces
+
+
+def open_grasps(
+    position: np.ndarray, yaw: np.ndarray, half: np.ndarray, sim: SimConfig
+) -> np.ndarray:
+    """Whether an antipodal grasp of each block at each of the oracle's yaws is open [n, YAWS]: two
+    faces across, no wider than the hand, and no other block where the fingers go down or close.
+
+    Args: centres [n, 3] m, yaws [n] rad and half extents [n, 3] m, as the blocks lie. Blocks are
+    their bounding boxes. A closing finger is a grid of points at the height of the grasp.
+    """
+    top = position[:, 2] + half[:, 2]
+    tip = np.maximum(top - sim.grasp_depth, sim.clearance) + 0.002
+    outside = 0.5 * MAX_OPENING + PAD_HALF_WIDTH + FINGER_HALF[0]
+    found = np.zeros((len(half), YAWS), bool)
+    for i, j in itertools.product(range(len(half)), range(YAWS)):
+        angle = j * np.pi / YAWS
+        off = (angle - yaw[i] + 0.25 * np.pi) % (0.5 * np.pi) - 0.25 * np.pi
+        across = round((angle - yaw[i] - off) / (0.5 * np.pi)) % 2  # x or y of the block
+        face = half[i, across]
+        if abs(off) > PARALLEL or 2.0 * face > MAX_OPENING - 0.02:
+            continue
+        along = np.linspace(face + 0.0005, outside, 12)
+        x, y = np.meshgrid([*-along, *along], np.linspace(-1.0, 1.0, 5) * FINGER_HALF[1])
+        points = position[i, :2] + np.stack([x.ravel(), y.ravel()], axis=1) @ _turn(angle).T
+        found[i, j] = not any(
+            top[k] > tip[i]
+            and np.any(np.all(np.abs((points - position[k, :2]) @ _turn(yaw[k])) < half[k, :2], 1))
+            for k in range(len(half))
+            if k != i
+        )
+    return found
+
+
+def _turn(angle: float) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def distance(one: np.ndarray, others: np.ndarray) -> float:
+    """RMS distance in m of centres `one` [n, 3] from as many of `others` [m, 3], matched one to one
+    in the best way, after the best shift and rotation about z, mirrored or not; inf if m < n."""
+    n = len(one)
+    orders = np.array(list(itertools.permutations(range(len(others)), n)), int).reshape(-1, n)
+    if not len(orders):
+        return np.inf
+    a, b = one - one.mean(axis=0), others[orders]
+    a, b = np.broadcast_to(a, b.shape).copy(), b - b.mean(axis=1, keepdims=True)
+    best = np.inf
+    for mirror in (1.0, -1.0):
+        p = a[..., 0] + 1j * mirror * a[..., 1]
+        q = b[..., 0] + 1j * b[..., 1]
+        flat = np.sum(abs(p) ** 2 + abs(q) ** 2, axis=1) - 2.0 * abs(np.sum(p.conj() * q, axis=1))
+        high = np.sum((a[..., 2] - b[..., 2]) ** 2, axis=1)
+        best = min(best, np.sqrt(np.min(np.maximum(flat, 0.0) + high) / n))
+    return float(best)
