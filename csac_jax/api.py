@@ -14,12 +14,12 @@ from csac_jax.config import Config, DenseNet121
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import policies, rollout
 from csac_jax.evaluation.policies import LearnedPolicy, Policy
-from csac_jax.io import leaves, policy_file, weights
+from csac_jax.io import leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
 from csac_jax.report.progress import Reporters, Terminal
 from csac_jax.runtime import cache, cluster, provenance, signals
 from csac_jax.sim import backend
-from csac_jax.sweeps import grid, replicas, runner
+from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
 from csac_jax.training import loop, memory, sharding, step
@@ -113,22 +113,24 @@ def sweep(
     devices: int | None = None,
     shard: Shard = "seeds",
     init: str | Path | None = None,
+    episodes: int = 0,
     verbose: bool = True,
     stop: signals.Stop | None = None,
 ) -> dict[str, Any]:
     """Trains several seeds, with every combination of settings, side by side in one program.
 
-    Args: seeds, cfg.seed and those after it. vary, values by dotted setting or "algo", as in
-    {"learn.tau": (0.01, 0.02)}. run_dir, a folder that does not exist. devices, how many to use;
-    shard, what they divide: the seeds, or the scenes of each seed. Returns: the summary, grasp
-    success of every combination over its seeds with 95 % intervals. Raises as `train`.
+    Args: seeds, cfg.seed and those after it. vary, values by dotted setting, "algo" or "task", as
+    in {"learn.tau": (0.01, 0.02)}. run_dir, a folder that does not exist. devices, how many to use;
+    shard, what they divide: the seeds, or the scenes of each seed. episodes, that every final
+    policy is evaluated in. Returns: the summary, grasp success of every combination over its seeds
+    with 95 % intervals. Raises as `train`.
     """
     points = _points(cfg, dict(vary or {}))
-    _checked(runner.check_plan, SweepPlan(seeds, points))
+    _checked(runner.check_plan, SweepPlan(seeds, points, episodes))
     runs = seeds * len(points)
     points = [one._replace(cfg=backend.resolve(one.cfg, devices or 1, runs)) for one in points]
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
-    plan = SweepPlan(seeds, points)
+    plan = SweepPlan(seeds, points, episodes)
     return run_sweep(plan, folder, devices, shard, init, verbose, stop or signals.Stop()).summary
 
 
@@ -156,7 +158,14 @@ def run_sweep(
 
     with Terminal(Console(quiet=not (verbose and cluster.is_first()))) as terminal:
         terminal.say(f"sweep {folder}")
-        return runner.run(plan, folder, make_program, terminal, stop, resume=resume)
+        result = runner.run(plan, folder, make_program, terminal, stop, resume=resume)
+        if result.stopped_by is not None or not plan.episodes or not cluster.is_first():
+            return result
+        with lock.exclusive(folder):
+            stopped = final.measure(plan, folder, terminal, stop)
+        if stopped is not None:
+            terminal.say(f"stopped; go on with: csac-jax sweep --resume {folder}")
+        return result._replace(stopped_by=stopped)
 
 
 def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
@@ -225,7 +234,9 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
         _checked(grid.kind_of, name)
 
     def configure(values: dict[str, Any]) -> Config:
-        settings = {name: value for name, value in values.items() if name != "algo"}
+        settings: dict[str, Any] = {}
+        for name, value in values.items():
+            settings |= {} if name == "algo" else grid.settings_of(name, value)
         base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
         return step.replace_settings(base, settings)
 

@@ -17,7 +17,6 @@ RobotKind = Literal["hand", "ur5"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 MOST_ITEMS = 64  # of a setting that is a list (ours: networks and scenes end far below)
-WARP_WORLDS = 4096  # scenes that Warp's contacts, which all of them share, are laid out for
 
 
 _LARGEST = 2**53  # integers up to here are floats too
@@ -132,7 +131,8 @@ class TaskConfig(Section, section="task"):
     max_steps_without_change = 10  # actions in a row without visible change that cut it off (VPG)
 
     kind: Literal["clear", "target"] = "clear"
-    """`clear`: take every block. `target`: get one marked block, then the next (CSAC sec. 4.4)."""
+    """`clear`: take every block (CSAC sec. 4.2). `target`: get one block, marked at random, then
+    the next, and another scene where none is left (sec. 4.3)."""
     max_actions: int = _bounded(15, 1)  # Actions after which an episode is cut off.
 
 
@@ -364,6 +364,9 @@ class TargetConfig(Section, section="target"):
     """V(s'): softmax over noisy target actions (line 17), or the dense map's maximum (eq. 9)."""
     gamma: float = _bounded(0.5, 0.0, 1.0)  # Discount (VPG).
     samples: int = _bounded(50, 1)  # Noisy target actions per primitive in the softmax (SD3).
+    bootstrap: Literal["episodic", "continuing"] = "episodic"
+    """Where V(s') is 0: after the end of an episode; or, as in VPG's code, where an action neither
+    changed nor lifted anything, and an episode's end bootstraps from the next one's first state."""
 
     def check(self) -> None:
         _require(self.gamma < 1.0, "target.gamma: must be below 1")
@@ -376,18 +379,24 @@ class RewardConfig(Section, section="reward"):
     dead_band = 0.1  # gain in the best grasp's value that a good push must exceed (ours)
     push_level = 0.0  # s_c of eq. 13, the push's level
     grasp_level = 1.0  # s_g of eq. 13, the grasp's level, which is s_max
+    eta = (0.0, 1.0)  # eta_0 and eta_1 of eq. 13, for which no numbers are given
 
     success_bonus: float = 1.0  # r2 of eq. 11: the hand comes back with a block.
     distance_weight: float = _bounded(0.0, 0.0)
     """w: penalty per metre between the place and where the tips acted (eq. 10, sign turned)."""
-    eta: tuple[float, float] = (0.0, 1.0)  # eta_0 and eta_1 of eq. 13.
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
-    push_effect: Literal["value", "change"] = "value"
-    """What makes a push good: the best grasp gains value (eq. 16), or the map has changed (VPG)."""
+    push_effect: Literal["value", "renewed", "change"] = "value"
+    """What makes a push good: the best grasp gains value (eq. 16), judged once as it is made, or
+    judged anew by the target critic at each replay; or the map has changed (VPG)."""
     push_levels: tuple[float, float] = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = _bounded(0.0, 0.0)
     """Cost of an action after which a block has left the workspace for good (ours)."""
+
+    @property
+    def renewed(self) -> bool:
+        """The label of a push is that of the critic of now."""
+        return self.push_effect == "renewed"
 
     def check(self) -> None:
         rising = list(self.grasp_levels) == sorted(self.grasp_levels)
@@ -444,7 +453,7 @@ class UniformReplay(Section, section="replay"):
     """CSAC's replay: all transitions are equally likely."""
 
     sampler: Literal["uniform"] = "uniform"
-    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
@@ -457,7 +466,7 @@ class PrioritisedReplay(Section, section="replay"):
     per_epsilon = 0.01  # added to abs(TD error), so that no transition is out of reach (ours)
 
     sampler: Literal["prioritised"] = "prioritised"
-    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
 
 
@@ -470,7 +479,7 @@ class BetaReplay(Section, section="replay"):
     middle_at = 0.4  # share of all updates after which (a, b) is `middle` (ours)
 
     sampler: Literal["beta"] = "beta"
-    """`uniform` (CSAC), `prioritised` (CSAC-PER) or `beta` (CSAC-beta)."""
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
     capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
     rank_by: Literal["error", "reward"] = "error"
     """Rank 0: the largest abs(TD error) (sec. 3.5) or reward (Algorithm 1 line 15)."""
@@ -482,7 +491,18 @@ class BetaReplay(Section, section="replay"):
     """(a, b) in the end (CSAC sec. 4.3)."""
 
 
-ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay
+class OppositeReplay(Section, section="replay"):
+    """VPG's replay: with each of the newest transitions one of the same primitive whose outcome was
+    the opposite; its rank by abs(TD error) follows Beta(1, 2) (Zeng et al., code, `trainer.py`)."""
+
+    law = (1.0, 2.0)  # (a, b) of the ranks: a power law of exponent 2 (Zeng et al., code)
+
+    sampler: Literal["opposite"] = "opposite"
+    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
+    capacity: int = _bounded(4096, 2, 2**30)  # C, transitions kept.
+
+
+ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay | OppositeReplay
 
 
 class TrainConfig(Section, section="train"):
@@ -502,7 +522,7 @@ class TrainConfig(Section, section="train"):
 
 ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
     "net": ("kind", (SmallNet, DenseNet121)),
-    "replay": ("sampler", (UniformReplay, PrioritisedReplay, BetaReplay)),
+    "replay": ("sampler", (UniformReplay, PrioritisedReplay, BetaReplay, OppositeReplay)),
 }
 """Sections that are unions: the field that names the alternative, and the alternatives."""
 
@@ -542,6 +562,11 @@ class Config(Section):
         """Raises ValueError for sections that do not fit one another."""
         may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
         _require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
+        _require(
+            not self.reward.renewed or self.target.bootstrap == "episodic",
+            "reward.push_effect: renewed needs target.bootstrap episodic, by which a transition "
+            "ends in the scene that the push left",
+        )
         batch, starts = self.learn.batch, self.train.learning_starts
         _require(
             batch <= starts,
@@ -560,8 +585,6 @@ class Config(Section):
         if self.sim.physics == "warp":
             alike = self.scene.size_jitter[1] == 0.0 or not set(MESH_KINDS) & set(self.scene.slots)
             _require(alike, "scene.size_jitter: the second must be 0 where sim.physics is warp")
-            few = self.train.scenes <= WARP_WORLDS
-            _require(few, f"train.scenes: at most {WARP_WORLDS} where sim.physics is warp")
 
 
 def _changed(section: Any, value: Any) -> Any:

@@ -21,7 +21,7 @@ RUNS = {
     "paper_small/csac_per-2": COPIES,
     "paper_small/csac": "CSAC likewise; the four cases",
     "paper_small/csac-2": COPIES,
-    "paper_small/vpg": "VPG likewise; the four cases",
+    "paper_small/vpg": "VPG likewise, in its first variant; the four cases",
     "paper_small/vpg-2": COPIES,
     "paper_small/reactive": "P+G reactive likewise; the four cases",
     "paper_small/reactive-2": COPIES,
@@ -62,6 +62,21 @@ BENCHES = {
     "train/h200-fast-cached": (
         "the same from the cache",
         "train fast --sim.physics mjx --train.actions 4096",
+    ),
+    "train/h200-fast-warp": ("a whole run of `fast`", "train fast"),
+    "train/h200-fast-4096": (
+        "the same, more scenes and a smaller net",
+        "train fast --train.scenes 4096 --net.head 48 --net.growth 32 --net.stem 32",
+    ),
+    "train/h200-fast-4096-long": (
+        "three times as many actions",
+        "train fast --train.scenes 4096 --train.actions 491520 --net.head 48 --net.growth 32 "
+        "--net.stem 32",
+    ),
+    "train/h200-fast-8192-long": (
+        "more scenes, larger updates",
+        "train fast --train.scenes 8192 --train.actions 491520 --learn.updates 128 "
+        "--learn.batch 128 --net.head 48 --net.growth 32 --net.stem 32",
     ),
     "step/xeon-quick": ("a step of `quick` and its stages, Intel Xeon", "bench step quick"),
     "step/epyc-quick": ("the same, AMD EPYC", "bench step quick"),

@@ -56,15 +56,34 @@ def test_sizes_stay_the_presets(name):
     assert before.replay.capacity == after.replay.capacity
 
 
-def test_vpg_by_hand():
+@pytest.mark.parametrize("name", ["vpg", "vpg_episodic"])
+def test_vpg_by_hand(name):
     """Claim: VPG's numbers: discount 0.5, primitive at random 0.5 -> 0.1, half of those pushes,
-    maximum over pixels by the network itself, no actor, power law Beta(1, 2)."""
-    cfg = algorithms.configure(presets.quick(), "vpg")
+    maximum over pixels by the network itself, no actor."""
+    cfg = algorithms.configure(presets.quick(), name)
     assert (cfg.target.gamma, cfg.target.value, cfg.policy.place) == (0.5, "max", "argmax")
     assert (cfg.explore.epsilon_primitive, cfg.explore.push_fraction) == ((0.5, 0.1), 0.5)
     assert (cfg.learn.tau, cfg.learn.target_update_period, cfg.learn.actor) == (1.0, 1, False)
-    assert cfg.replay.sampler == "beta"
+
+
+@pytest.mark.parametrize("preset", list(presets.PRESETS))
+def test_vpg_as_its_authors_have_it(preset):
+    """Claim: VPG bootstraps as in its code and replays opposite outcomes, by the power law; all
+    baselines have the critics and the loss of the preset, as the CSAC family has."""
+    cfg, own = presets.get(preset), algorithms.configure(presets.get(preset), "vpg")
+    assert (own.target.bootstrap, own.replay.sampler) == ("continuing", "opposite")
+    assert own.replay.law == (1.0, 2.0)
+    for name in ("csac", "csac_per", "vpg", "reactive", "grasp_only"):
+        learn = algorithms.configure(cfg, name).learn
+        assert (learn.critics, learn.loss) == (cfg.learn.critics, cfg.learn.loss)
+
+
+def test_former_vpg_by_hand():
+    """Claim: `vpg_episodic` ends with the episode and draws by Beta(1, 2), with one critic."""
+    cfg = algorithms.configure(presets.get("fast"), "vpg_episodic")
+    assert (cfg.target.bootstrap, cfg.replay.sampler) == ("episodic", "beta")
     assert cfg.replay.start == cfg.replay.middle == cfg.replay.end == (1.0, 2.0)
+    assert (cfg.learn.critics, cfg.learn.loss) == (1, "huber")
 
 
 def test_unknown_algorithm_names_the_known():

@@ -24,6 +24,8 @@ from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, rotate
 from csac_jax.vision.heightmap import Observation
 
+_QUARTERS = 4  # parts of a batch that are asked for phi one after the other
+
 
 @struct.dataclass
 class Params:
@@ -162,6 +164,47 @@ def best_grasp(state: DenseMaps) -> jax.Array:
     return jnp.where(jnp.any(valid), best, 0.0)
 
 
+def best_grasps(
+    learner: ActorCritic, params: Params, obs: Observation, wanted: jax.Array
+) -> jax.Array:
+    """phi_g [B] of those observations, leaves [B, ...], that are `wanted` [B] bool; else 0.
+
+    These come first, and are passed through the networks by a quarter of the batch at a time, ours;
+    a quarter with none of them costs nothing. Under vmap every one is computed.
+    """
+    num = wanted.shape[0]
+    size = -(-num // _QUARTERS)
+    places = jnp.argsort(~wanted, stable=True).astype(jnp.int32)
+    rows = jnp.pad(places, (0, -num % size), constant_values=num).reshape(-1, size)
+
+    def phi(row: jax.Array) -> jax.Array:
+        part = jax.tree.map(lambda leaf: leaf.at[row].get(mode="clip"), obs)
+        return jax.vmap(best_grasp)(dense_maps(learner, params, part))
+
+    def of_row(row: jax.Array) -> jax.Array:
+        asked = jnp.any(wanted.at[row].get(mode="fill", fill_value=False))
+        return jax.lax.cond(asked, phi, lambda row: jnp.zeros(row.shape), row)
+
+    values = jnp.zeros(num).at[rows].set(jax.lax.map(of_row, rows), mode="drop")
+    return jnp.where(wanted, values, 0.0)
+
+
+def renewed_reward(
+    learner: ActorCritic, params: Params, batch: Transition, next_maps: DenseMaps
+) -> jax.Array:
+    """Rewards [B], eq. 16's label by the networks `params`; as stored if no label is renewed.
+
+    phi(s') is read off `next_maps`, of the same networks; only pushes ask for phi(s).
+    """
+    if batch.push_better is None:
+        return batch.reward
+    cfg, pushed = learner.cfg.reward, batch.action.primitive == Primitive.PUSH
+    before = best_grasps(learner, params, heightmap.unpack(batch.obs), pushed)
+    good = rewards.gains_value(cfg, before, jax.vmap(best_grasp)(next_maps))
+    relabelled = rewards.relabel(cfg, batch.reward, batch.push_better, good)
+    return jnp.where(pushed, relabelled, batch.reward)
+
+
 def next_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """V(s') [] over the primitives that the policy takes, as `target.value` says."""
     return NEXT_VALUES[learner.cfg.target.value](learner, key, state)
@@ -251,7 +294,8 @@ def update_critic(
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(batch.reward.shape[0]))
     values = jax.vmap(next_value, (None, 0, 0))(learner, keys, next_maps)
     values = jnp.clip(values, *learner.bounds)
-    y = losses.td_target(batch.reward, cfg.target.gamma, batch.terminated, values)
+    reward = renewed_reward(learner, state.target, batch, next_maps)
+    y = losses.td_target(reward, cfg.target.gamma, batch.terminated, values)
     obs, critic = heightmap.unpack(batch.obs), state.online.critic
 
     def loss(learned: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:

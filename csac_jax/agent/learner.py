@@ -26,6 +26,7 @@ class Transition:
     reward: jax.Array  # [] float32, R of CSAC eq. 12
     next_obs: PackedObservation
     terminated: jax.Array  # [] bool, a true end: nothing follows
+    push_better: jax.Array | None = None  # [] bool, label in `reward`; None if it is not renewed
 
 
 class UpdateInfo(NamedTuple):

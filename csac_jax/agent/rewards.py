@@ -22,8 +22,18 @@ class ActionResult(NamedTuple):
     blocks_lost: jax.Array  # [] int32, blocks that left the workspace
 
 
+def gains_value(cfg: RewardConfig, before: jax.Array, after: jax.Array) -> jax.Array:
+    """Whether the best grasp's value phi, any shape, has risen by more than the dead band."""
+    return after > before + cfg.dead_band
+
+
+def _eq_16(cfg: RewardConfig, result: ActionResult) -> jax.Array:
+    return gains_value(cfg, result.phi_before, result.phi_after)
+
+
 GOOD_PUSH: dict[str, Callable[[RewardConfig, ActionResult], jax.Array]] = {
-    "value": lambda cfg, result: result.phi_after > result.phi_before + cfg.dead_band,  # eq. 16
+    "value": _eq_16,
+    "renewed": _eq_16,
     "change": lambda cfg, result: result.changed,  # VPG
 }
 
@@ -48,9 +58,20 @@ def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
 
 
 def push_effect(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """I_c []: the second of `push_levels` after a good push by `push_effect`, else the first."""
+    """I_c [] of a push, good or not by `push_effect`."""
+    return push_level(cfg, GOOD_PUSH[cfg.push_effect](cfg, result))
+
+
+def push_level(cfg: RewardConfig, good: jax.Array) -> jax.Array:
+    """I_c of pushes that are `good` or not, any shape: the second or the first of `push_levels`."""
     worse, better = cfg.push_levels
-    return jnp.where(GOOD_PUSH[cfg.push_effect](cfg, result), better, worse)
+    return jnp.where(good, better, worse)
+
+
+def relabel(cfg: RewardConfig, reward: jax.Array, was: jax.Array, good: jax.Array) -> jax.Array:
+    """Rewards of pushes, any shape, whose label is `good` where it `was` another."""
+    change = push_level(cfg, good) - push_level(cfg, was)
+    return reward + scale(cfg, cfg.push_level) * change
 
 
 def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
@@ -69,7 +90,7 @@ def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
 def rewards_of(cfg: RewardConfig, results: ActionResult) -> tuple[jax.Array, jax.Array]:
     """Rewards [E] and which pushes were good [E] bool, of results with leaves [E]."""
     each = jax.vmap(reward, (None, 0))(cfg, results)
-    return each, (results.primitive == Primitive.PUSH) & GOOD_PUSH["value"](cfg, results)
+    return each, (results.primitive == Primitive.PUSH) & _eq_16(cfg, results)
 
 
 def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:

@@ -9,8 +9,9 @@ import tyro
 
 from csac_jax import presets
 from csac_jax.cli import failures, output, parsing, settings
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
+from csac_jax.cli.failures import PROGRAM, BadArgumentsError, as_bad_arguments
 from csac_jax.config import Config
+from csac_jax.io import files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import grid
 
@@ -18,7 +19,11 @@ EXAMPLES = (
     "quick --seeds 8",
     "quick --seeds 4 --vary replay.sampler=uniform,beta --vary learn.tau=0.01,0.02",
     "fast --seeds 4 --devices 4 --init shipped",
+    "paper_small --vary algo=csac,csac_beta --vary task=clear,packed --evaluate 500",
 )
+
+
+STUDY = "study.md"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +35,11 @@ class SweepOptions:
     seeds: int = 4
     """Seeds of every setting: --seed, --seed + 1, ..."""
     vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=A,B,...: a setting, or algo, and the values it takes; once per setting, every
-    combination is run. Colons separate the items of a tuple: replay.end=1:4,1:12."""
+    """NAME=A,B,...: a setting, algo or task (clear, target, packed), and the values it takes; once
+    per setting, every combination is run. Colons separate a tuple's items: replay.end=1:4,1:12."""
+    evaluate: int = 0
+    """Episodes that every final policy is evaluated in; with some, the sweep ends with a table,
+    study.md, and a figure, study.png, in its folder."""
     run_dir: Path | None = None
     """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
     resume: Path | None = None
@@ -78,6 +86,8 @@ def run(arguments: list[str]) -> int:
         raise failures.exists(folder) from None
     if cluster.is_first():
         _report(options, folder, result, round(time.time() - begun, 1))
+        if plan.episodes and result.stopped_by is None:
+            _write_study(folder)
     return 0 if result.stopped_by is None else 128 + result.stopped_by
 
 
@@ -96,6 +106,18 @@ def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) ->
         output.write_result(path, written)
 
 
+def _write_study(folder: Path) -> None:
+    """Writes one table and one figure of the evaluated policies."""
+    from csac_jax.report import charts, comparison, results, study, tables
+
+    report = comparison.build(results.read([folder]))
+    table, command = tables.table_text(study.table(report)), f"{PROGRAM} sweep --resume {folder}"
+    text = f"# Study\n\nWritten by `{command}`.\n\n{tables.EXPLAINED}\n\n{table}\n"
+    files.replace(folder / STUDY, text)
+    charts.save(study.figure(report), (folder / STUDY).with_suffix(".png"))
+    print(f"table and figure: {folder / STUDY}, {(folder / STUDY).with_suffix('.png')}")
+
+
 def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
     """Options and plan of a sweep: from the command line, or from the folder if it is resumed."""
     preset, flags = settings.split(arguments)
@@ -107,7 +129,7 @@ def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
     if options.resume is None:
         settings.check_new("sweep", preset, options.run_dir)
         return options, _new_plan(name, flags, options)
-    given = (preset, options.vary, options.run_dir)
+    given = (preset, options.vary, options.run_dir, options.evaluate)
     if any(given) or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
         raise BadArgumentsError(
             "sweep --resume: a sweep goes on with its own settings; leave all others out"
@@ -147,7 +169,7 @@ def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
     points = [one._replace(cfg=backend.resolve(one.cfg, devices, runs)) for one in points]
     for point in points:
         failures.check_physics(point.cfg, devices)
-    plan = runner.SweepPlan(options.seeds, points)
+    plan = runner.SweepPlan(options.seeds, points, options.evaluate)
     with as_bad_arguments(runner.SweepError, ValueError):
         runner.check_plan(plan)
         runner.groups_of(plan._replace(seeds=1))

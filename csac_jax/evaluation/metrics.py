@@ -13,8 +13,13 @@ target task only the target counts as a block.
 `action_efficiency`            blocks taken / actions (pushes and grasps), over all episodes.
 `action_efficiency_completed`  mean of blocks at the start / actions over the episodes of
                                `completion`: VPG's "action efficiency" (Zeng et al. 2018, sec. VI).
+`action_efficiency_grasps`     mean of lifted / grasps over the episodes with a grasp: CSAC's
+                               "action efficiency" (sec. 4.2). It does not charge for pushes.
+`actions_per_episode`          pushes and grasps / episodes.
+`pushes_per_episode`           pushes / episodes.
 
-The efficiencies are no shares: a grasp that lifts two blocks takes both, so they can exceed 1.
+The first two efficiencies are no shares: a grasp that lifts two blocks takes both, so they can
+exceed 1. A metric that does not charge for pushes never stands alone where methods are compared.
 
 `failures` are shares too, see `_failures`. `outcomes` counts grasps by outcome. `counts` holds
 episodes, blocks, pushes, grasps, and blocks taken and lost.
@@ -29,6 +34,7 @@ from csac_jax.constants import OUTCOMES, Outcome, Primitive
 
 ENDINGS = ("terminated", "action_cap", "no_change_cap", "physics_diverged")  # why an episode ended
 PER_ACTION = ("action_efficiency", "action_efficiency_completed")  # blocks per action, no shares
+PER_EPISODE = ("actions_per_episode", "pushes_per_episode")  # counts, no shares
 NO_CASES = {"value": None, "low": None, "high": None, "n": 0}
 RESAMPLES = 2000
 
@@ -79,23 +85,33 @@ def summarise(episodes: Episodes) -> dict[str, Any]:
     outcomes = np.bincount(episodes.outcome[grasps], minlength=len(OUTCOMES))
     took_all = completed & (taken == blocks)
     rates = blocks[took_all] / np.maximum(actions[took_all], 1)
+    tried, lifted = grasps.sum(axis=1), (grasps & (episodes.outcome == Outcome.LIFTED)).sum(axis=1)
+    pushes = actions - tried
     return {
         "grasp_success": wilson(int(outcomes[Outcome.LIFTED]), int(grasps.sum())),
         "completion": _share(took_all),
         "completion_reachable": _share(completed),
         "action_efficiency": bootstrap_ratio(taken, actions, int(actions.sum())),
-        "action_efficiency_completed": bootstrap_ratio(rates, np.ones_like(rates), rates.size),
+        "action_efficiency_completed": _mean(rates),
+        "action_efficiency_grasps": _mean(lifted[tried > 0] / tried[tried > 0]),
+        "actions_per_episode": _mean(actions),
+        "pushes_per_episode": _mean(pushes),
         "failures": _failures(episodes, grasps),
         "outcomes": {name: int(count) for name, count in zip(OUTCOMES, outcomes, strict=True)},
         "counts": {
             "episodes": int(completed.size),
             "blocks": int(blocks.sum()),
-            "pushes": int((valid & ~grasps).sum()),
+            "pushes": int(pushes.sum()),
             "grasps": int(grasps.sum()),
             "taken": int(taken.sum()),
             "blocks_lost": int(episodes.blocks_lost.sum()),
         },
     }
+
+
+def _mean(values: np.ndarray) -> dict[str, Any]:
+    """The mean of a value per episode [M]."""
+    return bootstrap_ratio(values, np.ones(values.shape), values.size)
 
 
 def _share(true: np.ndarray, of: np.ndarray | None = None) -> dict[str, Any]:

@@ -1,12 +1,19 @@
-"""Means over seeds with bootstrap bands, after Agarwal et al. (arXiv:2108.13264); no JAX."""
+"""Means over seeds with bootstrap bands, after Agarwal et al. (arXiv:2108.13264); no JAX.
+
+A stratum is a task: a sequence with an item per seed, its value or an array of its values on
+several hosts. The bootstrap is hierarchical: it draws seeds within each stratum, then hosts within
+each drawn seed. A seed counts with the mean of its hosts, however many it has.
+"""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
 
 RESAMPLES = 10_000
+
+Stratum = Sequence[Any] | np.ndarray  # [seeds], of numbers or of arrays [hosts]
 
 
 class Band(NamedTuple):
@@ -18,8 +25,14 @@ class Band(NamedTuple):
     n: int  # seeds, the fewest of any stratum
 
 
-def band(strata: Sequence[np.ndarray], seed: int = 0) -> Band:
-    """Mean over strata (tasks) of the IQM over each one's seeds [seeds], drawn within each stratum.
+def by_seed(seeds: Sequence[int], values: Sequence[Any] | np.ndarray) -> list[np.ndarray]:
+    """The stratum of values [n, ...] that belong to seeds [n]: an array [hosts, ...] per seed."""
+    values, owners = np.asarray(values, float), np.asarray(seeds)
+    return [values[owners == seed] for seed in dict.fromkeys(seeds)]
+
+
+def band(strata: Sequence[Stratum], seed: int = 0) -> Band:
+    """Mean over strata (tasks) of the IQM over each one's seeds, drawn within each stratum.
 
     Unlike Agarwal et al. there is no IQM over all strata at once: of four cases it would leave out
     the hardest. Raises ValueError where a stratum is empty.
@@ -28,43 +41,117 @@ def band(strata: Sequence[np.ndarray], seed: int = 0) -> Band:
     if fewest == 0:
         raise ValueError("no values to take a mean of")
     if fewest == 1:
-        return Band(float(_mean_iqm(*strata)), None, None, 1)
+        return Band(float(_mean_iqm(*map(_seed_means, strata))), None, None, 1)
     return _bootstrapped(strata, _mean_iqm, seed)
 
 
-def difference(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], seed: int = 0) -> Band:
+def difference(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> Band:
     """`band` of ours less `band` of theirs, seeds drawn independently; strata in the same order.
-    Raises ValueError where one has fewer than two values."""
-    if min(map(len, (*ours, *theirs)), default=0) < 2:
-        raise ValueError("a difference needs two values of each")
+    Raises ValueError where one has fewer than two seeds."""
+    _check_pair(ours, theirs)
 
-    def gap(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+    def gap(*strata: np.ndarray) -> np.ndarray:
         return _mean_iqm(*strata[: len(ours)]) - _mean_iqm(*strata[len(ours) :])
 
     return _bootstrapped((*ours, *theirs), gap, seed)
 
 
-def _mean_iqm(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Mean over strata of the IQM over the last axis, which SciPy passes by name: without a quarter
-    of the values, rounded down, at either end."""
-    means = [scipy.stats.trim_mean(np.asarray(values, float), 0.25, axis=-1) for values in strata]
+def improvement(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> Band:
+    """Probability that a seed of ours is above one of theirs in a stratum drawn at random.
+
+    P = mean over strata of mean over pairs of (x > y) + (x = y) / 2, Agarwal et al. sec. 4.3: the
+    Mann-Whitney U over the number of pairs. Raises ValueError as `difference`.
+    """
+    _check_pair(ours, theirs)
+
+    def probability(*strata: np.ndarray) -> np.ndarray:
+        pairs = zip(strata[: len(ours)], strata[len(ours) :], strict=True)
+        return np.mean([_above(x, y) for x, y in pairs], axis=0)
+
+    return _bootstrapped((*ours, *theirs), probability, seed)
+
+
+def profile(strata: Sequence[Stratum], thresholds: np.ndarray, seed: int = 0) -> list[Band]:
+    """Share of the seeds above each threshold [m], mean over strata: the performance profile of
+    Agarwal et al. sec. 4.2. Raises ValueError where a stratum is empty."""
+    if min(map(len, strata), default=0) == 0:
+        raise ValueError("no values to take a share of")
+
+    def shares(*strata: np.ndarray) -> np.ndarray:
+        above = [np.mean(values[..., None] > thresholds, axis=-2) for values in strata]
+        return np.mean(above, axis=0)  # [..., m]
+
+    values, fewest = shares(*map(_seed_means, strata)), min(map(len, strata))
+    if fewest == 1:
+        return [Band(float(value), None, None, 1) for value in values]
+    low, high = np.percentile(shares(*_draws(strata, seed)), [2.5, 97.5], axis=0)
+    rows = zip(values.tolist(), low.tolist(), high.tolist(), strict=True)
+    return [Band(*row, fewest) for row in rows]
+
+
+def curves(
+    points: Sequence[tuple[np.ndarray, np.ndarray]], seeds: Sequence[int]
+) -> tuple[np.ndarray, list[Band]]:
+    """IQM and band of the curves of runs with these seeds, at the first one's places x [m] up to
+    the shortest's end. A curve holds its first value before its points, x [n] rising and y [n], and
+    is linear between them."""
+    end = min(x[-1] for x, _ in points)
+    places = points[0][0][points[0][0] <= end]
+    values = np.stack([np.interp(places, x, y) for x, y in points])  # [runs, m]
+    return places, [band([by_seed(seeds, column)]) for column in values.T]
+
+
+def area(x: np.ndarray, y: np.ndarray, end: float) -> float:
+    """Mean of a curve, see `curves`, from 0 to `end`: the area below it over its length."""
+    inner = x[(x > 0.0) & (x < end)]
+    places = np.concatenate([[0.0], inner, [end]])
+    return float(np.trapezoid(np.interp(places, x, y), places) / end)
+
+
+def _check_pair(ours: Sequence[Stratum], theirs: Sequence[Stratum]) -> None:
+    if min(map(len, (*ours, *theirs)), default=0) < 2:
+        raise ValueError("a difference needs two values of each")
+
+
+def _mean_iqm(*strata: np.ndarray) -> np.ndarray:
+    """Mean over strata of the IQM over the last axis: without a quarter of the values, rounded
+    down, at either end."""
+    means = [scipy.stats.trim_mean(values, 0.25, axis=-1) for values in strata]
     return np.mean(means, axis=0)
 
 
-def _bootstrapped(strata: Sequence[np.ndarray], statistic: Callable, seed: int) -> Band:
-    """The statistic of strata [seeds], with its 95 % percentile bootstrap band."""
-    samples = [np.asarray(stratum, float) for stratum in strata]
-    low, high = scipy.stats.bootstrap(
-        samples, statistic, n_resamples=RESAMPLES, method="percentile", rng=seed
-    ).confidence_interval
-    return Band(float(statistic(*samples)), float(low), float(high), min(map(len, samples)))
+def _above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Share [...] of the pairs of x [..., n] and y [..., m] with x above y, ties by half."""
+    x, y = x[..., :, None], y[..., None, :]
+    return np.mean((x > y) + 0.5 * (x == y), axis=(-2, -1))
 
 
-def curves(points: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, list[Band]]:
-    """IQM and band of curves, one per seed, at the first one's places x [m] up to the shortest's
-    end. A curve holds its first value before its points, x [n] rising and y [n], and is linear
-    between them."""
-    end = min(x[-1] for x, _ in points)
-    places = points[0][0][points[0][0] <= end]
-    values = np.stack([np.interp(places, x, y) for x, y in points])  # [seeds, m]
-    return places, [band([column]) for column in values.T]
+def _seed_means(stratum: Stratum) -> np.ndarray:
+    """The mean of each seed's hosts, [seeds]."""
+    return np.array([np.mean(one) for one in stratum], float)
+
+
+def _bootstrapped(strata: Sequence[Stratum], statistic: Callable, seed: int) -> Band:
+    """The statistic of strata, arrays [..., seeds] -> [...], with its 95 % percentile band."""
+    value = statistic(*map(_seed_means, strata))
+    low, high = np.percentile(statistic(*_draws(strata, seed)), [2.5, 97.5])
+    return Band(float(value), float(low), float(high), min(map(len, strata)))
+
+
+def _draws(strata: Sequence[Stratum], seed: int) -> list[np.ndarray]:
+    """Of each stratum RESAMPLES draws, [RESAMPLES, seeds]."""
+    rng = np.random.default_rng(seed)
+    return [_draw(rng, [np.atleast_1d(one) for one in stratum]) for stratum in strata]
+
+
+def _draw(rng: np.random.Generator, hosts: Sequence[np.ndarray]) -> np.ndarray:
+    """Means of drawn hosts of drawn seeds, [RESAMPLES, seeds]; hosts [seeds][hosts of a seed]."""
+    drawn = rng.integers(0, len(hosts), (RESAMPLES, len(hosts)))
+    counts = np.array(list(map(len, hosts)))
+    most = counts.max()
+    table = np.stack([np.resize(np.asarray(one, float), most) for one in hosts])  # cyclic padding
+    if most == 1:
+        return table[drawn, 0]
+    number = counts[drawn][..., None]  # [RESAMPLES, seeds, 1]
+    which = (rng.random((*drawn.shape, most)) * number).astype(np.int64)
+    return np.mean(table[drawn[..., None], which], axis=-1, where=np.arange(most) < number)

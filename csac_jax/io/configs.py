@@ -31,10 +31,18 @@ def from_dict(values: Any) -> Config:
             f"this version reads up to {renames.FORMAT}; update csac-jax"
         )
     try:
-        values = _from_format_1(values) if number == 1 else values
+        values = _from_format_1(values) if number == 1 else _without_constants(values)
     except (TypeError, KeyError, IndexError, AttributeError, OverflowError):
         raise ValueError("a setting of the old format has a value of another kind") from None
+    values["algo"] = algorithm(values)
     return Config(**{name: _validated(name, value) for name, value in values.items()})
+
+
+def algorithm(values: dict[str, Any]) -> Any:
+    """Today's name of the algorithm of a stored config; the default's where it has none."""
+    stored, target = values.get("algo", Config.algo), values.get("target")
+    former, setting = renames.ALGORITHMS.get(str(stored), (stored, ""))
+    return stored if isinstance(target, dict) and setting in target else former
 
 
 def differences(a: Config, b: Config) -> list[str]:
@@ -86,6 +94,18 @@ def _adapter(kind: Any) -> Any:
     import pydantic  # slow
 
     return pydantic.TypeAdapter(kind)
+
+
+def _without_constants(values: dict[str, Any]) -> dict[str, Any]:
+    """The values of a config of format 2 without what is no setting any more."""
+    values = dict(values)
+    for name in renames.CONSTANTS:
+        section, field = name.split(".")
+        if isinstance(stored := values.get(section), dict) and field in stored:
+            now = list(getattr(type(getattr(Config, section)), field))
+            _require_same(name, stored[field], now)
+            values[section] = {key: value for key, value in stored.items() if key != field}
+    return values
 
 
 def _from_format_1(values: dict[str, Any]) -> dict[str, Any]:

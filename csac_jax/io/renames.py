@@ -62,3 +62,10 @@ for name, items in _TUPLES.items():
 
 GONE = {"learn.augment_turn": 0.0, "net.border": False, "policy.mask": True}
 """Settings of format 1 whose part is gone: a file must hold this value."""
+
+CONSTANTS = ("reward.eta",)
+"""Settings of format 2 that are constants now: a file must hold their value."""
+
+ALGORITHMS = {"vpg": ("vpg_episodic", "bootstrap")}
+"""Algorithm that has changed -> its former name now, and the setting of `target` that files which
+mean the former one lack."""

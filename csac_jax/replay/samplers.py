@@ -1,4 +1,5 @@
-"""Which transitions are replayed: uniform (CSAC), prioritised (CSAC-PER), by rank (CSAC-beta).
+"""Which transitions are replayed: uniform (CSAC), prioritised (CSAC-PER), by rank (CSAC-beta), or
+of opposite outcomes (VPG).
 
 Algorithm 1 lines 15-16. A sampler of your own is any object with the methods of `Sampler`.
 """
@@ -10,9 +11,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
-from csac_jax.config import BetaReplay, PrioritisedReplay, UniformReplay
+from csac_jax.config import BetaReplay, OppositeReplay, PrioritisedReplay, UniformReplay
 from csac_jax.replay import ring
 from csac_jax.replay.ring import ReplayState
 
@@ -125,12 +127,51 @@ def beta_slots(
     """
     key_rank, key_ties = jax.random.split(key)
     slots = jnp.arange(values.shape[0], dtype=jnp.int32)
-    descending = -jnp.where(jnp.isnan(values), jnp.inf, values)
     ties = jax.random.bits(key_ties, values.shape)
-    filled_first = jnp.where(slots < size, descending, jnp.inf)
+    filled_first = jnp.where(slots < size, _descending(values), jnp.inf)
     _, _, order = jax.lax.sort((filled_first, ties, slots), num_keys=2)
     rank = (_beta(key_rank, a, b, num) * size.astype(jnp.float32)).astype(jnp.int32)
     return order[jnp.clip(rank, 0, jnp.maximum(size - 1, 0))]
+
+
+def _descending(values: jax.Array) -> jax.Array:
+    """Keys [C] that sort `values` [C] from the largest down, NaN first."""
+    return -jnp.where(jnp.isnan(values), jnp.inf, values)
+
+
+def newest_slots(key: jax.Array, state: ReplayState, among: int, num: int) -> jax.Array:
+    """One slot of each of `num` equal parts of the newest `among` >= `num` transitions: [num]
+    int32, the newest part first; where fewer are stored, the oldest one stands in."""
+    part = jnp.arange(num, dtype=jnp.float32) + jax.random.uniform(key, (num,))
+    age = jnp.minimum(jnp.floor(part * (among / num)).astype(jnp.int32), among - 1)
+    age = jnp.clip(age, 0, jnp.maximum(state.size - 1, 0))
+    return (state.head - 1 - age) % state.priority.shape[0]
+
+
+def opposite_slots(
+    key: jax.Array, state: ReplayState, slots: jax.Array, a: ArrayLike, b: ArrayLike
+) -> tuple[jax.Array, jax.Array]:
+    """For each of `slots` [B] one of the same primitive and the opposite outcome, and whether there
+    is one, [B] bool; else the slot itself. Zeng et al., code: `main.py`, "experience replay".
+
+    An outcome is good if its reward is positive. The rank by priority follows Beta(a, b) within the
+    transitions that fit, rank 0 = largest.
+    """
+    key_rank, key_ties = jax.random.split(key)
+    every = jnp.arange(state.priority.shape[0], dtype=jnp.int32)
+    good = (state.items.reward > 0.0).astype(jnp.int32)
+    kind = 2 * state.items.action.primitive + good
+    group = jnp.where(every < state.size, kind, jnp.int32(4))  # [C]
+    ties = jax.random.bits(key_ties, every.shape)
+    keys = (group, _descending(state.priority), ties, every)
+    *_, order = jax.lax.sort(keys, num_keys=3)
+    sizes = jnp.sum(group[None] == np.arange(5, dtype=np.int32)[:, None], axis=1, dtype=jnp.int32)
+    wanted = jnp.bitwise_xor(group[slots], 1)  # [B]
+    first, count = (jnp.cumsum(sizes) - sizes)[wanted], sizes[wanted]
+    rank = (_beta(key_rank, a, b, len(slots)) * count.astype(jnp.float32)).astype(jnp.int32)
+    found = count > 0
+    fitting = order[jnp.where(found, first + jnp.clip(rank, 0, count - 1), 0)]
+    return jnp.where(found, fitting, slots), found
 
 
 def _beta(key: jax.Array, a: ArrayLike, b: ArrayLike, num: int) -> jax.Array:
@@ -176,6 +217,7 @@ class _Configured(Sampler):
     """A sampler that a replay section describes."""
 
     cfg: Any
+    scenes: int = 1  # transitions that a step adds
 
     def replace_hyperparams(self, cfg: Any) -> Sampler:
         return dataclasses.replace(self, cfg=cfg)
@@ -213,10 +255,32 @@ class Beta(_Configured):
         return Sample(beta_slots(key, values, state.size, a, b, num), jnp.ones(num))
 
 
-BUILDERS = {UniformReplay: Uniform, PrioritisedReplay: Prioritised, BetaReplay: Beta}
+class Opposite(_Configured):
+    """Half of a batch is new, the other half of opposite outcomes; VPG's code.
+
+    VPG trains once on its newest transition and once on one drawn against it. Of larger batches the
+    first half is spread over the newest transitions, at least those of one step. A draw without a
+    counterpart has weight 0.
+    """
+
+    def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
+        key_new, key_opposite = jax.random.split(key)
+        num_new = num - num // 2
+        new = newest_slots(key_new, state, max(self.scenes, num_new), num_new)
+        opposite, found = opposite_slots(key_opposite, state, new[: num // 2], *self.cfg.law)
+        weights = jnp.append(jnp.ones(num_new), found.astype(jnp.float32))
+        return Sample(jnp.append(new, opposite), weights)
 
 
-def make(cfg: Any) -> Sampler:
-    """The sampler of a replay section."""
+BUILDERS = {
+    UniformReplay: Uniform,
+    PrioritisedReplay: Prioritised,
+    BetaReplay: Beta,
+    OppositeReplay: Opposite,
+}
+
+
+def make(cfg: Any, scenes: int = 1) -> Sampler:
+    """The sampler of a replay section, where a step adds a transition of each of `scenes`."""
     kind: Any = BUILDERS[type(cfg)]
-    return kind(cfg)
+    return kind(cfg, scenes)

@@ -15,17 +15,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import tables
 from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped, label
 from csac_jax.report.tables import PAPER_ACTIONS, PAPER_CASES, PAPER_TRAINING
 
 SAMPLERS = ("csac", "csac_per", "csac_beta")
-PALETTE = ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759")
+PALETTE = ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#b07aa1")
 COLOURS = dict(zip(NAMES, PALETTE, strict=True))
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
 _short = functools.partial(label, preset=False, most=3)  # name of a variant in a legend
 LEGEND_WIDTH = 56  # characters
+PROFILED = np.linspace(0.0, 1.0, 101)  # values that a performance profile is drawn over
 INSIDE = 6  # curves whose legend has room among them
 PAPER_MARK: dict[str, Any] = {"marker": "D", "markeredgecolor": "black", "linestyle": ""}
 
@@ -50,6 +52,10 @@ def draw(report: Report) -> Iterator[Chart]:
     for (suite, preset), scores in by_suite.items():
         title = f"The four cases (figure 9), suite {suite}, preset {preset}"
         yield Chart(f"four-cases-{suite}-{preset}", title, _cases(scores))
+        several = [score for score in scores if score.policy == "learned" and score.seeds > 1]
+        if len(several) > 1:
+            title = f"Performance profiles, suite {suite}, preset {preset}"
+            yield Chart(f"profiles-{suite}-{preset}", title, _profiles(several))
 
 
 def _training(curves: Sequence[Curve]) -> dict[str, tuple[str, list[Curve]]]:
@@ -91,14 +97,14 @@ def success(curves: Sequence[Curve]) -> Figure:
 
 def _line(axes: Axes, curve: Curve, colour: Any) -> None:
     actions, bands = curve.points()
-    value, low, high = _percent(bands)
+    value, low, high = percent(bands)
     name = f"{_short(curve.variant)} ({len(curve.runs)})"
     axes.plot(actions, value, color=colour, label=textwrap.fill(name, LEGEND_WIDTH))
     if len(curve.runs) > 1:
         axes.fill_between(actions, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
-def _percent(bands: Sequence[Band | None]) -> np.ndarray:
+def percent(bands: Sequence[Band | None]) -> np.ndarray:
     """Value, low and high, [3, bands], %; NaN where there is none."""
     rows = [(None, None, None) if band is None else band[:3] for band in bands]
     return 100 * np.array(rows, float).reshape(-1, 3).T
@@ -128,7 +134,7 @@ def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> None:
     for index, score in enumerate(scores):
         bands = [score.only(part).band(metric) for part in parts]
         bands.append(score.band(metric) if len(score.parts) == len(parts) else None)
-        value, low, high = _percent(bands)
+        value, low, high = percent(bands)
         error = np.maximum([value - low, high - value], 0.0)
         offset = (index + 0.5) * 0.8 / len(scores) - 0.4
         panel.errorbar(places + offset, value, error, fmt="o", capsize=3, **_style(score, index))
@@ -136,11 +142,28 @@ def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> None:
     panel.set_xlim(-0.5, len(parts) + 0.5)
 
 
+def _profiles(scores: Sequence[Score]) -> Figure:
+    """Share of the seeds above each value, mean of the parts, by variant, arXiv:2108.13264."""
+    figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
+    for panel, (metric, title) in zip(panels, FIGURE_9.items(), strict=True):
+        for index, score in enumerate(scores):
+            value, low, high = percent(statistics.profile(score.strata(metric), PROFILED))
+            style = _style(score, index)
+            panel.plot(100 * PROFILED, value, **style)
+            panel.fill_between(100 * PROFILED, low, high, color=style["color"], alpha=0.15)
+        panel.set(xlabel=f"{title}, %", xlim=(0, 100), ylim=(0, 101))
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("seeds above, %")
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, fontsize="small", loc="outside lower center", ncols=2)
+    return figure
+
+
 def _style(score: Score, index: int) -> dict[str, Any]:
     """Name and colour of a variant's marks."""
     variant = score.variant
     name = _short(variant) if score.policy == "learned" else score.policy
-    name = f"{name}, {score.physics}, {score.robot} ({max(map(len, score.parts.values()))})"
+    name = f"{name}, {score.physics}, {score.robot} ({score.most_runs})"
     known = variant.unchanged and variant.algo in COLOURS
     colour = COLOURS[variant.algo] if known else plt.get_cmap("tab20")(index)
     return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}

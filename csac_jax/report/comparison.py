@@ -1,7 +1,7 @@
 """Recorded runs and evaluations grouped over their seeds, and how variants differ."""
 
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ NAMES = {
     "csac": "CSAC",
     "csac_per": "CSAC-PER",
     "csac_beta": "CSAC-beta",
+    "vpg_episodic": "VPG, episodic",
 }
 
 
@@ -33,13 +34,39 @@ class Curve(NamedTuple):
         return sorted({int(run.actions[-1]) for run in self.runs})
 
     @property
-    def last(self) -> np.ndarray:
-        """Success over the last grasps of each run, wherever it ends, [seeds]."""
-        return np.array([run.success[-1] for run in self.runs])
+    def seeds(self) -> list[int]:
+        """The seed of each run."""
+        return seeds_of(self.runs)
+
+    @property
+    def final(self) -> list[np.ndarray]:
+        """Success over the last grasps of the runs, wherever they end, by seed."""
+        return self.by_seed([run.success[-1] for run in self.runs])
+
+    @property
+    def area(self) -> list[np.ndarray]:
+        """Area under the curve of success over its length, up to where the shortest run ends."""
+        end = self.ends[0]
+        return self.by_seed([statistics.area(run.actions, run.success, end) for run in self.runs])
+
+    def by_seed(self, values: Sequence[float] | np.ndarray) -> list[np.ndarray]:
+        """Values of the runs as a stratum: an array [hosts] per seed."""
+        return statistics.by_seed(self.seeds, values)
+
+    def rate(self, above: Sequence[str], below: Sequence[str]) -> Band | None:
+        """Of all training together, sum of these totals over sum of those; None where a run has
+        not recorded them."""
+        if not all(run.totals.keys() >= {*above, *below} for run in self.runs):
+            return None
+        over, under = (
+            np.array([sum(run.totals[name] for name in names) for run in self.runs])
+            for names in (above, below)
+        )
+        return statistics.band([self.by_seed(over / under)]) if under.all() else None
 
     def points(self) -> tuple[np.ndarray, list[Band]]:
         """Actions [m], up to where the shortest run ends, and the success there."""
-        return statistics.curves([(run.actions, run.success) for run in self.runs])
+        return statistics.curves([(run.actions, run.success) for run in self.runs], self.seeds)
 
 
 class Score(NamedTuple):
@@ -59,6 +86,16 @@ class Score(NamedTuple):
         """Physics, robot and seed of the evaluation."""
         return f"{self.physics}, {self.robot}, {self.seed}"
 
+    @property
+    def most_runs(self) -> int:
+        """Evaluations of the part that has most."""
+        return max(map(len, self.parts.values()))
+
+    @property
+    def seeds(self) -> int:
+        """Seeds of the part that has fewest."""
+        return min(len(set(seeds_of(runs))) for runs in self.parts.values())
+
     def only(self, *parts: str) -> "Score":
         """The score in those of these parts that it has, in their order."""
         return self._replace(parts={name: self.parts[name] for name in parts if name in self.parts})
@@ -70,17 +107,36 @@ class Score(NamedTuple):
 
     def band(self, metric: str) -> Band | None:
         """Mean over parts of the IQM over runs, a single value as it is; None without cases."""
-        strata = self.strata(metric)
-        if [len(runs) for runs in strata] == [1]:
-            return Band._make((*strata[0][0], 1))
-        fewest = min(map(len, strata), default=0)
-        return statistics.band([runs[:, 0] for runs in strata]) if fewest else None
+        found = [_with_cases(runs, metric) for runs in self.parts.values()]
+        if [len(runs) for runs in found] == [1]:
+            share = found[0][0].metrics[metric]
+            return Band(share["value"], share["low"], share["high"], 1)
+        return statistics.band(self.strata(metric)) if all(found) else None
 
-    def strata(self, metric: str) -> list[np.ndarray]:
-        """Of each part value, low and high of the runs that have any cases, [runs, 3]."""
-        found = [[one.metrics.get(metric, {}) for one in runs] for runs in self.parts.values()]
-        rows = [[[e["value"], e["low"], e["high"]] for e in runs if e.get("n")] for runs in found]
-        return [np.array(runs, float).reshape(-1, 3) for runs in rows]
+    def strata(self, metric: str) -> list[list[np.ndarray]]:
+        """Of each part the values of the runs that have any cases: an array [hosts] per seed."""
+        found = [_with_cases(runs, metric) for runs in self.parts.values()]
+        return [
+            statistics.by_seed(seeds_of(runs), [one.metrics[metric]["value"] for one in runs])
+            for runs in found
+        ]
+
+
+def seeds_of(runs: Sequence[RecordedRun | Evaluation]) -> list[int]:
+    """The training's seed of each; the first records name none."""
+    return [one.config.get("seed", 0) for one in runs]
+
+
+def _with_cases(runs: Sequence[Evaluation], metric: str) -> list[Evaluation]:
+    return [one for one in runs if one.metrics.get(metric, {}).get("n")]
+
+
+class Lead(NamedTuple):
+    """How far CSAC-beta is ahead of another variant in training."""
+
+    final: Band  # difference of the success at the end
+    area: Band  # difference of the area under the curve
+    improvement: Band  # probability that a seed of CSAC-beta ends above one of the other
 
 
 class Report(NamedTuple):
@@ -145,36 +201,44 @@ def _pairs(items: Iterable[Any], alike: Callable[[Any], Any]) -> Iterator[tuple[
         yield from ((ours, item) for item in group if betas and item is not ours)
 
 
-def gaps(report: Report) -> Iterator[tuple[Score, Score, dict[str, Band]]]:
-    """CSAC-beta, another variant measured in the same scenes, and ours less theirs by metric: in
-    each part and in all parts of which both have several seeds."""
+def pairs(report: Report) -> Iterator[tuple[Score, Score]]:
+    """CSAC-beta and another variant measured in the same scenes: in each part and in all parts of
+    which both have several seeds."""
     learned = [score for score in report.scores if score.policy == "learned"]
-    several = [s.only(*(part for part in s.parts if len(s.parts[part]) > 1)) for s in learned]
+    several = [
+        s.only(*(part for part, runs in s.parts.items() if len(set(seeds_of(runs))) > 1))
+        for s in learned
+    ]
     alike = operator.attrgetter("variant.preset", "suite", "world", "episodes")
     for ours, other in _pairs([score for score in several if score.parts], alike):
         theirs = other.only(*ours.parts)
-        for a, b in zip(ours.only(*theirs.parts).split(), theirs.split(), strict=True):
-            yield a, b, _difference(a, b)
+        yield from zip(ours.only(*theirs.parts).split(), theirs.split(), strict=True)
 
 
-def _difference(ours: Score, theirs: Score) -> dict[str, Band]:
-    """In every metric that all evaluations have."""
-    bands = {}
-    for metric in recorded.METRICS:
-        a, b = ([runs[:, 0] for runs in score.strata(metric)] for score in (ours, theirs))
-        if min(map(len, (*a, *b))) > 1:
-            bands[metric] = statistics.difference(a, b)
-    return bands
-
-
-def leads(report: Report) -> dict[Variant, Band]:
-    """Final success of CSAC-beta less that of each variant trained as long in the same scenes and
-    task; only of several seeds of both."""
+def compared(
+    ours: Score, theirs: Score, compare: Callable[..., Band], metrics: Iterable[str]
+) -> dict[str, Band]:
+    """By metric, `statistics.difference` or `improvement` where all have several seeds."""
+    strata = {metric: (ours.strata(metric), theirs.strata(metric)) for metric in metrics}
     return {
-        theirs.variant: statistics.difference([ours.last], [theirs.last])
-        for ours, theirs in _pairs(report.curves, _trained)
-        if min(len(ours.runs), len(theirs.runs)) > 1
+        metric: compare(a, b) for metric, (a, b) in strata.items() if min(map(len, (*a, *b))) > 1
     }
+
+
+def leads(report: Report) -> dict[Variant, Lead]:
+    """How far CSAC-beta is ahead of each variant trained as long in the same scenes and task; only
+    of several seeds of both."""
+    return {
+        theirs.variant: _lead(ours, theirs)
+        for ours, theirs in _pairs(report.curves, _trained)
+        if min(len(ours.final), len(theirs.final)) > 1
+    }
+
+
+def _lead(ours: Curve, theirs: Curve) -> Lead:
+    final = [ours.final], [theirs.final]
+    area = statistics.difference([ours.area], [theirs.area])
+    return Lead(statistics.difference(*final), area, statistics.improvement(*final))
 
 
 def _trained(curve: Curve) -> tuple[Any, ...]:

@@ -28,8 +28,13 @@ METRICS = {
     "completion_reachable": "completion, reachable blocks",
     "action_efficiency": "blocks / actions",
     "action_efficiency_completed": "blocks / actions, completed episodes",
+    "action_efficiency_grasps": "lifted / grasps, mean of episodes",
+    "actions_per_episode": "actions / episode",
+    "pushes_per_episode": "pushes / episode",
 }
 """Metric -> its title in tables; `evaluation.metrics` defines them."""
+TOTALS = ("pushes", "grasps", "lifted", "cleared", "terminated", "truncated")
+"""Sums of a training's log; of `outcomes` the lifts."""
 
 Json = dict[str, Any]
 
@@ -39,7 +44,8 @@ _SHARE = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int}
 _CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "robot": str}}
 _RECORD = {"device": _TEXT, "versions": (dict, type(None)), "commit": _TEXT}
 _RECORD |= {"wall_seconds": _NUMBER}
-_METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": {"episodes": int}, "failures": {}}
+_COUNTS = dict.fromkeys(("episodes", "pushes", "grasps"), int)
+_METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": _COUNTS, "failures": {}}
 _EVALUATION = {"policy": str, "suite": str, "seed": int, "seconds": _NUMBER, "parts": {}}
 
 
@@ -67,6 +73,7 @@ class RecordedRun(NamedTuple):
     grasps: np.ndarray  # [n] at most GRASP_WINDOW
     seconds: np.ndarray  # [n] spent training since the run began, without compilation
     record: Json  # wall_seconds; device, versions and commit if `train` wrote them
+    totals: dict[str, int]  # sums over the run, those of TOTALS that were recorded
 
 
 class Evaluation(NamedTuple):
@@ -160,7 +167,15 @@ def _add_run(path: Path, results: Results) -> None:
         names = ("actions", "grasp_success", "grasps_counted", "seconds")
         columns = [np.array([line[name] for line in lines], float) for name in names]
         record = {"wall_seconds": float(columns[-1][-1]), **_record(path.parent, config)}
-        results.runs.append(RecordedRun._make((path, config, variant(config), *columns, record)))
+        fields = (path, config, variant(config), *columns, record, _totals(every))
+        results.runs.append(RecordedRun._make(fields))
+
+
+def _totals(lines: Sequence[Json]) -> dict[str, int]:
+    """What all lines together count: of TOTALS what every line has."""
+    rows = [line | {"lifted": (line.get("outcomes") or {}).get("lifted")} for line in lines]
+    kept = [name for name in TOTALS if all(type(row.get(name)) is int for row in rows)]
+    return {name: sum(row[name] for row in rows) for name in kept}
 
 
 def _record(folder: Path, config: Json) -> Json:
@@ -195,7 +210,21 @@ def _evaluations(path: Path) -> list[Evaluation]:
                 raise ValueError("a share lacks its interval")
     config, policy, seed = content["config"], content["policy"], content.get("seed", 0)
     asked = path, config, variant(config), policy, suite
-    return [Evaluation(*asked, part, seed, found, record) for part, found in parts.items()]
+    return [
+        Evaluation(*asked, part, seed, _per_episode(found) | found, record)
+        for part, found in parts.items()
+    ]
+
+
+def _per_episode(metrics: Json) -> Json:
+    """Actions and pushes per episode by the counts alone, without intervals: older records have
+    nothing else."""
+    counts = metrics.get("counts", {})
+    if not (counts.keys() >= _COUNTS.keys() and counts["episodes"] > 0):
+        return {}
+    n, pushes = counts["episodes"], counts["pushes"]
+    sums = {"actions_per_episode": pushes + counts["grasps"], "pushes_per_episode": pushes}
+    return {name: {"value": s / n, "low": None, "high": None, "n": n} for name, s in sums.items()}
 
 
 def _without_evaluation(results: Results) -> Iterator[str]:
@@ -210,7 +239,7 @@ def _without_evaluation(results: Results) -> Iterator[str]:
 
 def variant(config: Json) -> Variant:
     """What a recorded config is a variant of. Settings that the config lacks are passed over."""
-    preset, algo = config.get("preset", ""), config.get("algo", "csac_beta")
+    preset, algo = config.get("preset", ""), configs.algorithm(config)
     base: Json = {}
     with contextlib.suppress(ValueError):  # a name that is no more
         base = configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))

@@ -8,10 +8,20 @@ import numpy as np
 
 from csac_jax.constants import GRASP_WINDOW
 from csac_jax.evaluation import statistics
-from csac_jax.evaluation.metrics import PER_ACTION
+from csac_jax.evaluation.metrics import PER_ACTION, PER_EPISODE
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import results as recorded
-from csac_jax.report.comparison import Curve, Report, Score, gaps, label, leads
+from csac_jax.report.comparison import (
+    Curve,
+    Lead,
+    Report,
+    Score,
+    compared,
+    label,
+    leads,
+    pairs,
+    seeds_of,
+)
 from csac_jax.report.results import Evaluation, RecordedRun, Variant
 
 PAPER_TRAINING = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
@@ -23,14 +33,19 @@ PAPER_CASES = {
 }
 """Means of the four cases, figure 9 (sec. 4.4 and 5). The text gives no other numbers."""
 GOOD = 0.9  # grasp success whose time is reported
-LAST = f"success, last {GRASP_WINDOW} grasps"
-SUMMARY = ("method", "runs", LAST, "paper", "training time")  # columns of the training table
+LAST = "final success"
+AREA = "area under the curve"
+SUMMARY = ("method", "runs", LAST, "paper", AREA, "training time")  # of the training table
+RATES = {
+    "blocks / action": (("cleared",), ("pushes", "grasps"), "action_efficiency"),
+    "lifted / grasp": (("lifted",), ("grasps",), "grasp_success"),
+    "actions / episode": (("pushes", "grasps"), ("terminated", "truncated"), "actions_per_episode"),
+    "pushes / episode": (("pushes",), ("terminated", "truncated"), "pushes_per_episode"),
+}
+"""Column of the training table -> totals above and below, and the metric with its unit."""
+IMPROVED = tuple(name for name in recorded.METRICS if name not in PER_EPISODE)  # more is better
 
 Table = list[dict[str, str]]  # rows; column -> cell
-
-
-def _seeds(runs: Sequence[RecordedRun | Evaluation]) -> list[int]:
-    return sorted(one.config.get("seed", 0) for one in runs)
 
 
 def _time_to_good(run: RecordedRun) -> float | None:
@@ -48,28 +63,31 @@ def as_json(report: Report) -> dict[str, Any]:
         "differences": [
             {"ours": _named(ours.variant), "theirs": _named(theirs.variant)}
             | {"suite": ours.suite, "parts": list(ours.parts), "world": ours.world}
-            | {"metrics": _plain(bands)}
-            for ours, theirs, bands in gaps(report)
+            | {"metrics": _plain(compared(ours, theirs, statistics.difference, recorded.METRICS))}
+            | {"improvement": _plain(compared(ours, theirs, statistics.improvement, IMPROVED))}
+            for ours, theirs in pairs(report)
         ],
         "provenance": provenance(report),
         "notes": report.notes,
     }
 
 
-def _curve_json(curve: Curve, ahead: Band | None) -> recorded.Json:
+def _curve_json(curve: Curve, ahead: Lead | None) -> recorded.Json:
     actions, success = curve.points()
     return _named(curve.variant) | {
-        "seeds": _seeds(curve.runs),
+        "seeds": sorted(curve.seeds),
         "seconds_to_90": [_time_to_good(run) for run in curve.runs],
         "seconds": [float(run.seconds[-1]) for run in curve.runs],
         "actions": actions.tolist(),
         "success": [band._asdict() for band in success],
-        **_plain({"final": statistics.band([curve.last]), "ahead": ahead}),
+        **_plain({"final": statistics.band([curve.final]), "area": statistics.band([curve.area])}),
+        "ahead": ahead and _plain(ahead._asdict()),
+        "rates": _plain({name: curve.rate(*of) for name, (*of, _) in RATES.items()}),
     }
 
 
 def _score_json(score: Score, part: str) -> recorded.Json:
-    fields = score._asdict() | {"part": part, "seeds": _seeds(score.parts[part])}
+    fields = score._asdict() | {"part": part, "seeds": sorted(seeds_of(score.parts[part]))}
     del fields["parts"]
     metrics = _plain({name: score.only(part).band(name) for name in recorded.METRICS})
     return _named(fields.pop("variant")) | fields | {"metrics": metrics}
@@ -92,6 +110,7 @@ def tables(report: Report) -> dict[str, Table]:
         "Training": trained,
         "Evaluation": evaluation(report),
         "Differences": differences(report),
+        "Probability of improvement": improvements(report),
         "Failures": failures(report),
         "Provenance": provenance(report),
     }
@@ -103,14 +122,22 @@ def training(report: Report) -> Table:
     rows, ahead = [], leads(report)
     for curve in report.curves:
         mark = PAPER_TRAINING.get(curve.variant.algo) if curve.variant.unchanged else None
+        lead = ahead.get(curve.variant)
         rows.append(
             {
                 "method": label(curve.variant),
                 "runs": str(len(curve.runs)),
-                "seeds": ", ".join(map(str, dict.fromkeys(_seeds(curve.runs)))),
+                "seeds": ", ".join(map(str, sorted(set(curve.seeds)))),
                 "actions": _range(curve.ends, ","),
-                LAST: shown(statistics.band([curve.last])),
-                "CSAC-beta ahead by": shown(ahead.get(curve.variant), "+"),
+                LAST: shown(statistics.band([curve.final])),
+                "CSAC-beta ahead by": shown(lead and lead.final, "+"),
+                "P(CSAC-beta ahead)": shown(lead and lead.improvement),
+                AREA: shown(statistics.band([curve.area])),
+                "CSAC-beta's area ahead by": shown(lead and lead.area, "+"),
+                **{
+                    name: shown(curve.rate(*sums), metric=metric)
+                    for name, (*sums, metric) in RATES.items()
+                },
                 "paper": "-" if mark is None else f"{100 * mark:.0f} %",
                 "time to 90 %": _times([_time_to_good(run) for run in curve.runs]),
                 "training time": _times([float(run.seconds[-1]) for run in curve.runs]),
@@ -136,8 +163,8 @@ def evaluation(report: Report) -> Table:
 
 
 def _evaluation_row(score: Score) -> dict[str, str]:
-    runs = [len(runs) for runs in score.parts.values()]
-    counts = {"runs": str(max(runs)), "episodes": str(score.episodes * sum(runs))}
+    runs = sum(map(len, score.parts.values()))
+    counts = {"runs": str(score.most_runs), "episodes": str(score.episodes * runs)}
     return _first_cells(score) | counts | _metric_cells(score.band)
 
 
@@ -149,11 +176,26 @@ def _metric_cells(band: Callable[[str], Band | None], sign: str = "") -> dict[st
 def differences(report: Report) -> Table:
     """By how many points CSAC-beta is ahead, a row per other variant and part."""
     return [
-        {"ahead": label(ours.variant), "of": label(theirs.variant)}
-        | _place_cells(ours)
-        | _metric_cells(bands.get, "+")
-        for ours, theirs, bands in gaps(report)
+        _pair_cells(ours, theirs)
+        | _metric_cells(compared(ours, theirs, statistics.difference, recorded.METRICS).get, "+")
+        for ours, theirs in pairs(report)
     ]
+
+
+def improvements(report: Report) -> Table:
+    """How probably a seed of CSAC-beta is ahead of one of another variant, row by row as in
+    `differences`."""
+    rows = []
+    for ours, theirs in pairs(report):
+        bands = compared(ours, theirs, statistics.improvement, IMPROVED)
+        cells = {recorded.METRICS[name]: shown(bands.get(name)) for name in IMPROVED}
+        rows.append(_pair_cells(ours, theirs) | cells)
+    return rows
+
+
+def _pair_cells(ours: Score, theirs: Score) -> dict[str, str]:
+    names = {"ahead": label(ours.variant), "of": label(theirs.variant)}
+    return names | _place_cells(ours)
 
 
 def failures(report: Report) -> Table:
@@ -220,18 +262,29 @@ def _wall_time(record: recorded.Json) -> str:
 
 
 def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
-    """A band as blocks per action or in per cent; with a sign, as a difference in points."""
+    """A band as blocks per action, counts per episode or in per cent; with a sign, as a difference
+    in points."""
     if band is None:
         return "-"
-    scale, digits, unit = (1, 3, "") if metric in PER_ACTION else (100, 1, "" if sign else " %")
+    if metric in (*PER_ACTION, *PER_EPISODE):
+        scale, digits, unit = 1, 3 if metric in PER_ACTION else 2, ""
+    else:
+        scale, digits, unit = 100, 1, "" if sign else " %"
     value, *ends = (f"{scale * x:{sign}.{digits}f}" for x in band[:3] if x is not None)
     return f"{value}{unit} ({' to '.join(ends)})" if ends else f"{value}{unit}"
 
 
 EXPLAINED = (
-    "Several runs: the interquartile mean, and in brackets its 95 % band (bootstrap over seeds). "
+    "Several runs: the interquartile mean, and in brackets its 95 % band. The bootstrap is "
+    "hierarchical: it draws seeds, then the hosts that a drawn seed ran on. "
     "One run: its value; where it was evaluated, the 95 % interval of its episodes. "
+    f"Final success: over the last {GRASP_WINDOW} grasps. "
+    "Area under the curve: of that success over all actions, divided by their number. "
+    "Rates in the training table are over all of training. "
     "Differences: of interquartile means, in points of per cent. "
+    "Probability of improvement: that a seed of one method is above one of the other. "
+    "Lifted / grasps, mean of episodes, is the paper's action efficiency; it charges nothing for "
+    "pushes. "
     "`csac_jax/evaluation/metrics.py` defines the metrics. "
     "Paper: numbers of CSAC's text (sec. 4.3, 4.4 and 5), for one scene and 2,500 actions. "
     "Only the preset `paper` keeps to that protocol."

@@ -106,7 +106,7 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
         _add_parts(spec, body, scene.slots[slot])
-    if sim.physics != "mjx":  # which reads its contacts instead
+    if sim.physics == "c":  # the others read their contacts instead
         _add_touch_sensors(spec, len(scene.slots))
     spec.option.timestep = sim.timestep
     spec.option.iterations = sim.iterations

@@ -1,7 +1,6 @@
 """Primitives in MJX: a fixed-length scan of physics steps per scene; callers vmap."""
 
 import dataclasses
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +24,6 @@ class MjxPhysics:
     cfg: SimConfig
     model: mjx.Model
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
-    touch: Callable[[World, mjx.Data], tuple[jax.Array, jax.Array]]
-    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing,
-    [] bool."""
-    step: Callable[[mjx.Model, mjx.Data], mjx.Data] = mjx.step
 
     def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
         """See `physics.Physics`. Matrix products keep float32: a GPU would cut them to 10 bits."""
@@ -36,9 +31,9 @@ class MjxPhysics:
         initial = initial_data(self, scene, joints)
 
         def substep(data, control):
-            data = self.step(model, data.replace(ctrl=control))
+            data = mjx_step.step(model, data.replace(ctrl=control))
             data = _restrain(world, ~scene.in_play, initial, data)
-            touching, overflow = self.touch(world, data)
+            touching, overflow = _touch(world, data)
             rise = data.qpos[world.block_qpos[:, 2]] - scene.position[:, 2]
             gap = 2.0 * data.qpos[world.robot_qpos[-2]]
             return data, Substep(touching, rise, gap, overflow)
@@ -53,7 +48,7 @@ class MjxPhysics:
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
     """Physics of a world, MJX with its JAX implementation."""
     mjx_model, data = mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax")
-    return MjxPhysics(world, cfg, mjx_model, data, _contact_touch, mjx_step.step)
+    return MjxPhysics(world, cfg, mjx_model, data)
 
 
 def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
@@ -63,12 +58,11 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
     added_mass = jnp.sum(fields.mass - model.body_mass[bodies])
     subtree = model.body_subtreemass.at[0].add(added_mass)
-    if model.impl == mjx.Impl.JAX:
-        meshes = [  # None for a mesh that no slot uses; `face` repeats the corners of the faces
-            mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
-            for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
-        ]
-        model = model.replace(_impl=model._impl.replace(mesh_convex=tuple(meshes)))
+    meshes = [  # None for a mesh that no slot uses; `face` repeats the corners of the faces
+        mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
+        for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
+    ]
+    model = model.replace(_impl=model._impl.replace(mesh_convex=tuple(meshes)))
     return model.replace(
         geom_size=model.geom_size.at[geoms].set(fields.size),
         geom_pos=model.geom_pos.at[geoms].set(fields.centre),
@@ -102,8 +96,9 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
     return data.replace(qpos=data.qpos.at[address].set(qpos), qvel=data.qvel.at[dofs].set(qvel))
 
 
-def _contact_touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """See `MjxPhysics.touch`; contacts may be missing once all slots are in use."""
+def _touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
+    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing,
+    [] bool: once all slots are in use."""
     active, pair = data._impl.contact.dist < 0.0, data._impl.contact.geom  # [C], [C, 2]
     is_pad = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1)
     is_hand = is_pad & active[None]  # [3, C]

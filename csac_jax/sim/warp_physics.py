@@ -1,51 +1,114 @@
-"""Primitives in MJX with its Warp implementation: the scan of `mjx_physics`, other contacts.
+"""Primitives on MuJoCo Warp: all substeps of many scenes are one call, see `warp_action`.
 
-All scenes share one array of contacts, which a scene cannot read: touch sensors tell which block
-the hand touches. Meshes have one size in all scenes. Results are not repeatable bit for bit.
+Meshes have one size in all scenes. Results are not repeatable bit for bit.
 """
 
+import dataclasses
 import functools
+import importlib.util
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from csac_jax.config import WARP_WORLDS, SimConfig
+from csac_jax.config import MESH_KINDS, SimConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene.model import HAND_GEOMS, World
-from csac_jax.sim.mjx_physics import MjxPhysics
-from csac_jax.sim.quiet_mjx import mjx
+from csac_jax.scene import layout
+from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import World, scene_fields
+from csac_jax.sim.outcome import Trace
+from csac_jax.sim.primitives import JointTrajectory
 
 
-def make(world: World, cfg: SimConfig) -> MjxPhysics:
+@dataclasses.dataclass(frozen=True, eq=False)
+class WarpPhysics:
+    """A world on Warp; every batch of scenes lies on the device once it has been used."""
+
+    world: World
+    simulator: Any
+    """`warp_action.Simulator`"""
+
+    @functools.cached_property
+    def _simulate(self) -> Callable[[dict[str, jax.Array]], dict[str, jax.Array]]:
+        return _flat_vmap(lambda inputs: self.simulator(**inputs))
+
+    def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+        """See `physics.Physics`."""
+        world = self.world
+        scene = layout.park(scene, scene.in_play)  # where nothing meets them
+        inputs = {**_model_fields(world, scene), **_start(world, scene, joints)}
+        inputs |= {"control": joints.control, "in_play": scene.in_play}
+        results = self._simulate(jax.tree.map(lambda leaf: leaf[None], inputs))
+        results = jax.tree.map(lambda leaf: leaf[0], results)
+        # XLA runs a call twice on a GPU if a scan stores one of its results unchanged.
+        results["contact_overflow"] = results["contact_overflow"].astype(jnp.int32)
+        pose, velocity = results.pop("qpos")[world.block_qpos], results.pop("qvel")
+        moved = scene.replace(
+            position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity[world.block_dofs]
+        )
+        return moved, Trace(**results)
+
+
+def make(world: World, cfg: SimConfig) -> WarpPhysics:
     """Physics of a world on Warp. Raises SceneError where Warp is not installed."""
-    try:
-        import warp
-    except ImportError:
-        raise SceneError(
-            "sim.physics: warp is an extra; run: pip install 'csac-jax[warp]'"
-        ) from None
-    from mujoco.mjx.third_party.mujoco_warp import OverflowType
-    from mujoco.mjx.warp.types import GraphMode
+    if importlib.util.find_spec("warp") is None:
+        raise SceneError("sim.physics: warp is an extra; run: pip install 'csac-jax[warp]'")
+    from csac_jax.sim import warp_action
 
-    warp.config.log_level = warp.LOG_WARNING  # not a line for each of its kernels
-    # On CUDA, MJX's own choice records a new graph for every set of buffers from XLA. A training
-    # step has many: 1,024 scenes took 3.7 s an action. One graph with its own buffers takes 0.52 s
-    # (H200, `experiments/bench`).
-    graph_mode = GraphMode.WARP_STAGED if jax.default_backend() == "gpu" else None
-    model = mjx.put_model(world.model, impl="warp", graph_mode=graph_mode)
-    model = model.tree_replace({"opt._impl.warn_overflow": 0})
-    data = mjx.make_data(
-        world.model,
-        impl="warp",
-        naconmax=WARP_WORLDS * cfg.contacts,
-        njmax=4 * cfg.contacts + 32,  # the edges of friction pyramids; joints and limits
-    )
-    stopped_early = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS  # the solver, by design
-    lost_contacts = int(OverflowType.ALL & ~stopped_early)
-    return MjxPhysics(world, cfg, model, data, functools.partial(_sensor_touch, lost_contacts))
+    return WarpPhysics(world, warp_action.Simulator(world, cfg))
 
 
-def _sensor_touch(lost_contacts: int, world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """See `MjxPhysics.touch`; the bits `lost_contacts` tell that an array of contacts ran over."""
-    touching = data.sensordata.reshape(len(HAND_GEOMS), len(world.slots)) > 0.0
-    return touching, jnp.any((data._impl.overflow & lost_contacts) != 0)
+def _flat_vmap(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A function of leaves [E, ...], whose vmap gives it leaves [S * E, ...]."""
+    flat = jax.custom_batching.custom_vmap(function)
+
+    @flat.def_vmap
+    def _(size: int, batched: Any, inputs: Any) -> tuple[Any, Any]:
+        def join(leaf: jax.Array, is_batched: bool) -> jax.Array:
+            every = leaf if is_batched else jnp.broadcast_to(leaf[None], (size, *leaf.shape))
+            return every.reshape(-1, *every.shape[2:])
+
+        results = flat(jax.tree.map(join, inputs, *batched))
+        split = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), results)
+        return split, jax.tree.map(lambda _: True, split)
+
+    return flat
+
+
+def _model_fields(world: World, scene: Scene) -> dict[str, jax.Array]:
+    """The model's fields with this scene's block sizes, masses and frictions."""
+    model, fields = world.model, scene_fields(world, scene)
+    geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
+    is_mesh = np.array([kind in MESH_KINDS for kind in world.slots])[world.parts.slot]
+    bounds = jnp.stack([jnp.zeros_like(fields.size), fields.size], axis=1)  # centre, half size
+    bounds = jnp.where(is_mesh[:, None, None], model.geom_aabb[geoms].reshape(-1, 2, 3), bounds)
+    mass = jnp.asarray(model.body_mass, jnp.float32)
+    added_mass = jnp.sum(fields.mass - mass[bodies])
+    subtree = jnp.asarray(model.body_subtreemass, jnp.float32).at[0].add(added_mass)
+
+    def base(name: str) -> jax.Array:
+        return jnp.asarray(getattr(model, name), jnp.float32)
+
+    return {
+        "geom_size": base("geom_size").at[geoms].set(fields.size),
+        "geom_pos": base("geom_pos").at[geoms].set(fields.centre),
+        "geom_aabb": base("geom_aabb").reshape(-1, 2, 3).at[geoms].set(bounds),
+        "geom_rbound": base("geom_rbound").at[geoms].set(fields.rbound),
+        "geom_friction": base("geom_friction").at[geoms, 0].set(fields.friction),
+        "body_mass": mass.at[bodies].set(fields.mass),
+        "body_subtreemass": subtree.at[bodies].set(fields.mass),
+        "body_inertia": base("body_inertia").at[bodies].set(fields.inertia),
+        "body_ipos": base("body_ipos").at[bodies].set(fields.com),
+        "body_invweight0": base("body_invweight0").at[bodies].set(fields.body_invweight),
+        "dof_invweight0": base("dof_invweight0").at[dofs].set(fields.dof_invweight),
+    }
+
+
+def _start(world: World, scene: Scene, joints: JointTrajectory) -> dict[str, jax.Array]:
+    """The blocks of the scene, and the robot at rest at its first set-point."""
+    poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
+    qpos = jnp.asarray(world.model.qpos0, jnp.float32).at[world.robot_qpos].set(joints.start)
+    qvel = jnp.zeros(world.model.nv).at[world.block_dofs].set(scene.velocity)
+    return {"qpos": qpos.at[world.block_qpos].set(poses), "qvel": qvel}

@@ -10,11 +10,18 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from csac_jax.algorithms import unknown
 from csac_jax.config import ALTERNATIVES, Config, Section
 
 BASE = "base"  # name of the only point where nothing is varied
 LONGEST = 120  # characters of a point's name, which is a folder's
 MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
+TASKS: dict[str, dict[str, Any]] = {
+    "clear": {"task.kind": "clear", "scene.arranged": 0.0},
+    "target": {"task.kind": "target", "scene.arranged": 0.0},
+    "packed": {"task.kind": "clear", "scene.arranged": 1.0},
+}
+"""Values of `--vary task=...`: what is to be done, and in which scenes."""
 _VALUE = re.compile(r"([^./-]|-?\.?\d|-inf)[^/]*")  # a negative number is no flag
 
 
@@ -78,7 +85,7 @@ def kind_of(name: str) -> object:
     """Type of a setting by its dotted name. Raises ValueError for what cannot be varied."""
     if name == "seed":
         raise ValueError("--vary: seeds are varied by --seeds")
-    kinds: dict[str, object] = {"algo": str}
+    kinds: dict[str, object] = {"algo": str, "task": str}
     for section, default in vars(Config()).items():
         if isinstance(default, Section):
             _, alternatives = ALTERNATIVES.get(section, ("", (type(default),)))
@@ -93,7 +100,20 @@ def kind_of(name: str) -> object:
     return kinds[name]
 
 
+def settings_of(name: str, value: Any) -> dict[str, Any]:
+    """The settings that a varied name stands for: those of a task, or itself. Raises ValueError for
+    an unknown task."""
+    if name != "task":
+        return {name: value}
+    if value not in TASKS:
+        raise ValueError(unknown("task", value, TASKS))
+    return TASKS[value]
+
+
 def _flags(name: str, value: str) -> list[str]:
+    if name == "task":
+        settings = settings_of(name, value)
+        return [flag for key, given in settings.items() for flag in _flags(key, str(given))]
     flag = "--" + name.replace("_", "-")
     if kind_of(name) is bool:
         if value not in ("true", "false"):

@@ -3,6 +3,7 @@
 SWEEP/sweep.json                what was asked for; a sweep is resumed from it
 SWEEP/summary.json              grasp success of every point over its seeds, and of every run
 SWEEP/POINT/seed-K/             a run, laid out like one of `train`; its checkpoint comes at the end
+SWEEP/POINT/seed-K/eval.json    its final policy, measured, where the plan has `episodes`
 SWEEP/groups/I/checkpoints/     the state of all runs of group I, until they are done
 SWEEP/groups/I/done             their checkpoints are written
 
@@ -22,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from csac_jax.config import WARP_WORLDS, Config, shown
+from csac_jax.config import Config, shown
 from csac_jax.errors import FailedError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import NO_CASES
@@ -40,6 +41,7 @@ DONE = "done"
 RESERVED = ("groups", PLAN, SUMMARY, "train.json")  # in the sweep's folder
 DIGEST = "sha256"  # key of the plan's own digest
 _NAME = re.compile(rf"[^./\\][^/\\]{{0,{grid.LONGEST - 1}}}")  # of a folder inside the sweep
+MOST_EPISODES = 100_000  # of an evaluation, ours: more is a slip of the pen
 _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
 
 
@@ -52,6 +54,7 @@ class SweepPlan(NamedTuple):
 
     seeds: int
     points: list[SweepPoint]
+    episodes: int = 0  # that every final policy is evaluated in
 
 
 class SweepRun(NamedTuple):
@@ -124,13 +127,13 @@ def read_plan(folder: Path) -> SweepPlan:
         stored = files.read_object(folder / PLAN)
         if stored.pop(DIGEST, None) not in (None, _digest(stored)):  # old ones have none
             raise ValueError("it was changed after it had been written")
-        if stored.keys() != {"seeds", "settings"}:
+        if stored.keys() - {"episodes"} != {"seeds", "settings"}:
             raise ValueError("it is no plan of a sweep")
         points = [
             SweepPoint(point["name"], point["values"], configs.from_dict(point["config"]))
             for point in stored["settings"]
         ]
-        plan = SweepPlan(stored["seeds"], points)
+        plan = SweepPlan(stored["seeds"], points, stored.get("episodes", 0))
         check_plan(plan)
         _check_unchanged(plan, folder)
         return plan
@@ -147,7 +150,7 @@ def plan_text(plan: SweepPlan) -> str:
         {"name": point.name, "values": point.values, "config": configs.to_dict(point.cfg)}
         for point in plan.points
     ]
-    content = {"seeds": plan.seeds, "settings": points}
+    content = {"seeds": plan.seeds, "settings": points, "episodes": plan.episodes}
     return json.dumps({**content, DIGEST: _digest(content)}, indent=2) + "\n"
 
 
@@ -159,6 +162,8 @@ def check_plan(plan: SweepPlan) -> None:
     """Raises ValueError for a number of runs, or a name of a folder, that cannot be meant."""
     if type(plan.seeds) is not int or not 1 <= plan.seeds * len(plan.points) <= grid.MOST_RUNS:
         raise ValueError(f"--seeds: 1 to {grid.MOST_RUNS} runs in all, seeds times settings")
+    if type(plan.episodes) is not int or not 0 <= plan.episodes <= MOST_EPISODES:
+        raise ValueError(f"--evaluate: 0 to {MOST_EPISODES} episodes")
     names = [point.name for point in plan.points]
     for name in names:
         if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.isprintable():
@@ -199,16 +204,9 @@ def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
 
 
 def check_room(plan: SweepPlan, devices: int) -> None:
-    """Raises ValueError where a group's runs, divided among `devices`, exceed a device's memory, or
-    the scenes of Warp's contacts."""
+    """Raises ValueError where a group's runs, divided among `devices`, exceed a device's memory."""
     for group, _ in groups_of(plan._replace(seeds=1)):
         cfg, runs = group.configs[0], -(-len(group.configs) * plan.seeds // devices)
-        scenes = cfg.train.scenes
-        if cfg.sim.physics == "warp" and runs * scenes > WARP_WORLDS:
-            raise ValueError(
-                f"--seeds: {runs} runs of {scenes} scenes side by side, Warp has room for "
-                f"{WARP_WORLDS} scenes; lower --seeds or --train.scenes, or take --sim.physics mjx"
-            )
         memory.check(cfg, runs)
 
 

@@ -1,6 +1,6 @@
 """The algorithm: one training step of all scenes, CSAC Algorithm 1, compiled as a chunk of many.
 
-Observe, act, simulate, remember, learn, replace finished scenes. E = scenes, B = batch.
+Observe, act, simulate, replace finished scenes, remember, learn. E = scenes, B = batch.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config
-from csac_jax.constants import CHANGE_AREA, Primitive
+from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
@@ -92,7 +92,7 @@ def make(
     """The program of a config, with parts of your own in place of the config's."""
     env = environment.make_env(cfg) if env is None else env
     learner = CSAC(actor_critic.make(cfg, network)) if learner is None else learner
-    sampler = samplers.make(cfg.replay) if sampler is None else sampler
+    sampler = samplers.make(cfg.replay, cfg.train.scenes) if sampler is None else sampler
     return Program(cfg, env, learner, sampler)
 
 
@@ -131,11 +131,17 @@ def train_step(
     # Simulate.
     after = sharding.map_scenes(program.mesh, jax.vmap(env.step))(scenes, action)
 
+    # Replace finished scenes.
+    fresh = jax.vmap(env.auto_reset)(_keys(key_reset, cfg.train.scenes), after)
+    scenes_next = _where(after.done, fresh, after)
+
     # Reward and remember (lines 14-15).
     info, result = after.info, action_result(action, after.info)
     reward, push_better = learner.reward(cfg.reward, state.learner, scenes.obs, after.obs, result)
-    before, seen = heightmap.pack(scenes.obs), heightmap.pack(after.obs)
-    transition = Transition(before, action, reward, seen, after.terminated)
+    next_obs, terminated = BOOTSTRAPS[cfg.target.bootstrap](after, scenes_next)
+    before, seen = heightmap.pack(scenes.obs), heightmap.pack(next_obs)
+    label = push_better if cfg.reward.renewed else None
+    transition = Transition(before, action, reward, seen, terminated, label)
     replay = ring.add(state.replay, transition, ~info.physics_diverged)
 
     # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch costs more.
@@ -144,10 +150,6 @@ def train_step(
     learned, priority, losses = _learn(program, key_learn, state.learner, replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     replay = replay.replace(priority=jnp.where(ready, priority, replay.priority))
-
-    # Replace finished scenes.
-    fresh = jax.vmap(env.auto_reset)(_keys(key_reset, cfg.train.scenes), after)
-    scenes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after)
 
     metrics = StepMetrics(
         primitive=action.primitive,
@@ -165,7 +167,34 @@ def train_step(
         finite=_is_finite(learned),
         **losses,
     )
-    return TrainState(state.key, state.step + 1, scenes, learned, replay), metrics
+    return TrainState(state.key, state.step + 1, scenes_next, learned, replay), metrics
+
+
+def _episodic(after: environment.State, _: environment.State) -> tuple[Observation, jax.Array]:
+    """Nothing follows the end of an episode."""
+    return after.obs, after.terminated
+
+
+def _continuing(
+    after: environment.State, scenes_next: environment.State
+) -> tuple[Observation, jax.Array]:
+    """The last action of an episode is followed by the next scene, and one without any effect by
+    nothing; Zeng et al., code: `get_label_value`.
+
+    Deviation: an episode that is cut off goes on in its own scene.
+    """
+    effect = (after.info.moved > CHANGE_AREA) | (after.info.outcome == Outcome.LIFTED)
+    return _where(after.terminated, scenes_next.obs, after.obs), ~effect
+
+
+BOOTSTRAPS = {"episodic": _episodic, "continuing": _continuing}
+"""States after actions and those acted in next, leaves [E, ...] -> what a transition is followed
+by, leaves [E, ...], and whether V of it is 0, [E] bool."""
+
+
+def _where(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """Scene by scene, leaves [E, ...], `yes` where the condition [E] holds, else `no`."""
+    return jax.tree.map(lambda a, b: jax.vmap(jnp.where)(condition, a, b), yes, no)
 
 
 def action_result(action: Action, info: environment.Info) -> ActionResult:
@@ -265,7 +294,8 @@ def example(cfg: Config) -> Transition:
         obs = Observation(colour=colour, height=jnp.zeros(rows), target=target)
         action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
         packed = heightmap.pack(obs)
-        return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool))
+        label = jnp.zeros((), bool) if cfg.reward.renewed else None
+        return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool), label)
 
     return jax.eval_shape(build)
 

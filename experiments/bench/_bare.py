@@ -17,7 +17,7 @@ from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.physics import Physics
 from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
-from experiments.warp.physics import WarpPhysics
+from csac_jax.sim.warp_physics import WarpPhysics
 
 
 def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:

@@ -47,8 +47,9 @@ def _canvas(pixels: int, multiple: int) -> int:
 
 
 def _densenet(pixels: int, zoom: int) -> Config:
-    """The preset `paper` with maps of `pixels` cells, as fine as its height map."""
-    paper = presets.paper()
+    """The preset `paper`, which clears the table as VPG does, on maps of `pixels` cells as fine as
+    its height map."""
+    paper = presets.paper().change(task={"kind": "clear"})
     try:
         margin = _canvas(pixels, max(DenseNet121.STRIDE // zoom, 1)) / pixels - 1.0
         net = FineDenseNet(**dataclasses.asdict(paper.net) | {"margin": margin, "zoom": zoom})

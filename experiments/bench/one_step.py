@@ -16,7 +16,7 @@ import numpy as np
 
 from csac_jax.scene import model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, primitives
+from csac_jax.sim import c_physics, mjx_physics, mjx_step, primitives
 from csac_jax.sim.quiet_mjx import mjx
 from experiments.bench._options import timed
 from experiments.bench.parity import STREAM, TEN, Bench, pile_config
@@ -85,7 +85,7 @@ def _by_mjx(
     def one(scene: Scene, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> jax.Array:
         its = mjx_physics.scene_model(physics, scene)
         data = physics.data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl)
-        after = physics.step(its, data)
+        after = mjx_step.step(its, data)
         return jnp.stack([mjx.kinematics(its, data).xpos, mjx.kinematics(its, after).xpos])
 
     every = jax.jit(jax.vmap(one))

@@ -7,7 +7,8 @@ Each stage of `train_step` is compiled by itself and timed beside the whole step
 STEPS (2) steps as in training, and beside a bare loop of the engine's own steps of the same scenes
 and set-points: in one process, turn by turn, the median of REPEATS (5) rounds, so that what else
 the machine does hits all alike. Trust ratios. `learn` is taken apart once more, into single calls:
-`draw` a batch, its `next_value`, `update_critic` with that inside, and `update_actor`.
+`draw` a batch, its `next_value`, `update_critic` with that inside, and `update_actor`. With
+`--reward.push-effect renewed` there are the `labels` of a batch too, as part of `update_critic`.
 
 With --curve the whole step alone is timed at A, 2 A, 4 A .. B scenes, blocks, cells along a side of
 the map, or transitions in the ring; contact caps grow with the blocks. On an accelerator,
@@ -50,6 +51,7 @@ from experiments.bench._timing import medians
 
 CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
 _PARTS = ("draw", "next_value", "update_critic", "update_actor")  # of learning
+_LABELS = ("labels", "no_labels")  # likewise, where labels are renewed
 _SEPARATE = ("dense_maps", "act", "simulate", "reward", "remember", "learn", "replace")
 
 
@@ -121,14 +123,13 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
-        transition = Transition(packed[0], action, jnp.zeros(num), packed[1], after.terminated)
+        ended = after.terminated
+        label = ended if cfg.reward.renewed else None
+        transition = Transition(packed[0], action, jnp.zeros(num), packed[1], ended, label)
         return ring.add(replay, transition, ~after.info.physics_diverged)
 
     def replace(keys: jax.Array, after: Any) -> Any:
-        fresh = jax.vmap(env.auto_reset)(keys, after)
-        return jax.tree.map(
-            lambda new, old: jax.vmap(jnp.where)(after.done, new, old), fresh, after
-        )
+        return step._where(after.done, jax.vmap(env.auto_reset)(keys, after), after)
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
@@ -206,11 +207,26 @@ def _learning(
     actor = jit(lambda nets, obs: actor_critic.update_actor(parts, nets, heightmap.unpack(obs)))
     _, weights, batch = draw(replay)
     obs = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
-    return {
+    calls: dict[str, Callable[[], Any]] = {
         "draw": lambda: draw(replay),
         "next_value": lambda: value(nets, batch),
         "update_critic": lambda: critic(nets, batch, weights),
         "update_actor": lambda: actor(nets, obs),
+    }
+    return calls | _labels(parts, nets, batch)
+
+
+def _labels(parts: ActorCritic, nets: Any, batch: Transition) -> dict[str, Callable[[], Any]]:
+    """The labels that an update renews, of a batch of which every fourth is a push, and of none."""
+    if not parts.cfg.reward.renewed:
+        return {}
+    fourth = jnp.arange(parts.cfg.learn.batch) % 4 == 0
+    obs = jax.jit(heightmap.unpack)(batch.obs)
+    jit = functools.partial(jax.jit, compiler_options=compiler.options(parts.cfg))
+    best = jit(lambda params, asked: actor_critic.best_grasps(parts, params, obs, asked))
+    return {
+        "labels": lambda: best(nets.target, fourth),
+        "no_labels": lambda: best(nets.target, jnp.zeros_like(fourth)),
     }
 
 
@@ -286,7 +302,9 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     return {
         "stage_seconds": stages,
         "stage_shares": {name: value / total for name, value in stages.items()},
-        "learn_call_seconds": {name: seconds[name] for name in _PARTS},
+        "learn_call_seconds": {
+            name: seconds[name] for name in (*_PARTS, *_LABELS) if name in seconds
+        },
         "step_seconds": whole,
         "sum_of_stages_over_step": total / whole,
         **_rates(cfg, whole),

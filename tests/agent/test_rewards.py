@@ -92,7 +92,7 @@ def test_scale():
     """Claim: eq. 13 by hand: eta0 + eta1 2^(s - s_max)."""
     assert rewards.scale(CFG, CFG.push_level) == 0.5
     assert rewards.scale(CFG, CFG.grasp_level) == 1.0
-    other = with_constants(RewardConfig(eta=(0.25, 3.0)), grasp_level=2.0)
+    other = with_constants(RewardConfig(), eta=(0.25, 3.0), grasp_level=2.0)
     assert rewards.scale(other, 0.0) == 1.0
 
 
@@ -100,17 +100,18 @@ def test_scale():
     "cfg",
     [
         CFG,
-        RewardConfig(eta=(0.5, 1.0), distance_weight=1.5),
+        with_constants(RewardConfig(distance_weight=1.5), eta=(0.5, 1.0)),
         RewardConfig(
             push_levels=(2.0, 9.0), grasp_levels=(1.0, 1.0, 1.0, 1.0, 1.0), success_bonus=0.0
         ),
         RewardConfig(
             grasp_levels=(-1.0, -0.5, -0.25, 0.0, 0.0), success_bonus=-3.0, push_levels=(-1.0, -0.5)
         ),
-        RewardConfig(eta=(0.0, -2.0)),
+        with_constants(RewardConfig(), eta=(0.0, -2.0)),
         RewardConfig(lost_block_penalty=1.5),
         with_constants(
-            RewardConfig(distance_weight=3.0, eta=(0.1, 1.0)),
+            RewardConfig(distance_weight=3.0),
+            eta=(0.1, 1.0),
             distance_cap=0.5,
             push_level=-2.0,
             grasp_level=0.5,

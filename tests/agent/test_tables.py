@@ -9,6 +9,7 @@ from csac_jax import config
 from csac_jax.agent import actor_critic, cem, losses, policy, rewards
 from csac_jax.config import CEMConfig, LearnConfig, PolicyConfig, RewardConfig, TargetConfig
 from csac_jax.replay import samplers
+from csac_jax.training import step
 
 
 @pytest.mark.parametrize(
@@ -21,6 +22,7 @@ from csac_jax.replay import samplers
         (policy.PRIMITIVE_RULES, PolicyConfig, "primitive"),
         (rewards.GOOD_PUSH, RewardConfig, "push_effect"),
         (losses.TD_LOSSES, LearnConfig, "loss"),
+        (step.BOOTSTRAPS, TargetConfig, "bootstrap"),
     ],
 )
 def test_tables_are_total(table, section, name):

@@ -150,10 +150,6 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
         ("bench step --learn.tau 2", "bench step: learn.tau: must be above 0, at most 1"),
         ("bench step smoke --learn.update 2", "bench step: Unrecognized options: --learn.update"),
-        (
-            "bench step fast --physics warp --curve scenes --smallest 8192 --largest 8192",
-            "train.scenes: at most 4096",
-        ),
         ("doctor --preset", "Missing value for argument '--preset'"),
         ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
         ("doctor --preset quick --learn.tau 2", "learn.tau: must be above 0, at most 1"),

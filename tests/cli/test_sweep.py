@@ -2,16 +2,20 @@
 configs."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import sweep as command
+from csac_jax.config import Config
+from csac_jax.evaluation import metrics
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
-from csac_jax.sweeps import runner
+from csac_jax.sweeps import final, runner
 from csac_jax.training import loop, step
 from tests.training import toys
 
@@ -154,17 +158,96 @@ def test_plan_survives_its_file(tmp_path: Path):
     assert command.read(["--resume", str(tmp_path)])[1] == plan
 
 
+def test_plans_without_evaluation_are_read(tmp_path: Path):
+    """Claim: a plan written before plans had an evaluation asks for none; one that is no number of
+    episodes is refused."""
+    _, plan = command.read(["smoke", "--evaluate", "7"])
+    content = json.loads(runner.plan_text(plan))
+    del content["sha256"]
+    (tmp_path / runner.PLAN).write_text(json.dumps(content))
+    assert command.read(["--resume", str(tmp_path)])[1].episodes == 7
+    del content["episodes"]
+    (tmp_path / runner.PLAN).write_text(json.dumps(content))
+    assert command.read(["--resume", str(tmp_path)])[1] == plan._replace(episodes=0)
+    (tmp_path / runner.PLAN).write_text(json.dumps({**content, "episodes": "7"}))
+    with pytest.raises(runner.SweepError, match="--evaluate: 0 to"):
+        command.read(["--resume", str(tmp_path)])
+
+
+METHODS = ("CSAC-beta", "VPG")
+STUDY = "--seeds 2 --vary algo=csac_beta,vpg --vary task=clear,packed --vary train.actions=16,32"
+
+
+def _episodes(lifted: int) -> metrics.Episodes:
+    """Four episodes of one block and one action: so many of their grasps lift it, the others touch
+    it."""
+    done, ones = np.arange(4) < lifted, np.ones((4, 1), np.int32)
+    return metrics.Episodes(
+        valid=ones > 0,
+        primitive=ones,
+        outcome=np.where(done, 4, 2)[:, None],
+        cleared=done[:, None].astype(np.int32),
+        blocks_lost=0 * ones[:, 0],
+        changed=ones > 0,
+        wrong=ones < 0,
+        blocks=ones[:, 0],
+        completed=done,
+        ending=np.where(done, 0, 1),
+    )
+
+
+@pytest.mark.optax
+def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `sweep --evaluate` over methods, tasks and actions evaluates every final policy once,
+    also where it was interrupted, and writes one table and one figure. A small step and a law of
+    successes stand in for the learner's."""
+    monkeypatch.setattr(runner, "run", RUN)
+    _with_toys(monkeypatch)
+    measured: list[str] = []
+    stop = signals.Stop()
+    monkeypatch.setattr(signals, "install", lambda: stop)
+
+    def measure(folder: Path, parts: dict, episodes: int, *_) -> dict:
+        assert (parts, episodes) == ({"packed": "packed" in str(folder)}, 4)
+        measured.append(str(folder))
+        stop.signal = 15 if len(measured) == 5 else None
+        return metrics.summarise(_episodes(4 if "vpg" in str(folder) else 2 + int(folder.name[-1])))
+
+    def environments(cfg: Config, suite: str, *_) -> dict:
+        return {"packed": cfg.scene.arranged == 1.0}
+
+    monkeypatch.setattr(final.policies, "load", lambda folder: folder)
+    monkeypatch.setattr(final.suites, "environments", environments)
+    monkeypatch.setattr(final.rollout, "measure", measure)
+    begun = cli.main(["sweep", "smoke", *STUDY.split(), "--evaluate", "4", "--run-dir", "run"])
+    assert (begun, len(measured), Path("run/study.md").exists()) == (128 + 15, 5, False)
+    stop.signal = None
+    assert cli.main(["sweep", "--resume", "run"]) == 0
+    assert len(measured) == len(set(measured)) == 2 * 2 * 2 * 2
+    assert Path("run/study.png").read_bytes()[:4] == b"\x89PNG"
+    _, *table = [line for line in Path("run/study.md").read_text().splitlines() if "|" in line]
+    rows = [[cell.strip() for cell in line.split("|")[1:5]] for line in table[1:]]
+    wanted = itertools.product(("clear", "packed"), ("16", "32"), METHODS)
+    assert rows == [[*row, "2"] for row in wanted]
+    assert all(("100.0 % (100.0 to 100.0)" in line) == ("VPG" in line) for line in table[1:])
+    assert all(("62.5 % (50.0 to 75.0)" in line) == ("CSAC-beta" in line) for line in table[1:])
+    assert "table and figure" in capsys.readouterr().out
+
+
+def _with_toys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Puts a small step in place of the learner's."""
+    toy = {"make": lambda cfg, *_, **__: toys.program(cfg)}
+    toy |= {"init_state": toys.init_state, "train_step": toys.train_step}
+    for name, part in toy.items():
+        monkeypatch.setattr(step, name, part)
+
+
 @pytest.mark.optax
 def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: a sweep that is stopped by a signal exits with 130 or 143 and says how to go on;
     resumed, it ends with 0 and its results. A small step stands in for the learner's."""
     monkeypatch.setattr(runner, "run", RUN)
-    for name, toy in (
-        ("make", lambda cfg, *_, **__: toys.program(cfg)),
-        ("init_state", toys.init_state),
-        ("train_step", toys.train_step),
-    ):
-        monkeypatch.setattr(step, name, toy)
+    _with_toys(monkeypatch)
     for number in (2, 15):
         stopped = signals.Stop()
         stopped.signal = number
@@ -197,10 +280,6 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
             "--learn.batch 8000 --train.learning_starts 8000",
             "bench sweep: replay.capacity: must hold",
         ),
-        (
-            "fast --physics warp --seeds 2 4",
-            "--seeds: 4 runs of 2048 scenes side by side, Warp has room for",
-        ),
         ("smoke --train.scene 4", "bench sweep: Unrecognized options: --train.scene"),
     ],
 )
@@ -216,12 +295,7 @@ def test_bad_arguments_of_the_benchmark(
 def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: `bench sweep` prints a row for each number of seeds, and the run of one seed by
     itself, with where they come from. A small step stands in for the learner's."""
-    for name, toy in (
-        ("make", lambda cfg, *_, **__: toys.program(cfg)),
-        ("init_state", toys.init_state),
-        ("train_step", toys.train_step),
-    ):
-        monkeypatch.setattr(step, name, toy)
+    _with_toys(monkeypatch)
     assert (
         cli.main(
             [

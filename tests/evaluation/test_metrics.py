@@ -84,6 +84,9 @@ def test_summary_by_hand():
         "completion_reachable": (2 / 3, 3),
         "action_efficiency": (3 / 9, 9),  # 3 blocks in 3 + 2 + 4 actions
         "action_efficiency_completed": (2 / 3, 1),  # 2 blocks in 3 actions, of episode 0 alone
+        "action_efficiency_grasps": ((2 / 2 + 1 / 2 + 0 / 3) / 3, 3),  # not the 3 / 7 of all
+        "actions_per_episode": (9 / 3, 3),
+        "pushes_per_episode": (2 / 3, 3),
     }
     assert got["outcomes"] == {"nothing": 1, "empty": 1, "touched": 1, "dropped": 1, "lifted": 3}
     assert got["counts"] == {
@@ -146,8 +149,14 @@ def test_efficiency_counts_blocks_per_action():
     )
     for name in metrics.PER_ACTION:
         assert got[name]["value"] == got[name]["low"] == got[name]["high"] == 2.0
-    shares = {name for name, entry in got.items() if "value" in entry} - set(metrics.PER_ACTION)
-    assert shares == {"grasp_success", "completion", "completion_reachable"}
+    counts = {*metrics.PER_ACTION, *metrics.PER_EPISODE}
+    shares = {name for name, entry in got.items() if "value" in entry} - counts
+    assert shares == {
+        "grasp_success",
+        "completion",
+        "completion_reachable",
+        "action_efficiency_grasps",
+    }
     assert all(got[name]["high"] <= 1.0 for name in shares)
 
 
@@ -159,4 +168,6 @@ def test_no_grasps():
     got = metrics.summarise(episodes)
     assert got["grasp_success"]["n"] == 0
     assert got["action_efficiency_completed"]["n"] == 0
+    assert got["action_efficiency_grasps"]["n"] == 0
+    assert got["pushes_per_episode"]["value"] == got["actions_per_episode"]["value"] == 3.0
     assert got["completion"]["value"] == 0.0

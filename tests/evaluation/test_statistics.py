@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from csac_jax.evaluation import statistics
 
@@ -58,3 +59,94 @@ def test_difference_is_bootstrapped():
     np.testing.assert_allclose((result.low, result.high), wanted, rtol=1e-13)
     with pytest.raises(ValueError, match="two values"):
         statistics.difference([ours], [theirs[:1]])
+
+
+def _nested(rng: np.random.Generator, hosts: list[np.ndarray]) -> np.ndarray:
+    """Interquartile means of the hierarchical bootstrap [RESAMPLES], one draw after the other."""
+    means = []
+    for _ in range(statistics.RESAMPLES):
+        seeds = rng.integers(0, len(hosts), len(hosts))
+        means.append([rng.choice(hosts[seed], len(hosts[seed])).mean() for seed in seeds])
+    return _middle(np.array(means))
+
+
+def test_bootstrap_draws_seeds_then_hosts():
+    """Claim: the band draws seeds, then hosts within each drawn seed; a seed counts once, however
+    many hosts it ran on."""
+    rng = np.random.default_rng(2)
+    hosts = [rng.normal(0.0, 2.0, n) for n in (2, 2, 2, 2, 2, 3)]
+    hosts = [one - 0.9 * one.mean() for one in hosts]  # seeds hardly differ
+    result = statistics.band([hosts])
+    assert result.value == pytest.approx(_middle(np.array([one.mean() for one in hosts])))
+    assert result.n == 6
+    wanted = np.percentile(_nested(np.random.default_rng(8), hosts), [2.5, 97.5])
+    np.testing.assert_allclose((result.low, result.high), wanted, atol=0.04)  # of a width of 1.3
+    # The 13 runs as seeds of their own:
+    flat = statistics.band([np.concatenate(hosts)])
+    assert abs((flat.high - flat.low) - (result.high - result.low)) > 0.2
+
+
+def test_more_hosts_do_not_narrow_the_band_of_seeds():
+    """Claim: a run repeated on hosts that agree leaves the band as it was."""
+    values = np.random.default_rng(4).normal(size=5)
+    once = statistics.band([values])
+    again = statistics.band([[np.full(9, value) for value in values]])
+    assert again.value == pytest.approx(once.value)
+    assert again.high - again.low == pytest.approx(once.high - once.low, rel=0.03)
+
+
+def test_values_are_grouped_by_seed():
+    """Claim: a stratum has an array of values for each seed, in the order of appearance."""
+    grouped = statistics.by_seed([4, 2, 4, 7], [0.1, 0.2, 0.3, 0.4])
+    assert [one.tolist() for one in grouped] == [[0.1, 0.3], [0.2], [0.4]]
+
+
+def test_improvement_is_mann_whitney():
+    """Claim: the probability of improvement is SciPy's Mann-Whitney U over the pairs, ties by half,
+    mean over strata; its band is SciPy's percentile bootstrap."""
+    rng = np.random.default_rng(6)
+    ours, theirs = [rng.integers(0, 5, (2, n)).astype(float) for n in (7, 9)]
+    pairs = list(zip(ours, theirs, strict=True))
+    result = statistics.improvement(ours, theirs)
+    share = [scipy.stats.mannwhitneyu(x, y).statistic / (x.size * y.size) for x, y in pairs]
+    assert result.value == pytest.approx(np.mean(share))
+
+    def probability(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        return scipy.stats.mannwhitneyu(x, y, axis=axis, method="asymptotic").statistic / 63
+
+    one = statistics.improvement(ours[:1], theirs[:1], seed=5)
+    wanted = scipy.stats.bootstrap(
+        (ours[0], theirs[0]), probability, n_resamples=10_000, method="percentile", rng=5
+    ).confidence_interval
+    np.testing.assert_allclose((one.low, one.high), wanted, rtol=1e-13)
+    mirrored = statistics.improvement(theirs, ours)
+    assert mirrored.value == pytest.approx(1.0 - result.value)
+    with pytest.raises(ValueError, match="two values"):
+        statistics.improvement(ours, [row[:1] for row in theirs])
+
+
+def test_profile_is_the_share_above():
+    """Claim: the performance profile is the share of seeds above each threshold, one less SciPy's
+    empirical distribution; its band is the binomial law's."""
+    values = np.random.default_rng(7).uniform(size=40)
+    thresholds = np.linspace(0.05, 0.95, 19)
+    found = statistics.profile([values], thresholds)
+    distribution = scipy.stats.ecdf(values)
+    shares = distribution.sf.evaluate(thresholds)
+    assert [band.value for band in found] == pytest.approx(shares)
+    law = scipy.stats.binom(40, shares)  # what draws with replacement count
+    for end, share in (("low", 0.025), ("high", 0.975)):
+        got = [getattr(band, end) for band in found]
+        np.testing.assert_allclose(got, law.ppf(share) / 40, atol=1.01 / 40)
+    two = statistics.profile([values, values + 1.0], thresholds)
+    assert [band.value for band in two] == pytest.approx((shares + 1.0) / 2)
+    assert statistics.profile([values[:1]], thresholds)[0].low is None
+
+
+def test_area_in_closed_form():
+    """Claim: the area is the integral of the curve over its length: its first value held before its
+    points, linear between, cut at the end."""
+    x, y = np.array([100.0, 300.0, 500.0]), np.array([0.2, 0.6, 0.6])
+    assert statistics.area(x, y, 500.0) == pytest.approx((100 * 0.2 + 200 * 0.4 + 200 * 0.6) / 500)
+    assert statistics.area(x, y, 200.0) == pytest.approx((100 * 0.2 + 100 * 0.3) / 200)
+    assert statistics.area(x[:1], y[:1], 100.0) == pytest.approx(0.2)

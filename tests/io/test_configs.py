@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from csac_jax import presets
+from csac_jax import algorithms, presets
 from csac_jax.config import Config, LearnConfig, SimConfig, UniformReplay
 from csac_jax.io import configs, renames
 
@@ -89,6 +89,26 @@ def test_every_format_is_read(number: int):
     stored = json.loads((FORMATS / f"format-{number}.json").read_text())
     assert stored.get("format", 1) == number
     assert configs.from_dict(stored) == presets.quick()
+
+
+def test_first_configs_of_format_2_are_read():
+    """Claim: so is one of format 2 with settings that are constants now, unless its value is
+    another."""
+    stored = json.loads((FORMATS / "format-2-first.json").read_text())
+    assert configs.from_dict(stored) == presets.quick()
+    stored["reward"]["eta"] = [0.5, 1.0]
+    with pytest.raises(ValueError, match=r"^reward\.eta: is \[0\.0, 1\.0\] now"):
+        configs.from_dict(stored)
+
+
+@pytest.mark.parametrize("file", ["format-1.json", "format-2-first.json"])
+def test_former_vpg_keeps_what_it_was(file: str):
+    """Claim: a stored config of the algorithm `vpg` from before it was changed is one of
+    `vpg_episodic`; one of today's keeps its name."""
+    stored = json.loads((FORMATS / file).read_text()) | {"algo": "vpg"}
+    assert configs.from_dict(stored).algo == "vpg_episodic"
+    today = algorithms.configure(presets.quick(), "vpg")
+    assert configs.from_dict(_through_text(today)) == today
 
 
 def test_newest_format_is_stored():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import BetaReplay, PrioritisedReplay, UniformReplay
+from csac_jax.config import BetaReplay, OppositeReplay, PrioritisedReplay, UniformReplay
 from csac_jax.replay import ring, samplers
 from csac_jax.training import step
 
@@ -26,7 +26,7 @@ def test_values_out_of_range(name, value):
         BetaReplay(**{name: value})
 
 
-@pytest.mark.parametrize("kind", [UniformReplay, PrioritisedReplay, BetaReplay])
+@pytest.mark.parametrize("kind", [UniformReplay, PrioritisedReplay, BetaReplay, OppositeReplay])
 @pytest.mark.parametrize("capacity", [0, 1, 2**30 + 1])
 def test_capacity_out_of_range(kind, capacity):
     """Claim: so is a capacity below 2 or above 2^30, with every sampler."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from csac_jax.config import BetaReplay, Config, PrioritisedReplay, UniformReplay
+from csac_jax.config import BetaReplay, Config, OppositeReplay, PrioritisedReplay, UniformReplay
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.samplers import Sampler
 from tests.sections import with_constants
@@ -260,6 +260,78 @@ def test_equal_errors_are_drawn_equally(replay):
         keys
     )
     assert_fits(np.asarray(slots).ravel(), np.ones(10))
+
+
+@dataclasses.dataclass
+class Action:
+    primitive: jax.Array
+
+
+@dataclasses.dataclass
+class Tried:
+    """Stored transitions, as far as the sampler of opposites reads them."""
+
+    action: Action
+    reward: jax.Array
+
+
+def tried(primitive, reward, errors, size: int, head: int = 0) -> ring.ReplayState:
+    """A ring of these transitions, all leaves [C], `head` the slot written next."""
+    state = stored(samplers.make(OppositeReplay()), errors, size)
+    items = Tried(Action(jnp.asarray(primitive, jnp.int32)), jnp.asarray(reward, jnp.float32))
+    return dataclasses.replace(state, items=items, head=jnp.int32(head))
+
+
+@pytest.mark.parametrize("kind", range(4))
+def test_opposites_follow_vpgs_law(kind):
+    """Claim: against a transition VPG draws one of the same primitive and the opposite outcome, by
+    Beta(1, 2) over the ranks of those that fit, in a ring that is partly filled."""
+    rng = np.random.default_rng(0)
+    primitive, good = rng.integers(2, size=CAPACITY), rng.integers(2, size=CAPACITY)
+    errors = rng.normal(size=CAPACITY).astype(np.float32)
+    state = tried(primitive, 0.5 * good, errors, 700)
+    newest = np.flatnonzero((2 * primitive + good == kind)[:700])[0]
+    state = dataclasses.replace(state, head=jnp.int32(newest + 1))
+    sampler = samplers.make(OppositeReplay())
+    slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 2)
+    assert slots[0] == newest
+    given = jnp.full(NUM, newest, jnp.int32)
+    slots, found = samplers.opposite_slots(jax.random.key(1), state, given, 1.0, 2.0)
+    assert np.all(found)
+    np.testing.assert_array_equal(weights, 1.0)
+    fitting = np.flatnonzero(2 * primitive[:700] + good[:700] == (kind ^ 1))
+    assert np.isin(slots, fitting).all()
+    place = np.searchsorted(fitting, slots)
+    edges = np.linspace(0.0, 1.0, fitting.size + 1)
+    assert_fits(ranks(np.abs(errors[fitting]), place), np.diff(special.betainc(1.0, 2.0, edges)))
+
+
+@pytest.mark.parametrize(
+    ("scenes", "num", "ages"),
+    [(1, 2, [{0}]), (1, 6, [{0}, {1}, {2}]), (8, 4, [set(range(4)), set(range(4, 8))])],
+)
+def test_half_of_vpgs_batch_is_new(scenes, num, ages):
+    """Claim: the first half of a batch is one transition of each equal part of the newest, which
+    are those of a step or more; a batch of two has the newest itself."""
+    sampler = samplers.make(OppositeReplay(), scenes)
+    state = tried(np.ones(40), np.arange(40) % 2, np.ones(40), 40, head=5)
+    keys = jax.random.split(jax.random.key(0), 200)
+    draw = jax.vmap(lambda key: sampler.sample(key, state, jnp.float32(0.0), num).slots)
+    slots = np.asarray(jax.jit(draw)(keys))
+    for drawn, wanted in zip(slots.T, ages, strict=False):
+        assert set((4 - drawn) % 40) == wanted
+    half = num // 2
+    assert np.all((slots[:, :half] + slots[:, half:]) % 2 == 1)
+
+
+def test_without_an_opposite_only_the_new_counts():
+    """Claim: where no transition has the opposite outcome, the draw against it has no weight, and
+    no unfilled slot is drawn."""
+    sampler = samplers.make(OppositeReplay())
+    state = tried([1, 0, 1, 1, 1], [0.0, 0.5, 0.0, 1.0, 1.0], np.ones(5), 3, head=3)
+    slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
+    np.testing.assert_array_equal(slots, [2, 1, 2, 1])
+    np.testing.assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
 
 
 def test_nan_is_ranked_first():

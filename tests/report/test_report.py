@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,13 @@ def _evaluation(
     path.write_text(json.dumps({**asked, "parts": dict.fromkeys(CASES, part), "config": config}))
 
 
+@pytest.fixture(autouse=True)
+def close_figures() -> Iterator[None]:
+    """Closes what a test drew."""
+    yield
+    charts.plt.close("all")
+
+
 @pytest.fixture
 def recorded(tmp_path: Path) -> Path:
     """Two seeds of CSAC-beta, one of which ended early; one of VPG; one ablation; evaluations of
@@ -146,7 +154,10 @@ def test_runs_are_grouped_by_what_they_are(recorded: Path):
     assert actions.tolist() == [200, 300]
     assert [band.value for band in success] == pytest.approx([0.6, 0.85])
     assert (success[0].low, success[0].high) == pytest.approx((0.5, 0.7))
-    assert statistics.band([both.last]).value == pytest.approx(0.925)
+    assert statistics.band([both.final]).value == pytest.approx(0.925)
+    # to 300 actions: first value held to 200, then linear
+    areas = [(200 * 0.5 + 100 * 0.65) / 300, (200 * 0.7 + 100 * 0.8) / 300]
+    assert np.concatenate(both.area) == pytest.approx(areas)
     assert [run.seconds[-1] for run in both.runs] == [40.0, 30.0]
 
 
@@ -215,18 +226,19 @@ def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
     the same scenes, part by part and over all parts; what was measured once, or in other scenes, is
     not."""
     alone = comparison.build(results.read([recorded]))
-    assert not list(comparison.gaps(alone))  # VPG has one seed
+    assert not list(comparison.pairs(alone))  # VPG has one seed
     for seed, lifted in ((1, 3), (2, 4)):
         config = _config("vpg", seed, sim__physics="c")
         _evaluation(recorded / "vpg" / f"more-{seed}.json", config, lifted)
         config = _config("csac_beta", seed, sim__physics="c", target__value="max")
         _evaluation(recorded / "max" / f"other-{seed}.json", config, lifted, episodes=20)
     whole = comparison.build(results.read([recorded]))
-    found = list(comparison.gaps(whole))
-    assert [(theirs.variant.algo, theirs.suite, tuple(theirs.parts)) for _, theirs, _ in found] == [
+    found = list(comparison.pairs(whole))
+    assert [(theirs.variant.algo, theirs.suite, tuple(theirs.parts)) for _, theirs in found] == [
         ("vpg", "cases", (case,)) for case in CASES
     ] + [("vpg", "cases", CASES)]
-    for ours, theirs, bands in found:
+    for ours, theirs in found:
+        bands = comparison.compared(ours, theirs, statistics.difference, results.METRICS)
         assert ours.variant.algo == "csac_beta"
         assert not ours.variant.changed
         assert tuple(ours.parts) == tuple(theirs.parts)
@@ -238,7 +250,9 @@ def test_differences_are_of_several_seeds_in_the_same_scenes(recorded: Path):
     rows = tables.differences(whole)
     assert [row["part"] for row in rows] == ["cases: hole", "cases: row", "cases: mean of 2 parts"]
     assert rows[0]["grasp success"].startswith("+50.0 (+")
-    assert len(tables.as_json(whole)["differences"]) == 3
+    written = tables.as_json(whole)["differences"]
+    assert [row["improvement"]["completion"]["value"] for row in written] == [1.0] * 3
+    assert tables.improvements(whole)[0]["completion"] == "100.0 % (100.0 to 100.0)"
 
 
 def test_training_is_compared_where_it_is_alike(tmp_path: Path):
@@ -258,7 +272,10 @@ def test_training_is_compared_where_it_is_alike(tmp_path: Path):
         _run(tmp_path / "short" / str(seed), _config("csac_per", seed), [0.5])
     _run(tmp_path / "once", _config("vpg", 0), [0.5, 0.5])
     found = comparison.build(results.read([tmp_path]))
-    ((variant, band),) = comparison.leads(found).items()
+    ((variant, lead),) = comparison.leads(found).items()
+    band = lead.final
+    assert lead.improvement == (1.0, 1.0, 1.0, 2)
+    assert lead.area.value == pytest.approx((0.675 - 0.525) / 3)  # of the last third
     assert (variant.algo, variant.changed) == ("csac_beta", (("target.value", "max"),))
     assert band.value == pytest.approx(0.85 - 0.55)
     assert band.low == pytest.approx(0.2)
@@ -268,6 +285,73 @@ def test_training_is_compared_where_it_is_alike(tmp_path: Path):
         *["-"] * 5,
     ]
     assert sum(curve["ahead"] is not None for curve in tables.as_json(found)["curves"]) == 1
+
+
+def test_repeats_of_a_seed_are_no_seeds(recorded: Path):
+    """Claim: a run repeated on another host is no further seed: it counts in its seed's mean, and
+    two hosts of one seed are neither set against others nor given a band."""
+    _run(recorded / "again" / "seed-1", _config("csac_beta", 1), [0.7, 0.5])
+    _run(recorded / "vpg-again", _config("vpg", 0), [0.2, 0.3, 0.5])
+    for name in "ab":  # as long as the shorter of CSAC-beta's
+        _run(recorded / f"per-{name}", _config("csac_per", 0), [0.2, 0.3])
+    _evaluation(recorded / "again" / "eval.json", _config("csac_beta", 1, sim__physics="c"), 2)
+    report = comparison.build(results.read([recorded]))
+    curves = {curve.variant.algo: curve for curve in report.curves if not curve.variant.changed}
+    final = curves["csac_beta"].final
+    assert sorted(sorted(one.tolist()) for one in final) == [[0.5, 0.9], [0.95]]
+    assert statistics.band([final]).value == pytest.approx((0.7 + 0.95) / 2)
+    rows = {row["method"]: row for row in tables.training(report)}
+    assert (rows["VPG (paper)"]["runs"], rows["VPG (paper)"]["final success"]) == ("2", "45.0 %")
+    assert not comparison.leads(report)
+    scores = {(one.variant.algo, one.seeds): one for one in report.scores}
+    assert scores["csac_beta", 2].band("completion").value == pytest.approx((1.0 + 0.5) / 2)
+
+
+def test_rates_of_training_stand_side_by_side(tmp_path: Path):
+    """Claim: beside success the training table has blocks per action, lifts per grasp, actions and
+    pushes per episode, over all of training; a dash where a run has not recorded them."""
+    counts = {"pushes": 4, "grasps": 6, "outcomes": {"lifted": 3}, "cleared": 5}
+    ends = {"terminated": 1, "truncated": 1}
+    _run(tmp_path / "told", _config("vpg", 0), [0.5, 0.5])
+    log = tmp_path / "told" / files.METRICS
+    lines = [json.loads(line) for line in log.read_text().splitlines()[:-1]]
+    told = [line | counts | (ends if i else dict.fromkeys(ends, 0)) for i, line in enumerate(lines)]
+    log.write_text("".join(json.dumps(line) + "\n" for line in told))
+    _run(tmp_path / "untold", _config("csac_per", 0), [0.5, 0.5])
+    rows = tables.training(comparison.build(results.read([tmp_path])))
+    cells = [[row[name] for name in tables.RATES] for row in rows]
+    # 3 chunks of 10 actions: 15 blocks, 9 lifts of 18 grasps, 12 pushes, 4 episodes
+    assert cells == [["0.500", "50.0 %", "7.50", "3.00"], ["-"] * 4]
+
+
+def test_older_evaluations_tell_actions_and_pushes_by_their_counts(tmp_path: Path):
+    """Claim: an evaluation that has no metrics per episode gets them of its counts, without an
+    interval; one that has them keeps its own."""
+    path, config = tmp_path / "eval.json", _config("vpg", 0)
+    _evaluation(path, config, 5)
+    content = json.loads(path.read_text())
+    for part in content["parts"].values():
+        part["counts"] |= {"pushes": 30, "grasps": 20}
+        del part["pushes_per_episode"]
+    path.write_text(json.dumps(content))
+    row = tables.evaluation(comparison.build(results.read([path])))[0]
+    assert row["pushes / episode"] == "3.00"
+    assert row["actions / episode"].startswith("0.50 (")  # what `_evaluation` wrote
+
+
+def test_profiles_are_drawn_of_several_seeds(recorded: Path):
+    """Claim: performance profiles are drawn of two methods with several seeds each, as the share of
+    the seeds above each value; of a single seed there is none."""
+    name = "profiles-cases-paper"
+    alone = comparison.build(results.read([recorded]))
+    assert name not in {chart.name for chart in charts.draw(alone)}
+    _evaluation(recorded / "vpg" / "more.json", _config("vpg", 1, sim__physics="c"), 3)
+    report = comparison.build(results.read([recorded]))
+    drawn = {chart.name: chart.figure for chart in charts.draw(report)}
+    lines = drawn[name].axes[0].get_lines()
+    shares = {line.get_label().split(",")[0]: line.get_ydata() for line in lines}
+    at = {name: [share[i] for i in (20, 40, 60, 90)] for name, share in shares.items()}
+    assert at == {"VPG": [100, 50, 0, 0], "CSAC-beta": [100, 100, 100, 50]}  # 5, 3 and 10, 8 of 10
 
 
 def test_labels():
@@ -325,7 +409,7 @@ def test_command_gives_the_config_back():
     }
     config = _config("csac_per", 7, **changed)
     variant = results.variant(config)
-    run = results.RecordedRun(Path("x"), config, variant, *[np.zeros(1)] * 4, record={})
+    run = results.RecordedRun(Path("x"), config, variant, *[np.zeros(1)] * 4, record={}, totals={})
     program, command, *flags = results.command(run).split()
     assert (program, command) == ("csac-jax", "train")
     assert configs.to_dict(train.read(flags)[1]) == config

@@ -40,13 +40,12 @@ def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize(
     ("platform", "installed", "measured", "mesh_jitter", "scenes", "chosen"),
     [
-        ("gpu", True, range(64, 5001), 0.0, 256, "warp"),
-        ("cpu", True, range(64, 5001), 0.0, 256, "c"),
-        ("gpu", False, range(64, 5001), 0.0, 256, "mjx"),
-        ("gpu", True, range(64, 5001), 0.1, 256, "mjx"),
-        ("gpu", True, range(64, 5001), 0.0, 32, "mjx"),
-        ("gpu", True, range(64, 5001), 0.0, 5000, "mjx"),
-        ("gpu", True, range(0), 0.0, 256, "mjx"),
+        ("gpu", True, 64, 0.0, 256, "warp"),
+        ("gpu", True, 256, 0.0, 256, "warp"),
+        ("cpu", True, 64, 0.0, 256, "c"),
+        ("gpu", False, 64, 0.0, 256, "mjx"),
+        ("gpu", True, 64, 0.1, 256, "mjx"),
+        ("gpu", True, 257, 0.0, 256, "mjx"),
     ],
 )
 def test_choice(
@@ -64,9 +63,8 @@ def test_choice(
         cfg, sim=dataclasses.replace(cfg.sim, physics=chosen)
     )
     assert backend.resolve(cfg, 2).sim.physics == "mjx"
-    if chosen == "warp":
-        assert backend.resolve(cfg, 1, 5000 // scenes).sim.physics == "warp"
-        assert backend.resolve(cfg, 1, 5001 // scenes + 1).sim.physics == "mjx"
+    if (platform, installed, mesh_jitter) == ("gpu", True, 0.0):
+        assert backend.resolve(cfg, 1, 2).sim.physics == "warp"
 
 
 def test_other_choices_stay():

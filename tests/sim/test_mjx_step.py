@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.scene import layout, model
-from csac_jax.sim import mjx_physics
+from csac_jax.sim import mjx_physics, mjx_step
 from csac_jax.sim.quiet_mjx import mjx
 
 pytestmark = pytest.mark.mjx
@@ -94,7 +94,7 @@ def ours(world: model.World, scene: layout.Scene) -> Ends:
 
     def one(qpos: jax.Array, ctrl: jax.Array) -> mjx.Data:
         its = mjx_physics.scene_model(physics, scene)
-        return physics.step(its, physics.data.replace(qpos=qpos, ctrl=ctrl))
+        return mjx_step.step(its, physics.data.replace(qpos=qpos, ctrl=ctrl))
 
     states = [
         np.float32(column)

@@ -1,24 +1,65 @@
-"""MJX on Warp beside C MuJoCo, where Warp is installed; without a GPU it runs on the CPU,
-slowly."""
+"""Warp beside C MuJoCo, where Warp is installed; without a GPU it runs on the CPU, slowly."""
 
+import dataclasses
+import functools
+import importlib.util
 import sys
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
+from csac_jax import presets
+from csac_jax.config import Config, PhysicsKind, SlotKind
+from csac_jax.constants import Outcome
 from csac_jax.errors import SceneError
-from csac_jax.scene import model
-from csac_jax.sim import mjx_physics, physics as simulation, warp_physics
-from tests.sim import on_warp
+from csac_jax.scene import layout, model, pool
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import oracle, physics as simulation, primitives, warp_physics
+from csac_jax.sim.outcome import Trace, grasp_outcome
+from csac_jax.sim.primitives import JointTrajectory
+from csac_jax.vision import observe
+from tests.sim.conftest import CASES, CONFIG
+
+SCENES = 4
+SLOTS: tuple[SlotKind, ...] = ("box", "arch", "prism", "cylinder")
+
+
+def needs_warp(test: Any) -> Any:
+    """Marks of a test that runs Warp."""
+    skip = pytest.mark.skipif(
+        importlib.util.find_spec("warp") is None,
+        reason="Warp is an extra: pip install 'csac-jax[warp]'",
+    )
+    return pytest.mark.mjx(pytest.mark.slow(skip(test)))
+
+
+def _config(slots: tuple[SlotKind, ...] = CONFIG.scene.slots) -> Config:
+    """Of Warp's physics, with meshes of one size."""
+    quick = presets.get("quick")
+    scene = dataclasses.replace(
+        quick.scene, slots=slots, min_blocks=len(slots), size_jitter=(0.1, 0.0)
+    )
+    return dataclasses.replace(
+        quick, scene=scene, sim=dataclasses.replace(quick.sim, physics="warp")
+    )
+
+
+class Ran(NamedTuple):
+    """What primitives started from, and what they came to on Warp and in C; leaves [E, ...]."""
+
+    scene: Scene
+    joints: JointTrajectory
+    warp: tuple[Scene, Trace]
+    c: tuple[Scene, Trace]
 
 
 def test_missing_warp_is_one_line(monkeypatch: pytest.MonkeyPatch):
     """Claim: physics on Warp without Warp names the extra to install."""
     monkeypatch.setitem(sys.modules, "warp", None)  # importing it raises ImportError
-    cfg = on_warp.config()
+    cfg = _config(SLOTS)
     with pytest.raises(SceneError, match=r"pip install 'csac-jax\[warp\]'"):
         warp_physics.make(model.build(cfg.scene, cfg.sim), cfg.sim)
 
@@ -26,41 +67,171 @@ def test_missing_warp_is_one_line(monkeypatch: pytest.MonkeyPatch):
 def test_meshes_of_two_sizes_are_refused():
     """Claim: Warp's meshes have one size, and a config that asks for several is refused, one of
     boxes alone is not."""
-    cfg = on_warp.config()
+    cfg = _config(SLOTS)
     with pytest.raises(ValueError, match=r"scene\.size_jitter: the second must be 0"):
         cfg.change(scene={"size_jitter": (0.1, 0.1)})
     boxes = {"slots": ("box", "arch"), "min_blocks": 2, "size_jitter": (0.1, 0.1)}
     assert cfg.change(scene=boxes).sim.physics == "warp"
 
 
-@on_warp.needs_warp
+@pytest.fixture(scope="module")
+def run_on_warp() -> Any:
+    """One primitive of one scene of `_config` on Warp."""
+    return _physics("warp").run
+
+
+@pytest.fixture(scope="module")
+def ran(run_on_warp: Any) -> Ran:
+    """The scripted cases of this folder, in a world of a mesh and of boxes."""
+    cfg = _config()
+    scenes, actions = (_stack(*part) for part in zip(*CASES.values(), strict=True))
+    scenes = jax.tree.map(np.asarray, jax.vmap(lambda scene: layout.park(scene, True))(scenes))
+    height = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))(scenes)
+    plan = jax.vmap(functools.partial(primitives.plan, cfg.sim, cfg.heightmap))(height, actions)
+    joints = jax.vmap(functools.partial(primitives.joint_trajectory, "hand"))(plan)
+    run_in_c = _physics("c").run
+    runs = [jax.jit(jax.vmap(run))(scenes, joints) for run in (run_on_warp, run_in_c)]
+    return jax.tree.map(np.asarray, Ran(scenes, joints, *runs))
+
+
+@needs_warp
+def test_scripted_primitives_go_as_in_c(ran: Ran):
+    """Claim: after an action, blocks lie where C MuJoCo leaves them, within a tenth of a
+    millimetre where no block was pressed aside, and every trace says the same."""
+    (after, trace), (after_c, trace_c) = ran.warp, ran.c
+    names = list(CASES)
+    apart = np.linalg.norm(after.position - after_c.position, axis=2).max(axis=1)
+    pressed = {"touched": 5e-3, "spinning": 1e-2}  # small differences grow
+    for name, distance in zip(names, apart, strict=True):
+        assert name == "nan" or distance < pressed.get(name, 1e-4), name
+    well = np.array(names) != "nan"
+    for leaf in ("touched", "held"):
+        np.testing.assert_array_equal(getattr(trace, leaf)[well], getattr(trace_c, leaf)[well])
+    for leaf in ("held_rise", "rise", "gap_closed", "gap_end"):
+        got, wanted = getattr(trace, leaf)[well], getattr(trace_c, leaf)[well]
+        np.testing.assert_allclose(got, wanted, atol=1e-3, err_msg=leaf)
+    assert trace_c.touched.any()
+    assert trace_c.held.any()
+    assert not trace.contact_overflow.any()
+
+
+@needs_warp
+def test_parked_blocks_stay(ran: Ran):
+    """Claim: blocks out of play end parked, at rest and unmoved, wherever a scene says they are."""
+    after, trace = ran.warp
+    parked = ~ran.scene.in_play
+    places = np.broadcast_to(layout.parking(parked.shape[1]), after.position.shape)
+    np.testing.assert_array_equal(after.position[parked], places[parked])
+    assert not after.velocity[parked].any()
+    assert not trace.rise[parked].any()
+
+
+@needs_warp
+def test_nested_vmap_is_a_loop(ran: Ran, run_on_warp: Any):
+    """Claim: seeds of scenes are one batch, whose results are those of scenes one by one; what
+    seeds share may be given once."""
+    scenes, joints = _at(ran.scene, np.array([[4, 5], [4, 6]])), _at(ran.joints, [4, 5])
+    nested = jax.jit(jax.vmap(jax.vmap(run_on_warp), in_axes=(0, None)))(scenes, joints)
+    one = jax.jit(run_on_warp)
+    close = functools.partial(np.testing.assert_allclose, atol=1e-4)
+    for seed in range(2):
+        for row in range(2):
+            alone = one(_at(scenes, (seed, row)), _at(joints, row))
+            jax.tree.map(close, _at(nested, (seed, row)), alone)
+
+
+@needs_warp
+def test_scenes_have_their_own_blocks(ran: Ran, run_on_warp: Any):
+    """Claim: sizes, masses and frictions are those of each scene."""
+    rows = [0, 0, 4, 4]  # a cube that slides while nothing is grasped, a cube that is lifted
+    scenes, joints = jax.tree.map(lambda leaf: leaf[rows].copy(), (ran.scene, ran.joints))
+    scenes.velocity[:2, 0, 0] = -0.6
+    scenes.friction[1] = 3.0
+    scenes.density[3] *= 3.0
+    scenes.half_size[3, 0] *= 1.15
+    scenes.position[3, 0, 2] *= 1.15
+    after, trace = jax.jit(jax.vmap(run_on_warp))(scenes, joints)
+    after_c, trace_c = jax.jit(jax.vmap(_physics("c").run))(scenes, joints)
+    np.testing.assert_allclose(after.position, after_c.position, atol=5e-4)
+    np.testing.assert_allclose(trace.gap_end, trace_c.gap_end, atol=5e-4)
+    ends = np.asarray(after_c.position)[:, 0, 0]
+    assert ends[1] - ends[0] > 5e-3  # the more friction, the nearer
+    assert trace_c.gap_end[3] - trace_c.gap_end[2] > 5e-3
+
+
+@needs_warp
+def test_nothing_is_left_from_another_action(ran: Ran, run_on_warp: Any):
+    """Claim: a compiled program gives what its arguments say, whatever ran before it."""
+    run = jax.jit(jax.vmap(run_on_warp))
+    names = list(CASES)
+    first = [names.index("lifted"), names.index("nan")]
+    second = [names.index("push"), names.index("nothing")]
+    before = _at((ran.scene, ran.joints), first)
+    between = _at((ran.scene, ran.joints), second)
+    results = [jax.tree.map(np.array, run(*each)) for each in (before, between, before)]
+    jax.tree.map(np.testing.assert_array_equal, results[0], results[2])
+    close = functools.partial(np.testing.assert_allclose, atol=1e-5)
+    jax.tree.map(close, results[1], _at(ran.warp, second))
+
+
+@needs_warp
 def test_grasps_go_as_in_c():
     """Claim: the planner's grasps of blocks of four kinds end on Warp as they do in C MuJoCo."""
-    on_warp.compare_grasps(simulation.make)
+    outcome, position, trace = _end(_config(SLOTS))
+    outcome_c, position_c, _ = _end(_config(SLOTS).change(sim={"physics": "c"}))
+    assert (outcome_c == Outcome.LIFTED).all()
+    np.testing.assert_array_equal(outcome, outcome_c)
+    assert not trace.contact_overflow.any()
+    assert np.median(np.linalg.norm(position - position_c, axis=2)) < 1e-3
 
 
-@on_warp.needs_warp
+@needs_warp
 def test_spinning_block_goes_as_in_c():
-    """Claim: blocks that spin in the air, lighter than the model has them, are after a step as fast
-    as in C."""
-    cfg = on_warp.config()
-    world = model.build(cfg.scene, cfg.sim)
-    scene = on_warp.spinning()
-    fields = jax.device_get(model.scene_fields(world, scene))
-    exact = model.with_blocks(world, fields)
-    data = mujoco.MjData(exact)
-    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    data.qvel[world.block_dofs] = scene.velocity
-    mujoco.mj_forward(exact, data)
-    begun = data.qpos.copy(), data.qvel.copy()
-    mujoco.mj_step(exact, data)
+    """Claim: blocks that spin in the air, lighter than the model has them, are after some substeps
+    as fast as in C."""
+    cfg = _config(SLOTS).change(sim={"grasp_phases": (2, 1, 2)})
+    scene = _spinning()
+    start = np.float32([0.0, 0.0, 0.3, 0.0, 0.05, 0.05])
+    joints = JointTrajectory(start, np.tile(start[:5], (cfg.sim.substeps, 1)), np.ones((), bool))
+    after, _ = jax.jit(_physics("warp", cfg).run)(scene, joints)
+    after_c, _ = jax.jit(_physics("c", cfg).run)(scene, joints)
+    np.testing.assert_allclose(after.velocity, after_c.velocity, atol=2e-2)
 
-    physics = simulation.make(world, cfg.sim)
-    assert isinstance(physics, mjx_physics.MjxPhysics)
 
-    def step(scene):
-        blank = physics.data.replace(qpos=jnp.asarray(begun[0]), qvel=jnp.asarray(begun[1]))
-        return physics.step(mjx_physics.scene_model(physics, scene), blank).qvel
+def _physics(kind: PhysicsKind, cfg: Config | None = None) -> simulation.Physics:
+    cfg = cfg or _config()
+    sim = dataclasses.replace(cfg.sim, physics=kind)
+    return simulation.make(model.build(cfg.scene, sim), sim)
 
-    after = jax.jit(jax.vmap(step))(jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene))[0]
-    np.testing.assert_allclose(after[world.block_dofs], data.qvel[world.block_dofs], atol=2e-3)
+
+def _at(tree: Any, index: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _stack(*trees: Any) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def _spinning() -> Scene:
+    """Blocks that spin in the air, lighter than the model has them."""
+    scene = layout.parked(SLOTS)
+    rng = np.random.default_rng(0)
+    return scene.replace(
+        position=scene.position + np.float32([0.0, 0.0, 0.5]),
+        velocity=rng.normal(0.0, [1, 1, 1, 20, 20, 20], (len(SLOTS), 6)).astype(np.float32),
+        density=rng.uniform(450.0, 900.0, len(SLOTS)).astype(np.float32),
+        in_play=np.ones(len(SLOTS), bool),
+    )
+
+
+def _end(cfg: Config) -> tuple[np.ndarray, np.ndarray, Trace]:
+    """Outcomes [E], ends [E, N, 3] m and traces of the planner's grasps in settled scenes."""
+    scenes = pool.settled(cfg, 77, SCENES)
+    height = jax.vmap(lambda scene: observe.observe(cfg, scene).height)(scenes)
+    action = jax.vmap(functools.partial(oracle.grasp, cfg))(scenes, height)
+    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    run = functools.partial(simulation.execute, physics, cfg)
+    after, trace, plan = jax.jit(jax.vmap(run))(scenes, height, action)
+    rise = plan.start[:, 2] - jnp.min(plan.control[:, :, 2], axis=1)
+    outcome = jax.vmap(grasp_outcome)(trace, plan.surface, rise)
+    return np.asarray(outcome), np.asarray(after.position), jax.tree.map(np.asarray, trace)

@@ -38,6 +38,19 @@ def test_kinds_of_values():
     assert _points(["algo=csac_per"])[0].cfg == ["--algo", "csac_per"]
 
 
+def test_tasks_are_several_settings():
+    """Claim: a task is varied by its name, which stands for what is to be done and in which scenes;
+    an unknown one is refused with the nearest."""
+    flags = {point.values["task"]: point.cfg for point in _points(["task=clear,target,packed"])}
+    assert flags == {
+        "clear": ["--task.kind", "clear", "--scene.arranged", "0.0"],
+        "target": ["--task.kind", "target", "--scene.arranged", "0.0"],
+        "packed": ["--task.kind", "clear", "--scene.arranged", "1.0"],
+    }
+    with pytest.raises(ValueError, match="unknown task 'pack'; did you mean packed"):
+        _points(["task=pack"])
+
+
 def test_long_names_give_way_to_numbers():
     """Claim: a folder's name stays short, however much is varied."""
     names = ("start", "middle", "end")

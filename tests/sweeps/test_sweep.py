@@ -295,27 +295,3 @@ def test_plan_of_an_older_version_is_read():
     assert [point.cfg for point in plan.points] == [
         algorithms.configure(presets.smoke(), algo).change(seed=3) for algo in ("csac", "vpg")
     ]
-
-
-def test_runs_on_warp_must_fit_its_contacts():
-    """Claim: runs side by side share Warp's contacts, so that their scenes together are counted;
-    in another physics they are not."""
-    sections = {
-        "scene": {"size_jitter": (0.1, 0.0)},
-        "train": {"scenes": 40},
-        "replay": {"capacity": 64},
-    }
-    for physics, seeds, devices, fits in (
-        ("warp", 102, 1, True),
-        ("warp", 103, 1, False),
-        ("warp", 103, 2, True),
-    ):
-        plan = SweepPlan(seeds, [_point("a", sim={"physics": physics}, **sections)])
-        if fits:
-            runner.check_room(plan, devices)
-        else:
-            with pytest.raises(
-                ValueError, match=r"--seeds: 103 runs of 40 scenes .* room for 4096 scenes"
-            ):
-                runner.check_room(plan, devices)
-    runner.check_room(SweepPlan(103, [_point("a", sim={"physics": "mjx"}, **sections)]), 1)

@@ -42,15 +42,15 @@ class Still(Env):
 
 
 @pytest.mark.slow
-def test_paper_has_densenet_121_twice():
-    """Claim: the state of the preset `paper` can be made: a trunk each for colour and height,
-    online and target, and a ring that holds all 2,500 actions."""
+def test_paper_has_densenet_121_three_times():
+    """Claim: the state of the preset `paper` can be made: a trunk each for colour, height and
+    target mask, online and target, and a ring that holds all 2,500 actions."""
     cfg = presets.paper()
     state = step.abstract_state(cfg)
     for params in (state.learner.online, state.learner.target):
         trunks = [params.critic[kind]["trunk"] for kind in ("params", "batch_stats")]
-        assert sum(leaf.size for leaf in jax.tree.leaves(trunks)) == 2 * TRUNK
-        assert params.critic["params"]["head"]["conv0"]["kernel"].shape == (1, 2048, 64)
+        assert sum(leaf.size for leaf in jax.tree.leaves(trunks)) == 3 * TRUNK
+        assert params.critic["params"]["head"]["conv0"]["kernel"].shape == (1, 3072, 64)
     assert state.replay.items.obs.height.shape == (2500, 224, 224)
     assert cfg.train.steps == cfg.train.actions == 2500
 

@@ -7,7 +7,6 @@ launched until the primitive is over.
 """
 
 import contextlib
-import copy
 import functools
 import gc
 import inspect
@@ -26,13 +25,8 @@ from csac_jax.config import SimConfig
 from csac_jax.scene import layout
 from csac_jax.scene.model import World
 
-# A benchmark may set these before a physics has its first action.
 GRAPH_SUBSTEPS = 10  # most substeps in one recorded graph
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
-CONVEX_PAIRS = 1.0  # workspaces of convex collision, for each contact that has room
-SOLVER_EXITS_EARLY = True  # a conditional node ends the solver once every scene has converged
-BOXES_AS_PRIMITIVES = False  # a box-box function in place of the convex one
-BLOCK_DIM: dict[str, int] = {}  # threads in a block, where not those of `mujoco_warp.BlockDim`
 
 FIELDS = {
     "geom_size": wp.array2d[wp.vec3],
@@ -60,7 +54,7 @@ _TRACE = {  # leaves of `outcome.Trace`
     "rise": wp.array2d[float],
     "gap_closed": wp.array[float],
     "gap_end": wp.array[float],
-    "contact_overflow": wp.array[int],
+    "contact_overflow": wp.array[float],  # of whole numbers, see `warp_physics`
 }
 
 _STOPPED_EARLY = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS  # by design
@@ -134,7 +128,7 @@ def _observe(
     rise: wp.array2d[float],
     gap_closed: wp.array[float],
     gap_end: wp.array[float],
-    contact_overflow: wp.array[int],
+    contact_overflow: wp.array[float],
 ):
     """Holds parked blocks, limits speeds, extends the trace (`outcome.Trace`)."""
     scene, slot = wp.tid()
@@ -169,7 +163,7 @@ def _observe(
             gap_closed[scene] = gap
         gap_end[scene] = gap
         if (overflow[scene] & lost_contacts) != 0:
-            contact_overflow[scene] = contact_overflow[scene] + 1
+            contact_overflow[scene] = contact_overflow[scene] + 1.0
         overflow[scene] = 0
 
 
@@ -269,21 +263,13 @@ def _repeat(call: Callable[[], None], times: int) -> None:
 
 def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int) -> tuple[Any, Any]:
     """Warp's model, whose FIELDS every scene has its own of, and its data."""
-    own = copy.copy(model)
-    if BOXES_AS_PRIMITIVES:
-        own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-    put = mjw.put_model(own, batch_sizes=dict.fromkeys(FIELDS, scenes))
+    put = mjw.put_model(model, batch_sizes=dict.fromkeys(FIELDS, scenes))
     put.opt.warn_overflow = 0  # the trace counts
-    put.opt.graph_conditional = SOLVER_EXITS_EARLY
-    for kernel, threads in BLOCK_DIM.items():
-        setattr(put.block_dim, kernel, threads)
-    room = (scenes + SPARE_SCENES) * cfg.contacts
     data = mjw.make_data(
-        own,
+        model,
         nworld=scenes,
         nconmax=cfg.contacts,
-        naconmax=room,
-        naccdmax=round(room * CONVEX_PAIRS),
+        naconmax=(scenes + SPARE_SCENES) * cfg.contacts,
         njmax=4 * cfg.contacts + 32,  # the edges of friction pyramids; joints and limits
     )
     return put, data

@@ -1,0 +1,162 @@
+"""Eq. 16's label of a replayed push is that of the target critic of now."""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax.agent import actor_critic, rewards
+from csac_jax.agent.actor_critic import ActorCritic
+from csac_jax.agent.learner import Transition
+from csac_jax.constants import Primitive
+from csac_jax.nets import dense
+from csac_jax.sim.primitives import Action
+from csac_jax.training import step
+from csac_jax.vision import heightmap
+from csac_jax.vision.heightmap import Observation
+from tests.agent import toys
+
+pytestmark = pytest.mark.optax
+B = 6
+
+
+class Height(nn.Module):
+    """Q = weight x the highest surface of a cell, in block heights."""
+
+    stride: int = 2
+
+    @nn.compact
+    def __call__(self, maps, train=False):
+        """Q of all outputs alike, and no features worth the name."""
+        del train
+        weight = self.param("weight", nn.initializers.zeros, ())
+        height = nn.max_pool(maps[..., 3:4], (2, 2), (2, 2))
+        return weight * jnp.repeat(height, dense.OUTPUTS, axis=-1), height
+
+
+@pytest.fixture(scope="module")
+def renewing(cfg) -> ActorCritic:
+    """A learner whose critic is `Height`, and that renews labels."""
+    return actor_critic.make(cfg.change(reward={"push_effect": "renewed"}), Height())
+
+
+def _weighted(learner: ActorCritic, weight: float) -> actor_critic.LearnerState:
+    """Its state with a target network of this weight."""
+    state = actor_critic.init(jax.random.key(0), learner)
+    critic = jax.tree.map(lambda leaf: jnp.full_like(leaf, weight), state.target.critic)
+    return state.replace(target=state.target.replace(critic=critic))
+
+
+def _batch(observations, better: bool, reward: float) -> Transition:
+    """Pushes and grasps in turn; each finds what was twice as high after it."""
+    before = observations(B, 1)
+    after = dataclasses.replace(before, height=2.0 * before.height)
+    return Transition(
+        obs=heightmap.pack(before),
+        action=Action(jnp.arange(B, dtype=jnp.int32) % 2, jnp.zeros((B, 3))),
+        reward=jnp.full(B, reward),
+        next_obs=heightmap.pack(after),
+        terminated=jnp.zeros(B, bool),
+        push_better=jnp.full(B, better),
+    )
+
+
+def _renewed(learner: ActorCritic, weight: float, batch: Transition) -> np.ndarray:
+    target = _weighted(learner, weight).target
+    next_maps = actor_critic.dense_maps(learner, target, heightmap.unpack(batch.next_obs))
+    return np.asarray(actor_critic.renewed_reward(learner, target, batch, next_maps))
+
+
+def test_early_label_is_renewed(renewing, observations):
+    """Claim: a push that was labelled worse by a critic that knew nothing earns Gamma = 0.5 once
+    the critic values what it did, and loses as much once it does not; grasps keep their reward."""
+    pushed = np.arange(B) % 2 == Primitive.PUSH
+    for stored, reward in ((False, -0.5), (True, 0.5)):
+        batch = _batch(observations, stored, reward)
+        for weight, label in ((0.0, -0.5), (1.0, 0.5), (-1.0, -0.5)):
+            wanted = np.where(pushed, label, reward)
+            np.testing.assert_allclose(_renewed(renewing, weight, batch), wanted, atol=1e-6)
+
+
+def test_stored_label_stays_as_an_option(cfg, observations):
+    """Claim: by `push_effect` value the reward is the stored one, and no label is."""
+    learner = actor_critic.make(cfg, Height())
+    batch = _batch(observations, False, -0.5).replace(push_better=None)
+    np.testing.assert_array_equal(_renewed(learner, 1.0, batch), batch.reward)
+    assert step.example(learner.cfg).push_better is None
+    assert step.example(cfg.change(reward={"push_effect": "renewed"})).push_better.dtype == bool
+
+
+def test_update_does_not_depend_on_the_stored_label(renewing, observations):
+    """Claim: the TD error of a push is the same whatever label was stored with it."""
+    state = _weighted(renewing, 1.0)
+    errors = []
+    for stored, reward in ((False, -0.5), (True, 0.5)):
+        batch = _batch(observations, stored, reward)
+        batch = jax.tree.map(lambda leaf: leaf[::2], batch)  # pushes alone
+        weights = jnp.ones(B // 2)
+        update = actor_critic.update_critic(jax.random.key(1), renewing, state, batch, weights)
+        errors.append(update[1].error)
+    np.testing.assert_array_equal(*errors)
+
+
+@pytest.mark.parametrize("num", [1, 2, 5, 6])
+def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
+    """Claim: in parts of the batch phi_g is what it is all at once, and 0 where nobody asks."""
+    state = randomised(actor_critic.init(jax.random.key(0), learner))
+    obs = observations(num, 3)
+    every = jax.vmap(actor_critic.best_grasp)(actor_critic.dense_maps(learner, state.target, obs))
+    best_grasps = jax.jit(lambda asked: actor_critic.best_grasps(learner, state.target, obs, asked))
+    for seed in range(3):
+        wanted = np.random.default_rng(seed).random(num) < 0.5
+        found = best_grasps(jnp.asarray(wanted))
+        np.testing.assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+
+
+def test_relabelling_is_the_difference_of_two_rewards():
+    """Claim: a renewed reward is what the action would have earned with the new label, whatever
+    else it earned or lost."""
+    cfg = toys.config("csac", 8, 1).change(reward={"lost_block_penalty": 3.0}).reward
+    no = jnp.zeros((), bool)
+    worse, better = (
+        rewards.reward(
+            cfg,
+            rewards.ActionResult(
+                primitive=jnp.int32(Primitive.PUSH),
+                outcome=jnp.int32(0),
+                distance=jnp.float32(0.0),
+                phi_before=jnp.float32(0.0),
+                phi_after=jnp.float32(gain),
+                changed=no,
+                blocks_lost=jnp.int32(1),
+            ),
+        )
+        for gain in (0.0, 1.0)
+    )
+    assert rewards.relabel(cfg, worse, no, ~no) == better != worse
+    assert rewards.relabel(cfg, better, ~no, no) == worse
+
+
+@pytest.mark.slow
+def test_pushes_are_relabelled_as_the_critic_learns():
+    """Claim: where a push alone makes a grasp possible, the first such pushes are labelled worse,
+    and the critic that has learned labels them better, other pushes worse."""
+    cfg = toys.config("csac", actions=1600, max_actions=4)
+    cfg = cfg.change(reward={"push_effect": "renewed"}, replay={"capacity": 2048})
+    program = step.make(cfg, env=toys.two_step(cfg))
+    state, _ = step.compile_chunk(program, cfg.train.steps)(step.init(program))
+    early = jax.tree.map(lambda leaf: leaf[:200], state.replay.items)
+    opened = np.any(np.asarray(early.obs.colour != early.next_obs.colour), axis=(1, 2, 3))
+    pushed = np.asarray(early.action.primitive) == Primitive.PUSH
+    opened &= pushed
+    learner, target = program.learner.parts, state.learner.target
+    seen: Observation = heightmap.unpack(early.next_obs)
+    next_maps = actor_critic.dense_maps(learner, target, seen)
+    now = np.asarray(actor_critic.renewed_reward(learner, target, early, next_maps))
+    assert opened.sum() >= 10
+    assert np.mean(np.asarray(early.push_better)[opened]) < 0.5
+    assert np.mean(now[opened] > 0.0) > 0.9
+    assert np.mean(now[pushed & ~opened] < 0.0) > 0.9

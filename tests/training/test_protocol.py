@@ -1,0 +1,73 @@
+"""The paper's protocol, sec. 4.3: targets of one scene, one after the other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from csac_jax import presets
+from csac_jax.env import Env, State
+from csac_jax.scene import layout
+from csac_jax.scene.layout import Scene
+
+BLOCKS = 10
+
+
+@pytest.fixture(scope="module")
+def env() -> Env:
+    """The environment of `paper_small` without physics, whose pool is one scene of a grid."""
+    cfg = presets.paper_small()
+    scene = jax.tree.map(jnp.asarray, layout.parked(cfg.scene.slots))
+    along = 0.07 * (np.arange(BLOCKS) % 4 - 1.5), 0.07 * (np.arange(BLOCKS) // 4 - 1.0)
+    position = np.stack([*along, np.full(BLOCKS, 0.03)], axis=1).astype(np.float32)
+    scene = scene.replace(position=jnp.asarray(position), in_play=jnp.ones(BLOCKS, bool))
+    pool: Scene = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
+    return Env(cfg, None, pool)
+
+
+def _got(state: State) -> State:
+    """The state after the target was lifted off the table."""
+    rest = jnp.arange(BLOCKS) != state.scene.target
+    over, won = jnp.ones((), bool), jnp.ones((), jnp.float32)
+    return state.replace(scene=layout.park(state.scene, rest), terminated=over, reward=won)
+
+
+def test_presets_of_the_paper_ask_for_targets():
+    """Claim: `paper` and `paper_small` are the target task; the table is cleared as an option."""
+    for preset in (presets.paper(), presets.paper_small()):
+        assert preset.task.kind == "target"
+        assert preset.change(task={"kind": "clear"}).task.max_actions == preset.task.max_actions
+
+
+def test_targets_until_none_is_left(env: Env):
+    """Claim: after each success another block of the same scene is named, every block once; where
+    none is left comes another scene with all of them."""
+    following = jax.jit(lambda key, state: env.auto_reset(key, _got(state)))
+    state = jax.jit(env.reset)(jax.random.key(0))
+    named = [int(state.scene.target)]
+    for number in range(1, BLOCKS):
+        state = following(jax.random.key(number), state)
+        assert state.scene.in_play.sum() == BLOCKS - number
+        assert state.scene.in_play[state.scene.target]
+        assert (state.actions, state.terminated) == (0, False)
+        named.append(int(state.scene.target))
+    assert sorted(named) == list(range(BLOCKS))
+    assert named != sorted(named)
+    state = following(jax.random.key(99), state)
+    assert state.scene.in_play.all()
+
+
+def test_target_is_named_at_random(env: Env):
+    """Claim: each block of a scene is as likely to be the first target as any other."""
+    keys = jax.random.split(jax.random.key(1), 2000)
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
+    first = jax.jit(jax.vmap(lambda key: env.randomise_pose(key, scene).target))(keys)
+    assert stats.chisquare(np.bincount(np.asarray(first), minlength=BLOCKS)).pvalue > 1e-3
+
+
+def test_failure_replaces_the_scene(env: Env):
+    """Claim: where the actions are spent, the next scene is another, with all its blocks."""
+    state = _got(jax.jit(env.reset)(jax.random.key(0)))
+    spent = state.replace(reward=jnp.zeros(()), terminated=jnp.zeros((), bool))
+    assert jax.jit(env.auto_reset)(jax.random.key(1), spent).scene.in_play.all()
