@@ -1,8 +1,9 @@
 """A policy of the small net as an ONNX graph, which onnxruntime runs without JAX.
 
-Arguments and results as `export.from_maps`, and `q` [P, K, h, w]. The pose is the best cell's, as
-with `policy.place argmax`: the search between cells draws random numbers, which ONNX leaves to each
-runtime. Images are NCHW inside. M = critics, K = yaws, C = canvas, h = cells of a map.
+Arguments and results as `export.from_maps`; besides `q` [P, K, h, w] and `cells`, alike: where
+there is something to act on. The pose is the best cell's, as with `policy.place argmax`: the search
+between cells draws random numbers, which ONNX leaves to each runtime.
+Images are NCHW inside. M = critics, K = yaws, C = canvas, h = cells of a map.
 """
 
 from typing import Any
@@ -24,7 +25,7 @@ from csac_jax.sim import primitives
 from csac_jax.sim.outcome import BARE
 
 OPSET = 18
-OUTPUTS = ("primitive", "pose", "score", "valid", "stations", "q")
+OUTPUTS = ("primitive", "pose", "score", "valid", "stations", "q", "cells")
 _BACKWARDS = np.iinfo(np.int64).min
 
 
@@ -77,7 +78,7 @@ def make(cfg: Config, params: Params) -> bytes:
         axis=-1,
     )
     pose = graph.op("Gather", graph.const(poses.reshape(-1, 3)), cell)
-    results = (primitive, pose, score, is_valid, _stations(graph, cfg, primitive, pose), q)
+    results = (primitive, pose, score, is_valid, _stations(graph, cfg, primitive, pose), q, valid)
     for name, value in zip(OUTPUTS, results, strict=True):
         graph.nodes.append(helper.make_node("Identity", [value], [name]))
     return _model(graph, cfg, frames, has_target)
@@ -98,6 +99,7 @@ def _model(graph: Graph, cfg: Config, frames: Frames, has_target: bool) -> bytes
         "valid": (TensorProto.BOOL, []),
         "stations": (number, [4, 5]),
         "q": (number, q_shape),
+        "cells": (TensorProto.BOOL, q_shape),
     }
     given, made = (
         [helper.make_tensor_value_info(name, *kind) for name, kind in ports.items()]

@@ -123,7 +123,8 @@ def _random(cfg: Config, seed: int) -> tuple[Any, Observation]:
     rng, size = np.random.default_rng(seed), cfg.heightmap.size
     blank = actor_critic.abstract_params(cfg)
     params = jax.tree.map(lambda leaf: rng.normal(0.0, 0.2, leaf.shape).astype("f4"), blank)
-    height, target = np.zeros((size, size), np.float32), np.zeros((size, size), bool)
+    height = rng.uniform(0.0, 0.009, (size, size)).astype(np.float32)  # seen, too low to act on
+    target = np.zeros((size, size), bool)
     for number in range(4):
         row, col = rng.integers(2, size - 10, 2)
         height[row : row + 8, col : col + 6] = rng.uniform(0.02, 0.08)
@@ -163,7 +164,9 @@ def test_onnx_of_other_nets(name: str, empty: bool):
     decide, shapes = export.from_maps(cfg, params)
     assert len(shapes) == len(shown)
     look = jax.jit(lambda o: program.dense_maps(cfg, params, o, False))
-    q = look(jax.tree.map(jnp.asarray, obs)).q
+    state = look(jax.tree.map(jnp.asarray, obs))
+    q = state.q
+    np.testing.assert_array_equal(found[6], state.valid)
     scale = max(1.0, float(jnp.abs(q).max()))
     np.testing.assert_allclose(found[5], q, atol=TOLERANCE * scale, rtol=0)
     primitive, pose, score, valid, stations = jax.jit(decide)(*shown)
