@@ -119,7 +119,7 @@ def test_of_two_critics_the_lower_counts(learner):
 @pytest.mark.parametrize("start", ["both", "actor"])
 def test_search_finds_the_top_between_cells(learner, start):
     """Claim: on a hill CEM comes within a tenth of a cell of its top, wherever that lies, from the
-    actor's mean alone too; the best cell is further off, by more than 0.3 of a cell on average."""
+    actor's mean alone too; the best cell is further off, by more than 0.15 of a cell on average."""
     cfg = learner.cfg.change(cem={"start": start, "candidates": 64, "elites": 6, "rounds": 6})
     own = dataclasses.replace(learner, cfg=cfg)
     frames, searched, cells = own.frames, [], []
@@ -178,7 +178,6 @@ def test_trained_policy_acts_between_cells(kind):
     best = jax.vmap(lambda q, valid: maps.best_cells(q, valid, 1)[0])(*grasp)
     away = action.pose[:, :2] - learner.frames.xy.reshape(-1, 2)[best]
     moved = np.mean(np.linalg.norm(away, axis=1) > 0.5 * learner.frames.cell)
-    print(f"{kind}: success {success:.3f}, moved by more than half a cell {moved:.3f}")
     if kind == "offset":
         assert moved > 0.6
         assert success > 0.2

@@ -254,8 +254,9 @@ class Child:
         return None if said else f"ended with {self.process.exitcode} and said nothing"
 
     def go(self) -> None:
-        """Lets it go on that holds."""
-        self._pipe.send(None)
+        """Lets it go on that holds, if it lives."""
+        with contextlib.suppress(BrokenPipeError):
+            self._pipe.send(None)
 
     def end(self, limit: float) -> bool:
         """Takes the rest of what it says; whether it ended within `limit` s. It is dead then."""
