@@ -194,7 +194,8 @@ def _publish(draft: Path, folder: Path) -> None:
 def _clean(root: Path) -> None:
     """Removes what a save that did not end has left."""
     for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
-        shutil.rmtree(path, ignore_errors=True)
+        for _ in range(2):  # a disc that is full may refuse to open a folder once
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _name_run(root: Path) -> str:

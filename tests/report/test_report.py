@@ -262,7 +262,7 @@ def test_training_is_compared_where_it_is_alike(tmp_path: Path):
     others = {
         "base": {},
         "max": {"target__value": "max"},
-        "target": {"task__kind": "target"},
+        "clear": {"task__kind": "clear"},
         "packed": {"scene__arranged": 0.5},
     }
     for name, changed in others.items():

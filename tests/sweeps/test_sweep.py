@@ -293,5 +293,6 @@ def test_plan_of_an_older_version_is_read():
     plan = runner.read_plan(Path(__file__).parent / "stored")
     assert (plan.seeds, [point.name for point in plan.points]) == (2, ["algo=csac", "algo=vpg"])
     assert [point.cfg for point in plan.points] == [
-        algorithms.configure(presets.smoke(), algo).change(seed=3) for algo in ("csac", "vpg")
+        algorithms.configure(presets.smoke(), algo).change(seed=3)
+        for algo in ("csac", "vpg_episodic")  # what `vpg` was
     ]
