@@ -88,6 +88,7 @@ def test_q_is_continuous(learner):
         assert np.abs(np.diff(values)).max() < 0.05
 
 
+@pytest.mark.slow
 def test_value_in_the_loss_is_that_of_the_maps(learner, randomised, observations):
     """Claim: what the critic's update learns at a pose is what the search reads there, whatever
     yaw and primitive."""

@@ -91,6 +91,7 @@ def test_stablehlo_of_maps(policy: Policy, obs: Observation, tmp_path: Path, cap
     _assert_close(found, jax.jit(decide)(obs.colour, obs.height))
 
 
+@pytest.mark.slow
 def test_stablehlo_of_an_image(policy: Policy, tmp_path: Path):
     """Claim: jax alone computes from an image what `Policy.decide` returns."""
     file, depth = tmp_path / "policy.stablehlo", np.nan_to_num(IMAGE.depth)

@@ -83,6 +83,7 @@ def test_episode_that_is_cut_off_goes_on(bootstrap):
     assert not terminated.any()
 
 
+@pytest.mark.slow
 @pytest.mark.optax
 @pytest.mark.parametrize(("algo", "follows"), [("vpg", True), ("vpg_episodic", False)])
 def test_step_stores_what_is_acted_in_next(algo, follows):
