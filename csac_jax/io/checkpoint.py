@@ -15,7 +15,9 @@ import contextlib
 import functools
 import hashlib
 import itertools
+import json
 import logging
+import math
 import re
 import secrets
 import shutil
@@ -27,6 +29,7 @@ from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
+import tensorstore
 
 from csac_jax.config import Config
 from csac_jax.errors import DataWarning, FailedError
@@ -83,6 +86,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
         with _checkpointer() as checkpointer:
             checkpointer.save(draft, args=items)
         if cluster.is_first():
+            _check_complete(draft, arrays)
             files.write_json(draft / MANIFEST, _digests(draft))
             _publish(draft, folder)
     except Exception as error:  # TensorStore and Orbax raise nearly anything for a full disc
@@ -94,6 +98,21 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
         ) from error
     cluster.wait(f"saved {folder}")
     return folder
+
+
+def _check_complete(draft: Path, arrays: dict[str, Any]) -> None:
+    """Raises OSError where Orbax wrote less than all arrays without an error of its own: one call
+    that a full disc refuses is enough."""
+    spec = {"driver": "ocdbt", "base": f"file://{draft / 'state'}/"}
+    store = tensorstore.KvStore.open(spec).result()
+    kept = {key.decode() for key in store.list().result()}
+    for name, array in arrays.items():
+        if (form := f"{name}/.zarray") not in kept:
+            raise OSError(f"{name} was not written")
+        sides = json.loads(store.read(form).result().value)["chunks"]
+        wanted = math.prod(-(-n // m) for n, m in zip(array.shape, sides, strict=True))
+        if sum(key.startswith(f"{name}/") for key in kept) < wanted + 1:
+            raise OSError(f"{name} was not written whole")
 
 
 def load_config(run_dir: Path, step: int | None = None) -> Config:

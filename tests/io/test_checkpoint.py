@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tensorstore
 from flax import struct
 
 from csac_jax import presets
@@ -157,6 +158,27 @@ def test_a_step_that_is_saved_again_is_never_away(run_dir: Path, monkeypatch: py
             checkpoint.save(run_dir, 8, _state(8), CFG, {})
     checkpoint.save(run_dir, 12, _state(12), CFG, {})  # which clears what a save has left
     assert (run_dir / "checkpoints" / checkpoint.SET_ASIDE / "8" / checkpoint.MANIFEST).exists()
+
+
+@pytest.mark.parametrize("lost", [".zarray", "0"])
+def test_what_orbax_left_out_is_no_checkpoint(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, lost: str
+):
+    """Claim: where a part of an array is not there after a save that raised nothing, it is no
+    checkpoint, and those before stay."""
+    save, found = checkpoint.ocp.Checkpointer.save, checkpoint.latest_step(run_dir)
+
+    def save_less(self: Any, folder: Path, *given: Any, **named: Any) -> None:
+        save(self, folder, *given, **named)
+        spec = {"driver": "ocdbt", "base": f"file://{folder / 'state'}/"}
+        store = tensorstore.KvStore.open(spec).result()
+        part = next(key for key in store.list().result() if key.split(b"/")[-1] == lost.encode())
+        store.write(part, None).result()
+
+    monkeypatch.setattr(checkpoint.ocp.Checkpointer, "save", save_less)
+    with pytest.raises(CheckpointError, match="was not written"):
+        checkpoint.save(run_dir, 99, _state(99), CFG, {})
+    assert checkpoint.latest_step(run_dir) == found
 
 
 def _failing_from(name: str, call: Any, fail: Any) -> Any:
