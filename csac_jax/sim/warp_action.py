@@ -7,6 +7,7 @@ launched until the primitive is over.
 """
 
 import contextlib
+import copy
 import functools
 import gc
 import inspect
@@ -262,7 +263,12 @@ def _repeat(call: Callable[[], None], times: int) -> None:
 
 
 def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int) -> tuple[Any, Any]:
-    """Warp's model, whose FIELDS every scene has its own of, and its data."""
+    """Warp's model, whose FIELDS every scene has its own of, and its data.
+
+    By this flag Warp takes C's function for two boxes, not the general one for convex shapes.
+    """
+    model = copy.copy(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(FIELDS, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     data = mjw.make_data(
