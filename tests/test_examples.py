@@ -7,6 +7,7 @@ from types import ModuleType
 import pytest
 
 import csac_jax
+from csac_jax import presets
 
 FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
 ROBOTS = ("ros2_node", "ur_rtde")  # see test_robot_examples
@@ -33,18 +34,28 @@ def test_every_example_is_tested():
     }
 
 
-@pytest.mark.parametrize("path", FOLDER.glob("*.py"), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
 def test_examples_are_short(path: Path):
     """Claim: an example has at most 60 lines, one that drives a robot 100."""
     assert len(path.read_text().splitlines()) <= (100 if path.stem in ROBOTS else 60)
 
 
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Name of a small preset of C's physics, which compile fast."""
+    cfg = presets.smoke().change(sim={"physics": "c"})
+    monkeypatch.setitem(presets.PRESETS, "small", lambda: cfg)
+    return "small"
+
+
 @pytest.mark.mjx
 @pytest.mark.optax
-@pytest.mark.parametrize("name", TRAINERS)
-def test_own_parts_train(name: str, tmp_path: Path):
+@pytest.mark.parametrize(
+    "name", [TRAINERS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in TRAINERS[1:])]
+)
+def test_own_parts_train(small: str, name: str, tmp_path: Path):
     """Claim: a part of one's own trains a run to its end, and the run's policy acts with it."""
-    run = _module(name).main("smoke", tmp_path / "run")
+    run = _module(name).main(small, tmp_path / "run")
     assert run.summary.actions == 64
     assert run.summary.stopped_by is None
     table = csac_jax.evaluate(run.policy, suite="in_distribution", episodes=2)
@@ -52,6 +63,6 @@ def test_own_parts_train(name: str, tmp_path: Path):
 
 
 @pytest.mark.mjx
-def test_random_agent_runs():
+def test_random_agent_runs(small: str):
     """Claim: the environment runs in a scan of a vmap, with finished scenes replaced."""
-    assert 0.0 <= _module("random_agent").main("smoke", "6") <= 1.0
+    assert 0.0 <= _module("random_agent").main(small, "6") <= 1.0
