@@ -204,6 +204,7 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     _assert_same(state.scenes, fresh.scenes)
 
 
+@pytest.mark.slow
 @pytest.mark.mjx
 @pytest.mark.optax
 def test_complete_run_is_made_longer(trained, tmp_path: Path):

@@ -1,6 +1,7 @@
 """Eq. 16's label of a replayed push is that of the target critic of now."""
 
 import dataclasses
+import functools
 
 import flax.linen as nn
 import jax
@@ -42,7 +43,7 @@ def renewing(cfg) -> ActorCritic:
     return actor_critic.make(cfg.change(reward={"push_effect": "renewed"}), Height())
 
 
-def _weighted(learner: ActorCritic, weight: float) -> actor_critic.LearnerState:
+def _weighted(learner: ActorCritic, weight: jax.Array | float) -> actor_critic.LearnerState:
     """Its state with a target network of this weight."""
     state = actor_critic.init(jax.random.key(0), learner)
     critic = jax.tree.map(lambda leaf: jnp.full_like(leaf, weight), state.target.critic)
@@ -63,10 +64,11 @@ def _batch(observations, better: bool, reward: float) -> Transition:
     )
 
 
-def _renewed(learner: ActorCritic, weight: float, batch: Transition) -> np.ndarray:
+@functools.partial(jax.jit, static_argnums=0)
+def _renewed(learner: ActorCritic, weight: jax.Array, batch: Transition) -> jax.Array:
     target = _weighted(learner, weight).target
     next_maps = actor_critic.dense_maps(learner, target, heightmap.unpack(batch.next_obs))
-    return np.asarray(actor_critic.renewed_reward(learner, target, batch, next_maps))
+    return actor_critic.renewed_reward(learner, target, batch, next_maps)
 
 
 def test_early_label_is_renewed(renewing, observations):
@@ -77,14 +79,16 @@ def test_early_label_is_renewed(renewing, observations):
         batch = _batch(observations, stored, reward)
         for weight, label in ((0.0, -0.5), (1.0, 0.5), (-1.0, -0.5)):
             wanted = np.where(pushed, label, reward)
-            np.testing.assert_allclose(_renewed(renewing, weight, batch), wanted, atol=1e-6)
+            np.testing.assert_allclose(
+                _renewed(renewing, jnp.float32(weight), batch), wanted, atol=1e-6
+            )
 
 
 def test_stored_label_stays_as_an_option(cfg, observations):
     """Claim: by `push_effect` value the reward is the stored one, and no label is."""
     learner = actor_critic.make(cfg, Height())
     batch = _batch(observations, False, -0.5).replace(push_better=None)
-    np.testing.assert_array_equal(_renewed(learner, 1.0, batch), batch.reward)
+    np.testing.assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
     assert step.example(learner.cfg).push_better is None
     assert step.example(cfg.change(reward={"push_effect": "renewed"})).push_better.dtype == bool
 
@@ -108,7 +112,8 @@ def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
     """Claim: in parts of the batch phi_g is what it is all at once, and 0 where nobody asks."""
     state = randomised(actor_critic.init(jax.random.key(0), learner))
     obs = observations(num, 3)
-    every = jax.vmap(actor_critic.best_grasp)(actor_critic.dense_maps(learner, state.target, obs))
+    maps = jax.jit(lambda: actor_critic.dense_maps(learner, state.target, obs))()
+    every = jax.vmap(actor_critic.best_grasp)(maps)
     best_grasps = jax.jit(lambda asked: actor_critic.best_grasps(learner, state.target, obs, asked))
     for seed in range(3):
         wanted = np.random.default_rng(seed).random(num) < 0.5

@@ -159,15 +159,15 @@ def test_states_of_densenet_are_seen_in_groups():
     assert networks.make(DenseNet121()).states_at_once(320) == 4
     assert networks.make(SmallNet()).states_at_once(72) is None
     nets = networks.make(TINY["densenet121"])
-    critic = nets.critic
+    apply = jax.jit(nets.critic.apply)
     net_input = jax.random.normal(jax.random.key(0), (3, 2, 32, 32, 4))
-    variables = critic.init(jax.random.key(1), net_input[0])
+    variables = jax.jit(nets.critic.init)(jax.random.key(1), net_input[0])
     for group in (1, 2, 3):
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(networks, "_FULL", 32 * group**0.5)
             assert nets.states_at_once(32) == group
-            got = networks.apply(nets, variables, net_input)
-        apart = [critic.apply(variables, one) for one in net_input]
+            got = jax.jit(lambda: networks.apply(nets, variables, net_input))()
+        apart = [apply(variables, one) for one in net_input]
         for leaf, *wanted in zip(got, *apart, strict=True):
             np.testing.assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
 

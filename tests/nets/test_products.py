@@ -1,6 +1,10 @@
 """Convolutions as matrix products against XLA's own, the pool against Flax's; values and
 gradients."""
 
+import functools
+from collections.abc import Callable
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -8,6 +12,18 @@ import numpy as np
 import pytest
 
 from csac_jax.nets import products
+
+Function = Callable[[jax.Array, jax.Array], jax.Array]  # of maps and kernel
+
+
+def _both(one: Function, other: Function, given: Any, gradient: jax.Array) -> Any:
+    """Value and gradients of two functions."""
+
+    def seen(function: Function) -> Any:
+        value, back = jax.vjp(function, *given)
+        return value, *back(gradient)
+
+    return jax.jit(lambda: (seen(one), seen(other)))()
 
 
 @pytest.mark.parametrize(
@@ -34,11 +50,7 @@ def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
             maps, kernel, (stride, stride), pad, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
-    def both(function):
-        value, back = jax.vjp(function, maps, kernel)
-        return value, *back(gradient)
-
-    for got, wanted in zip(both(ours), both(plain), strict=True):
+    for got, wanted in zip(*_both(ours, plain, (maps, kernel), gradient), strict=True):
         np.testing.assert_allclose(got, wanted, atol=1e-4)
 
 
@@ -57,14 +69,10 @@ def test_doubled_cells_are_pixels_twice_over():
     def repeated(maps: jax.Array, kernel: jax.Array) -> jax.Array:
         return see(False, jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2), kernel)
 
-    (got, got_back), (wanted, back) = (
-        jax.vjp(function, maps, kernel)
-        for function in (lambda maps, kernel: see(True, maps, kernel), repeated)
-    )
-    for mine, other in zip((got, *got_back(gradient)), (wanted, *back(gradient)), strict=True):
-        np.testing.assert_allclose(
-            mine, other, atol=1e-4
-        )  # sums of up to 192 products of numbers near 1
+    ours = functools.partial(see, True)
+    for got, wanted in zip(*_both(ours, repeated, (maps, kernel), gradient), strict=True):
+        # sums of up to 192 products of numbers near 1
+        np.testing.assert_allclose(got, wanted, atol=1e-4)
 
 
 def test_max_pool_is_flaxs():
