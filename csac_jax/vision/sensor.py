@@ -1,7 +1,7 @@
 """Errors of a real depth camera; those that are switched off are left out of the program.
 
-    real = sensor.pose(key_pose, cfg, camera.make(believed))
-    rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)  # drawn from `real` by anything
+real = sensor.pose(key_pose, cfg, camera.make(believed))
+rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)  # drawn from `real` by anything
 """
 
 import jax

@@ -180,7 +180,7 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
 
 def test_unknown_suite():
     """Claim: a suite that is none is refused with the names of those that there are."""
-    names = "in_distribution, random10, random30, cases, target, generated"
+    names = "in_distribution, random10, random30, cases, target, generated, camera"
     with pytest.raises(ValueError, match=f"'hard'.*{names}"):
         suites.environments(CFG, "hard", EPISODES, 0)
 
