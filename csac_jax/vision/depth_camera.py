@@ -15,8 +15,10 @@ Sources:
 [6] Microsoft, "Azure Kinect DK hardware specifications": range and random error of NFOV unbinned.
 """
 
+import functools
+import itertools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,8 @@ UNIT = 0.001  # m, steps of a depth image of 16 bits
 JUMP = 0.01  # m (ours), a larger step between pixels is an edge
 LOST, FLYING = 0.5, 0.25  # shares of the pixels at an edge without depth and with a mixed one, ours
 DARK = 0.01  # least share of the light that must come back (ours)
+SUPPORT = 3  # neighbours that lie with a pixel: a corner of a surface has as many
+NEAR = 0.015  # share of the depth by which they may differ (ours); 3 px where those are coarser
 STEEP = math.cos(math.radians(80.0))  # of the largest angle between ray and normal (ours)
 
 
@@ -100,6 +104,23 @@ def measure(
     return depth, valid & in_range & ~lost & ~hidden(camera, eye, inverse)
 
 
+def supported(depth: jax.Array, focal: Any) -> jax.Array:
+    """Pixels [h, w] bool whose depth is that of SUPPORT of their eight neighbours or more: those
+    that have a depth and do not fly.
+
+    Args: depth [h, w] m, 0 where there is none; focal, px.
+    """
+    reach = depth * jnp.maximum(NEAR, 3.0 / focal)
+    padded, size = jnp.pad(depth, 1), depth.shape
+    neighbours = [
+        jax.lax.dynamic_slice(padded, (row, col), size)
+        for row, col in itertools.product(range(3), repeat=2)
+        if (row, col) != (1, 1)
+    ]
+    alike = [(jnp.abs(one - depth) < reach).astype(jnp.int32) for one in neighbours]
+    return functools.reduce(jnp.add, alike) >= SUPPORT
+
+
 def _shifted(inverse: jax.Array, radius: int) -> jax.Array:
     """The pixels `radius` to the right, left, below and above [4, h, w]; edges repeat."""
     padded, size = jnp.pad(inverse, radius, mode="edge"), inverse.shape
@@ -146,7 +167,7 @@ def _alike_within(noise: jax.Array, window: float) -> jax.Array:
     reach = round(window)
     for axis in range(2):
         moved = [jnp.roll(noise, shift, axis) for shift in range(-reach, reach + 1)]
-        noise = sum(moved[1:], moved[0]) / math.sqrt(len(moved))
+        noise = functools.reduce(jnp.add, moved) / math.sqrt(len(moved))
     return noise
 
 

@@ -18,7 +18,7 @@ from csac_jax import geometry
 from csac_jax.config import Config, HeightmapConfig, SensorConfig
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
-from csac_jax.vision import camera, heightmap, raycast, sensor
+from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
 from csac_jax.vision.camera import Camera
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 from csac_jax.vision.raycast import Polytopes, SurfaceHit
@@ -121,13 +121,16 @@ def from_pixels(
 def oblique_noisy(
     key: jax.Array, cfg: Config, shapes: Polytopes, tables: SurfaceTables, believed: Camera
 ) -> Observation:
-    """`from_pixels` with sensor noise; the real camera stands a little off the `believed` one."""
+    """`from_pixels` with sensor noise; the real camera stands a little off the `believed` one.
+    Flying pixels are left out, as `deploy` does."""
     key_pose, key_depth, key_colour = jax.random.split(key, 3)
     real = sensor.pose(key_pose, cfg.sensor, believed)
     hits = camera.cast_rays(real, raycast.cast_polytopes, shapes)
     exact = jnp.where(hits.valid, hits.distance, 0.0)
     lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
     depth, valid = sensor.depths(key_depth, cfg.sensor, cfg.camera, exact, hits.valid, lit)
+    if cfg.sensor.kind != "none":
+        valid &= depth_camera.supported(jnp.where(valid, depth, 0.0), cfg.camera.focal[0])
     hits = hits._replace(distance=depth, valid=valid)
     obs = from_pixels(cfg.heightmap, believed, hits, tables)
     return obs.replace(colour=sensor.colour(key_colour, cfg.sensor, obs.colour))
