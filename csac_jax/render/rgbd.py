@@ -63,7 +63,8 @@ class Studio:
 
 
 def _aim(camera: mujoco.MjvGLCamera, eye: Camera) -> None:
-    """OpenGL's camera with the pose and the intrinsics of `eye`; pixel centres are whole numbers."""
+    """Gives OpenGL's camera the pose and the intrinsics of `eye`, whose pixel centres are whole
+    numbers."""
     eye = jax.device_get(eye)
     camera.pos[:], camera.forward[:] = eye.position, eye.rotation[:, 2]
     camera.up[:] = -eye.rotation[:, 1]

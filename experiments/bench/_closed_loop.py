@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import functools
+import itertools
 import statistics
 import time
 import warnings
@@ -72,7 +73,7 @@ def set_points(cfg: SimConfig, decision: Decision) -> np.ndarray:
     )
     is_grasp = decision.primitive == "grasp"
     phases, rows = cfg.grasp_phases if is_grasp else cfg.push_phases, [stations[:1]]
-    for phase, (begin, end) in enumerate(zip(stations, stations[1:], strict=False)):
+    for phase, (begin, end) in enumerate(itertools.pairwise(stations)):
         share = np.arange(1, phases[phase] + 1)[:, None] / phases[phase]
         share = share**2 * (3.0 - 2.0 * share) if phase == 2 else share
         rows.append(begin + share * (end - begin))
