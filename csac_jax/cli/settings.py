@@ -91,12 +91,12 @@ def parse_view(
     }
 
 
-def _optional(section: type[config.Section]) -> Any:
+def _optional(section: Any) -> Any:
     """A dataclass of the settings of a section, each None if it is not given."""
     docs = _docs(section)
     fields = [
         (field.name, parsing.optional(field.type, docs[field.name]), None)
-        for field in dataclasses.fields(typing.cast(Any, section))
+        for field in dataclasses.fields(section)
     ]
     kind = dataclasses.make_dataclass(section.__name__, fields, frozen=True)
     kind.__doc__ = f"{section.__doc__} By default as the policy's."
