@@ -1,7 +1,6 @@
 """Episodes in which a deployed policy sees images of MuJoCo's renderer and moves a robot."""
 
 import collections
-import dataclasses
 import functools
 import itertools
 import statistics
@@ -28,6 +27,11 @@ from csac_jax.sim import outcome, physics as simulation, primitives
 from csac_jax.sim.primitives import Plan
 from csac_jax.vision import camera, sensor
 
+COUNTED = (
+    *("grasps", "pushes", "refused", "nothing_to_act_on", "out_of_reach", "warnings"),
+    *("blocks", "blocks_taken", "blocks_lost", "table_empty", "all_taken", *OUTCOMES),
+)
+"""What is counted: actions, decisions and images, blocks, episodes, grasps by outcome."""
 MOVED = 0.01  # m, a block that moves less has not changed the scene
 
 
@@ -104,18 +108,17 @@ def act(env: Env, scene: Scene, control: jax.Array, is_grasp: jax.Array) -> Step
 
 def measure(loop: Loop, errors: SensorConfig) -> dict[str, Any]:
     """What came of all episodes with images of this sensor."""
-    counts: collections.Counter[str] = collections.Counter()
+    counts = collections.Counter(dict.fromkeys(COUNTED, 0))
     seconds: list[float] = []
     for number in range(loop.episodes):
         _episode(loop, errors, number, counts, seconds)
-    grasps, taken = counts["grasps"], counts["blocks_taken"]
     return {
-        "sensor": dataclasses.asdict(errors),
-        "grasp_success": wilson(counts["lifted"], grasps),
-        "completion": wilson(counts["cleared"], loop.episodes),
+        "sensor": errors.kind,
+        "grasp_success": wilson(counts["lifted"], counts["grasps"]),
+        "completion": wilson(counts["all_taken"], loop.episodes),
+        "completion_reachable": wilson(counts["table_empty"], loop.episodes),
         "counts": dict(counts),
-        "blocks_taken": wilson(taken, counts["blocks"]),
-        "ms_per_decision": 1e3 * statistics.median(seconds) if seconds else None,
+        "ms_per_decision": 1e3 * statistics.median(seconds),
     }
 
 
@@ -129,7 +132,8 @@ def _episode(
     """One episode; adds what happened to `counts`, and the time of every decision."""
     env, task = loop.env, loop.env.cfg.task
     scene = _first_scene(loop, number)
-    counts["blocks"] += int(scene.in_play.sum())
+    blocks, taken_before = int(scene.in_play.sum()), counts["blocks_taken"]
+    counts["blocks"] += blocks
     studio = rgbd.Studio(model.build(env.cfg.scene, env.cfg.sim), scene, env.cfg.camera.size)
     unchanged = 0
     for action in range(task.max_actions):
@@ -145,7 +149,8 @@ def _episode(
         if not scene.in_play.any() or unchanged >= task.max_steps_without_change:
             break
     studio.close()
-    counts["cleared"] += not scene.in_play.any()
+    counts["table_empty"] += not scene.in_play.any()
+    counts["all_taken"] += counts["blocks_taken"] - taken_before == blocks
 
 
 def _first_scene(loop: Loop, number: int) -> Scene:

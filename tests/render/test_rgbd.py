@@ -94,7 +94,7 @@ def test_closed_loop():
     found = json.loads(done.stdout)
     for name, kind in (("clean", "none"), ("noise", "d415")):
         part = found[name]
-        assert part["sensor"]["kind"] == kind
+        assert part["sensor"] == kind
         assert part["counts"]["blocks"] == 10
         assert part["grasp_success"]["n"] == part["counts"]["grasps"] >= 8
         assert part["counts"]["lifted"] >= 6
