@@ -596,12 +596,10 @@ class Config(Section):
         )
         holds = max(self.train.scenes, batch) <= self.replay.capacity
         _require(holds, "replay.capacity: must hold train.scenes and learn.batch transitions")
-        no_camera, none, sensor = self.heightmap.view == "ortho", SensorConfig(), self.sensor
-        for name in ("pose_noise", "intrinsics_noise", "kind"):
-            value = getattr(none, name)
-            fits = getattr(sensor, name) == value or not no_camera
-            value = "none" if name == "kind" else 0
-            _require(fits, f"sensor.{name}: must be {value} where heightmap.view is ortho")
+        for name, off in (("pose_noise", 0), ("intrinsics_noise", 0), ("kind", "none")):
+            is_off = getattr(self.sensor, name) == getattr(SensorConfig, name)
+            fits = is_off or self.heightmap.view == "oblique"
+            _require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         _require(rotations % 2 == 0, "net.rotations: must be even")

@@ -78,10 +78,10 @@ def measure(
 ) -> tuple[jax.Array, jax.Array]:
     """Measured depths [h, w] m, and which pixels have one [h, w] bool.
 
-    No depth have: half of the pixels at edges; surfaces that are dark or seen at a flat angle; what
-    the second viewpoint does not see; what is too near or far. The signal that comes back is
-    lightness cos(angle). Windows are at least 3 px wide, whatever the camera. Multiple reflections,
-    sunlight and errors that stay from image to image are left out.
+    Half of the pixels at edges have no depth. Neither have surfaces that are dark or seen at a flat
+    angle, what the second viewpoint does not see, and what is too near or too far. The light that
+    comes back is lightness cos(angle). Edges are at least 1 px wide to both sides. Multiple
+    reflections, sunlight and errors that stay from image to image are left out.
 
     Args: exact [h, w] m along the optical axis; valid [h, w] bool, the ray hit anything; lightness
     [h, w], share of the light that the surface scatters; eye, whose intrinsics count.
