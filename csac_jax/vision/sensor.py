@@ -1,8 +1,12 @@
 """Errors of a real depth camera; those that are switched off are left out of the program.
 
-real = sensor.pose(key_pose, cfg, camera.make(believed))
-rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)  # drawn from `real` by anything
+An image of another renderer gets them so; `believed` is a CameraConfig:
+
+    real = sensor.pose(key_pose, cfg, camera.make(believed))  # draw rgb and depth from here
+    rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +48,7 @@ def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Arra
 
 
 def image(
-    key: jax.Array, cfg: SensorConfig, eye: CameraConfig, rgb: jax.Array, depth: jax.Array
+    key: jax.Array, cfg: SensorConfig, eye: CameraConfig, rgb: Any, depth: Any
 ) -> tuple[jax.Array, jax.Array]:
     """An image of any renderer as the sensor gives it; the pose's and the lens's errors are `pose`.
 
