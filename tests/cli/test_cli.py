@@ -816,5 +816,5 @@ def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str,
         yield from ()
 
     monkeypatch.setattr(rollout, "episode", episode)
-    play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE))
+    play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE), {})
     assert turned == [any_yaw]
