@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
 RobotKind = Literal["hand", "ur5"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
+SensorKind = Literal["none", "d415", "d435", "azure_kinect"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 MOST_ITEMS = 64  # of a setting that is a list (ours: networks and scenes end far below)
 
@@ -210,19 +211,29 @@ class CameraConfig(Section, section="camera"):
 
 
 class SensorConfig(Section, section="sensor"):
-    """Errors of a real depth camera; all 0: none, at no cost.
+    """Errors of a real depth camera; `none` and all 0: none, at no cost. Those of a `kind` come
+    first, the others are added.
 
     Depth errors: sigma = floor + square d^2. Khoshelham and Elberink (Sensors 12, 2012, 1437-1454)
     measured a square of 0.0014 for a structured-light camera.
     """
 
+    kind: SensorKind = "none"
+    """Camera whose depth images are imitated: noise, steps, holes and mixed pixels. The numbers
+    and their sources are in vision/depth_camera.py. It needs an oblique view."""
     depth_noise: tuple[float, float] = _bounded((0.0, 0.0), 0.0, 0.1)
     """Standard deviation of a depth: floor, m, and factor of the squared distance, 1/m."""
     dropped: float = _bounded(0.0, 0.0, 0.9)  # Probability that a pixel has no depth.
     pose_noise: tuple[float, float] = _bounded((0.0, 0.0), 0.0, 0.2)
     """Standard deviation of the camera's place, m, and orientation, rad, drawn in every view."""
+    intrinsics_noise: tuple[float, float] = _bounded((0.0, 0.0), 0.0, 0.05)
+    """Standard deviation of the focal lengths and of the optical axis, drawn in every view, as
+    shares of the focal length."""
     colour: float = _bounded(0.0, 0.0, 0.5)
     """Standard deviation of the gain of red, green and blue, drawn in every view."""
+    light: float = _bounded(0.0, 0.0, 0.5)
+    """Standard deviation of the light's direction and of the logarithm of its brightness, drawn in
+    every view."""
 
     @property
     def active(self) -> bool:
@@ -585,8 +596,10 @@ class Config(Section):
         )
         holds = max(self.train.scenes, batch) <= self.replay.capacity
         _require(holds, "replay.capacity: must hold train.scenes and learn.batch transitions")
-        has_camera = self.heightmap.view == "oblique" or self.sensor.pose_noise == (0.0, 0.0)
-        _require(has_camera, "sensor.pose_noise: must be 0 where heightmap.view is ortho")
+        for name, off in (("pose_noise", 0), ("intrinsics_noise", 0), ("kind", "none")):
+            is_off = getattr(self.sensor, name) == getattr(SensorConfig, name)
+            fits = is_off or self.heightmap.view == "oblique"
+            _require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         _require(rotations % 2 == 0, "net.rotations: must be even")

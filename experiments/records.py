@@ -162,6 +162,10 @@ BENCHES = {
     "one_step/cpu": ("MJX against C MuJoCo, one step", "bench one_step --states 1000"),
     "robots/cpu": ("the UR5 against the floating hand", "bench robots --grasps 500"),
     "export/cpu": ("exported policies; much other work on both cores", "bench export"),
+    "closed_loop/cpu": (
+        "the shipped policy, the UR5 and MuJoCo's renderer; much other work on both cores",
+        "bench closed_loop",
+    ),
     "serve/cpu": ("decisions over HTTP; other work on both cores", "bench serve"),
     "soak/h200": (
         "100,000 random actions: nothing lost, nothing infinite",

@@ -9,14 +9,15 @@ from typing import Any, Literal
 
 import tyro
 
-from csac_jax.cli import output, parsing
+from csac_jax.cli import output, settings
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
 from csac_jax.config import Config
 
 
 @dataclasses.dataclass(frozen=True)
 class EvalOptions:
-    """Measures a policy in scenes that training never saw."""
+    """Measures a policy in scenes that training never saw. It sees as it was trained to, unless
+    settings of its height map, camera or sensor are given."""
 
     source: tyro.conf.Positional[str]
     """A run's folder, a policy file, or shipped for the policy that comes with the package."""
@@ -27,7 +28,8 @@ class EvalOptions:
     blocks' poses."""
     suite: str = "in_distribution"
     """Scenes: in_distribution (like the training's), random10, random30, cases, target (needs a
-    policy of that task), generated, or a case file."""
+    policy of that task), generated, camera (random10 through ever worse cameras), or a case
+    file."""
     physics: Literal["auto", "mjx", "c"] = "auto"
     """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5"] = "hand"
@@ -42,7 +44,7 @@ class EvalOptions:
 
 def run(arguments: list[str]) -> int:
     """Measures and prints; returns the exit code."""
-    options = parsing.parse(EvalOptions, arguments, "eval")
+    options, view = settings.parse_view(EvalOptions, "eval", arguments)
     if options.episodes < 1:
         raise BadArgumentsError("--episodes: at least 1")
     check_seed(options.seed)
@@ -50,7 +52,9 @@ def run(arguments: list[str]) -> int:
 
     policy = policies.POLICIES[options.policy](options.source, options.step)
     begun = time.time()
-    cfg, result = _evaluate(options, policy)
+    with as_bad_arguments(ValueError):
+        seen = policy.cfg.change(**view)
+    cfg, result = _evaluate(options, policy, seen)
     seconds = round(time.time() - begun, 1)
     for part, summary in result.get("parts", {Path(options.suite).stem: result}).items():
         title = f"{options.policy} policy, {part}: {options.episodes} episodes, seed {options.seed}"
@@ -60,13 +64,14 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def _evaluate(options: EvalOptions, policy: Any) -> tuple[Config, dict[str, Any]]:
-    """The config that was measured in and the result, see `rollout.evaluate`; shows progress."""
+def _evaluate(options: EvalOptions, policy: Any, seen: Config) -> tuple[Config, dict[str, Any]]:
+    """The config that was measured in, from `seen`, and the result, see `rollout.evaluate`; shows
+    progress."""
     from csac_jax.evaluation import rollout, suites
     from csac_jax.runtime import cache
 
     cache.enable()
-    cfg = rollout.configured(policy.cfg, options.physics, options.robot)
+    cfg = rollout.configured(seen, options.physics, options.robot)
     count, seed, learned = options.episodes, options.seed, options.policy == "learned"
     with _progress_bar() as show:
         with as_bad_arguments(ValueError):

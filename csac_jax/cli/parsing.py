@@ -6,7 +6,7 @@ import io
 import os
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
@@ -31,6 +31,11 @@ def parse(
     except SystemExit:
         help_flag = "--help" if default is tyro.MISSING_NONPROP else "--help-all"
         raise BadArgumentsError(_one_line(complaint.getvalue(), f"{prog} {help_flag}")) from None
+
+
+def optional(kind: Any, text: str) -> Any:
+    """The type of a setting that may be left out, with its help."""
+    return Annotated[kind | None, tyro.conf.arg(help=text)]
 
 
 def asks_help(arguments: Sequence[str]) -> bool:

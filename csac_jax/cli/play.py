@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from csac_jax import presets
-from csac_jax.cli import output, parsing
+from csac_jax.cli import output, settings
 from csac_jax.cli.failures import as_bad_arguments, check_extra, check_seed
 
 
@@ -40,7 +40,7 @@ class PlayOptions:
 
 def run(arguments: list[str]) -> int:
     """Runs the episode; returns the exit code."""
-    options = parsing.parse(PlayOptions, arguments, "play")
+    options, view = settings.parse_view(PlayOptions, "play", arguments)
     _check(options)
     drawn, opengl = options.png is not None or options.video is not None, None
     if drawn:
@@ -48,7 +48,7 @@ def run(arguments: list[str]) -> int:
 
         opengl = gl.choose()  # before MuJoCo is imported
     begun = time.time()
-    env, steps = _play(options, _policy(options.policy))
+    env, steps = _play(options, _policy(options.policy), view)
     from csac_jax.render import episode
 
     print(episode.summary(env.cfg, steps))
@@ -95,15 +95,16 @@ def _policy(source: str) -> Any:
     return kinds[source](presets.quick()) if source in kinds else policies.load(source)
 
 
-def _play(options: PlayOptions, policy: Any) -> tuple[Any, list[Any]]:
-    """The environment and the records of the episode's steps, each printed as it happens."""
+def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any, list[Any]]:
+    """The environment and the records of the episode's steps, each printed as it happens; `view`
+    says what is changed in the policy's config."""
     from csac_jax.evaluation import rollout, suites
     from csac_jax.render import episode
     from csac_jax.runtime import cache
 
     cache.enable()
-    cfg = rollout.configured(policy.cfg, options.physics, options.robot)
     with as_bad_arguments(ValueError):
+        cfg = rollout.configured(policy.cfg.change(**view), options.physics, options.robot)
         (env,) = suites.environments(cfg, _suite(options.scene), 1, options.seed).values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")

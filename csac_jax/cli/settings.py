@@ -22,6 +22,8 @@ FIRST = (
     *("learn.updates", "target.gamma", "replay.sampler", "replay.capacity", "net.kind"),
 )
 """The settings that people change first."""
+VIEW = ("heightmap", "camera", "sensor")
+"""Sections that say how a policy sees; `eval` and `play` take them for any policy."""
 _METAVARS: Any = {bool: "", Path: "PATH", int: "N", str: "TEXT", tuple[str, ...]: "NAME=A,B"}
 _LAYOUT = partial(argparse.RawDescriptionHelpFormatter, max_help_position=32, width=100)
 
@@ -68,6 +70,37 @@ def parse(options: type, command: str, base: Config, flags: Sequence[str]) -> tu
     given = parsing.parse(kind, list(flags), command, default)
     changed = {name: getattr(given, name) for name in (*sections, "algo", "seed")}
     return given, dataclasses.replace(base, **changed)
+
+
+def parse_view(
+    options: type, command: str, flags: Sequence[str]
+) -> tuple[Any, dict[str, dict[str, Any]]]:
+    """The `options` of a command, and what its flags change in the sections VIEW, as
+    `Config.change` takes it; what no flag gives stays the policy's."""
+    fields = [(name, _optional(type(getattr(Config, name)))) for name in VIEW]
+    listed = [(name, kind, dataclasses.field(default=kind())) for name, kind in fields]
+    kind: Any = dataclasses.make_dataclass(
+        options.__name__, listed, bases=(options,), frozen=True, kw_only=True
+    )
+    kind.__doc__ = options.__doc__
+    given = parsing.parse(kind, list(flags), command)
+    changes = {name: vars(getattr(given, name)).items() for name in VIEW}
+    return given, {
+        name: {key: value for key, value in values if value is not None}
+        for name, values in changes.items()
+    }
+
+
+def _optional(section: Any) -> Any:
+    """A dataclass of the settings of a section, each None if it is not given."""
+    docs = _docs(section)
+    fields = [
+        (field.name, parsing.optional(field.type, docs[field.name]), None)
+        for field in dataclasses.fields(section)
+    ]
+    kind = dataclasses.make_dataclass(section.__name__, fields, frozen=True)
+    kind.__doc__ = f"{section.__doc__} By default as the policy's."
+    return kind
 
 
 def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:

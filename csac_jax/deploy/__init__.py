@@ -25,10 +25,12 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import policy_file
 from csac_jax.runtime import cache
 from csac_jax.sim.outcome import BARE
+from csac_jax.vision import depth_camera
 from csac_jax.vision.heightmap import Observation
 
 MOST_ALTERNATIVES = 64
 
+_supported = jax.jit(depth_camera.supported)
 _observe = jax.jit(program.observe, static_argnums=0)
 _dense_maps = jax.jit(program.dense_maps, static_argnums=(0, 3))
 _choose = jax.jit(program.choose, static_argnums=0)
@@ -122,6 +124,7 @@ class Policy:
         target = np.zeros(n, bool) if self.cfg.task.kind == "target" else None
         cache.enable()
         obs = _observe(self.cfg, *pixels, target)
+        _supported(np.zeros((height, width), np.float32), 1.0)
         state = _dense_maps(self.cfg, self.params, obs, target is not None)
         jax.block_until_ready(_choose(self.cfg, state, jax.numpy.zeros(rows)))
 
@@ -146,9 +149,11 @@ class Policy:
 
 
 def _pixels(view: View) -> tuple[Any, ...]:
-    """Points, which are valid, colours and target flags of a view's pixels, as `observe` takes."""
+    """Points, which are valid, colours and target flags of a view's pixels, as `observe` takes.
+    Pixels that fly, as depth cameras have them at edges, are not valid."""
     target = None if view.target is None else view.target.reshape(-1)
-    flat = view.points.reshape(-1, 3), view.valid.reshape(-1), view.colour.reshape(-1, 3), target
+    valid = _supported(view.depth, view.intrinsics.fx).reshape(-1)
+    flat = view.points.reshape(-1, 3), valid, view.colour.reshape(-1, 3), target
     return jax.device_put(flat)
 
 

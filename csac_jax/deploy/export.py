@@ -23,6 +23,7 @@ import numpy as np
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
 from csac_jax.deploy import program
+from csac_jax.vision import depth_camera
 from csac_jax.vision.heightmap import Observation
 
 Outputs = tuple[jax.Array, ...]  # see above
@@ -53,7 +54,7 @@ def from_image(
     ) -> Outputs:
         points = _points(depth, lens, pose).reshape(-1, 3)
         marked = mask[0].reshape(-1) if mask else None
-        colour, valid = rgb.reshape(-1, 3), depth.reshape(-1) > 0.0
+        colour, valid = rgb.reshape(-1, 3), depth_camera.supported(depth, lens[0]).reshape(-1)
         obs = program.observe(cfg, points, valid, colour, marked)
         return _outputs(cfg, params, obs, has_target)
 

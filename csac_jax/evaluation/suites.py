@@ -7,6 +7,8 @@
 `target`           the cases and random10 with one marked block to get within 5 actions (CSAC
                    sec. 4.4); for policies of the target task.
 `generated`        ordered arrangements of all levels of difficulty.
+`camera`           random10 seen straight down, from the side, with the noise of a depth camera,
+                   with a camera that is also 5 mm off, and with the noise and other colours.
 a path             the user's case file.
 
 Training draws from stream 0 of random numbers, a suite from stream 1 + seed; no case is in
@@ -24,7 +26,7 @@ import jax
 import numpy as np
 
 from csac_jax import env as environment, presets
-from csac_jax.config import Config, SceneConfig, SimConfig, SlotKind
+from csac_jax.config import Config, SceneConfig, SensorConfig, SensorKind, SimConfig, SlotKind
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
 from csac_jax.scene import arrange, cases, model, pool
@@ -144,9 +146,30 @@ def _generated(cfg: Config, episodes: int, stream: int) -> Env:
     return Env(cfg, _physics(cfg), scenes)
 
 
+def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
+    """`sensor.kind` of the config names the depth camera; `d415` where it is none."""
+    kind: SensorKind = "d415" if cfg.sensor.kind == "none" else cfg.sensor.kind
+    exact, noisy = SensorConfig(), SensorConfig(kind=kind)
+    sensors = {
+        "straight_down": exact,
+        "oblique": exact,
+        "noise": noisy,
+        "noise_5mm": dataclasses.replace(noisy, pose_noise=(0.005, 0.0)),
+        "noise_colours": dataclasses.replace(noisy, colour=0.2, light=0.2),
+    }
+    above = {"heightmap": {"view": "ortho"}, "sensor": exact}
+    ten = _ten(cfg.change(**above), episodes, stream)
+    views = {name: {"view": "oblique"} for name in sensors} | {"straight_down": {}}
+    return {
+        name: dataclasses.replace(ten, cfg=ten.cfg.change(heightmap=views[name], sensor=sensor))
+        for name, sensor in sensors.items()
+    }
+
+
 register(IN_DISTRIBUTION, lambda cfg, count, stream: environment.make_env(cfg, stream, count))
 register("random10", _ten)
 register("random30", _thirty)
 register("cases", lambda cfg, episodes, stream: _cases(cfg))
 register("target", _target, target=True)
 register("generated", _generated)
+register("camera", _camera)

@@ -38,9 +38,7 @@ class Stage:
         self._cfg, self._height, self._views = cfg, size[1], views
         self._world = model.build(cfg.scene, cfg.sim)
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
-        self._model = model.with_blocks(self._world, self._fields)
-        colours = blocks.COLOURS[first.scene.colour[self._world.parts.slot]]
-        self._model.geom_rgba[self._world.block_geoms, :3] = colours
+        self._model = picture.coloured(self._world, self._fields, first.scene)
         self._data = mujoco.MjData(self._model)
         self._draw = picture.renderer(self._model, VIEWS[cfg.sim.robot]._replace(size=size), opengl)
 

@@ -9,7 +9,9 @@ import mujoco
 import numpy as np
 
 from csac_jax.config import CameraConfig
-from csac_jax.scene import geoms, solids
+from csac_jax.scene import blocks, geoms, solids
+from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import BlockFields, World, with_blocks
 from csac_jax.vision import camera
 
 FLOOR = (0.75, 0.76, 0.78, 1.0)
@@ -25,6 +27,13 @@ class View(NamedTuple):
     position: tuple[float, float, float]  # m
     look_at: tuple[float, float, float]  # m
     size: tuple[int, int] = (640, 480)  # width and height, px
+
+
+def coloured(world: World, fields: BlockFields, scene: Scene) -> mujoco.MjModel:
+    """The world's model with the blocks of a scene, of these fields, in their colours."""
+    model = with_blocks(world, fields)
+    model.geom_rgba[world.block_geoms, :3] = blocks.COLOURS[scene.colour[world.parts.slot]]
+    return model
 
 
 def renderer(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:

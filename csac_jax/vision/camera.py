@@ -76,9 +76,10 @@ def cast_rays(camera: Camera, cast: Callable[..., Any], shapes: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), hits)
 
 
-def shade(colour: jax.Array, normal: jax.Array) -> jax.Array:
-    """Flat shading: colours [S, 3], 0 .. 1, of surfaces lit by their unit normals [S, 3]."""
-    x, y, z = LIGHT
+def shade(colour: jax.Array, normal: jax.Array, light: Any = LIGHT) -> jax.Array:
+    """Flat shading: colours [S, 3], 0 .. 1, of surfaces with unit normals [S, 3]; `light` [3] is
+    the unit vector towards the light."""
+    x, y, z = light
     cosine = normal[:, 0] * x + normal[:, 1] * y + normal[:, 2] * z  # [S]
     return (AMBIENT + (1.0 - AMBIENT) * jnp.maximum(cosine, 0.0))[:, None] * colour
 

@@ -8,19 +8,22 @@ A surface is a face of a geom or the table, numbered as in `raycast.SurfaceHit`.
 geoms, [h, w] = camera pixels.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from csac_jax import geometry
 from csac_jax.config import Config, HeightmapConfig, SensorConfig
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
-from csac_jax.vision import camera, heightmap, raycast, sensor
+from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
 from csac_jax.vision.camera import Camera
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 from csac_jax.vision.raycast import Polytopes, SurfaceHit
+
+_LIGHT = np.uint32(2**31)  # distinct from a view key's children by `split`
 
 
 class SurfaceTables(NamedTuple):
@@ -40,7 +43,8 @@ def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observat
         jax.vmap(geometry.quat_to_matrix)(scene.quaternion)[slot],
         jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
     )
-    tables = surface_tables(shapes, layout.is_target(scene)[slot])
+    is_target = layout.is_target(scene)[slot]
+    tables = surface_tables(shapes, is_target, _light(cfg.sensor, key))
     if cfg.heightmap.view == "ortho":
         exact = ortho(cfg.heightmap, shapes, tables)
         return exact if key is None else ortho_noisy(key, cfg.sensor, exact, tables)
@@ -51,17 +55,27 @@ def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observat
     return from_pixels(cfg.heightmap, believed, hits, tables)
 
 
-def surface_tables(shapes: Polytopes, is_target: jax.Array) -> SurfaceTables:
+def _light(noise: SensorConfig, key: jax.Array | None) -> Any:
+    """Unit vector [3] towards the light."""
+    if key is None or noise.light == 0.0:
+        return camera.LIGHT
+    return sensor.light(jax.random.fold_in(key, _LIGHT), noise)
+
+
+def surface_tables(
+    shapes: Polytopes, is_target: jax.Array, light: Any = camera.LIGHT
+) -> SurfaceTables:
     """Lit colour and target flag of every surface; the table counts as target if all geoms do.
 
-    Args: is_target [G] bool, geoms of the block to get; all True if any block will do.
+    Args: is_target [G] bool, geoms of the block to get; all True if any block will do; light, see
+    `camera.shade`.
     """
 
     def per_surface(table: jax.Array, geom: jax.Array) -> jax.Array:
         return jnp.concatenate([table[None], jnp.repeat(geom, shapes.offset.shape[1], axis=0)])
 
     colour = per_surface(jnp.asarray(blocks.TABLE_COLOUR), shapes.colour)
-    lit = camera.shade(colour, raycast.surface_normals(shapes))
+    lit = camera.shade(colour, raycast.surface_normals(shapes), light)
     return SurfaceTables(lit, per_surface(jnp.all(is_target), is_target))
 
 
@@ -107,11 +121,16 @@ def from_pixels(
 def oblique_noisy(
     key: jax.Array, cfg: Config, shapes: Polytopes, tables: SurfaceTables, believed: Camera
 ) -> Observation:
-    """`from_pixels` with sensor noise; the real camera stands a little off the `believed` one."""
+    """`from_pixels` with sensor noise; the real camera stands a little off the `believed` one.
+    Flying pixels are left out, as `deploy` does."""
     key_pose, key_depth, key_colour = jax.random.split(key, 3)
     real = sensor.pose(key_pose, cfg.sensor, believed)
     hits = camera.cast_rays(real, raycast.cast_polytopes, shapes)
-    depth, valid = sensor.depth(key_depth, cfg.sensor, jnp.where(hits.valid, hits.distance, 0.0))
-    hits = hits._replace(distance=depth, valid=hits.valid & valid)
+    exact = jnp.where(hits.valid, hits.distance, 0.0)
+    lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
+    depth, valid = sensor.depths(key_depth, cfg.sensor, cfg.camera, exact, hits.valid, lit)
+    if cfg.sensor.kind != "none":
+        valid &= depth_camera.supported(jnp.where(valid, depth, 0.0), cfg.camera.focal[0])
+    hits = hits._replace(distance=depth, valid=valid)
     obs = from_pixels(cfg.heightmap, believed, hits, tables)
     return obs.replace(colour=sensor.colour(key_colour, cfg.sensor, obs.colour))

@@ -1,12 +1,24 @@
-"""Noise of a real depth camera; noise of standard deviation 0 is left out of the program."""
+"""Errors of a real depth camera; those that are switched off are left out of the program.
+
+An image of another renderer gets them so; `believed` is a CameraConfig:
+
+    real = sensor.pose(key_pose, cfg, camera.make(believed))  # draw rgb and depth from here
+    rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)
+"""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.config import SensorConfig
+from csac_jax.config import CameraConfig, SensorConfig
+from csac_jax.vision import camera, depth_camera
 from csac_jax.vision.camera import Camera
+
+_OWN = np.uint32(2**31)  # distinct from a key's children by `split`
+_SRGB = 2.2  # exponent from a colour level to light, about that of sRGB
 
 
 def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
@@ -16,7 +28,7 @@ def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
         return None
     if key is None:
         raise ValueError("a reset with sensor noise (config section `sensor`) needs a key")
-    return jax.random.fold_in(key, np.uint32(2**31))  # distinct from the key's children by `split`
+    return jax.random.fold_in(key, _OWN)
 
 
 def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -35,8 +47,44 @@ def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Arra
     return measured, valid
 
 
+def image(
+    key: jax.Array, cfg: SensorConfig, eye: CameraConfig, rgb: Any, depth: Any
+) -> tuple[jax.Array, jax.Array]:
+    """An image of any renderer as the sensor gives it; the pose's and the lens's errors are `pose`.
+
+    Args: rgb [h, w, 3] uint8; depth [h, w] m along the optical axis, 0 or NaN where there is none.
+    Returns: the same; depth 0 where there is none.
+    """
+    key_depth, key_colour = jax.random.split(key)
+    exact, valid = depth.astype(jnp.float32), depth > 0.0
+    seen = rgb.astype(jnp.float32) / 255.0
+    found, kept = depths(key_depth, cfg, eye, jnp.where(valid, exact, 0.0), valid, seen)
+    levels = jnp.round(255.0 * colour(key_colour, cfg, seen)).astype(jnp.uint8)
+    return levels, jnp.where(kept, jnp.maximum(found, 0.0), 0.0)
+
+
+def depths(
+    key: jax.Array,
+    cfg: SensorConfig,
+    eye: CameraConfig,
+    exact: jax.Array,
+    valid: jax.Array,
+    colour: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Depth image [h, w] m and which pixels have a depth, bool: of `depth_camera`, then `depth`.
+
+    Args: exact [h, w] m; valid [h, w] bool; colour [h, w, 3], 0 .. 1, as lit.
+    """
+    if cfg.kind != "none":
+        lightness = jnp.mean(colour, axis=-1) ** _SRGB
+        camera, own = depth_camera.CAMERAS[cfg.kind], jax.random.fold_in(key, _OWN)
+        exact, valid = depth_camera.measure(own, camera, eye, exact, valid, lightness)
+    measured, kept = depth(key, cfg, exact)
+    return measured, valid & kept
+
+
 def pose(key: jax.Array, cfg: SensorConfig, believed: Camera) -> Camera:
-    """The real camera: the believed one, moved and rotated a little."""
+    """The real camera: the believed one, moved and rotated a little, with another lens."""
     key_position, key_rotation = jax.random.split(key)
     position, rotation = believed.position, believed.rotation
     std_position, std_rotation = cfg.pose_noise
@@ -47,12 +95,26 @@ def pose(key: jax.Array, cfg: SensorConfig, believed: Camera) -> Camera:
         quat = jnp.concatenate([jnp.ones(1), half_angle])  # small angles
         jitter = geometry.quat_to_matrix(quat / jnp.sqrt(jnp.sum(quat**2)))
         rotation = (jitter[:, :, None] * rotation[None]).sum(1)
-    return believed.replace(position=position, rotation=rotation)
+    focal, centre = believed.focal, believed.centre
+    if cfg.intrinsics_noise != (0.0, 0.0):
+        std = jnp.asarray(cfg.intrinsics_noise, jnp.float32)[:, None]
+        off = std * jax.random.normal(jax.random.fold_in(key, _OWN), (2, 2))
+        focal, centre = focal * (1.0 + off[0]), centre + focal * off[1]
+    return believed.replace(position=position, rotation=rotation, focal=focal, centre=centre)
+
+
+def light(key: jax.Array, cfg: SensorConfig) -> jax.Array:
+    """Unit vector [3] towards the light: that of `camera.shade`, turned a little."""
+    towards = jnp.asarray(camera.LIGHT, jnp.float32) + cfg.light * jax.random.normal(key, (3,))
+    return towards / jnp.sqrt(jnp.sum(towards**2))
 
 
 def colour(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> jax.Array:
-    """Colours [H, W, 3] in 0 .. 1 under another white balance: one random gain per channel."""
-    if cfg.colour == 0.0:
+    """Colours [H, W, 3] in 0 .. 1 under another white balance and brightness: one random gain per
+    channel, and one of all."""
+    if cfg.colour == 0.0 and cfg.light == 0.0:
         return exact
     gain = 1.0 + cfg.colour * jax.random.normal(key, (3,))
+    if cfg.light > 0.0:
+        gain = gain * jnp.exp(cfg.light * jax.random.normal(jax.random.fold_in(key, _OWN)))
     return jnp.clip(gain[None, None] * exact, 0.0, 1.0)

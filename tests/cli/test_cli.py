@@ -123,6 +123,10 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
+        ("eval shipped --sensor.kind d400", "invalid choice 'd400' for argument '--sensor.kind'"),
+        ("eval shipped --sensor.kind d415", "sensor.kind: must be none where heightmap.view is"),
+        ("eval shipped --camera.size 320 240", "camera.centre: (319.5, 239.5) is not near the"),
+        ("play --heightmap.size 60", "heightmap.size: must be a multiple of 8"),
         ("eval . --seed 2147483647", "--seed: must lie in"),
         (
             "eval shipped --suite nowhere",
@@ -154,6 +158,8 @@ def run_dir(tmp_path: Path) -> Path:
         ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
         ("doctor --preset quick --learn.tau 2", "learn.tau: must be above 0, at most 1"),
         ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
+        ("bench closed_loop --episodes 0", "bench closed_loop: --episodes: must be at least 1"),
+        ("bench closed_loop --robot ur3", "argument --robot: invalid choice: 'ur3'"),
         ("bench soak --actions 0", "bench soak: --actions: must be at least 1"),
         (
             "bench act --pixels 40",
@@ -462,6 +468,31 @@ def test_old_suite_is_accepted(capsys: pytest.CaptureFixture, monkeypatch: pytes
     monkeypatch.setitem(suites.SUITES, "in_distribution", suites.Suite(build))
     code, line = _fails(capsys, "eval", "shipped", "--suite", "own", "--episodes", "1")
     assert (code, line) == (2, "csac-jax: in_distribution is asked for\n")
+
+
+@pytest.mark.parametrize("command", ["eval shipped --suite random10", "play --policy shipped"])
+def test_any_policy_sees_through_another_camera(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, command: str
+):
+    """Claim: `eval` and `play` change how a policy sees by flags, and nothing else of it."""
+    asked = []
+
+    def build(cfg, *_):
+        asked.append(cfg)
+        raise ValueError("enough")
+
+    for name in ("random10", "in_distribution"):
+        monkeypatch.setitem(suites.SUITES, name, suites.Suite(build))
+    flags = "--heightmap.view oblique --camera.position -0.4 0 0.6 --sensor.kind d435 "
+    code, _ = _fails(capsys, *command.split(), *(flags + "--sensor.colour 0.1").split())
+    assert code == 2
+    (cfg,) = asked
+    trained = policies.load_config("shipped")
+    assert cfg.change(sim=trained.sim) == trained.change(
+        heightmap={"view": "oblique"},
+        camera={"position": (-0.4, 0.0, 0.6)},
+        sensor={"kind": "d435", "colour": 0.1},
+    )
 
 
 def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
@@ -785,5 +816,5 @@ def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str,
         yield from ()
 
     monkeypatch.setattr(rollout, "episode", episode)
-    play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE))
+    play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE), {})
     assert turned == [any_yaw]

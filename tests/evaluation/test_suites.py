@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import Config, TaskConfig
+from csac_jax.config import Config, SensorConfig, TaskConfig
 from csac_jax.evaluation import rollout, suites
 from csac_jax.scene import cases, layout, pool
 
@@ -178,9 +178,29 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
         suites.environments(CFG, "target", EPISODES, 0)
 
 
+def test_camera_suite(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the suite `camera` is the scenes of random10 through ever worse cameras: straight
+    down, from the side, with noise, 5 mm off, in other colours; a sensor that is named stays."""
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN.scene.slots))
+    monkeypatch.setattr(pool, "settled", lambda *_, **__: blank)
+    noisy = CFG.change(heightmap={"view": "oblique"}, sensor={"kind": "azure_kinect"})
+    for cfg, kind in ((CFG, "d415"), (noisy, "azure_kinect")):
+        parts = suites.environments(cfg, "camera", EPISODES, 0)
+        seen = [(env.cfg.heightmap.view, env.cfg.sensor) for env in parts.values()]
+        noise = SensorConfig(kind=kind)
+        assert seen == [
+            ("ortho", SensorConfig()),
+            ("oblique", SensorConfig()),
+            ("oblique", noise),
+            ("oblique", dataclasses.replace(noise, pose_noise=(0.005, 0.0))),
+            ("oblique", dataclasses.replace(noise, colour=0.2, light=0.2)),
+        ]
+        assert len({id(env.scenes) for env in parts.values()}) == 1
+
+
 def test_unknown_suite():
     """Claim: a suite that is none is refused with the names of those that there are."""
-    names = "in_distribution, random10, random30, cases, target, generated"
+    names = "in_distribution, random10, random30, cases, target, generated, camera"
     with pytest.raises(ValueError, match=f"'hard'.*{names}"):
         suites.environments(CFG, "hard", EPISODES, 0)
 

@@ -60,6 +60,35 @@ def test_colours_change_together():
     )
 
 
+def test_the_lens_is_another():
+    """Claim: focal lengths and the axis scatter by the stated shares of the focal length; nothing
+    else changes."""
+    errors, eye = SensorConfig(intrinsics_noise=(0.01, 0.02)), camera.make(CameraConfig())
+    keys = jax.random.split(jax.random.key(4), 3000)
+    real = jax.device_get(jax.jit(jax.vmap(lambda key: sensor.pose(key, errors, eye)))(keys))
+    focal, centre = jax.device_get((eye.focal, eye.centre))
+    np.testing.assert_allclose((real.focal / focal).std(0), 0.01, rtol=0.06)
+    np.testing.assert_allclose(((real.centre - centre) / focal).std(0), 0.02, rtol=0.06)
+    np.testing.assert_array_equal(real.rotation[7], eye.rotation)
+
+
+def test_light_changes_in_every_view():
+    """Claim: the light's direction scatters about its own, and the logarithm of its brightness by
+    the stated standard deviation."""
+    errors = SensorConfig(light=0.1)
+    keys, others = jax.random.split(jax.random.key(5), (2, 3000))
+    towards = np.asarray(jax.jit(jax.vmap(lambda key: sensor.light(key, errors)))(keys))
+    np.testing.assert_allclose(np.linalg.norm(towards, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(towards.mean(0), camera.LIGHT, atol=0.02)
+    assert 0.05 < towards.std(0).max() < 0.11
+    grey = jnp.full((1, 1, 3), 0.3)
+    gains = (
+        np.asarray(jax.jit(jax.vmap(lambda key: sensor.colour(key, errors, grey)))(others)) / 0.3
+    )
+    np.testing.assert_allclose(np.log(gains[:, 0, 0, 0]).std(), 0.1, rtol=0.06)
+    np.testing.assert_allclose(gains, np.broadcast_to(gains[..., :1], gains.shape), rtol=1e-5)
+
+
 def test_no_errors_change_nothing():
     """Claim: with every standard deviation 0 each part gives back what it was given."""
     none, eye = SensorConfig(), camera.make(CameraConfig())
@@ -107,6 +136,11 @@ _PUSH = Action(primitive=jnp.int32(0), pose=jnp.array([0.15, 0.15, 0.0]))
         (SMALL, ERRORS),
         pytest.param(
             OBLIQUE, dataclasses.replace(ERRORS, pose_noise=(0.005, 0.01)), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            OBLIQUE,
+            SensorConfig(kind="d415", intrinsics_noise=(0.002, 0.002), light=0.1),
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -190,6 +224,15 @@ def test_an_episode_with_errors_needs_a_key():
         (lambda: SensorConfig(dropped=1.0), "sensor.dropped"),
         (lambda: SensorConfig(depth_noise=(0.0, -0.1)), "sensor.depth_noise"),
         (lambda: Config(sensor=SensorConfig(pose_noise=(0.0, 0.01))), "sensor.pose_noise.*ortho"),
+        (
+            lambda: Config(sensor=SensorConfig(kind="d415")),
+            "sensor.kind: must be none where.*ortho",
+        ),
+        (
+            lambda: Config(sensor=SensorConfig(intrinsics_noise=(0.0, 0.01))),
+            "sensor.intrinsics_noise.*ortho",
+        ),
+        (lambda: SensorConfig(kind="d400"), "sensor.kind: 'd400' is not one of: none, d415"),
         (lambda: HeightmapConfig(view="side"), "heightmap.view"),
         (lambda: HeightmapConfig(size=60), "heightmap.size"),
         (lambda: dataclasses.replace(Config(), heightmap=HeightmapConfig(size=80)), "net.margin"),

@@ -1,0 +1,90 @@
+"""The camera's pose from points that the robot has touched: hand-eye calibration, no target needed.
+
+Mark five places or more, not on one line, at different heights if possible. Note each one's pixel
+in an image, touch it with the point between the closed finger tips, and note where the robot is.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from csac_jax.deploy import images
+from csac_jax.errors import SettingsError
+
+LEAST = 4  # points: three fit always, and leave no residual
+SCALE_TOLERANCE = 0.02  # of distances in the image over distances touched (ours)
+_AROUND = 2  # px to all sides in which the median depth is taken
+_LINE = 0.01  # m, least standard deviation of the points across the line through them
+
+
+class Calibration(NamedTuple):
+    """A camera's pose and how well it fits. n = points."""
+
+    pose: np.ndarray  # [4, 4] camera (x right, y down, z forward) to the frame of what was touched
+    residual_mm: np.ndarray  # [n] from each touched point to where the pose puts the seen one
+    scale: float  # distances between the seen points over those between the touched ones
+
+
+def seen_points(depth: Any, intrinsics: Any, pixels: Any) -> np.ndarray:
+    """Points [n, 3] m in the camera's frame of pixels [n, 2], column and row.
+
+    Args: depth [h, w] m, 0 or NaN where there is none; intrinsics as `Policy.decide` takes them.
+    Raises SettingsError for pixels outside of the image, or with no depth around them.
+    """
+    camera, depth = images.Intrinsics.of(intrinsics), np.asarray(depth, np.float64)
+    if depth.shape != camera.shape:
+        raise SettingsError("depth: its size is not that of the intrinsics")
+    places = _points(pixels, 2, "pixels").round().astype(int)
+    if np.any(places < 0) or np.any(places >= depth.shape[::-1]):
+        raise SettingsError("pixels: must lie in the image, column first")
+    distance = np.array([_median_depth(depth, col, row) for col, row in places])
+    return images.rays(camera)[places[:, 1], places[:, 0]] * distance[:, None]
+
+
+def _median_depth(depth: np.ndarray, col: int, row: int) -> float:
+    top, left = max(row - _AROUND, 0), max(col - _AROUND, 0)
+    around = depth[top : row + _AROUND + 1, left : col + _AROUND + 1]
+    measured = around[around > 0.0]
+    if not measured.size:
+        raise SettingsError(f"pixels: there is no depth at column {col}, row {row}; choose another")
+    return float(np.median(measured))
+
+
+def fit(seen: Any, touched: Any) -> Calibration:
+    """The rigid pose that maps seen points [n, 3] to touched ones [n, 3], m, by least squares.
+
+    Closed form: Kabsch, Acta Crystallographica A 32, 1976. Raises SettingsError for fewer than
+    LEAST points, for points on a line, and for distances that differ by more than SCALE_TOLERANCE.
+    """
+    seen, touched = _points(seen, 3, "seen"), _points(touched, 3, "touched")
+    if len(seen) != len(touched) or len(seen) < LEAST:
+        raise SettingsError(
+            f"touched: give one point for each one seen, {LEAST} or more, not {len(touched)} for "
+            f"{len(seen)}"
+        )
+    from_mean, to_mean = seen - seen.mean(axis=0), touched - touched.mean(axis=0)
+    if np.linalg.svd(to_mean, compute_uv=False)[1] < _LINE * len(seen) ** 0.5:
+        raise SettingsError("touched: the points lie on a line; choose some beside it")
+    scale = float(np.linalg.norm(from_mean) / np.linalg.norm(to_mean))
+    if abs(scale - 1.0) > SCALE_TOLERANCE:
+        raise SettingsError(
+            f"seen: distances between the points are {scale:.3f} times those touched; check the "
+            "intrinsics, the unit of the depth, and the points"
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.align_vectors(to_mean, from_mean)[0].as_matrix()
+    pose[:3, 3] = touched.mean(axis=0) - pose[:3, :3] @ seen.mean(axis=0)
+    off = seen @ pose[:3, :3].T + pose[:3, 3] - touched
+    return Calibration(pose, 1e3 * np.linalg.norm(off, axis=1), scale)
+
+
+def _points(values: Any, size: int, name: str) -> np.ndarray:
+    """An array [n, size] of finite numbers. Raises SettingsError for what is none."""
+    try:
+        points = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        points = np.zeros(0)
+    if points.ndim != 2 or points.shape[1] != size or not np.isfinite(points).all():
+        raise SettingsError(f"{name}: must be rows of {size} finite numbers")
+    return points

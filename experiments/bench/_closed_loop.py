@@ -1,0 +1,214 @@
+"""Episodes in which a deployed policy sees images of MuJoCo's renderer and moves a robot."""
+
+import collections
+import functools
+import itertools
+import statistics
+import time
+import warnings
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac_jax.config import Config, RobotKind, SensorConfig, SimConfig
+from csac_jax.constants import OUTCOMES
+from csac_jax.deploy import Policy
+from csac_jax.deploy.decision import Decision
+from csac_jax.env import Env
+from csac_jax.errors import DataWarning, ViewError
+from csac_jax.evaluation import suites
+from csac_jax.evaluation.metrics import wilson
+from csac_jax.render import rgbd
+from csac_jax.scene import layout, model
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import outcome, physics as simulation, primitives
+from csac_jax.sim.primitives import Plan
+from csac_jax.vision import camera, sensor
+
+COUNTED = (
+    *("grasps", "pushes", "refused", "nothing_to_act_on", "out_of_reach", "warnings"),
+    *("blocks", "blocks_taken", "blocks_lost", "table_empty", "all_taken", *OUTCOMES),
+)
+"""What is counted: actions, decisions and images, blocks, episodes, grasps by outcome."""
+MOVED = 0.01  # m, a block that moves less has not changed the scene
+
+
+class Loop(NamedTuple):
+    """A policy, and the scenes that it acts in."""
+
+    policy: Policy
+    env: Env
+    episodes: int
+    seed: int
+
+
+def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
+    """Of the policy `source`, see `Policy.load`, in random10."""
+    policy = Policy.load(source)
+    clear = policy.cfg.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
+    cfg = clear.change(sim={"physics": "c", "robot": robot})
+    (env,) = suites.environments(cfg, "random10", episodes, seed).values()
+    return Loop(policy, env, episodes, seed)
+
+
+def sensors(kind: Any) -> dict[str, SensorConfig]:
+    """By name, what images are taken with."""
+    return {"clean": SensorConfig(), "noise": SensorConfig(kind=kind)}
+
+
+class Step(NamedTuple):
+    """What the robot did. N = block slots."""
+
+    scene: Scene
+    reachable: jax.Array  # [] bool
+    lifted: jax.Array  # [N] bool
+    blocks_lost: jax.Array  # [] int32
+    outcome: jax.Array  # [] int32, Outcome of a grasp, EMPTY at least
+    moved: jax.Array  # [] bool, the scene has changed
+
+
+def set_points(cfg: SimConfig, decision: Decision) -> np.ndarray:
+    """The hand at every substep [1 + T, 5], at first at the approach, as `primitives.Plan.control`:
+    straight from waypoint to waypoint, with a smooth retreat."""
+    stations = np.array(
+        [(*point.position, point.yaw, 0.5 * point.opening) for point in decision.waypoints]
+    )
+    is_grasp = decision.primitive == "grasp"
+    phases, rows = cfg.grasp_phases if is_grasp else cfg.push_phases, [stations[:1]]
+    for phase, (begin, end) in enumerate(itertools.pairwise(stations)):
+        share = np.arange(1, phases[phase] + 1)[:, None] / phases[phase]
+        share = share**2 * (3.0 - 2.0 * share) if phase == 2 else share
+        rows.append(begin + share * (end - begin))
+        closing = np.minimum(1.3 * share[:, 0], 1.0)  # before the way ends: the retreat begins
+        rows[-1][:, 4] = begin[4] + closing * (end[4] - begin[4])
+    return np.concatenate(rows).astype(np.float32)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def act(env: Env, scene: Scene, control: jax.Array, is_grasp: jax.Array) -> Step:
+    """Moves the robot along set-points [1 + T, 5]; blocks lifted or lost are taken away."""
+    plan = Plan(control[1:], control[0], jnp.float32(1.0))
+    joints = primitives.joint_trajectory(env.cfg.sim.robot, plan)
+    after, trace = env.physics.run(scene, joints)
+    rise = plan.start[2] - jnp.min(plan.control[:, 2])
+    lifted = outcome.lifted_blocks(trace, rise) & is_grasp
+    inside = layout.inside(after.position, env.cfg.heightmap.extent)
+    way = jnp.linalg.norm(after.position - scene.position, axis=1)
+    return Step(
+        scene=layout.park(after, ~lifted & inside),
+        reachable=joints.reachable & simulation.healthy(after),
+        lifted=lifted,
+        blocks_lost=jnp.sum(after.in_play & ~inside & ~lifted, dtype=jnp.int32),
+        outcome=outcome.grasp_outcome(trace, plan.surface, rise),
+        moved=jnp.any((way > MOVED) & scene.in_play),
+    )
+
+
+def measure(loop: Loop, errors: SensorConfig) -> dict[str, Any]:
+    """What came of all episodes with images of this sensor."""
+    counts = collections.Counter(dict.fromkeys(COUNTED, 0))
+    seconds: list[float] = []
+    for number in range(loop.episodes):
+        _episode(loop, errors, number, counts, seconds)
+    return {
+        "sensor": errors.kind,
+        "grasp_success": wilson(counts["lifted"], counts["grasps"]),
+        "completion": wilson(counts["all_taken"], loop.episodes),
+        "completion_reachable": wilson(counts["table_empty"], loop.episodes),
+        "counts": dict(counts),
+        "ms_per_decision": 1e3 * statistics.median(seconds),
+    }
+
+
+def _episode(
+    loop: Loop,
+    errors: SensorConfig,
+    number: int,
+    counts: collections.Counter[str],
+    seconds: list[float],
+) -> None:
+    """One episode; adds what happened to `counts`, and the time of every decision."""
+    env, task = loop.env, loop.env.cfg.task
+    scene = _first_scene(loop, number)
+    blocks, taken_before = int(scene.in_play.sum()), counts["blocks_taken"]
+    counts["blocks"] += blocks
+    studio = rgbd.Studio(model.build(env.cfg.scene, env.cfg.sim), scene, env.cfg.camera.size)
+    unchanged = 0
+    for action in range(task.max_actions):
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(loop.seed), number), action)
+        image = _photograph(env.cfg, errors, key, studio, scene)
+        begun = time.perf_counter()
+        decision = _decide(loop.policy, env.cfg, image, counts)
+        seconds.append(time.perf_counter() - begun)
+        moved = False
+        if decision is not None:
+            scene, moved = _move(env, scene, decision, counts)
+        unchanged = 0 if moved else unchanged + 1
+        if not scene.in_play.any() or unchanged >= task.max_steps_without_change:
+            break
+    studio.close()
+    counts["table_empty"] += not scene.in_play.any()
+    counts["all_taken"] += counts["blocks_taken"] - taken_before == blocks
+
+
+def _first_scene(loop: Loop, number: int) -> Scene:
+    """The scene that an episode of `eval` with this seed starts with."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(loop.seed), 0), number)
+    row = number * loop.env.scenes.position.shape[0] // loop.episodes
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), loop.env.scenes)
+    return jax.device_get(loop.env.randomise_pose(key, scene))
+
+
+def _photograph(
+    cfg: Config, errors: SensorConfig, key: jax.Array, studio: rgbd.Studio, scene: Scene
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and depth of a scene as the sensor gives them."""
+    key_pose, key_image = jax.random.split(key)
+    real = sensor.pose(key_pose, errors, camera.make(cfg.camera))
+    rgb, depth = studio.image(scene, real)
+    if not errors.active:
+        return rgb, depth
+    return jax.device_get(_sensed(key_image, errors, cfg.camera, rgb, depth))
+
+
+_sensed = jax.jit(sensor.image, static_argnums=(1, 2))
+
+
+def _decide(
+    policy: Policy,
+    cfg: Config,
+    image: tuple[np.ndarray, np.ndarray],
+    counts: collections.Counter[str],
+) -> Decision | None:
+    """The best action; None where the image is refused or shows nothing to act on."""
+    eye, pose = camera.make(cfg.camera), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = eye.rotation, eye.position
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DataWarning)
+        try:
+            decisions = policy.decide(*image, rgbd.intrinsics(cfg.camera), pose)
+        except ViewError:
+            counts["refused"] += 1
+            return None
+    counts["warnings"] += len(caught)
+    counts["nothing_to_act_on"] += not decisions
+    return decisions[0] if decisions else None
+
+
+def _move(
+    env: Env, scene: Scene, decision: Decision, counts: collections.Counter[str]
+) -> tuple[Scene, bool]:
+    """The scene after a decision, and whether it has changed."""
+    is_grasp = decision.primitive == "grasp"
+    step = jax.device_get(act(env, scene, set_points(env.cfg.sim, decision), jnp.bool(is_grasp)))
+    counts["grasps" if is_grasp else "pushes"] += 1
+    if not step.reachable:
+        counts["out_of_reach"] += 1
+        return scene, False
+    if is_grasp:
+        counts[OUTCOMES[int(step.outcome)]] += 1
+    counts["blocks_taken"] += int(step.lifted.sum())
+    counts["blocks_lost"] += int(step.blocks_lost)
+    return step.scene, bool(step.moved)
