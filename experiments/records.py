@@ -156,6 +156,7 @@ BENCHES = {
     ),
     "parity/h200-warp": ("Warp against C MuJoCo, whole actions", "bench parity --warp"),
     "one_step/cpu": ("MJX against C MuJoCo, one step", "bench one_step --states 1000"),
+    "labels/cpu": ("outcomes by finger gap and by ground truth", "bench labels"),
     "robots/cpu": ("the UR5 against the floating hand", "bench robots --grasps 500"),
     "export/cpu": ("exported policies; much other work on both cores", "bench export"),
     "serve/cpu": ("decisions over HTTP; other work on both cores", "bench serve"),
