@@ -6,7 +6,8 @@
 `cases`            the shipped hard arrangements, one part each, turned in every episode.
 `target`           the cases and random10 with one marked block to get within 5 actions (CSAC
                    sec. 4.4); for policies of the target task.
-`generated`        ordered arrangements of all levels of difficulty.
+`packed`           ordered arrangements of all levels of difficulty. Records of `generated` are of
+                   other families.
 a path             the user's case file.
 
 Training draws from stream 0 of random numbers, a suite from stream 1 + seed; no case is in
@@ -138,7 +139,7 @@ def _cases(cfg: Config) -> dict[str, Env]:
     return {name: Env(cfg, physics, _pool(cases.seat(one, slots))) for name, one in every.items()}
 
 
-def _generated(cfg: Config, episodes: int, stream: int) -> Env:
+def _packed(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _wide(cfg, SceneConfig(slots=PACKED, min_blocks=arrange.MIN_ARRANGED))
     scenes = arrange.arrangements(cfg.scene, cfg.heightmap.extent, stream, episodes)
     return Env(cfg, _physics(cfg), scenes)
@@ -149,4 +150,4 @@ register("random10", _ten)
 register("random30", _thirty)
 register("cases", lambda cfg, episodes, stream: _cases(cfg))
 register("target", _target, target=True)
-register("generated", _generated)
+register("packed", _packed)
