@@ -107,7 +107,7 @@ def kind_of(name: str) -> object:
     """Type of a setting by its dotted name. Raises ValueError for what cannot be varied."""
     if name == "seed":
         raise ValueError("--vary: seeds are varied by --seeds")
-    kinds: dict[str, object] = {"algo": str} | dict.fromkeys(BUNDLES, str)
+    kinds: dict[str, object] = {"algo": str, **dict.fromkeys(BUNDLES, str)}
     for section, default in vars(Config()).items():
         if isinstance(default, Section):
             _, alternatives = ALTERNATIVES.get(section, ("", (type(default),)))
