@@ -372,6 +372,9 @@ class PolicyConfig(Section, section="policy"):
     """Where: by the cross-entropy method, between cells and yaws, or the best cell (VPG)."""
     primitive: Literal["argmax", "rule", "grasp"] = "argmax"
     """That of larger value; a push after no visible change, else a grasp (sec. 3.4); a grasp."""
+    cells: Literal["occupied", "all"] = "occupied"
+    """Where actions may begin: where there is something to act on (SPOT); or everywhere (CSAC),
+    so that a grasp may meet nothing, eq. 15's lowest level."""
 
 
 class TargetConfig(Section, section="target"):
@@ -413,6 +416,9 @@ class RewardConfig(Section, section="reward"):
     push_levels: tuple[float, float] = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = _bounded(0.0, 0.0)
     """Cost of an action after which a block has left the workspace for good (ours)."""
+    source: Literal["truth", "sensed"] = "truth"
+    """What tells how a grasp ended: the simulator's contacts and poses, or the finger gap and the
+    change of the height map, as on a robot (sec. 3.3). A push is judged by maps in any case."""
 
     @property
     def renewed(self) -> bool:
@@ -422,6 +428,9 @@ class RewardConfig(Section, section="reward"):
     def check(self) -> None:
         rising = list(self.grasp_levels) == sorted(self.grasp_levels)
         _require(rising, "reward.grasp_levels: no level may be below the one before it")
+        for name in ("distance_weight", "lost_block_penalty") if self.source == "sensed" else ():
+            unseen = f"reward.{name}: must be 0 where reward.source is sensed, which cannot see it"
+            _require(getattr(self, name) == 0.0, unseen)
 
 
 class ExploreConfig(Section, section="explore"):

@@ -160,6 +160,7 @@ BENCHES = {
         "bench parity --warp --primitives 500 --poses 25",
     ),
     "one_step/cpu": ("MJX against C MuJoCo, one step", "bench one_step --states 1000"),
+    "labels/cpu": ("outcomes by finger gap and by ground truth", "bench labels"),
     "robots/cpu": ("the UR5 against the floating hand", "bench robots --grasps 500"),
     "export/cpu": ("exported policies; much other work on both cores", "bench export"),
     "closed_loop/cpu": (

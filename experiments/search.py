@@ -57,14 +57,15 @@ def trials(algo: str, count: int) -> list[dict[str, float]]:
 def plan(cfg: Config, methods: Sequence[str], count: int, seeds: int) -> SweepPlan:
     """The sweep of a search: `count` points for each method, named METHOD-I."""
     points = [
-        _point(f"{algo}-{i}", cfg, algo, settings, FIRST_SEED)
+        point(f"{algo}-{i}", cfg, algo, settings, FIRST_SEED)
         for algo in methods
         for i, settings in enumerate(trials(algo, count))
     ]
     return SweepPlan(seeds, points)
 
 
-def _point(name: str, cfg: Config, algo: str, settings: dict[str, Any], seed: int) -> SweepPoint:
+def point(name: str, cfg: Config, algo: str, settings: dict[str, Any], seed: int) -> SweepPoint:
+    """The point of an algorithm with these settings, by dotted name, from this seed on."""
     tried = step.replace_settings(algorithms.configure(cfg, algo), settings).change(seed=seed)
     told = {key: str(value) for key, value in settings.items()}
     return SweepPoint(name, told, backend.resolve(tried))
@@ -76,7 +77,7 @@ def run(
     methods: tuple[str, ...] = ("grasp_only", "vpg", "csac", "csac_per", "csac_beta"),
     trials: int = 16,
     seeds: int = 3,
-    task: str = "clear",
+    task: str = "target",
 ) -> None:
     """Tries `trials` settings of every method with `seeds` seeds each; goes on in a folder that
     exists. TASK is clear, target or packed."""

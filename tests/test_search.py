@@ -1,5 +1,6 @@
 """The search of settings: equal budgets, and seeds that no result has."""
 
+import inspect
 import json
 from pathlib import Path
 
@@ -36,6 +37,12 @@ def test_every_method_has_the_same_budget():
     assert {run.cfg.target.gamma for run in by_method["grasp_only"]} == {0.0}
     assert len({run.cfg.learn.learning_rate for run in by_method["vpg"]}) == 5
     assert len(group_configs([run.cfg for run in runs])) == len(METHODS)
+
+
+def test_the_task_is_that_of_the_paper():
+    """Claim: unless told otherwise, settings are searched for the target task, as in `paper`."""
+    task = inspect.signature(search.run).parameters["task"].default
+    assert task == presets.paper().task.kind == presets.paper_small().task.kind == "target"
 
 
 def test_values_fill_their_ranges():

@@ -40,6 +40,7 @@ class Frames:
     extent: float  # side of the workspace, m
     push_length: float  # m
     shows_target: bool  # the target task: the net sees the target's mask
+    all_cells: bool  # actions may begin on bare table
     xy: np.ndarray  # [K, h, w, 2] m, workspace position of every cell
     inside: np.ndarray  # [K, h, w] bool, above the workspace
 
@@ -64,6 +65,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         extent=extent,
         push_length=cfg.sim.push_length,
         shows_target=cfg.task.kind == "target",
+        all_cells=cfg.policy.cells == "all",
         xy=xy,
         inside=inside,
     )
@@ -75,7 +77,7 @@ class DenseMaps:
 
     q: jax.Array  # [P, K, h, w] float32, the critic's value
     logits: jax.Array  # [P, K, h, w] float32, the actor's
-    valid: jax.Array  # [P, K, h, w] bool, there is something to act on
+    valid: jax.Array  # [P, K, h, w] bool, see `actionable_cells`
     terms: jax.Array | None = None  # [P, K, h, w, T] float32, see `offsets`; None: Q is trilinear
 
 
@@ -113,8 +115,11 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.04730.
 
     Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
-    such a surface, of any block, lies within the push's length ahead.
+    such a surface, of any block, lies within the push's length ahead. With `policy.cells all`:
+    every cell inside the workspace.
     """
+    if frames.all_cells:
+        return jnp.broadcast_to(frames.inside, (len(Primitive), *frames.inside.shape))
     graspable = under = _cells_above_bare(frames, obs.height)
     if frames.shows_target:
         graspable = _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))

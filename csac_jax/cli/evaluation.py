@@ -28,8 +28,7 @@ class EvalOptions:
     blocks' poses."""
     suite: str = "in_distribution"
     """Scenes: in_distribution (like the training's), random10, random30, cases, target (needs a
-    policy of that task), generated, camera (random10 through ever worse cameras), or a case
-    file."""
+    policy of that task), packed, camera (random10 through ever worse cameras), or a case file."""
     physics: Literal["auto", "mjx", "c"] = "auto"
     """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5"] = "hand"

@@ -35,8 +35,9 @@ class SweepOptions:
     seeds: int = 4
     """Seeds of every setting: --seed, --seed + 1, ..."""
     vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=A,B,...: a setting, algo or task (clear, target, packed), and the values it takes; once
-    per setting, every combination is run. Colons separate a tuple's items: replay.end=1:4,1:12."""
+    """NAME=A,B,...: a setting, algo, task (clear, target, packed) or switch (none, sensed,
+    anywhere, oblique, noisy, ur5, together), and the values it takes; once per setting, every
+    combination is run. Colons separate a tuple's items: replay.end=1:4,1:12."""
     evaluate: int = 0
     """Episodes that every final policy is evaluated in; with some, the sweep ends with a table,
     study.md, and a figure, study.png, in its folder."""

@@ -214,7 +214,9 @@ def _group_norm(graph: Graph, maps: str, layer: Any) -> str:
 
 
 def _valid(graph: Graph, frames: Frames, has_target: bool) -> str:
-    """Cells with something to act on, [P, K, h, w] bool; see `maps.actionable_cells`."""
+    """Cells where an action may begin, [P, K, h, w] bool; see `maps.actionable_cells`."""
+    if frames.all_cells:
+        return graph.const(np.broadcast_to(frames.inside, (2, *frames.inside.shape)), bool)
     under = _above_bare(graph, frames, "height")
     graspable = under
     if has_target:

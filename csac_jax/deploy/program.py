@@ -52,7 +52,7 @@ def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool)
     state = jax.tree.map(lambda leaf: leaf[0], batch)
     if not only_target or learner.frames.shows_target:
         return state
-    frames = dataclasses.replace(learner.frames, shows_target=True)
+    frames = dataclasses.replace(learner.frames, shows_target=True, all_cells=False)
     valid = maps.actionable_cells(frames, obs).at[int(Primitive.PUSH)].set(False)
     return state.replace(valid=valid)
 

@@ -93,7 +93,7 @@ class LearnerPolicy:
 
 @struct.dataclass
 class RandomPolicy:
-    """Grasps at a random place above a block, with a random yaw."""
+    """Grasps at a random place, above a block unless `policy.cells` is `all`, at a random yaw."""
 
     cfg: Config = struct.field(pytree_node=False)
 

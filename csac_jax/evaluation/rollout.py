@@ -126,7 +126,8 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     key = jax.random.clone(key)  # the debug view is of the same draws
     debug, later = policy.debug(state, key), policy.debug(after, jax.random.clone(key))
     phi = {"phi_before": debug.best_grasp, "phi_after": later.best_grasp}  # the acting critic's
-    result = training.action_result(action, after.info)._replace(**phi)
+    paid = training.judged(policy.cfg.reward, after)
+    result = training.action_result(action, paid.info)._replace(**phi)
     reward = rewards.reward(policy.cfg.reward, result)
     return StepRecord(state, action, joints, after, reward, debug)
 

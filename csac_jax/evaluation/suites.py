@@ -6,7 +6,8 @@
 `cases`            the shipped hard arrangements, one part each, turned in every episode.
 `target`           the cases and random10 with one marked block to get within 5 actions (CSAC
                    sec. 4.4); for policies of the target task.
-`generated`        ordered arrangements of all levels of difficulty.
+`packed`           ordered arrangements of all levels of difficulty. Records of `generated` are of
+                   other families.
 `camera`           random10 seen straight down, from the side, with the noise of a depth camera,
                    with a camera that is also 5 mm off, and with the noise and other colours.
 a path             the user's case file.
@@ -140,7 +141,7 @@ def _cases(cfg: Config) -> dict[str, Env]:
     return {name: Env(cfg, physics, _pool(cases.seat(one, slots))) for name, one in every.items()}
 
 
-def _generated(cfg: Config, episodes: int, stream: int) -> Env:
+def _packed(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _wide(cfg, SceneConfig(slots=PACKED, min_blocks=arrange.MIN_ARRANGED))
     scenes = arrange.arrangements(cfg.scene, cfg.heightmap.extent, stream, episodes)
     return Env(cfg, _physics(cfg), scenes)
@@ -171,5 +172,5 @@ register("random10", _ten)
 register("random30", _thirty)
 register("cases", lambda cfg, episodes, stream: _cases(cfg))
 register("target", _target, target=True)
-register("generated", _generated)
+register("packed", _packed)
 register("camera", _camera)

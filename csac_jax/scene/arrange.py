@@ -101,7 +101,7 @@ def pack(
 ) -> tuple[Blocks, jax.Array]:
     """The packed blocks of an arrangement about the origin, and the slot of the target []."""
     slot, used = _assign(draws.preference, slots, family.roles)
-    optional = level * (0.5 + 0.5 * draws.optional) * (ROLES - family.needed)
+    optional = level * (0.75 + 0.25 * draws.optional) * (ROLES - family.needed)
     num_used = family.needed + jnp.round(optional).astype(jnp.int32)
     used = used & (np.arange(ROLES) < num_used)
     half = family.resize(sizes[np.array([role.long for role in family.roles], int), slot])

@@ -19,8 +19,10 @@ ROLES = 5  # of every family
 STACKED_GAP = 0.008  # m, widest gap that a block may bridge
 STACK_OFFSET = 0.003  # m, how far off the middle a stacked block may lie
 SUPPORT = 0.015  # m, how far a bridge's deck reaches onto its piers
-SLANT = 0.7  # of stairs: how much farther along a block begins, for each metre sideways
-FAN_ANGLE = np.deg2rad(70.0)  # between the ribs of a fan
+WIDE_GAP = 0.040  # m
+SLANTS = (0.7, 1.0)  # of stairs, how much farther along a block begins for each metre sideways:
+# where blocks touch, and where they are WIDE_GAP apart
+FAN_ANGLES = (np.deg2rad(50.0), np.deg2rad(70.0))  # between the ribs of a fan, likewise
 WEDGE_ANGLE = np.deg2rad(40.0)  # between an arm of a wedge and its middle
 
 
@@ -122,6 +124,12 @@ def _line(
     return start + 0.5 * (step - jnp.sum(step)), jnp.argmax(is_middle).astype(jnp.int32)
 
 
+def _by_gap(ends: tuple[float, float], gap: jax.Array) -> jax.Array:
+    """Number [] between that of touching blocks and that of blocks WIDE_GAP apart."""
+    touching, wide = (np.float32(end) for end in ends)
+    return touching + (wide - touching) * gap / np.float32(WIDE_GAP)
+
+
 def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
     """Two like bricks end to end, a block across their joint, one along each face."""
     crosswise = draws.crosswise & _is_role(3, 4)
@@ -137,16 +145,18 @@ def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) 
 def _place_stairs(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
     """Two flights side by side: each block begins farther along than the one nearer the middle."""
     y, middle = _line(draws.order, half[:, 1], used, gap)
-    return Placed(jnp.stack([SLANT * jnp.abs(y), y], axis=1), jnp.zeros_like(used), middle)
+    slant = _by_gap(SLANTS, gap)
+    return Placed(jnp.stack([slant * jnp.abs(y), y], axis=1), jnp.zeros_like(used), middle)
 
 
 def _place_fan(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
     """Like the ribs of a fan: each points away from one place, as near as its neighbours allow."""
-    sin, cos = np.float32(np.sin(0.5 * FAN_ANGLE)), np.float32(np.cos(0.5 * FAN_ANGLE))
+    between = _by_gap(FAN_ANGLES, gap)
+    sin, cos = jnp.sin(0.5 * between), jnp.cos(0.5 * between)
     away = (0.5 * gap + half[:, 1] * cos) / sin + half[:, 0]
     number = jnp.sum(used)
     rib = np.arange(ROLES, dtype=np.float32)
-    angle = np.float32(FAN_ANGLE) * (rib - 0.5 * (number.astype(jnp.float32) - 1.0))
+    angle = between * (rib - 0.5 * (number.astype(jnp.float32) - 1.0))
     xy = away[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     middle = ((number - 1) // 2).astype(jnp.int32)
     return Placed(xy, jnp.zeros_like(used), middle, yaw=jnp.asarray(angle))

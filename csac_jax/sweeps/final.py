@@ -45,7 +45,7 @@ def _measure_point(
     plan: SweepPlan, point: SweepPoint, folder: Path, runs: list[SweepRun], stop: Stop
 ) -> None:
     """Evaluates runs of one point, which share their scenes and the compiled episodes."""
-    cfg = rollout.configured(point.cfg, "auto", "hand")
+    cfg = rollout.configured(point.cfg, "auto", point.cfg.sim.robot)
     parts = suites.environments(cfg, SUITE, plan.episodes, SEED)
     for run in runs:
         if stop.signal is not None:

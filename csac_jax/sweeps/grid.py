@@ -22,6 +22,28 @@ TASKS: dict[str, dict[str, Any]] = {
     "packed": {"task.kind": "clear", "scene.arranged": 1.0},
 }
 """Values of `--vary task=...`: what is to be done, and in which scenes."""
+_OBLIQUE = {"heightmap.view": "oblique"}
+_NOISE = {
+    "sensor.depth_noise": (0.001, 0.0014),  # of a structured-light camera, see `SensorConfig`
+    "sensor.dropped": 0.02,
+    "sensor.pose_noise": (0.001, 0.002),
+    "sensor.colour": 0.05,
+}
+_SENSED, _ANYWHERE = {"reward.source": "sensed"}, {"policy.cells": "all"}
+_UR5 = {"sim.robot": "ur5"}
+SWITCHES: dict[str, dict[str, Any]] = {
+    "none": {},
+    "sensed": _SENSED,
+    "anywhere": _ANYWHERE,
+    "oblique": _OBLIQUE,
+    "noisy": _OBLIQUE | _NOISE,
+    "ur5": _UR5,
+    "together": _SENSED | _ANYWHERE | _OBLIQUE | _NOISE | _UR5,
+}
+"""Values of `--vary switch=...`: what is nearer to the paper's robot, one at a time or together;
+errors of the camera are ours."""
+BUNDLES = {"task": TASKS, "switch": SWITCHES}
+"""Varied names that stand for several settings."""
 _VALUE = re.compile(r"([^./-]|-?\.?\d|-inf)[^/]*")  # a negative number is no flag
 
 
@@ -85,7 +107,7 @@ def kind_of(name: str) -> object:
     """Type of a setting by its dotted name. Raises ValueError for what cannot be varied."""
     if name == "seed":
         raise ValueError("--vary: seeds are varied by --seeds")
-    kinds: dict[str, object] = {"algo": str, "task": str}
+    kinds: dict[str, object] = {"algo": str, **dict.fromkeys(BUNDLES, str)}
     for section, default in vars(Config()).items():
         if isinstance(default, Section):
             _, alternatives = ALTERNATIVES.get(section, ("", (type(default),)))
@@ -101,19 +123,19 @@ def kind_of(name: str) -> object:
 
 
 def settings_of(name: str, value: Any) -> dict[str, Any]:
-    """The settings that a varied name stands for: those of a task, or itself. Raises ValueError for
-    an unknown task."""
-    if name != "task":
+    """The settings that a varied name stands for: those of a bundle, or itself. Raises ValueError
+    for a value that the bundle lacks."""
+    if name not in BUNDLES:
         return {name: value}
-    if value not in TASKS:
-        raise ValueError(unknown("task", value, TASKS))
-    return TASKS[value]
+    if value not in BUNDLES[name]:
+        raise ValueError(unknown(name, value, BUNDLES[name]))
+    return BUNDLES[name][value]
 
 
 def _flags(name: str, value: str) -> list[str]:
-    if name == "task":
+    if name in BUNDLES:
         settings = settings_of(name, value)
-        return [flag for key, given in settings.items() for flag in _flags(key, str(given))]
+        return [flag for key, given in settings.items() for flag in _flags(key, _text(given))]
     flag = "--" + name.replace("_", "-")
     if kind_of(name) is bool:
         if value not in ("true", "false"):
@@ -122,3 +144,8 @@ def _flags(name: str, value: str) -> list[str]:
         return [flag if value == "true" else f"{section}.no-{field}"]
     items = value.split(":") if typing.get_origin(kind_of(name)) is tuple else [value]
     return [flag, *items]
+
+
+def _text(value: Any) -> str:
+    """A value as `--vary` takes it."""
+    return ":".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -17,7 +17,7 @@ from csac_jax.agent import actor_critic, augment
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.agent.rewards import ActionResult
-from csac_jax.config import Config
+from csac_jax.config import Config, RewardConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
@@ -136,9 +136,10 @@ def train_step(
     scenes_next = _where(after.done, fresh, after)
 
     # Reward and remember (lines 14-15).
-    info, result = after.info, action_result(action, after.info)
+    info, paid = after.info, judged(cfg.reward, after)
+    result = action_result(action, paid.info)
     reward, push_better = learner.reward(cfg.reward, state.learner, scenes.obs, after.obs, result)
-    next_obs, terminated = BOOTSTRAPS[cfg.target.bootstrap](after, scenes_next)
+    next_obs, terminated = BOOTSTRAPS[cfg.target.bootstrap](paid, scenes_next)
     before, seen = heightmap.pack(scenes.obs), heightmap.pack(next_obs)
     label = push_better if cfg.reward.renewed else None
     transition = Transition(before, action, reward, seen, terminated, label)
@@ -195,6 +196,14 @@ by, leaves [E, ...], and whether V of it is 0, [E] bool."""
 def _where(condition: jax.Array, yes: Any, no: Any) -> Any:
     """Scene by scene, leaves [E, ...], `yes` where the condition [E] holds, else `no`."""
     return jax.tree.map(lambda a, b: jax.vmap(jnp.where)(condition, a, b), yes, no)
+
+
+def judged(cfg: RewardConfig, after: environment.State) -> environment.State:
+    """States after actions, leaves [...], with the outcome that is paid for, by `reward.source`;
+    logs and evaluations keep that of ground truth."""
+    if cfg.source == "truth":
+        return after
+    return after.replace(info=after.info.replace(outcome=after.info.outcome_by_gap))
 
 
 def action_result(action: Action, info: environment.Info) -> ActionResult:

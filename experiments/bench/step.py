@@ -118,7 +118,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         return choose(keys, parts, maps, steps_without_change, jnp.int32(0))
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
-        result = step.action_result(action, after.info)
+        result = step.action_result(action, step.judged(cfg.reward, after).info)
         return learner.reward(cfg.reward, nets, before.obs, after.obs, result)[0]
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:

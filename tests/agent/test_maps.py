@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.agent import actor_critic, maps
+from csac_jax.agent import actor_critic, maps, policy
 from csac_jax.config import SmallNet
 from csac_jax.constants import Primitive
-from csac_jax.nets import dense
+from csac_jax.nets import dense, networks
+from csac_jax.sim import primitives
+from csac_jax.sim.outcome import BARE
 from csac_jax.vision.heightmap import Observation
 
 GRASP, PUSH = int(Primitive.GRASP), int(Primitive.PUSH)
@@ -259,6 +261,21 @@ def test_nothing_is_valid_outside_of_the_workspace(cfg, frames):
         valid[GRASP] == (np.max(np.abs(frames.xy), axis=-1) <= 0.5 * cfg.heightmap.extent)
     )
     assert not np.any(maps.actionable_cells(frames, full.replace(height=jnp.zeros((size, size)))))
+
+
+def test_actions_anywhere(cfg, frames):
+    """Claim: with `policy.cells all` every cell of the workspace is valid, on a bare table and in
+    the target task too, and random grasps meet bare table, as eq. 15's lowest level asks."""
+    anywhere = cfg.change(policy={"cells": "all"}, task={"kind": "target"})
+    free = maps.frames(anywhere, networks.make(cfg.net))
+    obs = _one_block(cfg)
+    for height in (obs.height, jnp.zeros_like(obs.height)):
+        valid = maps.actionable_cells(free, obs.replace(height=height))
+        np.testing.assert_array_equal(valid, np.stack([frames.inside] * 2))
+    keys = jax.random.split(jax.random.key(0), 100)
+    grasps = jax.jit(jax.vmap(lambda key: policy.random_grasp(key, free, valid)))(keys)
+    below = jax.vmap(lambda xy: primitives.local_top(cfg.heightmap, obs.height, xy, 0.02))
+    assert 0.5 < np.mean(below(grasps.pose[:, :2]) < BARE) < 1.0
 
 
 def test_target_task_grasps_the_target_alone(cfg, frames):

@@ -4,6 +4,8 @@ configs."""
 import dataclasses
 import itertools
 import json
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,8 @@ from csac_jax.evaluation import metrics
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
 from csac_jax.sweeps import final, runner
+from csac_jax.sweeps.grid import SweepPoint
+from csac_jax.sweeps.runner import SweepPlan
 from csac_jax.training import loop, step
 from tests.training import toys
 
@@ -234,6 +238,20 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     assert "table and figure" in capsys.readouterr().out
 
 
+def test_policies_are_measured_with_their_own_robot(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Claim: the final policies of a point are evaluated with the point's robot."""
+    seen: list[str] = []
+    note = lambda cfg, *_: seen.append(cfg.sim.robot)  # noqa: E731
+    monkeypatch.setattr(final.suites, "environments", note)
+    for robot in ("ur5", "hand"):
+        point = SweepPoint(robot, {}, presets.smoke().change(sim={"robot": robot}))
+        plan = SweepPlan(1, [point], 4)
+        final._measure_point(plan, point, tmp_path, [], signals.Stop())
+    assert seen == ["ur5", "hand"]
+
+
 def _with_toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """Puts a small step in place of the learner's."""
     toy = {"make": lambda cfg, *_, **__: toys.program(cfg)}
@@ -330,3 +348,26 @@ def test_devices_of_other_processes_count():
         command._devices(command.SweepOptions(**one))
         for one in ({}, {"devices": 1}, {"processes": 1})
     } == {1}
+
+
+def _study_commands() -> list[list[str]]:
+    """The arguments of every sweep of docs/study.md, its shell variables put in."""
+    page = (Path(cli.__file__).parents[2] / "docs" / "study.md").read_text()
+    values = dict(re.findall(r'^    (\w+)="(.*)"$', page, re.MULTILINE))
+    lines = re.findall(r"^    \$S (.*)$", page, re.MULTILINE)
+    fill = lambda line: re.sub(r"\$(\w+)", lambda found: values[found[1]], line)  # noqa: E731
+    return [shlex.split(fill(f"$S {line}"))[2:] for line in lines]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", _study_commands(), ids=lambda words: words[8])
+def test_study_can_begin_and_go_on(arguments: list[str], tmp_path: Path):
+    """Claim: every sweep of the study is one that can begin, in a folder of its own, with seeds 100
+    to 149 that no search uses, and that is read back as it was planned."""
+    options, plan = command.read(arguments)
+    assert arguments[0] == "paper_small"
+    assert [words[8] for words in _study_commands()].count(str(options.run_dir)) == 1
+    seeds = {run.cfg.seed for run in runner.runs_of(plan)}
+    assert (seeds, plan.episodes) == (set(range(100, 150)), 500)
+    (tmp_path / "sweep.json").write_text(runner.plan_text(plan))
+    assert runner.read_plan(tmp_path) == plan

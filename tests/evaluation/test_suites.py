@@ -52,7 +52,7 @@ def test_cases_are_the_shipped_files():
         assert env.cfg.sim.contacts >= 64
 
 
-@pytest.mark.parametrize("suite", ["random10", "generated"])
+@pytest.mark.parametrize("suite", ["random10", "packed"])
 def test_suite_is_the_same_for_every_policy(suite: str):
     """Claim: scenes that are dropped or drawn do not depend on what a policy was trained with."""
     alike = dataclasses.replace(
@@ -105,11 +105,11 @@ def test_target_is_the_cases_own():
 
 
 @pytest.mark.slow
-def test_generated_scenes_follow_the_seed():
-    """Claim: the suite `generated` is the same for the same seed, another for another, and harder
+def test_packed_scenes_follow_the_seed():
+    """Claim: the suite `packed` is the same for the same seed, another for another, and harder
     towards its end."""
     first, again, other = (
-        suites.environments(CFG, "generated", 30, seed)["generated"].scenes for seed in (0, 0, 1)
+        suites.environments(CFG, "packed", 30, seed)["packed"].scenes for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(first.position, again.position)
     assert len({scene.tobytes() for scene in (*first.position, *other.position)}) == 60
@@ -200,7 +200,7 @@ def test_camera_suite(monkeypatch: pytest.MonkeyPatch):
 
 def test_unknown_suite():
     """Claim: a suite that is none is refused with the names of those that there are."""
-    names = "in_distribution, random10, random30, cases, target, generated, camera"
+    names = "in_distribution, random10, random30, cases, target, packed, camera"
     with pytest.raises(ValueError, match=f"'hard'.*{names}"):
         suites.environments(CFG, "hard", EPISODES, 0)
 

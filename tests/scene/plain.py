@@ -22,25 +22,28 @@ def open_grasps(
     """
     top = position[:, 2] + half[:, 2]
     tip = np.maximum(top - sim.grasp_depth, sim.clearance) + 0.002
-    outside = 0.5 * MAX_OPENING + PAD_HALF_WIDTH + FINGER_HALF[0]
-    found = np.zeros((len(half), YAWS), bool)
-    for i, j in itertools.product(range(len(half)), range(YAWS)):
-        angle = j * np.pi / YAWS
+    found, angle = np.zeros((len(half), YAWS), bool), np.arange(YAWS) * np.pi / YAWS
+    for i in range(len(half)):
         off = (angle - yaw[i] + 0.25 * np.pi) % (0.5 * np.pi) - 0.25 * np.pi
-        across = round((angle - yaw[i] - off) / (0.5 * np.pi)) % 2  # x or y of the block
+        across = np.round((angle - yaw[i] - off) / (0.5 * np.pi)).astype(int) % 2  # x or y
         face = half[i, across]
-        if abs(off) > PARALLEL or 2.0 * face > MAX_OPENING - 0.02:
-            continue
-        along = np.linspace(face + 0.0005, outside, 12)
-        x, y = np.meshgrid([*-along, *along], np.linspace(-1.0, 1.0, 5) * FINGER_HALF[1])
-        points = position[i, :2] + np.stack([x.ravel(), y.ravel()], axis=1) @ _turn(angle).T
-        found[i, j] = not any(
-            top[k] > tip[i]
-            and np.any(np.all(np.abs((points - position[k, :2]) @ _turn(yaw[k])) < half[k, :2], 1))
-            for k in range(len(half))
-            if k != i
-        )
+        fits = np.flatnonzero((np.abs(off) <= PARALLEL) & (2.0 * face <= MAX_OPENING - 0.02))
+        fingers = [position[i, :2] + _fingers(face[j]) @ _turn(angle[j]).T for j in fits]
+        points = np.reshape(fingers, (-1, 120, 2))
+        blocked = np.zeros(len(fits), bool)
+        for k in np.flatnonzero((top > tip[i]) & (np.arange(len(half)) != i)):
+            inside = np.abs((points - position[k, :2]) @ _turn(yaw[k])) < half[k, :2]
+            blocked |= inside.all(axis=2).any(axis=1)
+        found[i, fits] = ~blocked
     return found
+
+
+def _fingers(face: float) -> np.ndarray:
+    """Points [120, 2] m where fingers that close along x on faces at +-`face` m go."""
+    outside = 0.5 * MAX_OPENING + PAD_HALF_WIDTH + FINGER_HALF[0]
+    along = np.linspace(face + 0.0005, outside, 12)
+    x, y = np.meshgrid([*-along, *along], np.linspace(-1.0, 1.0, 5) * FINGER_HALF[1])
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _turn(angle: float) -> np.ndarray:

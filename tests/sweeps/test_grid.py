@@ -2,7 +2,13 @@
 
 import pytest
 
+from csac_jax import presets
+from csac_jax.cli import settings
+from csac_jax.cli.sweep import SweepOptions
+from csac_jax.config import Config
+from csac_jax.io import configs
 from csac_jax.sweeps import grid
+from csac_jax.training import step
 
 
 def _points(varied: list[str]) -> list[grid.SweepPoint]:
@@ -49,6 +55,27 @@ def test_tasks_are_several_settings():
     }
     with pytest.raises(ValueError, match="unknown task 'pack'; did you mean packed"):
         _points(["task=pack"])
+
+
+def test_switches_are_changes_of_the_preset():
+    """Claim: each switch changes settings of its own and no other, alike in flags and in configs;
+    `none` changes nothing, `together` is all of them."""
+    base = presets.get("paper_small")
+    varied = f"switch={','.join(grid.SWITCHES)}"
+
+    def configure(flags: list[str]) -> Config:
+        return settings.parse(SweepOptions, "sweep", base, flags)[1]
+
+    found = {point.values["switch"]: point.cfg for point in grid.points([varied], configure)}
+    changed = {name: dict(grid.settings_of("switch", name)) for name in found}
+    for name, cfg in found.items():
+        assert cfg == step.replace_settings(base, changed[name])
+        assert set(configs.differences(base, cfg)) == set(changed[name])
+    assert changed["none"] == {}
+    assert len({str(sorted(each)) for each in changed.values()}) == len(grid.SWITCHES)
+    assert set(changed["together"]) == set().union(*changed.values())
+    with pytest.raises(ValueError, match="unknown switch 'ur'; did you mean ur5"):
+        _points(["switch=ur"])
 
 
 def test_long_names_give_way_to_numbers():

@@ -1,0 +1,101 @@
+"""The paper's switches: rewards from what is sensed, actions anywhere, its camera and arm."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import algorithms, presets
+from csac_jax.agent import rewards
+from csac_jax.config import Config
+from csac_jax.constants import Outcome, Primitive
+from csac_jax.env import Env, Info, State
+from csac_jax.scene import layout, model
+from csac_jax.sim import physics as simulation
+from csac_jax.sim.primitives import Action
+from csac_jax.training import step
+from csac_jax.vision.heightmap import Observation
+
+LEVELS = jnp.arange(len(Outcome), dtype=jnp.int32)
+TRUE, SENSED = (leaf.reshape(-1) for leaf in jnp.meshgrid(LEVELS, LEVELS))  # [25], every pair
+
+
+def _after(outcome: jax.Array, by_gap: jax.Array) -> State:
+    """States [T] after grasps that ended so, of a map that did not change."""
+    zero, none = jnp.zeros(outcome.shape), jnp.zeros(outcome.shape, jnp.int32)
+    no = jnp.zeros(outcome.shape, bool)
+    info = Info(outcome, by_gap, zero, zero, none, none, none, no)
+    return State(None, Observation(zero, zero, no), zero, no, no, none, none, info)
+
+
+def _paid(cfg: Config, after: State) -> tuple[np.ndarray, np.ndarray]:
+    """Rewards [T] of grasps, and whether nothing follows them, [T] bool."""
+    paid = step.judged(cfg.reward, after)
+    action = Action(jnp.full(TRUE.shape, Primitive.GRASP, jnp.int32), jnp.zeros((len(TRUE), 3)))
+    reward, _ = rewards.rewards_of(cfg.reward, step.action_result(action, paid.info))
+    return np.asarray(reward), np.asarray(step.BOOTSTRAPS[cfg.target.bootstrap](paid, paid)[1])
+
+
+@pytest.mark.parametrize("algo", ["csac", "vpg"])
+def test_rewards_follow_their_source(algo: str):
+    """Claim: with `reward.source sensed` a grasp is paid for, and bootstraps, as one whose true
+    outcome is the sensed one; by default what is sensed counts for nothing."""
+    truth = algorithms.configure(presets.smoke(), algo)
+    sensed = truth.change(reward={"source": "sensed"})
+    for cfg, outcome in ((truth, TRUE), (sensed, SENSED)):
+        found, wanted = _paid(cfg, _after(TRUE, SENSED)), _paid(truth, _after(outcome, outcome))
+        np.testing.assert_array_equal(found, wanted)
+    assert np.any(_paid(sensed, _after(TRUE, SENSED))[0] != _paid(truth, _after(TRUE, SENSED))[0])
+
+
+@pytest.mark.parametrize("name", ["distance_weight", "lost_block_penalty"])
+def test_what_is_not_sensed_costs_nothing(name: str):
+    """Claim: with `reward.source sensed`, a cost of what only the simulator knows is refused."""
+    with pytest.raises(ValueError, match=rf"^reward\.{name}: must be 0 where reward\.source is"):
+        presets.smoke().change(reward={"source": "sensed", name: 1.0})
+
+
+@pytest.mark.mjx
+def test_switches_combine(monkeypatch: pytest.MonkeyPatch):
+    """Claim: sensed rewards and actions anywhere can be trained with the oblique camera, its noise
+    and the arm: the whole step can be traced, and gives back a state of the same types. In it the
+    sensed outcome is paid for and bootstraps, and the true one is logged."""
+    cfg = presets.smoke().change(
+        task={"kind": "target"},
+        sim={"physics": "c", "robot": "ur5"},
+        heightmap={"view": "oblique"},
+        sensor={"depth_noise": (0.001, 0.0014), "dropped": 0.02, "pose_noise": (0.001, 0.002)},
+        policy={"cells": "all"},
+        reward={"source": "sensed"},
+    )
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    program, sources = step.make(cfg, Env(cfg, physics, blank)), {}
+
+    def seen(name: str, info: Info) -> None:
+        sources[name] = "sensed" if info.outcome is info.outcome_by_gap else "truth"
+
+    def paid(action: Action, info: Info) -> rewards.ActionResult:
+        seen("paid", info)
+        return step_result(action, info)
+
+    def bootstrapped(after: State, scenes_next: State) -> tuple[Observation, jax.Array]:
+        seen("bootstraps", after.info)
+        sources["logged"] = after.info.outcome
+        return episodic(after, scenes_next)
+
+    def logged(**metrics: jax.Array) -> step.StepMetrics:
+        own = metrics["outcome"] is sources["logged"]
+        sources["logged"] = "sensed" if own else "truth"
+        return step_metrics(**metrics)
+
+    step_result, step_metrics = step.action_result, step.StepMetrics
+    episodic = step.BOOTSTRAPS["episodic"]
+    monkeypatch.setattr(step, "action_result", paid)
+    monkeypatch.setitem(step.BOOTSTRAPS, "episodic", bootstrapped)
+    monkeypatch.setattr(step, "StepMetrics", logged)
+    state = jax.eval_shape(lambda: step.init_state(program, jax.random.key(0)))
+    after, _ = jax.eval_shape(lambda state: step.train_step(program, state), state)
+    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state, after)]
+    assert kinds[0] == kinds[1]
+    assert sources == {"paid": "sensed", "bootstraps": "sensed", "logged": "truth"}
