@@ -645,7 +645,8 @@ def alternative_kind(section: str, choice: Any) -> Any:
     """Class of the alternative of that name. Raises ValueError for an unknown one."""
     tag, kinds = ALTERNATIVES[section]
     choices = [getattr(kind, tag) for kind in kinds]
-    _require(choice in choices, f"{section}.{tag}: {choice!r} is not one of: {', '.join(choices)}")
+    fault = f"{section}.{tag}: {shown(choice)} is not one of: {', '.join(choices)}"
+    _require(choice in choices, fault)
     return kinds[choices.index(choice)]
 
 

@@ -103,7 +103,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
 def _check_complete(draft: Path, arrays: dict[str, Any]) -> None:
     """Raises OSError where Orbax wrote less than all arrays without an error of its own: one call
     that a full disc refuses is enough."""
-    spec = {"driver": "ocdbt", "base": f"file://{draft / 'state'}/"}
+    spec = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{draft / 'state'}/"}}
     store = tensorstore.KvStore.open(spec).result()
     kept = {key.decode() for key in store.list().result()}
     for name, array in arrays.items():

@@ -244,7 +244,7 @@ def _numbers(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         changed = _copied(whole)
         places = [place for place in _places(changed["settings"]) if _is_number(place)]
         container, key = places[int(rng.integers(len(places)))]
-        container[key] = container[key] * 2 + 1
+        container[key] = 2 * abs(container[key]) + 1
         if number % 2:
             del changed[runner.DIGEST]
         path.write_text(json.dumps(changed))

@@ -170,7 +170,7 @@ def test_what_orbax_left_out_is_no_checkpoint(
 
     def save_less(self: Any, folder: Path, *given: Any, **named: Any) -> None:
         save(self, folder, *given, **named)
-        spec = {"driver": "ocdbt", "base": f"file://{folder / 'state'}/"}
+        spec = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder / 'state'}/"}}
         store = tensorstore.KvStore.open(spec).result()
         part = next(key for key in store.list().result() if key.split(b"/")[-1] == lost.encode())
         store.write(part, None).result()
