@@ -28,6 +28,7 @@ Map, in the direction of data; imports point only backwards along it:
     evaluation  policies, suites, metrics, statistics
     deploy      a policy at a real camera: images in, actions out; runs without MuJoCo
     sweeps      many runs in one program, over devices and hosts
+    gym         Gymnasium's interface to the environment
     render      pictures and videos; report: tables, charts, pages
     api         the functions of the public API; cli: the command `csac-jax`
 

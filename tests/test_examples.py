@@ -50,9 +50,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.mark.mjx
 @pytest.mark.optax
-@pytest.mark.parametrize(
-    "name", [TRAINERS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in TRAINERS[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRAINERS)
 def test_own_parts_train(small: str, name: str, tmp_path: Path):
     """Claim: a part of one's own trains a run to its end, and the run's policy acts with it."""
     run = _module(name).main(small, tmp_path / "run")

@@ -21,7 +21,7 @@ ORDER = (
     ("cli",),
     ("api",),
     ("render", "report"),
-    ("sweeps", "deploy"),
+    ("sweeps", "deploy", "gym"),
     ("evaluation",),
     ("training",),
     ("io",),
@@ -57,6 +57,7 @@ ONLY_IN = {
     "uvicorn": ("cli/serve.py",),
     "safetensors": ("io",),
     "matplotlib": ("render", "report"),
+    "gymnasium": ("gym.py",),
     "imageio": ("render/media.py", "deploy/files.py"),
     "jinja2": ("report/charts.py",),
     "tensorboardX": ("report/progress.py",),
@@ -70,6 +71,7 @@ JIT_IN = (
     "scene/arrange.py",
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
     "render/picture.py",  # draws on machines without OpenGL
+    "gym.py",  # its users call it step by step
 )
 PURE = ("vision", "nets", "agent", "replay", "sim")  # no printing, no files
 NOT_PURE = ("sim/quiet_mjx.py",)  # passes on what MJX prints as it is imported

@@ -22,6 +22,7 @@ import re
 import secrets
 import shutil
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -91,7 +92,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
             _publish(draft, folder)
     except Exception as error:  # TensorStore and Orbax raise nearly anything for a full disc
         if cluster.is_first():
-            _clean(root)
+            _clean(root, times=10)
         raise CheckpointError(
             f"step {step} could not be saved in {root} ({files.first_line(error)}); earlier "
             "checkpoints are intact; make room there and go on with --resume"
@@ -210,10 +211,13 @@ def _publish(draft: Path, folder: Path) -> None:
         shutil.rmtree(folder.parent / str(number))
 
 
-def _clean(root: Path) -> None:
-    """Removes what a save that did not end has left."""
-    for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
-        for _ in range(2):  # a disc that is full may refuse to open a folder once
+def _clean(root: Path, times: int = 1) -> None:
+    """Removes what a save that did not end has left, again and again for half a second: threads of
+    Orbax's may still be on their way, and a full disc may refuse to open a folder."""
+    for number in range(times):
+        if number:
+            time.sleep(0.05)
+        for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
             shutil.rmtree(path, ignore_errors=True)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.config import Config, HeightmapConfig, SensorConfig
+from csac_jax.config import Config, HeightmapConfig, SensorConfig, SlotKind
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
@@ -36,14 +36,8 @@ class SurfaceTables(NamedTuple):
 def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observation:
     """The observation of one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor`
     drawn from `key`."""
-    slot = blocks.parts(cfg.scene.slots).slot  # [G], of each convex part
-    shapes = Polytopes(
-        *blocks.half_spaces(cfg.scene.slots, scene.half_size),
-        scene.position[slot],
-        jax.vmap(geometry.quat_to_matrix)(scene.quaternion)[slot],
-        jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
-    )
-    is_target = layout.is_target(scene)[slot]
+    shapes = polytopes(cfg.scene.slots, scene)
+    is_target = layout.is_target(scene)[blocks.parts(cfg.scene.slots).slot]
     tables = surface_tables(shapes, is_target, _light(cfg.sensor, key))
     if cfg.heightmap.view == "ortho":
         exact = ortho(cfg.heightmap, shapes, tables)
@@ -53,6 +47,17 @@ def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observat
         return oblique_noisy(key, cfg, shapes, tables, believed)
     hits = camera.cast_rays(believed, raycast.cast_polytopes, shapes)
     return from_pixels(cfg.heightmap, believed, hits, tables)
+
+
+def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
+    """The convex parts of a scene's blocks, for the raycaster."""
+    slot = blocks.parts(slots).slot  # [G], of each convex part
+    return Polytopes(
+        *blocks.half_spaces(slots, scene.half_size),
+        scene.position[slot],
+        jax.vmap(geometry.quat_to_matrix)(scene.quaternion)[slot],
+        jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
+    )
 
 
 def _light(noise: SensorConfig, key: jax.Array | None) -> Any:

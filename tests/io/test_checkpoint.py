@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import shutil
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -179,6 +180,22 @@ def test_what_orbax_left_out_is_no_checkpoint(
     with pytest.raises(CheckpointError, match="was not written"):
         checkpoint.save(run_dir, 99, _state(99), CFG, {})
     assert checkpoint.latest_step(run_dir) == found
+
+
+def test_threads_that_write_on_leave_no_draft(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: what Orbax's threads still write after a save has failed is removed too."""
+    late = run_dir / "checkpoints" / ".saving.orbax-checkpoint-tmp" / "state"
+    writer = threading.Timer(0.15, late.mkdir, kwargs={"parents": True})
+
+    def fail(*_: Any, **__: Any) -> None:
+        writer.start()
+        raise OSError("no space left")
+
+    monkeypatch.setattr(checkpoint.ocp.Checkpointer, "save", fail)
+    with pytest.raises(CheckpointError, match="no space left"):
+        checkpoint.save(run_dir, 99, _state(99), CFG, {})
+    writer.join()
+    assert not late.parent.exists()
 
 
 def _failing_from(name: str, call: Any, fail: Any) -> Any:
