@@ -80,11 +80,7 @@ def train(
     start = starting(cfg, init)
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
-        scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
-        terminal.say(
-            f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "
-            f"physics {cfg.sim.physics}, on {provenance.device()}"
-        )
+        terminal.say(_first_line(folder, cfg))
         program = step.make(cfg, learner=learner, sampler=sampler, network=network)
 
         def first_state() -> step.TrainState:
