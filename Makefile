@@ -38,7 +38,7 @@ test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run 
 test-slow: $(STAMP)  ## slow tests
 	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)
 
-test-faults: $(STAMP)  ## inject every fault (25 minutes); ARGS=NAME for those of that name
+test-faults: $(STAMP)  ## inject every fault (10 minutes); ARGS=NAME for those of that name
 	$(BIN)/python -m tests.faults $(ARGS)
 
 lint: $(STAMP)  ## ruff and mypy
