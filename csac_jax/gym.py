@@ -47,8 +47,10 @@ class Interface:
 
     @classmethod
     def make(cls, config: str | Config, actions: ActionKind, scenes: int) -> "Interface":
-        """Of a config or a preset's name, for so many scenes. Raises ValueError for unknown names,
-        and what `make_env` raises."""
+        """Of a config or a preset's name, for so many scenes. Raises ValueError for unknown names
+        and for no scene, and what `make_env` raises."""
+        if scenes < 1:
+            raise ValueError(f"num_envs: must be at least 1, not {scenes}")
         if actions not in ("continuous", "dense"):
             raise ValueError(f"actions: {actions!r} is not one of: continuous, dense")
         cfg = presets.get(config) if isinstance(config, str) else config
@@ -133,20 +135,19 @@ class ClutterEnv(gymnasium.Env[Any, Any]):
         return self.interface.seen(self.state.obs), {}
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """As `Env.step`."""
-        after = self.state = self._step(self.state, jnp.asarray(action))
+        """As `Env.step`. Raises ResetNeeded before the first reset."""
+        after = self.state = self._step(_ready(self.state), jnp.asarray(action))
         info = {name: np.asarray(getattr(after.info, name)).item() for name in _INFO}
         info["outcome"] = OUTCOMES[int(after.info.outcome)]
         ends = bool(after.terminated), bool(after.truncated)
         return self.interface.seen(after.obs), float(after.reward), *ends, info
 
     def render(self) -> np.ndarray | None:
-        """The scene from the side, [480, 640, 3] uint8, by our own rays; None without a mode."""
+        """The scene from the side, [480, 640, 3] uint8, by our own rays; None without a mode.
+        Raises ResetNeeded before the first reset."""
         if self.render_mode is None:
             return None
-        if self.state is None:
-            raise RuntimeError("call reset before render")
-        return np.asarray(_picture(self.interface.env.cfg, self.state.scene))
+        return np.asarray(_picture(self.interface.env.cfg, _ready(self.state).scene))
 
 
 class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
@@ -185,8 +186,10 @@ class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
     def step(
         self, actions: Any
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One action in every scene. `info` is of these actions, also where an episode ended."""
-        self.state, after = self._step(self._keys(), self.state, jnp.asarray(actions))
+        """One action in every scene. `info` is of these actions, also where an episode ended.
+        Raises ResetNeeded before the first reset."""
+        given = _ready(self.state), jnp.asarray(actions)
+        self.state, after = self._step(self._keys(), *given)
         ends = np.array(after.terminated), np.array(after.truncated)
         info = _infos(after.info)
         done = ends[0] | ends[1]
@@ -205,6 +208,12 @@ class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
         for number in np.flatnonzero(done):
             final[number] = {name: part[number] for name, part in seen.items()}
         return final
+
+
+def _ready(state: State | None) -> State:
+    if state is None:
+        raise gymnasium.error.ResetNeeded("call reset first")
+    return state
 
 
 def _key(rng: np.random.Generator) -> jax.Array:

@@ -1,6 +1,7 @@
 """The environment through Gymnasium, by Gymnasium's own checker and beside the environment."""
 
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -120,10 +121,23 @@ def test_target_is_seen_where_there_is_one():
 
 @pytest.mark.parametrize(
     ("given", "line"),
-    [({"config": "quik"}, "unknown preset 'quik'"), ({"actions": "both"}, "actions: 'both'")],
+    [
+        ({"config": "quik"}, "unknown preset 'quik'"),
+        ({"actions": "both"}, "actions: 'both'"),
+        ({"num_envs": 0}, "num_envs: must be at least 1"),
+    ],
 )
-def test_bad_argument_is_one_line(given: dict[str, str], line: str):
-    """Claim: an unknown preset or kind of action is a ValueError of one line."""
+def test_bad_argument_is_one_line(given: dict[str, Any], line: str):
+    """Claim: an unknown preset or kind of action, or no scene, is a ValueError of one line."""
     with pytest.raises(ValueError, match=line) as caught:
-        gymnasium.make(ID, **given)
+        gymnasium.make_vec(ID, **given)
     assert "\n" not in str(caught.value)
+
+
+def test_reset_comes_first():
+    """Claim: a step or a picture before the first reset says that a reset is needed."""
+    single = gymnasium.make(ID, config=CFG, render_mode="rgb_array").unwrapped
+    batch = gymnasium.make_vec(ID, num_envs=2, config=CFG)
+    for call in (lambda: single.step(np.zeros(4)), single.render, lambda: batch.step(np.zeros(8))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
+            call()

@@ -11,6 +11,7 @@ not at all. Orbax restores flipped bits and casts other dtypes silently. So ever
 against the manifest, and every leaf's shape and dtype against what the program expects.
 """
 
+import collections
 import contextlib
 import functools
 import hashlib
@@ -106,13 +107,14 @@ def _check_complete(draft: Path, arrays: dict[str, Any]) -> None:
     that a full disc refuses is enough."""
     spec = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{draft / 'state'}/"}}
     store = tensorstore.KvStore.open(spec).result()
-    kept = {key.decode() for key in store.list().result()}
+    parts = collections.Counter(key.rpartition(b"/")[0].decode() for key in store.list().result())
     for name, array in arrays.items():
-        if (form := f"{name}/.zarray") not in kept:
+        form = store.read(f"{name}/.zarray").result().value
+        if not form:
             raise OSError(f"{name} was not written")
-        sides = json.loads(store.read(form).result().value)["chunks"]
-        wanted = math.prod(-(-n // m) for n, m in zip(array.shape, sides, strict=True))
-        if sum(key.startswith(f"{name}/") for key in kept) < wanted + 1:
+        sides = json.loads(form)["chunks"]
+        chunks = math.prod(-(-n // m) for n, m in zip(array.shape, sides, strict=True))
+        if parts[name] < chunks + 1:
             raise OSError(f"{name} was not written whole")
 
 
