@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from csac_jax.config import Config
+from csac_jax.config import Config, PhysicsKind
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import provenance
@@ -44,8 +44,10 @@ def _is_left(folder: Path, run: SweepRun) -> bool:
 def _measure_point(
     plan: SweepPlan, point: SweepPoint, folder: Path, runs: list[SweepRun], stop: Stop
 ) -> None:
-    """Evaluates runs of one point, which share their scenes and the compiled episodes."""
-    cfg = rollout.configured(point.cfg, "auto", point.cfg.sim.robot)
+    """Evaluates runs of one point, which share their scenes and the compiled episodes; in C MuJoCo
+    if they were trained in it, on whatever device."""
+    physics: PhysicsKind = "c" if point.cfg.sim.physics == "c" else "auto"
+    cfg = rollout.configured(point.cfg, physics, point.cfg.sim.robot)
     parts = suites.environments(cfg, SUITE, plan.episodes, SEED)
     for run in runs:
         if stop.signal is not None:
