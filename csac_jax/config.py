@@ -248,7 +248,7 @@ class HeightmapConfig(Section, section="heightmap"):
     extent: float = _bounded(0.448, 0.1, 1.0)  # Side of the square workspace, m (VPG).
     view: Literal["ortho", "oblique"] = "ortho"
     """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image, projected;
-    what blocks hide from it is empty (CSAC sec. 3.1, VPG)."""
+    what blocks hide from it is empty (CSAC sec. 3.2, VPG)."""
 
     @property
     def cell(self) -> float:
@@ -456,7 +456,7 @@ class LearnConfig(Section, section="learn"):
     huber = 1.0  # width of the quadratic part of the Huber loss (CSAC sec. 4)
 
     learning_rate: float = _bounded(1e-3, 0.0, above=True)
-    """Adam's step size, critic (ours; CSAC and VPG 1e-4 on a pretrained DenseNet-121)."""
+    """Adam's step size, critic (ours; VPG 1e-4 on a pretrained DenseNet-121, CSAC gives none)."""
     actor_learning_rate: float = _bounded(3e-4, 0.0, above=True)
     """Adam's step size, actor head (ours)."""
     lr_final_fraction: float = _bounded(0.05, 0.0, 1.0, above=True)

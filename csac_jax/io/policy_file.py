@@ -1,7 +1,8 @@
 """A policy in a .safetensors file: its networks' variables and the config they were trained with.
 
 Nothing in such a file is executed. It holds a digest of all its content, and the versions that made
-it. `SHIPPED` comes with the package; its digest stands here, so that a replaced file is noticed.
+it. Those of `SHIPPED` come with the package; their digests stand here, so that a replaced file is
+noticed: `shipped` has seen exact maps from above, `shipped_camera` those of a noisy oblique camera.
 """
 
 import hashlib
@@ -22,8 +23,15 @@ from csac_jax.errors import DataWarning, FailedError
 from csac_jax.io import configs, files, leaves
 from csac_jax.runtime import provenance
 
-SHIPPED = Path(__file__).parents[1] / "policies" / "clear.safetensors"
-SHIPPED_SHA256 = "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c"
+_FOLDER = Path(__file__).parents[1] / "policies"
+SHIPPED = {
+    "shipped": _FOLDER / "clear.safetensors",
+    "shipped_camera": _FOLDER / "camera.safetensors",
+}
+_SHA256 = {
+    SHIPPED["shipped"]: "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c",
+    SHIPPED["shipped_camera"]: "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
+}
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
 
 
@@ -62,10 +70,11 @@ def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
 
 def find(source: str | Path) -> Path:
     """The policy file or run's folder that `source` names. Raises FileNotFoundError."""
-    path = SHIPPED if source == "shipped" else Path(source)
+    path = SHIPPED.get(str(source), Path(source))
     if not path.exists():
+        known = " or ".join(SHIPPED)
         raise FileNotFoundError(
-            f"there is no folder {path}; give the folder of a run, a policy file, or shipped"
+            f"there is no folder {path}; give the folder of a run, a policy file, or {known}"
         )
     return path
 
@@ -82,7 +91,8 @@ def is_policy(path: Path) -> bool:
 def load(path: Path) -> tuple[Config, Params]:
     """Config and networks of a policy. Raises PolicyFileError for a file that is none, is damaged
     or another version's. Warns of one without a digest, and of one by other versions."""
-    if path == SHIPPED and hashlib.sha256(path.read_bytes()).hexdigest() != SHIPPED_SHA256:
+    ours = path in _SHA256
+    if ours and hashlib.sha256(path.read_bytes()).hexdigest() != _SHA256[path]:
         raise PolicyFileError(f"{path} is not the file that this version ships; reinstall csac-jax")
     try:
         with safetensors.safe_open(path, "numpy") as file:
@@ -96,14 +106,16 @@ def load(path: Path) -> tuple[Config, Params]:
         raise PolicyFileError(
             f"{path} holds no config: it is no policy; csac-jax export writes one"
         )
-    if _DIGEST not in remarks and path != SHIPPED:
+    if _DIGEST not in remarks and not ours:
         text = f"{path} has no digest, so damage goes unseen; csac-jax export writes one"
         warnings.warn(text, DataWarning, stacklevel=2)
-    elif remarks.get(_DIGEST, SHIPPED_SHA256) not in (_digest(remarks, tensors), SHIPPED_SHA256):
+    elif not ours and remarks[_DIGEST] != _digest(remarks, tensors):
         raise PolicyFileError(f"{path} is damaged: its digest differs; give another file")
     try:
         cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG))
-        provenance.warn_if_other(files.parse(remarks.get(_VERSIONS, "{}"), _VERSIONS), str(path))
+        made = files.parse(remarks.get(_VERSIONS, "{}"), _VERSIONS)
+        if not ours:
+            provenance.warn_if_other(made, str(path))
     except ValueError as error:
         raise PolicyFileError(
             f"{path} was made by another version of csac_jax ({error}); use that version"

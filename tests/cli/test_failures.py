@@ -163,7 +163,7 @@ def test_file_that_holds_no_policy(capsys: pytest.CaptureFixture, command: str):
 def test_export_overwrites_nothing(capsys: pytest.CaptureFixture):
     """Claim: `export` refuses a file that exists, and leaves it as it is."""
     Path("p.safetensors").write_text("mine")
-    assert cli.main(["export", str(policy_file.SHIPPED), "p.safetensors"]) == 2
+    assert cli.main(["export", str(policy_file.find("shipped")), "p.safetensors"]) == 2
     assert capsys.readouterr() == ("", "csac-jax: p.safetensors exists; give another name\n")
     assert Path("p.safetensors").read_text() == "mine"
 

@@ -102,19 +102,23 @@ def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: 
     path = tmp_path / "clear.safetensors"
     policy_file.save(path, params, CFG)
     policy_file.load(path)
-    monkeypatch.setattr(policy_file, "SHIPPED", path)
+    monkeypatch.setitem(policy_file._SHA256, path, policy_file._SHA256[policy_file.find("shipped")])
     with pytest.raises(
         policy_file.PolicyFileError, match="is not the file that this version ships"
     ):
         policy_file.load(path)
 
 
-def test_shipped_policy():
-    """Claim: the policy that comes with the package is at most 5 MB, what its digest says, and of
-    this version."""
-    assert policy_file.SHIPPED.stat().st_size <= 5e6
-    cfg, params = policy_file.load(policy_file.SHIPPED)
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("name", "view"), [("shipped", "ortho"), ("shipped_camera", "oblique")])
+def test_shipped_policy(name: str, view: str):
+    """Claim: a policy that comes with the package is at most 5 MB, what its digest says, and of
+    this version; no version of JAX is warned of."""
+    path = policy_file.find(name)
+    assert path.stat().st_size <= 5e6
+    cfg, params = policy_file.load(path)
     assert (cfg.preset, cfg.task.kind, cfg.net.kind) == ("fast", "clear", "small")
+    assert cfg.heightmap.view == view
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
 
