@@ -36,6 +36,29 @@ RUNS = {
     "paper_small/no_colour": "ablation: heights alone",
     "paper_small/no_augmentation": "ablation: no shifts and no symmetries",
     "paper_small/no_shift": "ablation: no shifts",
+    "paper_small/target_csac_beta": "the target protocol of secs. 4.3 and 4.4: CSAC-beta",
+    "paper_small/target_csac_per": "the target protocol: CSAC-PER",
+    "paper_small/target_csac": "the target protocol: CSAC",
+    "paper_small/target_vpg": "the target protocol: VPG as its authors wrote it",
+    "paper_small/target_vpg_episodic": "the target protocol: VPG in its first variant",
+    "paper_small/target_reactive": "the target protocol: P+G reactive",
+    "paper_small/target_grasp_only": "the target protocol: Grasping-only",
+    "paper_small/target_stored_labels": "the target protocol: pushes labelled once",
+    "paper_small/target_offset": "the target protocol: Q between cells, search from the actor",
+    "paper_small/push_target_bonus1_gamma02": "bonus and discount of pushes: as in the preset",
+    "paper_small/push_target_bonus1_gamma05": "the same: a larger discount",
+    "paper_small/push_target_bonus0_gamma02": "the same: no bonus",
+    "paper_small/push_target_bonus0_gamma05": "the same: neither",
+    "paper_small/push_packed_bonus1_gamma02": "the same in packed scenes, the table cleared",
+    "paper_small/push_packed_bonus1_gamma05": "a larger discount there",
+    "paper_small/push_packed_bonus0_gamma02": "no bonus there",
+    "paper_small/push_packed_bonus0_gamma05": "neither there",
+    "paper_small/switch_sensed": "rewards by finger gap and depth",
+    "paper_small/switch_anywhere": "actions anywhere",
+    "paper_small/switch_oblique": "an oblique camera",
+    "paper_small/switch_noisy": "an oblique camera with noise",
+    "paper_small/switch_ur5": "the UR5",
+    "paper_small/switch_together": "all of these together",
     "paper/csac_beta": "the paper's protocol with DenseNet-121",
     "paper/csac_beta-2": "more seeds of it",
     "paper/csac_beta-3": "more seeds of it",
@@ -43,6 +66,9 @@ RUNS = {
     "fast/long": "three times as many actions",
     "fast/scenes_4096": "twice as many scenes, six times as many actions, a smaller net",
     "fast/shipped": "the shipped policy (seed 0) on every suite",
+    "fast/camera": "the policy `shipped_camera`, by `--init shipped`; all suites but "
+    "`camera` through exact maps from above",
+    "fast/camera_heights": "the same of heights alone, from nothing; stopped at 159,744 actions",
     "fast/updates_128": "twice as many updates",
     "fast/small_net": "a net with a third of the parameters",
     "fast/target": "the target task",
@@ -229,7 +255,8 @@ def _benches() -> Iterator[dict[str, str]]:
 
 def _row(claim: str, path: str, command: str, record: dict[str, Any]) -> dict[str, str]:
     link = f"[{path}]({path})"
-    return {"claim": claim, "folder": link, "command": command, "device": record["device"]}
+    device = record.get("device", "not recorded")  # of a sweep that was stopped
+    return {"claim": claim, "folder": link, "command": command, "device": device}
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax import algorithms, presets
-from csac_jax.config import shown
+from csac_jax.config import SimConfig, shown
 from csac_jax.io import configs, files, renames
 
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
@@ -269,6 +269,8 @@ def command(one: RecordedRun | Evaluation) -> str:
     preset, algo, changed = one.variant
     flags = "".join(f" {_flag(name, value)}" for name, value in changed)
     seed = f"--seed {one.config.get('seed', 0)} --sim.physics {physics}"
+    if robot != SimConfig().robot:
+        seed += f" --sim.robot {robot}"
     return f"csac-jax train {preset} --algo {algo} {seed}{flags}"
 
 

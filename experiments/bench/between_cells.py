@@ -7,6 +7,7 @@ best cells act alone, in the same scenes. Prints JSON: shares, and metrics of bo
 """
 
 import dataclasses
+import functools
 import json
 import time
 from typing import Any
@@ -32,9 +33,9 @@ def moved(cfg: Any, action: Action, cell: Action) -> tuple[jax.Array, jax.Array]
     [] bool; False for another primitive."""
     frames = maps.frames(cfg, networks.make(cfg.net))
     same = action.primitive == cell.primitive
-    apart = jnp.maximum(jnp.abs(action.x - cell.x), jnp.abs(action.y - cell.y))
-    turned = jnp.abs(jnp.mod(action.yaw - cell.yaw + jnp.pi, 2.0 * jnp.pi) - jnp.pi)
-    return same & (apart > 0.5 * frames.cell), same & (turned > jnp.pi / len(frames.yaws))
+    apart = jnp.abs(action.pose - cell.pose)
+    turned = jnp.minimum(apart[2], 2.0 * jnp.pi - apart[2])
+    return same & (apart[:2].max() > 0.5 * frames.cell), same & (turned > jnp.pi / len(frames.yaws))
 
 
 def compare(env: Env, policy: LearnedPolicy, cells: LearnedPolicy, episodes: int) -> dict[str, Any]:
@@ -48,7 +49,7 @@ def compare(env: Env, policy: LearnedPolicy, cells: LearnedPolicy, episodes: int
             lambda new, old: jax.vmap(jnp.where)(states.done, old, new), after, states
         )
         seen = (~states.done, action.primitive == cell.primitive)
-        return later, (*seen, *jax.vmap(moved, (None, 0, 0))(env.cfg, action, cell))
+        return later, (*seen, *jax.vmap(functools.partial(moved, env.cfg))(action, cell))
 
     key, act = jax.random.key(0), jax.jit(act)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(key, episodes))

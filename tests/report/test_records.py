@@ -12,7 +12,7 @@ from experiments import figures, records
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results"
-RUN = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/seed-\d/(config|train|eval[\w-]*)\.json")
+RUN = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/seed-\d+/(config|train|eval[\w-]*)\.json")
 SWEEP = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/(sweep|summary|train)\.json")
 BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h200)[\w-]*\.json")
 
