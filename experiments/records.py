@@ -193,6 +193,15 @@ BENCHES = {
         "the shipped policy, the UR5 and MuJoCo's renderer; much other work on both cores",
         "bench closed_loop",
     ),
+    "closed_loop/cpu-camera": (
+        "the same of `shipped_camera`",
+        "bench closed_loop --policy shipped_camera",
+    ),
+    "between_cells/cpu": (
+        "what search between cells lifts; RUN by `train quick --net.kind offset --cem.start actor "
+        "--sim.physics c --seed 20`",
+        "bench between_cells RUN",
+    ),
     "serve/cpu": ("decisions over HTTP; other work on both cores", "bench serve"),
     "soak/h200": (
         "100,000 random actions: nothing lost, nothing infinite",
