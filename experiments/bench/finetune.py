@@ -10,7 +10,9 @@ the same camera. Gains are means over the seeds, with Student's interval.
 """
 
 import json
+import sys
 import time
+from typing import Any
 
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
 from csac_jax.render import gl
@@ -40,11 +42,12 @@ def main(arguments: list[str]) -> None:
     names = ("updates", "batch", "learning_rate")
     learn = _finetune.Settings(**{name: options[name] for name in names})
     setting = _finetune.World(opening, options["episodes"], learn)
+    found: list[dict[str, Any]] = []
     with as_bad_arguments(ValueError, FileNotFoundError):
-        found = [
-            _finetune.measure(options["policy"], setting, options["grasps"], seed)
-            for seed in range(options["seeds"])
-        ]
+        for seed in range(options["seeds"]):
+            found.append(_finetune.measure(options["policy"], setting, options["grasps"], seed))
+            rates = [found[-1][when]["grasp_success"]["value"] for when in _finetune.TIMES]
+            print(f"seed {seed}: {rates[0]:.1%} -> {rates[1]:.1%}", file=sys.stderr, flush=True)
     gains = {name: _finetune.gain(found, name) for name in _finetune.SHOWN}
     seconds = time.perf_counter() - begun
     result = {"options": options, "gain": gains, "seeds": found, "seconds": seconds}
