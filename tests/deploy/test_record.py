@@ -103,15 +103,26 @@ def test_full_disc_leaves_no_half_entry(folder: Path, monkeypatch: pytest.Monkey
 
 def test_new_entries_come_last(folder: Path):
     """Claim: an entry gets the number after the last one, so that the order is that of time."""
-    shutil.rmtree(folder / "000001")
+    Recorder(folder, "shipped").add(image(), [GRASP])
+    for name in ("000001", "000002"):
+        shutil.rmtree(folder / name)
+    assert Recorder(folder, "shipped").add(image(), [GRASP]) == "000004"
+
+
+def test_number_that_is_taken_meanwhile(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: an entry that another process has just made stays; the new one comes after it."""
+    before = record.read(folder)
+    monkeypatch.setattr(record, "is_name", lambda name: False)  # none is seen yet
     assert Recorder(folder, "shipped").add(image(), [GRASP]) == "000003"
+    monkeypatch.undo()
+    assert record.read(folder)[:2] == before
 
 
 @pytest.mark.parametrize(
     ("name", "outcome", "error", "message"),
     [
         ("000003", Outcome("lifted"), FileNotFoundError, "there is no decision 000003"),
-        ("../0000", Outcome("lifted"), FileNotFoundError, "there is no decision ../0000"),
+        ("../record", Outcome("lifted"), FileNotFoundError, "there is no decision ../record"),
         ("000001", Outcome("lifted", 3), SettingsError, "number: there are 2 decisions, not 3"),
         ("000001", Outcome("pushed"), SettingsError, "outcome: of a grasp it is nothing, empty"),
         ("000002", Outcome("empty"), SettingsError, "outcome: of a push it is pushed, not empty"),
