@@ -97,6 +97,24 @@ def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
     assert done.action.primitive.tolist() == [1, 1, 1]
 
 
+def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
+    """Claim: Q of a stored transition is the score that its decision was taken for."""
+    recorder = Recorder(tmp_path, "test")
+    decisions = policy.decide(*BOTH, top=3)
+    recorder.add((*BOTH, None), decisions)
+    recorder.add((*ONLY_LEFT, None), [])
+    came = "pushed" if decisions[2].primitive == "push" else "empty"
+    recorder.post("000001", record.Outcome(came, number=3))
+    found = experience.load(policy, record.read(tmp_path))
+    learner = actor_critic.make(CFG)
+    obs = heightmap.unpack(jax.tree.map(jax.numpy.asarray, found.obs))
+    batch = actor_critic.dense_maps(learner, policy.params, obs)
+    state = jax.tree.map(lambda leaf: leaf[0], batch)
+    action = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), found.action)
+    q = maps.read_q(learner.frames, state, action.primitive, action.pose)
+    assert float(q) == pytest.approx(decisions[2].score, abs=1e-3)
+
+
 def test_pushes_are_judged_by_the_next_image(policy: Policy, tmp_path: Path):
     """Claim: a push earns as in training: by whether the map has changed, or by the critic."""
     folder = write(
