@@ -2,6 +2,7 @@
 
 python examples/camera_image.py demo          # rgb.png, depth.png, intrinsics.json, pose.json
 python examples/camera_image.py empty --empty # the same camera over the empty table
+python examples/camera_image.py board --board board.png  # the table with a printed page on it
 """
 
 import json
@@ -12,6 +13,7 @@ import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
 
 from csac_jax import geometry
 from csac_jax.config import CameraConfig
@@ -20,6 +22,8 @@ from csac_jax.vision import camera, observe, raycast
 
 POSES = ((0.10, 0.09, 0.4), (-0.10, -0.02, 1.0), (0.05, -0.12, 2.0))  # x m, y m, yaw rad
 HALF = (0.05, 0.025, 0.025)  # m, half sizes of a block
+DOTS = 300 / 0.0254  # of a printed page, per metre
+COARSE = 8  # dots along each side of what the camera tells apart
 AWAY = 3.0  # m, where the blocks lie if the table is to be empty
 
 
@@ -39,6 +43,22 @@ def draw(cfg: CameraConfig, shift: float) -> tuple[np.ndarray, np.ndarray]:
     return np.round(255 * colour).astype(np.uint8), np.round(1000 * depth).astype(np.uint16)
 
 
+def lay(cfg: CameraConfig, colour: np.ndarray, page: np.ndarray) -> np.ndarray:
+    """The image with a page [rows, columns] uint8 on the empty table, its middle at the origin."""
+    rows, cols = (side // COARSE for side in page.shape)
+    ink = page[: rows * COARSE, : cols * COARSE].reshape(rows, COARSE, cols, COARSE).mean((1, 3))
+    eye = camera.make(cfg)
+    start, ahead = (
+        np.asarray(eye.position),
+        np.asarray(camera.points(eye, jnp.ones(cfg.size[::-1]))),
+    )
+    rays = ahead - start
+    x, y, _ = np.moveaxis(start - rays * (start[2] / np.minimum(rays[..., 2:], -1e-3)), -1, 0)
+    col, row = x * DOTS / COARSE + 0.5 * (cols - 1), 0.5 * (rows - 1) - y * DOTS / COARSE
+    grey = ndimage.map_coordinates(ink, [row, col], order=1, cval=-1.0)
+    return np.where(grey[..., None] >= 0.0, grey[..., None], colour).astype(np.uint8)
+
+
 def main(folder: str, *options: str) -> None:
     """Writes the four files."""
     cfg, out = CameraConfig(), Path(folder)
@@ -47,7 +67,10 @@ def main(folder: str, *options: str) -> None:
     names = ("width", "height", "fx", "fy", "cx", "cy")
     intrinsics = dict(zip(names, (*cfg.size, *cfg.focal, *cfg.centre), strict=True))
     out.mkdir(parents=True, exist_ok=True)
-    colour, depth = draw(cfg, AWAY if "--empty" in options else 0.0)
+    colour, depth = draw(cfg, AWAY if options else 0.0)
+    if "--board" in options:
+        page = imageio.imread(options[options.index("--board") + 1])
+        colour = lay(cfg, colour, page)
     imageio.imwrite(out / "rgb.png", colour)
     imageio.imwrite(out / "depth.png", depth)
     (out / "intrinsics.json").write_text(json.dumps(intrinsics))

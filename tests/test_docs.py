@@ -55,6 +55,31 @@ def _run_command(line: str) -> None:
         assert cli.main(arguments) == 0, line
 
 
+@pytest.mark.slow
+def test_robot_page_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the policy of docs/robot.md learns from the page's own record, in a few updates, and
+    the next command takes it. The commands that train from nothing are good ones."""
+    from csac_jax.cli import train
+
+    monkeypatch.chdir(tmp_path)
+    page = ROBOT.read_text().replace("\\\n", " ")
+    lines = re.findall(r"^ *((?:python|csac-jax) .*)$", page, re.MULTILINE)
+    record = [line for line in lines if "--record record" in line]
+    for line in [one for one in lines if "camera_image.py" in one] + record:
+        if "--board" not in line:
+            _run_command(line)
+    (tmp_path / "record/000001/outcome.json").write_text('{"outcome": "lifted"}')
+    for line in [one for one in lines if "mine.safetensors" in one]:
+        few = line.replace("finetune shipped", "finetune shipped --updates 10 --batch 2")
+        _run_command(few)
+    training = [shlex.split(line)[2:] for line in lines if line.startswith("csac-jax train")]
+    assert len(training) == 2
+    for arguments in training:
+        _, cfg = train.read(arguments)
+        assert cfg.heightmap.view == "oblique"
+        assert cfg.sensor.kind == "d415"
+
+
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order, but those that
     need hardware, which are marked `py`."""

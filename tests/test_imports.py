@@ -53,6 +53,7 @@ ONLY_IN = {
     "rich": ("report", "cli", "api"),
     "pydantic": ("io", "deploy/service.py"),
     "onnx": ("deploy/onnx_graph.py",),
+    "cv2": ("deploy/board.py",),
     "fastapi": ("deploy/service.py",),
     "uvicorn": ("cli/serve.py",),
     "safetensors": ("io",),

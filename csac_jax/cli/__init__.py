@@ -16,9 +16,11 @@ from csac_jax import algorithms, presets
 from csac_jax.cli import (
     act,
     bench,
+    calibrate,
     doctor,
     evaluation,
     export,
+    finetune,
     output,
     parsing,
     play,
@@ -35,8 +37,10 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "sweep": sweep.run,
     "eval": evaluation.run,
     "play": play.run,
+    "calibrate": calibrate.run,
     "act": act.run,
     "serve": serve.run,
+    "finetune": finetune.run,
     "report": report.run,
     "export": export.run,
     "doctor": doctor.run,
@@ -53,8 +57,11 @@ A robot learns to push and grasp in clutter.
                      --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
   play               run one episode, as text, picture and video
+  calibrate          find the camera's pose by a printed board
   act POLICY         decide where to grasp or push in a camera's image
   serve POLICY       answer images by decisions over HTTP
+  finetune POLICY DIR
+                     learn from what act or serve recorded in DIR
   report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
   doctor             versions, devices and a self-test of this machine

@@ -7,7 +7,7 @@ from typing import Any
 import tyro
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import as_bad_arguments
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
 from csac_jax.errors import FailedError
 
 
@@ -33,6 +33,8 @@ class ActOptions:
     """How many actions to give, best first."""
     check: bool = False
     """Of an image of the empty table: says whether pose and intrinsics fit, and decides nothing."""
+    record: Path | None = None
+    """Folder to keep the image and the decisions in, for finetune."""
     json: Path | None = None
     """File to write the result to, as JSON."""
     png: Path | None = None
@@ -42,6 +44,8 @@ class ActOptions:
 def run(arguments: list[str]) -> int:
     """Decides and prints; returns the exit code."""
     options = parsing.parse(ActOptions, arguments, "act")
+    if options.check and options.record is not None:
+        raise BadArgumentsError("--record: --check decides nothing; leave one of them out")
     if options.png is not None:
         from csac_jax.render import media
 
@@ -62,10 +66,11 @@ def run(arguments: list[str]) -> int:
 
 
 def _decide(options: ActOptions, policy: Any, image: tuple[Any, Any, Any, Any]) -> int:
-    from csac_jax.deploy import files, images
+    from csac_jax.deploy import files, images, record
     from csac_jax.render import decision, media
 
     mask = None if options.mask is None else files.read_mask(options.mask)
+    recorder = None if options.record is None else record.Recorder(options.record, options.policy)
     decisions = policy.decide(*image, mask, options.top)
     for number, one in enumerate(decisions, 1):
         print(f"{number:2d} {decision.line(one)}")
@@ -74,7 +79,10 @@ def _decide(options: ActOptions, policy: Any, image: tuple[Any, Any, Any, Any]) 
     if options.png is not None:
         view, maps = images.make(*image, target_mask=mask), policy.maps(*image, mask)
         media.write_picture(options.png, decision.picture(policy.cfg, view, decisions, maps))
-    result = {"decisions": [one.to_dict() for one in decisions]}
+    result: dict[str, Any] = {"decisions": [one.to_dict() for one in decisions]}
+    if recorder is not None:
+        result["id"] = recorder.add((*image, mask), decisions)
+        print(f"recorded as {options.record / result['id']}")
     output.write_result(options.json, result, policy.cfg)
     return 0
 

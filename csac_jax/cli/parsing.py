@@ -33,9 +33,9 @@ def parse(
         raise BadArgumentsError(_one_line(complaint.getvalue(), f"{prog} {help_flag}")) from None
 
 
-def optional(kind: Any, text: str) -> Any:
-    """The type of a setting that may be left out, with its help."""
-    return Annotated[kind | None, tyro.conf.arg(help=text)]
+def inherited(kind: Any, text: str) -> Any:
+    """The type of a setting that is the policy's unless it is given, with its help."""
+    return Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint="(default: the policy's)")]
 
 
 def asks_help(arguments: Sequence[str]) -> bool:

@@ -14,7 +14,8 @@ SHORTEST_TOKEN = 16  # characters
 
 @dataclasses.dataclass(frozen=True)
 class ServeOptions:
-    """Answers images by decisions over HTTP: POST /decide, GET /health, GET /version."""
+    """Answers images by decisions over HTTP: POST /decide, POST /outcome, GET /health, GET
+    /version."""
 
     policy: tyro.conf.Positional[str]
     """A policy file, shipped for the policy that comes with the package, or a run's folder."""
@@ -26,6 +27,8 @@ class ServeOptions:
     """File whose first line clients must send as the header Authorization: Bearer LINE."""
     workspace: Path | None = None
     """JSON with the 4 x 4 matrix from workspace to robot, for the waypoints' tool poses."""
+    record: Path | None = None
+    """Folder to keep images, decisions and the outcomes posted in, for finetune; of one robot."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the images, px, to compile for at the start; others compile later."""
 
@@ -43,12 +46,13 @@ def run(arguments: list[str]) -> int:
     import uvicorn
 
     from csac_jax import deploy
-    from csac_jax.deploy import files, service
+    from csac_jax.deploy import files, record, service
 
     workspace = None if options.workspace is None else files.read_pose(options.workspace)
     policy = deploy.Policy.load(options.policy, workspace)
+    recorder = None if options.record is None else record.Recorder(options.record, options.policy)
     policy.warm_up(*options.size)
-    app = service.make(policy, options.policy, token)
+    app = service.make(policy, options.policy, token, recorder)
     uvicorn.run(app, host=options.host, port=options.port, log_level="warning", lifespan="off")
     return 0
 

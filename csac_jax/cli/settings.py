@@ -77,25 +77,26 @@ def parse_view(
 ) -> tuple[Any, dict[str, dict[str, Any]]]:
     """The `options` of a command, and what its flags change in the sections VIEW, as
     `Config.change` takes it; what no flag gives stays the policy's."""
-    fields = [(name, _optional(type(getattr(Config, name)))) for name in VIEW]
+    fields = [(name, _inherited(type(getattr(Config, name)))) for name in VIEW]
     listed = [(name, kind, dataclasses.field(default=kind())) for name, kind in fields]
     kind: Any = dataclasses.make_dataclass(
         options.__name__, listed, bases=(options,), frozen=True, kw_only=True
     )
     kind.__doc__ = options.__doc__
     given = parsing.parse(kind, list(flags), command)
+    named = {flag.split("=")[0].replace("-", "_") for flag in flags}
     changes = {name: vars(getattr(given, name)).items() for name in VIEW}
     return given, {
-        name: {key: value for key, value in values if value is not None}
+        name: {key: value for key, value in values if f"__{name}.{key}" in named}
         for name, values in changes.items()
     }
 
 
-def _optional(section: Any) -> Any:
-    """A dataclass of the settings of a section, each None if it is not given."""
+def _inherited(section: Any) -> Any:
+    """A dataclass of the settings of a section, which are the policy's unless they are given."""
     docs = _docs(section)
     fields = [
-        (field.name, parsing.optional(field.type, docs[field.name]), None)
+        (field.name, parsing.inherited(field.type, docs[field.name]), field.default)
         for field in dataclasses.fields(section)
     ]
     kind = dataclasses.make_dataclass(section.__name__, fields, frozen=True)

@@ -99,6 +99,13 @@ class Policy:
         obs, state = self._see(rgb, depth, intrinsics, camera_pose, target_mask)
         return Maps(np.asarray(obs.height), np.asarray(_best_over_yaws(self.cfg, state)))
 
+    def observe(
+        self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
+    ) -> Observation:
+        """The view from above that decisions about the same image follow from."""
+        view = self._checked_view(rgb, depth, intrinsics, camera_pose, target_mask)
+        return _observe(self.cfg, *_pixels(view))
+
     def check(self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any) -> Report:
         """What one image of the empty table says of the camera. Raises as `decide`, but measures a
         table that is not at z = 0."""
@@ -130,10 +137,9 @@ class Policy:
 
     def _see(self, *given: Any) -> tuple[Observation, DenseMaps]:
         """The observation and the dense maps of an image that decisions may be taken from."""
-        view = self._checked_view(*given)
         cache.enable()
-        obs = _observe(self.cfg, *_pixels(view))
-        return obs, _dense_maps(self.cfg, self.params, obs, view.target is not None)
+        obs, has_mask = self.observe(*given), given[-1] is not None
+        return obs, _dense_maps(self.cfg, self.params, obs, has_mask)
 
     def _checked_view(self, *given: Any) -> View:
         """A view that decisions may be taken from."""

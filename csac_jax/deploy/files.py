@@ -1,5 +1,6 @@
 """Images, intrinsics and poses as files. Each function raises SettingsError, one line."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,20 @@ def decode(content: bytes) -> np.ndarray:
         return imageio.imread(content)
     except Exception as error:  # damaged images raise nearly anything
         raise SettingsError(f"the image is damaged: {files.first_line(error)}") from None
+
+
+def encode(pixels: np.ndarray, dots_per_inch: int = 72) -> bytes:
+    """A PNG of pixels [h, w] or [h, w, 3] uint8."""
+    buffer = io.BytesIO()
+    imageio.imwrite(buffer, pixels, format="png", dpi=(dots_per_inch, dots_per_inch))
+    return buffer.getvalue()
+
+
+def encode_array(values: np.ndarray) -> bytes:
+    """An .npy file's content."""
+    buffer = io.BytesIO()
+    np.save(buffer, values, allow_pickle=False)
+    return buffer.getvalue()
 
 
 def _image(path: Path) -> np.ndarray:

@@ -1,12 +1,14 @@
 """A policy as an HTTP service: images in, decisions out, as JSON.
 
     POST /decide   {"rgb", "depth": PNG in base64, "intrinsics": {...}, "pose": {"matrix": 4 x 4},
-                    "mask"?: PNG in base64, "top"?: 1} -> {"decisions", "warnings", "milliseconds"}
+                    "mask"?: PNG in base64, "top"?: 1}
+                   -> {"decisions", "id", "warnings", "milliseconds"}; no id without a record
+    POST /outcome  {"id", "outcome", "number"?: 1, "ended"?: false} -> {"id"}; see `record`
     GET /health    {"status": "ok"}, with no token
     GET /version   versions, task and workspace of the policy
 
-Errors are {"detail": one line} with a status of 400 to 499. Decisions are taken one by one, and
-requests wait for their turn.
+Errors are {"detail": one line} with a status of 400 to 499, or 507 where the record's disc is
+full. Decisions are taken one by one, and requests wait for their turn.
 """
 
 import asyncio
@@ -26,6 +28,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 
 from csac_jax.deploy import Policy, files, images
+from csac_jax.deploy.record import Outcome, Recorder
 from csac_jax.errors import DataWarning, SettingsError, ViewError
 from csac_jax.runtime import provenance
 
@@ -55,6 +58,15 @@ class DecideRequest(pydantic.BaseModel, extra="forbid"):
     pose: Pose
     mask: str | None = None
     top: int = 1
+
+
+class OutcomeRequest(pydantic.BaseModel, extra="forbid", strict=True):
+    """The body of /outcome."""
+
+    id: str
+    outcome: str
+    number: int = 1
+    ended: bool = False
 
 
 class Gate:
@@ -119,12 +131,17 @@ async def _refuse(scope: Message, receive: Receive, send: Send, status: int, tex
     await JSONResponse({"detail": text}, status, headers)(scope, receive, send)
 
 
-def make(policy: Policy, source: str, token: str | None = None) -> Any:
-    """The service of a policy as an ASGI application; `source` is named by /version."""
+def make(
+    policy: Policy, source: str, token: str | None = None, recorder: Recorder | None = None
+) -> Any:
+    """The service of a policy as an ASGI application; `source` is named by /version. Images,
+    decisions and outcomes are kept by the `recorder`, if there is one."""
     app, turn = fastapi.FastAPI(openapi_url=None), threading.Lock()
     app.add_exception_handler(SettingsError, lambda _, error: _one_line(400, error))
     app.add_exception_handler(ViewError, lambda _, error: _one_line(422, error))
     app.add_exception_handler(RequestValidationError, lambda _, error: _invalid(error))
+    app.add_exception_handler(FileNotFoundError, lambda _, error: _one_line(404, error))
+    app.add_exception_handler(OSError, lambda _, error: _one_line(507, error))
 
     @app.get(OPEN)
     def health() -> dict[str, str]:
@@ -144,11 +161,22 @@ def make(policy: Policy, source: str, token: str | None = None) -> Any:
             begun = time.perf_counter()
             decisions = policy.decide(*given, request.top)
             seconds = time.perf_counter() - begun
+            entry = None if recorder is None else recorder.add(given, decisions)
         return {
             "decisions": [decision.to_dict() for decision in decisions],
+            "id": entry,
             "warnings": [str(warning.message) for warning in caught],
             "milliseconds": round(1e3 * seconds, 1),
         }
+
+    @app.post("/outcome")
+    def outcome(request: OutcomeRequest) -> dict[str, Any]:
+        if recorder is None:
+            raise FileNotFoundError("nothing is recorded; start the service with --record DIR")
+        values = request.model_dump(exclude={"id"})
+        with turn:
+            recorder.post(request.id, Outcome.of(values))
+        return {"id": request.id}
 
     return Gate(app, token)
 

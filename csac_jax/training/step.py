@@ -148,7 +148,7 @@ def train_step(
     # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch costs more.
     ready = taken + cfg.train.scenes >= cfg.train.learning_starts
     done = _updates_done(cfg, state.step)
-    learned, priority, losses = _learn(program, key_learn, state.learner, replay, done)
+    learned, priority, losses = learn(program, key_learn, state.learner, replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     replay = replay.replace(priority=jnp.where(ready, priority, replay.priority))
 
@@ -220,7 +220,7 @@ def action_result(action: Action, info: environment.Info) -> ActionResult:
     )
 
 
-def _learn(
+def learn(
     program: Program, key: jax.Array, state: Any, replay: ReplayState, done: jax.Array
 ) -> tuple[Any, jax.Array, dict[str, jax.Array]]:
     """The updates after `done` [] others, each on a batch of its own, then the end of the step on

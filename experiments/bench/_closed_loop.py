@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import Config, RobotKind, SensorConfig, SimConfig
-from csac_jax.constants import OUTCOMES
-from csac_jax.deploy import Policy
+from csac_jax.constants import OUTCOMES, Outcome
+from csac_jax.deploy import Policy, record
 from csac_jax.deploy.decision import Decision
+from csac_jax.deploy.record import Recorder
 from csac_jax.env import Env
 from csac_jax.errors import DataWarning, ViewError
 from csac_jax.evaluation import suites
@@ -42,6 +43,7 @@ class Loop(NamedTuple):
     env: Env
     episodes: int
     seed: int
+    recorder: Recorder | None = None  # keeps images, decisions and outcomes
 
 
 def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
@@ -122,6 +124,15 @@ def measure(loop: Loop, errors: SensorConfig) -> dict[str, Any]:
     }
 
 
+def collect(loop: Loop, errors: SensorConfig, grasps: int) -> dict[str, int]:
+    """Acts in one scene after another until so many grasps were made; what was counted."""
+    counts = collections.Counter(dict.fromkeys(COUNTED, 0))
+    numbers = itertools.cycle(range(loop.episodes))
+    while counts["grasps"] < grasps:
+        _episode(loop, errors, next(numbers), counts, [])
+    return dict(counts)
+
+
 def _episode(
     loop: Loop,
     errors: SensorConfig,
@@ -142,15 +153,38 @@ def _episode(
         begun = time.perf_counter()
         decision = _decide(loop.policy, env.cfg, image, counts)
         seconds.append(time.perf_counter() - begun)
-        moved = False
+        moved, came = False, record.PUSHED
         if decision is not None:
-            scene, moved = _move(env, scene, decision, counts)
+            scene, moved, came = _move(env, scene, decision, counts)
         unchanged = 0 if moved else unchanged + 1
-        if not scene.in_play.any() or unchanged >= task.max_steps_without_change:
+        ended = not scene.in_play.any() or unchanged >= task.max_steps_without_change
+        if loop.recorder is not None and decision is not None:
+            ended_by_hand = ended or action == task.max_actions - 1
+            _record(loop.recorder, env.cfg, image, decision, record.Outcome(came, 1, ended_by_hand))
+        if ended:
             break
     studio.close()
     counts["table_empty"] += not scene.in_play.any()
     counts["all_taken"] += counts["blocks_taken"] - taken_before == blocks
+
+
+def _record(
+    recorder: Recorder,
+    cfg: Config,
+    image: tuple[np.ndarray, np.ndarray],
+    decision: Decision,
+    came: record.Outcome,
+) -> None:
+    """Adds an image, its decision and what came of it."""
+    given = (*image, rgbd.intrinsics(cfg.camera), _pose(cfg), None)
+    recorder.post(recorder.add(given, [decision]), came)
+
+
+def _pose(cfg: Config) -> np.ndarray:
+    """Where the camera is believed to be [4, 4], camera to workspace."""
+    eye, pose = camera.make(cfg.camera), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = eye.rotation, eye.position
+    return pose
 
 
 def _first_scene(loop: Loop, number: int) -> Scene:
@@ -183,12 +217,10 @@ def _decide(
     counts: collections.Counter[str],
 ) -> Decision | None:
     """The best action; None where the image is refused or shows nothing to act on."""
-    eye, pose = camera.make(cfg.camera), np.eye(4)
-    pose[:3, :3], pose[:3, 3] = eye.rotation, eye.position
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DataWarning)
         try:
-            decisions = policy.decide(*image, rgbd.intrinsics(cfg.camera), pose)
+            decisions = policy.decide(*image, rgbd.intrinsics(cfg.camera), _pose(cfg))
         except ViewError:
             counts["refused"] += 1
             return None
@@ -199,16 +231,17 @@ def _decide(
 
 def _move(
     env: Env, scene: Scene, decision: Decision, counts: collections.Counter[str]
-) -> tuple[Scene, bool]:
-    """The scene after a decision, and whether it has changed."""
+) -> tuple[Scene, bool, str]:
+    """The scene after a decision, whether it has changed, and the outcome's name."""
     is_grasp = decision.primitive == "grasp"
     step = jax.device_get(act(env, scene, set_points(env.cfg.sim, decision), jnp.bool(is_grasp)))
     counts["grasps" if is_grasp else "pushes"] += 1
     if not step.reachable:
         counts["out_of_reach"] += 1
-        return scene, False
+        return scene, False, OUTCOMES[Outcome.NOTHING] if is_grasp else record.PUSHED
+    came = OUTCOMES[int(step.outcome)] if is_grasp else record.PUSHED
     if is_grasp:
-        counts[OUTCOMES[int(step.outcome)]] += 1
+        counts[came] += 1
     counts["blocks_taken"] += int(step.lifted.sum())
     counts["blocks_lost"] += int(step.blocks_lost)
-    return step.scene, bool(step.moved)
+    return step.scene, bool(step.moved), came

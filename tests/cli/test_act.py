@@ -82,6 +82,27 @@ def test_workspace_moves_the_tool(given: list[str], tmp_path: Path):
     assert found[0]["position"] == found[1]["position"]
 
 
+def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: --record keeps an image whose files are those of the command: it decides on them as
+    before. Images that are refused are not kept."""
+    record, out = tmp_path / "record", tmp_path / "out.json"
+    assert cli.main(["act", *given, "--record", str(record), "--json", str(out)]) == 0
+    first, line = capsys.readouterr().out.splitlines()
+    assert line == f"recorded as {record}/000001"
+    assert json.loads(out.read_text())["id"] == "000001"
+    kept = {"rgb": "rgb.png", "depth": "depth.npy", "intrinsics": "", "pose": ""}
+    files = [
+        part
+        for name, file in kept.items()
+        for part in (f"--{name}", str(record / "000001" / (file or f"{name}.json")))
+    ]
+    assert cli.main(["act", "shipped", *files]) == 0
+    assert capsys.readouterr().out.splitlines() == [first]
+    _ten_times(tmp_path)
+    assert cli.main(["act", *given, "--record", str(record)]) == 1
+    assert sorted(path.name for path in record.iterdir()) == ["000001", "record.json"]
+
+
 def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: --check accepts a right pose; it refuses one that is 2 cm off, a table with blocks,
     and a camera that sees too little, each by one line."""
@@ -176,6 +197,8 @@ def test_bad_files_are_one_line(
     [
         (["--top", "0"], "top: must lie in 1 .. 64, not 0"),
         (["--png", "out.bmp"], "its name must end in one of: .png"),
+        (["--check", "--record", "r"], "--record: --check decides nothing"),
+        (["--record", "."], "is no record: it has no record.json"),
     ],
 )
 def test_bad_options(

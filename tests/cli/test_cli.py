@@ -16,7 +16,7 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, api, cli, presets
-from csac_jax.cli import bench, evaluation, play, sweep, train
+from csac_jax.cli import bench, evaluation, play, settings, sweep, train
 from csac_jax.config import BetaReplay, Config, DenseNet121, SceneConfig, Section, UniformReplay
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
@@ -123,10 +123,15 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
-        ("eval shipped --sensor.kind d400", "invalid choice 'd400' for argument '--sensor.kind'"),
+        (
+            "eval shipped --sensor.kind d400",
+            "invalid choice 'd400' for argument '--sensor.kind'. "
+            "Expected one of ('none', 'd415', 'd435', 'azure_kinect')",
+        ),
         ("eval shipped --sensor.kind d415", "sensor.kind: must be none where heightmap.view is"),
         ("eval shipped --camera.size 320 240", "camera.centre: (319.5, 239.5) is not near the"),
         ("play --heightmap.size 60", "heightmap.size: must be a multiple of 8"),
+        ("bench finetune --grasps 0", "bench finetune: --grasps: must be at least 1"),
         ("eval . --seed 2147483647", "--seed: must lie in"),
         (
             "eval shipped --suite nowhere",
@@ -493,6 +498,14 @@ def test_any_policy_sees_through_another_camera(
         camera={"position": (-0.4, 0.0, 0.6)},
         sensor={"kind": "d435", "colour": 0.1},
     )
+
+
+def test_settings_of_a_view_are_those_given():
+    """Claim: a setting that is given counts, also where it is the package's default; no other."""
+    flags = ["shipped", "--sensor.dropped=0.0", "--camera.look_at", "0", "0", "0"]
+    _, changes = settings.parse_view(evaluation.EvalOptions, "eval", flags)
+    wanted = {"sensor": {"dropped": 0.0}, "camera": {"look_at": (0.0, 0.0, 0.0)}}
+    assert changes == {"heightmap": {}, **wanted}
 
 
 def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):

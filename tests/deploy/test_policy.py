@@ -214,3 +214,14 @@ def test_decides_without_mujoco(decisions: list[Decision], tmp_path: Path):
     np.testing.assert_allclose(found["position"], decisions[0].position, atol=1e-5)
     assert "needs mujoco" in complaint
     assert "csac-jax export" in complaint
+
+
+def test_net_of_heights_sees_no_colours():
+    """Claim: a policy with `net.colour` off decides the same whatever the colours are."""
+    cfg = presets.smoke().change(net={"colour": False})
+    learner = actor_critic.make(cfg)
+    params = jax.jit(lambda: actor_critic.init(jax.random.key(0), learner).online)()
+    heights = Policy(cfg, params)
+    other = IMAGE._replace(rgb=np.roll(255 - IMAGE.rgb, 7, axis=1))
+    first, second = (heights.decide(*image)[0].to_dict() for image in (IMAGE, other))
+    assert first == second

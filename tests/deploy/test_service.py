@@ -9,6 +9,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
@@ -16,7 +17,8 @@ import numpy as np
 import pytest
 
 from csac_jax.cli import main
-from csac_jax.deploy import Policy
+from csac_jax.deploy import Policy, record
+from csac_jax.deploy.record import Recorder
 from tests.deploy import image_files, scenes
 
 uvicorn = pytest.importorskip("uvicorn")
@@ -71,14 +73,95 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def policy() -> Policy:
+    loaded = Policy.load("shipped")
+    loaded.warm_up(640, 480)
+    return loaded
+
+
+@pytest.fixture(scope="module")
+def server(policy: Policy) -> Iterator[Server]:
     from csac_jax.deploy import service
 
-    policy = Policy.load("shipped")
-    policy.warm_up(640, 480)
     running = Server(service.make(policy, "shipped", TOKEN))
     yield running
     running.stop()
+
+
+@pytest.fixture
+def recording(policy: Policy, tmp_path: Path) -> Iterator[Server]:
+    """A service that records into the test's folder."""
+    from csac_jax.deploy import service
+
+    running = Server(service.make(policy, "shipped", TOKEN, Recorder(tmp_path, "shipped")))
+    yield running
+    running.stop()
+
+
+def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path):
+    """Claim: with a record, /decide names an entry, which holds what was sent and answered, and
+    /outcome adds to it, with and without a mask."""
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, 320:] = 255
+    _, first = recording.ask("POST", "/decide", {**BODY, "top": 2})
+    _, second = recording.ask("POST", "/decide", {**BODY, "mask": _png(mask)})
+    assert [first["id"], second["id"]] == ["000001", "000002"]
+    said = {"id": "000001", "outcome": "dropped", "number": 2, "ended": True}
+    assert recording.ask("POST", "/outcome", said) == (200, {"id": "000001"})
+    one, two = record.read(tmp_path)
+    assert one.outcome == record.Outcome("dropped", 2, True)
+    assert two.outcome is None
+    assert one.decisions == first["decisions"]
+    for entry, marked in [(one, None), (two, mask > 0)]:
+        rgb, depth, _, pose, found = entry.image
+        np.testing.assert_array_equal(rgb, IMAGE.rgb)
+        np.testing.assert_array_equal(depth, IMAGE.depth)
+        np.testing.assert_array_equal(pose, IMAGE.pose)
+        assert np.array_equal(found, marked) if marked is not None else found is None
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "detail"),
+    [
+        ({"id": "000007", "outcome": "lifted"}, 404, "there is no decision 000007 in the record"),
+        ({"id": "../../etc", "outcome": "lifted"}, 404, "there is no decision ../../etc"),
+        ({"id": "000001", "outcome": "good"}, 400, "outcome: must be one of nothing, empty"),
+        ({"id": "000001", "outcome": "lifted", "number": 2}, 400, "there are 1 decisions, not 2"),
+        ({"id": "000001", "outcome": "lifted", "number": "1"}, 422, "body.number: Input should be"),
+        ({"id": "000001", "outcome": "pushed"}, 400, "outcome: of a grasp it is nothing, empty"),
+        ({"id": "000001"}, 422, "body.outcome: Field required"),
+    ],
+)
+def test_bad_outcomes_are_refused(
+    recording: Server, tmp_path: Path, body: Any, status: int, detail: str
+):
+    """Claim: an outcome that fits no decision gets a status of 400 to 499 and one line, and changes
+    nothing."""
+    assert recording.ask("POST", "/decide", BODY)[0] == 200
+    found, answer = recording.ask("POST", "/outcome", body)
+    assert found == status, answer
+    assert detail in answer["detail"]
+    assert record.read(tmp_path)[0].outcome is None
+
+
+def test_outcome_without_a_record(server: Server):
+    """Claim: a service that records nothing says so."""
+    status, answer = server.ask("POST", "/outcome", {"id": "000001", "outcome": "lifted"})
+    assert status == 404
+    assert "start the service with --record DIR" in answer["detail"]
+    assert server.ask("POST", "/decide", BODY)[1]["id"] is None
+
+
+def test_full_disc_is_told(recording: Server, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a decision that cannot be recorded is not answered as if it were."""
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Recorder, "add", full)
+    status, answer = recording.ask("POST", "/decide", BODY)
+    assert status == 507
+    assert "No space left on device" in answer["detail"]
 
 
 def test_decides_as_the_library(server: Server):
@@ -115,10 +198,10 @@ def test_health_and_version(server: Server):
 
 
 @pytest.mark.parametrize("token", ["", "wrong", TOKEN[:-1], TOKEN + "x"])
-@pytest.mark.parametrize("path", ["/decide", "/version"])
+@pytest.mark.parametrize("path", ["/decide", "/outcome", "/version"])
 def test_token_is_asked_for(server: Server, path: str, token: str):
     """Claim: without the token nothing is decided or told."""
-    status, answer = server.ask("POST" if path == "/decide" else "GET", path, BODY, token)
+    status, answer = server.ask("GET" if path == "/version" else "POST", path, BODY, token)
     assert status == 401
     assert "Authorization" in answer["detail"]
 

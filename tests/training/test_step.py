@@ -380,7 +380,7 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     learner_state = actor_critic.LearnerState(None, None, None, None, jnp.int32(0))
     program = Program(cfg, nothing, CSAC(nothing), made)
     key, done = jax.random.key(0), jnp.int32(0)
-    _, priority, losses = step._learn(program, key, learner_state, replay, done)
+    _, priority, losses = step.learn(program, key, learner_state, replay, done)
     np.testing.assert_allclose(losses["critic_loss"], np.sum(weights * error), rtol=1e-5)
     expected = np.full(64, 7.0)
     expected[: 2 * num : 2] = (

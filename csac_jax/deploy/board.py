@@ -1,0 +1,153 @@
+"""The camera's pose from a printed board: ChArUco, by OpenCV (extra `calibrate`).
+
+The board lies on the table and its middle becomes the workspace's centre: one image. Or the gripper
+holds it, in several poses of the arm: hand-eye calibration. Its axes: x to the right of the page, y
+up the page, z out of it, from its middle.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from csac_jax.deploy import images
+from csac_jax.errors import FailedError, SettingsError
+
+COLUMNS, ROWS = 8, 6  # squares of the board; with 30 mm they fit A4
+DPI = 300  # of the printed picture
+LEAST_CORNERS = 12  # of 35 that must be seen
+LEAST_POSES = 3  # of the arm; OpenCV's methods need two rotations between them
+LEAST_TURN = np.radians(10.0)  # between two poses of the arm: less says too little (ours)
+_MARKER_SHARE = 0.7  # of a square
+_MARGIN = 0.01  # m, white border, in which the axes are drawn
+_INCH = 0.0254  # m
+
+
+@dataclasses.dataclass(frozen=True)
+class Board:
+    """A board as it came out of the printer."""
+
+    square: float = 0.03  # m, side of a square: measure it
+
+    def __post_init__(self) -> None:
+        if not 0.003 <= self.square <= 0.3:
+            raise SettingsError("square: the side of a square in m, 0.003 to 0.3")
+
+    @functools.cached_property
+    def charuco(self) -> Any:
+        """OpenCV's."""
+        words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        marker = _MARKER_SHARE * self.square
+        return cv2.aruco.CharucoBoard((COLUMNS, ROWS), self.square, marker, words)
+
+    @functools.cached_property
+    def corners(self) -> np.ndarray:
+        """The inner corners [35, 3] m in the board's axes, by OpenCV's numbers."""
+        own = np.asarray(self.charuco.getChessboardCorners(), np.float64)
+        middle = 0.5 * self.square * np.array([COLUMNS, ROWS, 0])
+        return (own - middle) * [1.0, -1.0, -1.0]  # OpenCV's y runs down the page
+
+    def picture(self) -> np.ndarray:
+        """What to print at DPI [rows, columns] uint8, with the x and the y axis in the margin."""
+        size = [round(side * self.square / _INCH * DPI) for side in (COLUMNS, ROWS)]
+        margin = round(_MARGIN / _INCH * DPI)
+        page = np.pad(self.charuco.generateImage(size), margin, constant_values=255)
+        corner, length = (margin // 2, page.shape[0] - margin // 2), 4 * margin
+        for name, tip in (("x", (length, corner[1])), ("y", (corner[0], corner[1] - length))):
+            cv2.arrowedLine(page, corner, tip, 0, 3, tipLength=0.05)
+            beside = (tip[0] + 10, tip[1] + 10) if name == "x" else (tip[0] - 10, tip[1] - 20)
+            cv2.putText(page, name, beside, cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 3)
+        return page
+
+
+class Located(NamedTuple):
+    """Where a board stands before a camera."""
+
+    pose: np.ndarray  # [4, 4] board to camera (x right, y down, z forward)
+    residual_mm: np.ndarray  # [n] of each corner seen, from where the pose puts it, at the board
+
+
+class HandEye(NamedTuple):
+    """A camera's pose by several poses of the arm. n = poses."""
+
+    pose: np.ndarray  # [4, 4] camera to robot
+    residual_mm: np.ndarray  # [n] the board's middle in the hand, from its mean
+
+
+def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
+    """Where the board is in an image [h, w, 3] uint8.
+
+    Raises SettingsError for arrays of a wrong form, FailedError where too little of it is seen.
+    """
+    camera, pixels = images.Intrinsics.of(intrinsics), np.asarray(rgb)
+    if pixels.shape != (*camera.shape, 3) or pixels.dtype != np.uint8:
+        raise SettingsError("rgb: must be uint8 [rows, columns, 3] of the intrinsics' size")
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    seen, numbers, *_ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(grey)
+    count = 0 if numbers is None else len(numbers)
+    if count < LEAST_CORNERS:
+        raise FailedError(
+            f"{count} of the board's {len(board.corners)} corners are seen, {LEAST_CORNERS} are "
+            "needed; bring it nearer, or give it more light"
+        )
+    seen = seen.reshape(-1, 2).astype(np.float64)
+    corners = board.corners[numbers.reshape(-1)]
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    lens = np.array(camera.distortion or (0.0,) * 5)
+    solved, turn, place = cv2.solvePnP(corners, seen, matrix, lens, flags=cv2.SOLVEPNP_IPPE)
+    if not solved:
+        raise FailedError("the board's pose cannot be found; take another image")
+    turn, place = cv2.solvePnPRefineLM(corners, seen, matrix, lens, turn, place)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], place.ravel()
+    again = cv2.projectPoints(corners, turn, place, matrix, lens)[0].reshape(-1, 2)
+    depth = corners @ pose[2, :3] + pose[2, 3]
+    off = (again - seen) / [camera.fx, camera.fy]
+    return Located(pose, 1e3 * depth * np.linalg.norm(off, axis=1))
+
+
+def on_table(found: Located) -> np.ndarray:
+    """The camera's pose [4, 4] in the workspace, whose axes are those of the board on the table."""
+    return np.linalg.inv(found.pose)
+
+
+def hand_eye(found: Sequence[Located], grippers: Sequence[Any]) -> HandEye:
+    """The pose of a fixed camera by a board that the gripper holds; Park and Martin 1994.
+
+    Args: grippers [4, 4], gripper to robot, one for each image. Raises SettingsError for too few
+    poses, or for poses that differ by too little.
+    """
+    arms = [images.rigid(pose, "robot") for pose in grippers]
+    if len(arms) != len(found) or len(arms) < LEAST_POSES:
+        raise SettingsError(
+            f"robot: give a pose of the arm for each image, {LEAST_POSES} or more, not "
+            f"{len(arms)} for {len(found)}"
+        )
+    axes = [_turn(arms[0], arm) for arm in arms[1:]]
+    if np.linalg.svd(np.array(axes), compute_uv=False)[1] < LEAST_TURN:
+        raise SettingsError(
+            "robot: the poses turn about one axis; turn the hand about two, by 30 degrees or more"
+        )
+    back = [np.linalg.inv(arm) for arm in arms]  # OpenCV's names are of a camera in the hand
+    pose = np.eye(4)
+    pose[:3, :3], place = cv2.calibrateHandEye(
+        [one[:3, :3] for one in back],
+        [one[:3, 3] for one in back],
+        [one.pose[:3, :3] for one in found],
+        [one.pose[:3, 3] for one in found],
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    pose[:3, 3] = place.ravel()
+    middles = np.array(
+        [(arm @ pose @ one.pose)[:3, 3] for arm, one in zip(back, found, strict=True)]
+    )
+    off = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
+    return HandEye(pose, 1e3 * off)
+
+
+def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The rotation vector [3] rad from one pose to another."""
+    return cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0].ravel()

@@ -1,0 +1,196 @@
+"""The printed board against poses that are known, and what is refused."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from csac_jax import cli
+from csac_jax.deploy import images
+from csac_jax.errors import FailedError, SettingsError
+from tests.deploy import boards, scenes
+
+pytest.importorskip("cv2")
+
+from csac_jax.deploy import board  # isort: skip
+
+BOARD = board.Board()
+ON_TABLE = np.linalg.inv(scenes.pose_of())  # the camera of VPG, 0.7 m away, 45 degrees down
+
+
+def _rigid(turn: Rotation, place: Any) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), place
+    return pose
+
+
+def _off(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """How far two poses differ, mm and degrees."""
+    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude()
+    return 1e3 * float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(np.degrees(turn))
+
+
+@pytest.mark.parametrize("lens", [boards.LENS, boards.DISTORTED], ids=["ideal", "distorted"])
+def test_board_on_the_table(lens: images.Intrinsics):
+    """Claim: one image of the board on the table gives the camera's pose to 1 mm and 0.1 degrees,
+    also through a distorted lens, with a residual below 0.3 mm."""
+    found = board.locate(BOARD, boards.take(BOARD, ON_TABLE, lens), lens)
+    place, turn = _off(board.on_table(found), np.linalg.inv(ON_TABLE))
+    assert place < 1.0
+    assert turn < 0.1
+    assert len(found.residual_mm) >= 20
+    assert found.residual_mm.max() < 0.3
+
+
+def test_residual_tells_a_wrong_lens():
+    """Claim: a focal length that is 14 % off makes the residual three times as large."""
+    image = boards.take(BOARD, ON_TABLE)
+    longer = dataclasses.replace(boards.LENS, fx=700.0, fy=700.0)
+    right, wrong = (board.locate(BOARD, image, lens) for lens in (boards.LENS, longer))
+    assert wrong.residual_mm.mean() > 3.0 * right.residual_mm.mean()
+
+
+CAMERA = _rigid(Rotation.from_euler("xyz", [150, 10, 80], degrees=True), [0.6, -0.2, 0.9])
+IN_HAND = _rigid(Rotation.from_euler("xyz", [20, -10, 30], degrees=True), [0.03, -0.02, 0.1])
+"""Camera to robot, and board to gripper."""
+
+
+def _arm(seed: int, num: int) -> list[np.ndarray]:
+    """Poses of the gripper in which the camera sees the board, gripper to robot."""
+    rng = np.random.default_rng(seed)
+    poses = []
+    for _ in range(num):
+        turns = rng.uniform([155, -25, -25], [205, 25, 25])
+        tilt = Rotation.from_euler("xyz", turns, degrees=True)
+        seen = _rigid(tilt, rng.uniform([-0.05, -0.05, 0.45], [0.05, 0.05, 0.6]))
+        poses.append(CAMERA @ seen @ np.linalg.inv(IN_HAND))
+    return poses
+
+
+def _seen_by_camera(arm: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(CAMERA) @ arm @ IN_HAND
+
+
+ARMS = _arm(0, 5)
+
+
+@pytest.fixture(scope="module")
+def in_hand() -> list[np.ndarray]:
+    """An image of the board in the gripper for each of ARMS."""
+    return [boards.take(BOARD, _seen_by_camera(arm)) for arm in ARMS]
+
+
+def test_hand_eye_from_images(in_hand: list[np.ndarray]):
+    """Claim: five images of the board in the gripper give the camera to 2 mm and 0.2 degrees,
+    and no residual is above 2 mm."""
+    found = board.hand_eye([board.locate(BOARD, one, boards.LENS) for one in in_hand], ARMS)
+    place, turn = _off(found.pose, CAMERA)
+    assert place < 2.0
+    assert turn < 0.2
+    assert found.residual_mm.max() < 2.0
+
+
+def test_hand_eye_residual_is_the_arms_error():
+    """Claim: exact poses give the camera to 1e-6 and no residual; with 2 mm of error at the arm
+    the residual is between 1 and 4 mm."""
+    arms, rng = _arm(1, 12), np.random.default_rng(2)
+    located = [board.Located(_seen_by_camera(arm), np.zeros(35)) for arm in arms]
+    exact = board.hand_eye(located, arms)
+    np.testing.assert_allclose(exact.pose, CAMERA, atol=1e-6)
+    assert exact.residual_mm.max() < 1e-3
+    for arm in arms:
+        arm[:3, 3] += rng.normal(scale=0.002, size=3)
+    assert 1.0 < board.hand_eye(located, arms).residual_mm.mean() < 4.0
+
+
+def test_too_little_is_refused():
+    """Claim: a covered board, an image of another size and arms that turn about one axis are
+    refused in one line."""
+    image = boards.take(BOARD, ON_TABLE)
+    image[:, :330] = 0
+    with pytest.raises(FailedError, match=r"\d of the board's 35 corners are seen, 12 are needed"):
+        board.locate(BOARD, image, boards.LENS)
+    with pytest.raises(SettingsError, match="of the intrinsics' size"):
+        board.locate(BOARD, image[::2], boards.LENS)
+    located = [board.Located(np.eye(4), np.zeros(35))] * 4
+    turned = [_rigid(Rotation.from_euler("z", 30 * i, degrees=True), [0, 0, 0]) for i in range(4)]
+    with pytest.raises(SettingsError, match="the poses turn about one axis"):
+        board.hand_eye(located, turned)
+    with pytest.raises(SettingsError, match="3 or more, not 2 for 4"):
+        board.hand_eye(located, turned[:2])
+    with pytest.raises(SettingsError, match="the side of a square in m"):
+        board.Board(30.0)
+
+
+def _write(path: Path, pose: np.ndarray) -> str:
+    path.write_text(json.dumps({"matrix": pose.tolist()}))
+    return str(path)
+
+
+def _lens_file(folder: Path) -> list[str]:
+    lens = boards.LENS
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    (folder / "lens.json").write_text(json.dumps({name: getattr(lens, name) for name in names}))
+    return ["--intrinsics", str(folder / "lens.json")]
+
+
+def test_command_on_the_table(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: the command prints a board of the size that it says, and writes the pose of an image
+    of it; the print's squares and the image's are the same."""
+    page = tmp_path / "board.png"
+    assert cli.main(["calibrate", "--board", str(page)]) == 0
+    assert "240 x 180 mm at 300 dpi" in capsys.readouterr().out
+    printed = imageio.imread(page)
+    np.testing.assert_array_equal(printed, BOARD.picture())
+    assert printed.shape == (round(200 / 25.4 * 300), round(260 / 25.4 * 300))
+    imageio.imwrite(tmp_path / "rgb.png", boards.take(BOARD, ON_TABLE))
+    out = tmp_path / "pose.json"
+    arguments = ["--rgb", str(tmp_path / "rgb.png"), *_lens_file(tmp_path), "--out", str(out)]
+    assert cli.main(["calibrate", *arguments]) == 0
+    assert "corners, residual 0." in capsys.readouterr().out
+    found = np.array(json.loads(out.read_text())["matrix"])
+    assert _off(found, np.linalg.inv(ON_TABLE))[0] < 1.0
+
+
+def test_command_in_the_hand(
+    in_hand: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    """Claim: images with poses of the arm give the camera's pose in the workspace."""
+    pictures, robots = [], []
+    for number, (image, arm) in enumerate(zip(in_hand, ARMS, strict=True)):
+        imageio.imwrite(tmp_path / f"{number}.png", image)
+        pictures.append(str(tmp_path / f"{number}.png"))
+        robots.append(_write(tmp_path / f"{number}.json", arm))
+    workspace = _rigid(Rotation.from_euler("z", 90, degrees=True), [0.5, 0.0, 0.02])
+    options = ["--workspace", _write(tmp_path / "workspace.json", workspace), *_lens_file(tmp_path)]
+    out = ["--out", str(tmp_path / "pose.json")]
+    assert cli.main(["calibrate", "--rgb", *pictures, "--robot", *robots, *options, *out]) == 0, (
+        capsys.readouterr().err
+    )
+    found = np.array(json.loads((tmp_path / "pose.json").read_text())["matrix"])
+    assert _off(found, np.linalg.inv(workspace) @ CAMERA)[0] < 3.0
+    assert "hand-eye: residual" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "calibrate: give --rgb and --intrinsics, or --board FILE to print"),
+        ("--board board.pdf", "--board: board.pdf must end in .png"),
+        ("--rgb a.png b.png --intrinsics c.json", "--rgb: one image of a board on the table"),
+        ("--rgb a.png --intrinsics c.json --robot d.json", "--robot and --workspace go together"),
+        ("--rgb a.png --intrinsics c.json", "there is no file c.json"),
+        ("--square 30", "square: the side of a square in m"),
+    ],
+)
+def test_bad_options(capsys: pytest.CaptureFixture, arguments: str, message: str):
+    """Claim: what cannot be calibrated from is refused with exit code 2 and one line."""
+    assert cli.main(["calibrate", *arguments.split()]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1

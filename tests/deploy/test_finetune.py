@@ -1,0 +1,288 @@
+"""Learning from a record: transitions as the environment would have made them, and what they
+teach."""
+
+import dataclasses
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from csac_jax import cli, presets
+from csac_jax.agent import actor_critic, maps
+from csac_jax.config import CameraConfig
+from csac_jax.constants import Outcome
+from csac_jax.deploy import Policy, experience, finetune, record
+from csac_jax.deploy.decision import Decision
+from csac_jax.deploy.finetune import Settings
+from csac_jax.deploy.record import Recorder
+from csac_jax.errors import FailedError, SettingsError
+from csac_jax.io import policy_file
+from csac_jax.runtime.signals import Stop
+from csac_jax.training import offline
+from csac_jax.vision import heightmap
+from tests.deploy import scenes
+
+pytestmark = pytest.mark.optax
+
+CFG = presets.smoke().change(target={"gamma": 0.0}, learn={"augment": False})
+SMALL = CameraConfig().scaled(0.25)
+LEFT, RIGHT = (-0.1, 0.0), (0.1, 0.05)
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    """An untrained one."""
+    learner = actor_critic.make(CFG)
+    params = jax.jit(lambda: actor_critic.init(jax.random.key(3), learner).online)()
+    return Policy(CFG, params)
+
+
+def _take(*places: tuple[float, float]) -> scenes.Image:
+    return scenes.take(scenes.blocks_at([(*place, 0.3) for place in [*places, (3.0, 3.0)]]), SMALL)
+
+
+BOTH, ONLY_LEFT, EMPTY = _take(LEFT, RIGHT), _take(LEFT), _take()
+
+
+def _grasp(place: tuple[float, float], primitive: str = "grasp") -> Decision:
+    return Decision(primitive, (*place, 0.02), 0.3, 0.11, 1.0, ())
+
+
+def write(folder: Path, *actions: tuple[scenes.Image, Decision, record.Outcome | None]) -> Path:
+    """A record of these actions, in their order."""
+    recorder = Recorder(folder, "test")
+    for image, decision, outcome in actions:
+        name = recorder.add((*image, None), [decision])
+        if outcome is not None:
+            recorder.post(name, outcome)
+    return folder
+
+
+Lifted, Empty, Pushed = map(record.Outcome, ("lifted", "empty", "pushed"))
+End = record.Outcome("lifted", ended=True)
+
+
+def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
+    """Claim: an action is stored with the map that it was decided on, the map of the next image,
+    its pose, and the reward of eqs. 10 to 15; the end of a scene ends an episode; an action without
+    outcome or without a next image is left out."""
+    folder = write(
+        tmp_path,
+        (BOTH, _grasp(RIGHT), Lifted),
+        (ONLY_LEFT, _grasp(LEFT), Empty),
+        (ONLY_LEFT, _grasp(LEFT), End),
+        (BOTH, _grasp(LEFT), None),
+        (BOTH, _grasp(LEFT), Lifted),
+    )
+    found = experience.load(policy, record.read(folder))
+    assert found.outcome.tolist() == [Outcome.LIFTED, Outcome.EMPTY, Outcome.LIFTED]
+    both, left = (policy.observe(*image) for image in (BOTH, ONLY_LEFT))
+    for number, (before, after) in enumerate([(both, left), (left, left), (left, None)]):
+        for seen, wanted in [(found.obs, before), (found.next_obs, after)]:
+            if wanted is not None:
+                row = jax.tree.map(lambda leaf, n=number: leaf[n], seen)
+                jax.tree.map(np.testing.assert_array_equal, row, heightmap.pack(wanted))
+    program = offline.make(finetune.configure(CFG, Settings(batch=2), 3))
+    learner = offline.init(program, policy.params)
+    done = experience.transitions(policy, program.learner, learner, found)
+    np.testing.assert_allclose(done.reward, [1.0 + 1.0, -0.5, 1.0 + 1.0], atol=1e-6)
+    assert done.terminated.tolist() == [False, False, True]
+    np.testing.assert_allclose(done.action.pose[:, :2], [RIGHT, LEFT, LEFT], atol=1e-6)
+    np.testing.assert_allclose(done.action.pose[:, 2], 0.3, atol=1e-6)
+    assert done.action.primitive.tolist() == [1, 1, 1]
+
+
+def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
+    """Claim: Q of a stored transition is the score that its decision was taken for."""
+    recorder = Recorder(tmp_path, "test")
+    decisions = policy.decide(*BOTH, top=3)
+    recorder.add((*BOTH, None), decisions)
+    recorder.add((*ONLY_LEFT, None), [])
+    came = "pushed" if decisions[2].primitive == "push" else "empty"
+    recorder.post("000001", record.Outcome(came, number=3))
+    found = experience.load(policy, record.read(tmp_path))
+    learner = actor_critic.make(CFG)
+    obs = heightmap.unpack(jax.tree.map(jax.numpy.asarray, found.obs))
+    batch = actor_critic.dense_maps(learner, policy.params, obs)
+    state = jax.tree.map(lambda leaf: leaf[0], batch)
+    action = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), found.action)
+    q = maps.read_q(learner.frames, state, action.primitive, action.pose)
+    assert float(q) == pytest.approx(decisions[2].score, abs=1e-3)
+
+
+def test_pushes_are_judged_by_the_next_image(policy: Policy, tmp_path: Path):
+    """Claim: a push earns as in training: by whether the map has changed, or by the critic."""
+    folder = write(
+        tmp_path,
+        (BOTH, _grasp(RIGHT, "push"), Pushed),
+        (ONLY_LEFT, _grasp(LEFT, "push"), Pushed),
+        (ONLY_LEFT, _grasp(LEFT), None),
+    )
+    cfg = CFG.change(reward={"push_effect": "change"})
+    judge = dataclasses.replace(policy, cfg=cfg)
+    found = experience.load(judge, record.read(folder))
+    program = offline.make(finetune.configure(cfg, Settings(batch=2), 2))
+    learner = offline.init(program, policy.params)
+    done = experience.transitions(judge, program.learner, learner, found)
+    np.testing.assert_allclose(done.reward, [0.5, -0.5], atol=1e-6)
+
+
+def _q(policy: Policy, image: scenes.Image, place: tuple[float, float]) -> float:
+    """Q of a grasp at a place."""
+    learner = actor_critic.make(policy.cfg)
+    obs = policy.observe(*image)
+    batch = actor_critic.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
+    state = jax.tree.map(lambda leaf: leaf[0], batch)
+    pose = np.array([*place, 0.3], np.float32)
+    return float(maps.read_q(learner.frames, state, np.int32(1), pose))
+
+
+LESSON = [(BOTH, _grasp(RIGHT), Lifted), (BOTH, _grasp(LEFT), Empty)] * 6 + [
+    (BOTH, _grasp(LEFT), None)
+]
+"""The right block can be lifted, the left one never."""
+
+
+SETTINGS = Settings(updates=100, learning_rate=1e-2, batch=8)
+
+
+@pytest.fixture(scope="module")
+def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("lesson") / "record", *LESSON)
+
+
+def test_it_learns_what_works(policy: Policy, lesson: Path):
+    """Claim: after learning, Q of what lifted something is near its reward 2, Q of what failed near
+    -0.5; config and the policy that was given stay."""
+    before = jax.device_get(policy.params)
+    tuned, done = finetune.run(policy, lesson, SETTINGS)
+    assert (done.actions, done.lifted, done.updates) == (12, 6, 100)
+    assert done.td_error[1] < 0.2 < done.td_error[0]
+    assert abs(_q(tuned, BOTH, RIGHT) - 2.0) < 0.3
+    assert abs(_q(tuned, BOTH, LEFT) + 0.5) < 0.3
+    assert tuned.cfg == policy.cfg
+    jax.tree.map(np.testing.assert_array_equal, before, jax.device_get(policy.params))
+
+
+def test_stop_keeps_what_was_learned(policy: Policy, lesson: Path):
+    """Claim: a signal ends the learning after the step that runs, and its networks are returned;
+    one that came before keeps those that were given."""
+    stop, seen = Stop(), []
+
+    def interrupt(progress: finetune.Progress) -> None:
+        seen.append(progress)
+        stop.signal = signal.SIGINT
+
+    tuned, done = finetune.run(policy, lesson, SETTINGS, interrupt, stop)
+    assert (done.updates, done.stopped_by, len(seen)) == (10, signal.SIGINT, 1)
+    assert (seen[0].updates, seen[0].total) == (10, 100)
+    again, none = finetune.run(policy, lesson, SETTINGS, interrupt, stop)
+    assert none.updates == 0
+    jax.tree.map(np.testing.assert_array_equal, again.params, policy.params)
+    changed = jax.tree.map(lambda a, b: bool(np.any(a != b)), tuned.params, policy.params)
+    assert any(jax.tree.leaves(changed))
+
+
+def test_command_writes_a_policy(
+    policy: Policy, lesson: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    """Claim: the command writes a policy file that loads and decides, and says what it did; it
+    overwrites nothing."""
+    start, out = tmp_path / "start.safetensors", tmp_path / "new.safetensors"
+    policy_file.save(start, policy.params, policy.cfg)
+    options = [
+        "--updates",
+        "100",
+        "--batch",
+        "8",
+        "--learning-rate",
+        "1e-2",
+        "--json",
+        str(tmp_path / "done.json"),
+    ]
+    arguments = ["finetune", str(start), str(lesson), "--out", str(out), *options]
+    assert cli.main(arguments) == 0
+    told = capsys.readouterr().out
+    assert "100 of 100 updates, TD error" in told
+    assert "learned from 12 actions, 6 of them lifted something; TD error" in told
+    assert f"done after 100 updates; wrote {out}" in told
+    assert json.loads((tmp_path / "done.json").read_text())["updates"] == 100
+    tuned = Policy.load(out)
+    assert tuned.cfg == CFG
+    assert tuned.decide(*BOTH)
+    assert cli.main(arguments) == 2
+    assert f"--out: {out} exists; give another name" in capsys.readouterr().err
+
+
+def _no_outcomes(folder: Path) -> None:
+    for path in folder.glob("*/outcome.json"):
+        path.unlink()
+
+
+def _cut_image(folder: Path) -> None:
+    path = folder / "000002" / "rgb.png"
+    path.write_bytes(path.read_bytes()[:200])
+
+
+def _no_depth(folder: Path) -> None:
+    (folder / "000001" / "depth.npy").unlink()
+
+
+def _millimetres(folder: Path) -> None:
+    path = folder / "000001" / "depth.npy"
+    np.save(path, 1000 * np.load(path))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_no_outcomes, "the record has no action with an outcome and an image after it"),
+        (_cut_image, r"000002/rgb\.png: "),
+        (_no_depth, r"there is no file .*000001/depth\.npy"),
+        (_millimetres, "000001: depth is .* times what camera_pose says"),
+    ],
+)
+def test_bad_records_are_refused(
+    policy: Policy, tmp_path: Path, spoil: Callable[[Path], None], message: str
+):
+    """Claim: a record that nothing can be learned from, or that is damaged, is one line that says
+    where."""
+    folder = write(tmp_path / "record", (BOTH, _grasp(LEFT), Lifted), (BOTH, _grasp(LEFT), Lifted))
+    spoil(folder)
+    with pytest.raises(SettingsError, match=message) as found:
+        finetune.run(policy, folder)
+    assert "\n" not in str(found.value)
+
+
+def test_loss_that_is_not_finite(policy: Policy, lesson: Path):
+    """Claim: where learning diverges, nothing is returned, and one line says what to change."""
+    broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * np.nan, policy.params))
+    with pytest.raises(FailedError, match=r"not finite after 10 updates; lower --learning-rate"):
+        finetune.run(broken, lesson, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--out new.bin", "--out: new.bin must end in .safetensors"),
+        ("--updates 0", "--updates: at least 1"),
+        ("--batch 0", "--batch: must lie in 1 .. 4096"),
+        ("--learning-rate 0", "--learning-rate: must lie between 0 and 1"),
+        ("--seed -1", "--seed: must lie in 0 .. 2147483646"),
+        ("", "nowhere is no record: it has no record.json"),
+    ],
+)
+def test_bad_options(
+    capsys: pytest.CaptureFixture, monkeypatch: Any, tmp_path: Path, options: str, message: str
+):
+    """Claim: what cannot be learned is refused with exit code 2 and one line."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["finetune", "shipped", "nowhere", *options.split()]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
