@@ -1,8 +1,9 @@
-"""What `mkdocs build` adds to docs: pages of source files, references from the code, mathematics."""
+"""What `mkdocs build` adds: pages of source files, references from the code, mathematics."""
 
 import contextlib
 import dataclasses
 import html
+import inspect
 import io
 import os
 import posixpath
@@ -20,6 +21,7 @@ sys.path.insert(0, str(ROOT))  # the package of this checkout, even where anothe
 from latex2mathml.converter import convert  # noqa: E402
 from mkdocs.structure.files import File  # noqa: E402
 
+import csac_jax  # noqa: E402
 from csac_jax import cli, config  # noqa: E402
 from csac_jax.cli import settings  # noqa: E402
 from csac_jax.config import Config, Section  # noqa: E402
@@ -30,15 +32,26 @@ SOURCES = ROOT / "build" / "sources"  # mkdocs.yml names it, too
 LANGUAGES = {".py": "python", ".json": "json", ".ipynb": "json", ".toml": "toml"}
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
 EQUATION = re.compile(r'<(div|span) class="arithmatex">\\([\[(])(.*?)\\[\])]</\1>', re.DOTALL)
+FIELD = re.compile(r"^(    \w+: [^#\n]+?)  # (?!type|noqa)(.+)$", re.MULTILINE)
 WIDTH = 100  # characters of a line of help
 
 
 def on_startup(command: str, dirty: bool) -> None:
-    """Copies the package for mkdocstrings, which reads no folder without `__init__.py`."""
+    """Copies the package for mkdocstrings, which reads no folder without `__init__.py`, and of a
+    field no comment, only a docstring below it, and follows no assignment to another name."""
     shutil.rmtree(SOURCES, ignore_errors=True)
     shutil.copytree(ROOT / "csac_jax", SOURCES / "csac_jax", ignore=shutil.ignore_patterns("__py*"))
-    for folder in {path.parent for path in SOURCES.rglob("*.py")}:
-        (folder / "__init__.py").touch()
+    for path in list(SOURCES.rglob("*.py")):
+        path.write_text(FIELD.sub(r'\1\n    """\2"""', path.read_text()))
+        (path.parent / "__init__.py").touch()
+    named = [(name, getattr(csac_jax, name)) for name in csac_jax.__all__]
+    lines = [
+        f"from {value.__module__} import {value.__qualname__} as {name}\n"
+        for name, value in named
+        if not inspect.ismodule(value)
+    ]
+    with (SOURCES / "csac_jax" / "__init__.py").open("a") as file:
+        file.writelines(lines)  # where each public name is at home
 
 
 def on_files(files: Any, config: Any) -> Any:

@@ -49,7 +49,10 @@ def still(name: str) -> np.ndarray:
     world = model.build(scene, SimConfig())
     fields = jax.device_get(model.scene_fields(world, case.scene))
     shown = picture.coloured(world, fields, case.scene)
-    draw, data = picture.renderer(shown, close_view(case.scene.position), OPENGL), mujoco.MjData(shown)
+    draw, data = (
+        picture.renderer(shown, close_view(case.scene.position), OPENGL),
+        mujoco.MjData(shown),
+    )
     poses = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
     data.qpos[world.block_qpos], data.qpos[world.robot_qpos[2]] = poses, ABOVE
     mujoco.mj_kinematics(shown, data)
