@@ -164,7 +164,7 @@ def _add(group: Any, name: str, value: Any, text: str) -> None:
 def field_docs(kind: Any) -> dict[str, str]:
     """The text beside or below each field of a dataclass and of its bases, in one line."""
     field = r'^    (\w+): .*(?:  # (.*)|\n    """([^"]*)""")$'
-    classes = [base for base in reversed(kind.__mro__) if dataclasses.is_dataclass(base)]
-    source = "".join(map(inspect.getsource, classes))
+    classes: list[Any] = [one for one in reversed(kind.__mro__) if dataclasses.is_dataclass(one)]
+    source = "".join(inspect.getsource(one) for one in classes)
     found = re.findall(field, source, re.MULTILINE)
     return {name: " ".join((beside or below).split()) for name, beside, below in found}

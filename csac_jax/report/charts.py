@@ -125,8 +125,8 @@ def _marks(panel: Axes, metric: str, scores: Sequence[Score], shared: Changes) -
         value, low, high = percent(bands)
         error = np.maximum([value - low, high - value], 0.0)
         offset = (index + 0.5) * 0.8 / len(scores) - 0.4
-        style = {"fmt": MARKERS[index % len(MARKERS)], "capsize": 3}
-        panel.errorbar(places + offset, value, error, **style, **_style(scores, index, shared))
+        fmt, style = MARKERS[index % len(MARKERS)], _style(scores, index, shared)
+        panel.errorbar(places + offset, value, error, fmt=fmt, capsize=3, **style)
         bottoms.append(np.nanmin(low))
     panel.set_xticks(places, [*parts, "mean"])
     panel.set_xlim(-0.5, len(parts) + 0.5)
