@@ -30,7 +30,7 @@ LEGEND: dict[str, Any] = {  # right of a panel, where no curve is
     "fontsize": "small",
     "frameon": False,
 }
-BESIDE = 36  # characters of a line of it
+NAME_WIDTH = 36  # characters of a line of it
 MOST = 6  # lines of a panel
 REFERENCE = "#7F7F7F"  # colour of the variant that is in every panel
 Changes = tuple[tuple[str, str], ...]  # as in `Variant.changed`
@@ -96,7 +96,7 @@ def _line(axes: Axes, curve: Curve, colour: str, shared: Changes, paper: bool) -
     actions, bands = curve.points()
     value, low, high = percent(bands)
     name = f"{short(without(curve.variant, shared))} ({len(curve.runs)})"
-    axes.plot(actions, value, color=colour, label=textwrap.fill(name, BESIDE))
+    axes.plot(actions, value, color=colour, label=textwrap.fill(name, NAME_WIDTH))
     if len(curve.runs) > 1:
         axes.fill_between(actions, low, high, color=colour, alpha=0.15, linewidth=0)
     published = PAPER_TRAINING.get(curve.variant.algo) if paper else None
