@@ -37,13 +37,19 @@ WIDTH = 100  # characters of a line of help
 
 
 def on_startup(command: str, dirty: bool) -> None:
-    """Copies the package for mkdocstrings, which reads no folder without `__init__.py`, and of a
-    field no comment, only a docstring below it, and follows no assignment to another name."""
+    """Copies the package for mkdocstrings, which reads no folder without `__init__.py` and no
+    comment next to a field, only a docstring below it."""
     shutil.rmtree(SOURCES, ignore_errors=True)
     shutil.copytree(ROOT / "csac_jax", SOURCES / "csac_jax", ignore=shutil.ignore_patterns("__py*"))
     for path in list(SOURCES.rglob("*.py")):
         path.write_text(FIELD.sub(r'\1\n    """\2"""', path.read_text()))
         (path.parent / "__init__.py").touch()
+    _name_homes()
+
+
+def _name_homes() -> None:
+    """Writes into the copy where each public name is defined: mkdocstrings follows imports, and no
+    assignment to another name."""
     named = [(name, getattr(csac_jax, name)) for name in csac_jax.__all__]
     lines = [
         f"from {value.__module__} import {value.__qualname__} as {name}\n"
@@ -51,7 +57,7 @@ def on_startup(command: str, dirty: bool) -> None:
         if not inspect.ismodule(value)
     ]
     with (SOURCES / "csac_jax" / "__init__.py").open("a") as file:
-        file.writelines(lines)  # where each public name is at home
+        file.writelines(lines)
 
 
 def on_files(files: Any, config: Any) -> Any:

@@ -49,10 +49,8 @@ def still(name: str) -> np.ndarray:
     world = model.build(scene, SimConfig())
     fields = jax.device_get(model.scene_fields(world, case.scene))
     shown = picture.coloured(world, fields, case.scene)
-    draw, data = (
-        picture.renderer(shown, close_view(case.scene.position), OPENGL),
-        mujoco.MjData(shown),
-    )
+    draw = picture.renderer(shown, close_view(case.scene.position), OPENGL)
+    data = mujoco.MjData(shown)
     poses = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
     data.qpos[world.block_qpos], data.qpos[world.robot_qpos[2]] = poses, ABOVE
     mujoco.mj_kinematics(shown, data)
@@ -113,7 +111,7 @@ def _pictures(env: Env, steps: list[Any], every: int, hold: int) -> Iterator[Any
 
 
 def write_animation(path: Path, pictures: list[tuple[np.ndarray, int]]) -> None:
-    """Writes an animated WebP; pictures that are smaller are centred."""
+    """Writes an animated WebP of pictures [H, W, 3] uint8 and their times, ms."""
     first, *others = [Image.fromarray(image) for image, _ in pictures]
     durations = [duration for _, duration in pictures]
     first.save(
