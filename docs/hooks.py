@@ -5,6 +5,7 @@ import dataclasses
 import html
 import inspect
 import io
+import json
 import os
 import posixpath
 import re
@@ -29,7 +30,7 @@ from csac_jax.evaluation import metrics, suites  # noqa: E402
 from csac_jax.training import loop  # noqa: E402
 
 SOURCES = ROOT / "build" / "sources"  # mkdocs.yml names it, too
-LANGUAGES = {".py": "python", ".json": "json", ".ipynb": "json", ".toml": "toml"}
+LANGUAGES = {".py": "python", ".json": "json", ".toml": "toml"}
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
 EQUATION = re.compile(r'<(div|span) class="arithmatex">\\([\[(])(.*?)\\[\])]</\1>', re.DOTALL)
 FIELD = re.compile(r"^(    \w+: [^#\n]+?)  # (?!type|noqa)(.+)$", re.MULTILINE)
@@ -65,10 +66,25 @@ def on_files(files: Any, config: Any) -> Any:
     pages = [file for file in files if file.is_documentation_page()]
     linked = {path for page in pages for _, path in _outside(page.src_uri, page.content_string)}
     for path in sorted(linked):
-        if (language := LANGUAGES.get(Path(path).suffix)) and (ROOT / path).is_file():
-            text = f"# {path}\n\n````{language}\n{(ROOT / path).read_text()}\n````\n"
+        if (ROOT / path).is_file() and (text := _as_markdown(ROOT / path)):
             files.append(File.generated(config, _source_page(path), content=text))
     return files
+
+
+def _as_markdown(path: Path) -> str | None:
+    """A source file as a page, a notebook cell by cell; None for files of other kinds."""
+    if path.suffix == ".ipynb":
+        cells = json.loads(path.read_text())["cells"]
+        sources = [(cell["cell_type"], "".join(cell["source"])) for cell in cells]
+        parts = [text if kind == "markdown" else _code("python", text) for kind, text in sources]
+        return "\n\n".join(parts)
+    if language := LANGUAGES.get(path.suffix):
+        return f"# {path.relative_to(ROOT)}\n\n{_code(language, path.read_text())}"
+    return None
+
+
+def _code(language: str, text: str) -> str:
+    return f"````{language}\n{text}\n````"
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
