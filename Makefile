@@ -13,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup train eval test test-slow test-faults lint format bench pictures figures doctor clean
+.PHONY: help setup train eval test test-slow test-faults lint format bench pictures figures docs doctor clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -53,16 +53,18 @@ format: $(STAMP)  ## rewrite the sources in ruff's format
 bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke for another preset
 	$(BIN)/csac-jax bench $(NAME) $(ARGS)
 
-pictures: $(STAMP)  ## draw the pictures of README.md
-	for shown in row:hand ridge:hand pinwheel:ur5 hole:ur5; do \
-	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 480 360 --no-views --png docs/pictures/$${shown%:*}.png; \
-	done
-	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
+pictures: $(STAMP)  ## draw the pictures of README and docs (4 minutes)
+	$(BIN)/python -m experiments.pictures
+	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --size 960 720 --png docs/pictures/views.png
 
 figures: $(STAMP)  ## the figures, tables and index of the recorded results
 	$(BIN)/csac-jax report experiments/results --markdown docs/results.md > /dev/null
 	$(BIN)/python -m experiments.records
 	$(BIN)/python -m experiments.figures
+
+docs: $(STAMP)  ## build the site of docs/ into build/docs; no network is needed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "read it: $(BIN)/python -m http.server --directory build/docs"
 
 doctor: $(STAMP)  ## versions, devices, numerics self-test
 	$(BIN)/csac-jax doctor $(ARGS)

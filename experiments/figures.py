@@ -10,10 +10,12 @@ import matplotlib
 
 matplotlib.use("Agg")  # no display
 import matplotlib.pyplot as plt
-from matplotlib import ticker
+from matplotlib import cycler, ticker
 from matplotlib.figure import Figure
 
-from csac_jax.report import charts, comparison, results
+from csac_jax.report import charts, comparison, curves, results
+
+plt.rcParams["axes.prop_cycle"] = cycler(color=curves.PALETTE)
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, FIGURES = ROOT / "experiments" / "results", ROOT / "docs" / "figures"

@@ -1,23 +1,38 @@
-"""Every Python block of README and docs runs."""
+"""README and docs: their code runs or parses, their links lead somewhere, README stays short."""
 
+import importlib.util
+import json
 import re
 import runpy
 import shlex
+import shutil
+import subprocess
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
+import matplotlib
 import pytest
+import yaml
 
 import csac_jax
 from csac_jax import cli, presets
+from csac_jax.cli import parsing, sweep
+from csac_jax.io import checkpoint
 
 ROOT = Path(csac_jax.__file__).parents[1]
+README = ROOT / "README.md"
 ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
-PAGES = [
-    page
-    for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
-    if "```python" in page.read_text() and page != ROBOT
-]
+TUTORIAL = ROOT / "docs" / "tutorial" / "first-training.md"
+RECORD = ROOT / "experiments" / "results" / "quick" / "csac_beta" / "seed-0" / "metrics.jsonl"
+ALL = [README, *sorted(ROOT.glob("docs/**/*.md"))]
+PAGES = [page for page in ALL if "```python" in page.read_text() and page != ROBOT]
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
+SHELL = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+PROGRAMS = ("csac-jax", "make", "pip", "python", "jupyter", "source", "srun")
+WORDS, LINES, SENTENCE = 1000, 150, 20  # of README
+names = pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
 
 
 def blocks(page: Path) -> list[str]:
@@ -25,9 +40,20 @@ def blocks(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
+def commands(page: Path) -> Iterator[list[str]]:
+    """The words of each command in a page's indented blocks and scripts."""
+    text = page.read_text()
+    bare = re.sub(r"(?ms)^```.*?^```", "", text)
+    code = re.findall(r"(?m)^    (.*)$", bare) + "\n".join(SHELL.findall(text)).splitlines()
+    for line in "\n".join(code).replace("\\\n", " ").splitlines():
+        if line.split()[:1] and line.split()[0] in PROGRAMS:
+            words = shlex.split(line.replace("$", "").split(";")[0], comments=True)
+            yield words[1:] if words[0] == "srun" else words
+
+
 def test_readme_has_an_example():
     """Claim: the test below has something to run."""
-    assert ROOT / "README.md" in PAGES
+    assert README in PAGES
 
 
 @pytest.mark.mjx
@@ -35,14 +61,97 @@ def test_readme_has_an_example():
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the blocks of a page run, one after the other, with a small preset for `quick`, few
-    episodes and few seeds."""
+    episodes and few seeds, in a folder with a recorded run."""
     monkeypatch.chdir(tmp_path)
+    matplotlib.use("Agg")
+    (tmp_path / "runs" / "first").mkdir(parents=True)
+    shutil.copy(RECORD, tmp_path / "runs" / "first")
     small = presets.smoke().change(sim={"physics": "auto"})  # as in `quick`
     monkeypatch.setattr(presets, "quick", lambda: small)
-    monkeypatch.setitem(presets.PRESETS, "quick", lambda: small)
+    monkeypatch.setattr(presets, "PRESETS", {**presets.PRESETS, "quick": lambda: small})
     namespace = {"__name__": page.stem}
     for block in blocks(page):
         exec(compile(NUMBERS.sub(r"\1=2", block), page.name, "exec"), namespace)
+
+
+class Parsed(BaseException):
+    """Arguments were read; nothing runs."""
+
+
+@pytest.fixture
+def parses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands end once they have read their arguments. Every run is one of `quick`."""
+    parse = parsing.parse
+
+    def stop(*args, **kwargs):
+        parse(*args, **kwargs)
+        raise Parsed
+
+    monkeypatch.setattr(parsing, "parse", stop)
+    monkeypatch.setattr(checkpoint, "load_config", lambda folder, at=None: presets.quick())
+
+
+def _check(words: list[str], extras: set[str], targets: set[str]) -> None:
+    """Fails for a command that is none."""
+    program, *arguments = words
+    if program == "csac-jax" and arguments[0] == "bench":
+        assert (ROOT / "experiments" / "bench" / f"{arguments[1]}.py").exists()
+    elif program == "csac-jax":
+        with pytest.raises(Parsed):
+            assert cli.main(arguments) == 0, words
+    elif program == "make":
+        assert arguments[0] in targets
+    elif program == "pip":
+        named = re.findall(r"\[([\w,]+)\]", " ".join(arguments))
+        assert {extra for one in named for extra in one.split(",")} <= extras | {"k8s"}
+    elif program == "python" and arguments[0] == "-m":
+        assert importlib.util.find_spec(arguments[1]) is not None
+    elif program in ("python", "jupyter"):
+        assert (ROOT / arguments[-1 if program == "jupyter" else 0]).exists()
+
+
+@names
+def test_commands_are_those_of_the_package(page: Path, parses: None):
+    """Claim: the real parser reads every csac-jax command of a page; targets of make, extras of
+    pip, modules and files of python are there."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    targets = set(re.findall(r"(?m)^([a-z-]+):", (ROOT / "Makefile").read_text()))
+    for words in commands(page):
+        _check(words, set(project["optional-dependencies"]), targets)
+
+
+def test_commands_are_found():
+    """Claim: the test above reads the commands that are there, continued lines too."""
+    found = [words for page in ALL for words in commands(page)]
+    assert len(found) > 40
+    assert sum(words[1:2] == ["sweep"] and words.count("--vary") == 3 for words in found) == 1
+
+
+@pytest.mark.slow
+def test_sweeps_can_be_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: what the pages on sweeps vary are settings, of values that they can have."""
+    monkeypatch.chdir(tmp_path)
+    pages = (ROOT / "docs" / "how-to" / name for name in ("sweeps.md", "scenes.md"))
+    lines = [words[2:] for page in pages for words in commands(page) if words[1] == "sweep"]
+    plans = [sweep.read(words)[1] for words in lines if "--resume" not in words]
+    assert [len(plan.points) for plan in plans] == [2, 48, 7, 4]
+
+
+@names
+def test_other_blocks_parse(page: Path):
+    """Claim: every fenced block names its language, and is Python, a script, JSON, YAML, BibTeX or
+    text."""
+    for language, code in FENCE.findall(page.read_text()):
+        if language in ("python", "py"):
+            compile(code, page.name, "exec")
+        elif language == "json":
+            json.loads(code)
+        elif language == "yaml":
+            list(yaml.safe_load_all(code))
+        elif language == "sh":
+            subprocess.run(["bash", "-n"], input=code, text=True, check=True)
+        else:
+            assert language in ("text", "bibtex"), f"{page}: {language!r}"
 
 
 def _run_command(line: str) -> None:
@@ -96,3 +205,63 @@ def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             exec(compile(block, "robot.md", "exec"), namespace)
     assert len(steps) >= 6
     assert Path("demo/decision.png").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the commands of the tutorial run in their order, with a small preset for `quick`."""
+    monkeypatch.chdir(tmp_path)
+    small = presets.smoke().change(sim={"physics": "c"})
+    monkeypatch.setitem(presets.PRESETS, "quick", lambda: small)
+    ran = [words for words in commands(TUTORIAL) if words[0] == "csac-jax"]
+    for words in ran:
+        assert cli.main(words[1:]) == 0, words
+    assert [words[1] for words in ran] == ["doctor", "train", "eval", "play", "report"]
+    assert Path("first.webp").exists()
+    assert "smoke" in Path("first.md").read_text()
+
+
+def _sentences(page: Path) -> list[list[str]]:
+    """The words of each sentence of a page's text, without code, tables and titles."""
+    text = re.sub(r"(?ms)^(```|\$\$).*?^(```|\$\$)", "", page.read_text())
+    kept = [line for line in text.splitlines() if not re.match(r"    |\||#|!|\s*$|\d+\. ", line)]
+    bare = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", "\n".join(kept).replace("\n- ", "\n"))
+    return [sentence.split() for sentence in re.split(r"(?<=[.:!?])\s+", bare) if sentence.strip()]
+
+
+def test_readme_is_short():
+    """Claim: README has at most 150 lines, 1,000 words, and sentences of 20 words."""
+    text = README.read_text()
+    assert len(text.splitlines()) <= LINES
+    assert len(text.split()) <= WORDS
+    long = [" ".join(words) for words in _sentences(README) if len(words) > SENTENCE]
+    assert not long
+
+
+@pytest.mark.parametrize("folder", ["tutorial", "how-to", "reference", "explanation"])
+def test_sentences_of_pages_are_short(folder: str):
+    """Claim: no sentence of these pages has more than 20 words."""
+    pages = (ROOT / "docs" / folder).glob("*.md")
+    sentences = [words for page in pages for words in _sentences(page)]
+    assert len(sentences) > 10
+    assert not [" ".join(words) for words in sentences if len(words) > SENTENCE]
+
+
+def test_readme_has_the_recorded_numbers():
+    """Claim: what README says of the shipped policy is what was recorded."""
+    folder = ROOT / "experiments" / "results" / "fast" / "shipped" / "seed-0"
+    rows = [row.split("|") for row in README.read_text().splitlines() if "**shipped**" in row]
+    said = [[re.findall(r"[\d.]+", cell) for cell in row[3:6]] for row in rows]
+    for name, numbers in zip(("cases", "random30", "random10"), said, strict=True):
+        measured = json.loads((folder / f"eval-{name}-c.json").read_text())
+        parts = measured.get("parts", {name: measured}).values()
+        for metric, shown in zip(("completion", "grasp_success"), numbers, strict=False):
+            values = [100 * part[metric]["value"] for part in parts]
+            assert [float(shown[0]), float(shown[-1])] == pytest.approx(
+                [min(values), max(values)], abs=0.5 if "." not in shown[0] else 0.06
+            )
+        rates = [part["action_efficiency"]["value"] for part in parts]
+        bounds = [float(numbers[2][0]), float(numbers[2][-1])]
+        assert bounds == pytest.approx([min(rates), max(rates)], abs=0.0051)

@@ -3,6 +3,7 @@
 import importlib.util
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -10,6 +11,7 @@ import csac_jax
 from csac_jax import presets
 
 FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
+NOTEBOOK = FOLDER / "first_grasp.ipynb"
 ROBOTS = ("ros2_node", "ur_rtde")  # see test_robot_examples
 BY_PAGE = ("camera_image",)  # run by docs/robot.md, see test_docs
 TRAINERS = ("own_sampler", "own_network", "own_learner")
@@ -65,3 +67,40 @@ def test_own_parts_train(small: str, name: str, tmp_path: Path):
 def test_random_agent_runs(small: str):
     """Claim: the environment runs in a scan of a vmap, with finished scenes replaced."""
     assert 0.0 <= _module("random_agent").main(small, "6") <= 1.0
+
+
+def _notebook() -> Any:
+    return pytest.importorskip("nbformat").read(NOTEBOOK, as_version=4)
+
+
+def test_notebook_has_no_outputs():
+    """Claim: the notebook is kept without what it printed and drew, and installs itself first."""
+    cells = [cell for cell in _notebook().cells if cell.cell_type == "code"]
+    assert not [cell for cell in cells if cell.outputs or cell.execution_count]
+    assert "pip" in cells[0].source
+    for cell in cells:
+        compile(cell.source, NOTEBOOK.name, "exec")
+
+
+@pytest.mark.slow
+def test_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the notebook runs from its first to its last cell, trains, and shows three figures and
+    a video; here with fewer actions."""
+    nbclient = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    monkeypatch.setenv("PYTHONPATH", str(FOLDER.parent))
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    notebook, fewer = (
+        _notebook(),
+        {'"actions": 480': '"actions": 160', '"480", "360"': '"96", "64"'},
+    )
+    for cell in notebook.cells:
+        for long, short in fewer.items():
+            cell.source = cell.source.replace(long, short)
+    resources = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=900, resources=resources).execute()
+    outputs = [out for cell in notebook.cells for out in cell.get("outputs", ())]
+    shown = [kind for out in outputs for kind in out.get("data", ()) if kind.startswith("image/")]
+    assert shown == ["image/png"] * 3 + ["image/gif"]
+    text = "".join(out.get("text", "") for out in outputs)
+    assert "160 actions, success" in text

@@ -112,7 +112,7 @@ def _all_frames(ahead: jax.Array, back: jax.Array) -> jax.Array:
 
 
 def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.04730.
+    """Cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
 
     Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
     such a surface, of any block, lies within the push's length ahead. With `policy.cells all`:

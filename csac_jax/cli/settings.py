@@ -94,7 +94,7 @@ def parse_view(
 
 def _inherited(section: Any) -> Any:
     """A dataclass of the settings of a section, which are the policy's unless they are given."""
-    docs = _docs(section)
+    docs = field_docs(section)
     fields = [
         (field.name, parsing.inherited(field.type, docs[field.name]), field.default)
         for field in dataclasses.fields(section)
@@ -138,14 +138,19 @@ def print_help(options: type, command: str, examples: Sequence[str], arguments: 
     )
     for option in dataclasses.fields(options):
         kind = next(iter(typing.get_args(option.type)), None)
-        _add(parser, option.name, _METAVARS.get(kind, option.default), _docs(options)[option.name])
+        _add(
+            parser,
+            option.name,
+            _METAVARS.get(kind, option.default),
+            field_docs(options)[option.name],
+        )
     _add(parser, "device", "cpu|gpu", "Where JAX computes; by default on a GPU, if there is one.")
     title = f"settings that people change first, with the values of {cfg.preset}"
     first = parser.add_argument_group(title)
     for setting in FIRST:
         section_name, field = setting.split(".")
         section = getattr(cfg, section_name)
-        _add(first, setting, getattr(section, field), _docs(section.__class__)[field])
+        _add(first, setting, getattr(section, field), field_docs(section.__class__)[field])
     parser.print_help()
 
 
@@ -157,8 +162,10 @@ def _add(group: Any, name: str, value: Any, text: str) -> None:
 
 
 @cache
-def _docs(kind: Any) -> dict[str, str]:
-    """The text beside or below each field of a dataclass, in one line."""
+def field_docs(kind: Any) -> dict[str, str]:
+    """The text beside or below each field of a dataclass and of its bases, in one line."""
     field = r'^    (\w+): .*(?:  # (.*)|\n    """([^"]*)""")$'
-    found = re.findall(field, inspect.getsource(kind), re.MULTILINE)
+    classes: list[Any] = [one for one in reversed(kind.__mro__) if dataclasses.is_dataclass(one)]
+    source = "".join(inspect.getsource(one) for one in classes)
+    found = re.findall(field, source, re.MULTILINE)
     return {name: " ".join((beside or below).split()) for name, beside, below in found}

@@ -18,8 +18,8 @@ from csac_jax.scene import blocks, layout, model
 from csac_jax.sim import c_physics
 
 VIEWS: dict[RobotKind, View] = {
-    "hand": View(position=(-0.45, -0.45, 0.45), look_at=(0.0, 0.0, 0.04)),
-    "ur5": View(position=(-0.75, -1.05, 0.75), look_at=(0.15, 0.0, 0.25)),
+    "hand": View(position=(-0.22, -0.5, 0.46), look_at=(0.0, -0.01, 0.05)),
+    "ur5": View(position=(-0.85, -1.25, 0.85), look_at=(0.19, 0.0, 0.33)),
 }
 STOPPED = {
     "action_cap": "stopped at the action limit",

@@ -14,9 +14,10 @@ from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World, with_blocks
 from csac_jax.vision import camera
 
-FLOOR = (0.75, 0.76, 0.78, 1.0)
+FLOOR = (0.85, 0.86, 0.88, 1.0)
 SKY = np.ones(4, np.float32)
 FOVY = 45.0  # vertical field of view, degrees
+LAMP = np.array([-0.7, -0.5, 2.2])  # place of the light, m: shadows fall away from the viewer
 
 Draw = Callable[[mujoco.MjData], np.ndarray]  # a state -> its picture [H, W, 3] uint8
 
@@ -48,7 +49,7 @@ def renderer(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
 def _opengl_renderer(model: mujoco.MjModel, view: View) -> Draw:
     model.vis.global_.fovy = FOVY
     model.vis.global_.offwidth, model.vis.global_.offheight = view.size
-    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.35, 0.3
+    _light(model)
     opengl = mujoco.Renderer(model, *reversed(view.size))
     opengl.scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = 0  # the sky is seen from inside
     eye, offset = mujoco.MjvCamera(), np.array(view.look_at) - np.array(view.position)
@@ -68,6 +69,16 @@ def _opengl_renderer(model: mujoco.MjModel, view: View) -> Draw:
         return opengl.render().copy()
 
     return draw
+
+
+def _light(model: mujoco.MjModel) -> None:
+    """One bright lamp over the whole table, its shadows fine near the workspace."""
+    model.light_pos[:], model.light_dir[:] = LAMP, -LAMP / np.linalg.norm(LAMP)
+    model.light_cutoff[:], model.light_exponent[:] = 80.0, 0.0  # degrees; as bright at the edge
+    model.light_diffuse[:], model.light_specular[:] = 0.45, 0.1
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.5, 0.2
+    model.vis.map.shadowscale = 0.3  # of the lamp's cone; all of the arm lies in it
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 4096, 8
 
 
 def _ray_renderer(model: mujoco.MjModel, view: View) -> Draw:

@@ -1,6 +1,5 @@
 """Figures 6, 7 and 9 of the paper and of variants, and the page of `csac-jax report --out`."""
 
-import functools
 import io
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -16,20 +15,27 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from csac_jax.evaluation import statistics
-from csac_jax.evaluation.statistics import Band
 from csac_jax.report import tables
-from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped, label
-from csac_jax.report.tables import PAPER_ACTIONS, PAPER_CASES, PAPER_TRAINING
+from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped
+from csac_jax.report.curves import (
+    COLOURS,
+    LEGEND_WIDTH,
+    REFERENCE,
+    Changes,
+    floor,
+    percent,
+    say_shared,
+    shared_changes,
+    short,
+    success,
+    without,
+)
+from csac_jax.report.tables import PAPER_CASES
 
 SAMPLERS = ("csac", "csac_per", "csac_beta")
-PALETTE = ("#9c755f", "#bab0ac", "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#b07aa1")
-COLOURS = dict(zip(NAMES, PALETTE, strict=True))
 FIGURE_9 = {"completion": "completion", "action_efficiency": "action efficiency (blocks / actions)"}
-_short = functools.partial(label, preset=False, most=3)  # name of a variant in a legend
-LEGEND_WIDTH = 56  # characters
 PROFILED = np.linspace(0.0, 1.0, 101)  # values that a performance profile is drawn over
-INSIDE = 6  # curves whose legend has room among them
-PAPER_MARK: dict[str, Any] = {"marker": "D", "markeredgecolor": "black", "linestyle": ""}
+MARKERS = "os^DvP*"
 
 
 class Chart(NamedTuple):
@@ -46,7 +52,7 @@ def draw(report: Report) -> Iterator[Chart]:
         for name, (what, chosen) in _training(curves).items():
             if chosen:
                 title = f"Grasp success of {what}, preset {preset}"
-                yield Chart(f"{name}-{preset}", title, success(chosen))
+                yield Chart(f"{name}-{preset}", title, success(chosen, paper=name != "variants"))
     four = [score for score in report.scores if score.suite in ("cases", "target")]
     by_suite = grouped(four, lambda score: (score.suite, score.variant.preset))
     for (suite, preset), scores in by_suite.items():
@@ -60,12 +66,13 @@ def draw(report: Report) -> Iterator[Chart]:
 
 def _training(curves: Sequence[Curve]) -> dict[str, tuple[str, list[Curve]]]:
     """The figures of one preset's curves: name -> what they show, and which curves."""
-    methods = [curve for curve in curves if curve.variant.unchanged]
+    plain = [curve for curve in curves if curve.variant.unchanged]
+    methods = plain or _most_run(curves)
     samplers = [curve for curve in methods if curve.variant.algo in SAMPLERS]
     several = len({curve.variant.algo for curve in samplers}) > 1
     varied = [curve for curve in curves if not curve.variant.unchanged]
     algos = {curve.variant.algo for curve in varied}
-    base = [curve for curve in methods if curve.variant.algo in algos]
+    base = [curve for curve in plain if curve.variant.algo in algos]
     return {
         "methods": ("the methods (figure 6)", methods),
         "samplers": ("the samplers (figure 7)", samplers if several else []),
@@ -73,99 +80,93 @@ def _training(curves: Sequence[Curve]) -> dict[str, tuple[str, list[Curve]]]:
     }
 
 
-def success(curves: Sequence[Curve]) -> Figure:
-    """Success against actions: a line and band per variant, the paper's values as marks."""
-    figure, axes = plt.subplots(figsize=(8.0, 4.2), layout="constrained")
-    colours, spare = dict(COLOURS), iter(plt.get_cmap("tab20").colors)
-    for curve in curves:
-        algo = curve.variant.algo
-        colour = colours.pop(algo, None) or next(spare)
-        _line(axes, curve, colour)
-        if curve.variant.unchanged and algo in PAPER_TRAINING:
-            axes.plot(PAPER_ACTIONS, 100 * PAPER_TRAINING[algo], color=colour, **PAPER_MARK)
-    axes.plot([], [], color="white", label="paper: ten blocks, 2,500 actions", **PAPER_MARK)
-    axes.set(xlabel="actions", ylabel="success over the last 200 grasps, %", ylim=(0, 101))
-    axes.set_xlim(left=0)
-    axes.grid(alpha=0.3)
-    if len(curves) <= INSIDE:
-        axes.legend(loc="lower right", title="method (runs)", fontsize="small")
-        return figure
-    figure.set_figheight(figure.get_figheight() + 0.2 * len(curves))
-    figure.legend(loc="outside lower center", ncols=2, title="method (runs)", fontsize="small")
-    return figure
-
-
-def _line(axes: Axes, curve: Curve, colour: Any) -> None:
-    actions, bands = curve.points()
-    value, low, high = percent(bands)
-    name = f"{_short(curve.variant)} ({len(curve.runs)})"
-    axes.plot(actions, value, color=colour, label=textwrap.fill(name, LEGEND_WIDTH))
-    if len(curve.runs) > 1:
-        axes.fill_between(actions, low, high, color=colour, alpha=0.2, linewidth=0)
-
-
-def percent(bands: Sequence[Band | None]) -> np.ndarray:
-    """Value, low and high, [3, bands], %; NaN where there is none."""
-    rows = [(None, None, None) if band is None else band[:3] for band in bands]
-    return 100 * np.array(rows, float).reshape(-1, 3).T
+def _most_run(curves: Sequence[Curve]) -> list[Curve]:
+    """Of each algorithm the variant of most runs; none of several variants of one algorithm."""
+    by_algo = grouped(curves, lambda curve: curve.variant.algo).values()
+    if len(by_algo) == 1 < len(curves):
+        return []
+    return [max(one, key=lambda curve: len(curve.runs)) for one in by_algo]
 
 
 def _cases(scores: Sequence[Score]) -> Figure:
     """Completion and action efficiency by case and variant; the paper's means as lines."""
     figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
+    shared = shared_changes([score.variant for score in scores])
+    bottoms = []
     for panel, (metric, title) in zip(panels, FIGURE_9.items(), strict=True):
-        _marks(panel, metric, scores)
-        panel.set(title=title, ylim=(0, 104))
+        bottoms.append(_marks(panel, metric, scores, shared))
+        panel.set(title=title)
         panel.grid(alpha=0.3, axis="y")
         paper = PAPER_CASES[metric] if scores[0].suite == "cases" else {}
         for algo, value in paper.items():
             name = f"paper, mean of the cases, {NAMES[algo]}"
             panel.axhline(100 * value, color=COLOURS[algo], linestyle="--", linewidth=1, label=name)
-    panels[0].set_ylabel("%")
-    handles = panels[0].get_legend_handles_labels()
-    figure.legend(*handles, fontsize="small", loc="outside lower center", ncols=2)
+            bottoms.append(100 * value)
+    panels[0].set(ylabel="%", ylim=(floor(min(bottoms)), 104))
+    _finish(figure, panels[0], shared)
     return figure
 
 
-def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> None:
-    """A mark of each variant in each case, and in the mean of all if it has all."""
+def _finish(figure: Figure, panel: Axes, shared: Changes) -> None:
+    """The legend of a panel for the whole figure, and what all variants share."""
+    handles = panel.get_legend_handles_labels()
+    figure.legend(*handles, fontsize="small", loc="outside lower center", ncols=3)
+    say_shared(figure, shared)
+
+
+def _marks(panel: Axes, metric: str, scores: Sequence[Score], shared: Changes) -> float:
+    """A mark of each variant in each case, and in the mean of all if it has all; returns the
+    lowest value, %."""
     parts = list(dict.fromkeys(part for score in scores for part in score.parts))
-    places = np.arange(len(parts) + 1)
+    places, bottoms = np.arange(len(parts) + 1), []
     for index, score in enumerate(scores):
         bands = [score.only(part).band(metric) for part in parts]
         bands.append(score.band(metric) if len(score.parts) == len(parts) else None)
         value, low, high = percent(bands)
         error = np.maximum([value - low, high - value], 0.0)
         offset = (index + 0.5) * 0.8 / len(scores) - 0.4
-        panel.errorbar(places + offset, value, error, fmt="o", capsize=3, **_style(score, index))
+        fmt, style = MARKERS[index % len(MARKERS)], _style(scores, index, shared)
+        panel.errorbar(places + offset, value, error, fmt=fmt, capsize=3, **style)
+        bottoms.append(np.nanmin(low))
     panel.set_xticks(places, [*parts, "mean"])
     panel.set_xlim(-0.5, len(parts) + 0.5)
+    return float(min(bottoms))
 
 
 def _profiles(scores: Sequence[Score]) -> Figure:
     """Share of the seeds above each value, mean of the parts, by variant, arXiv:2108.13264."""
     figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
+    shared = shared_changes([score.variant for score in scores])
     for panel, (metric, title) in zip(panels, FIGURE_9.items(), strict=True):
+        left = 100.0
         for index, score in enumerate(scores):
             value, low, high = percent(statistics.profile(score.strata(metric), PROFILED))
-            style = _style(score, index)
+            style = _style(scores, index, shared)
             panel.plot(100 * PROFILED, value, **style)
             panel.fill_between(100 * PROFILED, low, high, color=style["color"], alpha=0.15)
-        panel.set(xlabel=f"{title}, %", xlim=(0, 100), ylim=(0, 101))
+            left = min(left, 100 * PROFILED[np.argmax(value < 100.0)])
+        panel.set(xlabel=f"{title}, %", xlim=(floor(left), 100), ylim=(0, 101))
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("seeds above, %")
-    handles = panels[0].get_legend_handles_labels()
-    figure.legend(*handles, fontsize="small", loc="outside lower center", ncols=2)
+    _finish(figure, panels[0], shared)
     return figure
 
 
-def _style(score: Score, index: int) -> dict[str, Any]:
-    """Name and colour of a variant's marks."""
-    variant = score.variant
-    name = _short(variant) if score.policy == "learned" else score.policy
-    name = f"{name}, {score.physics}, {score.robot} ({score.most_runs})"
-    known = variant.unchanged and variant.algo in COLOURS
-    colour = COLOURS[variant.algo] if known else plt.get_cmap("tab20")(index)
+def _style(scores: Sequence[Score], index: int, shared: Changes) -> dict[str, Any]:
+    """Name and colour of a variant's marks. Each algorithm's first variant has its colour."""
+    score = scores[index]
+    variant = without(score.variant, shared)
+    words = [short(variant) if score.policy == "learned" else score.policy]
+    words += [
+        one
+        for one, every in ((score.physics, "physics"), (score.robot, "robot"))
+        if len({getattr(other, every) for other in scores}) > 1
+    ]
+    firsts = [other.variant.algo for other in scores]
+    spare = [colour for algo, colour in COLOURS.items() if algo not in firsts] or [REFERENCE]
+    first = firsts.index(variant.algo) == index
+    colour = COLOURS[variant.algo] if first else spare[index % len(spare)]
+    name = f"{', '.join(words)} ({score.most_runs})"
     return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
 
 

@@ -1,5 +1,6 @@
 """Methods by task and number of actions: one table and one figure of an evaluated sweep."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from csac_jax.evaluation import statistics
-from csac_jax.report import charts, results, tables
+from csac_jax.report import curves, results, tables
 from csac_jax.report.comparison import Curve, Report, Score, grouped, label, seeds_of
 
 AXES = ("train.actions", "task.kind", "scene.arranged")  # settings that are columns here
@@ -29,9 +30,9 @@ class Cell(NamedTuple):
 
 def cells(report: Report) -> list[Cell]:
     """The evaluated methods by task, actions and name."""
-    curves = {curve.variant: curve for curve in report.curves}
+    trained = {curve.variant: curve for curve in report.curves}
     learned = [score for score in report.scores if score.policy == "learned"]
-    found = [_cell(score, curves.get(score.variant)) for score in learned]
+    found = [_cell(score, trained.get(score.variant)) for score in learned]
     return sorted(found, key=lambda cell: (cell.task, cell.actions, cell.method))
 
 
@@ -94,13 +95,13 @@ def figure(report: Report) -> Figure:
 
 
 def _lines(panel: Axes, metric: str, found: Sequence[Cell]) -> None:
-    spare = iter(plt.get_cmap("tab20").colors)
+    spare = itertools.cycle(curves.PALETTE)
     methods = grouped(found, lambda cell: cell.method)
     plain = [name for name in methods if "," not in name]
     for method, own in methods.items():
-        known = charts.COLOURS.get(own[0].algo) if method in plain else None
+        known = curves.COLOURS.get(own[0].algo) if method in plain else None
         actions = [cell.actions for cell in own]
-        value, low, high = charts.percent([cell.score.band(metric) for cell in own])
+        value, low, high = curves.percent([cell.score.band(metric) for cell in own])
         colour = known or next(spare)
         panel.plot(actions, value, "o-", color=colour, label=method)
         panel.fill_between(actions, low, high, color=colour, alpha=0.15, linewidth=0)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from csac_jax import cli
 from experiments import figures, records
@@ -53,6 +54,22 @@ def test_records_lie_in_one_layout():
 def test_every_figure_is_linked():
     """Claim: docs/figures holds what README and docs show, and nothing else."""
     assert {path.stem for path in figures.FIGURES.iterdir()} == figures.linked()
+
+
+def test_pictures_are_linked_large_and_small_in_bytes():
+    """Claim: docs/pictures holds what README and docs show; stills have 960 x 720 pixels or more
+    and less than 400 KB, the animation less than 4 MB."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    shown = {name for page in pages for name in re.findall(r"pictures/([\w.]+)", page.read_text())}
+    folder = ROOT / "docs" / "pictures"
+    assert {path.name for path in folder.iterdir()} == shown
+    for path in folder.iterdir():
+        with Image.open(path) as picture:
+            moving = picture.n_frames > 1 if path.suffix == ".webp" else False
+            assert moving or (picture.width >= 960 and picture.height >= 720), path
+        assert path.stat().st_size < (4e6 if moving else 4e5), path
+    for path in figures.FIGURES.iterdir():
+        assert path.stat().st_size < 4e5, path
 
 
 def _links() -> Iterator[tuple[Path, str]]:

@@ -17,7 +17,7 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import train
 from csac_jax.evaluation import metrics, statistics
 from csac_jax.io import configs, files
-from csac_jax.report import charts, comparison, results, tables
+from csac_jax.report import charts, comparison, curves, results, tables
 
 CASES = ("hole", "row")
 
@@ -349,7 +349,7 @@ def test_profiles_are_drawn_of_several_seeds(recorded: Path):
     report = comparison.build(results.read([recorded]))
     drawn = {chart.name: chart.figure for chart in charts.draw(report)}
     lines = drawn[name].axes[0].get_lines()
-    shares = {line.get_label().split(",")[0]: line.get_ydata() for line in lines}
+    shares = {line.get_label().split(" (")[0]: line.get_ydata() for line in lines}
     at = {name: [share[i] for i in (20, 40, 60, 90)] for name, share in shares.items()}
     assert at == {"VPG": [100, 50, 0, 0], "CSAC-beta": [100, 100, 100, 50]}  # 5, 3 and 10, 8 of 10
 
@@ -490,7 +490,7 @@ def test_figures(recorded: Path):
 
 def _marks(panel: Axes) -> list[list[float]]:
     """The places of the marks that are seen."""
-    lines = [line.get_xydata() for line in panel.get_lines() if line.get_marker() == "o"]
+    lines = [line.get_xydata() for line in panel.get_lines() if line.get_marker() in charts.MARKERS]
     return [mark for mark in np.concatenate(lines).tolist() if np.isfinite(mark).all()]
 
 
@@ -522,17 +522,51 @@ def test_samplers_are_drawn_where_there_are_several(recorded: Path):
     }
 
 
-def test_legend_of_many_curves_hides_none(recorded: Path):
-    """Claim: a legend lies among a few curves, and below the axes where many curves make it
-    large."""
-    curves = comparison.build(results.read([recorded])).curves
-    for number, below in ((charts.INSIDE, False), (charts.INSIDE + 1, True)):
-        figure = charts.success((curves * 3)[:number])
-        assert (figure.axes[0].get_legend() is None) == below
-        assert bool(figure.legends) == below
-        if below:
-            figure.draw_without_rendering()
-            assert figure.legends[0].get_window_extent().y1 <= figure.axes[0].get_window_extent().y0
+def _colours(panel: Axes) -> list[str]:
+    """The colours of the curves."""
+    return [line.get_color() for line in panel.get_lines() if line.get_marker() != "D"]
+
+
+def test_panels_have_few_curves(recorded: Path):
+    """Claim: a panel has at most six curves of different colours; of more, the variant of most
+    runs is in every panel, and each other in one."""
+    found = comparison.build(results.read([recorded])).curves
+    most, other = sorted(found, key=lambda curve: -len(curve.runs))[:2]
+    alone = curves.success([most, *[other] * (curves.MOST - 1)], paper=False).axes
+    assert len(alone) == 1
+    panels = curves.success([other] * 6 + [most] + [other] * 6, paper=True).axes
+    counts = [len(_colours(panel)) for panel in panels]
+    assert counts == [6, 6, 3]
+    for panel in panels:
+        colours = _colours(panel)
+        assert colours[0] == curves.REFERENCE
+        assert len(set(colours)) == len(colours)
+        assert f"({len(most.runs)})" in panel.get_lines()[0].get_label()
+
+
+def test_axes_lie_where_the_data_are(recorded: Path):
+    """Claim: the axis of success begins a little below the lowest value, and shows all marks."""
+    report = comparison.build(results.read([recorded]))
+    drawn = {chart.name: chart.figure for chart in charts.draw(report)}
+    panel = drawn["methods-paper"].axes[0]
+    values = [line.get_ydata() for line in panel.get_lines() if len(line.get_ydata())]
+    lowest = np.concatenate(values).min()
+    assert lowest - 12 <= panel.get_ylim()[0] <= lowest - 1
+    panel.figure.draw_without_rendering()  # no legend hides a curve or a mark
+    assert panel.get_legend().get_window_extent().x0 > panel.get_window_extent().x1
+
+
+def test_what_all_share_is_said_once(recorded: Path):
+    """Claim: a change that all variants of a figure make stands above it and in no legend."""
+    for algo in ("vpg", "csac"):
+        _run(recorded / f"tau-{algo}", _config(algo, 0, learn__tau=0.5), [0.5, 0.6])
+    found = comparison.build(results.read([recorded])).curves
+    chosen = [curve for curve in found if ("learn.tau", "0.5") in curve.variant.changed]
+    figure = curves.success(chosen, paper=False)
+    assert figure.get_suptitle() == "all with learn.tau 0.5"
+    names = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert len(names) == 2
+    assert not [name for name in names if "tau" in name]
 
 
 def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):

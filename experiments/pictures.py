@@ -1,0 +1,123 @@
+"""Draws the pictures of README and docs into docs/pictures: `python -m experiments.pictures`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from csac_jax.render import gl
+
+OPENGL = gl.choose()  # before MuJoCo is imported
+
+import jax  # noqa: E402
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from PIL import Image  # noqa: E402
+
+from csac_jax.config import SceneConfig, SimConfig  # noqa: E402
+from csac_jax.env import Env  # noqa: E402
+from csac_jax.evaluation import policies, rollout, suites  # noqa: E402
+from csac_jax.render import episode, media, picture  # noqa: E402
+from csac_jax.render.picture import View  # noqa: E402
+from csac_jax.runtime import cache  # noqa: E402
+from csac_jax.scene import cases, model  # noqa: E402
+
+FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
+SIZE = (960, 720)  # px
+FINER = 2  # pixels drawn per pixel of a still, along each axis: gaps of 1 mm are seen
+TOWARDS = np.array([-0.36, -0.7, 0.95])  # from what is shown to the camera
+ABOVE = 5.0  # m, where the hand is out of sight
+BLOCK = (-0.045, 0.045)  # m, about half of a long block, and a margin
+
+MOVING = (640, 480)  # px, of the scene in the animation
+PINWHEEL, PILE = 0, 0  # seeds of its two episodes
+FRAME_MS = 80  # of the animation
+END_MS = 900  # of an action's last picture, in which its outcome is read
+
+
+def main() -> None:
+    """Draws them all."""
+    cache.enable()
+    for name in cases.names():
+        media.write_picture(FOLDER / f"{name}.png", still(name))
+    write_animation(FOLDER / "clearing.webp", [*pinwheel(), *pile()])
+
+
+def still(name: str) -> np.ndarray:
+    """A shipped case with no robot [H, W, 3] uint8, as large as fits."""
+    case = cases.load(cases.shipped(name))
+    scene = SceneConfig(slots=case.slots, min_blocks=len(case.slots))
+    world = model.build(scene, SimConfig())
+    fields = jax.device_get(model.scene_fields(world, case.scene))
+    shown = picture.coloured(world, fields, case.scene)
+    draw = picture.renderer(shown, close_view(case.scene.position), OPENGL)
+    data = mujoco.MjData(shown)
+    poses = np.concatenate([case.scene.position, case.scene.quaternion], axis=1)
+    data.qpos[world.block_qpos], data.qpos[world.robot_qpos[2]] = poses, ABOVE
+    mujoco.mj_kinematics(shown, data)
+    mujoco.mj_camlight(shown, data)
+    return _smaller(draw(data))
+
+
+def close_view(positions: np.ndarray) -> View:
+    """The view of blocks at `positions` [N, 3] m that they fill."""
+    middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
+    corners = np.stack(np.meshgrid(*(BLOCK,) * 3), axis=-1).reshape(-1, 3)
+    offsets = (positions[:, None] - middle + corners).reshape(-1, 3)
+    back = TOWARDS / np.linalg.norm(TOWARDS)
+    right = np.cross([0.0, 0.0, 1.0], back) / np.hypot(*back[:2])
+    tangent = np.tan(np.radians(0.5 * picture.FOVY))
+    sides = {tangent: np.cross(back, right), tangent * SIZE[0] / SIZE[1]: right}
+    needed = [np.abs(offsets @ axis) / tangent + offsets @ back for tangent, axis in sides.items()]
+    size = (FINER * SIZE[0], FINER * SIZE[1])
+    return View(tuple(middle + np.max(needed) * back), tuple(middle), size)
+
+
+def _smaller(image: np.ndarray) -> np.ndarray:
+    """The mean of each FINER x FINER pixels."""
+    height, width, _ = image.shape
+    parts = image.reshape(height // FINER, FINER, width // FINER, FINER, 3)
+    return np.round(parts.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def pinwheel() -> Iterator[tuple[np.ndarray, int]]:
+    """Pictures and their times, ms: the shipped policy takes the pinwheel apart."""
+    return moving(str(cases.shipped("pinwheel")), PINWHEEL, every=2)
+
+
+def pile() -> Iterator[tuple[np.ndarray, int]]:
+    """Pictures and their times, ms: the shipped policy clears thirty blocks, in time lapse."""
+    return moving("random30", PILE, every=4, hold=3 * FRAME_MS)
+
+
+def moving(
+    suite: str, seed: int, every: int, hold: int = END_MS
+) -> Iterator[tuple[np.ndarray, int]]:
+    """Pictures [H, W, 3] uint8 of an episode with the views of its policy, and their times, ms;
+    `every` so many pictures of the motion one, and its end for `hold`."""
+    policy = policies.load("shipped")
+    cfg = rollout.configured(policy.cfg, "c", "hand")
+    (env,) = suites.environments(cfg, suite, 1, seed).values()
+    steps = list(rollout.episode(env, policy.replace(cfg=env.cfg), seed))
+    print(suite, episode.summary(env.cfg, steps))
+    yield from _pictures(env, steps, every, hold)
+
+
+def _pictures(env: Env, steps: list[Any], every: int, hold: int) -> Iterator[Any]:
+    stage = episode.Stage(env.cfg, steps[0].before, MOVING, OPENGL, views=True)
+    for number, step in enumerate(steps, 1):
+        frames = list(stage.motion(step, episode.line(number, step)))
+        yield from ((frame, FRAME_MS) for frame in frames[: -episode.HOLD : every])
+        yield frames[-1], hold
+
+
+def write_animation(path: Path, pictures: list[tuple[np.ndarray, int]]) -> None:
+    """Writes an animated WebP of pictures [H, W, 3] uint8 and their times, ms."""
+    first, *others = [Image.fromarray(image) for image, _ in pictures]
+    durations = [duration for _, duration in pictures]
+    first.save(
+        path, save_all=True, append_images=others, duration=durations, loop=0, quality=70, method=4
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""The site of docs/, built as `make docs` does."""
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import csac_jax
+from csac_jax import cli
+from csac_jax.config import Config, Section
+from csac_jax.training.loop import Record
+
+pytest.importorskip("mkdocs")
+ROOT = Path(csac_jax.__file__).parents[1]
+LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src"}
+LINKED = ("stylesheet", "preload", "preconnect", "icon", "manifest", "prefetch", "modulepreload")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the site."""
+    folder = tmp_path_factory.mktemp("site")
+    unreachable = {f"{name}_proxy": "http://127.0.0.1:9" for name in ("http", "https")}
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder],
+        cwd=ROOT,
+        env=os.environ | unreachable | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+class _Loads(HTMLParser):
+    """Collects what a page loads as it opens; links that a reader may follow are none."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list) -> None:
+        values = dict(attrs)
+        if tag in LOADED and LOADED[tag] in values:
+            self.found.append(values[LOADED[tag]])
+        if tag == "link" and set((values.get("rel") or "").split()) & set(LINKED):
+            self.found.append(values["href"])
+
+
+def _is_elsewhere(target: str) -> bool:
+    return re.match(r"(https?:)?//", target) is not None
+
+
+def test_nothing_is_loaded_from_elsewhere(site: Path):
+    """Claim: no page or style of the site loads a script, style, font or picture from a host."""
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 30
+    for page in pages:
+        loads = _Loads()
+        loads.feed(page.read_text())
+        assert len(loads.found) > 3
+        assert not [target for target in loads.found if _is_elsewhere(target)], page
+    for style in site.rglob("*.css"):
+        urls = re.findall(r"""(?:@import\s+|url\()\s*["']?([^"')\s]+)""", style.read_text())
+        assert not list(filter(_is_elsewhere, urls)), style
+
+
+def test_loaded_files_are_there(site: Path):
+    """Claim: what pages load is in the site."""
+    for page in site.rglob("*.html"):
+        loads = _Loads()
+        loads.feed(page.read_text())
+        paths = [target.split("?")[0].split("#")[0] for target in loads.found]
+        for path in paths if page.name != "404.html" else ():
+            assert path.startswith("data:") or (page.parent / path).exists(), (page, path)
+
+
+def test_every_setting_is_listed(site: Path):
+    """Claim: the reference has every setting of every section."""
+    text = (site / "reference" / "settings.html").read_text()
+    for section, value in vars(Config()).items():
+        if isinstance(value, Section):
+            for field in dataclasses.fields(value):
+                assert f"<code>{section}.{field.name}</code>" in text
+
+
+def test_every_command_is_shown(site: Path):
+    """Claim: the reference has each command's own help, and the metrics each field of a record."""
+    text = (site / "reference" / "commands.html").read_text()
+    for command in cli.COMMANDS:
+        assert f"usage: csac-jax {command}" in text
+    metrics = (site / "reference" / "metrics.html").read_text()
+    for field in dataclasses.fields(Record):
+        assert f"<code>{field.name}</code>" in metrics
+    assert "completion_reachable" in metrics
+
+
+def test_every_public_name_is_documented(site: Path):
+    """Claim: the API reference has each public name, functions with their arguments."""
+    text = (site / "reference" / "api.html").read_text()
+    for name in {*csac_jax.__all__} - {"deploy"}:
+        assert f'id="csac_jax.{name}"' in text, name
+    assert "init, networks to start from" in text
+
+
+def test_inserts_and_equations_are_filled_in(site: Path):
+    """Claim: no page shows a mark of the build or the source of an equation."""
+    for page in site.rglob("*.html"):
+        text = page.read_text()
+        assert "<!-- insert:" not in text, page
+        assert 'class="arithmatex"' not in text, page
+    assert "<math" in (site / "explanation" / "algorithm.html").read_text()
