@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from csac_jax.evaluation.policies import Policy
     from csac_jax.replay.samplers import Sample, Sampler
     from csac_jax.sim.primitives import Action
+    from csac_jax.training.callbacks import Callback, Record
     from csac_jax.vision.heightmap import Observation, unpack
 
 __version__ = "0.1.0"
@@ -71,17 +72,20 @@ _HOMES = {
     "csac_jax.evaluation.policies": ("Policy",),
     "csac_jax.replay.samplers": ("Sample", "Sampler"),
     "csac_jax.sim.primitives": ("Action",),
+    "csac_jax.training.callbacks": ("Callback", "Record"),
     "csac_jax.vision.heightmap": ("Observation", "unpack"),
 }
 
 __all__ = [
     "Action",
     "AutoResetEnv",
+    "Callback",
     "Config",
     "Env",
     "Learner",
     "Observation",
     "Policy",
+    "Record",
     "Run",
     "Sample",
     "Sampler",

@@ -19,6 +19,7 @@ from csac_jax.io import checkpoint, policy_file
 from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, signals
 from csac_jax.training import loop, step
+from csac_jax.training.callbacks import Summary
 
 SMOKE = presets.smoke()
 
@@ -86,7 +87,8 @@ def test_version(capsys: pytest.CaptureFixture):
 @pytest.mark.parametrize(
     ("arguments", "option", "extra"),
     [
-        ("train smoke --tensorboard", "--tensorboard", "tensorboard"),
+        ("train smoke --log tensorboard", "--log tensorboard", "tensorboard"),
+        ("train smoke --log tensorboard wandb", "--log tensorboard", "tensorboard"),
         ("report . --out page", "--out", "report"),
     ],
 )
@@ -265,7 +267,7 @@ def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):
     and there is one line."""
     monkeypatch.setattr(cache, "enable", lambda: None)
     monkeypatch.setattr(step, "make", lambda cfg, **_: None)
-    summary = loop.Summary(*[0] * len(loop.Summary._fields))
+    summary = Summary(*[0] * len(Summary._fields))
     monkeypatch.setattr(loop, "run", lambda *_, **__: summary)
     assert cli.main(["train", "smoke", "--run-dir", "a", "--json", "new/folder/out.json"]) == 0
     assert Path("new/folder/out.json").is_file()
