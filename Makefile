@@ -13,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup train eval test test-slow test-faults lint format bench pictures figures doctor clean
+.PHONY: help setup train eval test test-slow test-faults lint format bench pictures figures dist doctor clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -63,6 +63,12 @@ figures: $(STAMP)  ## the figures, tables and index of the recorded results
 	$(BIN)/csac-jax report experiments/results --markdown docs/results.md > /dev/null
 	$(BIN)/python -m experiments.records
 	$(BIN)/python -m experiments.figures
+
+dist: $(STAMP)  ## build wheel and sdist into dist/, and check them
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dist]'
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
 
 doctor: $(STAMP)  ## versions, devices, numerics self-test
 	$(BIN)/csac-jax doctor $(ARGS)

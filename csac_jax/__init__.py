@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from csac_jax.training.callbacks import Callback, Record
     from csac_jax.vision.heightmap import Observation, unpack
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "csac_jax": ("algorithms", "deploy", "presets"),
