@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import csac_jax
-from csac_jax.report import comparison, plots, results, tables
+from csac_jax.report import comparison, plots, results, tables, wording
 from csac_jax.report.comparison import NAMES, Report
 from csac_jax.report.results import Variant
 from csac_jax.report.tables import Table
@@ -25,23 +25,6 @@ FOLDED = ("Differences", "Probability of improvement", "Failures", "Provenance")
 MEDIA = {".png": "image", ".gif": "image", ".webp": "image", ".jpg": "image", ".mp4": "video"}
 LARGEST = 8 * 2**20  # bytes of a picture or video that the page takes up
 MOST_MEDIA = 12
-WORDS = {
-    "explore.decay": "exploration decay",
-    "heightmap.size": "map cells",
-    "learn.tau": "target update share",
-    "learn.updates": "updates per step",
-    "net.kind": "network",
-    "policy.place": "place by",
-    "policy.primitive": "primitive by",
-    "replay.capacity": "replay capacity",
-    "replay.sampler": "replay",
-    "scene.arranged": "share of packed scenes",
-    "target.gamma": "discount",
-    "target.value": "target value",
-    "task.kind": "task",
-    "train.actions": "actions",
-}
-"""Settings whose own name says too little; of the others it is the name without its section."""
 
 
 class Cell(NamedTuple):
@@ -109,12 +92,12 @@ def render(report: Report, paths: Sequence[Path]) -> str:
 
 
 def facts(report: Report) -> Iterator[tuple[str, str, str]]:
-    """What a reader wants to know first: a title, a value and what it is of. The best of each preset
-    and suite."""
+    """What a reader wants to know first, of each preset and suite: a title, the best value and what
+    it is of."""
     for preset, curves in comparison.grouped(report.curves, lambda one: one.variant.preset).items():
         best = max(curves, key=lambda curve: curve.points()[1][-1].value)
         value = tables.shown(best.points()[1][-1])
-        who = f"{name_of(best.variant)}, best of {len(curves)}"
+        who = f"{wording.name_of(best.variant)}, best of {len(curves)}"
         yield f"{preset}: grasp success at the end of training", value, who
     learned = [score for score in report.scores if score.policy == "learned"]
     alike = comparison.grouped(learned, lambda one: (one.variant.preset, one.suite))
@@ -123,23 +106,8 @@ def facts(report: Report) -> Iterator[tuple[str, str, str]]:
         there = [(band, score) for band, score in bands if band is not None]
         if there:
             band, score = max(there, key=lambda pair: pair[0].value)
-            who = f"{name_of(score.variant)}, best of {len(scores)}"
+            who = f"{wording.name_of(score.variant)}, best of {len(scores)}"
             yield f"{preset}: completion in suite {suite}", tables.shown(band), who
-
-
-def name_of(variant: Variant) -> str:
-    """A variant in words."""
-    changed = [f"{words(name)} {_value(value)}" for name, value in variant.changed]
-    return ", ".join([NAMES.get(variant.algo, variant.algo), *changed])
-
-
-def words(setting: str) -> str:
-    """The name of a setting in words."""
-    return WORDS.get(setting, setting.rpartition(".")[2].replace("_", " "))
-
-
-def _value(text: str) -> str:
-    return {"True": "on", "False": "off"}.get(text, text)
 
 
 def _table(report: Report, title: str, table: Table) -> Shown:
@@ -177,7 +145,7 @@ def _cell(named: dict[str, Variant], text: str, best: bool) -> Cell:
         return Cell(text, best=best)
     flags = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in variant.changed)
     title = f"{variant.preset} --algo {variant.algo} {flags}".rstrip()
-    return Cell(f"{name_of(variant)} ({variant.preset})", title, best)
+    return Cell(f"{wording.name_of(variant)} ({variant.preset})", title, best)
 
 
 def _best(table: Table, named: dict[str, Variant]) -> set[tuple[int, str]]:

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report import charts
-from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped, label
+from csac_jax.report import charts, wording
+from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped
 from csac_jax.report.tables import PAPER_ACTIONS, PAPER_TRAINING
 
 SPARE = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#999999")
@@ -48,7 +48,14 @@ def _training(title: str, curves: Sequence[Curve]) -> Plot:
         data += _band(curve, _colour(curve.variant.algo, curve.variant.unchanged, number), number)
     axes = {"xaxis": {"title": {"text": "actions"}, "rangemode": "tozero"}}
     y = {"title": {"text": "success over the last 200 grasps, %"}, "range": [0, 101]}
-    return Plot(title, data, {**axes, "yaxis": y, "hovermode": "x unified"})
+    height = {"height": _height(len(curves))}
+    return Plot(title, data, {**axes, "yaxis": y, "hovermode": "x unified"} | height)
+
+
+def _height(entries: int) -> int:
+    """Height of a figure with a legend of so many entries below it, px; the page's script knows
+    that 320 are for the rest."""
+    return 390 + 20 * entries
 
 
 def _colour(algo: str, plain: bool, number: int) -> str:
@@ -58,7 +65,7 @@ def _colour(algo: str, plain: bool, number: int) -> str:
 def _band(curve: Curve, colour: str, number: int) -> list[Trace]:
     """A line with its band, and the paper's mark."""
     actions, bands = curve.points()
-    x, name = actions.tolist(), f"{label(curve.variant, preset=False)} ({len(curve.runs)})"
+    x, name = actions.tolist(), f"{wording.name_of(curve.variant)} ({len(curve.runs)})"
     visible = True if number < SHOWN else "legendonly"
     shared = {"x": x, "legendgroup": name, "visible": visible}
     line = shared | {
@@ -102,9 +109,9 @@ def _suite(title: str, scores: Sequence[Score]) -> Plot:
         for k, text in enumerate(MEASURED.values())
     ]
     menu = {"type": "buttons", "direction": "right", "buttons": buttons, "x": 0, "y": 1.14}
-    menu |= {"xanchor": "left", "yanchor": "top", "pad": {"t": 0}}
-    layout = {"yaxis": {"title": {"text": "%"}, "range": [0, 104]}, "updatemenus": [menu]}
-    return Plot(title, data, layout | {"xaxis": {"type": "category"}, "scattermode": "group"})
+    menu |= {"xanchor": "left", "yanchor": "top", "showactive": False}
+    layout = {"yaxis": {"title": {"text": "%"}}, "updatemenus": [menu], "scattermode": "group"}
+    return Plot(title, data, layout | {"xaxis": {"type": "category"}, "height": _height(size)})
 
 
 def _marks(score: Score, metric: str, number: int) -> Trace:
@@ -115,7 +122,7 @@ def _marks(score: Score, metric: str, number: int) -> Trace:
     down = _percent(band.value - (band.low or band.value) for band in there.values())
     learned = score.policy == "learned"
     colour = _colour(score.variant.algo, learned and score.variant.unchanged, number)
-    name = label(score.variant, preset=False) if learned else score.policy
+    name = wording.name_of(score.variant) if learned else score.policy
     return {
         "type": "scatter",
         "mode": "markers",
