@@ -185,7 +185,7 @@ def test_run_is_complete(trained, capsys: pytest.CaptureFixture):
     assert (run.cfg, run.summary.actions, run.summary.stopped_by) == (SMOKE, 64, None)
     assert [record.actions for record in records] == [8 * n for n in range(1, 9)]
     assert capsys.readouterr().out == ""
-    assert config_file.load(run.run_dir / "config.json") == run.cfg
+    assert config_file.load_config(run.run_dir / "config.json") == run.cfg
 
 
 @pytest.mark.slow

@@ -61,6 +61,8 @@ ONLY_IN = {
     "imageio": ("render/media.py", "deploy/files.py"),
     "jinja2": ("report/page.py",),
     "plotly": ("report/page.py",),
+    "viser": ("render/viewer.py",),
+    "trimesh": ("render/viewer.py",),
     "tensorboardX": ("report/trackers.py",),
     "wandb": ("report/trackers.py",),
     "mlflow": ("report/trackers.py",),

@@ -54,7 +54,7 @@ def base(name: str | None, flags: Sequence[str]) -> Config:
     if file is not None and not parsing.asks_help(flags):
         from csac_jax.io import config_file
 
-        cfg = config_file.load(Path(file), name, algo)
+        cfg = config_file.load_config(file, name, algo)
     else:
         cfg = presets.get(name or Config.preset)
         cfg = cfg if algo is None else algorithms.configure(cfg, algo)

@@ -22,14 +22,14 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import configs, files
 
 
-def load(path: Path, preset: str | None = None, algo: str | None = None) -> Config:
+def load_config(path: str | Path, preset: str | None = None, algo: str | None = None) -> Config:
     """The config of a file; settings of the file win over what `algo` brings.
 
     Args: preset, given elsewhere, which the file's must not contradict; algo, which wins over the
     file's. Raises SettingsError, one line that names the file and the key.
     """
     try:
-        return _config(_read(path), preset, algo)
+        return _config(_read(Path(path)), preset, algo)
     except (OSError, ValueError) as error:
         text = error.strerror if isinstance(error, OSError) else str(error)
         raise SettingsError(f"{path}: {' '.join(str(text).split())}") from None

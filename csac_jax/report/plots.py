@@ -55,7 +55,7 @@ def _training(title: str, curves: Sequence[Curve]) -> Plot:
 def _height(entries: int) -> int:
     """Height of a figure with a legend of so many entries below it, px; the page's script knows
     that 320 are for the rest."""
-    return 390 + 20 * entries
+    return 390 + 24 * entries
 
 
 def _colour(algo: str, plain: bool, number: int) -> str:

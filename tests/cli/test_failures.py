@@ -16,6 +16,7 @@ from csac_jax import cli, presets
 from csac_jax.cli import doctor, failures
 from csac_jax.errors import FailedError, SceneError
 from csac_jax.io import checkpoint, policy_file
+from csac_jax.render import gl
 from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, signals
 from csac_jax.training import loop, step
@@ -90,6 +91,7 @@ def test_version(capsys: pytest.CaptureFixture):
         ("train smoke --log tensorboard", "--log tensorboard", "tensorboard"),
         ("train smoke --log tensorboard wandb", "--log tensorboard", "tensorboard"),
         ("report . --out page", "--out", "report"),
+        ("play --viewer", "--viewer: there is no display here, and its page", "viewer"),
     ],
 )
 def test_missing_extra(
@@ -101,6 +103,7 @@ def test_missing_extra(
 ):
     """Claim: an option that needs an extra says how to get it."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(gl, "has_display", lambda: False)
     assert cli.main(arguments.split()) == 2
     wanted = f"csac-jax: {option} needs an extra; run: pip install 'csac-jax[{extra}]'\n"
     assert capsys.readouterr() == ("", wanted)

@@ -57,8 +57,8 @@ def test_settings_are_those_of_the_preset_but_for_the_files(
     """Claim: TOML, YAML and JSON say the same; what a file leaves out is the preset's; whole
     numbers are good where the setting is a fraction."""
     path = _file(tmp_path, text or json.dumps(tomllib.loads(TOML)), suffix)
-    assert config_file.load(path) == WANTED
-    assert config_file.load(path, "smoke") == WANTED
+    assert config_file.load_config(path) == WANTED
+    assert config_file.load_config(path, "smoke") == WANTED
 
 
 def test_missing_file_is_named(tmp_path: Path):
@@ -66,15 +66,15 @@ def test_missing_file_is_named(tmp_path: Path):
     for path in (tmp_path / "no.toml", tmp_path / "folder.toml"):
         (tmp_path / "folder.toml").mkdir(exist_ok=True)
         with pytest.raises(SettingsError, match=f"^{path}: .*(No such file|folder)"):
-            config_file.load(path, "smoke")
+            config_file.load_config(path, "smoke")
 
 
 def test_config_of_a_run_is_taken_whole(tmp_path: Path):
     """Claim: the config.json of a run gives its config, also of a preset that is no more."""
     cfg = WANTED.change(preset="mine", algo="vpg", train={"actions": 128})
     path = _file(tmp_path, json.dumps(configs.to_dict(cfg)), ".json")
-    assert config_file.load(path) == cfg
-    assert config_file.load(path, algo="csac") == algorithms.configure(cfg, "csac")
+    assert config_file.load_config(path) == cfg
+    assert config_file.load_config(path, algo="csac") == algorithms.configure(cfg, "csac")
 
 
 def test_algorithm_comes_before_the_settings(tmp_path: Path):
@@ -83,13 +83,15 @@ def test_algorithm_comes_before_the_settings(tmp_path: Path):
     path = _file(tmp_path, 'preset = "smoke"\nalgo = "vpg"\n[target]\ngamma = 0.3\n')
     for algo, wanted in ((None, "vpg"), ("csac", "csac")):
         base = algorithms.configure(presets.smoke(), wanted)
-        assert config_file.load(path, algo=algo) == base.change(target={"gamma": 0.3})
+        assert config_file.load_config(path, algo=algo) == base.change(target={"gamma": 0.3})
 
 
 def test_alternative_takes_over_what_it_shares(tmp_path: Path):
     """Claim: another alternative of a section keeps the settings that both have."""
     path = _file(tmp_path, 'preset = "smoke"\nalgo = "csac"\n[replay]\nsampler = "beta"\n')
-    assert config_file.load(path).replay == BetaReplay(capacity=presets.smoke().replay.capacity)
+    assert config_file.load_config(path).replay == BetaReplay(
+        capacity=presets.smoke().replay.capacity
+    )
 
 
 @pytest.mark.parametrize(
@@ -120,7 +122,7 @@ def test_fault_names_file_and_key(tmp_path: Path, text: str, message: str):
     path = _file(tmp_path, text if named else f'preset = "smoke"\n{text}')
     given = "smoke" if "leave out smoke" in message else None
     with pytest.raises(SettingsError, match=f"^{path}: {message}") as caught:
-        config_file.load(path, given)
+        config_file.load_config(path, given)
     assert "\n" not in str(caught.value)
 
 
@@ -144,6 +146,6 @@ def test_hostile_file_is_refused(tmp_path: Path, suffix: str, text: str, message
     path = tmp_path / f"my{suffix}"
     path.write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(SettingsError, match=message) as caught:
-        config_file.load(path, "smoke")
+        config_file.load_config(path, "smoke")
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
