@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 import csac_jax
-from csac_jax import cli, presets
+from csac_jax import algorithms, cli, presets
+from csac_jax.evaluation import suites
 
 ROOT = Path(csac_jax.__file__).parents[1]
 ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
 PAGES = [
     page
-    for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md"))
     if "```python" in page.read_text() and page != ROBOT
 ]
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
@@ -40,6 +41,8 @@ def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     small = presets.smoke().change(sim={"physics": "auto"})  # as in `quick`
     monkeypatch.setattr(presets, "quick", lambda: small)
     monkeypatch.setitem(presets.PRESETS, "quick", lambda: small)
+    for module, name in ((algorithms, "ALGORITHMS"), (suites, "SUITES")):  # pages register theirs
+        monkeypatch.setattr(module, name, dict(getattr(module, name)))
     namespace = {"__name__": page.stem}
     for block in blocks(page):
         exec(compile(NUMBERS.sub(r"\1=2", block), page.name, "exec"), namespace)

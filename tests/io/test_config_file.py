@@ -1,11 +1,13 @@
 """Configs in files of one's own, against the presets and against `Config.change`."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
 import pytest
 
+import csac_jax
 from csac_jax import algorithms, presets
 from csac_jax.config import BetaReplay
 from csac_jax.errors import SettingsError
@@ -59,6 +61,15 @@ def test_settings_are_those_of_the_preset_but_for_the_files(
     path = _file(tmp_path, text or json.dumps(tomllib.loads(TOML)), suffix)
     assert config_file.load_config(path) == WANTED
     assert config_file.load_config(path, "smoke") == WANTED
+
+
+def test_files_of_the_manual_load(tmp_path: Path):
+    """Claim: every TOML file that the documentation shows is a config."""
+    pages = Path(csac_jax.__file__).parents[1].glob("docs/**/*.md")
+    shown = [one for page in pages for one in re.findall("(?s)```toml\n(.*?)```", page.read_text())]
+    assert shown
+    for text in shown:
+        assert config_file.load_config(_file(tmp_path, text)) != presets.quick()
 
 
 def test_missing_file_is_named(tmp_path: Path):
