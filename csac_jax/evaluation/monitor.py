@@ -8,6 +8,7 @@ They draw from keys of their own and call programs of their own: what is trained
 
 import json
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,8 +16,10 @@ from typing import Any, NamedTuple
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
 from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
+from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint, files
+from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.training import loop
 from csac_jax.training.callbacks import Callback, Record, RunInfo
 
@@ -68,10 +71,7 @@ class Monitor(Callback):
         self._run_dir, self._done = run.run_dir, run.step * self._cfg.train.scenes
         files.write_json(run.run_dir / PLAN, self._plan._asdict())
         files.truncate_log(run.run_dir / files.EVALUATIONS, run.step)
-        best = run.run_dir / files.BEST
-        checkpoint.set_aside_after(best, run.step)
-        if checkpoint.latest_step(best) is not None:
-            self._best = tuple(checkpoint.load_extra(best)["score"])
+        self._best = _best_score(run.run_dir / files.BEST, run.step)
 
     def chunk(self, record: Record, state: Any) -> None:
         """Evaluates after every so many actions, and after the last chunk."""
@@ -113,6 +113,19 @@ class Monitor(Callback):
             log.write(json.dumps(line) + "\n")
 
 
+def _best_score(folder: Path, step: int) -> Score:
+    """The score of the best state up to a step; later ones are set aside, and damaged ones."""
+    checkpoint.set_aside_after(folder, step)
+    if checkpoint.latest_step(folder) is None:
+        return ()
+    try:
+        return tuple(checkpoint.load_extra(folder)["score"])
+    except CheckpointError as error:
+        warnings.warn(f"{error}; the next evaluation is the best", DataWarning, stacklevel=2)
+    checkpoint.set_aside_after(folder, -1)
+    return ()
+
+
 def score_of(table: dict[str, Any]) -> Score:
     """What policies are ranked by: means over the parts of the suite, without cases 0."""
     parts = _parts(table)
@@ -120,12 +133,19 @@ def score_of(table: dict[str, Any]) -> Score:
 
 
 def read_plan(run_dir: Path) -> EvalPlan | None:
-    """How a run was evaluated on its way; None if it was not."""
+    """How a run was evaluated on its way; None if it was not. Raises SettingsError."""
     path = run_dir / PLAN
     if not path.exists():
         return None
-    stored = files.read_object(path)
-    return EvalPlan(**{name: stored[name] for name in EvalPlan._fields})
+    try:
+        plan = EvalPlan(**files.read_object(path))
+        plan.check()
+    except (TypeError, ValueError) as error:
+        fault = files.first_line(error)
+        raise SettingsError(
+            f"{path} is damaged ({fault}); remove it, or give --eval-every"
+        ) from None
+    return plan
 
 
 def _parts(table: dict[str, Any]) -> list[dict[str, Any]]:

@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
+from csac_jax import presets
 from csac_jax.config import Config
+from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.evaluation import monitor, policies
 from csac_jax.evaluation.monitor import EvalPlan, Monitor
 from csac_jax.io import checkpoint
@@ -17,12 +21,20 @@ from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import callbacks, loop
 from csac_jax.training.callbacks import Callback, Record, RunInfo, Summary
-from tests.training import toys
+from tests.metrics import step_metrics
 
-pytestmark = pytest.mark.optax
-CFG = toys.CFG.change(train={"actions": 20 * toys.SCENES})  # 5 chunks of 4 steps, 32 actions each
-PROGRAM = toys.program(CFG)
+E = 8
+CFG = presets.smoke().change(train={"scenes": E, "actions": 20 * E})  # 5 chunks of 4 steps
 UNTIMED = ("seconds", "actions_per_second")
+
+
+@struct.dataclass
+class State:
+    """A state like a run's, small."""
+
+    key: jax.Array
+    step: jax.Array
+    learner: jax.Array
 
 
 class Notes(Callback):
@@ -73,15 +85,18 @@ def scores(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     assert given == []
 
 
-def _first() -> Any:
-    return jax.jit(lambda: toys.init_state(PROGRAM, jax.random.key(0)))()
+def _first() -> State:
+    return State(jax.random.key(0), jnp.int32(0), jnp.zeros(4))
+
+
+def _step(state: State, _: None) -> tuple[State, Any]:
+    noise = jax.random.normal(jax.random.fold_in(state.key, state.step), (4,))
+    metrics = step_metrics(E, loss=jnp.abs(noise[0]), reward=jnp.full(E, noise[1]))
+    return State(state.key, state.step + 1, state.learner + noise), metrics
 
 
 def _chunk(num: int) -> Any:
-    def steps(state: Any) -> Any:
-        return jax.lax.scan(lambda one, _: toys.train_step(PROGRAM, one), state, length=num)
-
-    return jax.jit(steps, donate_argnums=0)
+    return jax.jit(lambda state: jax.lax.scan(_step, state, length=num), donate_argnums=0)
 
 
 def _run(
@@ -177,6 +192,26 @@ def test_plan_is_that_of_the_run(tmp_path: Path, scores: list[Any]):
     assert monitor.read_plan(tmp_path) is None
     _run(tmp_path / "run", Notes(), every=1000)
     assert monitor.read_plan(tmp_path / "run") == EvalPlan(1000)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"every": "x"}', '{"every": 0}', '{"each": 3}'])
+def test_damaged_plan_is_named(tmp_path: Path, text: str):
+    """Claim: a damaged plan is one line with the remedy."""
+    (tmp_path / monitor.PLAN).write_text(text)
+    with pytest.raises(SettingsError, match=r"evaluation\.json is damaged .*remove it") as caught:
+        monitor.read_plan(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_best_does_not_stop_a_run(tmp_path: Path, scores: list[Any]):
+    """Claim: a resumed run whose best is damaged says so, sets it aside and goes on."""
+    scores += [_table(0.7, 0.9), _table(0.1, 0.1), _table(0.0, 1.0)]
+    _run(tmp_path / "run", Notes(stop_after=2))
+    (tmp_path / "run/best/checkpoints/8" / checkpoint.MANIFEST).unlink()
+    with pytest.warns(DataWarning, match="the next evaluation is the best"):
+        _run(tmp_path / "run", Notes(), resume=True)
+    assert checkpoint.load_extra(tmp_path / "run/best")["score"] == [0.1, 0.1]
+    assert (tmp_path / "run/best/checkpoints/set-aside/8").is_dir()
 
 
 def test_failed_run_tells_its_callbacks(tmp_path: Path):

@@ -56,6 +56,7 @@ def test_surfaces_are_as_large_as_mujocos(robot: Any):
     assert {mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH} < kinds
 
 
+@pytest.mark.slow
 def test_page_follows_the_motion(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
 ):

@@ -111,6 +111,7 @@ def test_wandb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert settings["preset"] == '"smoke"'
 
 
+@pytest.mark.slow
 def test_mlflow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: one run of MLflow, in mlflow.db next to the run's folder, holds config and every
     number."""
