@@ -386,7 +386,8 @@ def test_bad_config_file(
 
 
 def test_resumed_sweep_takes_no_config_file(capsys: pytest.CaptureFixture, config_file: Path):
-    """Claim: a sweep goes on with its own settings."""
+    """Claim: a sweep goes on with its own settings; a file is refused even if it changes none."""
+    config_file.write_text('preset = "quick"')
     code, line = _fails(capsys, "sweep", "--resume", ".", "--config", str(config_file))
     assert (code, "a sweep goes on with its own settings" in line) == (2, True)
 
