@@ -56,11 +56,13 @@ if TYPE_CHECKING:
     from csac_jax.config import Config
     from csac_jax.env import AutoResetEnv, Env, State, make_env
     from csac_jax.evaluation.policies import Policy
+    from csac_jax.io.config_file import load_config
     from csac_jax.replay.samplers import Sample, Sampler
     from csac_jax.sim.primitives import Action
+    from csac_jax.training.callbacks import Callback, Record
     from csac_jax.vision.heightmap import Observation, unpack
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "csac_jax": ("algorithms", "deploy", "presets"),
@@ -70,18 +72,22 @@ _HOMES = {
     "csac_jax.env": ("AutoResetEnv", "Env", "State", "make_env"),
     "csac_jax.evaluation.policies": ("Policy",),
     "csac_jax.replay.samplers": ("Sample", "Sampler"),
+    "csac_jax.io.config_file": ("load_config",),
     "csac_jax.sim.primitives": ("Action",),
+    "csac_jax.training.callbacks": ("Callback", "Record"),
     "csac_jax.vision.heightmap": ("Observation", "unpack"),
 }
 
 __all__ = [
     "Action",
     "AutoResetEnv",
+    "Callback",
     "Config",
     "Env",
     "Learner",
     "Observation",
     "Policy",
+    "Record",
     "Run",
     "Sample",
     "Sampler",
@@ -91,6 +97,7 @@ __all__ = [
     "algorithms",
     "deploy",
     "evaluate",
+    "load_config",
     "load_policy",
     "make_env",
     "presets",

@@ -11,19 +11,21 @@ from csac_jax import algorithms
 from csac_jax.agent import actor_critic
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config, DenseNet121
+from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import SettingsError
-from csac_jax.evaluation import policies, rollout
+from csac_jax.evaluation import monitor, policies, rollout
+from csac_jax.evaluation.monitor import EvalPlan
 from csac_jax.evaluation.policies import LearnedPolicy, Policy
 from csac_jax.io import leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
-from csac_jax.report.progress import Reporters, Terminal
+from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, cluster, provenance, signals
 from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
-from csac_jax.training import loop, memory, sharding, step
-from csac_jax.training.loop import Record, Reporter, Summary
+from csac_jax.training import callbacks as followers, loop, memory, sharding, step
+from csac_jax.training.callbacks import Callback, Record, Summary
 from csac_jax.training.sharding import Shard
 
 RUNS = Path("runs")
@@ -55,8 +57,10 @@ def train(
     sampler: Sampler | None = None,
     network: Any = None,
     learner: Learner | None = None,
-    callbacks: Sequence[Callable[[Record], None]] = (),
-    reporters: Sequence[Reporter] = (),
+    callbacks: Sequence[Callback | Callable[[Record], None]] = (),
+    eval_every: int = 0,
+    eval_suite: str = EVAL_SUITE,
+    eval_episodes: int = EVAL_EPISODES,
     verbose: bool = True,
     stop: signals.Stop | None = None,
 ) -> Run:
@@ -67,7 +71,10 @@ def train(
     checkpoint to resume from, by default the newest sound one. init, networks to start from:
     "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121 as
     .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of your
-    own, which a resumed run needs again. callbacks, called with the `Record` of each chunk.
+    own, which a resumed run needs again. callbacks, each a `Callback` or a function of the `Record`
+    of each chunk. eval_every, actions between evaluations of the policy of now, in eval_episodes
+    episodes of eval_suite, see `evaluate`; the best state is kept, see `load_policy`. A resumed run
+    goes on with them.
     Raises SettingsError for settings that do not fit, FileExistsError for a folder that exists,
     TrainingError for a loss or parameter that is not finite, CheckpointError for nothing sound to
     resume or a disc that is full, LockedError for a run that another process trains.
@@ -78,10 +85,15 @@ def train(
     if resume:
         loop.check_resumable(cfg, folder, at)
     start = starting(cfg, init)
+    plan = _eval_plan(folder, resume, EvalPlan(eval_every, eval_suite, eval_episodes))
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
         terminal.say(_first_line(folder, cfg))
         program = step.make(cfg, learner=learner, sampler=sampler, network=network)
+        follower = followers.joined(callbacks)
+        if plan is not None:
+            how = (cfg, plan, follower, terminal.say, network, learner)
+            follower = followers.joined([follower, _checked(monitor.Monitor, *how)])
 
         def first_state() -> step.TrainState:
             state = step.init(program)
@@ -92,10 +104,11 @@ def train(
             folder,
             first_state,
             lambda num_steps: step.compile_chunk(program, num_steps),
-            Reporters([terminal, *reporters, *map(_Callback, callbacks)]),
+            terminal,
             stop or signals.Stop(),
             resume=resume,
             at=at,
+            callback=follower,
         )
     return Run(folder, cfg, summary, {"network": network, "learner": learner})
 
@@ -198,16 +211,12 @@ def new_folder(name: str) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
-class _Callback(NamedTuple):
-    """A function of records as a reporter."""
-
-    call: Callable[[Record], None]
-
-    def say(self, text: str) -> None:
-        pass
-
-    def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        self.call(record)
+def _eval_plan(folder: Path, resume: bool, asked: EvalPlan) -> EvalPlan | None:
+    """How a run is evaluated on its way, if it is: as asked for, else as before it was stopped."""
+    if not asked.every:
+        return monitor.read_plan(folder) if resume else None
+    _checked(asked.check)
+    return asked
 
 
 def _checked(call: Callable[..., Any], *args: Any) -> Any:

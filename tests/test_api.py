@@ -17,12 +17,13 @@ from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config, DenseNet121
 from csac_jax.errors import SettingsError
-from csac_jax.io import checkpoint, policy_file
+from csac_jax.evaluation import monitor
+from csac_jax.io import checkpoint, config_file, policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
 from csac_jax.training import step
-from csac_jax.training.loop import Record
+from csac_jax.training.callbacks import Record
 
 SMOKE = presets.smoke().change(sim={"physics": "c"})  # compiles in half of the time
 
@@ -184,6 +185,42 @@ def test_run_is_complete(trained, capsys: pytest.CaptureFixture):
     assert (run.cfg, run.summary.actions, run.summary.stopped_by) == (SMOKE, 64, None)
     assert [record.actions for record in records] == [8 * n for n in range(1, 9)]
     assert capsys.readouterr().out == ""
+    assert config_file.load_config(run.run_dir / "config.json") == run.cfg
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_evaluated_run_is_the_same(trained, tmp_path: Path):
+    """Claim: evaluations on the way change no bit of a run's log and end; each is what `evaluate`
+    says of the state then; RUN/best is a run like any other; a resumed run goes on with them."""
+    run, records = trained
+
+    class Tables(csac_jax.Callback):
+        def __init__(self) -> None:
+            self.found: dict[int, Any] = {}
+
+        def evaluated(self, record: Record, table: dict[str, Any]) -> None:
+            self.found[record.actions] = table
+
+    seen, again = Tables(), []
+    how = {"eval_every": 24, "eval_episodes": 3, "eval_suite": "in_distribution"}
+    done = api.train(SMOKE, tmp_path / "run", callbacks=[again.append, seen], verbose=False, **how)
+    timed = {"seconds": 0.0, "actions_per_second": 0.0}
+    for one, other in zip(again, records, strict=True):
+        assert dataclasses.replace(one, **timed) == dataclasses.replace(other, **timed)
+    for part in ("step", "scenes", "learner", "replay"):
+        _assert_same(getattr(_saved(done), part), getattr(_saved(run), part))
+    assert list(seen.found) == [24, 48, 64]
+    last = csac_jax.evaluate(done.policy, episodes=3, seed=monitor.SEED)
+    assert last == seen.found[64]
+    best = max(seen.found, key=lambda n: (monitor.score_of(seen.found[n]), -n))
+    policy = csac_jax.load_policy(done.run_dir, which="best")
+    assert csac_jax.evaluate(policy, episodes=3, seed=monitor.SEED) == seen.found[best]
+    assert policy.params is not None
+    longer = SMOKE.change(train={"actions": 72})
+    api.train(longer, done.run_dir, resume=True, callbacks=[seen], verbose=False)
+    assert list(seen.found) == [24, 48, 64, 72]
 
 
 @pytest.mark.mjx

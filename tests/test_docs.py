@@ -16,8 +16,9 @@ import pytest
 import yaml
 
 import csac_jax
-from csac_jax import cli, presets
+from csac_jax import algorithms, cli, presets
 from csac_jax.cli import parsing, sweep
+from csac_jax.evaluation import suites
 from csac_jax.io import checkpoint
 
 ROOT = Path(csac_jax.__file__).parents[1]
@@ -25,7 +26,7 @@ README = ROOT / "README.md"
 ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
 TUTORIAL = ROOT / "docs" / "tutorial" / "first-training.md"
 RECORD = ROOT / "experiments" / "results" / "quick" / "csac_beta" / "seed-0" / "metrics.jsonl"
-ALL = [README, *sorted(ROOT.glob("docs/**/*.md"))]
+ALL = [README, ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
 PAGES = [page for page in ALL if "```python" in page.read_text() and page != ROBOT]
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 SHELL = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -69,6 +70,8 @@ def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     small = presets.smoke().change(sim={"physics": "auto"})  # as in `quick`
     monkeypatch.setattr(presets, "quick", lambda: small)
     monkeypatch.setattr(presets, "PRESETS", {**presets.PRESETS, "quick": lambda: small})
+    for module, name in ((algorithms, "ALGORITHMS"), (suites, "SUITES")):  # pages register theirs
+        monkeypatch.setattr(module, name, dict(getattr(module, name)))
     namespace = {"__name__": page.stem}
     for block in blocks(page):
         exec(compile(NUMBERS.sub(r"\1=2", block), page.name, "exec"), namespace)

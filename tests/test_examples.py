@@ -33,6 +33,8 @@ def test_every_example_is_tested():
         *BY_PAGE,
         *ROBOTS,
         "random_agent",
+        "gym_policy_gradient",
+        "optuna_search",
     }
 
 
@@ -104,3 +106,37 @@ def test_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert shown == ["image/png"] * 3 + ["image/gif"]
     text = "".join(out.get("text", "") for out in outputs)
     assert "160 actions, success" in text
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+@pytest.mark.slow
+def test_policy_gradient_learns(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the learner in one file takes more blocks in the end than at first, among single cubes
+    in a small workspace."""
+    cfg = presets.smoke().change(
+        scene={"slots": ("box",), "min_blocks": 1, "pool": 16, "drop_extent": (0.05, 0.05)},
+        sim={"physics": "c"},
+        heightmap={"extent": 0.16},
+        task={"max_actions": 1},
+    )
+    monkeypatch.setitem(presets.PRESETS, "easy", lambda: cfg)
+    returns = _module("gym_policy_gradient").main("easy", "150", "16")
+    assert sum(returns[-50:]) > 1.3 * sum(returns[:50])
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+@pytest.mark.slow
+def test_search_tries_settings(small: str, tmp_path: Path):
+    """Claim: the search trains each trial into a folder of its own, keeps what it found, and goes
+    on with it."""
+    pytest.importorskip("optuna")
+    search = _module("optuna_search").main
+    assert len(search(small, tmp_path / "search", "1", "2").trials) == 1
+    study = search(small, tmp_path / "search", "1", "2")
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 2
+    assert all(0.0 <= trial.value <= 1.0 for trial in study.trials)
+    for number, trial in enumerate(study.trials):
+        cfg = csac_jax.load_config(tmp_path / f"search/trial-{number}/config.json")
+        assert cfg.learn.tau == trial.params["tau"]

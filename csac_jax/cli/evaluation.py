@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import tyro
 
-from csac_jax.cli import output, settings
+from csac_jax.cli import output, parsing, settings
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
 from csac_jax.config import Config
 
@@ -21,8 +21,9 @@ class EvalOptions:
 
     source: tyro.conf.Positional[str]
     """A run's folder, a policy file, or shipped for the policy that comes with the package."""
-    step: int | None = None
-    """Checkpoint of the run, by its step; the newest sound one if not given."""
+    which: str = "last"
+    """Checkpoint of the run: last, the newest sound one; best, of a run trained with --eval-every;
+    or a step."""
     policy: Literal["learned", "random", "oracle"] = "learned"
     """What acts: the networks; grasps at random places above blocks; or a planner that reads the
     blocks' poses."""
@@ -43,13 +44,16 @@ class EvalOptions:
 
 def run(arguments: list[str]) -> int:
     """Measures and prints; returns the exit code."""
+    if parsing.take(arguments, "--step")[0] is not None:
+        raise BadArgumentsError("--step: it is --which STEP now, next to best and last")
     options, view = settings.parse_view(EvalOptions, "eval", arguments)
     if options.episodes < 1:
         raise BadArgumentsError("--episodes: at least 1")
     check_seed(options.seed)
+    which = _which(options.which)
     from csac_jax.evaluation import policies
 
-    policy = policies.POLICIES[options.policy](options.source, options.step)
+    policy = policies.POLICIES[options.policy](options.source, which)
     begun = time.time()
     with as_bad_arguments(ValueError):
         seen = policy.cfg.change(**view)
@@ -58,9 +62,18 @@ def run(arguments: list[str]) -> int:
     for part, summary in result.get("parts", {Path(options.suite).stem: result}).items():
         title = f"{options.policy} policy, {part}: {options.episodes} episodes, seed {options.seed}"
         print_summary(title, summary)
-    asked = {name: getattr(options, name) for name in ("policy", "suite", "seed")}
+    asked = {name: getattr(options, name) for name in ("policy", "which", "suite", "seed")}
     output.write_result(options.json, {**asked, "seconds": seconds, **result}, cfg)
     return 0
+
+
+def _which(text: str) -> Any:
+    """`best`, `last`, or the number of a step."""
+    if text in ("best", "last"):
+        return text
+    if not text.isdecimal():
+        raise BadArgumentsError(f"--which: '{text}' is neither best, last nor a step")
+    return int(text)
 
 
 def _evaluate(options: EvalOptions, policy: Any, seen: Config) -> tuple[Config, dict[str, Any]]:

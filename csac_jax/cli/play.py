@@ -5,9 +5,12 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
+import tyro
+
 from csac_jax import presets
 from csac_jax.cli import output, settings
 from csac_jax.cli.failures import as_bad_arguments, check_extra, check_seed
+from csac_jax.render import gl
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +35,9 @@ class PlayOptions:
     views: bool = True
     """Show height map and action next to the scene; of a learned policy also Q of both primitives,
     best over yaws, and the candidates of its search."""
+    viewer: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show the episode to walk around in: in MuJoCo's window where there is a display, else as a
+    page for the browser (extra `viewer`)."""
     seed: int = 0
     """Number that the scene and the policy's noise follow from."""
     json: Path | None = None
@@ -44,15 +50,13 @@ def run(arguments: list[str]) -> int:
     _check(options)
     drawn, opengl = options.png is not None or options.video is not None, None
     if drawn:
-        from csac_jax.render import gl
-
         opengl = gl.choose()  # before MuJoCo is imported
     begun = time.time()
     env, steps = _play(options, _policy(options.policy), view)
     from csac_jax.render import episode
 
     print(episode.summary(env.cfg, steps))
-    if drawn:
+    if drawn or options.viewer:
         stage = episode.Stage(env.cfg, steps[0].before, options.size, opengl, options.views)
         episode.record(stage, steps, options.png, options.video)
     taken, lost = episode.totals(steps)
@@ -67,6 +71,8 @@ def run(arguments: list[str]) -> int:
         "seconds": round(time.time() - begun, 1),
     }
     output.write_result(options.json, result, env.cfg)
+    if options.viewer:
+        stage.show(steps, lambda text: print(text, flush=True))
     return 0
 
 
@@ -75,6 +81,8 @@ def _check(options: PlayOptions) -> None:
     check_seed(options.seed)
     if not all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size):
         raise ValueError("--size: both numbers must be even and lie in 16 .. 4096 px")
+    if options.viewer and not gl.has_display():
+        check_extra("--viewer: there is no display here, and its page", "viser", "viewer")
     if options.png is None and options.video is None:
         return
     from csac_jax.render import media

@@ -18,7 +18,8 @@ class ReportOptions:
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of runs, or of folders of runs, and files that `eval --json` wrote."""
     out: Path | None = None
-    """Folder to write a page with figures to, index.html; needs the extra `report`."""
+    """Folder to write a page to, index.html, with curves and the pictures and videos that lie in
+    the folders; needs the extra `report`."""
     markdown: Path | None = None
     """File to write the tables to, as a page of documentation."""
     json: Path | None = None
@@ -33,7 +34,8 @@ def run(arguments: list[str]) -> int:
             "report: give at least one folder of a run or file of `eval --json`"
         )
     if options.out is not None:
-        check_extra("--out", "jinja2", "report")
+        for module in ("jinja2", "plotly"):
+            check_extra("--out", module, "report")
     from csac_jax.report import comparison, results, tables
 
     with as_bad_arguments(ValueError):
@@ -47,9 +49,9 @@ def run(arguments: list[str]) -> int:
         command = f"{PROGRAM} report {runs} --markdown {options.markdown}"
         files.replace(options.markdown, f"# Results\n\nWritten by `{command}`.\n\n{text}")
     if options.out is not None:
-        from csac_jax.report import charts
+        from csac_jax.report import page
 
-        print(*charts.write_page(report, options.out), sep="\n")
+        print(*page.write(report, options.runs, options.out), sep="\n")
     if options.json is not None:
         files.write_json(options.json, tables.as_json(report))
     return 0

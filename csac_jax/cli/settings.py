@@ -35,21 +35,29 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     return None, list(arguments)
 
 
-def check_new(command: str, preset: str | None, folder: Path | None) -> None:
-    """A new run needs a preset and a folder that does not exist."""
-    if preset is None:
-        raise BadArgumentsError(f"{command}: give a preset first, one of: {PRESETS}")
+def check_new(command: str, preset: str | None, file: Path | None, folder: Path | None) -> None:
+    """A new run needs a preset or a config file, and a folder that does not exist."""
+    if preset is None and file is None:
+        raise BadArgumentsError(
+            f"{command}: give a preset first, one of: {PRESETS}; or --config FILE"
+        )
     if folder is not None and folder.exists():
         raise exists(folder)
 
 
 @as_bad_arguments(ValueError)
-def preset(name: str, flags: Sequence[str]) -> Config:
-    """The preset, of the algorithm and with networks of the policy that the flags name."""
-    cfg = presets.get(name)
-    algo, init = (parsing.take(flags, option)[0] for option in ("--algo", "--init"))
-    if algo is not None:
-        cfg = algorithms.configure(cfg, algo)
+def base(name: str | None, flags: Sequence[str]) -> Config:
+    """The preset, or the config of the file, of the algorithm and with networks of the policy that
+    the flags name."""
+    options = ("--algo", "--init", "--config")
+    algo, init, file = (parsing.take(flags, option)[0] for option in options)
+    if file is not None and not parsing.asks_help(flags):
+        from csac_jax.io import config_file
+
+        cfg = config_file.load_config(file, name, algo)
+    else:
+        cfg = presets.get(name or Config.preset)
+        cfg = cfg if algo is None else algorithms.configure(cfg, algo)
     if init is None or parsing.asks_help(flags):
         return cfg
     from csac_jax import api
@@ -126,7 +134,7 @@ def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:
 def print_help(options: type, command: str, examples: Sequence[str], arguments: list[str]) -> None:
     """The short help of a command that takes settings: examples, options, the settings of FIRST."""
     name, flags = split(arguments)
-    cfg = preset(name or "quick", flags)
+    cfg = base(name, flags)
     listed = "".join(f"\n  {PROGRAM} {command} {example}" for example in examples)
     parser = argparse.ArgumentParser(
         usage=f"{PROGRAM} {command} PRESET [--OPTION VALUE ...]",
@@ -156,7 +164,7 @@ def print_help(options: type, command: str, examples: Sequence[str], arguments: 
 
 def _add(group: Any, name: str, value: Any, text: str) -> None:
     """Adds a row to the help: a flag with its value, and what it does."""
-    shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    shown = " ".join(map(str, value)) or "NAME ..." if isinstance(value, tuple) else str(value)
     flag, text = f"--{name.replace('_', '-')}", text.replace("`", "").replace("%", "%%")
     group.add_argument(flag, metavar=shown, help=text)
 

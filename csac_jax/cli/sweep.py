@@ -57,6 +57,8 @@ class SweepOptions:
     """Number of this process, from 0."""
     cluster: tyro.conf.FlagCreatePairsOff[bool] = False
     """Join the processes of a job of SLURM, Open MPI or Kubernetes, which JAX finds itself."""
+    config: Path | None = None
+    """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
     init: str | None = None
     """Start from the networks of a run, a policy file or `shipped`; brings its net settings."""
     json: Path | None = None
@@ -122,15 +124,14 @@ def _write_study(folder: Path) -> None:
 def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
     """Options and plan of a sweep: from the command line, or from the folder if it is resumed."""
     preset, flags = settings.split(arguments)
-    name = preset or "quick"
-    options, cfg = _parse(name, flags)
+    options, cfg = _parse(preset, flags)
     if options.seeds < 1 or options.seed + options.seeds > 2**31:
         raise BadArgumentsError("--seeds: at least 1, and no seed may exceed 2147483647")
     _join(options)
     if options.resume is None:
-        settings.check_new("sweep", preset, options.run_dir)
-        return options, _new_plan(name, flags, options)
-    given = (preset, options.vary, options.run_dir, options.evaluate)
+        settings.check_new("sweep", preset, options.config, options.run_dir)
+        return options, _new_plan(preset, flags, options)
+    given = (preset, options.vary, options.run_dir, options.evaluate, options.config)
     if any(given) or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
         raise BadArgumentsError(
             "sweep --resume: a sweep goes on with its own settings; leave all others out"
@@ -140,9 +141,10 @@ def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
     return options, runner.read_plan(options.resume)
 
 
-def _parse(preset: str, flags: list[str]) -> tuple[SweepOptions, Config]:
+def _parse(preset: str | None, flags: list[str]) -> tuple[SweepOptions, Config]:
     """Options of a sweep and the config of a point, whose own flags come last."""
-    return settings.parse(SweepOptions, f"sweep {preset}", settings.preset(preset, flags), flags)
+    command = f"sweep {preset or 'PRESET'}"
+    return settings.parse(SweepOptions, command, settings.base(preset, flags), flags)
 
 
 def _join(options: SweepOptions) -> None:
@@ -160,7 +162,7 @@ def _join(options: SweepOptions) -> None:
         cluster.join(*place)
 
 
-def _new_plan(preset: str, flags: list[str], options: SweepOptions) -> Any:
+def _new_plan(preset: str | None, flags: list[str], options: SweepOptions) -> Any:
     with as_bad_arguments(ValueError):
         points = grid.points(options.vary, lambda own: _parse(preset, [*flags, *own])[1])
     from csac_jax.sim import backend  # with JAX, so after those complaints

@@ -3,12 +3,12 @@
 import dataclasses
 import time
 from pathlib import Path
-
-import tyro
+from typing import Literal
 
 from csac_jax.cli import failures, output, parsing, settings
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
+from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.runtime import signals
 
 EXAMPLES = (
@@ -16,8 +16,13 @@ EXAMPLES = (
     "quick --algo vpg --seed 1           # another algorithm and seed",
     "fast --init shipped                 # start from the shipped policy's networks",
     "quick --replay.sampler beta --replay.end 1 4",
+    "--config my.toml --learn.tau 0.02   # settings in a file, flags win over it",
+    "quick --eval-every 500 --log wandb  # measured on the way, and tracked",
     "--resume runs/a                     # go on with a run that was stopped",
 )
+
+
+MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}  # of trackers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,10 +35,18 @@ class TrainOptions:
     """Folder of a run to go on with; more --train.actions make it longer."""
     step: int | None = None
     """Checkpoint to resume from, by its step; the newest sound one if not given."""
+    config: Path | None = None
+    """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
     init: str | None = None
     """Start from the networks of a run, a policy file or `shipped`; brings its net settings."""
-    tensorboard: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Also write TensorBoard files into the folder of the run."""
+    log: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ()
+    """Trackers that get every number, each by an extra of its name."""
+    eval_every: int = 0
+    """Actions between evaluations of the policy of now; RUN/best keeps the state that did best."""
+    eval_suite: str = EVAL_SUITE
+    """Suite of these evaluations, as of `csac-jax eval`."""
+    eval_episodes: int = EVAL_EPISODES
+    """Episodes of each part of that suite."""
     json: Path | None = None
     """File to write the result to, as JSON."""
     seed: int = 0
@@ -53,11 +66,8 @@ def run(arguments: list[str]) -> int:
     from csac_jax import api
 
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")
-    reporters = []
-    if options.tensorboard:
-        from csac_jax.report.progress import TensorBoard
+    from csac_jax.report.trackers import TRACKERS
 
-        reporters.append(TensorBoard(folder))
     try:
         done = api.train(
             cfg,
@@ -65,7 +75,10 @@ def run(arguments: list[str]) -> int:
             resume=resume,
             at=options.step,
             init=options.init,
-            reporters=reporters,
+            callbacks=[TRACKERS[name]() for name in options.log],
+            eval_every=options.eval_every,
+            eval_suite=options.eval_suite,
+            eval_episodes=options.eval_episodes,
             stop=stop,
         )
     except FileExistsError:  # somebody has made it meanwhile
@@ -79,10 +92,12 @@ def run(arguments: list[str]) -> int:
 
 def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
     """Options and config of a run, from the command line and, if it is resumed, its checkpoint."""
+    if "--tensorboard" in arguments:
+        raise BadArgumentsError("--tensorboard: it is --log tensorboard now")
     preset, flags = settings.split(arguments)
     resumed, _ = parsing.take(flags, "--resume")
     if resumed is None or parsing.asks_help(flags):
-        base = settings.preset(preset or "quick", flags)
+        base = settings.base(preset, flags)
     else:
         from csac_jax.io import checkpoint
 
@@ -92,10 +107,18 @@ def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
     if options.step is not None and options.resume is None:
         raise BadArgumentsError("--step: give it with --resume RUN")
     if options.resume is None:
-        settings.check_new("train", preset, options.run_dir)
-    elif options.run_dir is not None or options.init is not None:
-        raise BadArgumentsError("--resume: a resumed run takes neither --run-dir nor --init")
+        settings.check_new("train", preset, options.config, options.run_dir)
+    elif (options.run_dir, options.init, options.config) != (None, None, None):
+        raise BadArgumentsError("--resume: a resumed run takes no --run-dir, --init or --config")
+    _check(options)
     failures.check_physics(cfg)
-    if options.tensorboard:
-        failures.check_extra("--tensorboard", "tensorboardX", "tensorboard")
     return options, cfg
+
+
+def _check(options: TrainOptions) -> None:
+    if options.eval_every < 0 or options.eval_episodes < 1:
+        raise BadArgumentsError("--eval-every, --eval-episodes: at least 1")
+    if not options.eval_every and options.eval_suite != EVAL_SUITE:
+        raise BadArgumentsError("--eval-suite: give it with --eval-every N")
+    for name in options.log:
+        failures.check_extra(f"--log {name}", MODULES[name], name)

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +15,14 @@ from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
 from csac_jax.env import State
-from csac_jax.io import checkpoint, policy_file
+from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
 from csac_jax.training import step as training
 from csac_jax.vision.heightmap import Observation
+
+Which = int | Literal["last", "best"]  # checkpoint of a run, see `load`
 
 
 class Policy(Protocol):
@@ -139,35 +141,55 @@ def act(policy: Policy, states: State, keys: jax.Array) -> Action:
     return jax.vmap(policy)(states, keys)
 
 
-def load_config(source: str | Path, step: int | None = None) -> Config:
+def load_config(source: str | Path, which: Which = "last") -> Config:
     """The config of a policy, see `load`."""
     path = policy_file.find(source)
-    return policy_file.load(path)[0] if path.is_file() else checkpoint.load_config(path, step)
+    if path.is_file():
+        return policy_file.load(path)[0]
+    return checkpoint.load_config(*_checkpoint(path, which))
 
 
 def load(
-    source: str | Path, network: Any = None, learner: Learner | None = None, step: int | None = None
+    source: str | Path, network: Any = None, learner: Learner | None = None, which: Which = "last"
 ) -> Policy:
     """The policy `shipped`, of a policy file, or of a checkpoint in a run's folder.
 
-    Args: network and learner of one's own, where the run was trained with them; step, whose
-    checkpoint, by default the newest sound one.
+    Args: network and learner of one's own, where the run was trained with them; which, the
+    checkpoint: `last`, the newest sound one; `best` of the evaluations on the way; or a step.
     Raises FileNotFoundError, PolicyFileError or CheckpointError, with the remedy.
     """
     path = policy_file.find(source)
     if path.is_file():
         return LearnedPolicy(*policy_file.load(path))
-    cfg = checkpoint.load_config(path, step)
-    state, _ = checkpoint.restore(path, training.abstract_state(cfg, learner, network), step)
+    folder, step = _checkpoint(path, which)
+    cfg = checkpoint.load_config(folder, step)
+    state, _ = checkpoint.restore(folder, training.abstract_state(cfg, learner, network), step)
+    if learner is None:
+        policy_file.check_finite(folder, state.learner.online)
+    return of_state(cfg, state.learner, network, learner)
+
+
+def of_state(
+    cfg: Config, state: Any, network: Any = None, learner: Learner | None = None
+) -> Policy:
+    """The policy of a learner's state; see `load`."""
     if learner is not None:
-        return LearnerPolicy(cfg, learner, state.learner)
-    policy_file.check_finite(path, state.learner.online)
-    return LearnedPolicy(cfg, state.learner.online, network)
+        return LearnerPolicy(cfg, learner, state)
+    return LearnedPolicy(cfg, state.online, network)
+
+
+def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
+    """The folder and step of a run's checkpoint; no step for the newest sound one."""
+    if which != "best":
+        return run_dir, None if which == "last" else int(which)
+    if not (best := run_dir / files.BEST).exists():
+        raise FileNotFoundError(f"there is no {best}; a run keeps its best with --eval-every N")
+    return best, None
 
 
 POLICIES: dict[str, Callable[..., Policy]] = {
-    "learned": lambda source, step=None: load(source, step=step),
-    "random": lambda source, step=None: RandomPolicy(load_config(source, step)),
-    "oracle": lambda source, step=None: OraclePolicy(load_config(source, step)),
+    "learned": lambda source, which="last": load(source, which=which),
+    "random": lambda source, which="last": RandomPolicy(load_config(source, which)),
+    "oracle": lambda source, which="last": OraclePolicy(load_config(source, which)),
 }
 """Kinds of policy by name: each made from a source, whose config it takes, see `load`."""

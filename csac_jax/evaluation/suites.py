@@ -69,6 +69,7 @@ def environments(
     Raises ValueError for an unknown suite, an unsound case file or one without the target asked
     for, and for a suite with targets where the policy is learned and was trained without.
     """
+    check(suite)
     suite = RENAMED_SUITES.get(suite, suite)
     if suite in SUITES:
         build, target = SUITES[suite]
@@ -79,9 +80,14 @@ def environments(
             )
         parts = build(cfg, episodes, 1 + seed)
         return parts if isinstance(parts, dict) else {suite: parts}
-    if Path(suite).is_file():
-        return {Path(suite).stem: _case(cfg, Path(suite))}
-    raise ValueError(f"--suite: '{suite}' is neither a case file nor one of: {', '.join(SUITES)}")
+    return {Path(suite).stem: _case(cfg, Path(suite))}
+
+
+def check(suite: str) -> None:
+    """Raises ValueError for the name of no suite and no file."""
+    if RENAMED_SUITES.get(suite, suite) not in SUITES and not Path(suite).is_file():
+        known = ", ".join(SUITES)
+        raise ValueError(f"--suite: '{suite}' is neither a case file nor one of: {known}")
 
 
 def _target(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:

@@ -186,9 +186,18 @@ def sound(run_dir: Path, step: int | None = None) -> Path:
 def set_aside(run_dir: Path, step: int | None = None) -> None:
     """Moves the steps that are newer than `step`, by default the newest sound one, out of the
     way."""
-    root, good = _root(run_dir), int(sound(run_dir, step).name)
-    for number in [number for number in _steps(run_dir) if number > good]:
-        _set_aside(root / str(number))
+    set_aside_after(run_dir, int(sound(run_dir, step).name))
+
+
+def set_aside_after(run_dir: Path, step: int) -> None:
+    """Moves the steps that are newer than `step` out of the way, sound or not."""
+    for number in [number for number in _steps(run_dir) if number > step]:
+        _set_aside(_root(run_dir) / str(number))
+
+
+def load_extra(run_dir: Path) -> dict[str, Any]:
+    """The `extra` of the newest sound step, see `save`."""
+    return _read(sound(run_dir), extra=ocp.args.JsonRestore())["extra"]["extra"]
 
 
 def latest_step(run_dir: Path) -> int | None:

@@ -1,8 +1,9 @@
 """Files of a run, written so that they are never seen half-written. Needs no JAX.
 
 RUN/config.json     the config, for people; the checkpoint holds its own copy
-RUN/metrics.jsonl   one `loop.Record` per chunk
+RUN/metrics.jsonl   one `callbacks.Record` per chunk
 RUN/checkpoints/    see `checkpoint`
+RUN/best/, RUN/evaluations.jsonl    see `evaluation.monitor`
 """
 
 import contextlib
@@ -21,6 +22,8 @@ from csac_jax.io import renames
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
+EVALUATIONS = "evaluations.jsonl"
+BEST = "best"
 LARGEST = 2**30  # bytes of a file that is read at once
 
 

@@ -1,6 +1,6 @@
 """One episode to look at: a line per action, a picture, a video."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -12,7 +12,7 @@ from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import metrics, rollout
 from csac_jax.evaluation.rollout import StepRecord
-from csac_jax.render import media, panels, picture
+from csac_jax.render import media, panels, picture, viewer
 from csac_jax.render.picture import View
 from csac_jax.scene import blocks, layout, model
 from csac_jax.sim import c_physics
@@ -51,12 +51,24 @@ class Stage:
         views, `text` up to its colon is below, and all of it in HOLD more pictures of the end."""
         image, frame, action = self._start(step), self._frame(step), text.split(":")[0]
         yield frame(image, action)
-        recorded = c_physics.trajectory(self._world, self._fields, step.before.scene, step.joints)
-        every = max(round(1.0 / (media.FRAMES_PER_SECOND * self._cfg.sim.timestep)), 1)
-        for pose in recorded.qpos[::every]:
+        for pose in self.poses(step):
             image = self._picture(pose)
             yield frame(image, action)
         yield from [frame(image, text)] * (HOLD if self._views else 0)
+
+    def poses(self, step: StepRecord) -> np.ndarray:
+        """The model's qpos [T, ...] while an action runs in C MuJoCo, a row per picture."""
+        recorded = c_physics.trajectory(self._world, self._fields, step.before.scene, step.joints)
+        every = max(round(1.0 / (media.FRAMES_PER_SECOND * self._cfg.sim.timestep)), 1)
+        return recorded.qpos[::every]
+
+    def show(self, steps: list[StepRecord], say: Callable[[str], None], again: bool = True) -> None:
+        """Shows the steps in a viewer, see `viewer.play`."""
+        texts = [line(number, step) for number, step in enumerate(steps, 1)]
+        pictured = [
+            viewer.Pictured(text, self.poses(step)) for text, step in zip(texts, steps, strict=True)
+        ]
+        viewer.play(self._model, pictured, say, again)
 
     def _start(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos.copy()

@@ -17,6 +17,11 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 """
 
 
+def has_display() -> bool:
+    """Whether a window can open here."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def choose() -> str | None:
     """Sets MUJOCO_GL, unless the user has, to a backend that draws; returns it, None if none."""
     if given := os.environ.get(VARIABLE, "").lower():

@@ -1,6 +1,5 @@
-"""Figures 6, 7 and 9 of the paper and of variants, and the page of `csac-jax report --out`."""
+"""Figures 6, 7 and 9 of the paper and of variants."""
 
-import io
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from csac_jax.evaluation import statistics
-from csac_jax.report import tables
 from csac_jax.report.comparison import NAMES, Curve, Report, Score, grouped
 from csac_jax.report.curves import (
     COLOURS,
@@ -170,37 +168,7 @@ def _style(scores: Sequence[Score], index: int, shared: Changes) -> dict[str, An
     return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
 
 
-def _svg(figure: Figure) -> str:
-    """The figure as the element <svg>."""
-    file = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": "csac_jax"}):
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    plt.close(figure)
-    return "<svg" + file.getvalue().partition("<svg")[2]
-
-
 def save(figure: Figure, path: Path) -> None:
     """Writes a PNG that is the same bytes for the same figure."""
     figure.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(figure)
-
-
-def write_page(report: Report, folder: Path) -> list[Path]:
-    """Writes a page that needs no other file, figures and tables. Needs the extra `report`."""
-    import jinja2
-
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = [(chart, _svg(chart.figure)) for chart in draw(report)]
-    source = Path(__file__).with_name("page.html").read_text()
-    template = jinja2.Template(source, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    page = template.render(
-        explained=tables.EXPLAINED,
-        figures={chart.title: svg for chart, svg in drawn},
-        tables=tables.tables(report),
-        notes=report.notes,
-    )
-    files = {f"{chart.name}.svg": svg for chart, svg in drawn}
-    files |= {"index.html": page, "results.md": tables.markdown(report)}
-    for name, text in files.items():
-        (folder / name).write_text(text)
-    return [folder / name for name in files]

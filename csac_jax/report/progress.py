@@ -1,16 +1,12 @@
-"""Reporters of a run: a live bar on a terminal, plain lines in a file, TensorBoard."""
+"""The reporter of a run: a live bar on a terminal, plain lines in a file."""
 
-import dataclasses
 import datetime
 import time
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from csac_jax.training.loop import Record, Reporter
+from csac_jax.training.callbacks import Record
 
 PLAIN_INTERVAL = 10.0  # s between lines where there is no terminal
 
@@ -58,42 +54,3 @@ class Terminal:
         elif now - self._printed_at >= PLAIN_INTERVAL or done >= total_actions:
             self._printed_at = now
             self.say(f"{done} of {total_actions} actions, {text}")
-
-
-class TensorBoard:
-    """Writes scalars over actions into RUN/tensorboard. Needs the extra `tensorboard`."""
-
-    def __init__(self, run_dir: Path) -> None:
-        self._folder = run_dir / "tensorboard"
-        self._writer: Any = None  # the run makes its folder before the first record
-
-    def say(self, text: str) -> None:
-        """Writes nothing."""
-
-    def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        """Writes one point per number. The first record voids later points of a killed process."""
-        if self._writer is None:
-            from tensorboardX import SummaryWriter
-
-            self._writer = SummaryWriter(str(self._folder), purge_step=record.actions)
-        numbers = dataclasses.asdict(record)
-        outcomes = {f"outcomes/{name}": count for name, count in numbers.pop("outcomes").items()}
-        for name, number in (numbers | outcomes).items():
-            if number is not None:
-                self._writer.add_scalar(name, number, record.actions)
-        self._writer.flush()
-
-
-class Reporters:
-    """Several reporters as one."""
-
-    def __init__(self, reporters: Sequence[Reporter]) -> None:
-        self._reporters = reporters
-
-    def say(self, text: str) -> None:
-        for reporter in self._reporters:
-            reporter.say(text)
-
-    def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        for reporter in self._reporters:
-            reporter.progress(record, total_actions, eta)

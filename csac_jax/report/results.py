@@ -18,7 +18,7 @@ from csac_jax.config import SimConfig, shown
 from csac_jax.io import configs, files, renames
 
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
-SKIPPED = ("checkpoints", "tensorboard")
+SKIPPED = ("checkpoints", "tensorboard", "wandb", "best")
 NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
 HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
 LENGTH = "train."  # settings of a run's length and shape do not make it another method

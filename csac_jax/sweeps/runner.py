@@ -34,6 +34,7 @@ from csac_jax.sweeps import grid
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
+from csac_jax.training.callbacks import Record
 
 PLAN = "sweep.json"
 SUMMARY = "summary.json"
@@ -244,7 +245,7 @@ class _Sweep:
         if self.stopped is None:
             training.finish()
 
-    def _show(self, index: int, records: list[loop.Record]) -> None:
+    def _show(self, index: int, records: list[Record]) -> None:
         """One line about all runs: their actions and speed together, means of the rest."""
 
         def mean(name: str) -> float | None:
@@ -306,7 +307,7 @@ class _GroupTraining:
         """Whether all runs are done or given up."""
         return None not in self.failed or self.step >= loop.total_steps(self.cfg)
 
-    def advance(self, chunk: Callable[[Any], Any], reporter: loop.Reporter) -> list[loop.Record]:
+    def advance(self, chunk: Callable[[Any], Any], reporter: loop.Reporter) -> list[Record]:
         """Runs a chunk, saves now and then; logs and returns a line of each run that goes on."""
         self.state, metrics, seconds = loop.timed(chunk, self.state)
         self.step += self.cfg.train.chunk

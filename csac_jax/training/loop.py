@@ -19,6 +19,7 @@ from csac_jax.io import checkpoint, configs, files, lock
 from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import memory
+from csac_jax.training.callbacks import SILENT, Callback, Record, RunInfo, Summary
 
 LOSSES = ("critic_loss", "actor_loss")
 SUMS = "cleared blocks_lost terminated truncated gap_disagrees contact_overflow physics_diverged"
@@ -28,46 +29,6 @@ DIVERGED_SHARE = 1e-3  # of a chunk's actions: diverged physics beyond it is tol
 
 class TrainingError(FailedError):
     """A run that cannot go on; the message is one line with the remedy."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Record:
-    """One line of metrics.jsonl: how far the run is, and what a chunk did, in sums and means."""
-
-    step: int  # training steps done
-    actions: int  # actions done, over all scenes
-    seconds: float  # spent in chunks since the run began, resumed parts included, compilation not
-    actions_per_second: float  # of this chunk
-    grasp_success: float | None  # share of the last `grasps_counted` grasps that lifted a block
-    grasps_counted: int  # min(grasps so far, GRASP_WINDOW); without any, success is None
-    pushes: int
-    grasps: int
-    outcomes: dict[str, int]  # grasps by what came of them
-    pushes_better: int  # pushes that made the best grasp worth more
-    cleared: int  # blocks taken from the table
-    blocks_lost: int  # blocks that left the workspace
-    terminated: int  # episodes that ended with a cleared table
-    truncated: int  # episodes that were cut off
-    reward: float
-    gap_disagrees: int  # grasps whose outcome the finger gap alone names differently
-    contact_overflow: int  # substeps in which contacts may have been dropped
-    physics_diverged: int  # scenes whose physics failed
-    critic_loss: float | None  # None during the warm-up, as the next three
-    actor_loss: float | None
-    td_error: float | None
-    q_mean: float | None
-
-
-class Summary(NamedTuple):
-    """How a run ended."""
-
-    step: int
-    actions: int
-    seconds: float  # as in `Record`
-    compile_seconds: float  # 0 if nothing was compiled
-    grasp_success: float | None  # as in `Record`
-    grasps_counted: int
-    stopped_by: int | None  # number of the signal; None if the run is complete
 
 
 class Reporter(Protocol):
@@ -101,22 +62,31 @@ def run(
     stop: Stop,
     resume: bool = False,
     at: int | None = None,
+    callback: Callback = SILENT,
 ) -> Summary:
     """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
 
     Args: run_dir, exists if `resume`, else is made; init, gives the first state, a pytree with
     `step` [] int32; compile_chunk, takes the number of steps and gives a jitted function state ->
     (state, StepMetrics [T, ...]) that may use up its argument; at, the step to resume from, by
-    default the newest sound one. Raises TrainingError on a loss or parameter that is not finite,
-    CheckpointError if there is nothing sound to resume from or the disc is full, LockedError if
-    another process trains in `run_dir`.
+    default the newest sound one; callback, which follows the run. Raises TrainingError on a loss or
+    parameter that is not finite, CheckpointError if there is nothing sound to resume from or the
+    disc is full, LockedError if another process trains in `run_dir`.
     """
     checkpoint.check_path(run_dir)
     if not resume:
         run_dir.mkdir(parents=True)
     with lock.exclusive(run_dir):
         state, progress = _begin(cfg, run_dir, init, resume, at)
-        return _go_on(cfg, run_dir, state, progress, compile_chunk, reporter, stop, resume)
+        callback.begin(RunInfo(cfg, run_dir, int(state.step)))
+        how = (compile_chunk, reporter, stop, resume, callback)
+        try:
+            summary = _go_on(cfg, run_dir, state, progress, *how)
+        except Exception:
+            callback.end(None)
+            raise
+        callback.end(summary)
+        return summary
 
 
 def _go_on(
@@ -128,6 +98,7 @@ def _go_on(
     reporter: Reporter,
     stop: Stop,
     resumed: bool,
+    callback: Callback,
 ) -> Summary:
     """Trains from this state on, see `run`; nobody else writes in the folder."""
     step, total, scenes = int(state.step), total_steps(cfg), cfg.train.scenes
@@ -150,6 +121,7 @@ def _go_on(
             reporter.say(doubt)
         if step % (cfg.train.save_every * cfg.train.chunk) == 0:
             saved = _save(cfg, run_dir, step, state, progress)
+        callback.chunk(record, state)
     if saved != step:
         _save(cfg, run_dir, step, state, progress)
     stopped = f"stopped and saved at step {step}; go on with: csac-jax train --resume {run_dir}"

@@ -64,6 +64,6 @@ def config(name: str, preset: str, flags: Sequence[str]) -> Config:
     """The preset with settings as `csac-jax train` takes them, for the benchmark `name`. Raises
     BadArgumentsError."""
     try:
-        return settings.parse(_Run, f"bench {name}", settings.preset(preset, flags), flags)[1]
+        return settings.parse(_Run, f"bench {name}", settings.base(preset, flags), flags)[1]
     except BadArgumentsError as error:
         raise BadArgumentsError(f"bench {name}: {error}") from None

@@ -23,11 +23,11 @@ from csac_jax.io import checkpoint
 from csac_jax.report.progress import Terminal
 from csac_jax.runtime import signals
 from csac_jax.scene import pool
-from csac_jax.training import loop
+from csac_jax.training.callbacks import Summary
 
 ROOT = Path(csac_jax.__file__).parents[1]
 SMOKE = presets.smoke()
-SUMMARY = loop.Summary(4, 8, 1.5, 0.5, None, 0, None)
+SUMMARY = Summary(4, 8, 1.5, 0.5, None, 0, None)
 
 
 @pytest.fixture(autouse=True)
@@ -72,6 +72,14 @@ def run_dir(tmp_path: Path) -> Path:
         ),
         ("train", "give a preset first, one of: smoke, quick"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
+        ("train --config no.toml", "no.toml"),
+        ("train smoke --tensorboard", "--tensorboard: it is --log tensorboard now"),
+        ("train smoke --log nothing", "invalid choice 'nothing' for argument '--log'"),
+        ("train smoke --eval-suite cases", "--eval-suite: give it with --eval-every N"),
+        ("train smoke --eval-every -1", "--eval-every, --eval-episodes: at least 1"),
+        ("train smoke --eval-every 8 --eval-suite no", "--suite: 'no' is neither a case file"),
+        ("eval shipped --step 3", "--step: it is --which STEP now"),
+        ("eval shipped --which worst", "--which: 'worst' is neither best, last nor a step"),
         ("train quik", "unknown preset 'quik'; did you mean quick? choose one of: smoke, quick"),
         (
             "train quick --learn.bath 3",
@@ -254,10 +262,10 @@ def test_resume_with_another_preset(capsys: pytest.CaptureFixture, run_dir: Path
 
 
 def test_resume_excludes_run_dir(capsys: pytest.CaptureFixture, run_dir: Path):
-    """Claim: --resume excludes --run-dir and --init."""
-    for option in ("--run-dir", "--init"):
+    """Claim: --resume excludes --run-dir, --init and --config."""
+    for option in ("--run-dir", "--init", "--config"):
         code, line = _fails(capsys, "train", "--resume", str(run_dir), option, "x")
-        assert (code, "takes neither --run-dir nor --init" in line) == (2, True)
+        assert (code, "takes no --run-dir, --init or --config" in line) == (2, True)
 
 
 @pytest.mark.parametrize("command", ["train", "sweep"])
@@ -335,6 +343,72 @@ def test_flags_choose_the_alternative():
     flags = "--algo csac --replay.sampler beta --replay.end 1 5"
     _, cfg = train.read(["smoke", *flags.split()])
     assert cfg.replay == BetaReplay(capacity=SMOKE.replay.capacity, end=(1.0, 5.0))
+
+
+@pytest.fixture
+def config_file(tmp_path: Path) -> Path:
+    """A file of settings."""
+    path = tmp_path / "my.toml"
+    path.write_text('preset = "smoke"\nseed = 5\n[learn]\ntau = 0.5\nbatch = 4\n')
+    return path
+
+
+def test_flags_win_over_the_config_file(config_file: Path):
+    """Claim: --config is the base in place of a preset, --algo and settings given as flags win over
+    it, before or after; a sweep's points have them too."""
+    wanted = SMOKE.change(seed=5, learn={"tau": 0.5, "batch": 4})
+    file = ["--config", str(config_file)]
+    assert train.read(file)[1] == wanted
+    assert train.read(["smoke", *file])[1] == wanted
+    wanted = algorithms.configure(SMOKE, "csac").change(seed=6, learn={"tau": 0.1, "batch": 4})
+    flags = ["--learn.tau", "0.1", "--algo", "csac", "--seed", "6"]
+    assert train.read([*file, *flags])[1] == wanted
+    assert train.read([*flags, f"--config={config_file}"])[1] == wanted
+    _, plan = sweep.read([*file, *flags, "--vary", "learn.updates=1,2", "--sim.physics", "mjx"])
+    updates = [wanted.change(learn={"updates": n}, sim={"physics": "mjx"}) for n in (1, 2)]
+    assert [point.cfg for point in plan.points] == updates
+
+
+@pytest.mark.parametrize("command", ["train", "sweep"])
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("quick", "my.toml: preset: is 'smoke'; leave out quick"),
+        ("--learn.batch 100", "learn.batch: 100 transitions cannot be drawn"),
+        ("--config other.yaml", "other.yaml: No such file"),
+        ("--config bad.json", "bad.json: learn.bath: unknown setting"),
+    ],
+)
+def test_bad_config_file(
+    capsys: pytest.CaptureFixture, config_file: Path, command: str, flags: str, message: str
+):
+    """Claim: a file that cannot be is one line with its name and the key, and exit code 2."""
+    Path("bad.json").write_text('{"preset": "smoke", "learn": {"bath": 1}}')
+    first = [flags] if flags == "quick" else []
+    rest = [] if flags == "quick" else flags.split()
+    code, line = _fails(capsys, command, *first, "--config", str(config_file), *rest)
+    assert (code, message in line) == (2, True), line
+
+
+def test_resumed_sweep_takes_no_config_file(capsys: pytest.CaptureFixture, config_file: Path):
+    """Claim: a sweep goes on with its own settings; a file is refused even if it changes none."""
+    config_file.write_text('preset = "quick"')
+    code, line = _fails(capsys, "sweep", "--resume", ".", "--config", str(config_file))
+    assert (code, "a sweep goes on with its own settings" in line) == (2, True)
+
+
+def test_which_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path):
+    """Claim: `--which` is the newest checkpoint, one by its step, or that of RUN/best; one that is
+    not there is a line with the remedy."""
+    assert policies.load_config(run_dir, 4) == policies.load_config(run_dir) == SMOKE
+    for which, message in (("best", "keeps its best with --eval-every N"), ("3", "saved are: 4")):
+        code, line = _fails(capsys, "eval", str(run_dir), "--policy", "random", "--which", which)
+        assert (code, message in line) == (1, True), line
+    other = SMOKE.change(seed=9)
+    state = {"step": checkpoint.jax.numpy.int32(2)}
+    checkpoint.save(run_dir / "best", 2, state, other, {"score": [0.5, 0.5]})
+    assert policies.load_config(run_dir, "best") == other
+    assert policies.load_config(run_dir, "last") == SMOKE
 
 
 @pytest.mark.parametrize("flag", ["--algo vpg", "--algo=vpg", "--algo csac --algo vpg"])
@@ -429,7 +503,9 @@ def test_help_without_a_preset(capsys: pytest.CaptureFixture, arguments: str):
     assert shown.endswith("PRESET --help-all\n")
 
 
-def test_examples_of_the_help_are_read(capsys: pytest.CaptureFixture, run_dir: Path):
+def test_examples_of_the_help_are_read(
+    capsys: pytest.CaptureFixture, run_dir: Path, config_file: Path
+):
     """Claim: the parser takes every example that the help shows."""
     for example in (*train.EXAMPLES, *sweep.EXAMPLES):
         words = example.split("#")[0].replace("runs/a", str(run_dir)).split()

@@ -16,9 +16,11 @@ from csac_jax import cli, presets
 from csac_jax.cli import doctor, failures
 from csac_jax.errors import FailedError, SceneError
 from csac_jax.io import checkpoint, policy_file
+from csac_jax.render import gl
 from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, signals
 from csac_jax.training import loop, step
+from csac_jax.training.callbacks import Summary
 
 SMOKE = presets.smoke()
 
@@ -86,8 +88,10 @@ def test_version(capsys: pytest.CaptureFixture):
 @pytest.mark.parametrize(
     ("arguments", "option", "extra"),
     [
-        ("train smoke --tensorboard", "--tensorboard", "tensorboard"),
+        ("train smoke --log tensorboard", "--log tensorboard", "tensorboard"),
+        ("train smoke --log tensorboard wandb", "--log tensorboard", "tensorboard"),
         ("report . --out page", "--out", "report"),
+        ("play --viewer", "--viewer: there is no display here, and its page", "viewer"),
     ],
 )
 def test_missing_extra(
@@ -99,6 +103,7 @@ def test_missing_extra(
 ):
     """Claim: an option that needs an extra says how to get it."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(gl, "has_display", lambda: False)
     assert cli.main(arguments.split()) == 2
     wanted = f"csac-jax: {option} needs an extra; run: pip install 'csac-jax[{extra}]'\n"
     assert capsys.readouterr() == ("", wanted)
@@ -265,7 +270,7 @@ def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):
     and there is one line."""
     monkeypatch.setattr(cache, "enable", lambda: None)
     monkeypatch.setattr(step, "make", lambda cfg, **_: None)
-    summary = loop.Summary(*[0] * len(loop.Summary._fields))
+    summary = Summary(*[0] * len(Summary._fields))
     monkeypatch.setattr(loop, "run", lambda *_, **__: summary)
     assert cli.main(["train", "smoke", "--run-dir", "a", "--json", "new/folder/out.json"]) == 0
     assert Path("new/folder/out.json").is_file()

@@ -30,6 +30,7 @@ from csac_jax.errors import FailedError, SettingsError
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
 from csac_jax.training import loop
+from csac_jax.training.callbacks import Record, Summary
 from csac_jax.training.step import StepMetrics
 from tests.metrics import step_metrics
 
@@ -107,7 +108,7 @@ class Quiet:
         """Reporter."""
         self.said.append(text)
 
-    def progress(self, record: loop.Record, total_actions: int, eta: float) -> None:
+    def progress(self, record: Record, total_actions: int, eta: float) -> None:
         """Reporter."""
         self.chunks += 1
         if self.chunks == self._stop_after:
@@ -122,7 +123,7 @@ def train(
     bad: Losses = SOUND,
     at: int | None = None,
     init: Callable[[], Any] | None = None,
-) -> loop.Summary:
+) -> Summary:
     """Trains in this process for `steps` more steps, of a run that has no end."""
     reporter = Quiet(stop_after=steps)
     return loop.run(

@@ -1,16 +1,12 @@
-"""Reporters of a run: the terminal, and TensorBoard with a writer that only takes notes."""
+"""The reporter of a run: the terminal."""
 
 import dataclasses
 import io
-import sys
-from pathlib import Path
-from types import SimpleNamespace
 
-import pytest
 from rich.console import Console
 
 from csac_jax.report import progress
-from csac_jax.training.loop import Record
+from csac_jax.training.callbacks import Record
 
 BLANK = {field.name: 1 for field in dataclasses.fields(Record)}
 
@@ -35,39 +31,3 @@ def test_plain_lines_are_rare_but_the_last_is_there():
         ),
         "",
     ]
-
-
-def test_reporters_pass_everything_on():
-    """Claim: each of several reporters gets every line and every record."""
-    notes: list[tuple] = []
-    one = SimpleNamespace(say=notes.append, progress=lambda *args: notes.append(args))
-    both = progress.Reporters([one, one])
-    both.say("a")
-    both.progress(_record(2), 6, 1.0)
-    assert notes == ["a", "a", (_record(2), 6, 1.0), (_record(2), 6, 1.0)]
-
-
-def test_tensorboard_gets_every_number(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Claim: every number of a record is a scalar over actions, outcomes by name, None left out;
-    the first record voids what a killed process wrote after it."""
-    notes: list[tuple] = []
-
-    class Writer:
-        def __init__(self, folder: str, purge_step: int) -> None:
-            notes.append((folder, purge_step))
-
-        def add_scalar(self, *point: object) -> None:
-            notes.append(point)
-
-        def flush(self) -> None:
-            pass
-
-    monkeypatch.setitem(sys.modules, "tensorboardX", SimpleNamespace(SummaryWriter=Writer))
-    board = progress.TensorBoard(tmp_path)
-    board.progress(_record(8), 10, 1.0)
-    board.progress(_record(9), 10, 1.0)
-    first, *points = notes
-    assert first == (str(tmp_path / "tensorboard"), 8)
-    tags = (BLANK.keys() - {"outcomes", "critic_loss"}) | {"outcomes/lifted"}
-    assert {(tag, step) for tag, _, step in points} == {(tag, n) for tag in tags for n in (8, 9)}
-    assert ("outcomes/lifted", 3, 9) in points

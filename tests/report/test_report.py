@@ -1,7 +1,10 @@
 """`csac-jax report` from recorded files to tables, figures and page."""
 
+import base64
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 import time
@@ -17,7 +20,7 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import train
 from csac_jax.evaluation import metrics, statistics
 from csac_jax.io import configs, files
-from csac_jax.report import charts, comparison, curves, results, tables
+from csac_jax.report import charts, comparison, curves, page, results, tables, wording
 
 CASES = ("hole", "row")
 
@@ -569,23 +572,140 @@ def test_what_all_share_is_said_once(recorded: Path):
     assert not [name for name in names if "tau" in name]
 
 
+def _drawn(page: str) -> list[Any]:
+    """The figures that a page gives to plotly."""
+    return json.loads(re.search(r"^const figures = (.*);$", page, re.MULTILINE)[1])
+
+
 def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: `report --out` writes one page with its figures inside, and the tables as text;
+    """Claim: `report --out` writes one page with its curves inside, and the tables as text;
     `--json` the numbers."""
     out, numbers = tmp_path / "out", tmp_path / "report.json"
     assert cli.main(["report", str(recorded), "--out", str(out), "--json", str(numbers)]) == 0
-    page = (out / "index.html").read_text()
-    assert page.count("<svg") == 3
-    assert "src=" not in page
-    assert "92.5 %" in page
-    assert page.index("<h2>Summary</h2>") < page.index("<svg")
-    assert page.count("<th>completion</th>") == 1
-    assert "head.onclick" in page  # sorts
+    assert {path.name for path in out.iterdir()} == {"index.html", "results.md"}
+    html = (out / "index.html").read_text()
+    own = html.split("<script>")[0] + html.split("</script>")[-1]
+    assert not re.findall('(?:src|href)="(?!#|data:)', own)
+    assert html.index("<h2>Summary</h2>") < html.index('id="curves"') < html.index('id="tables"')
     shown = capsys.readouterr().out
     assert (out / "results.md").read_text() in shown
     assert "grasp dropped" in shown
     assert "2 / 20" in shown  # of CSAC-beta: 0 and 2 of 10 grasps in each case
     assert len(json.loads(numbers.read_text())["curves"]) == 3
+
+
+def test_curves_of_the_page_are_the_reports(recorded: Path):
+    """Claim: the page draws each curve and each part's values, by the numbers of `--json`."""
+    report = comparison.build(results.read([recorded]))
+    figures, numbers = _drawn(page.render(report, [])), tables.as_json(report)
+    lines = [trace for _, data, _ in figures for trace in data if trace.get("mode") == "lines"]
+    named = [trace for trace in lines if "name" in trace]
+    assert len(named) == len(numbers["curves"])
+    for curve in numbers["curves"]:
+        wanted = [100 * band["value"] for band in curve["success"]]
+        found = [one for one in named if one["x"] == curve["actions"]]
+        assert any(np.allclose(one["y"], wanted, atol=1e-3) for one in found)
+    marks = [trace for _, data, _ in figures for trace in data if "error_y" in trace]
+    done = [score["metrics"]["completion"] for score in numbers["scores"]]
+    values = sorted(value for trace in marks if trace["visible"] for value in trace["y"])
+    assert np.allclose(values, sorted(100 * band["value"] for band in done if band), atol=1e-3)
+
+
+def test_best_is_bold_among_the_alike(recorded: Path):
+    """Claim: bold is the largest value of a column among learned methods of one preset in the same
+    scenes; a value that nothing is compared with is not."""
+    report = comparison.build(results.read([recorded]))
+    table = tables.tables(report)["Evaluation"]
+    shown = page._table(report, "Evaluation", table)
+    column = shown.columns.index("completion")
+    groups: dict[str, list[tuple[float, bool]]] = {}
+    for row in shown.rows:
+        if row.group not in ("oracle", "random"):
+            value = row.cells[column].text.split()[0]
+            groups.setdefault(row.cells[1].text, []).append((float(value), row.cells[column].best))
+    assert any(len(group) > 1 for group in groups.values())
+    for group in groups.values():
+        top = max(value for value, _ in group)
+        assert [best for _, best in group] == [len(group) > 1 and v == top for v, _ in group]
+    assert not any(cell.best for row in shown.rows for cell in row.cells[:5])
+
+
+def test_rows_are_grouped_by_method_and_settings_are_words(recorded: Path):
+    """Claim: rows of one method stand together, settings are words, and the pointer shows flags."""
+    report = comparison.build(results.read([recorded]))
+    shown = page._table(report, "Training", tables.tables(report)["Training"])
+    groups = [row.group for row in shown.rows]
+    assert groups == [name for name in dict.fromkeys(groups) for _ in range(groups.count(name))]
+    variant = results.Variant("paper", "vpg", (("learn.tau", "0.5"), ("learn.augment", "False")))
+    assert wording.name_of(variant) == "VPG, target update share 0.5, augment off"
+    cell = page._cell({"x": variant}, "x", False)
+    assert cell.title == "paper --algo vpg --learn.tau 0.5 --learn.augment False"
+
+
+def test_pictures_of_the_folders_are_in_the_page(recorded: Path):
+    """Claim: a picture or video in a run's folder is in the page; one in its checkpoints, or of
+    another kind, is not."""
+    (recorded / "max/checkpoints").mkdir(exist_ok=True)
+    for name in ("max/episode.webp", "max/checkpoints/no.png", "max/no.txt"):
+        (recorded / name).write_bytes(b"picture")
+    (one,) = page.media([recorded])
+    assert (one.kind, one.name) == ("image", str(recorded / "max/episode.webp"))
+    assert one.data == "data:image/webp;base64," + base64.b64encode(b"picture").decode()
+    assert one.data in page.render(comparison.build(results.read([recorded])), [recorded])
+
+
+WATCH = """<script>
+const faults = [];
+addEventListener("error", (event) => faults.push(event.message));
+const told = console.error;
+console.error = (...all) => { faults.push(all.join(" ")); told(...all); };
+addEventListener("load", () => setTimeout(() => {
+  const table = [...document.querySelectorAll("h2")].find((one) => one.textContent === "Training")
+    .nextElementSibling.querySelector("table");
+  const heads = [...table.tHead.rows[0].cells].map((head) => head.textContent);
+  const at = heads.indexOf("final success"), rows = table.tBodies[0].rows;
+  const column = () => [...rows].map((row) => row.cells[at].textContent);
+  const click = () => table.tHead.rows[0].cells[at].firstChild.click();
+  const seen = [column()];
+  click(); seen.push(column()); click(); seen.push(column());
+  const traces = (plot) => plot.querySelectorAll(".scatterlayer .trace").length;
+  const drawn = [...document.querySelectorAll(".plot")].map(traces);
+  const dark = getComputedStyle(document.body).backgroundColor;
+  document.body.innerHTML = "<pre id=found></pre>";
+  document.getElementById("found").textContent = JSON.stringify({ faults, seen, drawn, dark });
+}, 500));
+</script>"""
+
+
+def test_page_works_in_a_browser(recorded: Path, tmp_path: Path):
+    """Claim: in Chromium the page draws its curves and sorts its tables by a click, down and up,
+    without an error; it is dark where the reader's system is."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("no chromium here")
+    report = comparison.build(results.read([recorded]))
+    html, found = page.render(report, []), []
+    (tmp_path / "page.html").write_text(html.replace("<title>", WATCH + "<title>", 1))
+    off = ("gpu", "quic", "background-networking", "component-update", "sync")
+    flags = ["--headless", "--no-sandbox", "--no-first-run", *(f"--disable-{one}" for one in off)]
+    for scheme in (1, 0):  # light, dark
+        own = [f"--user-data-dir={tmp_path / f'profile{scheme}'}", "--virtual-time-budget=20000"]
+        own += [f"--blink-settings=preferredColorScheme={scheme}", "--dump-dom"]
+        command = [chromium, *flags, *own, (tmp_path / "page.html").as_uri()]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        text = re.search('<pre id="found">(.*?)</pre>', done.stdout)
+        assert text is not None, done.stdout[-500:] + done.stderr
+        found.append(json.loads(text[1]))
+    light, dark = found
+    assert light["faults"] == dark["faults"] == []
+    assert light["drawn"] == [
+        sum(one.get("visible", True) is True for one in data) for _, data, _ in _drawn(html)
+    ]
+    first, down, up = ([float(text.split()[0]) for text in rows] for rows in light["seen"])
+    assert len(set(first)) > 1
+    assert down == sorted(first, reverse=True)
+    assert up == sorted(first)
+    assert (light["dark"], dark["dark"]) == ("rgb(255, 255, 255)", "rgb(13, 17, 23)")
 
 
 def test_reads_without_jax(recorded: Path):

@@ -19,7 +19,8 @@ from csac_jax.io import checkpoint, configs
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import loop
-from csac_jax.training.loop import Record, TrainingError
+from csac_jax.training.callbacks import Record, Summary
+from csac_jax.training.loop import TrainingError
 from tests.metrics import step_metrics
 
 E = 3
@@ -101,7 +102,7 @@ class Listener:
 
 def _run(
     run_dir: Path, listener: Listener, fake: Fake, resume: bool = False, cfg: Config = CFG
-) -> loop.Summary:
+) -> Summary:
     return loop.run(cfg, run_dir, _init, fake.compile_chunk, listener, listener.stop, resume)
 
 

@@ -1,0 +1,114 @@
+"""The package as its users get it: a wheel, installed without the checkout."""
+
+import os
+import subprocess
+import sys
+import tarfile
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import csac_jax
+from csac_jax.scene import cases
+
+ROOT = Path(csac_jax.__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DATA = ("policies/clear.safetensors", "report/page.html", "py.typed", "_scenes/ur5.xml")
+COMMANDS = (
+    "train smoke --sim.physics c --run-dir run",
+    "eval run --episodes 2 --json run/eval.json",
+    "eval shipped --suite cases --episodes 1",
+    "play --scene pinwheel --policy shipped --png play.png",
+    "export run policy.safetensors",
+    "report run --out page",
+)
+
+
+def test_versions_agree():
+    """Claim: package, CITATION.cff and the newest heading of CHANGELOG.md name one version, and
+    the classifiers begin with the oldest Python that is let in."""
+    version = csac_jax.__version__
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    headings = [
+        line for line in (ROOT / "CHANGELOG.md").read_text().splitlines() if line[:3] == "## "
+    ]
+    assert headings[0].split(",")[0] == f"## {version}"
+    minor = [line.split("3.")[1] for line in PROJECT["classifiers"] if ":: 3." in line]
+    assert PROJECT["requires-python"] == f">=3.{minor[0]}"
+
+
+def test_extras_are_sorted_and_pinned():
+    """Claim: the extras for users stand in order, and every library of the checkout's extras has
+    a tested version in constraints.txt."""
+    extras = PROJECT["optional-dependencies"]
+    names = list(extras)
+    assert names[: names.index("bench")] == sorted(names[: names.index("bench")])
+    assert set(names[names.index("bench") :]) == {"bench", "dist", "dev"}
+    pinned = (ROOT / "constraints.txt").read_text().lower().replace("_", "-")
+    needed = [*PROJECT["dependencies"]]
+    for extra in ("bench", "dist", "dev", *extras["dev"][0][9:-1].split(","), "report"):
+        needed += extras[extra]
+    for one in needed:
+        name = one.split("[")[0].split(">")[0].split("=")[0].lower()
+        assert name == "csac-jax" or f"\n{name}==" in pinned, name
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with wheel and sdist."""
+    folder = tmp_path_factory.mktemp("dist")
+    pytest.importorskip("build")
+    command = [sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True, cwd=folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_wheel_and_sdist_are_whole(built: Path):
+    """Claim: the wheel holds scenes, cases, policy and page, the sdist what builds it, and twine
+    finds no fault."""
+    pytest.importorskip("twine")
+    (wheel,), (sdist,) = built.glob("*.whl"), built.glob("*.tar.gz")
+    held = set(zipfile.ZipFile(wheel).namelist())
+    wanted = {f"csac_jax/{name}" for name in DATA}
+    wanted |= {f"csac_jax/_scenes/cases/{name}.json" for name in cases.names()}
+    assert wanted <= held
+    assert not {name.split("/")[0] for name in held} - {"csac_jax", f"{wheel.name[:14]}.dist-info"}
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"CITATION.cff", "CONTRIBUTING.md", "pyproject.toml", "scenes/ur5.xml"} <= names
+    check = [sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist)]
+    subprocess.run(check, check=True, capture_output=True)
+
+
+@pytest.mark.slow
+def test_installed_package_works(built: Path, tmp_path: Path):
+    """Claim: a fresh environment with the wheel alone trains, evaluates, plays, exports and
+    reports, far from the checkout."""
+    venv.create(tmp_path / "venv", with_pip=True)
+    wheel = next(built.glob("*.whl"))
+    python = str(tmp_path / "venv/bin/python")
+    install = [
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "-c",
+        str(ROOT / "constraints.txt"),
+        f"{wheel}[report]",
+    ]
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    subprocess.run([python, *install], check=True, env=clean, capture_output=True)
+    where = "import csac_jax; print(csac_jax.__file__)"
+    (tmp_path / "work").mkdir()
+    here = {"cwd": tmp_path / "work", "env": clean, "capture_output": True, "text": True}
+    found = subprocess.run([python, "-c", where], check=True, **here).stdout
+    assert found.startswith(str(tmp_path / "venv"))
+    for command in COMMANDS:
+        done = subprocess.run([python, "-m", "csac_jax", *command.split()], check=False, **here)
+        assert done.returncode == 0, f"{command}: {done.stderr}"
+    made = {path.name for path in (tmp_path / "work").iterdir()}
+    assert made == {"run", "play.png", "policy.safetensors", "page"}
