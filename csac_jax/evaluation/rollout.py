@@ -119,7 +119,7 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     """One action in one scene."""
     action = policy(state, key)
     plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action)
-    joints = primitives.joint_trajectory(env.cfg.sim.robot, plan)
+    joints = primitives.joint_trajectory(env.cfg.sim, plan)
     after = env.step(state, action)
     if not isinstance(policy, LearnedPolicy):
         return StepRecord(state, action, joints, after, after.reward, None)

@@ -20,6 +20,7 @@ from csac_jax.sim import c_physics
 VIEWS: dict[RobotKind, View] = {
     "hand": View(position=(-0.45, -0.45, 0.45), look_at=(0.0, 0.0, 0.04)),
     "ur5": View(position=(-0.75, -1.05, 0.75), look_at=(0.15, 0.0, 0.25)),
+    "ur5e": View(position=(-0.75, -1.05, 0.75), look_at=(0.15, 0.0, 0.25)),
 }
 STOPPED = {
     "action_cap": "stopped at the action limit",

@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from csac_jax import grippers
 from csac_jax.config import Config, SlotKind
-from csac_jax.constants import MAX_OPENING, Primitive
+from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
 from csac_jax.scene import blocks
 from csac_jax.scene.layout import ANY, Scene
-from csac_jax.sim.primitives import Action, local_top
+from csac_jax.sim.primitives import Action, grasp_depth, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric
-PAD_HALF_WIDTH = 0.006  # m, across the pad: scenes/hand.xml
-FINGER_HALF = (0.008, 0.012)  # m, half footprint of a finger tip across and along its pad: roomy
+OPENING_ROOM = 0.02  # m, by which the opening must exceed what is held
 EXACT = jax.lax.Precision.HIGHEST  # a GPU would cut products of matrices to 10 bits
 ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
@@ -25,7 +25,8 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array) -> Action:
 
     Args: height [H, W] m.
     """
-    sim, slots = cfg.sim, cfg.scene.slots
+    sim, slots, gripper = cfg.sim, cfg.scene.slots, grippers.load(cfg.sim.gripper)
+    beside, (along, across_pad) = gripper.half[1] + 0.5 * gripper.finger[0], gripper.footprint
     hulls: tuple[SlotKind, ...] = tuple("box" if kind == "arch" else kind for kind in slots)
     normals, offsets = blocks.half_spaces(hulls, scene.half_size)
     rotation = jax.vmap(quat_to_matrix)(scene.quaternion)
@@ -39,13 +40,12 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array) -> Action:
         low, high = jnp.argmin(cosine), jnp.argmax(cosine)  # the faces most square to the pads
         width = offsets[slot, high] + offsets[slot, low]
         centre = scene.position[slot, :2]
-        top = local_top(cfg.heightmap, height, centre, sim.window)
-        tip = jnp.maximum(top - sim.grasp_depth, sim.clearance)
+        top = local_top(cfg.heightmap, height, centre, gripper.finger[1])
+        tip = jnp.maximum(top - grasp_depth(sim, gripper), gripper.clearance)
         local = jnp.abs(rotate2d(-yaw, cells - centre))
-        across = jnp.abs(local[..., 0] - 0.5 * MAX_OPENING - PAD_HALF_WIDTH) < FINGER_HALF[0]
-        finger = across & (local[..., 1] < FINGER_HALF[1])
+        finger = (jnp.abs(local[..., 0] - beside) < along) & (local[..., 1] < across_pad)
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
-        fits = width < MAX_OPENING - 0.02
+        fits = width < gripper.opening[1] - OPENING_ROOM
         square = jnp.minimum(cosine[high], -cosine[low])
         askew = jnp.maximum(1.0 - square - ALIGNED, 0.0)
         cost = 4.0 * blocked + 4.0 * ~fits + 20.0 * askew + 10.0 * width

@@ -51,7 +51,7 @@ def execute(
     Args: height [H, W] m, the map the action was chosen from.
     """
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
-    joints = primitives.joint_trajectory(cfg.sim.robot, plan)
+    joints = primitives.joint_trajectory(cfg.sim, plan)
     after, trace = physics.run(scene, joints)
     unmoved = layout.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
     choose = functools.partial(jnp.where, joints.reachable)

@@ -55,7 +55,7 @@ def record(bench: Bench, count: int) -> list[State]:
         height, action
     )
     joints = jax.device_get(
-        jax.vmap(lambda one: primitives.joint_trajectory(cfg.sim.robot, one))(plan)
+        jax.vmap(lambda one: primitives.joint_trajectory(cfg.sim, one))(plan)
     )
     fields = jax.device_get(
         jax.jit(jax.vmap(lambda scene: model.scene_fields(world, scene)))(scenes)
