@@ -36,7 +36,8 @@ ORDER = (
     ("presets",),
     ("algorithms",),
     ("config",),
-    ("constants", "errors", "cache_folder"),
+    ("grippers",),
+    ("constants", "errors", "cache_folder", "assets"),
     ("__init__",),
     ("_guard",),
 )

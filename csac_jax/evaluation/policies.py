@@ -115,7 +115,8 @@ class OraclePolicy:
         """Raises TypeError for an observation."""
         if not isinstance(scene, State):
             raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
-        return oracle.grasp(self.cfg, scene.scene, scene.obs.height)
+        failures = scene.steps_without_change
+        return oracle.grasp(self.cfg, scene.scene, scene.obs.height, failures)
 
 
 def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:

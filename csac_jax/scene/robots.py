@@ -70,11 +70,18 @@ def add(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
 
 
 def read(path: Path) -> mujoco.MjSpec:
-    """The MJCF of a file. Raises SceneError for one that cannot be read or compiled."""
+    """The MJCF of a file. Raises SceneError for one that cannot be read."""
     try:
-        # `attach` silently drops an element that refers to a missing one, which this refuses.
-        mujoco.MjModel.from_xml_path(str(path))
         return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise one_line(path, error) from None
+
+
+def _compiled(path: Path) -> mujoco.MjModel:
+    """The model of a file alone. `attach` silently drops an element that refers to a missing one,
+    which this refuses."""
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise one_line(path, error) from None
 
@@ -126,6 +133,7 @@ def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
     require(path, "body", ("base",), arm.bodies)
     require(path, "geom", ("base",), arm.geoms)
     _require_actuators(path, ARM_JOINTS, arm)
+    _compiled(path)
     x, y, z, yaw = sim.base
     base, pedestal, flange = arm.body("base"), arm.geom("base"), arm.site("flange")
     base.pos, base.quat = [x, y, z], [np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)]
@@ -142,27 +150,26 @@ def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
     require(path, "joint", gripper.joints, tool.joints)
     require(path, "geom", (gripper.palm, *gripper.pads), tool.geoms)
     _require_actuators(path, (gripper.actuator,), tool)
-    others = {joint.name for joint in tool.joints} - {*gripper.joints}
-    if others:
-        raise SceneError(f"{path}: joint '{min(others)}' has no place among the 'joints' of "
-                         f"{grippers.NUMBERS}")
+    for name in {joint.name for joint in tool.joints} - {*gripper.joints}:
+        raise SceneError(f"{path}: joint '{name}' is not among 'joints' of {grippers.NUMBERS}")
     for end, name in enumerate(("closed", "open")):
-        gap, lowest = _measured(gripper, end)
-        wanted = -float(gripper.drop(gripper.half[end]))
-        for what, found, number in (
-            ("opening", gap, gripper.opening[end]), ("tips' height", lowest, wanted)
-        ):
-            if abs(found - number) > _TOLERANCE:
-                raise SceneError(
-                    f"{path}: the {what} when {name} is {1e3 * found:.1f} mm, by "
-                    f"{grippers.NUMBERS} it is {1e3 * number:.1f} mm"
-                )
+        opening, height = _measured(gripper, end)
+        _require_same(path, f"opening when {name}", opening, gripper.opening[end])
+        below = float(gripper.drop(gripper.half[end]))
+        _require_same(path, f"height of the tips when {name}", height, -below)
+
+
+def _require_same(path: Path, what: str, found: float, wanted: float) -> None:
+    """Raises SceneError where a length in the MJCF, m, is not that of the numbers."""
+    if abs(found - wanted) > _TOLERANCE:
+        by_numbers = f"by {grippers.NUMBERS} {1e3 * wanted:.1f} mm"
+        raise SceneError(f"{path}: {what} is {1e3 * found:.1f} mm, {by_numbers}")
 
 
 @functools.lru_cache
 def _measured(gripper: Gripper, end: int) -> tuple[float, float]:
     """Opening and height of the tips, m, in the MJCF with its joints at one end."""
-    model = mujoco.MjModel.from_xml_path(str(gripper.folder / grippers.MJCF))
+    model = _compiled(gripper.folder / grippers.MJCF)
     data = mujoco.MjData(model)
     for name, ends in zip(gripper.joints, gripper.positions, strict=True):
         data.qpos[model.joint(name).qposadr[0]] = ends[end]
