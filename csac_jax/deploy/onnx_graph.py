@@ -216,7 +216,7 @@ def _group_norm(graph: Graph, maps: str, layer: Any) -> str:
 def _valid(graph: Graph, frames: Frames, has_target: bool) -> str:
     """Cells where an action may begin, [P, K, h, w] bool; see `maps.actionable_cells`."""
     if frames.all_cells:
-        return graph.const(np.broadcast_to(frames.inside, (2, *frames.inside.shape)), bool)
+        return graph.const(frames.inside[None] & frames.reachable, bool)
     under = _above_bare(graph, frames, "height")
     graspable = under
     if has_target:
@@ -225,7 +225,8 @@ def _valid(graph: Graph, frames: Frames, has_target: bool) -> str:
     reach = int(np.ceil(frames.push_length / frames.cell))
     near = graph.op("MaxPool", under, kernel_shape=[3, reach + 1], pads=[1, 0, 1, reach])
     both = graph.op("Concat", near, graspable, axis=1)  # [K, P, h, w], 0 or 1
-    inside = graph.op("Mul", both, graph.const(frames.inside[:, None]))
+    allowed = np.swapaxes(frames.inside[None] & frames.reachable, 0, 1)  # [K, P, h, w]
+    inside = graph.op("Mul", both, graph.const(allowed))
     first = graph.op("Transpose", inside, perm=[1, 0, 2, 3])
     return graph.op("Cast", first, to=TensorProto.BOOL)
 

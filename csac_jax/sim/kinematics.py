@@ -283,6 +283,15 @@ def joint_targets(
     return joints[branch], jnp.all(good[branch])
 
 
+def reaches(arm: Arm, tips: jax.Array, yaw: jax.Array) -> jax.Array:
+    """Whether one branch leads to all places `tips` [T, 3] m of a hand that points down at `yaw` [],
+    and the arm is clear at each of them, [] bool. It says nothing of the way between them."""
+    poses = jax.vmap(top_down, (0, None))(tips, yaw)
+    solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)  # [T, 8, 6], [T, 8]
+    clear_at = jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
+    return jnp.any(jnp.all(valid & clear_at, axis=0))
+
+
 def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, ...]:
     """One branch [T, 6] rad as far as it is valid [T] bool, without jumps, and within LIMITS.
 

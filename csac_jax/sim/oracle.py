@@ -13,7 +13,8 @@ from csac_jax.scene.layout import ANY, Scene
 from csac_jax.sim.primitives import Action, grasp_depth, local_top
 
 YAWS = 32  # over half a turn: the hand is symmetric
-OTHER_YAW = 5  # places in the order of yaws that a second try goes on: neighbours are alike
+SHIFTS = (-0.6, 0.0, 0.6)  # of the grasp, in shares of the way to the block's end
+OTHER_WAY = 5  # places in the order of ways that a second try goes on: neighbours are alike
 OPENING_ROOM = 0.02  # m, by which the opening must exceed what is held
 EXACT = jax.lax.Precision.HIGHEST  # a GPU would cut products of matrices to 10 bits
 OWN = 0.003  # m beyond its face that a block may reach within a pad's width
@@ -27,7 +28,7 @@ def grasp(
     high and narrow block.
 
     With a target, the best grasp is the target's, else that of the block nearest to it. After each
-    of several `failures` [] in a row, another block's turn comes, then another yaw.
+    of several `failures` [] in a row, another block's turn comes, then another way to take it.
 
     Args: height [H, W] m.
     """
@@ -40,12 +41,19 @@ def grasp(
     yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
     cells = cell_centres(cfg.heightmap)
 
-    def score(slot, yaw):
+    def place(slot, yaw, shift):
+        """Where the hand closes: `shift` of the way from the middle to the block's end."""
+        across = rotate2d(yaw, jnp.array([0.0, 1.0]))
+        cosine = jnp.matmul(world_normals[slot, :, :2], across, precision=EXACT)
+        end = offsets[slot, jnp.argmax(cosine)]
+        return scene.position[slot, :2] + shift * end * across
+
+    def score(slot, yaw, shift):
         axis = jnp.append(rotate2d(yaw, jnp.array([1.0, 0.0])), 0.0)
         cosine = jnp.matmul(world_normals[slot], axis, precision=EXACT)
         low, high = jnp.argmin(cosine), jnp.argmax(cosine)  # the faces most square to the pads
         width = offsets[slot, high] + offsets[slot, low]
-        centre = scene.position[slot, :2]
+        centre = place(slot, yaw, shift)
         top = local_top(cfg.heightmap, height, centre, gripper.finger[1])
         tip = jnp.maximum(top - grasp_depth(sim, gripper), gripper.clearance)
         local = jnp.abs(rotate2d(-yaw, cells - centre))
@@ -61,25 +69,27 @@ def grasp(
         square = jnp.minimum(cosine[high], -cosine[low])
         askew = jnp.maximum(1.0 - square - ALIGNED, 0.0)
         cost = 4.0 * blocked + 2.0 * caught + 4.0 * ~fits + 20.0 * askew + 10.0 * width
+        cost += jnp.abs(shift)
         # ANY indexes the last slot, whose distance is then unused.
         away = jnp.linalg.norm(centre - scene.position[scene.target, :2])
         asked = jnp.where(scene.target == slot, 3.0, -4.0 * away)
         wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[slot, 2], asked)
         return jnp.where(scene.in_play[slot], wanted - cost, -jnp.inf)
 
-    each_pair = jax.vmap(jax.vmap(score, (None, 0)), (0, None))
-    scores = each_pair(jnp.arange(len(slots)), yaws)  # [N, YAWS]
-    slot, yaw = _in_turn(scores, jnp.sum(scene.in_play), jnp.int32(failures))
-    pose = jnp.append(scene.position[slot, :2], yaws[yaw])
+    ways = jnp.repeat(yaws, len(SHIFTS)), jnp.tile(jnp.array(SHIFTS), YAWS)
+    scores = jax.vmap(jax.vmap(score, (None, 0, 0)), (0, None, None))(jnp.arange(len(slots)), *ways)
+    slot, way = _in_turn(scores, jnp.sum(scene.in_play), jnp.int32(failures))
+    yaw, shift = (each[way] for each in ways)
+    pose = jnp.append(place(slot, yaw, shift), yaw)
     return Action(primitive=jnp.int32(Primitive.GRASP), pose=pose)
 
 
 def _in_turn(
     scores: jax.Array, blocks_left: jax.Array, failures: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Slot and yaw [] of the next grasp to try, by `scores` [N, YAWS]: the best first."""
+    """Slot and way [] of the next grasp to try, by `scores` [N, ways]: the best first."""
     order = jnp.argsort(-jnp.max(scores, axis=1))
     around = jnp.maximum(blocks_left, 1)
     slot = order[failures % around]
-    yaws = jnp.argsort(-scores[slot])
-    return slot, yaws[(failures // around * OTHER_YAW) % YAWS]
+    ways = jnp.argsort(-scores[slot])
+    return slot, ways[(failures // around * OTHER_WAY) % scores.shape[1]]

@@ -59,6 +59,12 @@ def execute(
     return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
 
 
+def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
+    """Whether the robot can follow the whole of a primitive, as `execute` decides, [] bool."""
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+    return primitives.joint_trajectory(cfg.sim, plan).reachable
+
+
 def healthy(scene: Scene) -> jax.Array:
     """True where every entry of a scene lies within its bounds, [] bool.
 

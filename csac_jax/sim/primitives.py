@@ -11,6 +11,7 @@ from csac_jax.constants import Primitive
 from csac_jax.grippers import Gripper
 from csac_jax.sim import kinematics
 
+BLOCK = 0.05  # m, height of a common block
 START_GAP = 0.01  # m, between the open hand's tips and what lies under them at the start
 
 
@@ -76,9 +77,7 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
     low = jnp.maximum(surface - depth, gripper.clearance)
     around = local_top(heightmap, height, xy, 2.0 * gripper.radius)
     high = jnp.maximum(low + cfg.approach, around + START_GAP)
-    direction = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
-    limit = 0.5 * heightmap.extent
-    end = jnp.where(is_grasp, xy, jnp.clip(xy + cfg.push_length * direction, -limit, limit))
+    end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
     closed, opened = gripper.half
     opening = jnp.where(is_grasp, opened, closed)
 
@@ -89,6 +88,29 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
     fingers = closed + (opening - closed) * (1.0 - jnp.minimum(1.3 * act, 1.0))  # before the lift
     control = jnp.column_stack([place, z, jnp.full_like(z, yaw), fingers])
     return Plan(control=control, start=jnp.hstack([xy, high, yaw, opening]), surface=surface)
+
+
+def reachable(
+    cfg: SimConfig, heightmap: HeightmapConfig, primitive: jax.Array, xy: jax.Array, yaw: jax.Array
+) -> jax.Array:
+    """Whether the robot reaches where a primitive [] at `xy` [2] m begins and ends, [] bool.
+
+    It is asked before anything is known of the height: at the lowest, and over a block.
+    """
+    if cfg.robot == "hand":
+        return jnp.ones((), bool)
+    low, is_push = grippers.load(cfg.gripper).clearance, primitive == Primitive.PUSH
+    ends = xy, jnp.where(is_push, _push_end(cfg, heightmap, xy, yaw), xy)
+    tips = [jnp.append(end, z) for end in ends for z in (low, low + cfg.approach + BLOCK)]
+    return kinematics.reaches(kinematics.arm(cfg), jnp.stack(tips), yaw)
+
+
+def _push_end(
+    cfg: SimConfig, heightmap: HeightmapConfig, xy: jax.Array, yaw: jax.Array
+) -> jax.Array:
+    """Where a push from `xy` [2] m ends, [2] m."""
+    direction, limit = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]), 0.5 * heightmap.extent
+    return jnp.clip(xy + cfg.push_length * direction, -limit, limit)
 
 
 def grasp_depth(cfg: SimConfig, gripper: Gripper) -> float:

@@ -499,3 +499,20 @@ def test_one_scene_is_not_the_others_matter():
     alone, _ = targets_of(jnp.asarray(kinematics.HOME), control[3])
     np.testing.assert_allclose(batch[3], alone, atol=1e-5)
     np.testing.assert_allclose(batch[3], expected[3], atol=1e-5)
+
+
+def test_reaches_is_what_the_targets_say():
+    """Claim: where one branch leads to the ends of a straight way and is clear there, the arm can
+    mostly follow it; where none does, it never can."""
+    far = kinematics.arm(SimConfig(robot="ur5", base=(0.85, 0.0, 0.35, 0.0)))
+    places = np.random.default_rng(6).uniform(-HALF, HALF, (200, 2)).astype(np.float32)
+    ends = np.stack([np.column_stack([places, np.full(200, z)]) for z in (0.012, 0.16)], axis=1)
+    reached = jax.jit(jax.vmap(functools.partial(kinematics.reaches, far), (0, None)))(ends, 0.4)
+    ways = np.concatenate([ends, np.full((200, 2, 1), 0.4)], axis=2)
+    ways = np.stack([np.linspace(*way, 12) for way in ways])
+    follow = jax.vmap(functools.partial(kinematics.joint_targets, far), (None, 0))
+    _, followed = jax.jit(follow)(jnp.asarray(kinematics.HOME), jnp.asarray(ways, jnp.float32))
+    reached, followed = np.asarray(reached), np.asarray(followed)
+    assert 20 < reached.sum() < 180
+    assert not (followed & ~reached).any()
+    assert followed[reached].mean() > 0.9
