@@ -62,7 +62,9 @@ class Gripper:
     clearance: float  # m, least height of the tips above the table
     radius: float  # m, circle about the tool axis that holds the open hand
     body_radius: float  # m, capsule about the gripper's body
-    hand_capsule: tuple[float, float, float]  # m, about palm and fingers: back from the tips, radius
+    hand_capsule: tuple[
+        float, float, float
+    ]  # m, about palm and fingers: back from the tips, radius
 
     @property
     def footprint(self) -> tuple[float, float]:
@@ -170,17 +172,24 @@ def _gripper(folder: Path, given: dict[str, Any]) -> Gripper:
     actuator, joints = (_object(_need(given, name), name) for name in ("actuator", "joints"))
     pads, arc = _need(given, "pads"), _need(given, "arc_radius")
     _require(isinstance(pads, list) and len(pads) == 2, "'pads' must be the names of two geoms")
-    lengths = {name: _lengths(given, name, parts) for name, parts in _LENGTHS.items()}
+    words: dict[str, Any] = {name: _word(_need(given, name), name) for name in _WORDS}
+    lengths: dict[str, Any] = {}
+    for name, parts in _LENGTHS.items():
+        several = _lengths(given, name, parts)
+        lengths[name] = several if parts else several[0]
     return Gripper(
         folder=folder,
         pads=(_word(pads[0], "pads"), _word(pads[1], "pads")),
         actuator=_word(_need(actuator, "name", "actuator"), "actuator.name"),
         set_points=_ends(actuator, "actuator"),
         joints=tuple(joints),
-        positions=tuple(_ends(_object(ends, "joints"), f"joints.{n}") for n, ends in joints.items()),
+        positions=tuple(
+            _ends(_object(ends, f"joints.{joint}"), f"joints.{joint}")
+            for joint, ends in joints.items()
+        ),
         arc_radius=None if arc is None else _number(arc, "arc_radius"),
-        **{name: _word(_need(given, name), name) for name in _WORDS},
-        **{name: each if len(each) > 1 else each[0] for name, each in lengths.items()},
+        **words,
+        **lengths,
     )
 
 

@@ -142,7 +142,5 @@ def test_decisions_need_no_mujoco():
         "height = jnp.zeros((cfg.heightmap.size,) * 2)\n"
         "print(float(program.stations(cfg, height, Action.grasp(0.0, 0.0, 0.0))[0, 4]))\n"
     )
-    found = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True
-    )
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert float(found.stdout) == pytest.approx(0.0425)

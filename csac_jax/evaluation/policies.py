@@ -117,7 +117,9 @@ class OraclePolicy:
             raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
         # The same scene would have the same grasp fail again; a little turn is no change to see.
         failed = (scene.actions > 0) & (scene.info.cleared == 0)
-        failures = jnp.where(failed, jnp.maximum(scene.steps_without_change, 1 + scene.actions % 2), 0)
+        failures = jnp.where(
+            failed, jnp.maximum(scene.steps_without_change, 1 + scene.actions % 2), 0
+        )
         return oracle.grasp(self.cfg, scene.scene, scene.obs.height, failures)
 
 

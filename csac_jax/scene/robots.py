@@ -144,7 +144,7 @@ def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
 
 
 def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
-    """Raises SceneError where a gripper's MJCF lacks what its numbers name, or has other numbers."""
+    """Raises SceneError where a gripper's MJCF lacks what its numbers name, or has others."""
     path = gripper.folder / grippers.MJCF
     require(path, "body", (gripper.body,), tool.bodies)
     require(path, "joint", gripper.joints, tool.joints)

@@ -19,7 +19,6 @@ from csac_jax.config import SimConfig
 from csac_jax.geometry import FULL_TURN
 
 
-
 class Geometry(NamedTuple):
     """An arm by its maker, m: Denavit-Hartenberg parameters, and what surrounds the links."""
 
@@ -36,9 +35,7 @@ class Geometry(NamedTuple):
 
 _RADII = (0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045)  # of both (ur_description)
 MAKERS = {  # sources: scenes/README.md
-    "ur5": Geometry(
-        0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165, _RADII
-    ),
+    "ur5": Geometry(0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165, _RADII),
     "ur5e": Geometry(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007, _RADII),
 }
 
@@ -262,9 +259,7 @@ def clear(arm: Arm, q: jax.Array) -> jax.Array:
     return (to_table > _TABLE_CLEARANCE) & (between_links > _LINK_CLEARANCE)
 
 
-def joint_targets(
-    arm: Arm, q_start: jax.Array, control: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def joint_targets(arm: Arm, q_start: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Joint targets that lead the tips through set-points, all on one branch.
 
     It is the branch that reaches the most set-points; of several, the one with the least motion
@@ -284,8 +279,8 @@ def joint_targets(
 
 
 def reaches(arm: Arm, tips: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Whether one branch leads to all places `tips` [T, 3] m of a hand that points down at `yaw` [],
-    and the arm is clear at each of them, [] bool. It says nothing of the way between them."""
+    """Whether one branch leads to all places `tips` [T, 3] m of a hand that points down at `yaw` []
+    rad, and the arm is clear at each of them, [] bool. It says nothing of the way between them."""
     poses = jax.vmap(top_down, (0, None))(tips, yaw)
     solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)  # [T, 8, 6], [T, 8]
     clear_at = jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)

@@ -21,9 +21,7 @@ OWN = 0.003  # m beyond its face that a block may reach within a pad's width
 ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
 
-def grasp(
-    cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | int = 0
-) -> Action:
+def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | int = 0) -> Action:
     """The best grasp: room for both fingers as they go down and close, faces square to the pads, a
     high and narrow block.
 

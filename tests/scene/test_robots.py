@@ -12,7 +12,7 @@ import pytest
 from csac_jax import grippers
 from csac_jax.config import RobotKind, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import model, robots
+from csac_jax.scene import model
 
 SCENE = SceneConfig(slots=("box",), min_blocks=1)
 

@@ -134,10 +134,22 @@ def test_forward_agrees_with_c(name: str):
 
 # The makers' tables of Denavit-Hartenberg parameters: d m, a m, alpha rad.
 DH = {
-    "ur5": ((0.089159, 0, 0.5), (0, -0.425, 0), (0, -0.39225, 0), (0.10915, 0, 0.5),
-            (0.09465, 0, -0.5), (0.0823, 0, 0)),
-    "ur5e": ((0.1625, 0, 0.5), (0, -0.425, 0), (0, -0.3922, 0), (0.1333, 0, 0.5),
-             (0.0997, 0, -0.5), (0.0996, 0, 0)),
+    "ur5": (
+        (0.089159, 0, 0.5),
+        (0, -0.425, 0),
+        (0, -0.39225, 0),
+        (0.10915, 0, 0.5),
+        (0.09465, 0, -0.5),
+        (0.0823, 0, 0),
+    ),
+    "ur5e": (
+        (0.1625, 0, 0.5),
+        (0, -0.425, 0),
+        (0, -0.3922, 0),
+        (0.1333, 0, 0.5),
+        (0.0997, 0, -0.5),
+        (0.0996, 0, 0),
+    ),
 }
 
 
@@ -152,8 +164,12 @@ def test_forward_is_the_makers_table(robot: str):
         for theta, (d, a, turns) in zip(angles, DH[robot], strict=True):
             (c, s), (ca, sa) = ((np.cos(x), np.sin(x)) for x in (theta, turns * np.pi))
             pose = pose @ np.array(
-                [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d],
-                 [0, 0, 0, 1]]
+                [
+                    [c, -s * ca, s * sa, a * c],
+                    [s, c * ca, -c * sa, a * s],
+                    [0, sa, ca, d],
+                    [0, 0, 0, 1],
+                ]
             )
         np.testing.assert_allclose(found.position[index], pose[:3, 3], atol=POSITION)
         # The tip frame closes along x and points back along z.
@@ -165,7 +181,9 @@ def test_forward_is_the_makers_table(robot: str):
 def test_inverse_of_every_arm_returns(name: str):
     """Claim: of each arm, wherever it stands, every branch that counts leads back to the pose."""
     arm = kinematics.arm(SIMS[name])
-    there, back = (functools.partial(each, arm) for each in (kinematics.forward, kinematics.inverse))
+    there, back = (
+        functools.partial(each, arm) for each in (kinematics.forward, kinematics.inverse)
+    )
     pose = jax.jit(jax.vmap(there))(_random_joints(500, 5))
     solutions, valid = map(np.asarray, jax.jit(jax.vmap(back))(*pose))
     again = jax.jit(jax.vmap(jax.vmap(there)))(solutions)
@@ -305,7 +323,9 @@ def test_top_down_is_the_floating_hand():
         mujoco.mj_kinematics(model, data)
         pose = kinematics.top_down(jnp.asarray(values[:3]), jnp.asarray(values[3]))
         np.testing.assert_allclose(pose.position, data.body("hand/hand").xpos, atol=1e-6)
-        np.testing.assert_allclose(pose.rotation, data.body("hand/hand").xmat.reshape(3, 3), atol=1e-6)
+        np.testing.assert_allclose(
+            pose.rotation, data.body("hand/hand").xmat.reshape(3, 3), atol=1e-6
+        )
 
 
 def test_whole_workspace_is_reachable():

@@ -145,6 +145,6 @@ def test_local_top_of_coarse_maps():
     height = jnp.zeros((16, 16)).at[8, 8].set(0.05)
     centre = cell_centres(coarse)[8, 8]
     for offset in (0.0, 0.0139, -0.0139):
-        assert primitives.local_top(coarse, height, centre + offset, RG2.finger[1]) == pytest.approx(
-            0.05
-        )
+        assert primitives.local_top(
+            coarse, height, centre + offset, RG2.finger[1]
+        ) == pytest.approx(0.05)

@@ -124,7 +124,7 @@ def test_arm_presses_within_reason(x: float, side: int):
 
 
 def test_gripper_ends_at_the_flange():
-    """Claim: the tip frame is the gripper's depth below the flange, where the visible body of the gripper ends;
+    """Claim: the tip frame is the gripper's depth below the flange, where its visible body ends;
     nothing of the arm collides, and gravity is compensated in all of it."""
     model = _model()
     data = mujoco.MjData(model)
