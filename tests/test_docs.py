@@ -12,6 +12,7 @@ from csac_jax import cli, presets
 
 ROOT = Path(csac_jax.__file__).parents[1]
 ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
+GRIPPERS = ROOT / "docs" / "grippers.md"
 PAGES = [
     page
     for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
@@ -71,3 +72,19 @@ def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             exec(compile(block, "robot.md", "exec"), namespace)
     assert len(steps) >= 6
     assert Path("demo/decision.png").exists()
+
+
+@pytest.mark.slow
+def test_grippers_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the blocks and commands of docs/grippers.md run in their order, with two episodes; the
+    gripper of its five steps is one that `eval` takes."""
+    monkeypatch.chdir(tmp_path)
+    page = re.sub(r"--episodes \d+", "--episodes 2", GRIPPERS.read_text())
+    steps = re.findall(r"(?ms)^```python\n(.*?)^```|^(?:    )?(csac-jax [^\n]*)", page)
+    namespace = {"__name__": "grippers"}
+    for block, command in steps:
+        if command:
+            _run_command(command)
+        else:
+            exec(compile(block, "grippers.md", "exec"), namespace)
+    assert len(steps) == 7
