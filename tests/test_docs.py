@@ -74,6 +74,8 @@ def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert Path("demo/decision.png").exists()
 
 
+@pytest.mark.mjx
+@pytest.mark.optax
 @pytest.mark.slow
 def test_grippers_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the blocks and commands of docs/grippers.md run in their order, with two episodes; the

@@ -54,13 +54,13 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | in
         centre = place(slot, yaw, shift)
         top = local_top(cfg.heightmap, height, centre, gripper.finger[1])
         tip = jnp.maximum(top - grasp_depth(sim, gripper), gripper.clearance)
-        local = jnp.abs(rotate2d(-yaw, cells - centre))
+        local = jnp.abs(rotate2d(-yaw, cells - centre[None, None]))
         finger = (jnp.abs(local[..., 0] - beside) < along) & (local[..., 1] < across_pad)
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
         beyond = local[..., 0] > 0.5 * width + OWN
         way = beyond & (local[..., 0] < beside) & (local[..., 1] < 0.5 * gripper.finger[1])
         caught = jnp.max(jnp.where(way, height, 0.0)) > tip
-        off = jnp.abs(rotate2d(-yaw, scene.position[:, :2] - centre))
+        off = jnp.abs(rotate2d(-yaw, scene.position[:, :2] - centre[None]))
         inside = (off[:, 0] < beside) & (off[:, 1] < across_pad) & (scene.position[:, 2] > tip)
         caught |= jnp.any(inside & scene.in_play & (jnp.arange(len(slots)) != slot))
         fits = width < gripper.opening[1] - OPENING_ROOM
