@@ -7,12 +7,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import grippers
+from csac_jax import deploy, grippers
+from csac_jax.deploy import decision, program
 from csac_jax.errors import SettingsError
+from csac_jax.sim.primitives import Action
 
 RG2 = grippers.load("rg2")
 
@@ -128,6 +131,20 @@ def test_no_gripper_is_one_line(source: str):
     """Claim: a name without a gripper says which there are."""
     with pytest.raises(SettingsError, match="neither one of 2f85, franka_hand, rg2 nor a folder"):
         grippers.load(source)
+
+
+@pytest.mark.mjx
+def test_deployed_policy_takes_another_gripper():
+    """Claim: a deployed policy decides for the gripper that it is given, its own by default."""
+    assert deploy.Policy.load("shipped").cfg.sim.gripper == "rg2"
+    policy = deploy.Policy.load("shipped", gripper="2f85")
+    height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
+    stations = program.stations(policy.cfg, height, Action.grasp(0.0, 0.0, 0.0))
+    choice = program.Choice(Action.grasp(0.0, 0.0, 0.0), jnp.zeros(()), jnp.bool(True), stations)
+    decided = decision.of(jax.device_get(choice), np.eye(4))
+    assert decided.width == pytest.approx(0.085)
+    with pytest.raises(SettingsError, match="neither one of"):
+        deploy.Policy.load("shipped", gripper="2f86")
 
 
 def test_decisions_need_no_mujoco():

@@ -26,6 +26,8 @@ class ServeOptions:
     """File whose first line clients must send as the header Authorization: Bearer LINE."""
     workspace: Path | None = None
     """JSON with the 4 x 4 matrix from workspace to robot, for the waypoints' tool poses."""
+    gripper: str | None = None
+    """The robot's gripper, by name or folder; by default that of the training."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the images, px, to compile for at the start; others compile later."""
 
@@ -46,7 +48,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax.deploy import files, service
 
     workspace = None if options.workspace is None else files.read_pose(options.workspace)
-    policy = deploy.Policy.load(options.policy, workspace)
+    policy = deploy.Policy.load(options.policy, workspace, options.gripper)
     policy.warm_up(*options.size)
     app = service.make(policy, options.policy, token)
     uvicorn.run(app, host=options.host, port=options.port, log_level="warning", lifespan="off")
