@@ -13,7 +13,7 @@ import typing
 from typing import Any, ClassVar, Literal
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
-RobotKind = Literal["hand", "ur5"]
+RobotKind = Literal["hand", "ur5", "ur5e"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 SensorKind = Literal["none", "d415", "d435", "azure_kinect"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
@@ -145,16 +145,21 @@ class SimConfig(Section, section="sim"):
     line_search = 8  # line-search steps of one Newton iteration (ours)
     approach = 0.10  # height above the place at which a primitive starts and ends, m
     grasp_depth = 0.035  # how far the finger tips go below the surface, m (VPG: 0.03 to 0.04)
-    clearance = 0.012  # lowest height of the finger tips above the table, m (VPG: 0.01 to 0.02)
     push_length = 0.10  # length of a push, m (VPG)
     push_depth = 0.02  # how far below the local top the tips push, m (ours)
-    window = 0.02  # side of the window whose highest surface is the local top, m (a finger's width)
 
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
     `warp` on one CUDA device where it is known to be faster, else `mjx`."""
-    robot: RobotKind = "hand"  # `hand`: the RG2 alone, floating, for training. `ur5`: on the arm.
+    robot: RobotKind = "hand"
+    """`hand`: the gripper alone, floating, for training. `ur5`, `ur5e`: on that arm."""
+    gripper: str = "rg2"
+    """`rg2`, `2f85`, `franka_hand`, or a folder with gripper.json and gripper.xml of your own."""
+    base: tuple[float, float, float, float] = _bounded((0.6, 0.0, 0.35, 0.0), -math.pi, math.pi)
+    """Where the arm's base stands: x, y and z, m, and its yaw, rad (ours: scenes/README.md)."""
+    adapter: float = _bounded(0.0, 0.0, 0.3)
+    """Length of what is mounted between the arm's flange and the gripper, m."""
     grasp_phases: tuple[int, int, int] = _bounded((60, 50, 80), 1)
     """Substeps of a grasp: descend, close the fingers, lift."""
     geom_pairs: int = _bounded(12, 1)  # Geom pairs examined per collision function, nearest first.

@@ -23,7 +23,6 @@ class Outcome(enum.IntEnum):
 OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome)
 CHANGE_AREA = 12.0  # cm^2 of the height map that must move for an action to count as a change (VPG)
 GRASP_WINDOW = 200  # grasps that the running success is taken over (VPG; CSAC gives none)
-MAX_OPENING = 0.110  # m, between the open fingers (RG2 data sheet)
 RENAMED_SUITES = {"own": "in_distribution"}  # old name, in records, -> the name now
 EVAL_SUITE = "in_distribution"  # of evaluations during training
 EVAL_EPISODES = 20  # of each part of that suite (ours: an interval of some 20 points)

@@ -24,6 +24,7 @@ from csac_jax.io import checkpoint
 ROOT = Path(csac_jax.__file__).parents[1]
 README = ROOT / "README.md"
 ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
+GRIPPERS = ROOT / "docs" / "grippers.md"
 TUTORIAL = ROOT / "docs" / "tutorial" / "first-training.md"
 RECORD = ROOT / "experiments" / "results" / "quick" / "csac_beta" / "seed-0" / "metrics.jsonl"
 ALL = [README, ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -268,3 +269,21 @@ def test_readme_has_the_recorded_numbers():
         rates = [part["action_efficiency"]["value"] for part in parts]
         bounds = [float(numbers[2][0]), float(numbers[2][-1])]
         assert bounds == pytest.approx([min(rates), max(rates)], abs=0.0051)
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+@pytest.mark.slow
+def test_grippers_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the blocks and commands of docs/grippers.md run in their order, with two episodes; the
+    gripper of its five steps is one that `eval` takes."""
+    monkeypatch.chdir(tmp_path)
+    page = re.sub(r"--episodes \d+", "--episodes 2", GRIPPERS.read_text())
+    steps = re.findall(r"(?ms)^```python\n(.*?)^```|^(?:    )?(csac-jax [^\n]*)", page)
+    namespace = {"__name__": "grippers"}
+    for block, command in steps:
+        if command:
+            _run_command(command)
+        else:
+            exec(compile(block, "grippers.md", "exec"), namespace)
+    assert len(steps) == 7

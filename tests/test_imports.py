@@ -36,7 +36,8 @@ ORDER = (
     ("presets",),
     ("algorithms",),
     ("config",),
-    ("constants", "errors", "cache_folder"),
+    ("grippers",),
+    ("constants", "errors", "cache_folder", "assets"),
     ("__init__",),
     ("_guard",),
 )
@@ -76,6 +77,7 @@ JIT_IN = (
         "runtime/selftest.py",
     ),  # small programs that show what this machine does
     "scene/arrange.py",
+    "agent/maps.py",  # where an arm reaches is a table, computed once
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
     "render/picture.py",  # draws on machines without OpenGL
     "gym.py",  # its users call it step by step

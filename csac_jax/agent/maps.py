@@ -6,6 +6,7 @@ action is trilinear: bilinear in the two frames next to its yaw, linear between 
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,11 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.agent import box, offsets
-from csac_jax.config import Config, PolicyConfig
+from csac_jax.config import Config, HeightmapConfig, PolicyConfig, SimConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.nets.networks import Networks
+from csac_jax.sim import primitives
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation
@@ -43,6 +45,7 @@ class Frames:
     all_cells: bool  # actions may begin on bare table
     xy: np.ndarray  # [K, h, w, 2] m, workspace position of every cell
     inside: np.ndarray  # [K, h, w] bool, above the workspace
+    reachable: np.ndarray  # [P, K, h, w] bool, the robot reaches both ends of the action
 
 
 def frames(cfg: Config, networks: Networks) -> Frames:
@@ -50,15 +53,11 @@ def frames(cfg: Config, networks: Networks) -> Frames:
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
     tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
     side, cell = tables.canvas // networks.stride, tables.cell * networks.stride
-    yaws = 2.0 * np.pi * np.arange(rotations) / rotations
-    along = (np.arange(side) - 0.5 * (side - 1)) * cell
-    x, y = along[None, None, :], along[None, :, None]
-    cos, sin = np.cos(yaws)[:, None, None], np.sin(yaws)[:, None, None]
-    xy = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1).astype(np.float32)
+    xy, yaws = _cells(rotations, side, cell)
     inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
     return Frames(
         tables=tables,
-        yaws=yaws.astype(np.float32),
+        yaws=yaws,
         networks=networks,
         side=side,
         cell=cell,
@@ -68,7 +67,34 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         all_cells=cfg.policy.cells == "all",
         xy=xy,
         inside=inside,
+        reachable=_reachable(cfg.sim, cfg.heightmap, rotations, side, cell),
     )
+
+
+def _cells(rotations: int, side: int, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """Workspace position [K, h, w, 2] m of every cell, and the yaws [K] rad of the frames."""
+    yaws = 2.0 * np.pi * np.arange(rotations) / rotations
+    along = (np.arange(side) - 0.5 * (side - 1)) * cell
+    x, y = along[None, None, :], along[None, :, None]
+    cos, sin = np.cos(yaws)[:, None, None], np.sin(yaws)[:, None, None]
+    xy = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    return xy.astype(np.float32), yaws.astype(np.float32)
+
+
+@functools.lru_cache(maxsize=8)
+def _reachable(
+    sim: SimConfig, heightmap: HeightmapConfig, rotations: int, side: int, cell: float
+) -> np.ndarray:
+    """Where the robot can act, [P, K, h, w] bool: a table, computed once."""
+    xy, yaws = _cells(rotations, side, cell)
+    if sim.robot == "hand":
+        return np.ones((len(Primitive), *xy.shape[:3]), bool)
+
+    one = functools.partial(primitives.reachable, sim, heightmap)
+    over_cells = jax.vmap(jax.vmap(one, (None, 0, None)), (None, 0, None))
+    every = jax.jit(jax.vmap(jax.vmap(over_cells, (None, 0, 0)), (0, None, None)))
+    with jax.ensure_compile_time_eval():
+        return np.asarray(every(jnp.arange(len(Primitive)), xy, yaws))
 
 
 @struct.dataclass
@@ -116,10 +142,11 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
 
     Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
     such a surface, of any block, lies within the push's length ahead. With `policy.cells all`:
-    every cell inside the workspace.
+    every cell inside the workspace. Of all these, those that the robot reaches.
     """
+    allowed = frames.inside[None] & frames.reachable
     if frames.all_cells:
-        return jnp.broadcast_to(frames.inside, (len(Primitive), *frames.inside.shape))
+        return jnp.asarray(allowed)
     graspable = under = _cells_above_bare(frames, obs.height)
     if frames.shows_target:
         graspable = _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
@@ -127,7 +154,7 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     ahead = jax.lax.reduce_window(
         under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
     )
-    return jnp.stack([ahead & frames.inside, graspable & frames.inside])
+    return jnp.stack([ahead, graspable]) & allowed
 
 
 def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:

@@ -29,6 +29,8 @@ class ActOptions:
     """Image or .npy that is not 0 at the object to get."""
     workspace: Path | None = None
     """JSON with the 4 x 4 matrix from workspace to robot, for the waypoints' tool poses."""
+    gripper: str | None = None
+    """The robot's gripper, by name or folder; by default that of the training."""
     top: int = 1
     """How many actions to give, best first."""
     check: bool = False
@@ -55,7 +57,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax.deploy import files
 
     workspace = None if options.workspace is None else files.read_pose(options.workspace)
-    policy = deploy.Policy.load(options.policy, workspace)
+    policy = deploy.Policy.load(options.policy, workspace, options.gripper)
     image = (
         files.read_rgb(options.rgb),
         files.read_depth(options.depth),

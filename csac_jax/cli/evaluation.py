@@ -16,8 +16,8 @@ from csac_jax.config import Config
 
 @dataclasses.dataclass(frozen=True)
 class EvalOptions:
-    """Measures a policy in scenes that training never saw. It sees as it was trained to, unless
-    settings of its height map, camera or sensor are given."""
+    """Measures a policy in scenes that training never saw. It sees as it was trained to, and
+    has the same gripper, unless other settings are given."""
 
     source: tyro.conf.Positional[str]
     """A run's folder, a policy file, or shipped for the policy that comes with the package."""
@@ -32,8 +32,8 @@ class EvalOptions:
     policy of that task), packed, camera (random10 through ever worse cameras), or a case file."""
     physics: Literal["auto", "mjx", "c"] = "auto"
     """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
-    robot: Literal["hand", "ur5"] = "hand"
-    """What moves the gripper: nothing, it floats as in training; or the arm."""
+    robot: Literal["hand", "ur5", "ur5e"] = "hand"
+    """What moves the gripper: nothing, it floats as in training; or an arm."""
     episodes: int = 50
     """Episodes of every part of the suite, each with a fresh scene where the part has several."""
     seed: int = 0

@@ -19,8 +19,8 @@ class PlayOptions:
 
     scene: str = "random"
     """What lies on the table: random (dropped blocks), a shipped case by name, or a case file."""
-    robot: Literal["hand", "ur5"] = "hand"
-    """What moves the gripper: nothing, it floats; or the arm."""
+    robot: Literal["hand", "ur5", "ur5e"] = "hand"
+    """What moves the gripper: nothing, it floats; or an arm."""
     policy: str = "oracle"
     """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped
     (learned, comes with the package), the folder of a run or a policy file."""

@@ -29,6 +29,8 @@ class ServeOptions:
     """JSON with the 4 x 4 matrix from workspace to robot, for the waypoints' tool poses."""
     record: Path | None = None
     """Folder to keep images, decisions and the outcomes posted in, for finetune; of one robot."""
+    gripper: str | None = None
+    """The robot's gripper, by name or folder; by default that of the training."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the images, px, to compile for at the start; others compile later."""
 
@@ -49,7 +51,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax.deploy import files, record, service
 
     workspace = None if options.workspace is None else files.read_pose(options.workspace)
-    policy = deploy.Policy.load(options.policy, workspace)
+    policy = deploy.Policy.load(options.policy, workspace, options.gripper)
     recorder = None if options.record is None else record.Recorder(options.record, options.policy)
     policy.warm_up(*options.size)
     app = service.make(policy, options.policy, token, recorder)

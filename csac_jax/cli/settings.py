@@ -22,8 +22,14 @@ FIRST = (
     *("learn.updates", "target.gamma", "replay.sampler", "replay.capacity", "net.kind"),
 )
 """The settings that people change first."""
-VIEW = ("heightmap", "camera", "sensor")
-"""Sections that say how a policy sees; `eval` and `play` take them for any policy."""
+VIEW: dict[str, tuple[str, ...]] = {
+    "heightmap": (),
+    "camera": (),
+    "sensor": (),
+    "sim": ("gripper", "base", "adapter"),
+}
+"""Sections that say how a policy sees and what hand it moves, () or some of their settings; `eval`
+and `play` take them for any policy."""
 _METAVARS: Any = {bool: "", Path: "PATH", int: "N", str: "TEXT", tuple[str, ...]: "NAME=A,B"}
 _LAYOUT = partial(argparse.RawDescriptionHelpFormatter, max_help_position=32, width=100)
 
@@ -85,7 +91,7 @@ def parse_view(
 ) -> tuple[Any, dict[str, dict[str, Any]]]:
     """The `options` of a command, and what its flags change in the sections VIEW, as
     `Config.change` takes it; what no flag gives stays the policy's."""
-    fields = [(name, _inherited(type(getattr(Config, name)))) for name in VIEW]
+    fields = [(name, _inherited(type(getattr(Config, name)), some)) for name, some in VIEW.items()]
     listed = [(name, kind, dataclasses.field(default=kind())) for name, kind in fields]
     kind: Any = dataclasses.make_dataclass(
         options.__name__, listed, bases=(options,), frozen=True, kw_only=True
@@ -100,12 +106,13 @@ def parse_view(
     }
 
 
-def _inherited(section: Any) -> Any:
-    """A dataclass of the settings of a section, which are the policy's unless they are given."""
+def _inherited(section: Any, some: tuple[str, ...]) -> Any:
+    """A dataclass of all or some settings of a section, which are the policy's unless given."""
     docs = field_docs(section)
     fields = [
         (field.name, parsing.inherited(field.type, docs[field.name]), field.default)
         for field in dataclasses.fields(section)
+        if not some or field.name in some
     ]
     kind = dataclasses.make_dataclass(section.__name__, fields, frozen=True)
     kind.__doc__ = f"{section.__doc__} By default as the policy's."

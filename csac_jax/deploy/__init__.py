@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from csac_jax import grippers
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
@@ -53,15 +54,21 @@ class Policy:
     workspace_pose: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))  # to robot
 
     @classmethod
-    def load(cls, source: str | Path = "shipped", workspace_pose: Any = None) -> "Policy":
+    def load(
+        cls, source: str | Path = "shipped", workspace_pose: Any = None, gripper: str | None = None
+    ) -> "Policy":
         """The policy `shipped`, of a policy file, or of a run's folder, which needs MuJoCo.
 
-        Args: workspace_pose, 4 x 4, workspace to robot frame; the identity by default.
+        Args: workspace_pose, 4 x 4, workspace to robot frame; the identity by default. gripper, the
+        robot's, by name or folder; by default the one that the policy was trained with.
         Raises FileNotFoundError, PolicyFileError, CheckpointError or SettingsError.
         """
         path = policy_file.find(source)
         pose = np.eye(4) if workspace_pose is None else images.rigid(workspace_pose, "workspace")
         cfg, params = policy_file.load(path) if path.is_file() else _of_run(path)
+        if gripper is not None:
+            grippers.load(gripper)  # refuses what is none
+            cfg = cfg.change(sim={"gripper": gripper})
         return cls(cfg, jax.device_put(params), pose)
 
     def decide(

@@ -17,7 +17,7 @@ from csac_jax.deploy.images import View
 from csac_jax.errors import DataWarning, ViewError
 from csac_jax.scene.blocks import COLOURS
 
-TABLE_TOLERANCE = 0.008  # m (ours): finger tips go down to `sim.clearance`, 12 mm, above z = 0
+TABLE_TOLERANCE = 0.008  # m (ours): finger tips go down to 12 mm above z = 0
 SEEN_SHARE = 0.8  # of the workspace's cells (ours)
 HIGHEST_POSE = 5.0  # m, farther cameras are poses in another unit
 _WINDOW = 5  # px, side of the window in which one pixel with a depth is enough

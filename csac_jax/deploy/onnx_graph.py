@@ -13,12 +13,12 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from csac_jax import geometry
+from csac_jax import geometry, grippers
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import Frames
 from csac_jax.config import Config, SmallNet
-from csac_jax.constants import MAX_OPENING, Primitive
+from csac_jax.constants import Primitive
 from csac_jax.errors import SettingsError
 from csac_jax.nets import dense, networks
 from csac_jax.sim import primitives
@@ -216,7 +216,7 @@ def _group_norm(graph: Graph, maps: str, layer: Any) -> str:
 def _valid(graph: Graph, frames: Frames, has_target: bool) -> str:
     """Cells where an action may begin, [P, K, h, w] bool; see `maps.actionable_cells`."""
     if frames.all_cells:
-        return graph.const(np.broadcast_to(frames.inside, (2, *frames.inside.shape)), bool)
+        return graph.const(frames.inside[None] & frames.reachable, bool)
     under = _above_bare(graph, frames, "height")
     graspable = under
     if has_target:
@@ -225,7 +225,8 @@ def _valid(graph: Graph, frames: Frames, has_target: bool) -> str:
     reach = int(np.ceil(frames.push_length / frames.cell))
     near = graph.op("MaxPool", under, kernel_shape=[3, reach + 1], pads=[1, 0, 1, reach])
     both = graph.op("Concat", near, graspable, axis=1)  # [K, P, h, w], 0 or 1
-    inside = graph.op("Mul", both, graph.const(frames.inside[:, None]))
+    allowed = np.swapaxes(frames.inside[None] & frames.reachable, 0, 1)  # [K, P, h, w]
+    inside = graph.op("Mul", both, graph.const(allowed))
     first = graph.op("Transpose", inside, perm=[1, 0, 2, 3])
     return graph.op("Cast", first, to=TensorProto.BOOL)
 
@@ -261,7 +262,7 @@ def _best(graph: Graph, cfg: Config, q: str, valid: str) -> tuple[str, str, str,
 
 def _stations(graph: Graph, cfg: Config, primitive: str, pose: str) -> str:
     """Set-points [4, 5]; see `program.stations` and `primitives.plan`."""
-    sim, limit = cfg.sim, 0.5 * cfg.heightmap.extent
+    sim, limit, gripper = cfg.sim, 0.5 * cfg.heightmap.extent, grippers.load(cfg.sim.gripper)
     grasp = graph.op("Equal", primitive, graph.const(int(Primitive.GRASP), np.int32))
 
     def choose(of_grasp: str, of_push: str) -> str:
@@ -272,17 +273,17 @@ def _stations(graph: Graph, cfg: Config, primitive: str, pose: str) -> str:
 
     xy = graph.op("Slice", pose, _axes(graph, 0), _axes(graph, 2))
     yaw = graph.op("Slice", pose, _axes(graph, 2), _axes(graph, 3))
-    depth = choose(value(sim.grasp_depth), value(sim.push_depth))
-    surface = _local_top(graph, cfg, xy, sim.window)
-    low = graph.op("Max", graph.op("Sub", surface, depth), value(sim.clearance))
-    around = _local_top(graph, cfg, xy, 2.0 * primitives.HAND_RADIUS)
+    depth = choose(value(primitives.grasp_depth(sim, gripper)), value(sim.push_depth))
+    surface = _local_top(graph, cfg, xy, gripper.finger[1])
+    low = graph.op("Max", graph.op("Sub", surface, depth), value(gripper.clearance))
+    around = _local_top(graph, cfg, xy, 2.0 * gripper.radius)
     clear = graph.op("Add", around, value(primitives.START_GAP))
     high = graph.op("Max", graph.op("Add", low, value(sim.approach)), clear)
     along = graph.op("Concat", graph.op("Cos", yaw), graph.op("Sin", yaw), axis=0)
     way = graph.op("Mul", along, value(sim.push_length))
     end = choose(xy, graph.clip(graph.op("Add", xy, way), -limit, limit))
-    opening = choose(value(0.5 * MAX_OPENING), value(0.0))
-    closed = value(0.0)
+    closed, opened = map(value, gripper.half)
+    opening = choose(opened, closed)
     rows = [(xy, high, yaw, opening), (xy, low, yaw, opening)]
     rows += [(end, low, yaw, closed), (end, high, yaw, closed)]
     return graph.reshape(graph.op("Concat", *(part for row in rows for part in row), axis=0), 4, 5)

@@ -49,6 +49,7 @@ class Episodes(NamedTuple):
     blocks_lost: Any  # [M] int32, blocks that left the workspace
     changed: Any  # [M, T] bool, the height map moved by more than 12 cm^2
     wrong: Any  # [M, T] bool, the grasp took a block, but not the target
+    unreachable: Any  # [M, T] bool, the robot cannot follow the action, so that nothing moved
     blocks: Any = None  # [M] int32, in play at the start; these three come at the end
     completed: Any = None  # [M] bool, no block was in the workspace at the end
     ending: Any = None  # [M] int32, index into ENDINGS
@@ -121,7 +122,8 @@ def _share(true: np.ndarray, of: np.ndarray | None = None) -> dict[str, Any]:
 
 
 def _failures(episodes: Episodes, grasps: np.ndarray) -> dict[str, dict[str, Any]]:
-    """What went wrong, by cause; `grasps` [M, T] bool. No action has two causes."""
+    """What went wrong, by cause; `grasps` [M, T] bool. No action has two causes, but what is out of
+    reach also has the outcome of an action that moves nothing."""
     grasped = [_share(~episodes.wrong & (episodes.outcome == kind), grasps) for kind in Outcome]
     ended = {name: _share(episodes.ending == number) for number, name in enumerate(ENDINGS)}
     return {  # of all grasps:
@@ -132,6 +134,8 @@ def _failures(episodes: Episodes, grasps: np.ndarray) -> dict[str, dict[str, Any
         "grasp_wrong_block": _share(episodes.wrong, grasps),  # took another than the target
         # Of pushes, those that moved at most 12 cm^2 of the height map.
         "push_no_change": _share(~episodes.changed, episodes.valid & ~grasps),
+        # Of actions, those that the robot cannot follow: nothing moved.
+        "action_unreachable": _share(episodes.unreachable, episodes.valid),
         # Of blocks at the start, those that left the workspace.
         "block_lost": wilson(int(episodes.blocks_lost.sum()), int(episodes.blocks.sum())),
         # Of episodes:

@@ -117,7 +117,12 @@ class OraclePolicy:
         """Raises TypeError for an observation."""
         if not isinstance(scene, State):
             raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
-        return oracle.grasp(self.cfg, scene.scene, scene.obs.height)
+        # The same scene would have the same grasp fail again; a little turn is no change to see.
+        failed = (scene.actions > 0) & (scene.info.cleared == 0)
+        failures = jnp.where(
+            failed, jnp.maximum(scene.steps_without_change, 1 + scene.actions % 2), 0
+        )
+        return oracle.grasp(self.cfg, scene.scene, scene.obs.height, failures)
 
 
 def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:

@@ -16,7 +16,7 @@ from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import backend, primitives
+from csac_jax.sim import backend, physics as simulation, primitives
 from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.training import step as training
 
@@ -119,7 +119,7 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     """One action in one scene."""
     action = policy(state, key)
     plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action)
-    joints = primitives.joint_trajectory(env.cfg.sim.robot, plan)
+    joints = primitives.joint_trajectory(env.cfg.sim, plan)
     after = env.step(state, action)
     if not isinstance(policy, LearnedPolicy):
         return StepRecord(state, action, joints, after, after.reward, None)
@@ -200,6 +200,9 @@ def _step(
         changed=info.moved > CHANGE_AREA,
         wrong=(info.cleared > 0) & (after.reward == 0.0) & has_target,
         blocks_lost=target_lost if has_target else info.blocks_lost,
+        unreachable=~jax.vmap(functools.partial(simulation.reachable, env.cfg))(
+            states.obs.height, action
+        ),
     )
     record = jax.tree.map(lambda leaf: jnp.where(running, leaf, jnp.zeros_like(leaf)), record)
     keep = jax.vmap(jnp.where)

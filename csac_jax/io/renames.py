@@ -60,7 +60,13 @@ for name, items in _TUPLES.items():
     section = name.split(".")[0]
     SETTINGS |= {f"{section}.{item}": f"{name}.{place}" for place, item in enumerate(items)}
 
-GONE = {"learn.augment_turn": 0.0, "net.border": False, "policy.mask": True}
+GONE = {
+    "learn.augment_turn": 0.0,
+    "net.border": False,
+    "policy.mask": True,
+    "sim.clearance": 0.012,  # the gripper's now, as is the next
+    "sim.window": 0.02,
+}
 """Settings of format 1 whose part is gone: a file must hold this value."""
 
 CONSTANTS = ("reward.eta",)

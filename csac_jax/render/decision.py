@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from csac_jax import grippers
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.deploy import Maps, images
@@ -42,18 +43,18 @@ def _draw_image(cfg: Config, axes: Axes, view: View, decisions: list[Decision]) 
     _draw_path(axes, view, corners, color="white", lw=0.8)
     for number, decision in reversed(list(enumerate(decisions))):
         colour = OTHERS if number else maps.CHOSEN
-        for path in paths(decision):
+        for path in paths(decision, grippers.load(cfg.sim.gripper).footprint[1]):
             _draw_path(axes, view, path, color=colour, lw=2.2, path_effects=maps.OUTLINE)
 
 
-def paths(decision: Decision) -> list[np.ndarray]:
+def paths(decision: Decision, half_finger: float) -> list[np.ndarray]:
     """Lines [n, 3] m of a decision: of a grasp the way down and the gap between the tips with the
-    fingers at its ends, of a push its way."""
+    fingers at its ends, of half this width, m; of a push its way."""
     places = np.array([waypoint.position for waypoint in decision.waypoints])
     if decision.primitive == Primitive.PUSH.name.lower():
         return [places[:3]]
     along = np.array([np.cos(decision.yaw), np.sin(decision.yaw), 0.0])
-    across = 0.5e-3 * maps.FINGER * np.array([-along[1], along[0], 0.0])
+    across = half_finger * np.array([-along[1], along[0], 0.0])
     tips = places[1] + 0.5 * decision.width * np.stack([-along, along])
     return [places[:2], tips, *(np.stack([tip - across, tip + across]) for tip in tips)]
 

@@ -20,6 +20,7 @@ from csac_jax.sim import c_physics
 VIEWS: dict[RobotKind, View] = {
     "hand": View(position=(-0.22, -0.5, 0.46), look_at=(0.0, -0.01, 0.05)),
     "ur5": View(position=(-0.85, -1.25, 0.85), look_at=(0.19, 0.0, 0.33)),
+    "ur5e": View(position=(-0.85, -1.25, 0.85), look_at=(0.19, 0.0, 0.33)),
 }
 STOPPED = {
     "action_cap": "stopped at the action limit",

@@ -11,13 +11,13 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from csac_jax import grippers
 from csac_jax.config import Config
-from csac_jax.constants import MAX_OPENING, Primitive
+from csac_jax.constants import Primitive
 
 CHOSEN = "#D55E00"  # palette of Okabe and Ito
 INVALID = "#EBEBEB"  # cells of a Q map with nothing to act on
 TALLEST = 120.0  # mm, the end of the height map's scale
-FINGER = 24.0  # mm, width of a finger as drawn
 OUTLINE = [patheffects.withStroke(linewidth=3.9, foreground="white")]
 
 DPI = 90.0  # beside a scene 480 px high; it grows with the picture
@@ -85,8 +85,9 @@ def draw_action(cfg: Config, axes: Axes, primitive: int, pose: Any) -> None:
         arrow = axes.arrow(*centre, *way, width=5.0, head_width=26.0, length_includes_head=True)
         arrow.set(lw=0.6, label="chosen push", zorder=4, **style)
         return
-    half = 0.5 * MAX_OPENING * along
-    across = 0.5e-3 * FINGER * np.array([-along[1], along[0]])
+    gripper = grippers.load(cfg.sim.gripper)
+    half = gripper.half[1] * along
+    across = gripper.footprint[1] * np.array([-along[1], along[0]])
     tips = np.stack([centre - half, centre + half])
     axes.plot(*tips.T, lw=1.3, label="chosen grasp", **style)
     for tip in tips:

@@ -2,9 +2,6 @@
 
 import copy
 import dataclasses
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,41 +10,17 @@ import numpy as np
 from flax import struct
 from scipy.spatial.transform import Rotation
 
-from csac_jax.config import MESH_KINDS, RobotKind, SceneConfig, SimConfig, SlotKind
+from csac_jax import grippers
+from csac_jax.assets import assets
+from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig, SlotKind
 from csac_jax.errors import SceneError
-from csac_jax.scene import blocks, layout, lint
+from csac_jax.grippers import Gripper
+from csac_jax.scene import blocks, layout, lint, robots
 from csac_jax.scene.blocks import Parts
 from csac_jax.scene.layout import Scene
 
-HAND_GEOMS = ("palm", "pad_low", "pad_high")
 LARGEST = 1.25  # compiled over nominal block size: C culls pairs by the bounds it was compiled with
 HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above the highest drop
-
-
-class RobotPart(NamedTuple):
-    """A MJCF file of a robot, and the elements that it must have."""
-
-    file: str
-    prefix: str  # of its names in the model
-    joints: tuple[str, ...]
-    actuators: tuple[str, ...]  # no others, in the order of set-points
-    geoms: tuple[str, ...] = ()
-    sites: tuple[str, ...] = ()
-    mount: str | None = None  # site of an earlier part that this one is attached to
-
-
-_FINGERS = ("finger_low", "finger_high")
-_FLOAT = ("x", "y", "z", "yaw")
-_ARM = ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3")
-ROBOTS: dict[RobotKind, tuple[RobotPart, ...]] = {
-    "hand": (
-        RobotPart("hand.xml", "hand/", (*_FLOAT, *_FINGERS), (*_FLOAT, "finger"), HAND_GEOMS),
-    ),
-    "ur5": (
-        RobotPart("ur5.xml", "ur5/", _ARM, _ARM, sites=("tip",)),
-        RobotPart("rg2.xml", "hand/", _FINGERS, ("finger",), HAND_GEOMS, mount="ur5/tip"),
-    ),
-}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,44 +35,28 @@ class World:
     block_qpos: np.ndarray  # [N, 7] addresses in qpos: position, quaternion
     block_dofs: np.ndarray  # [N, 6] addresses in qvel
     slot_of_geom: np.ndarray  # [geoms] slot that a geom belongs to, -1 if it is no block's
-    robot_qpos: np.ndarray  # [Q] addresses in qpos, order of ROBOTS; the last two are the fingers
+    robot_qpos: np.ndarray  # [Q] addresses in qpos, the gripper's joints last
+    gripper: Gripper
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
     mesh_scale: float  # size of compiled meshes relative to nominal
 
-
-def assets() -> Path:
-    """Folder of the MJCF files, in a checkout or in an installed package."""
-    package = Path(__file__).resolve().parent.parent
-    for folder in (package.parent / "scenes", package / "_scenes"):
-        if (folder / "table.xml").is_file():
-            return folder
-    raise FileNotFoundError(f"no MJCF files beside {package}; install csac_jax again")
+    @property
+    def finger_qpos(self) -> int:
+        """Address in qpos of the joint that the gripper's opening is read from."""
+        return int(self.robot_qpos[-len(self.gripper.joints)])
 
 
 def _read(file: str) -> mujoco.MjSpec:
     try:
         return mujoco.MjSpec.from_file(str(assets() / file))
     except ValueError as error:
-        raise _one_line(assets() / file, error) from None
-
-
-def _one_line(path: Path, error: ValueError) -> SceneError:
-    return SceneError(f"{path}: {' '.join(str(error).split())}")
-
-
-def _require(file: str, kind: str, required: tuple[str, ...], elements: Iterable[Any]) -> None:
-    """Raises SceneError where an element that the package addresses by name is missing."""
-    present = [element.name for element in elements if element.name]
-    for name in required:
-        if name not in present:
-            has = ", ".join(present) or "none"
-            raise SceneError(f"{assets() / file}: {kind} '{name}' is missing; it has: {has}")
+        raise robots.one_line(assets() / file, error) from None
 
 
 def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
+    gripper = grippers.load(sim.gripper)
     spec = _read("table.xml")
-    for part in ROBOTS[sim.robot]:
-        _add_robot_part(spec, part)
+    robots.add(spec, sim, gripper)
     # Warp's meshes have one size in all scenes.
     _add_block_assets(spec, 1.0 if sim.physics == "warp" else LARGEST)
     for slot, place in enumerate(layout.parking(len(scene.slots))):
@@ -107,7 +64,7 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
         body.add_freejoint(name=f"block{slot}")
         _add_parts(spec, body, scene.slots[slot])
     if sim.physics == "c":  # the others read their contacts instead
-        _add_touch_sensors(spec, len(scene.slots))
+        _add_touch_sensors(spec, gripper, len(scene.slots))
     spec.option.timestep = sim.timestep
     spec.option.iterations = sim.iterations
     spec.option.ls_iterations = sim.line_search
@@ -116,26 +73,10 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     return spec
 
 
-def _add_robot_part(spec: mujoco.MjSpec, part: RobotPart) -> None:
-    robot = _read(part.file)
-    _require(part.file, "joint", part.joints, robot.joints)
-    _require(part.file, "geom", part.geoms, robot.geoms)
-    _require(part.file, "site", part.sites, robot.sites)
-    required, present = ", ".join(part.actuators), ", ".join(a.name for a in robot.actuators)
-    if present != required:
-        raise SceneError(f"{assets() / part.file}: actuators must be {required}, not {present}")
-    # `attach` silently drops an element that refers to a missing one, which this refuses.
-    mujoco.MjModel.from_xml_path(str(assets() / part.file))
-    if part.mount:
-        spec.attach(robot, prefix=part.prefix, site=spec.site(part.mount))
-    else:
-        spec.attach(robot, prefix=part.prefix, frame=spec.worldbody.add_frame())
-
-
 def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
     """The block material and the meshes, at this scale."""
     part = _read("blocks.xml")
-    _require("blocks.xml", "mesh", MESH_KINDS, part.meshes)
+    robots.require(assets() / "blocks.xml", "mesh", MESH_KINDS, part.meshes)
     if part.find_default("block") is None:
         raise SceneError(f"{assets() / 'blocks.xml'}: default class 'block' is missing")
     for mesh in part.meshes:
@@ -143,12 +84,12 @@ def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
     spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
 
 
-def _add_touch_sensors(spec: mujoco.MjSpec, slots: int) -> None:
-    """A sensor [1] of the number of contacts for each of HAND_GEOMS x slots, in that order."""
-    for geom in HAND_GEOMS:
+def _add_touch_sensors(spec: mujoco.MjSpec, gripper: Gripper, slots: int) -> None:
+    """A sensor [1] of the number of contacts for each of palm and pads x slots, in that order."""
+    for geom in robots.hand_geoms(gripper):
         for slot in range(slots):
             sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
-            sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, f"hand/{geom}"
+            sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, geom
             sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, f"block{slot}"
             sensor.intprm[:3] = [1, 0, 1]  # data `found`, no reduction, one contact
 
@@ -174,7 +115,7 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     try:
         model = _spec(scene, sim).compile()
     except ValueError as error:
-        raise _one_line(assets(), error) from None
+        raise robots.one_line(assets(), error) from None
     if sim.physics == "mjx":
         for fault in lint.faults(model):
             raise SceneError(f"MJX {fault}")
@@ -185,7 +126,8 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     slot_of_body = np.full(model.nbody, -1)
     slot_of_body[bodies] = slots
     slot_of_geom = slot_of_body[model.geom_bodyid]
-    joints = [part.prefix + name for part in ROBOTS[sim.robot] for name in part.joints]
+    gripper = grippers.load(sim.gripper)
+    joints = robots.joint_names(sim, gripper)
     return World(
         model=model,
         slots=scene.slots,
@@ -196,7 +138,8 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         block_dofs=model.jnt_dofadr[free_joints][:, None] + np.arange(6),
         slot_of_geom=slot_of_geom,
         robot_qpos=np.array([model.joint(name).qposadr[0] for name in joints]),
-        hand_geoms=np.array([model.geom(f"hand/{name}").id for name in HAND_GEOMS]),
+        gripper=gripper,
+        hand_geoms=np.array([model.geom(name).id for name in robots.hand_geoms(gripper)]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
     )
 

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 from csac_jax import cache_folder
+from csac_jax.assets import assets
 from csac_jax.config import Config, SceneConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import arrange, blocks, layout, model
@@ -68,7 +69,7 @@ def settled(cfg: Config, stream: int, count: int, poured: bool = False) -> Scene
     path = cache and cache / f"{_digest(cfg, scene, stream, count, poured)}.npz"
     if path and (cached := _read(path)) is not None:
         return cached
-    world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand"))
+    world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
     fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
     rng = np.random.default_rng([stream, 20221])
     block_counts = range(scene.min_blocks, len(scene.slots) + 1)
@@ -205,8 +206,8 @@ def _digest(cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bo
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     relevant = (_VERSION, mujoco.__version__, repr(scene), *numbers)
     content = hashlib.sha256(repr((*relevant, "poured") if poured else relevant).encode())
-    for name in ("table.xml", "hand.xml", "blocks.xml"):
-        content.update((model.assets() / name).read_bytes())
+    for name in ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml"):
+        content.update((assets() / name).read_bytes())
     return content.hexdigest()[:32]
 
 

@@ -22,7 +22,7 @@ from mujoco import rollout
 from csac_jax.config import SimConfig
 from csac_jax.scene import layout, model
 from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import HAND_GEOMS, BlockFields, World
+from csac_jax.scene.model import BlockFields, World
 from csac_jax.sim import host_call, outcome
 from csac_jax.sim.outcome import Substep, Trace
 from csac_jax.sim.primitives import JointTrajectory
@@ -42,7 +42,7 @@ class CPhysics:
     _idle: list["Simulator"] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        if self.world.model.nsensordata != len(HAND_GEOMS) * len(self.world.slots):
+        if self.world.model.nsensordata != len(self.world.hand_geoms) * len(self.world.slots):
             raise ValueError("world: it has no touch sensors; build it with sim.physics c")
 
     @functools.cached_property
@@ -109,7 +109,7 @@ class CPhysics:
         moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
         touching = sensed.reshape(seen.touching.shape) > 0.0
         rise = (qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2]).astype(np.float32)
-        gap = (2.0 * qpos[:, world.robot_qpos[-2]]).astype(np.float32)
+        gap = world.gripper.gap(qpos[:, world.finger_qpos]).astype(np.float32)
         return moved, seen.replace(touching=touching, rise=rise, gap=gap)
 
 

@@ -1,11 +1,12 @@
-"""UR5 kinematics in closed form: the pose of the finger tips, and joint angles for a pose.
+"""UR5 and UR5e in closed form: the pose of the finger tips, and joint angles for a pose.
 
-The arm's base frame has the world's axes. The tip frame is that of `scenes/rg2.xml`: between the
-finger tips, z back to the flange, fingers closing along x. Joint angles [6] rad have the maker's
+The arm's base frame is turned by its yaw. The tip frame is the gripper's: between the open finger
+tips, z back to the flange, fingers closing along x. Joint angles [6] rad have the maker's
 order and sense: shoulder pan, shoulder lift, elbow, wrist 1, 2, 3. Sums are written out, since a
 GPU may round matrix products to ten bits.
 """
 
+import functools
 import itertools
 from typing import NamedTuple
 
@@ -13,12 +14,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from csac_jax import grippers
+from csac_jax.config import SimConfig
 from csac_jax.geometry import FULL_TURN
 
-# The maker's Denavit-Hartenberg parameters, m (Universal Robots, UR5 of series 3).
-D1, A2, A3, D4, D5, D6 = 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823
-BASE = (0.6, 0.0, 0.35)  # m, ours: see scenes/README.md
-TOOL = 0.213  # m, flange to finger tips: mean of the RG2 open and closed, see scenes/README.md
+
+class Geometry(NamedTuple):
+    """An arm by its maker, m: Denavit-Hartenberg parameters, and what surrounds the links."""
+
+    d1: float
+    a2: float
+    a3: float
+    d4: float
+    d5: float
+    d6: float
+    shoulder_offset: float  # along `side`, of the upper arm's middle
+    forearm_offset: float  # and of the forearm's
+    radii: tuple[float, ...]  # of the capsules along `_chain`, pedestal to wrist 2
+
+
+_RADII = (0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045)  # of both (ur_description)
+MAKERS = {  # sources: scenes/README.md
+    "ur5": Geometry(0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165, _RADII),
+    "ur5e": Geometry(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007, _RADII),
+}
+
+
+class Arm(NamedTuple):
+    """An arm where it stands, with its gripper."""
+
+    links: Geometry
+    base: tuple[float, float, float, float]  # x, y, z m and yaw rad
+    tool: float  # m, flange to tip frame
+    body_radius: float  # m, of the capsule about wrist 3 and the gripper's body
+    hand_capsule: tuple[float, float, float]  # m, about the open hand: back from the tips, radius
+
+
+def arm(cfg: SimConfig) -> Arm:
+    """The arm of a config, with its gripper."""
+    gripper = grippers.load(cfg.gripper)
+    tool = cfg.adapter + gripper.depth[1]
+    return Arm(MAKERS[cfg.robot], cfg.base, tool, gripper.body_radius, gripper.hand_capsule)
+
+
 LIMITS = np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0], np.float32)  # rad, either way
 # rad, ours: tips 0.2 m above the centre
 HOME = np.array([-0.183, -0.976, 1.832, -2.426, -1.571, 1.388], np.float32)
@@ -43,12 +81,14 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.sum(a * b, axis=-1)
 
 
-def _frames(q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array, jax.Array]:
+def _frames(arm: Arm, q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array, jax.Array]:
     """The arm at the joint angles `q` [6], by the maker's parameters, world frame.
 
     Returns: shoulder, elbow and wrists 1, 2, 3, [3] m each; the axis of joints 2 to 4 [3]; the x
     axis of the tip frame [3]; the axis of joint 6 [3], from the flange to the tips.
     """
+    links, (*base, yaw) = arm.links, arm.base
+    q = q.at[0].add(yaw)
     cos, sin = jnp.cos(q), jnp.sin(q)
     ahead, side = jnp.array([cos[0], sin[0], 0.0]), jnp.array([sin[0], -cos[0], 0.0])
     up = jnp.array([0.0, 0.0, 1.0])
@@ -56,23 +96,23 @@ def _frames(q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array, jax.Ar
     def along(angle):
         return jnp.cos(angle) * ahead + jnp.sin(angle) * up
 
-    shoulder = jnp.array(BASE) + D1 * up
-    elbow = shoulder + A2 * along(q[1])
-    wrist1 = elbow + A3 * along(q[1] + q[2])
+    shoulder = jnp.array(base) + links.d1 * up
+    elbow = shoulder + links.a2 * along(q[1])
+    wrist1 = elbow + links.a3 * along(q[1] + q[2])
     bend = q[1] + q[2] + q[3]
     x4, z4 = along(bend), jnp.sin(bend) * ahead - jnp.cos(bend) * up
-    wrist2 = wrist1 + D4 * side
-    wrist3 = wrist2 + D5 * z4
+    wrist2 = wrist1 + links.d4 * side
+    wrist3 = wrist2 + links.d5 * z4
     closing = cos[5] * (cos[4] * x4 + sin[4] * side) - sin[5] * z4
     down = cos[4] * side - sin[4] * x4
     return [shoulder, elbow, wrist1, wrist2, wrist3], side, closing, down
 
 
-def forward(q: jax.Array) -> Pose:
+def forward(arm: Arm, q: jax.Array) -> Pose:
     """Pose of the finger tips at the joint angles `q` [6] rad."""
-    (*_, wrist3), _, closing, down = _frames(q)
+    (*_, wrist3), _, closing, down = _frames(arm, q)
     columns = (closing, jnp.cross(closing, down), -down)
-    return Pose(wrist3 + (D6 + TOOL) * down, jnp.stack(columns, axis=1))
+    return Pose(wrist3 + (arm.links.d6 + arm.tool) * down, jnp.stack(columns, axis=1))
 
 
 def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
@@ -81,7 +121,7 @@ def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
     return Pose(xyz, jnp.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]))
 
 
-def inverse(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
+def inverse(arm: Arm, position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Joint angles of all eight branches to a pose of the tips, in closed form.
 
     After Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
@@ -96,15 +136,19 @@ def inverse(position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Ar
     unit = jnp.all(jnp.abs(jnp.sum(rotation**2, axis=0) - 1.0) < 0.01)
     sane = jnp.all(jnp.abs(position) < _FAR) & unit  # False for NaN
     position, rotation = jnp.where(sane, position, 0.0), jnp.where(sane, rotation, jnp.eye(3))
-    joints, valid = jax.vmap(_branch, (None, None, 0))(position, rotation, jnp.asarray(BRANCHES))
+    branch = functools.partial(_branch, arm)
+    joints, valid = jax.vmap(branch, (None, None, 0))(position, rotation, jnp.asarray(BRANCHES))
     return joints, valid & sane
 
 
-def _branch(position: jax.Array, rotation: jax.Array, signs: jax.Array) -> tuple[jax.Array, ...]:
+def _branch(
+    arm: Arm, position: jax.Array, rotation: jax.Array, signs: jax.Array
+) -> tuple[jax.Array, ...]:
     """Joint angles [6] of the branch of these `signs` [3], and whether they count [] bool."""
+    links, (*base, yaw) = arm.links, arm.base
     x6, y6, down = rotation[:, 0], -rotation[:, 1], -rotation[:, 2]
-    from_base = position - jnp.array(BASE) - (D6 + TOOL) * down  # wrist 3
-    pan, shoulder_ok = _shoulder(from_base[:2], signs[0])
+    from_base = position - jnp.array(base) - (links.d6 + arm.tool) * down  # wrist 3
+    pan, shoulder_ok = _shoulder(links, from_base[:2], signs[0])
     cos, sin = jnp.cos(pan), jnp.sin(pan)
     ahead, side = jnp.array([cos, sin, 0.0]), jnp.array([sin, -cos, 0.0])
 
@@ -114,18 +158,19 @@ def _branch(position: jax.Array, rotation: jax.Array, signs: jax.Array) -> tuple
     z4 = -jnp.sin(wrist3) * x6 - jnp.cos(wrist3) * y6
     bend = jnp.arctan2(x4[2], _dot(x4, ahead))
 
-    wrist1 = from_base - D5 * z4 - D4 * side
-    lift, elbow, elbow_ok = _elbow(_dot(wrist1, ahead), wrist1[2] - D1, signs[1])
-    q = jnp.stack([pan, lift, elbow, bend - lift - elbow, wrist2, wrist3])
+    wrist1 = from_base - links.d5 * z4 - links.d4 * side
+    place = _dot(wrist1, ahead), wrist1[2] - links.d1
+    lift, elbow, elbow_ok = _elbow(links, *place, signs[1])
+    q = jnp.stack([pan - yaw, lift, elbow, bend - lift - elbow, wrist2, wrist3])
     return q - FULL_TURN * jnp.round(q / FULL_TURN), shoulder_ok & elbow_ok & wrist_ok
 
 
-def _shoulder(xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Shoulder pan [] that puts wrist 3 at `xy` [2] m from the base, D4 beside the arm's plane."""
-    square = _dot(xy, xy)
-    ok = square - D4**2 > SINGULAR**2 * square
+def _shoulder(links: Geometry, xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Shoulder pan [] that puts wrist 3 at `xy` [2] m from the base, d4 beside the arm's plane."""
+    d4, square = links.d4, _dot(xy, xy)
+    ok = square - d4**2 > SINGULAR**2 * square
     xy, square = jnp.where(ok, xy, jnp.array([1.0, 0.0])), jnp.where(ok, square, 1.0)
-    towards, offset = jnp.arctan2(xy[1], xy[0]), jnp.arctan2(jnp.sqrt(square - D4**2), D4)
+    towards, offset = jnp.arctan2(xy[1], xy[0]), jnp.arctan2(jnp.sqrt(square - d4**2), d4)
     return towards + 0.5 * np.pi + sign * offset, ok
 
 
@@ -137,45 +182,43 @@ def _wrist(x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array) -> tuple[j
     return jnp.arctan2(sign * jnp.sqrt(square), z), jnp.arctan2(-sign * y, sign * x), ok
 
 
-def _elbow(ahead: jax.Array, up: jax.Array, sign: jax.Array) -> tuple[jax.Array, ...]:
+def _elbow(
+    links: Geometry, ahead: jax.Array, up: jax.Array, sign: jax.Array
+) -> tuple[jax.Array, ...]:
     """Shoulder lift and elbow [] that put wrist 1 `ahead` and `up` [] m from the shoulder.
 
     With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3),
     cos^2(q3 / 2) = (r^2 - (a2 - a3)^2) / (4 a2 a3).
     """
-    square = ahead**2 + up**2
-    sin2 = ((A2 + A3) ** 2 - square) / (4.0 * A2 * A3)
-    cos2 = (square - (A2 - A3) ** 2) / (4.0 * A2 * A3)
+    a2, a3, square = links.a2, links.a3, ahead**2 + up**2
+    sin2 = ((a2 + a3) ** 2 - square) / (4.0 * a2 * a3)
+    cos2 = (square - (a2 - a3) ** 2) / (4.0 * a2 * a3)
     ok = jnp.minimum(sin2, cos2) > (0.5 * SINGULAR) ** 2
     ahead, up = jnp.where(ok, ahead, 0.5), jnp.where(ok, up, 0.0)
     sin2, cos2 = jnp.where(ok, sin2, 0.5), jnp.where(ok, cos2, 0.5)
     sin, cos = sign * 2.0 * jnp.sqrt(sin2 * cos2), cos2 - sin2
-    lift = jnp.arctan2(up, ahead) - jnp.arctan2(A3 * sin, A2 + A3 * cos)
+    lift = jnp.arctan2(up, ahead) - jnp.arctan2(a3 * sin, a2 + a3 * cos)
     return lift, 2.0 * sign * jnp.arctan2(jnp.sqrt(sin2), jnp.sqrt(cos2)), ok
 
 
-# m along `side`, of the links' middles (ur_description).
-_SHOULDER_OFFSET, _FOREARM_OFFSET = 0.13585, 0.0165
-_PALM, _FINGERS = 0.115, 0.07  # m from the tips back to the ends of the gripper's two capsules
-# m, of the capsules along _chain
-_RADII = np.array([0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045, 0.045, 0.07], np.float32)
 # Capsules that could meet: i and any from `first` on. The shape of the links rules out all others.
 _PAIRS = np.array([(i, j) for i, first in enumerate((3, 4, 5, 7, 7)) for j in range(first, 9)])
 _ABOVE_TABLE = slice(2, 8)  # not the hand, whose height is the planner's choice
 
 
-def _chain(q: jax.Array) -> jax.Array:
+def _chain(arm: Arm, q: jax.Array) -> jax.Array:
     """Points [10, 3] m along the arm; the capsules about it run from each to the next.
 
     They are pedestal, shoulder, upper arm, elbow, forearm, wrist 1, wrist 2, wrist 3 with the
-    gripper's body, and open fingers. All but the last two are geoms of `scenes/ur5.xml`.
+    gripper's body, and open fingers. All but the last two are geoms of the arm's MJCF.
     """
-    (shoulder, elbow, wrist1, wrist2, wrist3), side, _, down = _frames(q)
-    foot = jnp.array([BASE[0], BASE[1], 0.0])
-    outer, inner = _SHOULDER_OFFSET * side, _FOREARM_OFFSET * side
-    palm, tips = (wrist3 + (D6 + TOOL - back) * down for back in (_PALM, _FINGERS))
-    arm = [foot, shoulder, shoulder + outer, elbow + outer, elbow + inner, wrist1 + inner]
-    return jnp.stack([*arm, wrist2, wrist3, palm, tips])
+    links, (near, far, _) = arm.links, arm.hand_capsule
+    (shoulder, elbow, wrist1, wrist2, wrist3), side, _, down = _frames(arm, q)
+    foot = jnp.array([arm.base[0], arm.base[1], 0.0])
+    outer, inner = links.shoulder_offset * side, links.forearm_offset * side
+    palm, tips = (wrist3 + (links.d6 + arm.tool - back) * down for back in (near, far))
+    points = [foot, shoulder, shoulder + outer, elbow + outer, elbow + inner, wrist1 + inner]
+    return jnp.stack([*points, wrist2, wrist3, palm, tips])
 
 
 def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array) -> jax.Array:
@@ -195,45 +238,53 @@ def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array
     return jnp.sqrt(jnp.maximum(_dot(gap, gap), 1e-12))
 
 
-def clearance(q: jax.Array) -> tuple[jax.Array, jax.Array]:
+def clearance(arm: Arm, q: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Least distance [] m at the joint angles `q` [6] rad from arm to table, and between links.
 
     The links are capsules, the fingers may touch the table. Negative: they overlap.
     """
-    chain = _chain(q)
+    chain = _chain(arm, q)
+    radii = np.array([*arm.links.radii, arm.body_radius, arm.hand_capsule[2]], np.float32)
     start, end = chain[:-1], chain[1:]
-    above = jnp.minimum(start[:, 2], end[:, 2]) - _RADII
+    above = jnp.minimum(start[:, 2], end[:, 2]) - radii
     first, second = _PAIRS.T
     axes = jax.vmap(_segment_distance)(start[first], end[first], start[second], end[second])
-    between = axes - (_RADII[first] + _RADII[second])
+    between = axes - (radii[first] + radii[second])
     return jnp.min(above[_ABOVE_TABLE]), jnp.min(between)
 
 
-def clear(q: jax.Array) -> jax.Array:
+def clear(arm: Arm, q: jax.Array) -> jax.Array:
     """True where the arm at the joint angles `q` [6] rad avoids the table and itself, [] bool."""
-    to_table, between_links = clearance(q)
+    to_table, between_links = clearance(arm, q)
     return (to_table > _TABLE_CLEARANCE) & (between_links > _LINK_CLEARANCE)
 
 
-def joint_targets(q_start: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
+def joint_targets(arm: Arm, q_start: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Joint targets that lead the tips through set-points, all on one branch.
 
     It is the branch that reaches the most set-points; of several, the one with the least motion
     from `q_start` on. The only jump is the one from `q_start`. The arm stops for good at the first
     set-point that the branch does not reach, or reaches only through the table or itself.
 
-    Args: q_start [6] rad; control [T, 5] as in `primitives.Plan`.
-    Returns: [T, 7], six joint angles rad and half the opening m; [] bool, True if the branch
-    reaches every set-point.
+    Args: q_start [6] rad; control [T, 4 or more] as in `primitives.Plan`, for the tip frame.
+    Returns: joint angles [T, 6] rad; [] bool, True if the branch reaches every set-point.
     """
     poses = jax.vmap(top_down)(control[:, :3], control[:, 3])
-    solutions, valid = jax.vmap(inverse)(*poses)  # [T, 8, 6], [T, 8]
-    valid = valid & jax.vmap(jax.vmap(clear))(solutions)
+    solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)  # [T, 8, 6], [T, 8]
+    valid = valid & jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
     joints, good, motion = jax.vmap(_follow, (None, 1, 1))(q_start, solutions, valid)  # by branch
     reached = jnp.sum(good, axis=1)
     branch = jnp.argmin(jnp.where(reached == jnp.max(reached), motion, jnp.inf))
-    target = jnp.concatenate([joints[branch], control[:, 4:]], axis=1)
-    return target, jnp.all(good[branch])
+    return joints[branch], jnp.all(good[branch])
+
+
+def reaches(arm: Arm, tips: jax.Array, yaw: jax.Array) -> jax.Array:
+    """Whether one branch leads to all places `tips` [T, 3] m of a hand that points down at `yaw` []
+    rad, and the arm is clear at each of them, [] bool. It says nothing of the way between them."""
+    poses = jax.vmap(top_down, (0, None))(tips, yaw)
+    solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)  # [T, 8, 6], [T, 8]
+    clear_at = jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
+    return jnp.any(jnp.all(valid & clear_at, axis=0))
 
 
 def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, ...]:

@@ -35,7 +35,7 @@ class MjxPhysics:
             data = _restrain(world, ~scene.in_play, initial, data)
             touching, overflow = _touch(world, data)
             rise = data.qpos[world.block_qpos[:, 2]] - scene.position[:, 2]
-            gap = 2.0 * data.qpos[world.robot_qpos[-2]]
+            gap = world.gripper.gap(data.qpos[world.finger_qpos], jnp)
             return data, Substep(touching, rise, gap, overflow)
 
         with jax.default_matmul_precision("highest"):
@@ -97,7 +97,7 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
 
 
 def _touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """Which of HAND_GEOMS touches which block, [3, N] bool, and whether contacts may be missing,
+    """Which of palm and pads touches which block, [3, N] bool, and whether contacts may be missing,
     [] bool: once all slots are in use."""
     active, pair = data._impl.contact.dist < 0.0, data._impl.contact.geom  # [C], [C, 2]
     is_pad = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1)

@@ -22,7 +22,7 @@ class Substep:
 
     touching: jax.Array  # [3, N] bool, palm, low pad and high pad against each block
     rise: jax.Array  # [N] m, height gained since the primitive began
-    gap: jax.Array  # [] m, between the fingers
+    gap: jax.Array  # [] m, between the fingers, beyond that of the closed hand
     contact_overflow: jax.Array  # [] bool, contacts may be missing
 
 

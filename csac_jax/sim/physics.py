@@ -51,12 +51,18 @@ def execute(
     Args: height [H, W] m, the map the action was chosen from.
     """
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
-    joints = primitives.joint_trajectory(cfg.sim.robot, plan)
+    joints = primitives.joint_trajectory(cfg.sim, plan)
     after, trace = physics.run(scene, joints)
     unmoved = layout.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
     choose = functools.partial(jnp.where, joints.reachable)
     after, trace = jax.tree.map(choose, (after, trace), unmoved)
     return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
+
+
+def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
+    """Whether the robot can follow the whole of a primitive, as `execute` decides, [] bool."""
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+    return primitives.joint_trajectory(cfg.sim, plan).reachable
 
 
 def healthy(scene: Scene) -> jax.Array:

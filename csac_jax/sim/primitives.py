@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from csac_jax import geometry
-from csac_jax.config import HeightmapConfig, RobotKind, SimConfig
-from csac_jax.constants import MAX_OPENING, Primitive
+from csac_jax import geometry, grippers
+from csac_jax.config import HeightmapConfig, SimConfig
+from csac_jax.constants import Primitive
+from csac_jax.grippers import Gripper
 from csac_jax.sim import kinematics
 
-HAND_RADIUS = 0.09  # m, circle about the tool axis that holds the open hand
+BLOCK = 0.05  # m, height of a common block
 START_GAP = 0.01  # m, between the open hand's tips and what lies under them at the start
 
 
@@ -70,22 +71,51 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
     """
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
-    surface = local_top(heightmap, height, xy, cfg.window)
-    low = jnp.maximum(surface - jnp.where(is_grasp, cfg.grasp_depth, cfg.push_depth), cfg.clearance)
-    around = local_top(heightmap, height, xy, 2.0 * HAND_RADIUS)
+    gripper = grippers.load(cfg.gripper)
+    surface = local_top(heightmap, height, xy, gripper.finger[1])
+    depth = jnp.where(is_grasp, grasp_depth(cfg, gripper), cfg.push_depth)
+    low = jnp.maximum(surface - depth, gripper.clearance)
+    around = local_top(heightmap, height, xy, 2.0 * gripper.radius)
     high = jnp.maximum(low + cfg.approach, around + START_GAP)
-    direction = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
-    limit = 0.5 * heightmap.extent
-    end = jnp.where(is_grasp, xy, jnp.clip(xy + cfg.push_length * direction, -limit, limit))
-    opening = jnp.where(is_grasp, 0.5 * MAX_OPENING, 0.0)
+    end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
+    closed, opened = gripper.half
+    opening = jnp.where(is_grasp, opened, closed)
 
     phases = jnp.where(is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases))
     descend, act, lift = phases  # [T] each
     z = high + (low - high) * descend + (high - low) * lift
     place = xy[None] + act[:, None] * (end - xy)[None]
-    fingers = opening * (1.0 - jnp.minimum(1.3 * act, 1.0))  # closed before the lift begins
+    fingers = closed + (opening - closed) * (1.0 - jnp.minimum(1.3 * act, 1.0))  # before the lift
     control = jnp.column_stack([place, z, jnp.full_like(z, yaw), fingers])
     return Plan(control=control, start=jnp.hstack([xy, high, yaw, opening]), surface=surface)
+
+
+def reachable(
+    cfg: SimConfig, heightmap: HeightmapConfig, primitive: jax.Array, xy: jax.Array, yaw: jax.Array
+) -> jax.Array:
+    """Whether the robot reaches where a primitive [] at `xy` [2] m begins and ends, [] bool.
+
+    It is asked before anything is known of the height: at the lowest, and over a block.
+    """
+    if cfg.robot == "hand":
+        return jnp.ones((), bool)
+    low, is_push = grippers.load(cfg.gripper).clearance, primitive == Primitive.PUSH
+    ends = xy, jnp.where(is_push, _push_end(cfg, heightmap, xy, yaw), xy)
+    tips = [jnp.append(end, z) for end in ends for z in (low, low + cfg.approach + BLOCK)]
+    return kinematics.reaches(kinematics.arm(cfg), jnp.stack(tips), yaw)
+
+
+def _push_end(
+    cfg: SimConfig, heightmap: HeightmapConfig, xy: jax.Array, yaw: jax.Array
+) -> jax.Array:
+    """Where a push from `xy` [2] m ends, [2] m."""
+    direction, limit = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]), 0.5 * heightmap.extent
+    return jnp.clip(xy + cfg.push_length * direction, -limit, limit)
+
+
+def grasp_depth(cfg: SimConfig, gripper: Gripper) -> float:
+    """How far the tips go below the surface that they grasp, m; no palm comes down on it."""
+    return min(cfg.grasp_depth, gripper.deepest)
 
 
 def _progress(phases: tuple[int, int, int]) -> np.ndarray:
@@ -100,11 +130,22 @@ def _progress(phases: tuple[int, int, int]) -> np.ndarray:
     return linear.astype(np.float32)
 
 
-def joint_trajectory(kind: RobotKind, plan: Plan) -> JointTrajectory:
-    """How a robot's joints follow a plan: the floating hand as it is, the arm by its inverse."""
-    if kind == "hand":
-        start, reachable = jnp.append(plan.start, plan.start[4]), jnp.ones((), bool)
-        return JointTrajectory(start, plan.control, reachable)
+def joint_trajectory(cfg: SimConfig, plan: Plan) -> JointTrajectory:
+    """How a robot's joints follow a plan: the floating hand as it is, an arm by its inverse.
+
+    The robot moves the tip frame of the open hand. Where the tips go lower as they close, on an
+    arc, the hand goes up by as much, so that the tips stay where the plan has them.
+    """
+    gripper = grippers.load(cfg.gripper)
     control = jnp.concatenate([plan.start[None], plan.control])
-    target, reachable = kinematics.joint_targets(jnp.asarray(kinematics.HOME), control)
-    return JointTrajectory(jnp.append(target[0], target[0, 6]), target[1:], reachable)
+    half = control[:, 4]
+    control = control.at[:, 2].add(gripper.drop(half, jnp))
+    start = jnp.stack(gripper.joint_positions(half[0], jnp))
+    set_point = gripper.set_point(half[1:], jnp)[:, None]
+    if cfg.robot == "hand":
+        moved, reachable = control[:, :4], jnp.ones((), bool)
+    else:
+        arm, home = kinematics.arm(cfg), jnp.asarray(kinematics.HOME)
+        moved, reachable = kinematics.joint_targets(arm, home, control)
+    targets = jnp.concatenate([moved[1:], set_point], axis=1)
+    return JointTrajectory(jnp.concatenate([moved[0], start]), targets, reachable)

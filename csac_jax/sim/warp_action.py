@@ -48,7 +48,7 @@ _COMMAND = {
     "control": wp.array3d[float],  # [E, T, nu]
     "in_play": wp.array2d[wp.bool],  # [E, N]
 }
-_TRACE = {  # leaves of `outcome.Trace`
+_TRACE = {  # leaves of `outcome.Trace`; gaps are positions of the finger's joint
     "touched": wp.array[wp.bool],
     "held_rise": wp.array2d[float],
     "held": wp.array2d[wp.bool],
@@ -83,7 +83,7 @@ def _mark_touch(
     distance: wp.array[float],
     margin: wp.array[float],
     slot_of_geom: wp.array[int],  # [G], -1: no block
-    part_of_geom: wp.array[int],  # [G] row of HAND_GEOMS, -1: not of the hand
+    part_of_geom: wp.array[int],  # [G] 0 palm, 1 and 2 pads, -1: not of the hand
     touching: wp.array3d[int],  # [E, 3, N]
 ):
     """Which part of the hand touches which block, from the contacts of the last step."""
@@ -131,7 +131,7 @@ def _observe(
     gap_end: wp.array[float],
     contact_overflow: wp.array[float],
 ):
-    """Holds parked blocks, limits speeds, extends the trace (`outcome.Trace`)."""
+    """Holds parked blocks, limits speeds, extends the trace (see _TRACE)."""
     scene, slot = wp.tid()
     first = position[slot]
     dof = velocity[slot]
@@ -159,10 +159,9 @@ def _observe(
         touching[scene, part, slot] = 0
 
     if slot == 0:
-        gap = 2.0 * qpos[scene, finger]
         if done[scene] == closed_after:
-            gap_closed[scene] = gap
-        gap_end[scene] = gap
+            gap_closed[scene] = qpos[scene, finger]
+        gap_end[scene] = qpos[scene, finger]
         if (overflow[scene] & lost_contacts) != 0:
             contact_overflow[scene] = contact_overflow[scene] + 1.0
         overflow[scene] = 0
@@ -183,7 +182,7 @@ class Batch:
         self._constants = [
             sum(cfg.grasp_phases[:2]),
             _LOST_CONTACTS,
-            int(world.robot_qpos[-2]),
+            world.finger_qpos,
             wp.array(world.block_qpos[:, 0], dtype=int),
             wp.array(world.block_dofs[:, 0], dtype=int),
             wp.array(layout.SPEED_LIMIT, dtype=float),

@@ -42,6 +42,8 @@ class WarpPhysics:
         inputs |= {"control": joints.control, "in_play": scene.in_play}
         results = self._simulate(jax.tree.map(lambda leaf: leaf[None], inputs))
         results = jax.tree.map(lambda leaf: leaf[0], results)
+        for name in ("gap_closed", "gap_end"):
+            results[name] = world.gripper.gap(results[name], jnp)
         # XLA runs a call twice on a GPU if a scan stores one of its results unchanged.
         results["contact_overflow"] = results["contact_overflow"].astype(jnp.int32)
         pose, velocity = results.pop("qpos")[world.block_qpos], results.pop("qvel")

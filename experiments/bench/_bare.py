@@ -25,7 +25,7 @@ def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> Joint
 
     def joints(height: jax.Array, action: Action) -> JointTrajectory:
         plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
-        return primitives.joint_trajectory(cfg.sim.robot, plan)
+        return primitives.joint_trajectory(cfg.sim, plan)
 
     return jax.jit(jax.vmap(joints))(height, actions)
 

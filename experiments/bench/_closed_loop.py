@@ -92,7 +92,7 @@ def set_points(cfg: SimConfig, decision: Decision) -> np.ndarray:
 def act(env: Env, scene: Scene, control: jax.Array, is_grasp: jax.Array) -> Step:
     """Moves the robot along set-points [1 + T, 5]; blocks lifted or lost are taken away."""
     plan = Plan(control[1:], control[0], jnp.float32(1.0))
-    joints = primitives.joint_trajectory(env.cfg.sim.robot, plan)
+    joints = primitives.joint_trajectory(env.cfg.sim, plan)
     after, trace = env.physics.run(scene, joints)
     rise = plan.start[2] - jnp.min(plan.control[:, 2])
     lifted = outcome.lifted_blocks(trace, rise) & is_grasp

@@ -54,9 +54,7 @@ def record(bench: Bench, count: int) -> list[State]:
     plan = jax.jit(jax.vmap(lambda h, a: primitives.plan(cfg.sim, cfg.heightmap, h, a)))(
         height, action
     )
-    joints = jax.device_get(
-        jax.vmap(lambda one: primitives.joint_trajectory(cfg.sim.robot, one))(plan)
-    )
+    joints = jax.device_get(jax.vmap(lambda one: primitives.joint_trajectory(cfg.sim, one))(plan))
     fields = jax.device_get(
         jax.jit(jax.vmap(lambda scene: model.scene_fields(world, scene)))(scenes)
     )

@@ -194,6 +194,7 @@ def _episodes(lifted: int) -> metrics.Episodes:
         blocks_lost=0 * ones[:, 0],
         changed=ones > 0,
         wrong=ones < 0,
+        unreachable=ones < 0,
         blocks=ones[:, 0],
         completed=done,
         ending=np.where(done, 0, 1),

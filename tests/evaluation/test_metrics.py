@@ -70,6 +70,7 @@ def _episodes() -> Episodes:
         blocks_lost=np.array([0, 1, 0], np.int32),
         changed=np.array([[0, 1, 1, 1], [0, 1, 0, 0], [0, 0, 0, 0]], bool),
         wrong=np.array([[1, 0, 0, 1], [0, 0, 1, 1], [0, 0, 1, 0]], bool),
+        unreachable=np.array([[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]], bool),
         ending=np.array([0, 0, 1], np.int32),
     )
 
@@ -100,8 +101,7 @@ def test_summary_by_hand():
 
 
 def test_failures_by_hand():
-    """Claim: every cause of failure is what its definition says, worked out by hand; no action has
-    two."""
+    """Claim: every cause of failure is what its definition says, worked out by hand."""
     got = metrics.summarise(_episodes())["failures"]
     assert {name: (entry["value"] * entry["n"], entry["n"]) for name, entry in got.items()} == {
         "grasp_nothing": (1, 7),
@@ -110,6 +110,7 @@ def test_failures_by_hand():
         "grasp_dropped": (1, 7),
         "grasp_wrong_block": (1, 7),
         "push_no_change": (2, 2),
+        "action_unreachable": (2, 9),
         "block_lost": (1, 6),
         "episode_action_cap": (1, 3),
         "episode_no_change_cap": (0, 3),

@@ -10,11 +10,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from csac_jax import presets
-from csac_jax.constants import MAX_OPENING, Primitive
+from csac_jax import grippers, presets
+from csac_jax.constants import Primitive
 from csac_jax.render import maps, panels
 
 CFG = presets.smoke()
+RG2 = grippers.load("rg2")
 SIZE = CFG.heightmap.size
 HEIGHT = 480  # px
 HIGHEST = to_hex(colormaps["viridis"](1.0))
@@ -78,8 +79,8 @@ def test_height_map_and_grasp_lie_where_they_are():
     hand = _places(fig, "Height map", maps.CHOSEN)
     np.testing.assert_allclose(hand.mean(axis=0), [-0.1, 0.05], atol=0.003)
     width, height = np.ptp(hand, axis=0)
-    assert width == pytest.approx(MAX_OPENING, abs=0.01)
-    assert height == pytest.approx(1e-3 * maps.FINGER, abs=0.01)
+    assert width == pytest.approx(RG2.opening[1], abs=0.01)
+    assert height == pytest.approx(2.0 * RG2.footprint[1], abs=0.01)
 
 
 def test_push_is_an_arrow_over_its_way():

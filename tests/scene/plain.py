@@ -4,9 +4,10 @@ import itertools
 
 import numpy as np
 
+from csac_jax import grippers
 from csac_jax.config import SimConfig
-from csac_jax.constants import MAX_OPENING
-from csac_jax.sim.oracle import FINGER_HALF, PAD_HALF_WIDTH, YAWS
+from csac_jax.grippers import Gripper
+from csac_jax.sim.oracle import OPENING_ROOM, YAWS
 
 PARALLEL = 0.1  # rad, of a closing direction to the normals of two faces
 
@@ -21,14 +22,16 @@ def open_grasps(
     their bounding boxes. A closing finger is a grid of points at the height of the grasp.
     """
     top = position[:, 2] + half[:, 2]
-    tip = np.maximum(top - sim.grasp_depth, sim.clearance) + 0.002
+    gripper = grippers.load(sim.gripper)
+    tip = np.maximum(top - sim.grasp_depth, gripper.clearance) + 0.002
+    widest = gripper.opening[1] - OPENING_ROOM
     found, angle = np.zeros((len(half), YAWS), bool), np.arange(YAWS) * np.pi / YAWS
     for i in range(len(half)):
         off = (angle - yaw[i] + 0.25 * np.pi) % (0.5 * np.pi) - 0.25 * np.pi
         across = np.round((angle - yaw[i] - off) / (0.5 * np.pi)).astype(int) % 2  # x or y
         face = half[i, across]
-        fits = np.flatnonzero((np.abs(off) <= PARALLEL) & (2.0 * face <= MAX_OPENING - 0.02))
-        fingers = [position[i, :2] + _fingers(face[j]) @ _turn(angle[j]).T for j in fits]
+        fits = np.flatnonzero((np.abs(off) <= PARALLEL) & (2.0 * face <= widest))
+        fingers = [position[i, :2] + _fingers(gripper, face[j]) @ _turn(angle[j]).T for j in fits]
         points = np.reshape(fingers, (-1, 120, 2))
         blocked = np.zeros(len(fits), bool)
         for k in np.flatnonzero((top > tip[i]) & (np.arange(len(half)) != i)):
@@ -38,11 +41,12 @@ def open_grasps(
     return found
 
 
-def _fingers(face: float) -> np.ndarray:
+def _fingers(gripper: Gripper, face: float) -> np.ndarray:
     """Points [120, 2] m where fingers that close along x on faces at +-`face` m go."""
-    outside = 0.5 * MAX_OPENING + PAD_HALF_WIDTH + FINGER_HALF[0]
+    thickness, width = gripper.footprint
+    outside = gripper.half[1] + 0.5 * gripper.finger[0] + thickness
     along = np.linspace(face + 0.0005, outside, 12)
-    x, y = np.meshgrid([*-along, *along], np.linspace(-1.0, 1.0, 5) * FINGER_HALF[1])
+    x, y = np.meshgrid([*-along, *along], np.linspace(-1.0, 1.0, 5) * width)
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 

@@ -4,12 +4,14 @@ there."""
 import importlib
 import inspect
 import itertools
+import typing
 from typing import Any
 
 import mujoco
 import pytest
 
-from csac_jax.config import Config, SimConfig
+from csac_jax import grippers
+from csac_jax.config import Config, RobotKind, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import lint, model
 from csac_jax.sim.quiet_mjx import mjx
@@ -197,10 +199,12 @@ def test_what_mjx_takes_is_not_refused(parts: dict[str, str]):
     mjx.put_model(built, impl="jax")
 
 
-def test_worlds_of_both_robots_pass():
+@pytest.mark.parametrize("robot", typing.get_args(RobotKind))
+@pytest.mark.parametrize("gripper", grippers.shipped())
+def test_worlds_of_all_robots_pass(robot: RobotKind, gripper: str):
     """Claim: the shipped MJCF has nothing that MJX ignores."""
-    for robot in ("hand", "ur5"):
-        assert list(lint.faults(model.build(Config().scene, SimConfig(robot=robot)).model)) == []
+    sim = SimConfig(robot=robot, gripper=gripper)
+    assert list(lint.faults(model.build(Config().scene, sim).model)) == []
 
 
 def test_build_runs_the_linter(monkeypatch: pytest.MonkeyPatch):

@@ -175,7 +175,7 @@ def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]
     engine = c_physics.CPhysics(c_world, CONFIG.sim)
 
     def one(scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
-        return engine.run(scene, primitives.joint_trajectory("hand", plan))
+        return engine.run(scene, primitives.joint_trajectory(CONFIG.sim, plan))
 
     run = jax.jit(jax.vmap(one))
     after, trace = jax.tree.map(np.asarray, run(grasped.scene, grasped.plan))

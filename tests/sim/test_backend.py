@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from csac_jax import presets
-from csac_jax.config import Config, PhysicsKind, RobotKind
+from csac_jax import grippers, presets
+from csac_jax.config import Config, PhysicsKind, RobotKind, SceneConfig
 from csac_jax.scene import model
-from csac_jax.sim import backend, physics, primitives
+from csac_jax.sim import backend, kinematics, physics, primitives
 from csac_jax.sim.primitives import Action
 
 
@@ -81,22 +81,24 @@ def test_auto_is_no_engine():
 
 
 def test_tables_are_those_of_the_config():
-    """Claim: every physics and robot that the config allows has its entry, and there are no
+    """Claim: every physics and arm that the config allows has its entry, and there are no
     others."""
     assert {*physics.PHYSICS, "auto"} == {*typing.get_args(PhysicsKind)}
-    assert {*model.ROBOTS} == {*typing.get_args(RobotKind)}
+    assert {*kinematics.MAKERS, "hand"} == {*typing.get_args(RobotKind)}
 
 
+@pytest.mark.parametrize("gripper", grippers.shipped())
 @pytest.mark.parametrize("kind", typing.get_args(RobotKind))
-def test_plans_move_every_robot_of_the_config(kind: RobotKind):
-    """Claim: a plan becomes a start of every joint and a set-point of every actuator, in the order
-    of the robot's table, for every robot that the config allows."""
-    cfg, parts = Config(), model.ROBOTS[kind]
+def test_plans_move_every_robot_of_the_config(kind: RobotKind, gripper: str):
+    """Claim: a plan becomes a start of every joint and a set-point of every actuator, for every
+    robot and gripper that come with the package."""
+    cfg = Config().change(sim={"robot": kind, "gripper": gripper, "physics": "c"})
+    world = model.build(SceneConfig(slots=("box",), min_blocks=1), cfg.sim)
     height = jnp.zeros((cfg.heightmap.size,) * 2)
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, Action.grasp(0.05, 0.1, 0.3))
-    joints = jax.jit(functools.partial(primitives.joint_trajectory, kind))(plan)
-    assert joints.start.shape == (sum(len(part.joints) for part in parts),)
-    assert joints.control.shape == (cfg.sim.substeps, sum(len(part.actuators) for part in parts))
+    joints = jax.jit(functools.partial(primitives.joint_trajectory, cfg.sim))(plan)
+    assert joints.start.shape == world.robot_qpos.shape
+    assert joints.control.shape == (cfg.sim.substeps, world.model.nu)
     assert joints.reachable
 
 

@@ -27,7 +27,7 @@ def pushed(c_world: model.World) -> tuple:
     action = jax.tree.map(jnp.asarray, conftest.push(0.0, 0.0))
     plan = primitives.plan(cfg.sim, cfg.heightmap, jnp.zeros((cfg.heightmap.size,) * 2), action)
     fields = jax.device_get(model.scene_fields(c_world, scene))
-    return scene, fields, jax.device_get(primitives.joint_trajectory("hand", plan))
+    return scene, fields, jax.device_get(primitives.joint_trajectory(cfg.sim, plan))
 
 
 def _assert_equal(ours: Trajectory, theirs: Trajectory) -> None:

@@ -1,4 +1,4 @@
-"""UR5 kinematics against C MuJoCo, against itself, and at the ends of its reach."""
+"""UR5 and UR5e against the maker's parameters, C MuJoCo, themselves, and at the ends of reach."""
 
 import functools
 
@@ -8,25 +8,30 @@ import mujoco
 import numpy as np
 import pytest
 
+from csac_jax import grippers
+from csac_jax.assets import assets
 from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.geometry import cell_centres
-from csac_jax.scene.model import assets
+from csac_jax.scene import robots
 from csac_jax.sim import kinematics, primitives
 from csac_jax.sim.kinematics import Pose
 from csac_jax.sim.primitives import Action
 
-SIM, MAP = SimConfig(), HeightmapConfig()
+SIM, MAP = SimConfig(robot="ur5"), HeightmapConfig()
+ARM = kinematics.arm(SIM)
 HALF = 0.5 * MAP.extent
 POSITION, ANGLE = 2e-6, 5e-6  # m, rad: a few times what float32 leaves, 7e-7 and 1.3e-6
 
-forward = jax.jit(jax.vmap(kinematics.forward))
-inverse = jax.jit(jax.vmap(kinematics.inverse))
+forward = jax.jit(jax.vmap(functools.partial(kinematics.forward, ARM)))
+inverse_of_one = jax.jit(functools.partial(kinematics.inverse, ARM))
+inverse = jax.jit(jax.vmap(functools.partial(kinematics.inverse, ARM)))
 top_down = jax.jit(jax.vmap(kinematics.top_down))
-clearance = jax.jit(jax.vmap(kinematics.clearance))
-clear = jax.jit(jax.vmap(jax.vmap(kinematics.clear)))
-targets_of = jax.jit(kinematics.joint_targets)
-gradients = jax.jit(jax.grad(lambda *pose: jnp.sum(kinematics.inverse(*pose)[0]), argnums=(0, 1)))
-targets_of_batch = jax.jit(jax.vmap(kinematics.joint_targets, (None, 0)))
+clearance = jax.jit(jax.vmap(functools.partial(kinematics.clearance, ARM)))
+is_clear = functools.partial(kinematics.clear, ARM)
+clear = jax.jit(jax.vmap(jax.vmap(is_clear)))
+targets_of = jax.jit(functools.partial(kinematics.joint_targets, ARM))
+gradients = jax.jit(jax.grad(lambda *pose: jnp.sum(inverse_of_one(*pose)[0]), argnums=(0, 1)))
+targets_of_batch = jax.jit(jax.vmap(functools.partial(kinematics.joint_targets, ARM), (None, 0)))
 
 
 def _random_joints(num: int, seed: int = 0) -> np.ndarray:
@@ -55,10 +60,10 @@ def _angles_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _arm() -> mujoco.MjModel:
-    """The arm with the capsules of the gripper, which `ur5.xml` leaves to `rg2.xml`."""
+    """The arm with the capsules of the gripper, which `ur5.xml` leaves to the gripper."""
     spec = mujoco.MjSpec.from_file(str(assets() / "ur5.xml"))
     wrist3 = spec.body("wrist3")
-    tip = kinematics.D6 + kinematics.TOOL
+    tip = ARM.links.d6 + ARM.tool
     for name, start, end, radius in (
         ("tool", 0.0, tip - 0.115, 0.045),
         ("fingers", tip - 0.115, tip - 0.07, 0.07),
@@ -93,19 +98,99 @@ def _moves(num: int = 64) -> tuple[np.ndarray, tuple[jax.Array, jax.Array]]:
     return np.asarray(control), targets_of_batch(jnp.asarray(kinematics.HOME), control)
 
 
-def test_forward_agrees_with_c():
-    """Claim: the tips are where C MuJoCo has them in the arm of `ur5.xml`, which is built of the
-    same parameters."""
-    model, joints = _arm(), _random_joints(1000)
+SIMS = {
+    "ur5": SIM,
+    "ur5e": SimConfig(robot="ur5e", gripper="2f85"),
+    "moved": SimConfig(
+        robot="ur5", base=(-0.5, 0.3, 0.2, 1.1), adapter=0.04, gripper="franka_hand"
+    ),
+}
+
+
+def _tips_by_c(sim: SimConfig, joints: np.ndarray) -> Pose:
+    """Poses of the tips by C MuJoCo in the MJCF of the robot."""
+    spec = mujoco.MjSpec.from_file(str(assets() / "table.xml"))
+    robots.add(spec, sim, grippers.load(sim.gripper))
+    model = spec.compile()
     data, position, rotation = mujoco.MjData(model), [], []
     for q in joints:
-        data.qpos[:] = q
+        data.qpos[:6] = q
         mujoco.mj_kinematics(model, data)
-        position.append(data.site("tip").xpos.copy())
-        rotation.append(data.site("tip").xmat.reshape(3, 3).copy())
-    distance, angle = _errors(forward(joints), Pose(np.array(position), np.array(rotation)))
+        position.append(data.body("hand/hand").xpos.copy())
+        rotation.append(data.body("hand/hand").xmat.reshape(3, 3).copy())
+    return Pose(np.array(position), np.array(rotation))
+
+
+@pytest.mark.parametrize("name", SIMS)
+def test_forward_agrees_with_c(name: str):
+    """Claim: the tips are where C MuJoCo has them in the MJCF of each arm, wherever its base stands
+    and whatever it carries."""
+    joints, arm = _random_joints(300), kinematics.arm(SIMS[name])
+    found = jax.jit(jax.vmap(functools.partial(kinematics.forward, arm)))(joints)
+    distance, angle = _errors(found, _tips_by_c(SIMS[name], joints))
     assert distance.max() < POSITION
     assert angle.max() < ANGLE
+
+
+# The makers' tables of Denavit-Hartenberg parameters: d m, a m, alpha rad.
+DH = {
+    "ur5": (
+        (0.089159, 0, 0.5),
+        (0, -0.425, 0),
+        (0, -0.39225, 0),
+        (0.10915, 0, 0.5),
+        (0.09465, 0, -0.5),
+        (0.0823, 0, 0),
+    ),
+    "ur5e": (
+        (0.1625, 0, 0.5),
+        (0, -0.425, 0),
+        (0, -0.3922, 0),
+        (0.1333, 0, 0.5),
+        (0.0997, 0, -0.5),
+        (0.0996, 0, 0),
+    ),
+}
+
+
+@pytest.mark.parametrize("robot", DH)
+def test_forward_is_the_makers_table(robot: str):
+    """Claim: the flange is where the product of the maker's Denavit-Hartenberg matrices has it."""
+    arm = kinematics.arm(SimConfig(robot=robot))._replace(base=(0.0, 0.0, 0.0, 0.0), tool=0.0)
+    joints = _random_joints(50, 4)
+    found = jax.jit(jax.vmap(functools.partial(kinematics.forward, arm)))(joints)
+    for index, angles in enumerate(joints.astype(np.float64)):
+        pose = np.eye(4)
+        for theta, (d, a, turns) in zip(angles, DH[robot], strict=True):
+            (c, s), (ca, sa) = ((np.cos(x), np.sin(x)) for x in (theta, turns * np.pi))
+            pose = pose @ np.array(
+                [
+                    [c, -s * ca, s * sa, a * c],
+                    [s, c * ca, -c * sa, a * s],
+                    [0, sa, ca, d],
+                    [0, 0, 0, 1],
+                ]
+            )
+        np.testing.assert_allclose(found.position[index], pose[:3, 3], atol=POSITION)
+        # The tip frame closes along x and points back along z.
+        frame = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        np.testing.assert_allclose(found.rotation[index], frame, atol=ANGLE)
+
+
+@pytest.mark.parametrize("name", SIMS)
+def test_inverse_of_every_arm_returns(name: str):
+    """Claim: of each arm, wherever it stands, every branch that counts leads back to the pose."""
+    arm = kinematics.arm(SIMS[name])
+    there, back = (
+        functools.partial(each, arm) for each in (kinematics.forward, kinematics.inverse)
+    )
+    pose = jax.jit(jax.vmap(there))(_random_joints(500, 5))
+    solutions, valid = map(np.asarray, jax.jit(jax.vmap(back))(*pose))
+    again = jax.jit(jax.vmap(jax.vmap(there)))(solutions)
+    distance, angle = _errors(again, Pose(*(np.asarray(leaf)[:, None] for leaf in pose)))
+    assert valid.any(axis=1).mean() > 0.99
+    assert distance[valid].max() < POSITION
+    assert angle[valid].max() < ANGLE
 
 
 def test_inverse_returns_to_the_pose():
@@ -114,7 +199,7 @@ def test_inverse_returns_to_the_pose():
     joints = _random_joints(10_000)
     pose = forward(joints)
     solutions, valid = map(np.asarray, inverse(*pose))
-    again = jax.jit(jax.vmap(jax.vmap(kinematics.forward)))(solutions)
+    again = jax.jit(jax.vmap(jax.vmap(functools.partial(kinematics.forward, ARM))))(solutions)
     distance, angle = _errors(again, Pose(*(np.asarray(leaf)[:, None] for leaf in pose)))
     assert valid.any(axis=1).mean() > 0.99  # else singular
     assert distance[valid].max() < POSITION
@@ -144,16 +229,16 @@ def test_eight_branches_are_distinct():
     assert (np.sign(solutions[..., [2, 4]]) == kinematics.BRANCHES[:, 1:]).all()
 
 
-CENTRE, ABOVE_BASE = (0.0, 0.0, 0.1), kinematics.BASE[2] + 0.5
+CENTRE, ABOVE_BASE = (0.0, 0.0, 0.1), ARM.base[2] + 0.5
 NOWHERE = {
     "beyond": ((-0.6, 0.0, 0.1), 0.0),
     "very far": ((1e30, 0.0, 0.1), 0.0),
     "nearer to the axis than the wrist is wide": (
-        (kinematics.BASE[0] + 0.5 * kinematics.D4, 0.0, ABOVE_BASE),
+        (ARM.base[0] + 0.5 * ARM.links.d4, 0.0, ABOVE_BASE),
         0.0,
     ),
     "straight beside the axis": (
-        (kinematics.BASE[0], kinematics.D4, ABOVE_BASE),
+        (ARM.base[0], ARM.links.d4, ABOVE_BASE),
         0.0,
     ),  # both shoulders meet
     "nan": ((0.0, np.nan, 0.1), 0.0),
@@ -168,7 +253,7 @@ def test_poses_without_an_answer(name: str):
     gradients."""
     xyz, yaw = NOWHERE[name]
     pose = kinematics.top_down(jnp.array(xyz), jnp.array(yaw))
-    solutions, valid = jax.jit(kinematics.inverse)(*pose)
+    solutions, valid = inverse_of_one(*pose)
     assert not valid.any()
     assert np.isfinite(solutions).all()
     assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
@@ -177,7 +262,7 @@ def test_poses_without_an_answer(name: str):
 def test_a_matrix_that_turns_nothing():
     """Claim: what is no rotation has no valid branch, and finite angles and gradients."""
     pose = Pose(jnp.array(CENTRE), jnp.zeros((3, 3)))
-    solutions, valid = jax.jit(kinematics.inverse)(*pose)
+    solutions, valid = inverse_of_one(*pose)
     assert not valid.any()
     assert np.isfinite(solutions).all()
     assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
@@ -189,8 +274,8 @@ def test_a_matrix_that_turns_nothing():
 def test_singular_branches_are_flagged(joint: int, angle: float):
     """Claim: of a pose with a straight elbow or wrist, the branches that meet there do not count;
     all stay finite."""
-    pose = kinematics.forward(jnp.array([0.3, -0.5, 1.0, -1.0, 1.0, 0.2]).at[joint].set(angle))
-    solutions, valid = map(np.asarray, jax.jit(kinematics.inverse)(*pose))
+    pose = kinematics.forward(ARM, jnp.array([0.3, -0.5, 1.0, -1.0, 1.0, 0.2]).at[joint].set(angle))
+    solutions, valid = map(np.asarray, inverse_of_one(*pose))
     assert np.isfinite(solutions).all()
     assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
     assert not valid.all()
@@ -216,7 +301,9 @@ def test_gradient_of_inverse():
     xyz, yaw = jnp.array([0.1, -0.05, 0.1]), jnp.array(0.4)
 
     def there_and_back(xyz, yaw):
-        pose = kinematics.forward(kinematics.inverse(*kinematics.top_down(xyz, yaw))[0][1])
+        pose = kinematics.forward(
+            ARM, kinematics.inverse(ARM, *kinematics.top_down(xyz, yaw))[0][1]
+        )
         return jnp.append(pose.position, jnp.arctan2(pose.rotation[1, 0], pose.rotation[0, 0]))
 
     by_xyz, by_yaw = jax.jit(jax.jacobian(there_and_back, (0, 1)))(xyz, yaw)
@@ -224,9 +311,10 @@ def test_gradient_of_inverse():
 
 
 def test_top_down_is_the_floating_hand():
-    """Claim: a hand that points down at a yaw stands as the floating hand of `hand.xml` does at
-    that yaw."""
-    model = mujoco.MjModel.from_xml_path(str(assets() / "hand.xml"))
+    """Claim: a hand that points down at a yaw stands as the floating hand does at that yaw."""
+    spec = mujoco.MjSpec()
+    robots.add(spec, SimConfig(), grippers.load("rg2"))
+    model = spec.compile()
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for values in rng.uniform([-0.2, -0.2, 0, 0], [0.2, 0.2, 0.3, 2 * np.pi], (20, 4)).astype(
         np.float32
@@ -234,8 +322,10 @@ def test_top_down_is_the_floating_hand():
         data.qpos[:4] = values
         mujoco.mj_kinematics(model, data)
         pose = kinematics.top_down(jnp.asarray(values[:3]), jnp.asarray(values[3]))
-        np.testing.assert_allclose(pose.position, data.body("hand").xpos, atol=1e-6)
-        np.testing.assert_allclose(pose.rotation, data.body("hand").xmat.reshape(3, 3), atol=1e-6)
+        np.testing.assert_allclose(pose.position, data.body("hand/hand").xpos, atol=1e-6)
+        np.testing.assert_allclose(
+            pose.rotation, data.body("hand/hand").xmat.reshape(3, 3), atol=1e-6
+        )
 
 
 def test_whole_workspace_is_reachable():
@@ -245,8 +335,8 @@ def test_whole_workspace_is_reachable():
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, None, None))
     def reachable(xy, z, yaw):
-        solutions, valid = kinematics.inverse(*kinematics.top_down(jnp.append(xy, z), yaw))
-        return jnp.any(valid & jax.vmap(kinematics.clear)(solutions))
+        solutions, valid = kinematics.inverse(ARM, *kinematics.top_down(jnp.append(xy, z), yaw))
+        return jnp.any(valid & jax.vmap(is_clear)(solutions))
 
     centres = cell_centres(MAP).reshape(-1, 2)
     for z in np.float32([0.01, 0.12, 0.23, 0.35]):
@@ -257,9 +347,9 @@ def test_whole_workspace_is_reachable():
 def test_home_is_above_the_centre():
     """Claim: at HOME the tips are 0.2 m above the workspace centre, and the arm is clear."""
     np.testing.assert_allclose(
-        kinematics.forward(jnp.asarray(kinematics.HOME)).position, [0, 0, 0.2], atol=2e-3
+        kinematics.forward(ARM, jnp.asarray(kinematics.HOME)).position, [0, 0, 0.2], atol=2e-3
     )
-    assert kinematics.clear(jnp.asarray(kinematics.HOME))
+    assert is_clear(jnp.asarray(kinematics.HOME))
 
 
 CAPSULES = (
@@ -320,16 +410,14 @@ def test_links_left_out_never_change():
 
 
 def test_targets_hits_the_set_points():
-    """Claim: the joint targets put the tips on every set-point of a plan, and hand on the
-    fingers."""
+    """Claim: the joint targets put the tips on every set-point of a plan."""
     control, (target, reachable) = _moves()
     assert reachable.all()
-    tips = jax.jit(jax.vmap(jax.vmap(kinematics.forward)))(target[..., :6])
+    tips = jax.jit(jax.vmap(jax.vmap(functools.partial(kinematics.forward, ARM))))(target[..., :6])
     wanted = jax.jit(jax.vmap(jax.vmap(kinematics.top_down)))(control[..., :3], control[..., 3])
     distance, angle = _errors(tips, wanted)
     assert distance.max() < POSITION
     assert angle.max() < ANGLE
-    np.testing.assert_array_equal(target[..., 6], control[..., 4])
 
 
 def test_targets_is_continuous():
@@ -431,3 +519,20 @@ def test_one_scene_is_not_the_others_matter():
     alone, _ = targets_of(jnp.asarray(kinematics.HOME), control[3])
     np.testing.assert_allclose(batch[3], alone, atol=1e-5)
     np.testing.assert_allclose(batch[3], expected[3], atol=1e-5)
+
+
+def test_reaches_is_what_the_targets_say():
+    """Claim: where one branch leads to the ends of a straight way and is clear there, the arm can
+    mostly follow it; where none does, it never can."""
+    far = kinematics.arm(SimConfig(robot="ur5", base=(0.85, 0.0, 0.35, 0.0)))
+    places = np.random.default_rng(6).uniform(-HALF, HALF, (200, 2)).astype(np.float32)
+    ends = np.stack([np.column_stack([places, np.full(200, z)]) for z in (0.012, 0.16)], axis=1)
+    reached = jax.jit(jax.vmap(functools.partial(kinematics.reaches, far), (0, None)))(ends, 0.4)
+    ways = np.concatenate([ends, np.full((200, 2, 1), 0.4)], axis=2)
+    ways = np.stack([np.linspace(*way, 12) for way in ways])
+    follow = jax.vmap(functools.partial(kinematics.joint_targets, far), (None, 0))
+    _, followed = jax.jit(follow)(jnp.asarray(kinematics.HOME), jnp.asarray(ways, jnp.float32))
+    reached, followed = np.asarray(reached), np.asarray(followed)
+    assert 20 < reached.sum() < 180
+    assert not (followed & ~reached).any()
+    assert followed[reached].mean() > 0.9

@@ -27,7 +27,7 @@ def _pushes(program: env.Env):
     def push(pose: jax.Array):
         action = Action(primitive=jnp.int32(Primitive.PUSH), pose=pose)
         plan = primitives.plan(cfg.sim, cfg.heightmap, bare, action)
-        return primitives.joint_trajectory(cfg.sim.robot, plan)
+        return primitives.joint_trajectory(cfg.sim, plan)
 
     joints = jax.vmap(push)(pose)
     begin = jax.vmap(lambda scene, one: mjx_physics.initial_data(program.physics, scene, one))

@@ -125,7 +125,7 @@ def test_fast_spin_does_not_blow_up(executed, c_world):
     """Claim: a thin block that comes in spinning at 250 rad/s is held to the speed limit, in MJX
     and in C."""
     run = executed.case("spinning")
-    joints = primitives.joint_trajectory("hand", run.plan)
+    joints = primitives.joint_trajectory(CONFIG.sim, run.plan)
     end, _ = c_physics.CPhysics(c_world, CONFIG.sim).run(run.scene, joints)
     for after in (run.after, end):
         assert simulation.healthy(after)

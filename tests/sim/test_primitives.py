@@ -4,13 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from csac_jax import grippers
 from csac_jax.config import HeightmapConfig, SimConfig
-from csac_jax.constants import MAX_OPENING, Primitive
+from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres
 from csac_jax.sim import primitives
 from csac_jax.sim.primitives import Action, Plan
 
 SIM = SimConfig()
+RG2 = grippers.load("rg2")
 MAP = HeightmapConfig(size=224)  # 2 mm cells
 X, Y, Z, YAW, FINGERS = range(5)
 
@@ -69,7 +71,7 @@ def test_descent_and_lift(primitive: Primitive):
     and ends gently."""
     phases = SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases
     plan = _plan(primitive, _height())
-    z, high, low = np.asarray(plan.control[:, Z]), float(plan.start[Z]), SIM.clearance
+    z, high, low = np.asarray(plan.control[:, Z]), float(plan.start[Z]), RG2.clearance
     down, lift = phases[0], phases[0] + phases[1]
     np.testing.assert_allclose(
         z[:down], high + (low - high) * np.arange(1, down + 1) / down, atol=1e-6
@@ -90,7 +92,7 @@ def test_grasp_closes_in_place():
     )
     down, close, _ = SIM.grasp_phases
     fingers = np.asarray(plan.control[:, FINGERS])
-    np.testing.assert_allclose(fingers[:down], 0.5 * MAX_OPENING)
+    np.testing.assert_allclose(fingers[:down], RG2.half[1])
     assert (np.diff(fingers) <= 0.0).all()
     assert fingers[down + close - 1] == 0.0
     kept = np.array([X, Y, YAW, FINGERS])
@@ -133,7 +135,7 @@ def test_local_top_is_that_of_the_window(offset: float, top: float):
     """Claim: the highest surface in a window of 2 cm about the place counts, nothing beyond it,
     corners included."""
     height = _height((offset, -offset, 0.0022, 0.04))
-    assert primitives.local_top(MAP, height, jnp.zeros(2), SIM.window) == pytest.approx(top)
+    assert primitives.local_top(MAP, height, jnp.zeros(2), RG2.finger[1]) == pytest.approx(top)
 
 
 def test_local_top_of_coarse_maps():
@@ -143,6 +145,6 @@ def test_local_top_of_coarse_maps():
     height = jnp.zeros((16, 16)).at[8, 8].set(0.05)
     centre = cell_centres(coarse)[8, 8]
     for offset in (0.0, 0.0139, -0.0139):
-        assert primitives.local_top(coarse, height, centre + offset, SIM.window) == pytest.approx(
-            0.05
-        )
+        assert primitives.local_top(
+            coarse, height, centre + offset, RG2.finger[1]
+        ) == pytest.approx(0.05)

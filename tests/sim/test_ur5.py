@@ -1,5 +1,4 @@
-"""The arm of `ur5.xml` with the hand of `rg2.xml`: follows plans, grasps, and presses no harder
-than it should."""
+"""Arms with grippers: they follow plans, grasp, and press no harder than they should."""
 
 import functools
 
@@ -10,18 +9,21 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from csac_jax import grippers
+from csac_jax.assets import assets
 from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.constants import Primitive
-from csac_jax.scene.model import assets
+from csac_jax.scene import robots
 from csac_jax.sim import kinematics, primitives
 from csac_jax.sim.primitives import Action
 
-SIM, MAP = SimConfig(), HeightmapConfig()
+SIM, MAP = SimConfig(robot="ur5"), HeightmapConfig()
+RG2 = grippers.load("rg2")
 CUBE = 0.025  # m, half its side
 FINGER = 6  # address in qpos of the first finger, after the six joints
 BLOCK = 8  # address in qpos of the block
 
-_target = jax.jit(functools.partial(kinematics.joint_targets, kinematics.HOME))
+_joints = jax.jit(functools.partial(primitives.joint_trajectory, SIM))
 
 
 def _part(name: str) -> mujoco.MjSpec:
@@ -32,8 +34,7 @@ def _part(name: str) -> mujoco.MjSpec:
 def _model(with_block: bool = False) -> mujoco.MjModel:
     """Table, arm, hand and at will a cube, with the solver as in training."""
     spec = _part("table")
-    spec.attach(_part("ur5"), prefix="ur5/", frame=spec.worldbody.add_frame())
-    spec.attach(_part("rg2"), prefix="hand/", site=spec.site("ur5/tip"))
+    robots.add(spec, SIM, RG2)
     spec.attach(_part("blocks"), prefix="blocks/", frame=spec.worldbody.add_frame())
     if with_block:
         body = spec.worldbody.add_body(name="block")
@@ -55,10 +56,10 @@ def _plan(
     plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(
         jnp.full((MAP.size, MAP.size), top), action
     )
-    control = jnp.concatenate([plan.start[None], plan.control])
-    target, reachable = _target(control)
-    assert reachable
-    return np.asarray(control), np.asarray(target)
+    joints = _joints(plan)
+    assert joints.reachable
+    target = jnp.concatenate([joints.start[None, :7], joints.control])
+    return np.concatenate([plan.start[None], plan.control]), np.asarray(target)
 
 
 def _start(
@@ -122,52 +123,17 @@ def test_arm_presses_within_reason(x: float, side: int):
     assert data.qpos[BLOCK + 2] < 2 * CUBE
 
 
-def test_hand_is_the_floating_one():
-    """Claim: palm, pads, fingers and finger drive of `rg2.xml` are those of `hand.xml`."""
-    ours, floating = (
-        mujoco.MjModel.from_xml_path(str(assets() / name)) for name in ("rg2.xml", "hand.xml")
-    )
-    for name in ("palm", "pad_low", "pad_high"):
-        for field in (
-            "size",
-            "pos",
-            "friction",
-            "solref",
-            "priority",
-            "contype",
-            "conaffinity",
-            "condim",
-        ):
-            np.testing.assert_array_equal(
-                *(getattr(model.geom(name), field) for model in (ours, floating)), field
-            )
-    for name in ("finger_low", "finger_high"):
-        for field in ("axis", "range", "limited", "damping", "pos"):
-            theirs, mine = (getattr(model.joint(name), field, None) for model in (ours, floating))
-            np.testing.assert_array_equal(theirs, mine, field)
-        for field in ("mass", "inertia", "pos"):
-            np.testing.assert_array_equal(
-                *(getattr(model.body(name), field) for model in (ours, floating)), field
-            )
-    for field in ("gainprm", "biasprm", "forcerange"):
-        np.testing.assert_array_equal(
-            *(getattr(model.actuator("finger"), field) for model in (ours, floating)), field
-        )
-    np.testing.assert_array_equal(ours.eq_data, floating.eq_data)
-    np.testing.assert_array_equal(ours.eq_solref, floating.eq_solref)
-
-
 def test_gripper_ends_at_the_flange():
-    """Claim: the tip frame is TOOL below the flange, where the visible body of the gripper ends;
+    """Claim: the tip frame is the gripper's depth below the flange, where its visible body ends;
     nothing of the arm collides, and gravity is compensated in all of it."""
     model = _model()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     flange, tip = data.site("ur5/flange"), data.site("ur5/tip")
     height = (flange.xpos - tip.xpos) @ tip.xmat.reshape(3, 3)[:, 2]
-    assert height == pytest.approx(kinematics.TOOL, abs=1e-6)
+    assert height == pytest.approx(RG2.depth[1], abs=1e-6)
     body = model.geom("hand/body")
-    assert body.pos[2] + body.size[2] == pytest.approx(kinematics.TOOL)
+    assert body.pos[2] + body.size[2] == pytest.approx(RG2.depth[1])
     assert (model.geom("hand/palm").pos + model.geom("hand/palm").size)[2] == pytest.approx(
         body.pos[2] - body.size[2]
     )
@@ -199,5 +165,7 @@ def test_arm_follows_the_plan_in_mjx():
     for place in ((-0.224, -0.224, 0.0, 0.0), (0.224, 0.0, 3.0, 0.1)):
         control, target = _plan(Primitive.PUSH, *place)
         joints = run(jnp.asarray(_start(model, target).qpos, jnp.float32), jnp.asarray(target[1:]))
-        tips = jax.vmap(kinematics.forward)(joints[ends - 1]).position
+        tips = jax.vmap(functools.partial(kinematics.forward, kinematics.arm(SIM)))(
+            joints[ends - 1]
+        ).position
         assert np.linalg.norm(tips - control[ends, :3], axis=1).max() < 0.003, place

@@ -88,7 +88,7 @@ def ran(run_on_warp: Any) -> Ran:
     scenes = jax.tree.map(np.asarray, jax.vmap(lambda scene: layout.park(scene, True))(scenes))
     height = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))(scenes)
     plan = jax.vmap(functools.partial(primitives.plan, cfg.sim, cfg.heightmap))(height, actions)
-    joints = jax.vmap(functools.partial(primitives.joint_trajectory, "hand"))(plan)
+    joints = jax.vmap(functools.partial(primitives.joint_trajectory, cfg.sim))(plan)
     run_in_c = _physics("c").run
     runs = [jax.jit(jax.vmap(run))(scenes, joints) for run in (run_on_warp, run_in_c)]
     return jax.tree.map(np.asarray, Ran(scenes, joints, *runs))

@@ -1,0 +1,186 @@
+"""Arms and grippers as MJCF: put together, and checked against the gripper's numbers.
+
+A gripper of gripper.json alone has no drives but its fingers'. The robot `hand` carries it through
+the air on four more; any other robot is an arm that has it at its flange.
+"""
+
+import functools
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from csac_jax import grippers
+from csac_jax.assets import assets
+from csac_jax.config import SimConfig
+from csac_jax.errors import SceneError
+from csac_jax.grippers import Gripper
+
+PREFIX = "hand/"  # of the gripper's names in the model
+ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3")
+FLOAT_MASS, FLOAT_COM, FLOAT_INERTIA = 1.0, 0.1, 0.002  # kg, m, kg m^2: ours, of all floating hands
+_TOLERANCE = 0.001  # m, ours: between MJCF and numbers
+
+
+class Drive(NamedTuple):
+    """A joint of the floating hand and the position actuator that moves it."""
+
+    name: str
+    kind: mujoco.mjtJoint
+    axis: tuple[float, float, float]
+    kp: float  # N/m or N m/rad
+    kv: float
+    force: float  # most, N or N m
+
+
+_SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+FLOAT = (  # ours
+    Drive("x", _SLIDE, (1.0, 0.0, 0.0), 6000.0, 150.0, 150.0),
+    Drive("y", _SLIDE, (0.0, 1.0, 0.0), 6000.0, 150.0, 150.0),
+    Drive("z", _SLIDE, (0.0, 0.0, 1.0), 6000.0, 150.0, 100.0),
+    Drive("yaw", _HINGE, (0.0, 0.0, 1.0), 60.0, 1.2, 10.0),
+)
+
+
+def hand_geoms(gripper: Gripper) -> tuple[str, str, str]:
+    """Names in the model of palm, low pad and high pad."""
+    low, high = gripper.pads
+    return PREFIX + gripper.palm, PREFIX + low, PREFIX + high
+
+
+def joint_names(sim: SimConfig, gripper: Gripper) -> list[str]:
+    """Names in the model of all joints of the robot; the gripper's come last."""
+    fingers = [PREFIX + name for name in gripper.joints]
+    if sim.robot == "hand":
+        return [PREFIX + drive.name for drive in FLOAT] + fingers
+    return [f"{sim.robot}/{name}" for name in ARM_JOINTS] + fingers
+
+
+def add(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
+    """Adds the robot of a config. Raises SceneError for MJCF that does not fit."""
+    tool = read(gripper.folder / grippers.MJCF)
+    _check(tool, gripper)
+    if sim.robot == "hand":
+        _add_floating(spec, tool, gripper)
+    else:
+        _add_arm(spec, sim, gripper)
+        spec.attach(tool, prefix=PREFIX, site=spec.site(f"{sim.robot}/tip"))
+
+
+def read(path: Path) -> mujoco.MjSpec:
+    """The MJCF of a file. Raises SceneError for one that cannot be read."""
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise one_line(path, error) from None
+
+
+def _compiled(path: Path) -> mujoco.MjModel:
+    """The model of a file alone. `attach` silently drops an element that refers to a missing one,
+    which this refuses."""
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise one_line(path, error) from None
+
+
+def one_line(path: Path, error: ValueError) -> SceneError:
+    """An error of MuJoCo's about a file."""
+    return SceneError(f"{path}: {' '.join(str(error).split())}")
+
+
+def require(path: Path, kind: str, required: Iterable[str], elements: Iterable[Any]) -> None:
+    """Raises SceneError where an element that the package addresses by name is missing."""
+    present = [element.name for element in elements if element.name]
+    for name in required:
+        if name not in present:
+            has = ", ".join(present) or "none"
+            raise SceneError(f"{path}: {kind} '{name}' is missing; it has: {has}")
+
+
+def _require_actuators(path: Path, required: Iterable[str], spec: mujoco.MjSpec) -> None:
+    wanted, present = ", ".join(required), ", ".join(each.name for each in spec.actuators)
+    if present != wanted:
+        raise SceneError(f"{path}: actuators must be {wanted}, not {present}")
+
+
+def _add_floating(spec: mujoco.MjSpec, tool: mujoco.MjSpec, gripper: Gripper) -> None:
+    """The gripper alone. What only shows its body stays away; all have one weight, which the drives
+    are made for."""
+    root = tool.body(gripper.body)
+    for geom in list(root.geoms):
+        if not geom.contype and not geom.conaffinity:
+            tool.delete(geom)
+    root.explicitinertial, root.mass, root.ipos = True, FLOAT_MASS, [0.0, 0.0, FLOAT_COM]
+    root.inertia, root.iquat = [FLOAT_INERTIA] * 3, [1.0, 0.0, 0.0, 0.0]
+    for drive in FLOAT:
+        root.add_joint(name=drive.name, type=drive.kind, axis=drive.axis)
+        actuator = spec.add_actuator(name=PREFIX + drive.name, target=PREFIX + drive.name)
+        actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        actuator.set_to_position(kp=drive.kp, kv=drive.kv)
+        actuator.forcerange = [-drive.force, drive.force]
+    spec.attach(tool, prefix=PREFIX, frame=spec.worldbody.add_frame())
+
+
+def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
+    """The arm on its base, and a site `tip` where the gripper belongs."""
+    path = assets() / f"{sim.robot}.xml"
+    arm = read(path)
+    require(path, "joint", ARM_JOINTS, arm.joints)
+    require(path, "site", ("flange",), arm.sites)
+    require(path, "body", ("base",), arm.bodies)
+    require(path, "geom", ("base",), arm.geoms)
+    _require_actuators(path, ARM_JOINTS, arm)
+    _compiled(path)
+    x, y, z, yaw = sim.base
+    base, pedestal, flange = arm.body("base"), arm.geom("base"), arm.site("flange")
+    base.pos, base.quat = [x, y, z], [np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)]
+    pedestal.fromto = [0.0, 0.0, -z, *pedestal.fromto[3:]]
+    length = flange.pos[2] + sim.adapter + gripper.depth[1]
+    flange.parent.add_site(name="tip", pos=[0.0, 0.0, length], quat=[0.0, 1.0, 0.0, 0.0])
+    spec.attach(arm, prefix=f"{sim.robot}/", frame=spec.worldbody.add_frame())
+
+
+def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
+    """Raises SceneError where a gripper's MJCF lacks what its numbers name, or has others."""
+    path = gripper.folder / grippers.MJCF
+    require(path, "body", (gripper.body,), tool.bodies)
+    require(path, "joint", gripper.joints, tool.joints)
+    require(path, "geom", (gripper.palm, *gripper.pads), tool.geoms)
+    _require_actuators(path, (gripper.actuator,), tool)
+    for name in {joint.name for joint in tool.joints} - {*gripper.joints}:
+        raise SceneError(f"{path}: joint '{name}' is not among 'joints' of {grippers.NUMBERS}")
+    for end, name in enumerate(("closed", "open")):
+        opening, height = _measured(gripper, end)
+        _require_same(path, f"opening when {name}", opening, gripper.opening[end])
+        below = float(gripper.drop(gripper.half[end]))
+        _require_same(path, f"height of the tips when {name}", height, -below)
+
+
+def _require_same(path: Path, what: str, found: float, wanted: float) -> None:
+    """Raises SceneError where a length in the MJCF, m, is not that of the numbers."""
+    if abs(found - wanted) > _TOLERANCE:
+        by_numbers = f"by {grippers.NUMBERS} {1e3 * wanted:.1f} mm"
+        raise SceneError(f"{path}: {what} is {1e3 * found:.1f} mm, {by_numbers}")
+
+
+@functools.lru_cache
+def _measured(gripper: Gripper, end: int) -> tuple[float, float]:
+    """Opening and height of the tips, m, in the MJCF with its joints at one end."""
+    model = _compiled(gripper.folder / grippers.MJCF)
+    data = mujoco.MjData(model)
+    for name, ends in zip(gripper.joints, gripper.positions, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = ends[end]
+    mujoco.mj_kinematics(model, data)
+    root = data.body(gripper.body)
+    turn, low_high, lowest = root.xmat.reshape(3, 3), [], []
+    for name, side in zip(gripper.pads, (1.0, -1.0), strict=True):
+        geom, box = model.geom(name).id, model.geom_aabb[model.geom(name).id]
+        rotation = turn.T @ data.geom_xmat[geom].reshape(3, 3)
+        centre = turn.T @ (data.geom_xpos[geom] - root.xpos) + rotation @ box[:3]
+        half = np.abs(rotation) @ box[3:]
+        low_high.append(centre[0] + side * half[0])
+        lowest.append(centre[2] - half[2])
+    return float(low_high[1] - low_high[0]), float(min(lowest))

@@ -1,0 +1,116 @@
+"""Arms and grippers put together, and MJCF of one's own that does not fit its numbers."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from csac_jax import grippers
+from csac_jax.config import RobotKind, SceneConfig, SimConfig
+from csac_jax.errors import SceneError
+from csac_jax.scene import model
+
+SCENE = SceneConfig(slots=("box",), min_blocks=1)
+
+
+def _built(gripper: str, robot: RobotKind = "hand", physics: str = "c") -> model.World:
+    return model.build(SCENE, SimConfig(gripper=gripper, robot=robot, physics=physics))
+
+
+def _settled(gripper: str, half: float) -> mujoco.MjData:
+    """The floating hand after a second at the origin with the fingers told to be at this half
+    opening, m."""
+    world = _built(gripper)
+    data = mujoco.MjData(world.model)
+    data.ctrl[2], data.ctrl[4] = 0.5, world.gripper.set_point(half)
+    data.qpos[world.robot_qpos[2]] = 0.5
+    mujoco.mj_step(world.model, data, nstep=250)
+    mujoco.mj_kinematics(world.model, data)
+    return data
+
+
+@pytest.mark.parametrize("name", grippers.shipped())
+def test_hand_opens_as_its_numbers_say(name: str):
+    """Claim: in C MuJoCo's physics the pads come within 1 mm of the opening that is asked for, stay
+    upright, and are as low as the numbers say."""
+    gripper = grippers.load(name)
+    for share in (0.0, 0.4, 1.0):
+        half = gripper.half[0] + share * (gripper.half[1] - gripper.half[0])
+        data = _settled(name, half)
+        low, high = (data.geom(f"hand/{pad}") for pad in gripper.pads)
+        size = data.model.geom(f"hand/{gripper.pads[0]}").size
+        apart = high.xpos - low.xpos
+        assert apart[0] - 2.0 * size[0] == pytest.approx(2.0 * half, abs=0.001)
+        assert np.abs(low.xmat[8] - 1.0) < 1e-3
+        lowest = low.xpos[2] - size[2] - 0.5
+        assert lowest == pytest.approx(-float(gripper.drop(half)), abs=0.001)
+
+
+@pytest.mark.parametrize("name", grippers.shipped())
+def test_gripper_hangs_at_the_flange(name: str):
+    """Claim: the tip frame is adapter and depth from the arm's flange, fingers down, z back."""
+    gripper = grippers.load(name)
+    sim = SimConfig(gripper=name, robot="ur5e", adapter=0.03, base=(0.5, -0.1, 0.4, 0.3))
+    world = model.build(SCENE, sim)
+    data = mujoco.MjData(world.model)
+    mujoco.mj_kinematics(world.model, data)
+    flange, hand = data.site("ur5e/flange"), data.body(f"hand/{gripper.body}")
+    back = (flange.xpos - hand.xpos) @ hand.xmat.reshape(3, 3)
+    np.testing.assert_allclose(back, [0.0, 0.0, 0.03 + gripper.depth[1]], atol=1e-9)
+    base = data.body("ur5e/base")
+    np.testing.assert_allclose(base.xpos, sim.base[:3])
+    np.testing.assert_allclose(base.xmat[[0, 3]], [np.cos(0.3), np.sin(0.3)])
+    foot = world.model.geom("ur5e/base")
+    assert data.geom("ur5e/base").xpos[2] - foot.size[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def _mine(folder: Path, file: str, old: str, new: str) -> str:
+    """A folder with the RG2, one thing changed."""
+    shutil.copytree(grippers.load("rg2").folder, folder)
+    text = (folder / file).read_text()
+    assert old in text
+    (folder / file).write_text(text.replace(old, new))
+    return str(folder)
+
+
+SPARE = '<joint name="spare" axis="0 1 0"/><geom name="palm"'
+UNFIT = {
+    "geom": ('name="pad_low"', 'name="left"', "geom 'pad_low' is missing; it has: palm, "),
+    "palm": ('"palm"', '"Palm"', "geom 'palm' is missing; it has: Palm, "),
+    "body": ('<body name="hand"', '<body name="base"', "body 'hand' is missing; it has: "),
+    "joint": ('joint name="finger_high"', 'joint name="f"', "joint 'finger_high' is missing"),
+    "actuator": ('<position name="finger"', '<position name="f"', "must be finger, not f"),
+    "second": ("</actuator>", '<motor name="m" joint="finger_low"/></actuator>', "not finger, m"),
+    "spare": ('<geom name="palm"', SPARE, "joint 'spare' is not among 'joints' of gripper.json"),
+    "reference": ('joint2="finger_high"', 'joint2="thumb"', "thumb"),
+    "xml": ("<mujoco", "<mujocoo", "XML parse error"),
+    "opening": ('pos="-0.006 0 0"', 'pos="-0.02 0 0"', "opening when closed is 14.0 mm, by "),
+    "tips": ('pos="0 0 0.030"', 'pos="0 0 0.050"', "height of the tips when closed is 20.0 mm"),
+}
+
+
+@pytest.mark.parametrize("case", UNFIT)
+def test_mjcf_that_does_not_fit_is_one_line(tmp_path: Path, case: str):
+    """Claim: MJCF that lacks what the numbers name, has other numbers or does not compile gives one
+    line with the file and what is wrong, whatever the robot and physics."""
+    old, new, says = UNFIT[case]
+    folder = _mine(tmp_path / "mine", grippers.MJCF, old, new)
+    for robot, physics in (("hand", "mjx"), ("ur5", "c")):
+        with pytest.raises(SceneError, match=re.escape(says)) as error:
+            _built(folder, robot, physics)
+        assert str(error.value).startswith(f"{folder}/gripper.xml: ")
+        assert "\n" not in str(error.value)
+
+
+def test_wide_hand_in_numbers_only_is_refused(tmp_path: Path):
+    """Claim: the numbers of one gripper with the MJCF of another are refused, not run wrong."""
+    numbers = json.loads((grippers.load("rg2").folder / grippers.NUMBERS).read_text())
+    numbers["opening"]["open"] = 0.085
+    folder = _mine(tmp_path / "mine", grippers.NUMBERS, "", "")
+    (Path(folder) / grippers.NUMBERS).write_text(json.dumps(numbers))
+    with pytest.raises(SceneError, match=r"opening when open is 110\.0 mm, by gripper\.json 85\.0"):
+        _built(folder)

@@ -1,0 +1,163 @@
+"""The numbers of grippers: closed forms, and files of one's own."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac_jax import deploy, grippers
+from csac_jax.deploy import decision, program
+from csac_jax.errors import SettingsError
+from csac_jax.sim.primitives import Action
+
+RG2 = grippers.load("rg2")
+
+
+def _numbers(name: str = "rg2") -> dict[str, Any]:
+    return json.loads((grippers.load(name).folder / grippers.NUMBERS).read_text())
+
+
+def _write(folder: Path, numbers: Any) -> str:
+    folder.mkdir(exist_ok=True)
+    (folder / grippers.NUMBERS).write_text(json.dumps(numbers))
+    return str(folder)
+
+
+def test_shipped_grippers_name_their_sources():
+    """Claim: three grippers come with the package, and each says where its lengths are from."""
+    assert grippers.shipped() == ["2f85", "franka_hand", "rg2"]
+    for name in grippers.shipped():
+        sources = _numbers(name)["sources"]
+        assert {*sources} >= {*grippers._LENGTHS} - {"clearance"}
+        assert all(len(text) >= 4 for text in sources.values())
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize("name", grippers.shipped())
+def test_gap_is_the_inverse_of_the_joints(name: str, xp: Any):
+    """Claim: joints and actuator go from one end to the other with the opening, and the gap is read
+    back from the first joint."""
+    gripper = grippers.load(name)
+    half = xp.linspace(*gripper.half, 50)
+    for joint, (closed, opened) in zip(
+        gripper.joint_positions(half, xp), gripper.positions, strict=True
+    ):
+        np.testing.assert_allclose([joint[0], joint[-1]], [closed, opened], atol=1e-6)
+        assert (np.diff(joint) * np.sign(opened - closed) > 0.0).all()
+    ends = gripper.set_point(half, xp)
+    np.testing.assert_allclose([ends[0], ends[-1]], gripper.set_points, atol=1e-6)
+    gap = gripper.gap(gripper.joint_positions(half, xp)[0], xp)
+    np.testing.assert_allclose(gap, 2.0 * half - gripper.opening[0], atol=1e-6)
+
+
+def test_arc_is_a_circle():
+    """Claim: pads of a linkage move on a circle of its radius, by both ends of its depth."""
+    gripper = grippers.load("2f85")
+    half = np.linspace(*gripper.half, 9)
+    drop = gripper.drop(half)
+    assert drop[0] == pytest.approx(gripper.depth[0] - gripper.depth[1])
+    assert drop[-1] == pytest.approx(0.0, abs=1e-12)
+    # Two circles of a radius pass through both ends; the centre of this one is towards the flange.
+    a, b = np.array([half[0], -drop[0]]), np.array([half[-1], -drop[-1]])
+    middle, chord = 0.5 * (a + b), b - a
+    normal = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord)
+    away = np.sqrt(gripper.arc_radius**2 - 0.25 * (chord @ chord))
+    centre = middle + away * normal
+    radii = np.hypot(half - centre[0], -drop - centre[1])
+    np.testing.assert_allclose(radii, gripper.arc_radius, atol=1e-9)
+
+
+def test_rg2_moves_as_it_is_told():
+    """Claim: of the RG2, joints and actuator are half the opening, to the last bit."""
+    half = np.float32(np.random.default_rng(0).uniform(0.0, 0.055, 1000))
+    for values in (*RG2.joint_positions(half), RG2.set_point(half), 0.5 * RG2.gap(half)):
+        np.testing.assert_array_equal(values, half)
+    assert not RG2.drop(half).any()
+
+
+WRONG = {
+    "missing": (("opening", None), "'opening' is missing"),
+    "part": (("finger", {"thickness": 0.01, "width": 0.02}), "'finger.length' is missing"),
+    "end": (("actuator", {"name": "finger", "open": 1.0}), "'actuator.closed' is missing"),
+    "unknown": (("fingers", 2), "'fingers' is unknown; the keys are: format, name"),
+    "format": (("format", 2), "'format' must be 1"),
+    "word": (("palm", 3), "'palm' must be a name"),
+    "pads": (("pads", ["pad"]), "'pads' must be the names of two geoms"),
+    "joints": (("joints", {}), "'joints' must name 1 to 16"),
+    "text": (("depth", {"closed": "0.2", "open": 0.2}), "'depth.closed' must be a number"),
+    "nan": (("radius", float("nan")), "'radius' must be a number"),
+    "millimetres": (("opening", {"closed": 0, "open": 110}), "'opening' must lie in 0 .. 1 m"),
+    "swapped": (("opening", {"closed": 0.1, "open": 0}), "'opening' must grow from closed"),
+    "moves": (("depth", {"closed": 0.2, "open": 0.21}), "'depth' must be the same at both ends"),
+    "still": (("joints", {"a": {"closed": 1, "open": 1}}), "must differ between closed and open"),
+    "narrow": (("radius", 0.05), "'radius' must hold the open fingers"),
+    "tight": (("arc_radius", 0.02), "'arc_radius' must be above 0.0275"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_numbers_that_do_not_fit_are_named(tmp_path: Path, case: str):
+    """Claim: numbers that are missing, unknown or cannot be are one line with file and key."""
+    (key, value), says = WRONG[case]
+    numbers = _numbers()
+    numbers[key] = value
+    if value is None:
+        del numbers[key]
+    folder = _write(tmp_path / "mine", numbers)
+    with pytest.raises(SettingsError, match=re.escape(says)) as error:
+        grippers.load(folder)
+    assert str(error.value).startswith(f"{folder}/gripper.json: ")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, "\xff\xfe"])
+def test_files_that_are_no_numbers_are_refused(tmp_path: Path, text: str):
+    """Claim: a file that holds no JSON object is one line, however it is damaged."""
+    (tmp_path / grippers.NUMBERS).write_text(text, encoding="latin-1")
+    with pytest.raises(SettingsError, match=r"gripper\.json: ") as error:
+        grippers.load(str(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("source", ["rg3", "", "/nowhere", "a\nb"])
+def test_no_gripper_is_one_line(source: str):
+    """Claim: a name without a gripper says which there are."""
+    with pytest.raises(SettingsError, match="neither one of 2f85, franka_hand, rg2 nor a folder"):
+        grippers.load(source)
+
+
+@pytest.mark.mjx
+def test_deployed_policy_takes_another_gripper():
+    """Claim: a deployed policy decides for the gripper that it is given, its own by default."""
+    assert deploy.Policy.load("shipped").cfg.sim.gripper == "rg2"
+    policy = deploy.Policy.load("shipped", gripper="2f85")
+    height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
+    stations = program.stations(policy.cfg, height, Action.grasp(0.0, 0.0, 0.0))
+    choice = program.Choice(Action.grasp(0.0, 0.0, 0.0), jnp.zeros(()), jnp.bool(True), stations)
+    decided = decision.of(jax.device_get(choice), np.eye(4))
+    assert decided.width == pytest.approx(0.085)
+    with pytest.raises(SettingsError, match="neither one of"):
+        deploy.Policy.load("shipped", gripper="2f86")
+
+
+def test_decisions_need_no_mujoco():
+    """Claim: the waypoints of a decision follow from gripper.json alone."""
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "import jax.numpy as jnp, csac_jax\n"
+        "from csac_jax import presets\n"
+        "from csac_jax.deploy import program\n"
+        "from csac_jax.sim.primitives import Action\n"
+        "cfg = presets.smoke().change(sim={'gripper': '2f85'})\n"
+        "height = jnp.zeros((cfg.heightmap.size,) * 2)\n"
+        "print(float(program.stations(cfg, height, Action.grasp(0.0, 0.0, 0.0))[0, 4]))\n"
+    )
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert float(found.stdout) == pytest.approx(0.0425)
