@@ -32,6 +32,7 @@ ORDER = (
     ("vision",),
     ("sim",),
     ("scene",),
+    ("objects",),
     ("geometry",),
     ("presets",),
     ("algorithms",),
@@ -60,6 +61,8 @@ ONLY_IN = {
     "gymnasium": ("gym.py",),
     "imageio": ("render/media.py", "deploy/files.py"),
     "jinja2": ("report/charts.py",),
+    "trimesh": ("objects/importing.py",),
+    "coacd": ("objects/importing.py",),
     "tensorboardX": ("report/progress.py",),
 }
 JIT_IN = (

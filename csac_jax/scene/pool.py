@@ -21,7 +21,7 @@ import numpy as np
 from csac_jax import cache_folder
 from csac_jax.config import Config, SceneConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import arrange, blocks, layout, model
+from csac_jax.scene import arrange, blocks, layout, model, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World
 
@@ -111,14 +111,15 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
     in_play = rng.permutation(num) < count
     quaternion = rng.normal(size=(num, 4))
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    spacing = max(_SPACING, 2.0 * stock.table(cfg).radius) if cfg.has_objects else _SPACING
     half = 0.5 * rng.uniform(*cfg.drop_extent)
     xy = rng.uniform(-half, half, (num, 2))
-    z = cfg.drop_height + _SPACING * rng.permutation(num)[:, None]
+    z = cfg.drop_height + spacing * rng.permutation(num)[:, None]
     position = np.where(in_play[:, None], np.concatenate([xy, z], axis=1), layout.parking(num))
     scale = blocks.scales(cfg, rng.uniform(-1.0, 1.0, num))[:, None]
     shapes = map(blocks.half_size_choices, cfg.slots)
     half_size = np.stack([choices[rng.integers(len(choices))] for choices in shapes]) * scale
-    return layout.parked(cfg.slots).replace(
+    dropped = layout.parked(cfg.slots).replace(
         position=position.astype(np.float32),
         quaternion=quaternion.astype(np.float32),
         half_size=half_size.astype(np.float32),
@@ -127,6 +128,7 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
         colour=rng.permutation(max(num, num_colours))[:num].astype(np.int32) % num_colours,
         in_play=in_play,
     )
+    return stock.drawn(rng, cfg, dropped) if cfg.has_objects else dropped
 
 
 def _falling(world: World, scene: Scene, fields: BlockFields) -> mujoco.MjData:
@@ -203,6 +205,8 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
 def _digest(cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bool) -> str:
     """Name of a pool: hash of everything that decides its content."""
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
+    if scene.has_objects:  # what is in a library counts, not where it lies
+        scene = dataclasses.replace(scene, objects=stock.library(scene).sha256)
     relevant = (_VERSION, mujoco.__version__, repr(scene), *numbers)
     content = hashlib.sha256(repr((*relevant, "poured") if poured else relevant).encode())
     for name in ("table.xml", "hand.xml", "blocks.xml"):
@@ -229,7 +233,7 @@ def _read(path: Path) -> Scene | None:
 
 def _write(path: Path, scenes: Scene) -> None:
     """Saves the scenes for the next run; a cache that cannot be written is no error."""
-    arrays: dict[str, Any] = vars(scenes)
+    arrays: dict[str, Any] = {k: leaf for k, leaf in vars(scenes).items() if leaf is not None}
     temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
