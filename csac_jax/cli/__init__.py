@@ -19,6 +19,7 @@ from csac_jax.cli import (
     doctor,
     evaluation,
     export,
+    objects,
     output,
     parsing,
     play,
@@ -39,6 +40,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "serve": serve.run,
     "report": report.run,
     "export": export.run,
+    "objects": objects.run,
     "doctor": doctor.run,
     "bench": bench.run,
 }
@@ -57,6 +59,7 @@ A robot learns to push and grasp in clutter.
   serve POLICY       answer images by decisions over HTTP
   report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
+  objects COMMAND    make, import or show a library of objects
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 

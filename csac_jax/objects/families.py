@@ -5,6 +5,7 @@ The parts of an object touch, and do not overlap. Sizes are such that the hand, 
 so that they come to rest. z is up as the object stands.
 """
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -14,7 +15,7 @@ from csac_jax.objects import library, solid
 from csac_jax.objects.library import Object
 from csac_jax.objects.solid import Part
 
-SIDES = 8  # of walls of hollow things
+SIDES = 6  # of walls of hollow things
 _ROUND = 12  # sides of full round things
 
 
@@ -43,7 +44,9 @@ def _wall(
     inner: tuple[float, float], outer: tuple[float, float], bottom: float, top: float, sides: int
 ) -> list[Part]:
     """The parts of a ring, radii at the bottom and at the top."""
-    rings = [[_circle(radius, sides) for radius in radii] for radii in zip(inner, outer, strict=True)]
+    rings = [
+        [_circle(radius, sides) for radius in radii] for radii in zip(inner, outer, strict=True)
+    ]
     parts = []
     for i in range(sides):
         edge = np.array([i, (i + 1) % sides])
@@ -55,7 +58,9 @@ def _wall(
 def bottle(rng: Generator) -> list[Part]:
     """Body, shoulder and neck, revolved."""
     body, neck = rng.uniform(0.018, 0.034), rng.uniform(0.008, 0.013)
-    heights = np.cumsum([0.0, rng.uniform(0.05, 0.09), rng.uniform(0.01, 0.03), rng.uniform(0.015, 0.03)])
+    heights = np.cumsum(
+        [0.0, rng.uniform(0.05, 0.09), rng.uniform(0.01, 0.03), rng.uniform(0.015, 0.03)]
+    )
     rings = [_circle(radius) for radius in (body, body, neck, neck)]
     return [_frustum(rings[i], rings[i + 1], heights[i], heights[i + 1]) for i in range(3)]
 
@@ -72,7 +77,12 @@ def _vessel(radii: tuple[float, float], wall: float, height: float, floor: float
 def bowl(rng: Generator) -> list[Part]:
     """A floor and a wall that opens upwards."""
     top = rng.uniform(0.04, 0.06)
-    return _vessel((top * rng.uniform(0.55, 0.8), top), rng.uniform(0.004, 0.007), rng.uniform(0.03, 0.05), 0.005)
+    return _vessel(
+        (top * rng.uniform(0.55, 0.8), top),
+        rng.uniform(0.004, 0.007),
+        rng.uniform(0.03, 0.05),
+        0.005,
+    )
 
 
 def cup(rng: Generator) -> list[Part]:
@@ -81,9 +91,7 @@ def cup(rng: Generator) -> list[Part]:
     side = radius * np.cos(np.pi / SIDES)  # of the wall, from the axis
     reach, thick, half = rng.uniform(0.018, 0.026), 0.006, rng.uniform(0.004, 0.007)
     low, high = 0.2 * height, 0.8 * height
-    bars = [
-        _box((side, -half, z), (side + reach, half, z + thick)) for z in (low, high - thick)
-    ]
+    bars = [_box((side, -half, z), (side + reach, half, z + thick)) for z in (low, high - thick)]
     grip = _box((side + reach, -half, low), (side + reach + thick, half, high))
     return [*_vessel((radius, radius), rng.uniform(0.004, 0.006), height, 0.005), *bars, grip]
 
@@ -123,12 +131,18 @@ def tube(rng: Generator) -> list[Part]:
 def nut(rng: Generator) -> list[Part]:
     """A hexagon with a hole."""
     outer = rng.uniform(0.018, 0.034)
-    return _wall((outer * rng.uniform(0.45, 0.65),) * 2, (outer,) * 2, 0.0, rng.uniform(0.012, 0.025), 6)
+    return _wall(
+        (outer * rng.uniform(0.45, 0.65),) * 2, (outer,) * 2, 0.0, rng.uniform(0.012, 0.025), 6
+    )
 
 
 def star(rng: Generator) -> list[Part]:
     """A core with three to six pointed arms."""
-    arms, radius, thick = int(rng.integers(3, 7)), rng.uniform(0.012, 0.02), rng.uniform(0.012, 0.025)
+    arms, radius, thick = (
+        int(rng.integers(3, 7)),
+        rng.uniform(0.012, 0.02),
+        rng.uniform(0.012, 0.025),
+    )
     core, tip = _circle(radius, arms), rng.uniform(0.03, 0.05)
     parts = [_prism(core, 0.0, thick)]
     for i in range(arms):
@@ -163,7 +177,7 @@ def rod(rng: Generator) -> list[Part]:
         across = heading[max(i - 1, 0)] + cut + 0.5 * np.pi
         side = section[:, :1] / np.cos(cut) * [np.cos(across), np.sin(across)]
         rings.append(np.column_stack([knots[i] + side, section[:, 1]]))
-    return [solid.convex(np.concatenate(pair)) for pair in zip(rings, rings[1:], strict=False)]
+    return [solid.convex(np.concatenate(pair)) for pair in itertools.pairwise(rings)]
 
 
 def tool(rng: Generator) -> list[Part]:
@@ -176,10 +190,16 @@ def tool(rng: Generator) -> list[Part]:
         return [handle, _box((length, -deep, -high), (length + wide, deep, high))]
     if kind == 1:
         thin = rng.uniform(0.003, 0.005)
-        return [handle, _box((length, -thin, -thin), (length + rng.uniform(0.03, 0.05), thin, thin))]
+        return [
+            handle,
+            _box((length, -thin, -thin), (length + rng.uniform(0.03, 0.05), thin, thin)),
+        ]
     wide, jaw = rng.uniform(0.018, 0.026), rng.uniform(0.007, 0.01)
     head = length + 0.015
-    jaws = [_box((head, min(y), -half), (head + 0.02, max(y), half)) for y in ((wide, wide - jaw), (-wide, jaw - wide))]
+    jaws = [
+        _box((head, min(y), -half), (head + 0.02, max(y), half))
+        for y in ((wide, wide - jaw), (-wide, jaw - wide))
+    ]
     return [handle, _box((length, -wide, -half), (head, wide, half)), *jaws]
 
 
@@ -193,7 +213,9 @@ def stone(rng: Generator) -> list[Part]:
 def dumbbell(rng: Generator) -> list[Part]:
     """Two discs and a bar between them, or a spool."""
     ends, bar = rng.uniform(0.018, 0.036, 2), rng.uniform(0.007, 0.012)
-    heights = np.cumsum([0.0, *rng.uniform(0.01, 0.025, 1), rng.uniform(0.03, 0.05), rng.uniform(0.01, 0.025)])
+    heights = np.cumsum(
+        [0.0, *rng.uniform(0.01, 0.025, 1), rng.uniform(0.03, 0.05), rng.uniform(0.01, 0.025)]
+    )
     rings = [_circle(radius) for radius in (ends[0], bar, ends[1])]
     return [_prism(ring, heights[i], heights[i + 1]) for i, ring in enumerate(rings)]
 

@@ -1,6 +1,6 @@
 """A library of objects: a folder of two files.
 
-LIB/objects.json  format, the digest of the other file, and of each object what `Object` says
+LIB/objects.json  format, a digest of all that follows, and of each object what `Object` says
 LIB/parts.npz     corners, triangles and half-spaces of all convex parts, one after the other
 
 An object's frame has the axes of its file and its origin at the centre of mass.
@@ -57,6 +57,11 @@ class Object:
         """Lowest and highest corner of the bounding box [2, 3] m."""
         points = np.concatenate([part.vertices for part in self.parts])
         return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    @property
+    def narrowest(self) -> float:
+        """Least width, m, between two parallel planes, one of them along a face of the hull."""
+        return solid.narrowest(self.parts)
 
     @property
     def held_out(self) -> bool:
@@ -123,7 +128,7 @@ def save(folder: Path, objects: Sequence[Object]) -> Library:
     if folder.exists():
         raise FileExistsError(f"{folder} exists; give another name")
     arrays = _packed(objects)
-    index = _index(objects, hashlib.sha256(arrays).hexdigest())
+    index = _index(objects, arrays)
     folder.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -153,7 +158,12 @@ def _packed(objects: Iterable[Object]) -> bytes:
     return file.getvalue()
 
 
-def _index(objects: Iterable[Object], arrays_sha256: str) -> bytes:
+def _digest(entries: Any, arrays: bytes) -> str:
+    """Of all that a library holds."""
+    return hashlib.sha256(json.dumps(entries).encode() + arrays).hexdigest()
+
+
+def _index(objects: Iterable[Object], arrays: bytes) -> bytes:
     entries = [
         {
             "name": each.name,
@@ -170,7 +180,12 @@ def _index(objects: Iterable[Object], arrays_sha256: str) -> bytes:
         }
         for each in objects
     ]
-    content = {"format": FORMAT, "density": DENSITY, "sha256": arrays_sha256, "objects": entries}
+    content = {
+        "format": FORMAT,
+        "density": DENSITY,
+        "sha256": _digest(entries, arrays),
+        "objects": entries,
+    }
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
@@ -188,9 +203,18 @@ def load(folder: Path) -> Library:
     except OSError as error:
         missing = f"{folder}: no library of objects there ({error.strerror})"
         raise LibraryError(f"{missing}; csac-jax objects make --out {folder} makes one") from None
-    except (ArithmeticError, ValueError, LookupError, TypeError, zipfile.BadZipFile, RecursionError) as error:
+    except (
+        ArithmeticError,
+        ValueError,
+        LookupError,
+        TypeError,
+        zipfile.BadZipFile,
+        RecursionError,
+    ) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise LibraryError(f"{folder}: damaged library of objects: {reason}; make it again") from None
+        raise LibraryError(
+            f"{folder}: damaged library of objects: {reason}; make it again"
+        ) from None
 
 
 def _bytes(path: Path) -> bytes:
@@ -203,11 +227,13 @@ def _bytes(path: Path) -> bytes:
 def _read(folder: Path, index: bytes) -> list[Object]:
     content = json.loads(index)
     if content["format"] != FORMAT:
-        raise ValueError(f"format {str(content['format'])[:20]} is unknown, this version reads {FORMAT}")
+        raise ValueError(
+            f"format {str(content['format'])[:20]} is unknown, this version reads {FORMAT}"
+        )
     packed = _bytes(folder / ARRAYS)
-    if hashlib.sha256(packed).hexdigest() != content["sha256"]:
-        raise ValueError(f"{ARRAYS} has another digest than {INDEX} says")
     entries = content["objects"]
+    if _digest(entries, packed) != content["sha256"]:
+        raise ValueError(f"the digest in {INDEX} is another than that of the files")
     if not 1 <= len(entries) <= MOST_OBJECTS:
         raise ValueError(f"1 to {MOST_OBJECTS} objects, not {len(entries)}")
     parts = _parts(packed)
@@ -237,7 +263,9 @@ def _parts(packed: bytes) -> list[Part]:
             raise ValueError(f"{name} does not fit the counts, or is not finite")
         rows.append(np.split(array, ends[:-1]))
     parts = [Part(*arrays) for arrays in zip(*rows, strict=True)]
-    if any((part.triangles < 0).any() or part.triangles.max() >= len(part.vertices) for part in parts):
+    if any(
+        (part.triangles < 0).any() or part.triangles.max() >= len(part.vertices) for part in parts
+    ):
         raise ValueError("triangles name corners that there are not")
     return parts[::-1]
 
@@ -262,9 +290,13 @@ def faults(one: Object) -> str | None:
     if not (one.name.isprintable() and 1 <= len(one.name) <= 100):
         return "has no name of 1 to 100 printable characters"
     size = np.ptp(one.bounds, axis=0)
-    if not (1e-3 <= size.min() and size.max() <= LARGEST):
-        return f"is {1e3 * size.min():.3g} to {1e3 * size.max():.3g} mm large, not 1 to {1e3 * LARGEST:g}"
-    if len(one.parts) > MOST_PARTS or max(len(part.planes) for part in one.parts) > solid.MOST_FACES:
+    if not (size.min() >= 1e-3 and size.max() <= LARGEST):
+        sides = f"{1e3 * size.min():.3g} to {1e3 * size.max():.3g}"
+        return f"has sides of {sides} mm, not 1 to {1e3 * LARGEST:g}"
+    if (
+        len(one.parts) > MOST_PARTS
+        or max(len(part.planes) for part in one.parts) > solid.MOST_FACES
+    ):
         return f"has more than {MOST_PARTS} parts, or a part of more than {solid.MOST_FACES} faces"
     if not (0.0 < one.volume <= 1.01 * np.prod(size)):
         return "has a volume that is not positive, or larger than its bounding box"

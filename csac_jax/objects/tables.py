@@ -59,7 +59,10 @@ def of(source: Library) -> Tables:
     """The tables of a library."""
     objects = source.objects
     parts = max(len(one.parts) for one in objects)
-    middle, present = np.zeros((len(objects), parts, 3), np.float32), np.zeros((len(objects), parts), bool)
+    middle, present = (
+        np.zeros((len(objects), parts, 3), np.float32),
+        np.zeros((len(objects), parts), bool),
+    )
     for number, one in enumerate(objects):
         present[number, : len(one.parts)] = True
         middle[number, : len(one.parts)] = [_middle(part.vertices) for part in one.parts]

@@ -207,7 +207,9 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         robot_qpos=np.array([model.joint(name).qposadr[0] for name in joints]),
         hand_geoms=np.array([model.geom(f"hand/{name}").id for name in HAND_GEOMS]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
-        objects=objects.read(model, held, bodies[held], stock.library(scene)) if held.size else None,
+        objects=objects.read(model, held, bodies[held], stock.library(scene))
+        if held.size
+        else None,
     )
 
 

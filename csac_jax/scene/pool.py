@@ -54,40 +54,44 @@ def scenes(cfg: Config, stream: int, count: int | None = None) -> Scene:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def settled(cfg: Config, stream: int, count: int, poured: bool = False) -> Scene:
+def settled(
+    cfg: Config, stream: int, count: int, poured: bool = False, packed: bool = False
+) -> Scene:
     """`count` distinct settled scenes for each number of blocks from `scene.min_blocks` to N.
 
     NumPy leaves [P, N, ...], fewest blocks first; the same for the same arguments on every machine
     of one kind. Every block in play is at rest, its centre within extent / 2 of the workspace
     centre, so a scene can be rotated by any yaw. Blocks drop all at once, stacked in the air, or if
     `poured` one after another, from `drop_height` above the pile; one that rolls off drops again.
+    If `packed`, objects of a library stand on the table side by side, see `stock.packed`.
     Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
     cache = cache_folder.private("pools")
-    path = cache and cache / f"{_digest(cfg, scene, stream, count, poured)}.npz"
+    path = cache and cache / f"{_digest(cfg, scene, stream, count, poured, packed)}.npz"
     if path and (cached := _read(path)) is not None:
         return cached
     world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand"))
     fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
     rng = np.random.default_rng([stream, 20221])
     block_counts = range(scene.min_blocks, len(scene.slots) + 1)
-    drops = [functools.partial(_drop, scene, rng, num) for num in block_counts]
-    parts = [_settle(world, drop, fall, count, poured) for drop in drops]
+    draw = _stand if packed else _drop
+    drops = [functools.partial(draw, scene, rng, num) for num in block_counts]
+    parts = [_settle(world, drop, fall, count, poured or packed) for drop in drops]
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     if path:
         _write(path, scenes)
     return scenes
 
 
-def _settle(world: World, drop: Drop, fall: Fall, count: int, poured: bool) -> Scene:
+def _settle(world: World, drop: Drop, fall: Fall, count: int, costly: bool) -> Scene:
     """`count` scenes that are at rest after their fall."""
     fields_of = jax.vmap(functools.partial(model.scene_fields, world))
     settled: list[Scene] = []
     dropped = 0
     while len(settled) < count:
         # A round of piles takes minutes, so it is no larger than needed.
-        num = min(_ROUND, count - len(settled)) if poured else _ROUND
+        num = min(_ROUND, count - len(settled)) if costly else _ROUND
         drops = [drop() for _ in range(num)]
         fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
@@ -129,6 +133,11 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
         in_play=in_play,
     )
     return stock.drawn(rng, cfg, dropped) if cfg.has_objects else dropped
+
+
+def _stand(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
+    """A random scene of `count` objects that stand beside one another."""
+    return stock.packed(rng, cfg, _drop(cfg, rng, count))
 
 
 def _falling(world: World, scene: Scene, fields: BlockFields) -> mujoco.MjData:
@@ -202,13 +211,17 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
     )
 
 
-def _digest(cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bool) -> str:
+def _digest(
+    cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bool, packed: bool
+) -> str:
     """Name of a pool: hash of everything that decides its content."""
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     if scene.has_objects:  # what is in a library counts, not where it lies
         scene = dataclasses.replace(scene, objects=stock.library(scene).sha256)
     relevant = (_VERSION, mujoco.__version__, repr(scene), *numbers)
-    content = hashlib.sha256(repr((*relevant, "poured") if poured else relevant).encode())
+    content = hashlib.sha256(
+        repr((*relevant, *(["poured"] * poured), *(["packed"] * packed))).encode()
+    )
     for name in ("table.xml", "hand.xml", "blocks.xml"):
         content.update((model.assets() / name).read_bytes())
     return content.hexdigest()[:32]

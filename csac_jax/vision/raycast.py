@@ -16,7 +16,6 @@ from flax import struct
 from csac_jax.scene.solids import GeomGroup, Solids
 from csac_jax.vision import shapes
 
-
 # Rows and columns [h, w] of a grid of rays -> their origin and direction, [h, w, 3] or one for all.
 Ray = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
@@ -122,7 +121,10 @@ def cast_body(bodies: Bodies, origin: jax.Array, direction: jax.Array) -> Surfac
         normal, offset, first, number = chunk
         nearest = ended(nearest, part, first)
         part = jax.tree.map(functools.partial(jnp.where, first), outside, part)
-        return (nearest, shapes.clip(normal, offset, origin, direction, *part, number * faces)), None
+        return (
+            nearest,
+            shapes.clip(normal, offset, origin, direction, *part, number * faces),
+        ), None
 
     no_face = jnp.array(0, jnp.int32)
     outside: Any = (jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32), no_face)
