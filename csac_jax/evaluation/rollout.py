@@ -44,7 +44,8 @@ def evaluate(
     Args: suite, a name of `suites.SUITES` or a case file; episodes, of every part of the suite;
     progress, called after every action; objects and split, what suites of objects draw from, by
     default the library that the policy was trained with. Returns: the metrics; of a suite with
-    several parts {"parts": {name: metrics}}. Raises ValueError for a suite that is none or does not fit.
+    several parts {"parts": {name: metrics}}. Raises ValueError for a suite that is none or does
+    not fit.
     """
     seen = suites.with_objects(policy.cfg, suite, objects, split)
     cfg, learned = configured(seen, physics, robot), isinstance(policy, LearnedPolicy)

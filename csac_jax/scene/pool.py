@@ -32,7 +32,7 @@ _STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
-_MAX_PAUSES = 3  # per block, until pouring a scene is given up
+_MAX_PAUSES = 3  # per block, until pouring a scene is given up; for a few, 2 and the settling
 
 Drop = Callable[[], Scene]
 Fall = Callable[[Scene, BlockFields], Scene | None]
@@ -173,7 +173,8 @@ def pour(
     pinned = np.ones(num, bool)  # waiting in the air
     places, quiet = layout.parking(num), 0.0
 
-    for _ in range(_MAX_PAUSES * len(waiting)):
+    still = round(cfg.settle_time / _PAUSE)
+    for _ in range(max(_MAX_PAUSES * len(waiting), 2 * len(waiting) + still)):
         if waiting:
             slot = waiting.pop(0)
             top = data.qpos[world.block_qpos[~pinned, 2]].max(initial=0.0)
