@@ -11,11 +11,12 @@ import csac_jax
 from csac_jax import cli, presets
 
 ROOT = Path(csac_jax.__file__).parents[1]
-ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
+# Their commands make the files of their blocks.
+ROBOT, OBJECTS = (ROOT / "docs" / name for name in ("robot.md", "objects.md"))
 PAGES = [
     page
     for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
-    if "```python" in page.read_text() and page != ROBOT
+    if "```python" in page.read_text() and page not in (ROBOT, OBJECTS)
 ]
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 
@@ -55,19 +56,34 @@ def _run_command(line: str) -> None:
         assert cli.main(arguments) == 0, line
 
 
+def _run_page(page: Path) -> int:
+    """Runs the commands and Python blocks of a page in their order; returns their number."""
+    step = r"(?ms)^```python\n(.*?)^```|^    ((?:python|csac-jax) [^\n]*)"
+    steps = re.findall(step, re.sub(r"(?ms)^```py\n.*?^```", "", page.read_text()))
+    namespace = {"__name__": page.stem}
+    for block, command in steps:
+        if command:
+            _run_command(command)
+        else:
+            exec(compile(block, page.name, "exec"), namespace)
+    return len(steps)
+
+
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order, but those that
     need hardware, which are marked `py`."""
     for module in ("flatbuffers", "onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
-    step = r"(?ms)^```python\n(.*?)^```|^    ((?:python|csac-jax) [^\n]*)"
-    steps = re.findall(step, re.sub(r"(?ms)^```py\n.*?^```", "", ROBOT.read_text()))
-    namespace = {"__name__": "robot"}
-    for block, command in steps:
-        if command:
-            _run_command(command)
-        else:
-            exec(compile(block, "robot.md", "exec"), namespace)
-    assert len(steps) >= 6
+    assert _run_page(ROBOT) >= 6
     assert Path("demo/decision.png").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+def test_objects_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the commands and Python blocks of docs/objects.md run in their order."""
+    monkeypatch.chdir(tmp_path)
+    assert _run_page(OBJECTS) >= 6
+    for name in ("own.png", "cup.png", "pile.png", "result.json"):
+        assert Path("objects", name).exists()

@@ -186,7 +186,7 @@ def _objects(cfg: Config, count: int, extent: float) -> Config:
         "drop_extent": (extent, extent),
     }
     wide = _wide(cfg, dataclasses.replace(cfg.scene, **placed))
-    return wide.change(task={"max_actions": max(cfg.task.max_actions, ACTIONS_EACH * count)})
+    return wide.change(task={"max_actions": ACTIONS_EACH * count})
 
 
 def _pile(cfg: Config, episodes: int, stream: int) -> Env:

@@ -75,6 +75,11 @@ def _drawn(name: str) -> bool:
     return number < HELD_OUT * 2**64
 
 
+def renamed(one: Object, name: str) -> Object:
+    """The object under another name."""
+    return dataclasses.replace(one, name=name)
+
+
 def make(name: str, parts: Sequence[Part], **more: Any) -> Object:
     """The object of convex parts that do not overlap, shifted such that its centre of mass is the
     origin."""

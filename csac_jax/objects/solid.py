@@ -5,6 +5,7 @@ whose integrals of 1, x and x y are closed forms (Tonon 2005, J. Math. Stat. 1, 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -47,6 +48,31 @@ def convex(points: np.ndarray) -> Part:
     triangles[inwards] = triangles[inwards][:, [0, 2, 1]]
     planes = _merged(hull.equations * [1, 1, 1, -1], np.ptp(vertices, axis=0).max())
     return Part(vertices.astype(np.float32), triangles.astype(np.int32), planes)
+
+
+def simplified(points: np.ndarray) -> Part:
+    """The hull of as many of the points [n, 3] as give at most MOST_FACES faces: the outermost ones
+    along the axes, then again and again the one farthest outside.
+
+    Raises ValueError where they have no volume.
+    """
+    part = convex(points)
+    if len(part.planes) <= MOST_FACES:
+        return part
+    corners = part.vertices.astype(np.float64)
+    chosen = {*corners.argmin(axis=0).tolist(), *corners.argmax(axis=0).tolist()}
+    chosen |= {int(np.argmax(corners @ way)) for way in _DIAGONALS}
+    best = convex(corners[[*chosen]])
+    while True:
+        outside = (corners @ best.planes[:, :3].T - best.planes[:, 3]).max(axis=1)
+        chosen.add(int(outside.argmax()))
+        part = convex(corners[[*chosen]])
+        if len(part.planes) > MOST_FACES:
+            return best
+        best = part
+
+
+_DIAGONALS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
 
 
 def _merged(planes: np.ndarray, size: float) -> np.ndarray:
