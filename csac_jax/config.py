@@ -167,7 +167,7 @@ class SimConfig(Section, section="sim"):
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
-    `warp` on one CUDA device where it is known to be faster, else `mjx`."""
+    `warp` on one CUDA device where it is known to be faster, else `mjx`; for objects always `c`."""
     robot: RobotKind = "hand"  # `hand`: the RG2 alone, floating, for training. `ur5`: on the arm.
     grasp_phases: tuple[int, int, int] = _bounded((60, 50, 80), 1)
     """Substeps of a grasp: descend, close the fingers, lift."""

@@ -82,8 +82,13 @@ def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.slow
 @pytest.mark.mjx
 def test_objects_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the commands and Python blocks of docs/objects.md run in their order."""
+    """Claim: the commands and Python blocks of docs/objects.md run in their order, given a folder
+    of meshes in millimetres."""
+    pytest.importorskip("coacd")
+    trimesh = pytest.importorskip("trimesh")
     monkeypatch.chdir(tmp_path)
-    assert _run_page(OBJECTS) >= 6
+    Path("meshes").mkdir()
+    trimesh.creation.box((30, 40, 50)).export("meshes/box.stl")
+    assert _run_page(OBJECTS) >= 7
     for name in ("own.png", "cup.png", "pile.png", "result.json"):
         assert Path("objects", name).exists()

@@ -27,6 +27,7 @@ MODULES = ("trimesh", "coacd")
 MOST_BYTES, MOST_TRIANGLES = 2**26, 500_000  # of a file
 SOUND = (0.9, 1.15)  # volume of the parts / volume of the mesh, else it is said
 _PARTS, _THRESHOLD = 16, 0.05  # CoACD's bounds of number and of concavity
+_LEAST_VOLUME = 1e-4  # of the bounding box's: CoACD crashes on less
 _MEMORY = 2**33  # bytes that one worker may ask for
 
 Progress = Callable[[int, int, str], None]  # finished, all, name of the one just finished
@@ -117,8 +118,8 @@ def _closed(mesh: Any, scale: float) -> Any:
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         edges = np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1]
         raise ValueError(f"is open or torn at {(edges != 2).sum()} edges; close its mesh")
-    if mesh.volume <= 0.0:
-        raise ValueError("has no volume; turn its faces outwards")
+    if mesh.volume <= _LEAST_VOLUME * np.prod(np.ptp(mesh.vertices, axis=0)):
+        raise ValueError("has hardly any volume; close its mesh, and turn its faces outwards")
     return mesh
 
 

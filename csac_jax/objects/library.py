@@ -282,9 +282,11 @@ def _object(entry: dict[str, Any], parts: list[Part]) -> Object:
         raise ValueError(f"1 to {MOST_PARTS} parts an object, not {count}")
     own = tuple(parts.pop() for _ in range(count))
     inertia = np.array(entry["inertia"], np.float64) / DENSITY
-    texts = {name: str(entry[name]) for name in ("name", "family", "source", "source_sha256")}
-    numbers = {"volume": float(entry["volume"]), "scale": float(entry["scale"])}
-    found = Object(parts=own, inertia=inertia, **texts, **numbers)
+    texts: dict[str, Any] = {
+        name: str(entry[name]) for name in ("name", "family", "source", "source_sha256")
+    }
+    volume, scale = float(entry["volume"]), float(entry["scale"])
+    found = Object(parts=own, volume=volume, inertia=inertia, scale=scale, **texts)
     if fault := faults(found):
         raise ValueError(f"object '{found.name[:60]}' {fault}")
     return found

@@ -240,7 +240,7 @@ def _corners(case: Case) -> list[list[np.ndarray]]:
             local = scene.half_size[slot] * (centre + half * cube)
         corners[slot].append(rotations[slot].apply(local) + scene.position[slot])
     for slot in np.flatnonzero(blocks.is_object(case.slots)):
-        one = tables.find(case.objects, "all").objects[scene.object_id[slot]]
+        one = tables.find(case.objects, "all").objects[int(scene.numbers[slot])]
         for part in one.parts:
             corners[slot].append(rotations[slot].apply(part.vertices) + scene.position[slot])
     return corners

@@ -34,6 +34,13 @@ class Scene:
     target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
     object_id: jax.Array | None = None  # [N] int32, which of the library's; None without objects
 
+    @property
+    def numbers(self) -> jax.Array:
+        """`object_id` of a scene with objects."""
+        if self.object_id is None:
+            raise ValueError("the scene has no objects of a library")
+        return self.object_id
+
 
 def parking(num_slots: int) -> np.ndarray:
     """Parking places [N, 3] m, in the air and far apart, so that nothing touches."""

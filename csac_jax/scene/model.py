@@ -110,7 +110,7 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     for slot, place in enumerate(layout.parking(len(scene.slots))):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
-        if scene.slots[slot] == "object":
+        if library is not None and scene.slots[slot] == "object":
             objects.add_geoms(spec, body, library)
         else:
             _add_parts(spec, body, scene.slots[slot])
@@ -251,7 +251,7 @@ def scene_fields(world: World, scene: Scene) -> BlockFields:
     fields = _with_meshes(world, scene, _box_fields(world, scene))
     if world.objects is None:
         return fields
-    held = (scene.object_id, scene.density, scene.friction)
+    held = (scene.numbers, scene.density, scene.friction)
     return fields.replace(objects=ObjectFields(*(leaf[world.objects.slots] for leaf in held)))
 
 
@@ -345,7 +345,7 @@ def with_blocks(
     counts = model.mesh_vertnum[: len(fields.mesh_scale)]  # the blocks' meshes come first
     scales = np.repeat(fields.mesh_scale, counts)  # of corners, mesh by mesh
     model.mesh_vert[: len(scales)] = world.model.mesh_vert[: len(scales)] * scales[:, None]
-    if world.objects is not None:
+    if world.objects is not None and fields.objects is not None:
         objects.put(model, world.objects, fields.objects)
     mujoco.mj_setConst(model, scratch)
     return model

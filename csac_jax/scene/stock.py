@@ -35,7 +35,7 @@ def drawn(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
 
 def hold(scene: Scene, slots: np.ndarray, numbers: np.ndarray, known: Tables) -> Scene:
     """The scene with the objects `numbers` [M] of a library in `slots` [M]."""
-    object_id, half_size = scene.object_id.copy(), scene.half_size.copy()
+    object_id, half_size = np.array(scene.numbers), np.array(scene.half_size)
     object_id[slots], half_size[slots] = numbers, known.half[numbers]
     return scene.replace(object_id=object_id, half_size=half_size)
 
@@ -51,10 +51,10 @@ def packed(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
     Raises SceneError where there is no room.
     """
     half = 0.5 * rng.uniform(*cfg.drop_extent)
-    position, quaternion = scene.position.copy(), scene.quaternion.copy()
+    position, quaternion = np.array(scene.position), np.array(scene.quaternion)
     outlines: list[np.ndarray] = []
     for slot in np.flatnonzero(scene.in_play):
-        one = library(cfg).objects[int(scene.object_id[slot])]
+        one = library(cfg).objects[int(scene.numbers[slot])]
         corners = np.concatenate([part.vertices for part in one.parts])
         for _ in range(_TRIES):
             yaw, xy = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-half, half, 2)
@@ -91,7 +91,7 @@ def fingerprint(cfg: SceneConfig, scenes: Scene) -> str:
     frictions and colours. Physics touches none of it, so that it is the same on every machine."""
     objects = library(cfg).objects
     content = hashlib.sha256()
-    for number, held in zip(scenes.object_id.ravel(), scenes.in_play.ravel(), strict=True):
+    for number, held in zip(scenes.numbers.ravel(), scenes.in_play.ravel(), strict=True):
         one = objects[number]
         text = f"{one.name} {one.source_sha256} {one.volume:.4e} {held};"
         content.update(text.encode())

@@ -63,7 +63,7 @@ def _objects(cfg: Config, scene: Scene, height: jax.Array) -> tuple[jax.Array, j
     count = known.present.shape[1]
 
     def of_slot(slot: jax.Array) -> tuple[jax.Array, jax.Array]:
-        number = scene.object_id[slot]
+        number = scene.numbers[slot]
         normal, offset, part, middle, present = (
             jnp.asarray(leaf)[number]
             for leaf in (known.normal, known.offset, known.part, known.middle, known.present)

@@ -41,6 +41,11 @@ class Shapes(NamedTuple):
     blocks: Polytopes
     objects: Bodies | None = None
 
+    @property
+    def first(self) -> int:
+        """Number of the first surface of an object."""
+        return 1 + self.blocks.offset.size
+
 
 def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observation:
     """The observation of one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor`
@@ -75,7 +80,7 @@ def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
 
 def _objects(cfg: SceneConfig, scene: Scene) -> Bodies:
     known, slot = stock.table(cfg), np.flatnonzero(blocks.is_object(cfg.slots))  # [M]
-    number = scene.object_id[slot]
+    number = scene.numbers[slot]
     normal, offset, first, centre = (
         jnp.asarray(leaf)[number]
         for leaf in (known.normal, known.offset, known.first, known.centre)
@@ -147,49 +152,55 @@ def ortho(cfg: HeightmapConfig, shapes: Shapes, tables: SurfaceTables) -> Observ
     cast = jax.vmap(raycast.cast_polytopes, in_axes=(None, 0, None))
     hits = SurfaceHit(*(leaf.reshape(cfg.size, -1) for leaf in cast(shapes.blocks, origin, down)))
     if shapes.objects is not None:
-        hits = _objects_below(cfg, shapes, hits)
+        hits = _objects_below(cfg, shapes.objects, hits, shapes.first)
     colour, target = (table.at[hits.surface].get(mode="promise_in_bounds") for table in tables)
     return Observation(colour, jnp.maximum(VIEW_HEIGHT - hits.distance, 0.0), target)
 
 
-def _objects_below(cfg: HeightmapConfig, shapes: Shapes, hits: SurfaceHit) -> SurfaceHit:
-    """The hits of the rays straight down, with the objects."""
+def _objects_below(
+    cfg: HeightmapConfig, objects: Bodies, hits: SurfaceHit, first: int
+) -> SurfaceHit:
+    """The hits of the rays straight down, with the objects, whose surfaces count from `first`."""
     down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
-    side = min(math.ceil(2.0 * shapes.objects.radius / cfg.cell) + 1, cfg.size)
-    low = shapes.objects.centre[:, 1::-1] - shapes.objects.radius  # y, x
+    side = min(math.ceil(2.0 * objects.radius / cfg.cell) + 1, cfg.size)
+    low = objects.centre[:, 1::-1] - objects.radius  # y, x
     corner = jnp.floor((low + 0.5 * cfg.extent) / cfg.cell)
 
     def ray(rows: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
         x, y = ((i.astype(jnp.float32) - 0.5 * (cfg.size - 1)) * cfg.cell for i in (columns, rows))
         return jnp.stack([x, y, jnp.full_like(x, VIEW_HEIGHT)], axis=-1), down
 
-    return _windows(shapes, hits, corner, (side, side), ray)
+    return _windows(objects, hits, corner, (side, side), ray, first)
 
 
 def seen(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
     """What the pixels [h, w] of a camera hit that stands where `cfg.camera` does, or nearly."""
-    hits = camera.cast_rays(eye, raycast.cast_polytopes, shapes.blocks)
-    if shapes.objects is None:
+    hits, objects = camera.cast_rays(eye, raycast.cast_polytopes, shapes.blocks), shapes.objects
+    if objects is None:
         return hits
-    radius = 1.05 * shapes.objects.radius  # a camera with a noisy pose is a little nearer
+    radius = 1.05 * objects.radius  # a camera with a noisy pose is a little nearer
     side = camera.window(cfg.camera, cfg.heightmap.extent, HIGHEST, radius)
-    pixel = jax.vmap(camera.project, (None, 0))(eye, shapes.objects.centre)
+    pixel = jax.vmap(camera.project, (None, 0))(eye, objects.centre)
     corner = jnp.floor(pixel[:, ::-1] - 0.5 * jnp.asarray(side, jnp.float32)[None])
 
     def ray(rows: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
         return eye.position, camera.direction(eye, rows, columns)
 
-    return _windows(shapes, hits, corner, side, ray)
+    return _windows(objects, hits, corner, side, ray, shapes.first)
 
 
 def _windows(
-    shapes: Shapes, hits: SurfaceHit, corner: jax.Array, side: tuple[int, int], ray: raycast.Ray
+    objects: Bodies,
+    hits: SurfaceHit,
+    corner: jax.Array,
+    side: tuple[int, int],
+    ray: raycast.Ray,
+    first: int,
 ) -> SurfaceHit:
     """`raycast.cast_windows` with corners [M, 2], whole numbers, moved into the grid."""
     most = np.array(hits.distance.shape) - side
     inside = jnp.clip(corner, 0.0, jnp.asarray(most, jnp.float32)[None]).astype(jnp.int32)
-    first = 1 + shapes.blocks.offset.size
-    return raycast.cast_windows(shapes.objects, hits, inside, side, ray, first)
+    return raycast.cast_windows(objects, hits, inside, side, ray, first)
 
 
 def ortho_noisy(

@@ -120,11 +120,10 @@ def cast_body(bodies: Bodies, origin: jax.Array, direction: jax.Array) -> Surfac
         nearest, part = carry
         normal, offset, first, number = chunk
         nearest = ended(nearest, part, first)
-        part = jax.tree.map(functools.partial(jnp.where, first), outside, part)
-        return (
-            nearest,
-            shapes.clip(normal, offset, origin, direction, *part, number * faces),
-        ), None
+        enter, leave, face = jax.tree.map(functools.partial(jnp.where, first), outside, part)
+        ray = origin, direction
+        part = shapes.clip(normal, offset, *ray, enter, leave, face, number * faces)
+        return (nearest, part), None
 
     no_face = jnp.array(0, jnp.int32)
     outside: Any = (jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32), no_face)

@@ -99,7 +99,10 @@ REFUSED = {
     "empty": (lambda folder: _text(folder, "mesh.obj", ""), "mesh"),
     "huge header": (lambda folder: _text(folder, "mesh.ply", _PLY), "ply|mesh"),
     "not finite": (lambda folder: _text(folder, "mesh.obj", _NAN), "finite|open|mesh"),
-    "flat": (lambda folder: _file(folder, _box((0.03, 0.04, 1e-9))), "sides of 1e-06 to 40 mm, not 1 to 400"),
+    "flat": (
+        lambda folder: _file(folder, _box((0.03, 0.04, 1e-9))),
+        "sides of 1e-06 to 40 mm, not 1 to 400",
+    ),
 }
 
 
