@@ -58,6 +58,7 @@ pictures: $(STAMP)  ## draw the pictures of README.md
 	    $(BIN)/csac-jax play --scene $${shown%:*} --robot $${shown#*:} --size 480 360 --no-views --png docs/pictures/$${shown%:*}.png; \
 	done
 	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --png docs/pictures/views.png
+	$(BIN)/csac-jax play --scene pile --objects made:0:200 --policy $(VIEWED) --png docs/pictures/objects.png
 
 figures: $(STAMP)  ## the figures, tables and index of the recorded results
 	$(BIN)/csac-jax report experiments/results --markdown docs/results.md > /dev/null

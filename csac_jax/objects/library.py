@@ -111,6 +111,12 @@ class Library:
         return names.index(name)
 
 
+def of(objects: Sequence[Object]) -> Library:
+    """The library of these objects, in no file."""
+    names = " ".join(each.name for each in objects)
+    return Library(tuple(objects), hashlib.sha256(names.encode() + _packed(objects)).hexdigest())
+
+
 def chosen(library: Library, split: Split) -> Library:
     """The objects of a split. Raises LibraryError where there are none."""
     if split == "all":

@@ -48,7 +48,7 @@ def find(source: str, split: Split) -> Library:
 def _made(seed: int, count: int) -> Library:
     if not 1 <= count <= library.MOST_OBJECTS:
         raise LibraryError(f"made:{seed}:{count}: 1 to {library.MOST_OBJECTS} objects can be made")
-    return library.Library(tuple(families.draw(seed, count)), f"made:{seed}:{count}")
+    return library.of(families.draw(seed, count))
 
 
 _chosen = functools.lru_cache(maxsize=16)(library.chosen)
