@@ -56,6 +56,7 @@ bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke 
 pictures: $(STAMP)  ## draw the pictures of README and docs (4 minutes)
 	$(BIN)/python -m experiments.pictures
 	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --size 960 720 --png docs/pictures/views.png
+	$(BIN)/csac-jax play --scene pile --objects made:0:200 --policy $(VIEWED) --png docs/pictures/objects.png
 
 figures: $(STAMP)  ## the figures, tables and index of the recorded results
 	$(BIN)/csac-jax report experiments/results --markdown docs/results.md > /dev/null

@@ -15,6 +15,7 @@ Map, in the direction of data; imports point only backwards along it:
     config      every setting, as frozen dataclasses
     presets     named configs; algorithms: the CSAC family and its baselines
     geometry    poses, pixels <-> metres
+    objects     shapes of convex parts: libraries, own families, import of meshes
     scene       MJCF -> model and index of ids; block layouts; the pool of settled scenes
     sim         physics, push and grasp primitives, their outcomes
     vision      raycaster, height and colour maps, rotations of maps

@@ -12,7 +12,7 @@ import math
 import typing
 from typing import Any, ClassVar, Literal
 
-SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder"]
+SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder", "object"]
 RobotKind = Literal["hand", "ur5", "ur5e"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 SensorKind = Literal["none", "d415", "d435", "azure_kinect"]
@@ -102,7 +102,13 @@ class SceneConfig(Section, section="scene"):
     drop_height = 0.15  # height of the first drop, m (VPG); later blocks start above it
 
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
-    """Kind of each block slot; a box slot draws a cube, cuboid, plank or tile in every scene."""
+    """Kind of each slot; a box slot draws a cube, cuboid, plank or tile in every scene, an object
+    slot any object of the library."""
+    objects: str = ""
+    """Library that slots of kind object draw from: a folder, or made:SEED:COUNT for our own
+    shapes."""
+    split: Literal["train", "held_out", "all"] = "train"
+    """Which of its objects: those for training, those kept for evaluation, or all."""
     min_blocks: int = _bounded(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = _bounded(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
     arranged: float = _bounded(0.0, 0.0, 1.0)  # Share of packed scenes; the others are dropped.
@@ -124,6 +130,14 @@ class SceneConfig(Section, section="scene"):
         for name in ("density", "friction", "drop_extent"):
             low, high = getattr(self, name)
             _require(low <= high, f"scene.{name}: low <= high is needed")
+        if self.has_objects:
+            _require(self.objects != "", "scene.objects: slots of kind object need a library")
+            _require(self.arranged == 0.0, "scene.arranged: must be 0 with slots of kind object")
+
+    @property
+    def has_objects(self) -> bool:
+        """Some slot holds objects of a library."""
+        return "object" in self.slots
 
 
 class TaskConfig(Section, section="task"):
@@ -151,7 +165,7 @@ class SimConfig(Section, section="sim"):
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
-    `warp` on one CUDA device where it is known to be faster, else `mjx`."""
+    `warp` on one CUDA device where it is known to be faster, else `mjx`; for objects always `c`."""
     robot: RobotKind = "hand"
     """`hand`: the gripper alone, floating, for training. `ur5`, `ur5e`: on that arm."""
     gripper: str = "rg2"
@@ -619,6 +633,8 @@ class Config(Section):
         _require(rotations % 2 == 0, "net.rotations: must be even")
         _require(rotations <= most, f"net.rotations: at most {most} for heightmap.size {size}")
         self.net.check_canvas(size)
+        fits = not self.scene.has_objects or self.sim.physics in ("c", "auto")
+        _require(fits, "sim.physics: objects that differ between scenes need c or auto")
         if self.sim.physics == "warp":
             alike = self.scene.size_jitter[1] == 0.0 or not set(MESH_KINDS) & set(self.scene.slots)
             _require(alike, "scene.size_jitter: the second must be 0 where sim.physics is warp")

@@ -87,6 +87,7 @@ class Env:
     physics: Physics
     scenes: Scene  # NumPy leaves [P, N, ...], at rest
     any_yaw: bool = True  # False: `reset` rotates scenes by quarter turns only
+    max_failures: int = 0  # failed grasps in a row that end an episode of an evaluation; 0: none
 
     @property
     def observation_spec(self) -> Observation:

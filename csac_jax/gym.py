@@ -28,7 +28,7 @@ from csac_jax.runtime import cache
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend
 from csac_jax.sim.primitives import Action
-from csac_jax.vision import camera, observe, raycast
+from csac_jax.vision import camera, observe
 from csac_jax.vision.heightmap import Observation
 
 ActionKind = Literal["continuous", "dense"]
@@ -230,9 +230,9 @@ def _infos(info: Info) -> dict[str, Any]:
 @functools.partial(jax.jit, static_argnums=0)
 def _picture(cfg: Config, scene: Scene) -> jax.Array:
     """The scene as PICTURE's camera sees it, [h, w, 3] uint8."""
-    shapes = observe.polytopes(cfg.scene.slots, scene)
-    tables = observe.surface_tables(shapes, jnp.zeros(len(shapes.offset), bool))
-    hits = camera.cast_rays(camera.make(PICTURE), raycast.cast_polytopes, shapes)
+    shapes = observe.scene_shapes(cfg.scene, scene)
+    tables = observe.scene_tables(cfg.scene, scene, shapes)
+    hits = observe.seen(cfg.change(camera=PICTURE), camera.make(PICTURE), shapes)
     lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
     shown = jnp.where(hits.valid[..., None], lit, camera.SKY[None, None])
     return jnp.round(255.0 * shown).astype(jnp.uint8)

@@ -24,11 +24,12 @@ from csac_jax.io import checkpoint
 ROOT = Path(csac_jax.__file__).parents[1]
 README = ROOT / "README.md"
 ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
+OBJECTS = ROOT / "docs" / "objects.md"  # likewise
 GRIPPERS = ROOT / "docs" / "grippers.md"
 TUTORIAL = ROOT / "docs" / "tutorial" / "first-training.md"
 RECORD = ROOT / "experiments" / "results" / "quick" / "csac_beta" / "seed-0" / "metrics.jsonl"
 ALL = [README, ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
-PAGES = [page for page in ALL if "```python" in page.read_text() and page != ROBOT]
+PAGES = [page for page in ALL if "```python" in page.read_text() and page not in (ROBOT, OBJECTS)]
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 SHELL = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -193,21 +194,26 @@ def test_robot_page_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         assert cfg.sensor.kind == "d415"
 
 
+def _run_page(page: Path) -> int:
+    """Runs the commands and Python blocks of a page in their order; returns their number."""
+    step = r"(?ms)^```python\n(.*?)^```|^    ((?:python|csac-jax) [^\n]*)"
+    steps = re.findall(step, re.sub(r"(?ms)^```py\n.*?^```", "", page.read_text()))
+    namespace = {"__name__": page.stem}
+    for block, command in steps:
+        if command:
+            _run_command(command)
+        else:
+            exec(compile(block, page.name, "exec"), namespace)
+    return len(steps)
+
+
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order, but those that
     need hardware, which are marked `py`."""
     for module in ("flatbuffers", "onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
-    step = r"(?ms)^```python\n(.*?)^```|^    ((?:python|csac-jax) [^\n]*)"
-    steps = re.findall(step, re.sub(r"(?ms)^```py\n.*?^```", "", ROBOT.read_text()))
-    namespace = {"__name__": "robot"}
-    for block, command in steps:
-        if command:
-            _run_command(command)
-        else:
-            exec(compile(block, "robot.md", "exec"), namespace)
-    assert len(steps) >= 6
+    assert _run_page(ROBOT) >= 6
     assert Path("demo/decision.png").exists()
 
 
@@ -287,3 +293,16 @@ def test_grippers_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         else:
             exec(compile(block, "grippers.md", "exec"), namespace)
     assert len(steps) == 7
+
+
+def test_objects_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the commands and Python blocks of docs/objects.md run in their order, given a folder
+    of meshes in millimetres."""
+    pytest.importorskip("coacd")
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.chdir(tmp_path)
+    Path("meshes").mkdir()
+    trimesh.creation.box((30, 40, 50)).export("meshes/box.stl")
+    assert _run_page(OBJECTS) >= 7
+    for name in ("own.png", "cup.png", "pile.png", "result.json"):
+        assert Path("objects", name).exists()

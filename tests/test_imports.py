@@ -32,6 +32,7 @@ ORDER = (
     ("vision",),
     ("sim",),
     ("scene",),
+    ("objects",),
     ("geometry",),
     ("presets",),
     ("algorithms",),
@@ -64,11 +65,12 @@ ONLY_IN = {
     "jinja2": ("report/page.py",),
     "plotly": ("report/page.py",),
     "viser": ("render/viewer.py",),
-    "trimesh": ("render/viewer.py",),
     "tensorboardX": ("report/trackers.py",),
     "wandb": ("report/trackers.py",),
     "mlflow": ("report/trackers.py",),
     "yaml": ("io/config_file.py",),
+    "trimesh": ("objects/importing.py", "render/viewer.py"),
+    "coacd": ("objects/importing.py",),
 }
 JIT_IN = (
     *("training", "sweeps", "evaluation", "deploy"),

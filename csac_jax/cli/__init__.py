@@ -21,6 +21,7 @@ from csac_jax.cli import (
     evaluation,
     export,
     finetune,
+    objects,
     output,
     parsing,
     play,
@@ -43,6 +44,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "finetune": finetune.run,
     "report": report.run,
     "export": export.run,
+    "objects": objects.run,
     "doctor": doctor.run,
     "bench": bench.run,
 }
@@ -64,6 +66,7 @@ A robot learns to push and grasp in clutter.
                      learn from what act or serve recorded in DIR
   report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
+  objects COMMAND    make, import or show a library of objects
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 

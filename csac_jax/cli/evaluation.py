@@ -29,7 +29,13 @@ class EvalOptions:
     blocks' poses."""
     suite: str = "in_distribution"
     """Scenes: in_distribution (like the training's), random10, random30, cases, target (needs a
-    policy of that task), packed, camera (random10 through ever worse cameras), or a case file."""
+    policy of that task), packed, camera (random10 through ever worse cameras), pile,
+    objects_packed, objects10, target_objects (objects of a library), or a case file."""
+    objects: str | None = None
+    """Library that suites of objects draw from: a folder, or made:SEED:COUNT for our own shapes; by
+    default the policy's."""
+    split: Literal["held_out", "train", "all"] = "held_out"
+    """Which of its objects."""
     physics: Literal["auto", "mjx", "c"] = "auto"
     """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
@@ -51,18 +57,22 @@ def run(arguments: list[str]) -> int:
         raise BadArgumentsError("--episodes: at least 1")
     check_seed(options.seed)
     which = _which(options.which)
-    from csac_jax.evaluation import policies
+    from csac_jax.evaluation import policies, suites
 
     policy = policies.POLICIES[options.policy](options.source, which)
     begun = time.time()
     with as_bad_arguments(ValueError):
-        seen = policy.cfg.change(**view)
+        seen = suites.with_objects(
+            policy.cfg.change(**view), options.suite, options.objects, options.split
+        )
     cfg, result = _evaluate(options, policy, seen)
     seconds = round(time.time() - begun, 1)
     for part, summary in result.get("parts", {Path(options.suite).stem: result}).items():
         title = f"{options.policy} policy, {part}: {options.episodes} episodes, seed {options.seed}"
         print_summary(title, summary)
     asked = {name: getattr(options, name) for name in ("policy", "which", "suite", "seed")}
+    if seen.scene.has_objects:
+        asked |= {"objects": seen.scene.objects, "split": seen.scene.split}
     output.write_result(options.json, {**asked, "seconds": seconds, **result}, cfg)
     return 0
 
@@ -83,7 +93,8 @@ def _evaluate(options: EvalOptions, policy: Any, seen: Config) -> tuple[Config, 
     from csac_jax.runtime import cache
 
     cache.enable()
-    cfg = rollout.configured(seen, options.physics, options.robot)
+    with as_bad_arguments(ValueError):
+        cfg = rollout.configured(seen, options.physics, options.robot)
     count, seed, learned = options.episodes, options.seed, options.policy == "learned"
     with _progress_bar() as show:
         with as_bad_arguments(ValueError):

@@ -18,7 +18,10 @@ class PlayOptions:
     """Runs one episode and says what every action did. Draws it if asked to, with no display."""
 
     scene: str = "random"
-    """What lies on the table: random (dropped blocks), a shipped case by name, or a case file."""
+    """What lies on the table: random (dropped blocks), a shipped case by name, a case file, or
+    objects of a library: pile, objects_packed, objects10."""
+    objects: str | None = None
+    """Library that those draw from: a folder, or made:SEED:COUNT for our own shapes."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """What moves the gripper: nothing, it floats; or an arm."""
     policy: str = "oracle"
@@ -112,8 +115,10 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
 
     cache.enable()
     with as_bad_arguments(ValueError):
-        cfg = rollout.configured(policy.cfg.change(**view), options.physics, options.robot)
-        (env,) = suites.environments(cfg, _suite(options.scene), 1, options.seed).values()
+        suite = _suite(options.scene)
+        seen = suites.with_objects(policy.cfg.change(**view), suite, options.objects, "all")
+        cfg = rollout.configured(seen, options.physics, options.robot)
+        (env,) = suites.environments(cfg, suite, 1, options.seed).values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")
     steps: list[Any] = []
@@ -130,9 +135,12 @@ def _suite(scene: str) -> str:
 
     if scene == "random":
         return suites.IN_DISTRIBUTION
+    stocked = [name for name, one in suites.SUITES.items() if one.objects and not one.target]
+    if scene in stocked:
+        return scene
     if scene in cases.names():
         return str(cases.shipped(scene))
     if Path(scene).is_file():
         return scene
-    known = ", ".join(("random", *cases.names()))
+    known = ", ".join(("random", *cases.names(), *stocked))
     raise ValueError(f"--scene: '{scene}' is neither a case file nor one of: {known}")

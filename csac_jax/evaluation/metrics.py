@@ -10,6 +10,7 @@ target task only the target counts as a block.
                                was not taken.
 `completion_reachable`         episodes that ended with no block in the workspace / episodes. Lost
                                blocks do not count.
+`declutter_rate`               blocks taken / blocks at the start, over all episodes.
 `action_efficiency`            blocks taken / actions (pushes and grasps), over all episodes.
 `action_efficiency_completed`  mean of blocks at the start / actions over the episodes of
                                `completion`: VPG's "action efficiency" (Zeng et al. 2018, sec. VI).
@@ -32,7 +33,9 @@ import scipy.stats
 
 from csac_jax.constants import OUTCOMES, Outcome, Primitive
 
-ENDINGS = ("terminated", "action_cap", "no_change_cap", "physics_diverged")  # why an episode ended
+ENDINGS = (  # why an episode ended
+    *("terminated", "action_cap", "no_change_cap", "physics_diverged", "failed_grasps"),
+)
 PER_ACTION = ("action_efficiency", "action_efficiency_completed")  # blocks per action, no shares
 PER_EPISODE = ("actions_per_episode", "pushes_per_episode")  # counts, no shares
 NO_CASES = {"value": None, "low": None, "high": None, "n": 0}
@@ -92,6 +95,7 @@ def summarise(episodes: Episodes) -> dict[str, Any]:
         "grasp_success": wilson(int(outcomes[Outcome.LIFTED]), int(grasps.sum())),
         "completion": _share(took_all),
         "completion_reachable": _share(completed),
+        "declutter_rate": bootstrap_ratio(taken, blocks, int(blocks.sum())),
         "action_efficiency": bootstrap_ratio(taken, actions, int(actions.sum())),
         "action_efficiency_completed": _mean(rates),
         "action_efficiency_grasps": _mean(lifted[tried > 0] / tried[tried > 0]),
@@ -142,4 +146,5 @@ def _failures(episodes: Episodes, grasps: np.ndarray) -> dict[str, dict[str, Any
         "episode_action_cap": ended["action_cap"],  # stopped at `task.max_actions`
         "episode_no_change_cap": ended["no_change_cap"],  # at `task.max_steps_without_change`
         "episode_physics_diverged": ended["physics_diverged"],
+        "episode_failed_grasps": ended["failed_grasps"],  # after failures in a row, in some suites
     }

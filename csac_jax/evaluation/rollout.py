@@ -10,11 +10,13 @@ import numpy as np
 
 from csac_jax.agent import rewards
 from csac_jax.config import Config, PhysicsKind, RobotKind
-from csac_jax.constants import CHANGE_AREA
+from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
+from csac_jax.objects.library import Split
+from csac_jax.scene import stock
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, physics as simulation, primitives
 from csac_jax.sim.primitives import Action, JointTrajectory
@@ -34,14 +36,19 @@ def evaluate(
     physics: PhysicsKind = "auto",
     robot: RobotKind = "hand",
     progress: Progress | None = None,
+    objects: str | None = None,
+    split: Split = "held_out",
 ) -> dict[str, Any]:
     """Metrics of a policy in scenes that training never saw, see `metrics`.
 
     Args: suite, a name of `suites.SUITES` or a case file; episodes, of every part of the suite;
-    progress, called after every action. Returns: the metrics; of a suite with several parts
-    {"parts": {name: metrics}}. Raises ValueError for a suite that is none or does not fit.
+    progress, called after every action; objects and split, what suites of objects draw from, by
+    default the library that the policy was trained with. Returns: the metrics; of a suite with
+    several parts {"parts": {name: metrics}}. Raises ValueError for a suite that is none or does
+    not fit.
     """
-    cfg, learned = configured(policy.cfg, physics, robot), isinstance(policy, LearnedPolicy)
+    seen = suites.with_objects(policy.cfg, suite, objects, split)
+    cfg, learned = configured(seen, physics, robot), isinstance(policy, LearnedPolicy)
     parts = suites.environments(cfg, suite, episodes, seed, learned)
     return measure(policy, parts, episodes, seed, progress)
 
@@ -55,6 +62,8 @@ def measure(
         actor = policies.in_world(policy, env.cfg)
         report = functools.partial(progress, name) if progress else None
         found[name] = metrics.summarise(rollout(env, actor, episodes, seed, report))
+        if env.cfg.scene.has_objects:
+            found[name]["scenes_sha256"] = stock.fingerprint(env.cfg.scene, env.scenes)
     return next(iter(found.values())) if len(found) == 1 else {"parts": found}
 
 
@@ -149,10 +158,14 @@ def _run(
     states = begin(jax.random.fold_in(key, 0), numbers, scenes)
     blocks = np.asarray(states.scene.in_play.sum(axis=1))
     states = states.replace(truncated=jnp.asarray(numbers >= episodes))
-    records = []
+    records, failures = [], np.zeros(len(numbers), np.int32)
     for action in range(1, task.max_actions + 1):
         states, record = step(_pytree(policy), jax.random.fold_in(key, action), numbers, states)
         records.append(jax.device_get(record))
+        failures = failures_in_a_row(failures, records[-1])
+        if env.max_failures:
+            given_up = (failures >= env.max_failures) & ~np.asarray(states.done)
+            states = states.replace(truncated=states.truncated | given_up)
         if progress is not None:
             progress(min(int(numbers[0] + np.sum(states.done)), episodes), episodes)
         if np.all(states.done):
@@ -163,8 +176,19 @@ def _run(
         blocks_lost=steps.blocks_lost.sum(axis=1),
         blocks=np.ones_like(blocks) if task.kind == "target" else blocks,
         completed=np.asarray(states.terminated),
-        ending=endings(env.cfg, states),
+        ending=np.where(
+            (failures >= (env.max_failures or np.inf)) & ~np.asarray(states.terminated),
+            ENDINGS.index("failed_grasps"),
+            endings(env.cfg, states),
+        ),
     )
+
+
+def failures_in_a_row(before: np.ndarray, record: Episodes) -> np.ndarray:
+    """Grasps [E] that lifted nothing since the last one that did; a push is none."""
+    grasped = record.valid & (record.primitive == Primitive.GRASP)
+    after = np.where(record.outcome == Outcome.LIFTED, 0, before + 1)
+    return np.where(grasped, after, before)
 
 
 def endings(cfg: Config, last: State) -> np.ndarray:

@@ -10,8 +10,13 @@
                    other families.
 `camera`           random10 seen straight down, from the side, with the noise of a depth camera,
                    with a camera that is also 5 mm off, and with the noise and other colours.
+`pile`             five objects of a library, poured into a pile.
+`objects_packed`   five, upright side by side.
+`objects10`        ten, dropped as in random10.
+`target_objects`   one marked object among ten, to get within 5 actions.
 a path             the user's case file.
 
+Suites of objects draw from the library of `scene.objects`; docs/benchmark.md defines them.
 Training draws from stream 0 of random numbers, a suite from stream 1 + seed; no case is in
 training. Dropped and drawn blocks have SceneConfig's default sizes and materials. Every scene is
 turned by a random yaw, or by quarters where another turn would take a block out of the workspace.
@@ -21,7 +26,7 @@ import dataclasses
 import typing
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -30,6 +35,7 @@ from csac_jax import env as environment, presets
 from csac_jax.config import Config, SceneConfig, SensorConfig, SensorKind, SimConfig, SlotKind
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
+from csac_jax.objects.library import Split
 from csac_jax.scene import arrange, cases, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation
@@ -38,6 +44,10 @@ IN_DISTRIBUTION = "in_distribution"
 TEN = presets.get("fast")  # its blocks are those of random10, its contacts enough for ten
 TARGET_ACTIONS = 5  # CSAC sec. 4.4
 THIRTY = SimConfig(geom_pairs=72, contacts=240)  # three times those for ten
+FEW = 5  # objects of `pile` and `objects_packed` (VGN, arXiv:2101.01132)
+MAX_FAILURES = 2  # failed grasps in a row that end an episode there (VGN)
+PILE_EXTENT, PACKED_EXTENT = 0.10, 0.30  # m, squares that their objects are placed in (VGN)
+ACTIONS_EACH = 5  # most actions for each object (ours): pushes do not count as failures
 PACKED: tuple[SlotKind, ...] = ("box",) * 6 + ("arch",) * 2 + ("prism",) * 2 + ("cylinder",) * 2
 
 # Config of the policy, episodes, stream of random numbers -> parts by name, or the only one.
@@ -49,16 +59,35 @@ class Suite(NamedTuple):
 
     build: Build
     target: bool = False  # it asks for a target: a learned policy must know that task
+    objects: bool = False  # it needs a library of objects
 
 
 SUITES: dict[str, Suite] = {}
 
 
-def register(name: str, build: Build, target: bool = False) -> None:
+def register(name: str, build: Build, target: bool = False, objects: bool = False) -> None:
     """Adds a suite. Raises ValueError where there is one of that name."""
     if name in SUITES or name in RENAMED_SUITES:
         raise ValueError(f"there is a suite '{name}' already; choose another name")
-    SUITES[name] = Suite(build, target)
+    SUITES[name] = Suite(build, target, objects)
+
+
+def with_objects(cfg: Config, suite: str, objects: str | None, split: Split) -> Config:
+    """The config for a suite that may need objects: they come from the library `objects`, by
+    default that of the config. Raises ValueError where there is none."""
+    if suite not in SUITES or not SUITES[suite].objects:
+        if objects is not None:
+            names = ", ".join(name for name, one in SUITES.items() if one.objects)
+            raise ValueError(f"--objects: '{suite}' has no objects of a library; {names} have")
+        return cfg
+    source = objects or cfg.scene.objects
+    if not source:
+        raise ValueError(
+            f"--objects: {suite} needs a library; csac-jax objects make --out LIB makes one, or "
+            "give made:0:200"
+        )
+    scene = SceneConfig(slots=("object",), min_blocks=1, objects=source, split=split)
+    return cfg.change(scene=scene, sim={"physics": "auto"})
 
 
 def environments(
@@ -72,7 +101,7 @@ def environments(
     check(suite)
     suite = RENAMED_SUITES.get(suite, suite)
     if suite in SUITES:
-        build, target = SUITES[suite]
+        build, target, _ = SUITES[suite]
         if target and learned and cfg.task.kind != "target":
             raise ValueError(
                 f"--suite: {suite} needs a policy trained with --task.kind target, this one was "
@@ -131,7 +160,9 @@ def _case(cfg: Config, path: Path) -> Env:
     case = cases.load(path, cfg.heightmap.extent)
     if cfg.task.kind == "target":
         cases.require_target(case)
-    scene = dataclasses.replace(cfg.scene, slots=case.slots, min_blocks=len(case.slots))
+    held = {"objects": case.objects, "split": "all"} if case.objects else {}
+    placed: Any = {"slots": case.slots, "min_blocks": len(case.slots), "arranged": 0.0, **held}
+    scene = dataclasses.replace(cfg.scene, **placed)
     cfg = _wide(cfg, scene)
     return Env(cfg, _physics(cfg), _pool(case.scene))
 
@@ -151,6 +182,39 @@ def _packed(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _wide(cfg, SceneConfig(slots=PACKED, min_blocks=arrange.MIN_ARRANGED))
     scenes = arrange.arrangements(cfg.scene, cfg.heightmap.extent, stream, episodes)
     return Env(cfg, _physics(cfg), scenes)
+
+
+def _objects(cfg: Config, count: int, extent: float) -> Config:
+    """The config with `count` objects in play, placed in a square of side `extent` m."""
+    placed: Any = {
+        "slots": ("object",) * count,
+        "min_blocks": count,
+        "drop_extent": (extent, extent),
+    }
+    wide = _wide(cfg, dataclasses.replace(cfg.scene, **placed))
+    return wide.change(task={"max_actions": ACTIONS_EACH * count})
+
+
+def _pile(cfg: Config, episodes: int, stream: int) -> Env:
+    cfg = _objects(cfg, FEW, PILE_EXTENT)
+    scenes = pool.settled(cfg, stream, episodes, poured=True)
+    return Env(cfg, _physics(cfg), scenes, max_failures=MAX_FAILURES)
+
+
+def _objects_packed(cfg: Config, episodes: int, stream: int) -> Env:
+    cfg = _objects(cfg, FEW, PACKED_EXTENT)
+    scenes = pool.settled(cfg, stream, episodes, packed=True)
+    return Env(cfg, _physics(cfg), scenes, max_failures=MAX_FAILURES)
+
+
+def _objects10(cfg: Config, episodes: int, stream: int) -> Env:
+    cfg = _objects(cfg, 10, SceneConfig().drop_extent[0])
+    return Env(cfg, _physics(cfg), pool.settled(cfg, stream, episodes))
+
+
+def _target_objects(cfg: Config, episodes: int, stream: int) -> Env:
+    ten, task = _objects10(cfg, episodes, stream), {"kind": "target", "max_actions": TARGET_ACTIONS}
+    return dataclasses.replace(ten, cfg=ten.cfg.change(task=task))
 
 
 def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
@@ -180,3 +244,7 @@ register("cases", lambda cfg, episodes, stream: _cases(cfg))
 register("target", _target, target=True)
 register("packed", _packed)
 register("camera", _camera)
+register("pile", _pile, objects=True)
+register("objects_packed", _objects_packed, objects=True)
+register("objects10", _objects10, objects=True)
+register("target_objects", _target_objects, target=True, objects=True)

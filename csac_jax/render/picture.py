@@ -34,6 +34,10 @@ def coloured(world: World, fields: BlockFields, scene: Scene) -> mujoco.MjModel:
     """The world's model with the blocks of a scene, of these fields, in their colours."""
     model = with_blocks(world, fields)
     model.geom_rgba[world.block_geoms, :3] = blocks.COLOURS[scene.colour[world.parts.slot]]
+    if world.objects is not None:
+        own, number = world.objects, scene.numbers[world.objects.slots]
+        model.geom_rgba[own.geoms, :3] = blocks.COLOURS[scene.colour[own.slots]][:, None]
+        model.geom_rgba[own.geoms, 3] = own.tables.present[number]  # the others are not drawn
     return model
 
 

@@ -32,6 +32,7 @@ SHAPES = {
     "half_cylinder": Shape("half_cylinder", (0.025, 0.025, 0.0125)),
     "cylinder": Shape("cylinder", (0.0224, 0.0224, 0.025)),
 }
+OBJECT_HALF = (0.03, 0.03, 0.03)  # m, in slots of kind object until they hold one
 MAX_FACES = 10
 PADDING_OFFSET = 1e3  # m, offset of a face that is not there: every point lies inside it
 
@@ -54,8 +55,15 @@ TABLE_COLOUR = np.array([0.35, 0.33, 0.31], np.float32)
 
 def half_size_choices(kind: SlotKind) -> np.ndarray:
     """Nominal half sizes [choices, 3] m of the shapes that a slot of this kind may hold."""
+    if kind == "object":
+        return np.array([OBJECT_HALF], np.float32)
     shapes = SHAPES.values()
     return np.array([shape.half_size for shape in shapes if shape.kind == kind], np.float32)
+
+
+def is_object(slots: tuple[SlotKind, ...]) -> np.ndarray:
+    """[N] bool, slots that hold objects of a library."""
+    return np.array(slots) == "object"
 
 
 def is_mesh(slots: tuple[SlotKind, ...]) -> np.ndarray:
@@ -75,7 +83,7 @@ _ARCH = (  # two posts and a lintel: a square tunnel, 50 x 25 mm, for the half-r
 
 
 class Parts(NamedTuple):
-    """The convex parts of all slots. G = parts."""
+    """The convex parts of the blocks of all slots. G = parts."""
 
     slot: np.ndarray  # [G] int, slot that the part belongs to
     centre: np.ndarray  # [G, 3] in units of the slot's half size
@@ -83,10 +91,10 @@ class Parts(NamedTuple):
 
 
 def parts(slots: tuple[SlotKind, ...]) -> Parts:
-    """The parts of the slots, slot by slot."""
-    of_slot = [_ARCH if kind == "arch" else _WHOLE for kind in slots]
+    """The parts of the slots, slot by slot; objects of a library have none here."""
+    of_slot = [{"arch": _ARCH, "object": ()}.get(kind, _WHOLE) for kind in slots]
     slot = np.repeat(np.arange(len(slots)), [len(each) for each in of_slot])
-    every = np.concatenate(of_slot, dtype=np.float32)  # [G, 2, 3]
+    every = np.array([part for each in of_slot for part in each], np.float32).reshape(-1, 2, 3)
     return Parts(slot, every[:, 0], every[:, 1])
 
 

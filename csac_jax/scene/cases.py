@@ -4,9 +4,10 @@
         {"shape": "cube", "colour": "red", "position": [0.03, 0, 0.025],
          "quaternion": [1, 0, 0, 0], "target": true}, ...]}
 
-Shapes and colours are the names in `blocks`. A position, in metres, is that of the centre of the
-bounding box. A quaternion (w, x, y, z) is normalised. `target` is optional. Sizes, densities and
-frictions are nominal.
+Shapes and colours are the names in `blocks`. In place of a shape stands `"object": "NAME",
+"library": "LIB"` for an object of a library, the folder as seen from that of the file, or
+made:SEED:COUNT. A position, in metres, is that of the centre of the bounding box. A quaternion
+(w, x, y, z) is normalised. `target` is optional. Sizes, densities and frictions are nominal.
 """
 
 import itertools
@@ -21,7 +22,9 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from csac_jax.config import MESH_KINDS, HeightmapConfig, SlotKind
-from csac_jax.scene import blocks, layout, model
+from csac_jax.objects import tables
+from csac_jax.objects.library import LibraryError
+from csac_jax.scene import blocks, layout, model, stock
 from csac_jax.scene.layout import Scene
 
 MAX_OVERLAP = 0.002  # m, between two blocks or with the table
@@ -36,6 +39,7 @@ class Case(NamedTuple):
     name: str
     slots: tuple[SlotKind, ...]
     scene: Scene  # NumPy leaves, at rest
+    objects: str = ""  # library of its objects, as in SceneConfig
 
 
 def names() -> tuple[str, ...]:
@@ -56,9 +60,9 @@ def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
     Raises ValueError, one line with the file, the block (the first is 1) and what to change.
     """
     try:
-        case = _parse(_read(path))
+        case = _parse(_read(path), path.parent)
         _check_places(case, extent)
-    except ValueError as error:
+    except (ValueError, LibraryError) as error:
         raise ValueError(f"{path}: {error}") from None
     except RecursionError:
         raise ValueError(f"{path}: is nested too deeply for a case file") from None
@@ -122,8 +126,8 @@ _CASE: Keys = {
         f"a list of 1 to {MAX_BLOCKS} blocks",
     ),
 }
-_BLOCK: Keys = {
-    "shape": (lambda value: value in [*blocks.SHAPES], f"one of: {', '.join(blocks.SHAPES)}"),
+_TEXT = (lambda value: isinstance(value, str) and 1 <= len(value) <= 1000, "a text")
+_PLACED: Keys = {
     "colour": (blocks.COLOUR_NAMES.__contains__, f"one of: {', '.join(blocks.COLOUR_NAMES)}"),
     "position": (
         lambda value: _are_numbers(value, 3),
@@ -135,6 +139,9 @@ _BLOCK: Keys = {
     ),
     "target": (lambda value: isinstance(value, bool), "true or false"),
 }
+_SHAPE = (lambda value: value in [*blocks.SHAPES], f"one of: {', '.join(blocks.SHAPES)}")
+_BLOCK: Keys = {"shape": _SHAPE, **_PLACED}
+_OBJECT: Keys = {"object": _TEXT, "library": _TEXT, **_PLACED}
 
 
 def _check(values: Any, keys: Keys) -> None:
@@ -158,33 +165,53 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _parse(content: Any) -> Case:
-    """The case of a file's content; places are not checked yet."""
+def _parse(content: Any, folder: Path) -> Case:
+    """The case of the content of a file in this folder; places are not checked yet."""
     _check(content, _CASE)
     entries = content["blocks"]
     for number, entry in enumerate(entries, 1):
         try:
-            _check(entry, _BLOCK)
+            _check(entry, _OBJECT if isinstance(entry, dict) and "object" in entry else _BLOCK)
         except ValueError as error:
             raise ValueError(f"block {number}: {error}") from None
     targets = [slot for slot, entry in enumerate(entries) if entry.get("target")]
     if len(targets) > 1:
         first, second = targets[0] + 1, targets[1] + 1
         raise ValueError(f"block {second}: block {first} is the target already; mark only one")
-    shapes = [blocks.SHAPES[entry["shape"]] for entry in entries]
     quaternions = [np.array(entry["quaternion"]) for entry in entries]
-    slots = tuple(shape.kind for shape in shapes)
+    shapes = [blocks.SHAPES.get(entry.get("shape", "")) for entry in entries]
+    slots: tuple[SlotKind, ...] = tuple(shape.kind if shape else "object" for shape in shapes)
+    half_size = [shape.half_size if shape else blocks.OBJECT_HALF for shape in shapes]
     scene = layout.parked(slots).replace(
         position=np.array([entry["position"] for entry in entries], np.float32),
         quaternion=np.array([each / np.linalg.norm(each) for each in quaternions], np.float32),
-        half_size=np.array([shape.half_size for shape in shapes], np.float32),
+        half_size=np.array(half_size, np.float32),
         colour=np.array(
             [blocks.COLOUR_NAMES.index(entry["colour"]) for entry in entries], np.int32
         ),
         in_play=np.ones(len(slots), bool),
         target=np.int32(targets[0] if targets else layout.ANY),
     )
-    return Case(content["name"], slots, scene)
+    case = Case(content["name"], slots, scene)
+    return _with_objects(case, entries, folder) if "object" in slots else case
+
+
+def _with_objects(case: Case, entries: list[dict[str, Any]], folder: Path) -> Case:
+    """The case with the objects that its entries name."""
+    libraries = {entry["library"] for entry in entries if "object" in entry}
+    if len(libraries) > 1:
+        raise ValueError(f"objects of {len(libraries)} libraries; take all from one")
+    (name,) = libraries
+    source = name if name.startswith("made:") else str(folder / name)
+    objects, slots = tables.find(source, "all"), np.flatnonzero(blocks.is_object(case.slots))
+    numbers = [objects.number(entries[slot]["object"]) for slot in slots]
+    known = tables.of(objects)
+    scene = stock.hold(case.scene, slots, np.array(numbers), known)
+    # The origin of an object is its centre of mass.
+    rotation = Rotation.from_quat(scene.quaternion[slots], scalar_first=True)
+    position = scene.position.copy()
+    position[slots] -= rotation.apply(known.centre[numbers]).astype(np.float32)
+    return Case(case.name, case.slots, scene.replace(position=position), source)
 
 
 def _check_places(case: Case, extent: float) -> None:
@@ -212,6 +239,10 @@ def _corners(case: Case) -> list[list[np.ndarray]]:
         else:
             local = scene.half_size[slot] * (centre + half * cube)
         corners[slot].append(rotations[slot].apply(local) + scene.position[slot])
+    for slot in np.flatnonzero(blocks.is_object(case.slots)):
+        one = tables.find(case.objects, "all").objects[int(scene.numbers[slot])]
+        for part in one.parts:
+            corners[slot].append(rotations[slot].apply(part.vertices) + scene.position[slot])
     return corners
 
 

@@ -23,7 +23,7 @@ ANY = -1  # `Scene.target` in the clearing task
 class Scene:
     """Blocks of one scene. N = block slots; slots out of play are parked out of view."""
 
-    position: jax.Array  # [N, 3] float32 m, centre of the bounding box
+    position: jax.Array  # [N, 3] float32 m, centre of the bounding box; of mass of an object
     quaternion: jax.Array  # [N, 4] float32 (w, x, y, z), body -> world
     velocity: jax.Array  # [N, 6] float32 linear m/s (world), angular rad/s (body)
     half_size: jax.Array  # [N, 3] float32 m, half of the bounding box
@@ -32,6 +32,14 @@ class Scene:
     colour: jax.Array  # [N] int32, row of blocks.COLOURS
     in_play: jax.Array  # [N] bool
     target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
+    object_id: jax.Array | None = None  # [N] int32, which of the library's; None without objects
+
+    @property
+    def numbers(self) -> jax.Array:
+        """`object_id` of a scene with objects."""
+        if self.object_id is None:
+            raise ValueError("the scene has no objects of a library")
+        return self.object_id
 
 
 def parking(num_slots: int) -> np.ndarray:
@@ -53,6 +61,7 @@ def parked(slots: tuple[SlotKind, ...]) -> Scene:
         "colour": np.arange(num, dtype=np.int32) % len(blocks.COLOURS),
         "in_play": np.zeros(num, bool),
         "target": np.int32(ANY),
+        "object_id": np.zeros(num, np.int32) if "object" in slots else None,
     }
     return Scene(**leaves)
 

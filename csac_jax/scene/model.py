@@ -15,8 +15,9 @@ from csac_jax.assets import assets
 from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig, SlotKind
 from csac_jax.errors import SceneError
 from csac_jax.grippers import Gripper
-from csac_jax.scene import blocks, layout, lint, robots
+from csac_jax.scene import blocks, bodies as objects, layout, lint, robots, stock
 from csac_jax.scene.blocks import Parts
+from csac_jax.scene.bodies import Bodies, ObjectFields
 from csac_jax.scene.layout import Scene
 
 LARGEST = 1.25  # compiled over nominal block size: C culls pairs by the bounds it was compiled with
@@ -25,7 +26,7 @@ HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above th
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class World:
-    """A compiled model and the addresses in it. N = block slots, G = their convex parts."""
+    """A compiled model and the addresses in it. N = block slots, G = convex parts of blocks."""
 
     model: mujoco.MjModel
     slots: tuple[SlotKind, ...]
@@ -38,7 +39,8 @@ class World:
     robot_qpos: np.ndarray  # [Q] addresses in qpos, the gripper's joints last
     gripper: Gripper
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
-    mesh_scale: float  # size of compiled meshes relative to nominal
+    mesh_scale: float  # size of compiled meshes of blocks relative to nominal
+    objects: Bodies | None = None  # what slots of kind object hold; None where there are none
 
     @property
     def finger_qpos(self) -> int:
@@ -59,10 +61,16 @@ def _spec(scene: SceneConfig, sim: SimConfig) -> mujoco.MjSpec:
     robots.add(spec, sim, gripper)
     # Warp's meshes have one size in all scenes.
     _add_block_assets(spec, 1.0 if sim.physics == "warp" else LARGEST)
+    library = stock.library(scene) if scene.has_objects else None
+    if library is not None:
+        objects.add_meshes(spec, library)
     for slot, place in enumerate(layout.parking(len(scene.slots))):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
-        _add_parts(spec, body, scene.slots[slot])
+        if library is not None and scene.slots[slot] == "object":
+            objects.add_geoms(spec, body, library)
+        else:
+            _add_parts(spec, body, scene.slots[slot])
     if sim.physics == "c":  # the others read their contacts instead
         _add_touch_sensors(spec, gripper, len(scene.slots))
     spec.option.timestep = sim.timestep
@@ -128,12 +136,13 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     slot_of_geom = slot_of_body[model.geom_bodyid]
     gripper = grippers.load(sim.gripper)
     joints = robots.joint_names(sim, gripper)
+    held = np.flatnonzero(blocks.is_object(scene.slots))
     return World(
         model=model,
         slots=scene.slots,
         parts=blocks.parts(scene.slots),
         block_bodies=bodies,
-        block_geoms=np.flatnonzero(slot_of_geom >= 0),
+        block_geoms=np.flatnonzero((slot_of_geom >= 0) & ~np.isin(slot_of_geom, held)),
         block_qpos=model.jnt_qposadr[free_joints][:, None] + np.arange(7),
         block_dofs=model.jnt_dofadr[free_joints][:, None] + np.arange(6),
         slot_of_geom=slot_of_geom,
@@ -141,6 +150,9 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         gripper=gripper,
         hand_geoms=np.array([model.geom(name).id for name in robots.hand_geoms(gripper)]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
+        objects=objects.read(model, held, bodies[held], stock.library(scene))
+        if held.size
+        else None,
     )
 
 
@@ -168,6 +180,7 @@ class BlockFields:
     body_invweight: jax.Array  # [N, 2] 1/kg, 1/(kg m^2)
     dof_invweight: jax.Array  # [N, 6] the same for the six dofs
     mesh_scale: jax.Array  # [M] relative to the compiled mesh
+    objects: ObjectFields | None = None  # their rows of the other leaves mean nothing
 
 
 def scene_fields(world: World, scene: Scene) -> BlockFields:
@@ -178,7 +191,11 @@ def scene_fields(world: World, scene: Scene) -> BlockFields:
     m ~ rho s^3, I ~ rho s^5. Blocks of one mesh kind in a scene share their size.
     """
     scene = jax.tree.map(jnp.asarray, scene)
-    return _with_meshes(world, scene, _box_fields(world, scene))
+    fields = _with_meshes(world, scene, _box_fields(world, scene))
+    if world.objects is None:
+        return fields
+    held = (scene.numbers, scene.density, scene.friction)
+    return fields.replace(objects=ObjectFields(*(leaf[world.objects.slots] for leaf in held)))
 
 
 def _box_fields(world: World, scene: Scene) -> BlockFields:
@@ -188,8 +205,12 @@ def _box_fields(world: World, scene: Scene) -> BlockFields:
     half, centre = half_size * world.parts.half, half_size * world.parts.centre
     part_mass = 8.0 * scene.density[slot] * jnp.prod(half, axis=1)
 
+    # An object has no boxes: 1 kg and 1 kg m^2 stand in for nothing, which has no inverse.
+    held, num = blocks.is_object(world.slots), len(world.slots)
+
     def add(values: jax.Array) -> jax.Array:
-        return jnp.zeros((len(world.slots), *values.shape[1:])).at[slot].add(values)
+        blank = np.broadcast_to(held, (*values.shape[:0:-1], num)).T.astype(np.float32)
+        return jnp.asarray(blank).at[slot].add(values)
 
     mass = add(part_mass)
     com = add(part_mass[:, None] * centre) / mass[:, None]
@@ -218,26 +239,29 @@ def _with_meshes(world: World, scene: Scene, boxes: BlockFields) -> BlockFields:
     """`boxes`, but where a slot holds a mesh the compiled fields, scaled."""
     model, slot = world.model, world.parts.slot
     geoms, bodies = world.block_geoms, world.block_bodies
-    is_mesh = blocks.is_mesh(world.slots)
+    is_mesh = blocks.is_mesh(world.slots)  # [N]
+    of_part = is_mesh[slot]  # [G]
     scale = (blocks.mesh_scale(world.slots, scene.half_size) / world.mesh_scale)[:, None]  # [N, 1]
     heavier = (scene.density / layout.NOMINAL_DENSITY)[:, None]  # that of scenes/blocks.xml
     by_mass, by_inertia = heavier * scale**3, heavier * scale**5
     by_weight = jnp.concatenate([1.0 / by_mass, 1.0 / by_inertia], axis=1)  # [N, 2]
 
-    def choose(box: jax.Array, compiled: np.ndarray, by: jax.Array) -> jax.Array:
-        which = is_mesh if len(box) == len(is_mesh) else is_mesh[slot]  # [N] or [G]
+    def choose(
+        box: jax.Array, compiled: np.ndarray, by: jax.Array, which: np.ndarray = is_mesh
+    ) -> jax.Array:
         scaled = jnp.asarray(compiled, jnp.float32) * by
         return jnp.where(which.reshape(-1, *[1] * (box.ndim - 1)), scaled, box)
 
     # The first slot that uses each mesh; -1, of boxes, is the last row.
     meshes, first = np.unique(model.geom_dataid[geoms], return_index=True)
-    user = np.full(model.nmesh + 1, len(scale))
+    own_meshes = model.nmesh if world.objects is None else world.objects.meshes[0, 0]
+    user = np.full(own_meshes + 1, len(scale))
     user[meshes] = slot[first]
     by_dof = jnp.repeat(by_weight, 3, axis=1)
     return boxes.replace(
-        size=choose(boxes.size, model.geom_size[geoms], scale[slot]),
-        centre=choose(boxes.centre, model.geom_pos[geoms], scale[slot]),
-        rbound=choose(boxes.rbound, model.geom_rbound[geoms], scale[slot, 0]),
+        size=choose(boxes.size, model.geom_size[geoms], scale[slot], of_part),
+        centre=choose(boxes.centre, model.geom_pos[geoms], scale[slot], of_part),
+        rbound=choose(boxes.rbound, model.geom_rbound[geoms], scale[slot, 0], of_part),
         mass=choose(boxes.mass, model.body_mass[bodies], by_mass[:, 0]),
         inertia=choose(boxes.inertia, model.body_inertia[bodies], by_inertia),
         com=choose(boxes.com, model.body_ipos[bodies], scale),
@@ -261,7 +285,10 @@ def with_blocks(
     model.geom_pos[geoms], model.geom_friction[geoms, 0] = fields.centre, fields.friction
     model.body_mass[bodies], model.body_inertia[bodies] = fields.mass, fields.inertia
     model.body_ipos[bodies] = fields.com
-    scales = np.repeat(fields.mesh_scale, model.mesh_vertnum)  # of corners, mesh by mesh
-    model.mesh_vert[:] = world.model.mesh_vert * scales[:, None]
+    counts = model.mesh_vertnum[: len(fields.mesh_scale)]  # the blocks' meshes come first
+    scales = np.repeat(fields.mesh_scale, counts)  # of corners, mesh by mesh
+    model.mesh_vert[: len(scales)] = world.model.mesh_vert[: len(scales)] * scales[:, None]
+    if world.objects is not None and fields.objects is not None:
+        objects.put(model, world.objects, fields.objects)
     mujoco.mj_setConst(model, scratch)
     return model

@@ -22,7 +22,7 @@ from csac_jax import cache_folder
 from csac_jax.assets import assets
 from csac_jax.config import Config, SceneConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import arrange, blocks, layout, model
+from csac_jax.scene import arrange, blocks, layout, model, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World
 
@@ -33,7 +33,7 @@ _STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
-_MAX_PAUSES = 3  # per block, until pouring a scene is given up
+_MAX_PAUSES = 3  # per block, until pouring a scene is given up; for a few, 2 and the settling
 
 Drop = Callable[[], Scene]
 Fall = Callable[[Scene, BlockFields], Scene | None]
@@ -55,40 +55,44 @@ def scenes(cfg: Config, stream: int, count: int | None = None) -> Scene:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def settled(cfg: Config, stream: int, count: int, poured: bool = False) -> Scene:
+def settled(
+    cfg: Config, stream: int, count: int, poured: bool = False, packed: bool = False
+) -> Scene:
     """`count` distinct settled scenes for each number of blocks from `scene.min_blocks` to N.
 
     NumPy leaves [P, N, ...], fewest blocks first; the same for the same arguments on every machine
     of one kind. Every block in play is at rest, its centre within extent / 2 of the workspace
     centre, so a scene can be rotated by any yaw. Blocks drop all at once, stacked in the air, or if
     `poured` one after another, from `drop_height` above the pile; one that rolls off drops again.
+    If `packed`, objects of a library stand on the table side by side, see `stock.packed`.
     Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
     cache = cache_folder.private("pools")
-    path = cache and cache / f"{_digest(cfg, scene, stream, count, poured)}.npz"
+    path = cache and cache / f"{_digest(cfg, scene, stream, count, poured, packed)}.npz"
     if path and (cached := _read(path)) is not None:
         return cached
     world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
     fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
     rng = np.random.default_rng([stream, 20221])
     block_counts = range(scene.min_blocks, len(scene.slots) + 1)
-    drops = [functools.partial(_drop, scene, rng, num) for num in block_counts]
-    parts = [_settle(world, drop, fall, count, poured) for drop in drops]
+    draw = _stand if packed else _drop
+    drops = [functools.partial(draw, scene, rng, num) for num in block_counts]
+    parts = [_settle(world, drop, fall, count, poured or packed) for drop in drops]
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     if path:
         _write(path, scenes)
     return scenes
 
 
-def _settle(world: World, drop: Drop, fall: Fall, count: int, poured: bool) -> Scene:
+def _settle(world: World, drop: Drop, fall: Fall, count: int, costly: bool) -> Scene:
     """`count` scenes that are at rest after their fall."""
     fields_of = jax.vmap(functools.partial(model.scene_fields, world))
     settled: list[Scene] = []
     dropped = 0
     while len(settled) < count:
         # A round of piles takes minutes, so it is no larger than needed.
-        num = min(_ROUND, count - len(settled)) if poured else _ROUND
+        num = min(_ROUND, count - len(settled)) if costly else _ROUND
         drops = [drop() for _ in range(num)]
         fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
@@ -112,14 +116,15 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
     in_play = rng.permutation(num) < count
     quaternion = rng.normal(size=(num, 4))
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    spacing = max(_SPACING, 2.0 * stock.table(cfg).radius) if cfg.has_objects else _SPACING
     half = 0.5 * rng.uniform(*cfg.drop_extent)
     xy = rng.uniform(-half, half, (num, 2))
-    z = cfg.drop_height + _SPACING * rng.permutation(num)[:, None]
+    z = cfg.drop_height + spacing * rng.permutation(num)[:, None]
     position = np.where(in_play[:, None], np.concatenate([xy, z], axis=1), layout.parking(num))
     scale = blocks.scales(cfg, rng.uniform(-1.0, 1.0, num))[:, None]
     shapes = map(blocks.half_size_choices, cfg.slots)
     half_size = np.stack([choices[rng.integers(len(choices))] for choices in shapes]) * scale
-    return layout.parked(cfg.slots).replace(
+    dropped = layout.parked(cfg.slots).replace(
         position=position.astype(np.float32),
         quaternion=quaternion.astype(np.float32),
         half_size=half_size.astype(np.float32),
@@ -128,6 +133,12 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
         colour=rng.permutation(max(num, num_colours))[:num].astype(np.int32) % num_colours,
         in_play=in_play,
     )
+    return stock.drawn(rng, cfg, dropped) if cfg.has_objects else dropped
+
+
+def _stand(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
+    """A random scene of `count` objects that stand beside one another."""
+    return stock.packed(rng, cfg, _drop(cfg, rng, count))
 
 
 def _falling(world: World, scene: Scene, fields: BlockFields) -> mujoco.MjData:
@@ -163,7 +174,8 @@ def pour(
     pinned = np.ones(num, bool)  # waiting in the air
     places, quiet = layout.parking(num), 0.0
 
-    for _ in range(_MAX_PAUSES * len(waiting)):
+    still = round(cfg.settle_time / _PAUSE)
+    for _ in range(max(_MAX_PAUSES * len(waiting), 2 * len(waiting) + still)):
         if waiting:
             slot = waiting.pop(0)
             top = data.qpos[world.block_qpos[~pinned, 2]].max(initial=0.0)
@@ -201,11 +213,17 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
     )
 
 
-def _digest(cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bool) -> str:
+def _digest(
+    cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bool, packed: bool
+) -> str:
     """Name of a pool: hash of everything that decides its content."""
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
+    if scene.has_objects:  # what is in a library counts, not where it lies
+        scene = dataclasses.replace(scene, objects=stock.library(scene).sha256)
     relevant = (_VERSION, mujoco.__version__, repr(scene), *numbers)
-    content = hashlib.sha256(repr((*relevant, "poured") if poured else relevant).encode())
+    content = hashlib.sha256(
+        repr((*relevant, *(["poured"] * poured), *(["packed"] * packed))).encode()
+    )
     for name in ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml"):
         content.update((assets() / name).read_bytes())
     return content.hexdigest()[:32]
@@ -230,7 +248,7 @@ def _read(path: Path) -> Scene | None:
 
 def _write(path: Path, scenes: Scene) -> None:
     """Saves the scenes for the next run; a cache that cannot be written is no error."""
-    arrays: dict[str, Any] = vars(scenes)
+    arrays: dict[str, Any] = {k: leaf for k, leaf in vars(scenes).items() if leaf is not None}
     temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:

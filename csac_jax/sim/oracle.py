@@ -1,4 +1,6 @@
-"""A grasp planner that reads block poses: the ceiling that physics allows."""
+"""A grasp planner that reads the poses of blocks and objects: the ceiling that physics allows."""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ from csac_jax import grippers
 from csac_jax.config import Config, SlotKind
 from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
-from csac_jax.scene import blocks
+from csac_jax.scene import blocks, stock
 from csac_jax.scene.layout import ANY, Scene
 from csac_jax.sim.primitives import Action, grasp_depth, local_top
 
@@ -21,6 +23,23 @@ OWN = 0.003  # m beyond its face that a block may reach within a pad's width
 ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as parallel
 
 
+class Body(NamedTuple):
+    """What is held: a block, or a convex part of an object. F = faces."""
+
+    slot: jax.Array  # [] int32
+    centre: jax.Array  # [2] m
+    normal: jax.Array  # [F, 3] world frame, 0 where there is no face
+    offset: jax.Array  # [F] m, from the centre
+
+
+class Ways(NamedTuple):
+    """Grasps to choose from. n = ways."""
+
+    slot: jax.Array  # [n] int32, what is held
+    score: jax.Array  # [n], -inf where there is nothing
+    pose: jax.Array  # [n, 3] m, m, rad
+
+
 def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | int = 0) -> Action:
     """The best grasp: room for both fingers as they go down and close, faces square to the pads, a
     high and narrow block.
@@ -30,28 +49,88 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | in
 
     Args: height [H, W] m.
     """
-    sim, slots, gripper = cfg.sim, cfg.scene.slots, grippers.load(cfg.sim.gripper)
-    beside, (along, across_pad) = gripper.half[1] + 0.5 * gripper.finger[0], gripper.footprint
-    hulls: tuple[SlotKind, ...] = tuple("box" if kind == "arch" else kind for kind in slots)
+    ways = [_of_blocks(cfg, scene, height)]
+    if cfg.scene.has_objects:
+        ways.append(_of_objects(cfg, scene, height))
+    every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *ways)
+    chosen = _in_turn(every, len(cfg.scene.slots), jnp.sum(scene.in_play), jnp.int32(failures))
+    return Action(primitive=jnp.int32(Primitive.GRASP), pose=every.pose[chosen])
+
+
+def _in_turn(ways: Ways, slots: int, blocks_left: jax.Array, failures: jax.Array) -> jax.Array:
+    """Number [] of the next way to try: the best first."""
+    order = jnp.argsort(-jax.ops.segment_max(ways.score, ways.slot, slots))
+    around = jnp.maximum(blocks_left, 1)
+    own = (ways.slot == order[failures % around]) & (ways.score > -jnp.inf)
+    ranked = jnp.argsort(-jnp.where(own, ways.score, -jnp.inf))
+    return ranked[(failures // around * OTHER_WAY) % jnp.maximum(jnp.sum(own), 1)]
+
+
+def _of_blocks(cfg: Config, scene: Scene, height: jax.Array) -> Ways:
+    """Every way to take a block: at its middle and towards both ends."""
+    hulls: tuple[SlotKind, ...] = tuple(
+        "box" if kind == "arch" else kind for kind in cfg.scene.slots
+    )
     normals, offsets = blocks.half_spaces(hulls, scene.half_size)
-    rotation = jax.vmap(quat_to_matrix)(scene.quaternion)
+    slot = blocks.parts(hulls).slot
+    rotation = jax.vmap(quat_to_matrix)(scene.quaternion)[slot]
     world_normals = jnp.einsum("nij,nfj->nfi", rotation, normals, precision=EXACT)
-    yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
-    cells = cell_centres(cfg.heightmap)
+    bodies = Body(jnp.asarray(slot, jnp.int32), scene.position[slot, :2], world_normals, offsets)
+    return _ways(cfg, scene, height, bodies, SHIFTS)
 
-    def place(slot, yaw, shift):
-        """Where the hand closes: `shift` of the way from the middle to the block's end."""
+
+def _of_objects(cfg: Config, scene: Scene, height: jax.Array) -> Ways:
+    """Every way to take a part of an object, at its middle."""
+    known, slots = stock.table(cfg.scene), np.flatnonzero(blocks.is_object(cfg.scene.slots))
+    count = known.present.shape[1]
+
+    def of_slot(slot: jax.Array) -> Ways:
+        number = scene.numbers[slot]
+        normal, offset, part, middle, present = (
+            jnp.asarray(leaf)[number]
+            for leaf in (known.normal, known.offset, known.part, known.middle, known.present)
+        )
+        rotation = quat_to_matrix(scene.quaternion[slot])
+        own = jnp.repeat(part, offset.shape[1])[None] == np.arange(count)[:, None]  # [P, F]
+        flat = normal.reshape(-1, 3)  # [F, 3]
+        inner = jnp.matmul(middle, flat.T, precision=EXACT)  # [P, F] m, middle along the normals
+        turned = jnp.matmul(flat, rotation.T, precision=EXACT)
+        centre = scene.position[slot][None] + jnp.matmul(middle, rotation.T, precision=EXACT)
+        bodies = Body(
+            jnp.full(count, slot, jnp.int32),
+            centre[:, :2],
+            jnp.where(own[:, :, None], turned[None], 0.0),
+            offset.reshape(1, -1) - inner,
+        )
+        ways = _ways(cfg, scene, height, bodies, (0.0,))
+        there = jnp.repeat(present, YAWS)
+        return ways._replace(score=jnp.where(there, ways.score, -jnp.inf))
+
+    # One after the other: the masks of all grasps of all parts would not fit the memory.
+    ways = jax.lax.map(of_slot, jnp.asarray(slots, jnp.int32))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ways)
+
+
+def _ways(
+    cfg: Config, scene: Scene, height: jax.Array, bodies: Body, shifts: tuple[float, ...]
+) -> Ways:
+    """Grasps of bodies, leaves [B, ...], at YAWS and `shifts`; n = B YAWS len(shifts)."""
+    sim, gripper, cells = cfg.sim, grippers.load(cfg.sim.gripper), cell_centres(cfg.heightmap)
+    beside, (along, across_pad) = gripper.half[1] + 0.5 * gripper.finger[0], gripper.footprint
+    slots = jnp.arange(len(cfg.scene.slots))
+
+    def place(body: Body, yaw: jax.Array, shift: jax.Array) -> jax.Array:
+        """Where the hand closes: `shift` of the way from the middle to the body's end."""
         across = rotate2d(yaw, jnp.array([0.0, 1.0]))
-        cosine = jnp.matmul(world_normals[slot, :, :2], across, precision=EXACT)
-        end = offsets[slot, jnp.argmax(cosine)]
-        return scene.position[slot, :2] + shift * end * across
+        cosine = jnp.matmul(body.normal[:, :2], across, precision=EXACT)
+        return body.centre + shift * body.offset[jnp.argmax(cosine)] * across
 
-    def score(slot, yaw, shift):
+    def score(body: Body, yaw: jax.Array, shift: jax.Array) -> jax.Array:
         axis = jnp.append(rotate2d(yaw, jnp.array([1.0, 0.0])), 0.0)
-        cosine = jnp.matmul(world_normals[slot], axis, precision=EXACT)
+        cosine = jnp.matmul(body.normal, axis, precision=EXACT)
         low, high = jnp.argmin(cosine), jnp.argmax(cosine)  # the faces most square to the pads
-        width = offsets[slot, high] + offsets[slot, low]
-        centre = place(slot, yaw, shift)
+        width = body.offset[high] + body.offset[low]
+        centre = place(body, yaw, shift)
         top = local_top(cfg.heightmap, height, centre, gripper.finger[1])
         tip = jnp.maximum(top - grasp_depth(sim, gripper), gripper.clearance)
         local = jnp.abs(rotate2d(-yaw, cells - centre[None, None]))
@@ -62,7 +141,7 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | in
         caught = jnp.max(jnp.where(way, height, 0.0)) > tip
         off = jnp.abs(rotate2d(-yaw, scene.position[:, :2] - centre[None]))
         inside = (off[:, 0] < beside) & (off[:, 1] < across_pad) & (scene.position[:, 2] > tip)
-        caught |= jnp.any(inside & scene.in_play & (jnp.arange(len(slots)) != slot))
+        caught |= jnp.any(inside & scene.in_play & (slots != body.slot))
         fits = width < gripper.opening[1] - OPENING_ROOM
         square = jnp.minimum(cosine[high], -cosine[low])
         askew = jnp.maximum(1.0 - square - ALIGNED, 0.0)
@@ -70,24 +149,16 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | in
         cost += jnp.abs(shift)
         # ANY indexes the last slot, whose distance is then unused.
         away = jnp.linalg.norm(centre - scene.position[scene.target, :2])
-        asked = jnp.where(scene.target == slot, 3.0, -4.0 * away)
-        wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[slot, 2], asked)
-        return jnp.where(scene.in_play[slot], wanted - cost, -jnp.inf)
+        asked = jnp.where(scene.target == body.slot, 3.0, -4.0 * away)
+        wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[body.slot, 2], asked)
+        return jnp.where(scene.in_play[body.slot], wanted - cost, -jnp.inf)
 
-    ways = jnp.repeat(yaws, len(SHIFTS)), jnp.tile(jnp.array(SHIFTS), YAWS)
-    scores = jax.vmap(jax.vmap(score, (None, 0, 0)), (0, None, None))(jnp.arange(len(slots)), *ways)
-    slot, way = _in_turn(scores, jnp.sum(scene.in_play), jnp.int32(failures))
-    yaw, shift = (each[way] for each in ways)
-    pose = jnp.append(place(slot, yaw, shift), yaw)
-    return Action(primitive=jnp.int32(Primitive.GRASP), pose=pose)
+    def of_body(body: Body) -> Ways:
+        every = jax.vmap(score, (None, 0, 0))(body, *ways)
+        poses = jax.vmap(lambda *way: jnp.append(place(body, *way), way[0]))(*ways)
+        return Ways(jnp.full(len(every), body.slot), every, poses)
 
-
-def _in_turn(
-    scores: jax.Array, blocks_left: jax.Array, failures: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Slot and way [] of the next grasp to try, by `scores` [N, ways]: the best first."""
-    order = jnp.argsort(-jnp.max(scores, axis=1))
-    around = jnp.maximum(blocks_left, 1)
-    slot = order[failures % around]
-    ways = jnp.argsort(-scores[slot])
-    return slot, ways[(failures // around * OTHER_WAY) % scores.shape[1]]
+    yaws = jnp.asarray(np.arange(YAWS) * np.pi / YAWS, jnp.float32)
+    ways = jnp.repeat(yaws, len(shifts)), jnp.tile(jnp.array(shifts), YAWS)
+    found = jax.vmap(of_body)(bodies)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)

@@ -7,6 +7,8 @@ along z. A pixel's ray has no unit length: it advances by 1 m in depth per unit 
     picture = camera.render(eye, solids.place(geoms.read(model), data.geom_xpos, data.geom_xmat))
 """
 
+import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -58,10 +60,16 @@ def make(cfg: CameraConfig) -> Camera:
 
 def directions(camera: Camera) -> jax.Array:
     """Rays [H, W, 3] of all pixels in the world frame, each 1 m long in depth."""
-    x = (jnp.arange(camera.width, dtype=jnp.float32) - camera.centre[0]) / camera.focal[0]
-    y = (jnp.arange(camera.height, dtype=jnp.float32) - camera.centre[1]) / camera.focal[1]
-    right, down, forward = (axis[None, None] for axis in camera.rotation.T)
-    return x[None, :, None] * right + y[:, None, None] * down + forward
+    rows, columns = jnp.arange(camera.height), jnp.arange(camera.width)
+    return direction(camera, rows[:, None], columns[None])
+
+
+def direction(camera: Camera, row: jax.Array, column: jax.Array) -> jax.Array:
+    """Rays [..., 3] of the pixels at these rows and columns, as in `directions`."""
+    x = (column.astype(jnp.float32) - camera.centre[0]) / camera.focal[0]
+    y = (row.astype(jnp.float32) - camera.centre[1]) / camera.focal[1]
+    right, down, forward = (jnp.expand_dims(axis, range(x.ndim)) for axis in camera.rotation.T)
+    return x[..., None] * right + y[..., None] * down + forward
 
 
 def points(camera: Camera, depth: jax.Array) -> jax.Array:
@@ -74,6 +82,35 @@ def cast_rays(camera: Camera, cast: Callable[..., Any], shapes: Any) -> Any:
     rays, shape = directions(camera).reshape(-1, 3), (camera.height, camera.width)
     hits = jax.vmap(cast, in_axes=(None, None, 0))(shapes, camera.position, rays)
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), hits)
+
+
+def project(camera: Camera, point: jax.Array) -> jax.Array:
+    """Column and row [2] px, not whole, of the pixel that sees a point [3] m before the camera."""
+    x, y, depth = (point - camera.position) @ camera.rotation
+    return camera.focal * jnp.stack([x, y]) / depth + camera.centre
+
+
+@functools.lru_cache(maxsize=64)
+def window(cfg: CameraConfig, extent: float, highest: float, radius: float) -> tuple[int, int]:
+    """Rows and columns of a window that holds what the camera sees of any ball of `radius` m whose
+    centre lies over the square of side `extent` m, at most `highest` m high; at most the image.
+
+    In the plane of an image axis and the optical axis, a ball at angle a and distance d lies
+    between a - s and a + s with sin s = radius / d. The window is centred on what `project` gives.
+    """
+    with jax.ensure_compile_time_eval():
+        eye = jax.device_get(make(cfg))
+    steps = np.linspace(-0.5, 0.5, 9)
+    places = np.stack(np.meshgrid(extent * steps, extent * steps, highest * (steps + 0.5)), axis=-1)
+    local = (places.reshape(-1, 3) - eye.position) @ eye.rotation
+    reach = []
+    for axis in range(2):
+        angle = np.arctan2(local[:, axis], local[:, 2])
+        half = np.arcsin(np.minimum(radius / np.hypot(local[:, axis], local[:, 2]), 1.0))
+        ends = np.tan(np.clip(np.stack([angle - half, angle + half]), -1.5, 1.5)) - np.tan(angle)
+        reach.append(float(eye.focal[axis]) * float(np.abs(ends).max()))
+    columns, rows = (2 * math.ceil(each) + 3 for each in reach)
+    return min(rows, cfg.size[1]), min(columns, cfg.size[0])
 
 
 def shade(colour: jax.Array, normal: jax.Array, light: Any = LIGHT) -> jax.Array:

@@ -8,6 +8,7 @@ A surface is a face of a geom or the table, numbered as in `raycast.SurfaceHit`.
 geoms, [h, w] = camera pixels.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -15,14 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.config import Config, HeightmapConfig, SensorConfig, SlotKind
-from csac_jax.scene import blocks, layout
+from csac_jax.config import Config, HeightmapConfig, SceneConfig, SensorConfig, SlotKind
+from csac_jax.scene import blocks, layout, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
 from csac_jax.vision.camera import Camera
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
-from csac_jax.vision.raycast import Polytopes, SurfaceHit
+from csac_jax.vision.raycast import Bodies, Polytopes, SurfaceHit
 
+HIGHEST = 0.25  # m, of the middle of an object that the camera at the side sees whole
 _LIGHT = np.uint32(2**31)  # distinct from a view key's children by `split`
 
 
@@ -33,24 +35,40 @@ class SurfaceTables(NamedTuple):
     is_target: jax.Array  # [S] bool
 
 
+class Shapes(NamedTuple):
+    """What rays meet in a scene; surfaces of blocks are numbered before those of objects."""
+
+    blocks: Polytopes
+    objects: Bodies | None = None
+
+    @property
+    def first(self) -> int:
+        """Number of the first surface of an object."""
+        return 1 + self.blocks.offset.size
+
+
 def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observation:
     """The observation of one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor`
     drawn from `key`."""
-    shapes = polytopes(cfg.scene.slots, scene)
-    is_target = layout.is_target(scene)[blocks.parts(cfg.scene.slots).slot]
-    tables = surface_tables(shapes, is_target, _light(cfg.sensor, key))
+    shapes = scene_shapes(cfg.scene, scene)
+    tables = scene_tables(cfg.scene, scene, shapes, _light(cfg.sensor, key))
     if cfg.heightmap.view == "ortho":
         exact = ortho(cfg.heightmap, shapes, tables)
         return exact if key is None else ortho_noisy(key, cfg.sensor, exact, tables)
     believed = camera.make(cfg.camera)
     if key is not None:
         return oblique_noisy(key, cfg, shapes, tables, believed)
-    hits = camera.cast_rays(believed, raycast.cast_polytopes, shapes)
-    return from_pixels(cfg.heightmap, believed, hits, tables)
+    return from_pixels(cfg.heightmap, believed, seen(cfg, believed, shapes), tables)
+
+
+def scene_shapes(cfg: SceneConfig, scene: Scene) -> Shapes:
+    """The convex parts of a scene's blocks and objects, for the raycaster."""
+    own = polytopes(cfg.slots, scene)
+    return Shapes(own, _objects(cfg, scene) if cfg.has_objects else None)
 
 
 def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
-    """The convex parts of a scene's blocks, for the raycaster."""
+    """The convex parts of a scene's blocks."""
     slot = blocks.parts(slots).slot  # [G], of each convex part
     return Polytopes(
         *blocks.half_spaces(slots, scene.half_size),
@@ -60,11 +78,50 @@ def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
     )
 
 
+def _objects(cfg: SceneConfig, scene: Scene) -> Bodies:
+    known, slot = stock.table(cfg), np.flatnonzero(blocks.is_object(cfg.slots))  # [M]
+    number = scene.numbers[slot]
+    normal, offset, first, centre = (
+        jnp.asarray(leaf)[number]
+        for leaf in (known.normal, known.offset, known.first, known.centre)
+    )
+    position = scene.position[slot]
+    rotation = jax.vmap(geometry.quat_to_matrix)(scene.quaternion[slot])  # [M, 3, 3]
+    # Products and sums, as in `raycast.world_half_spaces`.
+    normal = (rotation[:, None, None] * normal[:, :, :, None]).sum(-1)
+    return Bodies(
+        normal,
+        offset + (normal * position[:, None, None]).sum(-1),
+        first,
+        position + (rotation * centre[:, None]).sum(-1),
+        jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
+        known.radius,
+    )
+
+
 def _light(noise: SensorConfig, key: jax.Array | None) -> Any:
     """Unit vector [3] towards the light."""
     if key is None or noise.light == 0.0:
         return camera.LIGHT
     return sensor.light(jax.random.fold_in(key, _LIGHT), noise)
+
+
+def scene_tables(
+    cfg: SceneConfig, scene: Scene, shapes: Shapes, light: Any = camera.LIGHT
+) -> SurfaceTables:
+    """Lit colour and target flag of every surface of a scene; see `surface_tables`."""
+    is_target = layout.is_target(scene)
+    of_blocks = is_target[blocks.parts(cfg.slots).slot]
+    tables = surface_tables(shapes.blocks, of_blocks, light)
+    if shapes.objects is None:
+        return tables
+    of_objects = is_target[np.flatnonzero(blocks.is_object(cfg.slots))]
+    faces = shapes.objects.normal[0].size // 3
+    colour = jnp.repeat(shapes.objects.colour, faces, axis=0)
+    lit = camera.shade(colour, shapes.objects.normal.reshape(-1, 3), light)
+    table = jnp.all(is_target)[None]
+    flags = [table, tables.is_target[1:], jnp.repeat(of_objects, faces)]
+    return SurfaceTables(jnp.concatenate([tables.colour, lit]), jnp.concatenate(flags))
 
 
 def surface_tables(
@@ -84,7 +141,7 @@ def surface_tables(
     return SurfaceTables(lit, per_surface(jnp.all(is_target), is_target))
 
 
-def ortho(cfg: HeightmapConfig, shapes: Polytopes, tables: SurfaceTables) -> Observation:
+def ortho(cfg: HeightmapConfig, shapes: Shapes, tables: SurfaceTables) -> Observation:
     """The view from above: one ray from VIEW_HEIGHT through every cell centre.
 
     The direction has no ray axis under vmap, so a plane costs one scalar product per ray.
@@ -93,9 +150,57 @@ def ortho(cfg: HeightmapConfig, shapes: Polytopes, tables: SurfaceTables) -> Obs
     origin = jnp.concatenate([geometry.cell_centres(cfg), height], axis=-1).reshape(-1, 3)
     down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
     cast = jax.vmap(raycast.cast_polytopes, in_axes=(None, 0, None))
-    distance, surface, _ = (leaf.reshape(cfg.size, -1) for leaf in cast(shapes, origin, down))
-    colour, target = (table.at[surface].get(mode="promise_in_bounds") for table in tables)
-    return Observation(colour, jnp.maximum(VIEW_HEIGHT - distance, 0.0), target)
+    hits = SurfaceHit(*(leaf.reshape(cfg.size, -1) for leaf in cast(shapes.blocks, origin, down)))
+    if shapes.objects is not None:
+        hits = _objects_below(cfg, shapes.objects, hits, shapes.first)
+    colour, target = (table.at[hits.surface].get(mode="promise_in_bounds") for table in tables)
+    return Observation(colour, jnp.maximum(VIEW_HEIGHT - hits.distance, 0.0), target)
+
+
+def _objects_below(
+    cfg: HeightmapConfig, objects: Bodies, hits: SurfaceHit, first: int
+) -> SurfaceHit:
+    """The hits of the rays straight down, with the objects, whose surfaces count from `first`."""
+    down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
+    side = min(math.ceil(2.0 * objects.radius / cfg.cell) + 1, cfg.size)
+    low = objects.centre[:, 1::-1] - objects.radius  # y, x
+    corner = jnp.floor((low + 0.5 * cfg.extent) / cfg.cell)
+
+    def ray(rows: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x, y = ((i.astype(jnp.float32) - 0.5 * (cfg.size - 1)) * cfg.cell for i in (columns, rows))
+        return jnp.stack([x, y, jnp.full_like(x, VIEW_HEIGHT)], axis=-1), down
+
+    return _windows(objects, hits, corner, (side, side), ray, first)
+
+
+def seen(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
+    """What the pixels [h, w] of a camera hit that stands where `cfg.camera` does, or nearly."""
+    hits, objects = camera.cast_rays(eye, raycast.cast_polytopes, shapes.blocks), shapes.objects
+    if objects is None:
+        return hits
+    radius = 1.05 * objects.radius  # a camera with a noisy pose is a little nearer
+    side = camera.window(cfg.camera, cfg.heightmap.extent, HIGHEST, radius)
+    pixel = jax.vmap(camera.project, (None, 0))(eye, objects.centre)
+    corner = jnp.floor(pixel[:, ::-1] - 0.5 * jnp.asarray(side, jnp.float32)[None])
+
+    def ray(rows: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return eye.position, camera.direction(eye, rows, columns)
+
+    return _windows(objects, hits, corner, side, ray, shapes.first)
+
+
+def _windows(
+    objects: Bodies,
+    hits: SurfaceHit,
+    corner: jax.Array,
+    side: tuple[int, int],
+    ray: raycast.Ray,
+    first: int,
+) -> SurfaceHit:
+    """`raycast.cast_windows` with corners [M, 2], whole numbers, moved into the grid."""
+    most = np.array(hits.distance.shape) - side
+    inside = jnp.clip(corner, 0.0, jnp.asarray(most, jnp.float32)[None]).astype(jnp.int32)
+    return raycast.cast_windows(objects, hits, inside, side, ray, first)
 
 
 def ortho_noisy(
@@ -124,13 +229,13 @@ def from_pixels(
 
 
 def oblique_noisy(
-    key: jax.Array, cfg: Config, shapes: Polytopes, tables: SurfaceTables, believed: Camera
+    key: jax.Array, cfg: Config, shapes: Shapes, tables: SurfaceTables, believed: Camera
 ) -> Observation:
     """`from_pixels` with sensor noise; the real camera stands a little off the `believed` one.
     Flying pixels are left out, as `deploy` does."""
     key_pose, key_depth, key_colour = jax.random.split(key, 3)
     real = sensor.pose(key_pose, cfg.sensor, believed)
-    hits = camera.cast_rays(real, raycast.cast_polytopes, shapes)
+    hits = seen(cfg, real, shapes)
     exact = jnp.where(hits.valid, hits.distance, 0.0)
     lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
     depth, valid = sensor.depths(key_depth, cfg.sensor, cfg.camera, exact, hits.valid, lit)

@@ -6,6 +6,7 @@ scene.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,9 @@ from flax import struct
 
 from csac_jax.scene.solids import GeomGroup, Solids
 from csac_jax.vision import shapes
+
+# Rows and columns [h, w] of a grid of rays -> their origin and direction, [h, w, 3] or one for all.
+Ray = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 @struct.dataclass
@@ -32,6 +36,19 @@ class Polytopes:
 
 
 @struct.dataclass
+class Bodies:
+    """Objects of many convex parts in one scene, world frame. M objects, C chunks of faces of the
+    one with the most, F faces of a chunk; see `objects.tables`."""
+
+    normal: jax.Array  # [M, C, F, 3] outward unit normals; unused faces as in Polytopes
+    offset: jax.Array  # [M, C, F] m, normal . x <= offset inside
+    first: jax.Array  # [M, C] bool, the chunk begins a part
+    centre: jax.Array  # [M, 3] m, middle of the object
+    colour: jax.Array  # [M, 3] red, green, blue in 0 .. 1
+    radius: float = struct.field(pytree_node=False)  # m, of a ball about `centre` that holds it
+
+
+@struct.dataclass
 class Hit:
     """Where one ray first hits; normal and geom are meaningless where not valid."""
 
@@ -42,7 +59,8 @@ class Hit:
 
 
 class SurfaceHit(NamedTuple):
-    """Where one ray first hits: surface 0 is the table, 1 + g F + f is face f of geom g."""
+    """Where one ray first hits: surface 0 is the table, 1 + g F + f is face f of geom g; those of
+    objects follow, object by object."""
 
     distance: jax.Array  # [] in lengths of the ray's direction; infinite where not valid
     surface: jax.Array  # [] int32; 0 where not valid
@@ -83,6 +101,67 @@ def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array
     rows = (normal, offset, jnp.arange(geoms, dtype=jnp.int32))
     (distance, surface), _ = jax.lax.scan(fold_geom, start, rows)
     return SurfaceHit(distance, surface, table.valid | (surface > 0))
+
+
+def cast_body(bodies: Bodies, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
+    """First face of one object, leaves without the axis M, on one ray; faces count from 0.
+
+    As `shapes.enter_half_spaces`, but a part may go on in the next chunk: the parts are what lies
+    between two chunks with `first`.
+    """
+    chunks, faces = bodies.offset.shape
+
+    def ended(nearest: Any, part: Any, ends: Any) -> Any:
+        enter, leave, _ = part
+        closer = ends & (enter >= 0.0) & (enter <= leave) & (enter < nearest[0])
+        return jax.tree.map(functools.partial(jnp.where, closer), (enter, part[2]), nearest)
+
+    def fold_chunk(carry: Any, chunk: Any) -> tuple[Any, None]:
+        nearest, part = carry
+        normal, offset, first, number = chunk
+        nearest = ended(nearest, part, first)
+        enter, leave, face = jax.tree.map(functools.partial(jnp.where, first), outside, part)
+        ray = origin, direction
+        part = shapes.clip(normal, offset, *ray, enter, leave, face, number * faces)
+        return (nearest, part), None
+
+    no_face = jnp.array(0, jnp.int32)
+    outside: Any = (jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32), no_face)
+    start: Any = ((jnp.array(jnp.inf, jnp.float32), no_face), outside)
+    rows = (bodies.normal, bodies.offset, bodies.first, jnp.arange(chunks, dtype=jnp.int32))
+    (nearest, last), _ = jax.lax.scan(fold_chunk, start, rows)
+    distance, face = ended(nearest, last, jnp.array(True))
+    return SurfaceHit(distance, face, distance < jnp.inf)
+
+
+def cast_windows(
+    bodies: Bodies, hits: SurfaceHit, corner: jax.Array, side: tuple[int, int], ray: Ray, first: int
+) -> SurfaceHit:
+    """The hits [h, w] of a grid of rays, with objects in the way: each meets a window of rays only.
+
+    The windows must hold all rays that meet the objects, so that nothing is missed: bounding
+    volumes are culled with shapes known at compile time.
+
+    Args: corner [M, 2] int32, first row and column of each object's window, which lies in the grid;
+    side, its rows and columns; ray, see `Ray`; first, number of the objects' first surface.
+    """
+    rows, columns = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in side), indexing="ij")
+    size = bodies.offset.shape[1] * bodies.offset.shape[2]
+
+    def fold_object(found: SurfaceHit, one: Any) -> tuple[SurfaceHit, None]:
+        body, at, number = one
+        before = jax.tree.map(lambda leaf: jax.lax.dynamic_slice(leaf, at, side), found)
+        rays = ray(at[0] + rows, at[1] + columns)
+        axes = (None, *(0 if leaf.ndim == 3 else None for leaf in rays))
+        inside = jax.vmap(jax.vmap(cast_body, axes), axes)(body, *rays)
+        after = inside._replace(surface=inside.surface + (first + number * size))
+        closer = after.valid & (after.distance < before.distance)
+        merged = jax.tree.map(functools.partial(jnp.where, closer), after, before)
+        paste = functools.partial(jax.lax.dynamic_update_slice, start_indices=at)
+        return jax.tree.map(paste, found, merged), None
+
+    numbers = jnp.arange(len(corner), dtype=jnp.int32)
+    return jax.lax.scan(fold_object, hits, (bodies, corner, numbers))[0]
 
 
 def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:

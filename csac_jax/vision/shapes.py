@@ -49,17 +49,33 @@ def enter_half_spaces(
     Returns: the distance, the face int32 and whether it enters, all []; see `Entry`.
     """
     enter, leave = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32)
-    face = jnp.array(0, jnp.int32)
+    start = enter, leave, jnp.array(0, jnp.int32)
+    enter, leave, face = clip(normal, offset, origin, direction, *start, 0)
+    return enter, face, (enter >= 0.0) & (enter <= leave)
+
+
+def clip(
+    normal: jax.Array,
+    offset: jax.Array,
+    origin: Vector,
+    direction: Vector,
+    enter: jax.Array,
+    leave: jax.Array,
+    face: jax.Array,
+    first: jax.Array | int,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The part from `enter` to `leave` of a ray, cut by more half-spaces, numbered from `first`;
+    `face` is the one at which it enters. All []; see `enter_half_spaces`."""
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
         inverse = 1.0 / jnp.where(speed == 0.0, _PARALLEL, speed)
         depth = (offset[f] - dot(normal[f], origin)) + _ON_PLANE  # m, not negative inside
         crossing = depth * inverse
         inwards = jnp.where(speed < 0.0, crossing, -jnp.inf)
-        face = jnp.where(inwards > enter, f, face)
+        face = jnp.where(inwards > enter, first + f, face)
         enter = jnp.maximum(enter, inwards)
         leave = jnp.minimum(leave, jnp.where(speed < 0.0, jnp.inf, crossing))
-    return enter, face, (enter >= 0.0) & (enter <= leave)
+    return enter, leave, face
 
 
 def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> Entry:

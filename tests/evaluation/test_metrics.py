@@ -83,6 +83,7 @@ def test_summary_by_hand():
         "grasp_success": (3 / 7, 7),  # lifts at 0.1, 0.2 and 1.1 of 2 + 2 + 3 grasps
         "completion": (1 / 3, 3),
         "completion_reachable": (2 / 3, 3),
+        "declutter_rate": (3 / 6, 6),  # 3 of 2 + 2 + 2 blocks
         "action_efficiency": (3 / 9, 9),  # 3 blocks in 3 + 2 + 4 actions
         "action_efficiency_completed": (2 / 3, 1),  # 2 blocks in 3 actions, of episode 0 alone
         "action_efficiency_grasps": ((2 / 2 + 1 / 2 + 0 / 3) / 3, 3),  # not the 3 / 7 of all
@@ -115,12 +116,13 @@ def test_failures_by_hand():
         "episode_action_cap": (1, 3),
         "episode_no_change_cap": (0, 3),
         "episode_physics_diverged": (0, 3),
+        "episode_failed_grasps": (0, 3),
     }
     for entry in got.values():
         assert entry["low"] <= entry["value"] <= entry["high"]
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_every_ending_is_counted(number: int):
     """Claim: of the endings, each that is a failure has its own share of the episodes."""
     got = metrics.summarise(_episodes()._replace(ending=np.full(3, number, np.int32)))["failures"]
@@ -156,6 +158,7 @@ def test_efficiency_counts_blocks_per_action():
         "grasp_success",
         "completion",
         "completion_reachable",
+        "declutter_rate",
         "action_efficiency_grasps",
     }
     assert all(got[name]["high"] <= 1.0 for name in shares)

@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from csac_jax.config import HeightmapConfig
+from csac_jax.objects import families, library
 from csac_jax.scene import blocks, cases, layout
 from tests.scene import placed
 
@@ -305,3 +306,62 @@ def test_hostile_file_is_one_line(tmp_path: Path, text: str, message: str):
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < len(str(path)) + 300
     assert time.monotonic() - begun < 2.0
+
+
+def _with_object(tmp_path: Path, **changes: object) -> Path:
+    """A case of a cup of a library beside the file, a cube, and changes to the cup's entry."""
+    if not (tmp_path / "lib").exists():
+        library.save(tmp_path / "lib", families.draw(0, 14))
+    cup = {
+        "object": "cup-0-2",
+        "library": "lib",
+        "colour": "red",
+        "position": [0.05, 0.0, 0.0311],
+        "quaternion": [1, 0, 0, 0],
+    }
+    cube = {
+        "shape": "cube",
+        "colour": "blue",
+        "position": [-0.05, 0.0, 0.025],
+        "quaternion": [1, 0, 0, 0],
+        "target": True,
+    }
+    path = tmp_path / "case.json"
+    path.write_text(json.dumps({"name": "cup", "blocks": [cup | changes, cube]}))
+    return path
+
+
+def test_a_case_names_objects(tmp_path: Path):
+    """Claim: an object of a library beside the file stands at its place: the middle of its bounding
+    box, not its centre of mass, is where the case says."""
+    case = cases.load(
+        _with_object(tmp_path, quaternion=[0.5, 0.5, 0.5, 0.5], position=[0, 0.1, 0.04])
+    )
+    assert case.slots == ("object", "box")
+    assert case.objects == str(tmp_path / "lib")
+    corners = np.concatenate(cases._corners(case)[0])
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    np.testing.assert_allclose(middle, [0.0, 0.1, 0.04], atol=1e-6)
+    assert np.linalg.norm(case.scene.position[0] - middle) > 1e-3
+    assert case.scene.target == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"object": "mug"}, "no object 'mug' in the library; it has: bottle-0-0"),
+        ({"library": "none"}, "no library of objects there"),
+        ({"library": 3}, '"library" must be a text'),
+        ({"shape": "cube"}, 'unknown key "shape"'),
+        ({"position": [0.05, 0.0, 0.02]}, "mm below the table"),
+        ({"position": [-0.04, 0.0, 0.0311]}, "overlaps block 1"),
+        ({"position": [0.2, 0.0, 0.0311]}, "beyond the square"),
+    ],
+)
+def test_an_unsound_object_is_named(tmp_path: Path, changes: dict[str, object], message: str):
+    """Claim: an object that is unknown, lies wrong or overlaps is one line with the file."""
+    path = _with_object(tmp_path, **changes)
+    with pytest.raises(ValueError, match=message) as caught:
+        cases.load(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)

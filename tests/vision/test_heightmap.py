@@ -23,7 +23,7 @@ _TABLE = blocks.TABLE_COLOUR
 def _look(cfg: HeightmapConfig, polytopes: raycast.Polytopes, is_target: jax.Array | None = None):
     every = jnp.ones(polytopes.offset.shape[0], bool)
     tables = observe.surface_tables(polytopes, every if is_target is None else is_target)
-    return observe.ortho(cfg, polytopes, tables)
+    return observe.ortho(cfg, observe.Shapes(polytopes), tables)
 
 
 def test_heights_agree_with_mujoco(reference):

@@ -82,7 +82,9 @@ def _views(polytopes: raycast.Polytopes, eye: camera.Camera) -> tuple[Observatio
     """From above, and by a camera; any block will do."""
     tables = observe.surface_tables(polytopes, jnp.ones(len(polytopes.offset), bool))
     hits = camera.cast_rays(eye, raycast.cast_polytopes, polytopes)
-    return observe.ortho(CFG, polytopes, tables), observe.from_pixels(CFG, eye, hits, tables)
+    return observe.ortho(CFG, observe.Shapes(polytopes), tables), observe.from_pixels(
+        CFG, eye, hits, tables
+    )
 
 
 def test_both_views_agree_where_the_camera_sees(reference):

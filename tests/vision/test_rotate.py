@@ -120,7 +120,7 @@ def test_a_block_appears_where_to_cell_says(k, x, y):
 @jax.jit
 def _look(block):
     tables = observe.surface_tables(block, jnp.ones(1, bool))
-    return observe.ortho(HeightmapConfig(64), block, tables).height
+    return observe.ortho(HeightmapConfig(64), observe.Shapes(block), tables).height
 
 
 def test_an_action_points_along_the_columns():

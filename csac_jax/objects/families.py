@@ -1,0 +1,250 @@
+"""Our own shapes: families of objects, each drawn from random numbers as convex parts.
+
+The parts of an object touch, and do not overlap. Sizes are such that the hand, which opens to
+110 mm, finds a grasp: what is wider has a thin wall, an arm or a handle. Round things are polygons,
+so that they come to rest. z is up as the object stands.
+"""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from numpy.random import Generator
+
+from csac_jax.objects import library, solid
+from csac_jax.objects.library import Object
+from csac_jax.objects.solid import Part
+
+SIDES = 6  # of walls of hollow things
+_ROUND = 12  # sides of full round things
+
+
+def _circle(radius: float, sides: int = _ROUND) -> np.ndarray:
+    """Corners [sides, 2] of a regular polygon; the middle of a side lies on the x axis."""
+    angle = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
+    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _frustum(low: np.ndarray, high: np.ndarray, bottom: float, top: float) -> Part:
+    """Between two polygons [n, 2], one at each height."""
+    ends = (np.column_stack([xy, np.full(len(xy), z)]) for xy, z in ((low, bottom), (high, top)))
+    return solid.convex(np.concatenate([*ends]))
+
+
+def _prism(polygon: np.ndarray, bottom: float, top: float) -> Part:
+    return _frustum(polygon, polygon, bottom, top)
+
+
+def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Part:
+    x, y, z = np.stack([low, high], axis=1)
+    return _prism(np.array([[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]]), *z)
+
+
+def _wall(
+    inner: tuple[float, float], outer: tuple[float, float], bottom: float, top: float, sides: int
+) -> list[Part]:
+    """The parts of a ring, radii at the bottom and at the top."""
+    rings = [
+        [_circle(radius, sides) for radius in radii] for radii in zip(inner, outer, strict=True)
+    ]
+    parts = []
+    for i in range(sides):
+        edge = np.array([i, (i + 1) % sides])
+        low, high = (np.concatenate([ring[0][edge], ring[1][edge[::-1]]]) for ring in rings)
+        parts.append(_frustum(low, high, bottom, top))
+    return parts
+
+
+def bottle(rng: Generator) -> list[Part]:
+    """Body, shoulder and neck, revolved."""
+    body, neck = rng.uniform(0.018, 0.034), rng.uniform(0.008, 0.013)
+    heights = np.cumsum(
+        [0.0, rng.uniform(0.05, 0.09), rng.uniform(0.01, 0.03), rng.uniform(0.015, 0.03)]
+    )
+    rings = [_circle(radius) for radius in (body, body, neck, neck)]
+    return [_frustum(rings[i], rings[i + 1], heights[i], heights[i + 1]) for i in range(3)]
+
+
+def _vessel(radii: tuple[float, float], wall: float, height: float, floor: float) -> list[Part]:
+    """A floor and a wall around it, radii outside at the bottom and at the top."""
+    inner = radii[0] - wall, radii[1] - wall
+    base = _prism(_circle(inner[0], SIDES), 0.0, floor)
+    slope = (inner[1] - inner[0]) / height
+    base = _frustum(_circle(inner[0], SIDES), _circle(inner[0] + slope * floor, SIDES), 0.0, floor)
+    return [base, *_wall(inner, radii, 0.0, height, SIDES)]
+
+
+def bowl(rng: Generator) -> list[Part]:
+    """A floor and a wall that opens upwards."""
+    top = rng.uniform(0.04, 0.06)
+    return _vessel(
+        (top * rng.uniform(0.55, 0.8), top),
+        rng.uniform(0.004, 0.007),
+        rng.uniform(0.03, 0.05),
+        0.005,
+    )
+
+
+def cup(rng: Generator) -> list[Part]:
+    """A floor, an upright wall and a handle of three bars."""
+    radius, height = rng.uniform(0.026, 0.038), rng.uniform(0.05, 0.08)
+    side = radius * np.cos(np.pi / SIDES)  # of the wall, from the axis
+    reach, thick, half = rng.uniform(0.018, 0.026), 0.006, rng.uniform(0.004, 0.007)
+    low, high = 0.2 * height, 0.8 * height
+    bars = [_box((side, -half, z), (side + reach, half, z + thick)) for z in (low, high - thick)]
+    grip = _box((side + reach, -half, low), (side + reach + thick, half, high))
+    return [*_vessel((radius, radius), rng.uniform(0.004, 0.006), height, 0.005), *bars, grip]
+
+
+def superquadric(rng: Generator) -> list[Part]:
+    """|x/a|^(2/e) + |y/b|^(2/e), to the power e/f, + |z/c|^(2/f) = 1, by 34 of its points (Barr
+    1981); convex, as e and f lie below 2."""
+    half, (east, north) = rng.uniform(0.015, 0.04, 3), rng.uniform(0.25, 1.3, 2)
+    around = np.pi * (np.arange(8) + 0.5) / 4.0
+    up, across = np.meshgrid(np.radians([-54.0, -18.0, 18.0, 54.0]), around)
+
+    def power(values: np.ndarray, exponent: float) -> np.ndarray:
+        return np.sign(values) * np.abs(values) ** exponent
+
+    flat = power(np.cos(up), north)
+    x, y = flat * power(np.cos(across), east), flat * power(np.sin(across), east)
+    points = np.stack([x, y, power(np.sin(up), north)], axis=-1).reshape(-1, 3)
+    return [solid.convex(half * np.concatenate([points, [[0, 0, 1], [0, 0, -1]]]))]
+
+
+def bracket(rng: Generator) -> list[Part]:
+    """A plate with one leg or two: an L or a U."""
+    thick, width = rng.uniform(0.008, 0.015), rng.uniform(0.02, 0.045)
+    length, legs = rng.uniform(0.05, 0.085), rng.uniform(0.025, 0.06, rng.integers(1, 3))
+    parts = [_box((0.0, 0.0, 0.0), (length, width, thick))]
+    for leg, start in zip(legs, (0.0, length - thick), strict=False):
+        parts.append(_box((start, 0.0, thick), (start + thick, width, thick + leg)))
+    return parts
+
+
+def tube(rng: Generator) -> list[Part]:
+    """A pipe or a ring."""
+    outer, wall = rng.uniform(0.015, 0.038), rng.uniform(0.004, 0.007)
+    return _wall((outer - wall,) * 2, (outer,) * 2, 0.0, rng.uniform(0.015, 0.08), SIDES)
+
+
+def nut(rng: Generator) -> list[Part]:
+    """A hexagon with a hole."""
+    outer = rng.uniform(0.018, 0.034)
+    return _wall(
+        (outer * rng.uniform(0.45, 0.65),) * 2, (outer,) * 2, 0.0, rng.uniform(0.012, 0.025), 6
+    )
+
+
+def star(rng: Generator) -> list[Part]:
+    """A core with three to six pointed arms."""
+    arms, radius, thick = (
+        int(rng.integers(3, 7)),
+        rng.uniform(0.012, 0.02),
+        rng.uniform(0.012, 0.025),
+    )
+    core, tip = _circle(radius, arms), rng.uniform(0.03, 0.05)
+    parts = [_prism(core, 0.0, thick)]
+    for i in range(arms):
+        side = core[[i, (i + 1) % arms]]
+        middle = side.mean(axis=0)
+        point = tip * middle / np.linalg.norm(middle)
+        parts.append(_prism(np.array([*side, point]), 0.0, thick))
+    return parts
+
+
+def wedge(rng: Generator) -> list[Part]:
+    """A ramp, its thin end cut off or not."""
+    length, width, height = rng.uniform([0.04, 0.025, 0.02], [0.09, 0.06, 0.05])
+    end = rng.choice([0.0, rng.uniform(0.2, 0.5)]) * height
+    x, z = np.array([0.0, length, length, 0.0]), np.array([0.0, 0.0, end, height])
+    ends = [np.column_stack([x, np.full(4, y), z]) for y in (0.0, width)]
+    return [solid.convex(np.concatenate(ends))]
+
+
+def rod(rng: Generator) -> list[Part]:
+    """A hexagonal bar with one to three bends in a plane; joints are mitred."""
+    bends = int(rng.integers(1, 4))
+    turns = rng.uniform(0.4, 1.2, bends) * rng.choice([-1.0, 1.0], bends)
+    heading = np.concatenate([[0.0], np.cumsum(turns)])
+    along = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    lengths = rng.uniform(0.03, 0.05, bends + 1)
+    knots = np.concatenate([np.zeros((1, 2)), np.cumsum(lengths[:, None] * along, axis=0)])
+    section = _circle(rng.uniform(0.007, 0.012), 6)  # sideways and up
+    cuts = np.concatenate([[0.0], 0.5 * turns, [0.0]])  # from the bar before to the joint's plane
+    rings = []
+    for i, cut in enumerate(cuts):
+        across = heading[max(i - 1, 0)] + cut + 0.5 * np.pi
+        side = section[:, :1] / np.cos(cut) * [np.cos(across), np.sin(across)]
+        rings.append(np.column_stack([knots[i] + side, section[:, 1]]))
+    return [solid.convex(np.concatenate(pair)) for pair in itertools.pairwise(rings)]
+
+
+def tool(rng: Generator) -> list[Part]:
+    """A hammer, a screwdriver or a spanner."""
+    length, half = rng.uniform(0.06, 0.1), rng.uniform(0.006, 0.011)
+    handle = _box((0.0, -half, -half), (length, half, half))
+    kind = rng.integers(3)
+    if kind == 0:
+        wide, deep, high = rng.uniform([0.02, 0.022, 0.01], [0.03, 0.04, 0.014])
+        return [handle, _box((length, -deep, -high), (length + wide, deep, high))]
+    if kind == 1:
+        thin = rng.uniform(0.003, 0.005)
+        return [
+            handle,
+            _box((length, -thin, -thin), (length + rng.uniform(0.03, 0.05), thin, thin)),
+        ]
+    wide, jaw = rng.uniform(0.018, 0.026), rng.uniform(0.007, 0.01)
+    head = length + 0.015
+    jaws = [
+        _box((head, min(y), -half), (head + 0.02, max(y), half))
+        for y in ((wide, wide - jaw), (-wide, jaw - wide))
+    ]
+    return [handle, _box((length, -wide, -half), (head, wide, half)), *jaws]
+
+
+def stone(rng: Generator) -> list[Part]:
+    """The hull of random points of an ellipsoid's surface."""
+    points = rng.normal(size=(int(rng.integers(10, 25)), 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return [solid.convex(points * rng.uniform(0.015, 0.04, 3))]
+
+
+def dumbbell(rng: Generator) -> list[Part]:
+    """Two discs and a bar between them, or a spool."""
+    ends, bar = rng.uniform(0.018, 0.036, 2), rng.uniform(0.007, 0.012)
+    heights = np.cumsum(
+        [0.0, *rng.uniform(0.01, 0.025, 1), rng.uniform(0.03, 0.05), rng.uniform(0.01, 0.025)]
+    )
+    rings = [_circle(radius) for radius in (ends[0], bar, ends[1])]
+    return [_prism(ring, heights[i], heights[i + 1]) for i, ring in enumerate(rings)]
+
+
+def brick(rng: Generator) -> list[Part]:
+    """A box, or a prism of three to eight sides."""
+    if rng.integers(2):
+        return [_box((0.0, 0.0, 0.0), tuple(rng.uniform(0.02, 0.085, 3)))]
+    sides = int(rng.integers(3, 9))
+    return [_prism(_circle(rng.uniform(0.018, 0.04), sides), 0.0, rng.uniform(0.025, 0.08))]
+
+
+Family = Callable[[Generator], list[Part]]
+FAMILIES: dict[str, Family] = {
+    family.__name__: family
+    for family in (
+        *(bottle, bowl, cup, superquadric, bracket, tube, nut),
+        *(star, wedge, rod, tool, stone, dumbbell, brick),
+    )
+}
+
+
+def draw(seed: int, count: int) -> list[Object]:
+    """`count` objects, family by family in turn; the same for the same seed. A longer list begins
+    with the shorter one."""
+    names = [*FAMILIES]
+    found = []
+    for i in range(count):
+        family = names[i % len(names)]
+        parts = FAMILIES[family](np.random.default_rng([seed, i]))
+        found.append(library.make(f"{family}-{seed}-{i}", parts, family=family))
+    return found

@@ -1,0 +1,120 @@
+"""Convex parts, and the mass and inertia of what they make up.
+
+Integrals over a polyhedron are sums over its triangles: each spans a tetrahedron with the origin,
+whose integrals of 1, x and x y are closed forms (Tonon 2005, J. Math. Stat. 1, 8-11).
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+MOST_FACES = 64  # of a part, after faces in one plane are merged
+_SAME_PLANE = 4  # decimals of normals and, in units of the part's size, of offsets
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Part:
+    """A convex polyhedron. V corners, T triangles, F faces."""
+
+    vertices: np.ndarray  # [V, 3] float32 m
+    triangles: np.ndarray  # [T, 3] int32, corners counter-clockwise as seen from outside
+    planes: np.ndarray  # [F, 4] float32, outward unit normal and offset m; n . p <= offset inside
+
+
+class Moments(NamedTuple):
+    """Integrals over a solid of density 1."""
+
+    volume: float  # m^3
+    first: np.ndarray  # [3] m^4, of x
+    second: np.ndarray  # [3, 3] m^5, of x x^T
+
+
+def convex(points: np.ndarray) -> Part:
+    """The convex hull of points [n, 3] m. Raises ValueError where it has no volume."""
+    points = np.asarray(points, np.float32).astype(np.float64)
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        raise ValueError("its points lie in one plane") from None
+    corners, triangles = np.unique(hull.simplices, return_inverse=True)
+    triangles = triangles.reshape(hull.simplices.shape)
+    vertices = points[corners]
+    sides = np.diff(vertices[triangles], axis=1)  # [T, 2, 3]
+    inwards = np.einsum("ti,ti->t", np.cross(*sides.transpose(1, 0, 2)), hull.equations[:, :3]) < 0
+    triangles[inwards] = triangles[inwards][:, [0, 2, 1]]
+    planes = _merged(hull.equations * [1, 1, 1, -1], np.ptp(vertices, axis=0).max())
+    return Part(vertices.astype(np.float32), triangles.astype(np.int32), planes)
+
+
+def simplified(points: np.ndarray) -> Part:
+    """The hull of as many of the points [n, 3] as give at most MOST_FACES faces: the outermost ones
+    along the axes, then again and again the one farthest outside.
+
+    Raises ValueError where they have no volume.
+    """
+    part = convex(points)
+    if len(part.planes) <= MOST_FACES:
+        return part
+    corners = part.vertices.astype(np.float64)
+    chosen = {*corners.argmin(axis=0).tolist(), *corners.argmax(axis=0).tolist()}
+    chosen |= {int(np.argmax(corners @ way)) for way in _DIAGONALS}
+    best = convex(corners[[*chosen]])
+    while True:
+        outside = (corners @ best.planes[:, :3].T - best.planes[:, 3]).max(axis=1)
+        chosen.add(int(outside.argmax()))
+        part = convex(corners[[*chosen]])
+        if len(part.planes) > MOST_FACES:
+            return best
+        best = part
+
+
+_DIAGONALS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
+
+
+def _merged(planes: np.ndarray, size: float) -> np.ndarray:
+    """One of each plane [F, 4] of the hull's triangles."""
+    rounded = (planes / [1, 1, 1, size]).round(_SAME_PLANE)
+    _, kept = np.unique(rounded, axis=0, return_index=True)
+    return planes[np.sort(kept)].astype(np.float32)
+
+
+def moments(part: Part) -> Moments:
+    """Integrals over a part."""
+    corners = part.vertices.astype(np.float64)[part.triangles]  # [T, 3, 3]
+    sixth = np.linalg.det(corners) / 6.0  # volumes of the tetrahedra
+    total = corners.sum(axis=1)
+    squares = np.einsum("tki,tkj->tij", corners, corners) + np.einsum("ti,tj->tij", total, total)
+    second = np.einsum("t,tij->ij", sixth, squares) / 20.0
+    return Moments(float(sixth.sum()), sixth @ total / 4.0, second)
+
+
+def joined(every: Iterable[Moments]) -> Moments:
+    """Integrals over solids that do not overlap."""
+    volumes, firsts, seconds = zip(*every, strict=True)
+    return Moments(sum(volumes), np.sum(firsts, axis=0), np.sum(seconds, axis=0))
+
+
+def inertia(solid: Moments) -> np.ndarray:
+    """Inertia [3, 3] m^5 about the centre of mass, axes as they are, of density 1."""
+    com = solid.first / solid.volume
+    about = solid.second - solid.volume * np.outer(com, com)
+    return np.trace(about) * np.eye(3) - about
+
+
+def moved(part: Part, shift: np.ndarray) -> Part:
+    """The part shifted by `shift` [3] m."""
+    vertices = (part.vertices + shift).astype(np.float32)
+    offsets = part.planes[:, 3] + part.planes[:, :3] @ np.asarray(shift, np.float32)
+    return Part(vertices, part.triangles, np.column_stack([part.planes[:, :3], offsets]))
+
+
+def narrowest(parts: Iterable[Part]) -> float:
+    """Least distance, m, of a face of the parts' common hull from the corner opposite it."""
+    points = np.concatenate([part.vertices for part in parts])
+    hull = ConvexHull(points)
+    along = hull.equations[:, :3] @ points[hull.vertices].T
+    return float(np.ptp(along, axis=1).min())

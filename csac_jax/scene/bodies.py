@@ -1,0 +1,104 @@
+"""Objects of a library in a MuJoCo model.
+
+The model has the meshes of all objects, and bodies with as many geoms as the object of most parts.
+For a scene, the geoms of a body are pointed at the meshes of its object, and what the compiler
+derives from a mesh is written with it. `mj_setConst` must follow: it renews what depends on that,
+such as the search trees over a body's geoms. Without it contacts would be missed silently.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+
+from csac_jax.objects import tables
+from csac_jax.objects.library import Library
+from csac_jax.objects.tables import Tables
+
+
+class ObjectFields(NamedTuple):
+    """What slots of kind object hold in a scene. M = such slots."""
+
+    number: jax.Array  # [M] int32, object of the library
+    density: jax.Array  # [M] kg/m^3
+    friction: jax.Array  # [M] sliding friction
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bodies:
+    """The bodies of objects in a compiled model. M = slots, O = objects, P = parts of one."""
+
+    tables: Tables
+    slots: np.ndarray  # [M] slots of kind object
+    bodies: np.ndarray  # [M] body ids
+    geoms: np.ndarray  # [M, P] geom ids
+    meshes: np.ndarray  # [O, P] mesh ids, that of the first part where there is no such part
+    boxes: np.ndarray  # [O, P, 2, 3] m, lowest and highest corner of these meshes, in their frames
+
+
+def add_meshes(spec: mujoco.MjSpec, objects: Library) -> None:
+    """A mesh for every part of every object."""
+    for number, one in enumerate(objects.objects):
+        for part, solid in enumerate(one.parts):
+            mesh = spec.add_mesh(name=_mesh(number, part))
+            mesh.uservert = solid.vertices.ravel()
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+
+
+def _mesh(number: int, part: int) -> str:
+    return f"object{number}/{part}"
+
+
+def add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, objects: Library) -> None:
+    """The geoms of one slot, all with the first mesh.
+
+    The inertia stands in for those of scenes, whose axes are not the body's.
+    """
+    for _ in range(tables.of(objects).present.shape[1]):
+        geom = body.add_geom(spec.find_default("blocks/block"))
+        geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, _mesh(0, 0)
+    body.mass, body.explicitinertial, body.simple = 0.1, True, False
+    body.ipos = [0.0, 0.0, 0.0]  # without a place the compiler drops the axes of `fullinertia`
+    body.fullinertia = [1e-4, 2e-4, 2.5e-4, 1e-5, 2e-5, 3e-5]
+
+
+def read(model: mujoco.MjModel, slots: np.ndarray, bodies: np.ndarray, objects: Library) -> Bodies:
+    """Where the objects are in a compiled model; `slots` [M] and `bodies` [M] are theirs.
+
+    The model's last meshes are those of the objects, in order.
+    """
+    found = tables.of(objects)
+    geoms = model.body_geomadr[bodies][:, None] + np.arange(found.present.shape[1])
+    first = model.mesh(_mesh(0, 0)).id + np.cumsum(found.present.sum(axis=1))
+    first -= found.present.sum(axis=1)  # [O]
+    meshes = first[:, None] + np.where(found.present, np.arange(geoms.shape[1]), 0)
+    starts = model.mesh_vertadr[meshes[0, 0] :]
+    corners = model.mesh_vert.astype(np.float64)
+    low, high = (each.reduceat(corners, starts) for each in (np.minimum, np.maximum))
+    boxes = np.stack([low, high], axis=1)[meshes - meshes[0, 0]]
+    return Bodies(found, slots, bodies, geoms, meshes, boxes)
+
+
+def put(model: mujoco.MjModel, own: Bodies, fields: ObjectFields) -> None:
+    """Writes the objects of a scene into a model, but for what `mj_setConst` derives from them.
+
+    As MuJoCo's compiler: the frame of a mesh is that of its inertia, its size reaches from the
+    frame's origin to the farthest corner along each axis, its radius is the norm of that size.
+    """
+    number = np.asarray(fields.number)
+    geoms, meshes, present = own.geoms, own.meshes[number], own.tables.present[number]
+    boxes = own.boxes[number]  # [M, P, 2, 3]
+    size = np.abs(boxes).max(axis=2)
+    model.geom_dataid[geoms] = meshes
+    model.geom_pos[geoms], model.geom_quat[geoms] = model.mesh_pos[meshes], model.mesh_quat[meshes]
+    model.geom_size[geoms], model.geom_rbound[geoms] = size, np.linalg.norm(size, axis=2)
+    model.geom_aabb[geoms, :3] = boxes.mean(axis=2)
+    model.geom_aabb[geoms, 3:] = 0.5 * np.ptp(boxes, axis=2)
+    model.geom_friction[geoms, 0] = np.asarray(fields.friction)[:, None]
+    model.geom_contype[geoms[~present]] = model.geom_conaffinity[geoms[~present]] = 0
+    density = np.asarray(fields.density, np.float64)
+    model.body_mass[own.bodies] = density * own.tables.volume[number]
+    model.body_inertia[own.bodies] = density[:, None] * own.tables.moments[number]
+    model.body_iquat[own.bodies], model.body_ipos[own.bodies] = own.tables.axes[number], 0.0

@@ -1,0 +1,100 @@
+"""Which objects the slots of a scene hold. It needs no MuJoCo."""
+
+import hashlib
+import itertools
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from csac_jax.config import SceneConfig
+from csac_jax.errors import SceneError
+from csac_jax.objects import tables
+from csac_jax.objects.library import Library
+from csac_jax.objects.tables import Tables
+from csac_jax.scene import blocks
+from csac_jax.scene.layout import Scene
+
+
+def library(cfg: SceneConfig) -> Library:
+    """The objects that scenes of this config draw from. Raises LibraryError."""
+    return tables.find(cfg.objects, cfg.split)
+
+
+def table(cfg: SceneConfig) -> Tables:
+    """The same as arrays."""
+    return tables.of(library(cfg))
+
+
+def drawn(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
+    """The scene with random objects in their slots, each at most once where there are enough."""
+    slots, known = np.flatnonzero(blocks.is_object(cfg.slots)), table(cfg)
+    rounds = -(-len(slots) // len(known.half))
+    order = np.concatenate([rng.permutation(len(known.half)) for _ in range(rounds)])
+    return hold(scene, slots, order[: len(slots)], known)
+
+
+def hold(scene: Scene, slots: np.ndarray, numbers: np.ndarray, known: Tables) -> Scene:
+    """The scene with the objects `numbers` [M] of a library in `slots` [M]."""
+    object_id, half_size = np.array(scene.numbers), np.array(scene.half_size)
+    object_id[slots], half_size[slots] = numbers, known.half[numbers]
+    return scene.replace(object_id=object_id, half_size=half_size)
+
+
+GAP = 0.005  # m, least distance of the outlines of packed objects
+_TRIES = 200  # random places tried for each
+
+
+def packed(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
+    """The scene with its objects in play standing on the table, as they do in their files, at
+    random places of the square of side `drop_extent` and random yaws, outlines GAP or more apart.
+
+    Raises SceneError where there is no room.
+    """
+    half = 0.5 * rng.uniform(*cfg.drop_extent)
+    position, quaternion = np.array(scene.position), np.array(scene.quaternion)
+    outlines: list[np.ndarray] = []
+    for slot in np.flatnonzero(scene.in_play):
+        one = library(cfg).objects[int(scene.numbers[slot])]
+        corners = np.concatenate([part.vertices for part in one.parts])
+        for _ in range(_TRIES):
+            yaw, xy = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-half, half, 2)
+            cos, sin = np.cos(yaw), np.sin(yaw)
+            outline = corners[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + xy
+            outline = outline[ConvexHull(outline).vertices]
+            if np.abs(outline).max() <= half and all(_apart(outline, each) for each in outlines):
+                break
+        else:
+            raise SceneError(
+                f"no room for '{one.name}' beside {len(outlines)} objects in a square of "
+                f"{2.0 * half:g} m; take smaller objects"
+            )
+        outlines.append(outline)
+        position[slot] = *xy, -corners[:, 2].min()
+        quaternion[slot] = np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)
+    return scene.replace(position=position, quaternion=quaternion)
+
+
+def _apart(one: np.ndarray, two: np.ndarray) -> bool:
+    """Whether convex outlines [n, 2] m are GAP or more apart, along the normal of some side."""
+    for first, second in itertools.permutations((one, two)):
+        side = np.roll(first, -1, axis=0) - first
+        normal = np.column_stack([side[:, 1], -side[:, 0]])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        gap = (second @ normal.T).min(axis=0) - (first @ normal.T).max(axis=0)
+        if gap.max() >= GAP:
+            return True
+    return False
+
+
+def fingerprint(cfg: SceneConfig, scenes: Scene) -> str:
+    """SHA-256 of what was drawn for scenes of objects, leaves [P, N, ...]: objects, densities,
+    frictions and colours. Physics touches none of it, so that it is the same on every machine."""
+    objects = library(cfg).objects
+    content = hashlib.sha256()
+    for number, held in zip(scenes.numbers.ravel(), scenes.in_play.ravel(), strict=True):
+        one = objects[number]
+        text = f"{one.name} {one.source_sha256} {one.volume:.4e} {held};"
+        content.update(text.encode())
+    for leaf in (scenes.density, scenes.friction, scenes.colour):
+        content.update(np.ascontiguousarray(leaf).tobytes())
+    return content.hexdigest()

@@ -1,0 +1,94 @@
+"""`csac-jax objects`: what it writes and what it refuses, in one line."""
+
+import json
+from pathlib import Path
+
+import imageio.v2 as imageio
+import pytest
+
+from csac_jax import cli
+from csac_jax.cli import objects
+from csac_jax.objects import library
+
+Capture = pytest.CaptureFixture[str]
+
+
+def test_make_and_show(tmp_path: Path, capsys: Capture):
+    """Claim: `make` writes a library, `show` lists it and draws a sheet; both write JSON."""
+    lib, png, out = tmp_path / "new" / "lib", tmp_path / "sheet.png", tmp_path / "list.json"
+    assert cli.main(["objects", "make", "--count", "14", "--out", str(lib)]) == 0
+    assert len(library.load(lib).objects) == 14
+    shown = capsys.readouterr().out
+    assert "bottle-0-0" in shown
+    assert "14 objects, " in shown
+    assert cli.main(["objects", "show", str(lib), "--png", str(png), "--json", str(out)]) == 0
+    picture = imageio.imread(png)
+    assert picture.shape[1] > picture.shape[0] > 100
+    assert picture.std() > 5
+    rows = json.loads(out.read_text())["objects"]
+    assert rows[0]["name"] == "bottle-0-0"
+    assert len(rows[0]["size_mm"]) == 3
+
+
+def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capture):
+    """Claim: objects that the hand cannot open for are named."""
+    monkeypatch.setattr("csac_jax.constants.MAX_OPENING", 0.03)
+    assert cli.main(["objects", "show", "made:0:14"]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("wider than the hand opens, 30 mm: ")
+
+
+REFUSED = {
+    "nothing": ([], 2, "usage"),
+    "another command": (["mak"], 2, "unknown command 'mak'"),
+    "no folder": (["make"], 2, "--out"),
+    "no objects": (["make", "--out", "x", "--count", "0"], 2, "--count: must lie in 1 .. 4096"),
+    "too many": (["make", "--out", "x", "--count", "9999"], 2, "--count: must lie in 1 .. 4096"),
+    "seed": (["make", "--out", "x", "--seed", "-1"], 2, "--seed: must lie in"),
+    "exists": (["make", "--out", "."], 2, "--out: . exists; give another name"),
+    "no library": (["show", "nowhere"], 1, "nowhere: no library of objects there"),
+    "picture": (["show", "made:0:3", "--png", "x.txt"], 2, "its name must end in one of: .png"),
+    "no files": (["import", "nowhere", "--out", "x"], 2, "nowhere does not exist"),
+    "no meshes": (["import", ".", "--out", "x"], 2, "no mesh file; known are: .obj"),
+    "scale": (["import", ".", "--out", "x", "--scale", "0"], 2, "--scale must be positive"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+):
+    """Claim: bad arguments and libraries are one line, exit code 2 or 1, and nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    arguments, code, message = REFUSED[name]
+    assert cli.main(["objects", *arguments]) == code
+    said = "".join(capsys.readouterr())
+    assert message in said
+    assert len(said.splitlines()) == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_without_the_extra_the_command_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+):
+    """Claim: `import` without its extra names the command that installs it."""
+    monkeypatch.setattr(objects, "check_extra", lambda *given: _missing(*given))
+    assert cli.main(["objects", "import", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
+    assert "pip install 'csac-jax[objects]'" in capsys.readouterr().err
+
+
+def _missing(option: str, module: str, extra: str) -> None:
+    from csac_jax.cli import failures
+
+    failures.check_extra(option, f"no_{module}", extra)
+
+
+def test_suites_need_a_library(capsys: Capture):
+    """Claim: `eval` and `play` refuse a suite of objects without a library, and the other way."""
+    for arguments, message in (
+        (["eval", "shipped", "--suite", "pile"], "--objects: pile needs a library"),
+        (["eval", "shipped", "--objects", "x"], "'in_distribution' has no objects of a library"),
+        (["play", "--scene", "pile"], "--objects: pile needs a library"),
+    ):
+        assert cli.main(arguments) == 2
+        assert message in capsys.readouterr().err

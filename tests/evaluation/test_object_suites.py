@@ -1,0 +1,68 @@
+"""Suites of objects: the library, the end after failures, and the fingerprint in the result."""
+
+import numpy as np
+import pytest
+
+from csac_jax import presets
+from csac_jax.constants import Outcome, Primitive
+from csac_jax.evaluation import metrics, policies, rollout, suites
+from csac_jax.evaluation.metrics import Episodes
+from csac_jax.scene import pool
+
+pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
+SMOKE = presets.smoke()
+
+
+@pytest.mark.parametrize(
+    ("suite", "objects", "message"),
+    [
+        ("pile", None, "--objects: pile needs a library; csac-jax objects make --out LIB"),
+        ("random10", "made:0:20", "'random10' has no objects of a library; pile, objects_packed"),
+    ],
+)
+def test_a_library_fits_the_suite(suite: str, objects: str | None, message: str):
+    """Claim: a suite of objects without a library, and a library for another suite, are refused."""
+    with pytest.raises(ValueError, match=message):
+        suites.with_objects(SMOKE, suite, objects, "held_out")
+
+
+def test_only_failed_grasps_count():
+    """Claim: failures in a row are grasps that lift nothing; a lift ends the row, a push and an
+    episode that is over leave it."""
+    lifted, touched = int(Outcome.LIFTED), int(Outcome.TOUCHED)
+    grasp, push = int(Primitive.GRASP), int(Primitive.PUSH)
+    record = Episodes(
+        valid=np.array([True, True, True, False]),
+        primitive=np.array([grasp, grasp, push, grasp]),
+        outcome=np.array([touched, lifted, 0, touched]),
+        cleared=None,
+        blocks_lost=None,
+        changed=None,
+        wrong=None,
+    )
+    assert rollout.failures_in_a_row(np.full(4, 1), record).tolist() == [2, 0, 1, 1]
+
+
+@pytest.mark.slow
+def test_a_pile_ends_after_two_failures(monkeypatch: pytest.MonkeyPatch, tmp_path):
+    """Claim: episodes of a pile end empty or after two failures in a row; the result has the
+    fingerprint of its scenes."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cfg = suites.with_objects(SMOKE.change(sim={"physics": "c"}), "pile", "made:0:42", "all")
+    cfg = rollout.configured(cfg, "c", "hand")
+    parts = suites.environments(cfg, "pile", 3, seed=0)
+    env = parts["pile"]
+    assert env.scenes.position.shape == (3, 5, 3)
+    episodes = rollout.rollout(env, policies.RandomPolicy(env.cfg), 3, seed=0)
+    for row in range(3):
+        valid = episodes.valid[row]
+        failed = episodes.outcome[row][valid] != Outcome.LIFTED
+        given_up = metrics.ENDINGS[episodes.ending[row]] == "failed_grasps"
+        assert given_up == bool(failed[-2:].all() and len(failed) > 1)
+        assert given_up != bool(episodes.completed[row])
+        assert not np.any(failed[:-1] & failed[1:]) or given_up
+    found = rollout.measure(policies.RandomPolicy(env.cfg), parts, 3, 0, None)
+    assert found["scenes_sha256"] == rollout.stock.fingerprint(env.cfg.scene, env.scenes)
+    assert found["declutter_rate"]["n"] == 15
+    again = pool.settled(env.cfg, 1, 3, poured=True)
+    assert rollout.stock.fingerprint(env.cfg.scene, again) == found["scenes_sha256"]

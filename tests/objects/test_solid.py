@@ -1,0 +1,64 @@
+"""Convex parts against trimesh, closed forms and brute force."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from csac_jax.objects import solid
+
+
+def _points(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(scale=[0.02, 0.03, 0.05], size=(20, 3)) + 0.1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_volume_and_inertia_are_trimeshs(seed: int):
+    """Claim: volume, centre of mass and inertia of a hull are those of trimesh."""
+    part = solid.convex(_points(seed))
+    whole, mesh = solid.moments(part), trimesh.Trimesh(part.vertices, part.triangles)
+    assert mesh.is_watertight
+    assert whole.volume == pytest.approx(mesh.volume, rel=1e-6)
+    np.testing.assert_allclose(whole.first / whole.volume, mesh.center_mass, rtol=1e-6)
+    np.testing.assert_allclose(solid.inertia(whole), mesh.moment_inertia, rtol=1e-5, atol=1e-14)
+
+
+def test_joined_boxes_are_one_box():
+    """Claim: two boxes side by side have the closed form of the box that they make up."""
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    halves = [solid.convex(cube * [0.5, 2.0, 3.0] + [x, 0.0, 0.0]) for x in (0.0, 0.5)]
+    whole = solid.joined(map(solid.moments, halves))
+    expected = 6.0 * np.diag([4.0 + 9.0, 1.0 + 9.0, 1.0 + 4.0]) / 12.0
+    assert whole.volume == pytest.approx(6.0)
+    np.testing.assert_allclose(solid.inertia(whole), expected, atol=1e-9)
+
+
+def test_planes_hold_the_corners_and_no_more():
+    """Claim: a point lies inside all planes of a hull just where trimesh has it inside."""
+    part = solid.convex(_points(0))
+    points = np.random.default_rng(1).uniform(0.0, 0.2, (4000, 3))
+    inside = (points @ part.planes[:, :3].T <= part.planes[:, 3]).all(axis=1)
+    mesh = trimesh.Trimesh(part.vertices, part.triangles)
+    np.testing.assert_array_equal(inside, trimesh.proximity.signed_distance(mesh, points) > 0)
+    assert 50 < inside.sum() < 3000
+
+
+def test_faces_in_one_plane_are_one():
+    """Claim: a cube has six planes, though twelve triangles."""
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    part = solid.convex(0.03 * cube)
+    assert len(part.triangles) == 12
+    assert len(part.planes) == 6
+
+
+def test_flat_points_are_refused():
+    """Claim: points in one plane are an error in words."""
+    with pytest.raises(ValueError, match="lie in one plane"):
+        solid.convex(np.random.default_rng(0).normal(size=(9, 3)) * [1, 1, 0])
+
+
+def test_narrowest_side_of_a_box():
+    """Claim: a box turned in space is as narrow as its shortest side."""
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    turn = trimesh.transformations.random_rotation_matrix()[:3, :3]
+    part = solid.convex(cube * [0.02, 0.05, 0.09] @ turn.T)
+    assert solid.narrowest([part]) == pytest.approx(0.02, rel=1e-4)

@@ -1,0 +1,84 @@
+"""Actions among objects of a library: what moves them, and the planner that reads their poses."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from csac_jax.config import Config
+from csac_jax.env import Env
+from csac_jax.scene import model, pool
+from csac_jax.sim import backend, oracle, physics
+
+pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
+CONFIG = Config().change(
+    scene={
+        "slots": ("object",) * 3,
+        "min_blocks": 3,
+        "objects": "made:0:42",
+        "drop_extent": (0.3, 0.3),
+        "settle_time": 1.0,
+    },
+    sim={"physics": "c"},
+    task={"kind": "clear"},
+)
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Env:
+    """Six scenes of three objects side by side."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
+        scenes = pool.settled(CONFIG, 1, 6, packed=True)
+    return Env(CONFIG, physics.make(model.build(CONFIG.scene, CONFIG.sim), CONFIG.sim), scenes)
+
+
+@pytest.fixture(scope="module")
+def stepped(env: Env):
+    """The scenes before and after the planner's grasp; the same in another order, which follows."""
+
+    @jax.jit
+    @jax.vmap
+    def run(scene):
+        state = env.reset_to(scene)
+        return state, env.step(state, oracle.grasp(CONFIG, state.scene, state.obs.height))
+
+    order = np.array([3, 4, 5, 0, 1, 2])
+    return run(env.scenes), run(jax.tree.map(lambda leaf: leaf[order], env.scenes)), order
+
+
+def test_the_planner_lifts_objects(stepped):
+    """Claim: the planner lifts an object in most scenes of objects side by side."""
+    (_, after), *_ = stepped
+    assert np.sum(after.info.cleared) >= 4
+    assert not np.any(after.info.physics_diverged)
+
+
+def test_scenes_of_a_batch_have_their_own_objects(env: Env, stepped):
+    """Claim: a scene of a batch moves as it does in another batch, to the bit, though its
+    neighbours hold other objects."""
+    (_, after), (_, other), order = stepped
+    assert len(np.unique(env.scenes.object_id)) > 6
+    for name in ("position", "quaternion"):
+        theirs = np.asarray(getattr(other.scene, name))
+        np.testing.assert_array_equal(np.asarray(getattr(after.scene, name))[order], theirs)
+
+
+def test_objects_choose_c():
+    """Claim: auto stands for C wherever there are objects, and other physics is refused in a line
+    that says what to take."""
+    unresolved = CONFIG.change(sim={"physics": "auto"})
+    assert backend.resolve(unresolved).sim.physics == "c"
+    for kind in ("mjx", "warp"):
+        with pytest.raises(ValueError, match=r"sim\.physics: objects .* need c or auto"):
+            CONFIG.change(sim={"physics": kind})
+
+
+def test_objects_need_a_library():
+    """Claim: slots of kind object without a library, and packed arrangements of blocks among them,
+    are refused in a line with the setting."""
+    with pytest.raises(ValueError, match=r"scene\.objects: slots of kind object need a library"):
+        dataclasses.replace(CONFIG.scene, objects="")
+    with pytest.raises(ValueError, match=r"scene\.arranged: must be 0"):
+        dataclasses.replace(CONFIG.scene, arranged=0.5)
