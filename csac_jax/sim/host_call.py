@@ -97,7 +97,8 @@ def _handler(pointer: Any) -> int | None:
     """What XLA calls, at first to ask for the version. Returns an error, or None."""
     frame = pointer.contents
     if frame.extension:
-        return _tell_version(frame)
+        _tell_version(frame)
+        return None
     try:
         _run(frame)
     except BaseException as error:  # nothing may pass through XLA
@@ -134,9 +135,9 @@ def _arrays(buffers: Any) -> list[np.ndarray]:
 
 def _array(buffer: Any) -> np.ndarray:
     shape = tuple(buffer.dims[: buffer.rank])
-    dtype = np.dtype(_TYPES[buffer.type])
+    dtype: Any = np.dtype(_TYPES[buffer.type])
     size = int(np.prod(shape)) * dtype.itemsize
     if not size:
         return np.empty(shape, dtype)
-    memory = (ctypes.c_byte * size).from_address(buffer.data)
+    memory: Any = (ctypes.c_byte * size).from_address(buffer.data)
     return np.frombuffer(memory, dtype).reshape(shape)
