@@ -3,6 +3,7 @@ teach."""
 
 import dataclasses
 import json
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -78,23 +79,26 @@ def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
         (ONLY_LEFT, _grasp(LEFT), End),
         (BOTH, _grasp(LEFT), None),
         (BOTH, _grasp(LEFT), Lifted),
+        (BOTH, _grasp(LEFT), Lifted),
+        (ONLY_LEFT, _grasp(LEFT), End),
     )
+    shutil.rmtree(folder / "000006")  # what the fifth action led to
     found = experience.load(policy, record.read(folder))
-    assert found.outcome.tolist() == [Outcome.LIFTED, Outcome.EMPTY, Outcome.LIFTED]
+    assert found.outcome.tolist() == [Outcome.LIFTED, Outcome.EMPTY, Outcome.LIFTED, Outcome.LIFTED]
     both, left = (policy.observe(*image) for image in (BOTH, ONLY_LEFT))
     for number, (before, after) in enumerate([(both, left), (left, left), (left, None)]):
         for seen, wanted in [(found.obs, before), (found.next_obs, after)]:
             if wanted is not None:
                 row = jax.tree.map(lambda leaf, n=number: leaf[n], seen)
                 jax.tree.map(np.testing.assert_array_equal, row, heightmap.pack(wanted))
-    program = offline.make(finetune.configure(CFG, Settings(batch=2), 3))
+    program = offline.make(finetune.configure(CFG, Settings(batch=2), 4))
     learner = offline.init(program, policy.params)
     done = experience.transitions(policy, program.learner, learner, found)
-    np.testing.assert_allclose(done.reward, [1.0 + 1.0, -0.5, 1.0 + 1.0], atol=1e-6)
-    assert done.terminated.tolist() == [False, False, True]
-    np.testing.assert_allclose(done.action.pose[:, :2], [RIGHT, LEFT, LEFT], atol=1e-6)
+    np.testing.assert_allclose(done.reward, [2.0, -0.5, 2.0, 2.0], atol=1e-6)
+    assert done.terminated.tolist() == [False, False, True, True]
+    np.testing.assert_allclose(done.action.pose[:, :2], [RIGHT, LEFT, LEFT, LEFT], atol=1e-6)
     np.testing.assert_allclose(done.action.pose[:, 2], 0.3, atol=1e-6)
-    assert done.action.primitive.tolist() == [1, 1, 1]
+    assert done.action.primitive.tolist() == [1, 1, 1, 1]
 
 
 def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
