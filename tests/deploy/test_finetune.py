@@ -5,6 +5,8 @@ import dataclasses
 import json
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -290,3 +292,14 @@ def test_bad_options(
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.err.count("\n") == 1
+
+
+def test_without_mujoco_it_is_one_line(tmp_path: Path):
+    """Claim: on a machine without MuJoCo the command says what it needs, in one line."""
+    start = "import sys; sys.modules['mujoco'] = None; from csac_jax import cli; "
+    command = [sys.executable, "-c", f"{start}sys.exit(cli.main())", "finetune", "shipped", "r"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "csac-jax: finetune needs mujoco; copy the record to a machine where it is installed\n"
+    )
