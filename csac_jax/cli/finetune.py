@@ -44,7 +44,12 @@ def run(arguments: list[str]) -> int:
     options = parsing.parse(FinetuneOptions, arguments, "finetune")
     _check(options)
     stop = signals.install()
-    from csac_jax.deploy import Policy, finetune
+    try:
+        from csac_jax.deploy import Policy, finetune
+    except ModuleNotFoundError as error:
+        raise BadArgumentsError(
+            f"finetune needs {error.name}; copy the record to a machine where it is installed"
+        ) from None
     from csac_jax.io import policy_file
 
     policy = Policy.load(options.policy)

@@ -1,6 +1,8 @@
 """A policy that learns from a record of its own actions, see `record`; no scene is simulated.
 
-policy, summary = finetune.run(Policy.load("shipped"), Path("record"))
+    policy, summary = finetune.run(Policy.load("shipped"), Path("record"))
+
+The learner's modules need MuJoCo installed.
 """
 
 import dataclasses

@@ -3,7 +3,10 @@ teach."""
 
 import dataclasses
 import json
+import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -78,23 +81,26 @@ def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
         (ONLY_LEFT, _grasp(LEFT), End),
         (BOTH, _grasp(LEFT), None),
         (BOTH, _grasp(LEFT), Lifted),
+        (BOTH, _grasp(LEFT), Lifted),
+        (ONLY_LEFT, _grasp(LEFT), End),
     )
+    shutil.rmtree(folder / "000006")  # what the fifth action led to
     found = experience.load(policy, record.read(folder))
-    assert found.outcome.tolist() == [Outcome.LIFTED, Outcome.EMPTY, Outcome.LIFTED]
+    assert found.outcome.tolist() == [Outcome.LIFTED, Outcome.EMPTY, Outcome.LIFTED, Outcome.LIFTED]
     both, left = (policy.observe(*image) for image in (BOTH, ONLY_LEFT))
     for number, (before, after) in enumerate([(both, left), (left, left), (left, None)]):
         for seen, wanted in [(found.obs, before), (found.next_obs, after)]:
             if wanted is not None:
                 row = jax.tree.map(lambda leaf, n=number: leaf[n], seen)
                 jax.tree.map(np.testing.assert_array_equal, row, heightmap.pack(wanted))
-    program = offline.make(finetune.configure(CFG, Settings(batch=2), 3))
+    program = offline.make(finetune.configure(CFG, Settings(batch=2), 4))
     learner = offline.init(program, policy.params)
     done = experience.transitions(policy, program.learner, learner, found)
-    np.testing.assert_allclose(done.reward, [1.0 + 1.0, -0.5, 1.0 + 1.0], atol=1e-6)
-    assert done.terminated.tolist() == [False, False, True]
-    np.testing.assert_allclose(done.action.pose[:, :2], [RIGHT, LEFT, LEFT], atol=1e-6)
+    np.testing.assert_allclose(done.reward, [2.0, -0.5, 2.0, 2.0], atol=1e-6)
+    assert done.terminated.tolist() == [False, False, True, True]
+    np.testing.assert_allclose(done.action.pose[:, :2], [RIGHT, LEFT, LEFT, LEFT], atol=1e-6)
     np.testing.assert_allclose(done.action.pose[:, 2], 0.3, atol=1e-6)
-    assert done.action.primitive.tolist() == [1, 1, 1]
+    assert done.action.primitive.tolist() == [1, 1, 1, 1]
 
 
 def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
@@ -286,3 +292,14 @@ def test_bad_options(
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.err.count("\n") == 1
+
+
+def test_without_mujoco_it_is_one_line(tmp_path: Path):
+    """Claim: on a machine without MuJoCo the command says what it needs, in one line."""
+    start = "import sys; sys.modules['mujoco'] = None; from csac_jax import cli; "
+    command = [sys.executable, "-c", f"{start}sys.exit(cli.main())", "finetune", "shipped", "r"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "csac-jax: finetune needs mujoco; copy the record to a machine where it is installed\n"
+    )
