@@ -21,6 +21,7 @@ from csac_jax.report.curves import (
     REFERENCE,
     Changes,
     floor,
+    lowest,
     percent,
     say_shared,
     shared_changes,
@@ -125,10 +126,10 @@ def _marks(panel: Axes, metric: str, scores: Sequence[Score], shared: Changes) -
         offset = (index + 0.5) * 0.8 / len(scores) - 0.4
         fmt, style = MARKERS[index % len(MARKERS)], _style(scores, index, shared)
         panel.errorbar(places + offset, value, error, fmt=fmt, capsize=3, **style)
-        bottoms.append(np.nanmin(low))
+        bottoms.append(lowest(low))
     panel.set_xticks(places, [*parts, "mean"])
     panel.set_xlim(-0.5, len(parts) + 0.5)
-    return float(min(bottoms))
+    return min(bottoms)
 
 
 def _profiles(scores: Sequence[Score]) -> Figure:

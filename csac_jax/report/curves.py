@@ -101,9 +101,9 @@ def _line(axes: Axes, curve: Curve, colour: str, shared: Changes, paper: bool) -
         axes.fill_between(actions, low, high, color=colour, alpha=0.15, linewidth=0)
     published = PAPER_TRAINING.get(curve.variant.algo) if paper else None
     if published is None:
-        return float(np.nanmin([value, low]))
+        return lowest([value, low])
     axes.plot(PAPER_ACTIONS, 100 * published, color=colour, clip_on=False, **PAPER_MARK)
-    return float(min(np.nanmin([value, low]), 100 * published))
+    return min(lowest([value, low]), 100 * published)
 
 
 def shared_changes(variants: Sequence[Variant]) -> Changes:
@@ -122,6 +122,12 @@ def say_shared(figure: Figure, shared: Changes) -> None:
     if shared:
         named = ", ".join(f"{setting} {value}" for setting, value in shared)
         figure.suptitle(f"all with {named}", fontsize="medium")
+
+
+def lowest(values: Any) -> float:
+    """The lowest of values that are there, %; 100 without any."""
+    there = np.isfinite(values)
+    return float(np.min(np.asarray(values)[there], initial=100.0))
 
 
 def floor(percentage: float) -> float:

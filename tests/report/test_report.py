@@ -559,6 +559,13 @@ def test_axes_lie_where_the_data_are(recorded: Path):
     assert panel.get_legend().get_window_extent().x0 > panel.get_window_extent().x1
 
 
+def test_figures_of_values_that_are_not_there():
+    """Claim: an axis has a beginning where no value is there."""
+    nothing = np.full(3, np.nan)
+    assert (curves.lowest(nothing), curves.lowest([*nothing, 42.0])) == (100.0, 42.0)
+    assert (curves.floor(100.0), curves.floor(42.0), curves.floor(0.5)) == (90.0, 40.0, 0.0)
+
+
 def test_what_all_share_is_said_once(recorded: Path):
     """Claim: a change that all variants of a figure make stands above it and in no legend."""
     for algo in ("vpg", "csac"):
