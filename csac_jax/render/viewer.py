@@ -23,7 +23,7 @@ class Pictured(NamedTuple):
     """An action to show."""
 
     text: str  # what it did
-    poses: Sequence[np.ndarray]  # [T] of qpos
+    poses: np.ndarray  # [T, ...] qpos
 
 
 class Showing(Protocol):
@@ -94,7 +94,7 @@ class Page:
         self._text = server.gui.add_markdown("")
         self.parts = {}
         for geom in np.flatnonzero(model.geom_rgba[:, 3] > 0.0):
-            vertices, faces = mesh(model, geom)
+            vertices, faces = mesh(model, int(geom))
             red, green, blue = (round(255 * float(one)) for one in model.geom_rgba[geom, :3])
             self.parts[int(geom)] = server.scene.add_mesh_simple(
                 f"/geom{geom}", vertices, faces, color=(red, green, blue), flat_shading=True
