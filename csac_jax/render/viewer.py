@@ -23,7 +23,7 @@ class Pictured(NamedTuple):
     """An action to show."""
 
     text: str  # what it did
-    poses: Sequence[np.ndarray] | np.ndarray  # [T] of qpos
+    poses: np.ndarray  # [T, ...] qpos
 
 
 class Showing(Protocol):

@@ -99,8 +99,8 @@ class MLflow(Tracker):
     def begin(self, run: RunInfo) -> None:
         from mlflow import MlflowClient
 
-        beside = f"sqlite:///{run.run_dir.resolve().parent / 'mlflow.db'}"
-        self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI", beside))
+        default = f"sqlite:///{run.run_dir.resolve().parent / 'mlflow.db'}"
+        self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI", default))
         path = run.run_dir / "mlflow-id"
         if path.exists():
             self._id = path.read_text()

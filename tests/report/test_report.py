@@ -603,6 +603,11 @@ def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.
 
 def test_curves_of_the_page_are_the_reports(recorded: Path):
     """Claim: the page draws each curve and each part's values, by the numbers of `--json`."""
+    for path in recorded.rglob("*.json"):
+        content = json.loads(path.read_text())
+        for one in content.get("parts", {}).values():
+            one["completion"] = metrics.wilson(9, 20)  # another than grasp success
+        path.write_text(json.dumps(content))
     report = comparison.build(results.read([recorded]))
     figures, numbers = _drawn(page.render(report, [])), tables.as_json(report)
     lines = [trace for _, data, _ in figures for trace in data if trace.get("mode") == "lines"]
@@ -618,31 +623,34 @@ def test_curves_of_the_page_are_the_reports(recorded: Path):
     assert np.allclose(values, sorted(100 * band["value"] for band in done if band), atol=1e-3)
 
 
-def test_best_is_bold_among_the_alike(recorded: Path):
+_VPG = results.Variant("paper", "vpg", ())
+
+
+def test_best_is_bold_among_the_alike():
     """Claim: bold is the largest value of a column among learned methods of one preset in the same
-    scenes; a value that nothing is compared with is not."""
-    report = comparison.build(results.read([recorded]))
-    table = tables.tables(report)["Evaluation"]
-    shown = page._table(report, "Evaluation", table)
-    column = shown.columns.index("completion")
-    groups: dict[str, list[tuple[float, bool]]] = {}
-    for row in shown.rows:
-        if row.group not in ("oracle", "random"):
-            value = row.cells[column].text.split()[0]
-            groups.setdefault(row.cells[1].text, []).append((float(value), row.cells[column].best))
-    assert any(len(group) > 1 for group in groups.values())
-    for group in groups.values():
-        top = max(value for value, _ in group)
-        assert [best for _, best in group] == [len(group) > 1 and v == top for v, _ in group]
-    assert not any(cell.best for row in shown.rows for cell in row.cells[:5])
+    scenes; a value that nothing is compared with is not, nor is one that is not there."""
+    names = ("ours", "theirs", "theirs", "ours", "oracle", "ours", "ours", "theirs")
+    parts = ("row", "row", "hole", "hole", "row", "tower", "bin", "bin")
+    values = ("90.0 % (1 to 2)", "80.0 %", "60.0 %", "50.0 %", "99.0 %", "70.0 %", "-", "40.0 %")
+    table = [
+        {"policy": name, "part": part, "runs": "3", "completion": value}
+        for name, part, value in zip(names, parts, values, strict=True)
+    ]
+    named = {"ours": results.Variant("paper", "csac", ()), "theirs": _VPG}
+    assert page._best(table, named) == {(0, "completion"), (2, "completion")}
+    table[1]["policy"] = "another preset's"
+    named["another preset's"] = results.Variant("quick", "vpg", ())
+    assert page._best(table, named) == {(2, "completion")}
 
 
 def test_rows_are_grouped_by_method_and_settings_are_words(recorded: Path):
     """Claim: rows of one method stand together, settings are words, and the pointer shows flags."""
     report = comparison.build(results.read([recorded]))
-    shown = page._table(report, "Training", tables.tables(report)["Training"])
-    groups = [row.group for row in shown.rows]
-    assert groups == [name for name in dict.fromkeys(groups) for _ in range(groups.count(name))]
+    table = tables.tables(report)["Training"]
+    for rows in (table, table[::-1], table[1:] + table[:1]):
+        groups = [row.group for row in page._table(report, "Training", rows).rows]
+        assert groups == sorted(groups, key=list(comparison.NAMES.values()).index)
+    assert len(set(groups)) > 1
     variant = results.Variant("paper", "vpg", (("learn.tau", "0.5"), ("learn.augment", "False")))
     assert wording.name_of(variant) == "VPG, target update share 0.5, augment off"
     cell = page._cell({"x": variant}, "x", False)

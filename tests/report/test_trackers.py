@@ -2,6 +2,7 @@
 
 import dataclasses
 import struct
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,8 @@ def _record(actions: int, success: float = 1.0) -> Record:
     return Record(**BLANK | own | {"critic_loss": None})
 
 
-def _follow(tracker: trackers.Tracker, folder: Path) -> None:
-    """A run that is stopped and resumed; an evaluation on its way."""
+def _follow(tracker: trackers.Tracker, folder: Path, pause: float = 0.0) -> None:
+    """A run that is stopped and, after a pause, s, resumed; an evaluation on its way."""
     folder.mkdir(parents=True)
     for step, success in ((0, 0.25), (4, 0.75)):
         tracker.begin(RunInfo(CFG, folder, step))
@@ -33,6 +34,7 @@ def _follow(tracker: trackers.Tracker, folder: Path) -> None:
         if step == 0:
             tracker.evaluated(_record(8), TABLE)
         tracker.end(DONE)
+        time.sleep(pause)
 
 
 def _check(found: Points) -> None:
@@ -91,7 +93,7 @@ def test_wandb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    _follow(trackers.WandB(), tmp_path / "run")
+    _follow(trackers.WandB(), tmp_path / "run", pause=1.1)  # its folders are named by the second
     found: Points = {}
     ids, settings = set(), {}
     for path in sorted((tmp_path / "run/wandb").glob("offline-run-*/*.wandb")):
