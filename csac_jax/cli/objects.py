@@ -193,11 +193,13 @@ def _list(objects: Any) -> None:
     Console(highlight=False).print(table)
     held_out = sum(row["split"] == "held_out" for row in rows)
     print(f"{len(rows)} objects, {held_out} of them held out")
-    from csac_jax.constants import MAX_OPENING
+    from csac_jax import grippers
+    from csac_jax.config import SimConfig
 
-    wide = [row["name"] for row in rows if row["narrowest_mm"] >= 1e3 * MAX_OPENING]
+    opening = 1e3 * grippers.load(SimConfig().gripper).opening[1]
+    wide = [row["name"] for row in rows if row["narrowest_mm"] >= opening]
     if wide:
-        print(f"wider than the hand opens, {1e3 * MAX_OPENING:g} mm: {', '.join(wide)}")
+        print(f"wider than the hand opens, {opening:g} mm: {', '.join(wide)}")
 
 
 COMMANDS = {"make": _make, "import": _import, "show": _show}

@@ -1,12 +1,13 @@
 """`csac-jax objects`: what it writes and what it refuses, in one line."""
 
+import dataclasses
 import json
 from pathlib import Path
 
 import imageio.v2 as imageio
 import pytest
 
-from csac_jax import cli
+from csac_jax import cli, grippers
 from csac_jax.cli import objects
 from csac_jax.objects import library
 
@@ -32,7 +33,8 @@ def test_make_and_show(tmp_path: Path, capsys: Capture):
 
 def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capture):
     """Claim: objects that the hand cannot open for are named."""
-    monkeypatch.setattr("csac_jax.constants.MAX_OPENING", 0.03)
+    narrow = dataclasses.replace(grippers.load("rg2"), opening=(0.0, 0.03))
+    monkeypatch.setattr(grippers, "load", lambda name: narrow)
     assert cli.main(["objects", "show", "made:0:14"]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("wider than the hand opens, 30 mm: ")

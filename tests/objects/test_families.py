@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from csac_jax.constants import MAX_OPENING
+from csac_jax import grippers
 from csac_jax.objects import families, library, solid, tables
 from csac_jax.objects.library import Object
 
@@ -28,7 +28,7 @@ def test_shapes_can_be_simulated_and_held(family: str):
     for one in (each for each in MADE if each.family == family):
         assert library.faults(one) is None
         assert len(one.parts) <= 12
-        assert solid.narrowest(one.parts) < MAX_OPENING - 0.02
+        assert solid.narrowest(one.parts) < grippers.load("rg2").opening[1] - 0.02
 
 
 @pytest.mark.parametrize("family", families.FAMILIES)
