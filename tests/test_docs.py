@@ -230,7 +230,7 @@ def test_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         assert cli.main(words[1:]) == 0, words
     assert [words[1] for words in ran] == ["doctor", "train", "eval", "play", "report"]
     assert Path("first.webp").exists()
-    assert "smoke" in Path("first.md").read_text()
+    assert "CSAC-beta (quick)" in Path("first.md").read_text()
 
 
 def _sentences(page: Path) -> list[list[str]]:
