@@ -19,7 +19,7 @@ import csac_jax
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import parsing, sweep
 from csac_jax.evaluation import suites
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, configs
 
 ROOT = Path(csac_jax.__file__).parents[1]
 README = ROOT / "README.md"
@@ -84,9 +84,15 @@ class Parsed(BaseException):
 
 
 @pytest.fixture
-def parses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Commands end once they have read their arguments. Every run is one of `quick`."""
+def parses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands end once they have read their arguments, in a folder with the files that pages name.
+    Every run is one of `quick`."""
     parse = parsing.parse
+    monkeypatch.chdir(tmp_path)
+    for folder in ("runs/NAME", "RUN/best"):
+        Path(folder).mkdir(parents=True)
+    Path("my.toml").write_text('preset = "quick"')
+    Path("runs/NAME/config.json").write_text(json.dumps(configs.to_dict(presets.quick())))
 
     def stop(*args, **kwargs):
         parse(*args, **kwargs)
@@ -144,13 +150,15 @@ def test_sweeps_can_be_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 @names
 def test_other_blocks_parse(page: Path):
-    """Claim: every fenced block names its language, and is Python, a script, JSON, YAML, BibTeX or
-    text."""
+    """Claim: every fenced block names its language, and is Python, a script, JSON, TOML, YAML, BibTeX
+    or text."""
     for language, code in FENCE.findall(page.read_text()):
         if language in ("python", "py"):
             compile(code, page.name, "exec")
         elif language == "json":
             json.loads(code)
+        elif language == "toml":
+            tomllib.loads(code)
         elif language == "yaml":
             list(yaml.safe_load_all(code))
         elif language == "sh":
@@ -295,6 +303,8 @@ def test_grippers_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert len(steps) == 7
 
 
+@pytest.mark.slow
+@pytest.mark.mjx
 def test_objects_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/objects.md run in their order, given a folder
     of meshes in millimetres."""
