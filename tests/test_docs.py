@@ -150,8 +150,8 @@ def test_sweeps_can_be_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 @names
 def test_other_blocks_parse(page: Path):
-    """Claim: every fenced block names its language, and is Python, a script, JSON, TOML, YAML, BibTeX
-    or text."""
+    """Claim: every fenced block names its language, and is Python, a script, JSON, TOML, YAML,
+    BibTeX or text."""
     for language, code in FENCE.findall(page.read_text()):
         if language in ("python", "py"):
             compile(code, page.name, "exec")
