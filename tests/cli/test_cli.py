@@ -581,7 +581,7 @@ def test_settings_of_a_view_are_those_given():
     flags = ["shipped", "--sensor.dropped=0.0", "--camera.look_at", "0", "0", "0"]
     _, changes = settings.parse_view(evaluation.EvalOptions, "eval", flags)
     wanted = {"sensor": {"dropped": 0.0}, "camera": {"look_at": (0.0, 0.0, 0.0)}}
-    assert changes == {"heightmap": {}, **wanted}
+    assert changes == {"heightmap": {}, "sim": {}, **wanted}
 
 
 def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):

@@ -39,6 +39,7 @@ def test_only_failed_grasps_count():
         blocks_lost=None,
         changed=None,
         wrong=None,
+        unreachable=None,
     )
     assert rollout.failures_in_a_row(np.full(4, 1), record).tolist() == [2, 0, 1, 1]
 

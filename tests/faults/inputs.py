@@ -137,7 +137,7 @@ def _pool(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
     def read() -> Any:
         if (found := pool._read(path)) is None:
             raise _RefusedError
-        return [(str(leaf.dtype), leaf.shape, leaf.tobytes()) for leaf in vars(found).values()]
+        return [(str(leaf.dtype), leaf.shape, leaf.tobytes()) for leaf in jax.tree.leaves(found)]
 
     return path, read, _RefusedError
 

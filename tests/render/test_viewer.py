@@ -91,6 +91,7 @@ def test_page_follows_the_motion(
     assert heights[19:] == heights[:11]
 
 
+@pytest.mark.slow
 def test_window_shows_every_pose():
     """Claim: where there is a display, MuJoCo's window opens and gets each pose."""
     if shutil.which("Xvfb") is None:

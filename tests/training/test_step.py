@@ -443,6 +443,6 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
         program = step.make(cfg, env=object())
         state = jax.eval_shape(program.learner.init, jax.random.key(0))
         replay = jax.eval_shape(lambda: ring.init(jnp.zeros(64), step.example(CFG)))
-        learn = functools.partial(step._learn, program)
+        learn = functools.partial(step.learn, program)
         jax.eval_shape(learn, jax.random.key(0), state, replay, jnp.int32(0))
     assert taken == [CFG.learn.batch, 3]
