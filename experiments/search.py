@@ -30,6 +30,7 @@ from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult, SweepRun, runs_of
 from csac_jax.training import step
 
+METHODS = ("grasp_only", "reactive", "vpg", "csac", "csac_per", "csac_beta")
 FIRST_SEED = 1_000_000  # of the search: results begin at 0
 CRITERION = "area under the training curve, mean over seeds"
 SPACE: dict[str, Callable[[float], float]] = {
@@ -74,7 +75,7 @@ def point(name: str, cfg: Config, algo: str, settings: dict[str, Any], seed: int
 def run(
     preset: tyro.conf.Positional[str],
     folder: tyro.conf.Positional[Path],
-    methods: tuple[str, ...] = ("grasp_only", "vpg", "csac", "csac_per", "csac_beta"),
+    methods: tuple[str, ...] = METHODS,
     trials: int = 16,
     seeds: int = 3,
     task: str = "target",
