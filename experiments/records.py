@@ -77,6 +77,9 @@ RUNS = {
 }
 """Folder of runs -> what it shows. Its command follows from its configs."""
 
+SEARCHES = ("paper_small",)
+"""Presets whose settings were searched."""
+
 BENCHES = {
     "train/xeon-quick": ("time of `quick`, Intel Xeon", "train quick"),
     "train/epyc-quick": ("time of `quick`, AMD EPYC", "train quick"),
@@ -221,6 +224,7 @@ history of this folder.
 |---|---|
 | `PRESET/VARIANT/seed-K/` | a run: `config.json`, `metrics.jsonl`, `eval*.json` |
 | `PRESET/VARIANT/*.json` | the sweep that made the runs, if one did |
+| `search/PRESET/METHOD.json` | what a search of settings tried |
 | `bench/NAME/DEVICE-*.json` | what `csac-jax bench NAME`, or a short `csac-jax train`, wrote |
 
 Files keep the names of settings and metrics that they were written with. A variant that ends in a
@@ -231,7 +235,7 @@ number repeats the one without. Most runs on H200s shared a host, so their secon
 
 def readme() -> str:
     """The whole file."""
-    return f"{HEAD}{tables.table_text([*_runs(), *_benches()])}\n"
+    return f"{HEAD}{tables.table_text([*_runs(), *_searches(), *_benches()])}\n"
 
 
 def _runs() -> Iterator[dict[str, str]]:
@@ -253,6 +257,17 @@ def _commands(found: results.Results, folder: Path) -> Iterator[str]:
         else:
             yield command.replace(f"--seed {seeds[0]}", f"--seed {'|'.join(seeds)}")
     yield from (results.command(one) for one in found.evaluations)
+
+
+def _searches() -> Iterator[dict[str, str]]:
+    for preset in SEARCHES:
+        for path in sorted((RESULTS / "search" / preset).glob("*.json")):
+            record = json.loads(path.read_text())
+            method, name = record["algo"], path.relative_to(RESULTS).as_posix()
+            run = f"run {preset} FOLDER --methods {method} --trials {record['budget']['settings']}"
+            kept = f"record FOLDER --actions {record['budget']['actions']}"
+            commands = f"`python -m experiments.search {run}`; `... {kept}`"
+            yield _row(f"settings searched for {method}", name, commands, record)
 
 
 def _benches() -> Iterator[dict[str, str]]:

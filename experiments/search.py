@@ -1,12 +1,14 @@
 """A search of settings with the same budget for every method, and the result with what it found.
 
     python -m experiments.search run paper_small runs/search --methods vpg csac csac_beta
+    python -m experiments.search record runs/search --actions 1750
     python -m experiments.search result runs/search runs/result --seeds 16 --evaluate 500
 
 Every method tries the same number of settings with the same seeds: first its own defaults, then
 draws from SPACE by the same random numbers. The best has the largest area under the training curve,
 mean over seeds; a run that was given up counts as 0. Each method has a record, METHOD.json, of all
-that was tried. `result` refuses records of different budgets, and seeds that the search has used.
+that was tried. `record` judges by a curve's first ACTIONS: a search may be stopped before its end.
+`result` refuses records of different budgets, and seeds that the search has used.
 """
 
 import json
@@ -33,6 +35,7 @@ from csac_jax.training import step
 METHODS = ("grasp_only", "reactive", "vpg", "csac", "csac_per", "csac_beta")
 FIRST_SEED = 1_000_000  # of the search: results begin at 0
 CRITERION = "area under the training curve, mean over seeds"
+MADE_WITH = "provenance.json"  # beside sweep.json: where the search was begun
 SPACE: dict[str, Callable[[float], float]] = {
     "learn.learning_rate": lambda u: 1e-4 * 30.0**u,
     "learn.lr_final_fraction": lambda u: 0.05 * 20.0**u,
@@ -95,21 +98,40 @@ def search(
     SettingsError where the folder holds another search."""
     if count < 1 or seeds < 1:
         raise SettingsError("--trials, --seeds: at least 1")
-    wanted, begun = plan(cfg, methods, count, seeds), folder.exists()
-    if begun and (folder / "sweep.json").read_text() != runner.plan_text(wanted):
+    wanted = plan(cfg, methods, count, seeds)
+    if not folder.exists():
+        folder.mkdir(parents=True)
+        files.write_json(folder / MADE_WITH, provenance.record())
+        files.replace(folder / runner.PLAN, runner.plan_text(wanted))
+    elif (folder / runner.PLAN).read_text() != runner.plan_text(wanted):
         raise SettingsError(f"{folder} holds another search; give another folder")
-    done = api.run_sweep(wanted, folder, None, "seeds", None, True, stop, resume=begun)
+    done = api.run_sweep(wanted, folder, None, "seeds", None, True, stop, resume=True)
     if done.stopped_by is None:
-        for algo in methods:
-            own = wanted._replace(points=[p for p in wanted.points if p.cfg.algo == algo])
-            files.write_json(folder / f"{algo}.json", _record(own, algo, folder))
+        _record_all(wanted, folder, cfg.train.steps * cfg.train.scenes)
     return done
 
 
-def _record(own: SweepPlan, algo: str, folder: Path) -> dict[str, Any]:
-    """What a method has tried, and the best of it."""
+def record(folder: tyro.conf.Positional[Path], actions: int) -> None:
+    """Records every method of a search, maybe a stopped one, by the first ACTIONS of each curve."""
+    _record_all(runner.read_plan(folder), folder, actions)
+
+
+def _record_all(wanted: SweepPlan, folder: Path, actions: int) -> None:
+    """Writes METHOD.json of every method. Raises SettingsError for more actions than there were."""
+    if not 1 <= actions <= min(p.cfg.train.steps * p.cfg.train.scenes for p in wanted.points):
+        raise SettingsError("--actions: at least 1, and no more than a run has")
+    for algo in dict.fromkeys(point.cfg.algo for point in wanted.points):
+        own = wanted._replace(points=[p for p in wanted.points if p.cfg.algo == algo])
+        files.write_json(folder / f"{algo}.json", _record(own, algo, folder, actions))
+
+
+def _record(own: SweepPlan, algo: str, folder: Path, actions: int) -> dict[str, Any]:
+    """What a method has tried, and the best of it by so many actions."""
     settings = trials(algo, len(own.points))
-    areas = [[_area(folder, one) for one in runs_of(own._replace(points=[p]))] for p in own.points]
+    areas = [
+        [_area(folder, one, actions) for one in runs_of(own._replace(points=[point]))]
+        for point in own.points
+    ]
     best = int(np.argmax([np.mean(row) for row in areas]))
     first = own.points[0].cfg
     seeds = list(range(first.seed, first.seed + own.seeds))
@@ -117,21 +139,21 @@ def _record(own: SweepPlan, algo: str, folder: Path) -> dict[str, Any]:
     return {
         "algo": algo,
         "criterion": CRITERION,
-        "budget": {"settings": len(settings), "seeds": seeds},
+        "budget": {"settings": len(settings), "seeds": seeds, "actions": actions},
         "tried": tried,
         "best": settings[best],
         "config": configs.to_dict(first),
-        **provenance.record(),
+        **files.read_object(folder / MADE_WITH),
     }
 
 
-def _area(folder: Path, run: SweepRun) -> float:
-    """The area under a run's training curve; 0 for one that was given up or grasped nothing."""
+def _area(folder: Path, run: SweepRun, actions: int) -> float:
+    """The area under the first `actions` of a run's training curve; 0 for one that did not come so
+    far, or grasped nothing."""
     found = results.read([folder / run.folder]).runs
-    total = run.cfg.train.steps * run.cfg.train.scenes
-    if not found or found[0].actions[-1] < total:
+    if not found or found[0].actions[-1] < actions:
         return 0.0
-    return statistics.area(found[0].actions, found[0].success, float(found[0].actions[-1]))
+    return statistics.area(found[0].actions, found[0].success, float(actions))
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
@@ -179,4 +201,4 @@ def result_plan(found: Sequence[dict[str, Any]], seeds: int, seed: int, episodes
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"run": run, "result": result})
+    tyro.extras.subcommand_cli_from_dict({"run": run, "record": record, "result": result})

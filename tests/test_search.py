@@ -93,7 +93,7 @@ def test_search_records_every_method_and_its_best(searched: Path):
     found = {record["algo"]: record for record in search.records(searched)}
     assert set(found) == {"vpg", "csac_beta"}
     for algo, record in found.items():
-        assert record["budget"] == {"settings": 3, "seeds": [10**6, 10**6 + 1]}
+        assert record["budget"] == {"settings": 3, "seeds": [10**6, 10**6 + 1], "actions": 24}
         means = [np.mean(one["areas"]) for one in record["tried"]]
         assert len(set(means)) == 3
         assert record["best"] == record["tried"][int(np.argmax(means))]["settings"]
@@ -119,6 +119,28 @@ def test_search_records_every_method_and_its_best(searched: Path):
 
 
 @pytest.mark.optax
+def test_a_stopped_search_is_judged_by_what_all_have_done(searched: Path):
+    """Claim: `record` judges every run by the first actions of its curve, one that did not come so
+    far by 0, and keeps where the search was made, not where it is recorded."""
+    (searched / "provenance.json").write_text('{"device": "another"}')
+    path = searched / "vpg-1" / "seed-1000001" / "metrics.jsonl"
+    lines = path.read_text().splitlines()
+    search.record(searched, 16)
+    before = json.loads((searched / "vpg.json").read_text())
+    points = [json.loads(line) for line in lines]
+    x, y = ([point[name] for point in points] for name in ("actions", "grasp_success"))
+    fine = np.linspace(0.0, 16.0, 100_001)
+    area = np.mean(np.interp(fine, x, y))  # brute force
+    assert before["tried"][1]["areas"][1] == pytest.approx(area, abs=1e-4)
+    assert (before["budget"]["actions"], before["device"]) == (16, "another")
+    path.write_text("\n".join(lines[: x.index(8) + 1]) + "\n")
+    search.record(searched, 16)
+    assert json.loads((searched / "vpg.json").read_text())["tried"][1]["areas"][1] == 0.0
+    with pytest.raises(SettingsError, match="--actions"):
+        search.record(searched, 25)
+
+
+@pytest.mark.optax
 def test_unequal_budgets_are_refused(searched: Path):
     """Claim: records of methods that tried more settings, or had other seeds, are no comparison."""
     path = searched / "vpg.json"
@@ -138,7 +160,7 @@ def test_a_lost_run_counts_as_nothing(tmp_path: Path):
     folder = tmp_path / run.folder
     folder.mkdir(parents=True)
     (folder / "config.json").write_text('{"seed": 1000000}')
-    assert search._area(tmp_path, run) == 0.0
+    assert search._area(tmp_path, run, 24) == 0.0
     line = {"step": 4, "actions": 8, "seconds": 1.0, "grasps_counted": 5, "grasp_success": 0.9}
     (folder / "metrics.jsonl").write_text(json.dumps(line) + "\n")
-    assert search._area(tmp_path, run) == 0.0
+    assert search._area(tmp_path, run, 24) == 0.0

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results"
 RUN = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/seed-\d+/(config|train|eval[\w-]*)\.json")
 SWEEP = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/(sweep|summary|train)\.json")
+SEARCH = re.compile(r"search/[a-z_]+/[a-z_]+\.json")
 BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h200)[\w-]*\.json")
 
 
@@ -41,12 +42,12 @@ def test_every_record_has_a_claim():
 
 
 def test_records_lie_in_one_layout():
-    """Claim: a record is a run's, a sweep's or a benchmark's file, each in its place."""
+    """Claim: a record is a run's, a sweep's, a search's or a benchmark's, each in its place."""
     files = [path for path in RESULTS.rglob("*") if path.is_file() and path.name != "README.md"]
     assert len(files) > 400
     for path in files:
         name = path.relative_to(RESULTS).as_posix().replace("metrics.jsonl", "config.json")
-        assert any(pattern.fullmatch(name) for pattern in (RUN, SWEEP, BENCH)), name
+        assert any(pattern.fullmatch(name) for pattern in (RUN, SWEEP, SEARCH, BENCH)), name
         if path.suffix == ".json":
             assert isinstance(json.loads(path.read_text()), dict)
 
