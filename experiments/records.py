@@ -66,8 +66,7 @@ RUNS = {
     "fast/long": "three times as many actions",
     "fast/scenes_4096": "twice as many scenes, six times as many actions, a smaller net",
     "fast/shipped": "the shipped policy (seed 0) on every suite",
-    "fast/camera": "the policy `shipped_camera`, by `--init shipped`; all suites but "
-    "`camera` through exact maps from above",
+    "fast/camera": "the policy `shipped_camera`, by `--init shipped`",
     "fast/camera_heights": "the same of heights alone, from nothing; stopped at 159,744 actions",
     "fast/updates_128": "twice as many updates",
     "fast/small_net": "a net with a third of the parameters",
@@ -256,7 +255,8 @@ def _commands(found: results.Results, folder: Path) -> Iterator[str]:
             yield command.replace("--seed ", f"--seeds {len(seeds)} --seed ")
         else:
             yield command.replace(f"--seed {seeds[0]}", f"--seed {'|'.join(seeds)}")
-    yield from (results.command(one) for one in found.evaluations)
+    trained = found.runs[0].config if found.runs else None
+    yield from (results.command(one, trained) for one in found.evaluations)
 
 
 def _searches() -> Iterator[dict[str, str]]:

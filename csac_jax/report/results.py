@@ -7,7 +7,7 @@ A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSO
 import contextlib
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ RECORD = "train.json"  # device, versions and commit: in the folder of a run or 
 SKIPPED = ("checkpoints", "tensorboard", "wandb", "best")
 NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
 HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
+VIEW = ("camera.", "sensor.", "heightmap.view")  # what may be another in an evaluation
 LENGTH = "train."  # settings of a run's length and shape do not make it another method
 METRICS = {
     "grasp_success": "grasp success",
@@ -246,7 +247,7 @@ def variant(config: Json) -> Variant:
     with contextlib.suppress(ValueError):  # written by a version that knew other settings
         config = configs.to_dict(configs.from_dict(config))
     changed = tuple(
-        (name, " ".join(map(str, value)) if isinstance(value, list) else str(value))
+        (name, _text(value))
         for name, value in configs.flat(config).items()
         if value != base.get(name, value) and name not in (*NAMED, *HOST)
     )
@@ -259,19 +260,37 @@ def world(config: Json) -> tuple[str, str]:
     return sim.get("physics", "mjx"), sim.get("robot", "hand")
 
 
-def command(one: RecordedRun | Evaluation) -> str:
-    """The command that makes such a run or evaluation, from what its record says."""
+def command(one: RecordedRun | Evaluation, trained: Json | None = None) -> str:
+    """The command that makes such a run or evaluation, from what its record says; of a policy of
+    the config `trained`, with the view that it was given in place of its own."""
     physics, robot = world(one.config)
     if isinstance(one, Evaluation):
         episodes = one.metrics.get("counts", {}).get("episodes")
         asked = f"--policy {one.policy} --suite {one.suite} --episodes {episodes} --seed {one.seed}"
-        return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}"
+        view = _flags(_view(one.config, trained or one.config))
+        return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}{view}"
     preset, algo, changed = one.variant
-    flags = "".join(f" {_flag(name, value)}" for name, value in changed)
+    flags = _flags(changed)
     seed = f"--seed {one.config.get('seed', 0)} --sim.physics {physics}"
     if robot != SimConfig().robot:
         seed += f" --sim.robot {robot}"
     return f"csac-jax train {preset} --algo {algo} {seed}{flags}"
+
+
+def _view(config: Json, trained: Json) -> Iterator[tuple[str, str]]:
+    """Names and texts of a config's settings of the camera that are other than `trained`'s."""
+    own = configs.flat(trained)
+    for name, value in configs.flat(config).items():
+        if name.startswith(VIEW) and value != own.get(name, value):
+            yield name, _text(value)
+
+
+def _text(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _flags(settings: Iterable[tuple[str, str]]) -> str:
+    return "".join(f" {_flag(name, value)}" for name, value in settings)
 
 
 def _flag(name: str, value: str) -> str:

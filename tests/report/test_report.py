@@ -17,7 +17,8 @@ import pytest
 from matplotlib.axes import Axes
 
 from csac_jax import algorithms, cli, presets
-from csac_jax.cli import train
+from csac_jax.cli import settings, train
+from csac_jax.cli.evaluation import EvalOptions
 from csac_jax.evaluation import metrics, statistics
 from csac_jax.io import configs, files
 from csac_jax.report import charts, comparison, curves, page, results, tables, wording
@@ -416,6 +417,22 @@ def test_command_gives_the_config_back():
     program, command, *flags = results.command(run).split()
     assert (program, command) == ("csac-jax", "train")
     assert configs.to_dict(train.read(flags)[1]) == config
+
+
+def test_command_of_an_evaluation_gives_its_view_back():
+    """Claim: an evaluation's command has the settings of its camera that are not the policy's, and
+    no others."""
+    noisy = _config("csac_beta", 0, heightmap__view="oblique", sensor__kind="d415")
+    lens = {"size": [320, 240], "focal": [309.0, 309.5], "centre": [159.5, 119.5]}
+    seen = _config("csac_beta", 0, **{f"camera__{name}": value for name, value in lens.items()})
+    given = (Path("x"), seen, results.variant(seen), "learned", "random10", "random10", 3)
+    one = results.Evaluation(*given, {"counts": {"episodes": 5}}, {})
+    program, command, run, *flags = results.command(one, noisy).split()
+    assert (program, command, run) == ("csac-jax", "eval", "RUN")
+    asked, view = settings.parse_view(EvalOptions, "eval", ["RUN", *flags])
+    assert (asked.episodes, asked.seed, asked.suite) == (5, 3, "random10")
+    assert configs.to_dict(configs.from_dict(noisy).change(**view)) == seen
+    assert "--camera" not in results.command(one, seen)
 
 
 def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
