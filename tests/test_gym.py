@@ -158,9 +158,11 @@ def test_stable_baselines_learns():
     )
     rewards: list[float] = []
 
-    def keep(given: dict[str, Any], _: dict[str, Any]) -> None:
+    def keep(given: dict[str, Any], _: dict[str, Any]) -> bool:
         rewards.append(float(given["rewards"][0]))
+        return True  # go on
 
     learner.learn(2000, callback=keep)
+    assert len(rewards) == 2000
     assert np.mean(rewards[:200]) < 0.1
     assert np.mean(rewards[-200:]) > 0.5

@@ -5,6 +5,7 @@ The page needs the extra `viewer`. It listens on this machine alone: 127.0.0.1.
 
 import contextlib
 import itertools
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -15,6 +16,7 @@ import numpy as np
 from csac_jax.render import gl, media
 
 PORT = 8080  # of the page; the next free one is taken
+CLOSING = 10.0  # s that a window may take to close
 _PLANE = 1.0  # half of the side of a plane that has no end, m
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
 
@@ -79,10 +81,15 @@ def _window(model: mujoco.MjModel) -> Iterator[Showing]:
 
     data = mujoco.MjData(model)
     panels = {"show_left_ui": False, "show_right_ui": False}
-    with mujoco.viewer.launch_passive(model, data, **panels) as handle:
-        handle.cam.lookat[:], handle.cam.distance = (0.0, 0.0, 0.05), 1.2
-        handle.cam.azimuth, handle.cam.elevation = 45.0, -35.0
-        yield _Window(handle, data)
+    others = set(threading.enumerate())
+    try:
+        with mujoco.viewer.launch_passive(model, data, **panels) as handle:
+            handle.cam.lookat[:], handle.cam.distance = (0.0, 0.0, 0.05), 1.2
+            handle.cam.azimuth, handle.cam.elevation = 45.0, -35.0
+            yield _Window(handle, data)
+    finally:
+        for thread in set(threading.enumerate()) - others:
+            thread.join(CLOSING)  # Python's end closes GLFW, and crashes a window that still draws
 
 
 class Page:

@@ -24,6 +24,7 @@ from experiments.bench import _closed_loop
 
 HELD_OUT = 1000  # added to the seed of scenes that nothing is learned from
 IMAGE = 0.5  # of the camera's pixels: enough for a map of 64 cells
+PLACES = {"above": (-0.03, 0.0, 0.7), "side": (-0.5, 0.0, 0.5)}  # m, where the camera stands
 TIMES = ("before", "after")
 SHOWN = ("grasp_success", "completion", "blocks_per_action", "pushes")
 
@@ -46,22 +47,24 @@ class World(NamedTuple):
     """What is measured in."""
 
     opening: float
+    place: str  # of PLACES
     episodes: int
     learn: Settings
 
 
-def world(policy: Policy, opening: float, episodes: int, seed: int) -> Env:
-    """random10 seen from the side, with that gripper."""
+def world(policy: Policy, setting: World, episodes: int, seed: int) -> Env:
+    """random10 seen by that camera, with that gripper."""
     cfg = policy.cfg.change(sim={"physics": "c"}, heightmap={"view": "oblique"})
-    cfg = cfg.change(camera=cfg.camera.scaled(IMAGE))
+    lens = dataclasses.replace(cfg.camera, position=PLACES[setting.place])
+    cfg = cfg.change(camera=lens.scaled(IMAGE))
     (env,) = suites.environments(cfg, "random10", episodes, seed).values()
-    return dataclasses.replace(env, physics=Narrow(env.physics, opening))
+    return dataclasses.replace(env, physics=Narrow(env.physics, setting.opening))
 
 
 def measure(source: str, setting: World, grasps: int, seed: int) -> dict[str, Any]:
     """One seed: scenes, grasps, order of learning and held-out scenes follow from it."""
     begun, policy = time.perf_counter(), Policy.load(source)
-    env = world(policy, setting.opening, 64, seed)
+    env = world(policy, setting, 64, seed)
     with tempfile.TemporaryDirectory() as folder:
         recorder = Recorder(Path(folder), source)
         loop = _closed_loop.Loop(policy, env, 64, seed, recorder)
@@ -69,7 +72,7 @@ def measure(source: str, setting: World, grasps: int, seed: int) -> dict[str, An
         recorded = time.perf_counter()
         tuned, done = finetune.run(policy, Path(folder), setting.learn._replace(seed=seed))
     learned = time.perf_counter()
-    held_out = world(policy, setting.opening, setting.episodes, HELD_OUT + seed)
+    held_out = world(policy, setting, setting.episodes, HELD_OUT + seed)
     found = {
         name: _evaluate(one, held_out, setting.episodes, HELD_OUT + seed)
         for name, one in zip(TIMES, (policy, tuned), strict=True)

@@ -1,6 +1,6 @@
 """Fine-tuning on recorded grasps of a gripper that opens less, as JSON: `csac-jax bench finetune
 [--seeds N] [--grasps N] [--opening-mm N] [--episodes N] [--updates N] [--batch N] [--policy SOURCE]
-[--learning-rate X]`.
+[--learning-rate X] [--camera above|side]`.
 
 The shipped policy was trained with fingers that open 110 mm. Here they open OPENING-MM (85, as
 those of a Robotiq 2F-85). For each of SEEDS (3): the policy acts through `deploy.Policy` on images
@@ -29,6 +29,7 @@ def main(arguments: list[str]) -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--learning-rate", type=float, default=3e-4)
     parser.add_argument("--policy", default="shipped")
+    parser.add_argument("--camera", choices=("above", "side"), default="above")
     options = vars(parser.parse_args(arguments))
     for name, value in options.items():
         if isinstance(value, int) and value < 1:
@@ -41,7 +42,7 @@ def main(arguments: list[str]) -> None:
     begun, opening = time.perf_counter(), 1e-3 * options["opening_mm"]
     names = ("updates", "batch", "learning_rate")
     learn = _finetune.Settings(**{name: options[name] for name in names})
-    setting = _finetune.World(opening, options["episodes"], learn)
+    setting = _finetune.World(opening, options["camera"], options["episodes"], learn)
     found: list[dict[str, Any]] = []
     with as_bad_arguments(ValueError, FileNotFoundError):
         for seed in range(options["seeds"]):
