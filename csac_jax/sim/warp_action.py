@@ -3,7 +3,8 @@
 Model and data of E scenes stay on the device. A call copies in what an action changes: the fields
 of the blocks, the state and the set-points. After every substep, kernels of our own hold parked
 blocks, limit speeds and extend the trace. On CUDA several substeps are one recorded graph, which is
-launched until the primitive is over.
+launched until the primitive is over. Parts of the scenes run side by side, each on a stream of its
+own: most kernels are too short to fill a GPU.
 """
 
 import contextlib
@@ -11,9 +12,10 @@ import copy
 import functools
 import gc
 import inspect
+import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import jax
@@ -27,6 +29,7 @@ from csac_jax.scene import layout
 from csac_jax.scene.model import World
 
 GRAPH_SUBSTEPS = 10  # most substeps in one recorded graph
+LANES = 2  # parts of the scenes that CUDA computes side by side (ours)
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
 FIELDS = {
@@ -221,9 +224,9 @@ class Batch:
 
     def recorded(self, substep: Callable[[], None]) -> Callable[[], None]:
         """A function that runs `substep` as often as a primitive does, on CUDA as graphs."""
+        load_kernels(substep)  # which a recording must not
         if not wp.get_device().is_cuda:
             return functools.partial(_repeat, substep, self.substeps)
-        load_kernels(substep)  # which a recording must not
         self.restart()
         substep()
         each = max(n for n in range(1, GRAPH_SUBSTEPS + 1) if self.substeps % n == 0)
@@ -270,6 +273,7 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int) -> tuple[Any, Any]:
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(FIELDS, scenes))
     put.opt.warn_overflow = 0  # the trace counts
+    put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
     data = mjw.make_data(
         model,
         nworld=scenes,
@@ -319,7 +323,7 @@ class Simulator:
     """
 
     def __init__(self, world: World, cfg: SimConfig) -> None:
-        self.batches: dict[tuple[Any, int, int], Batch] = {}
+        self.lanes: dict[tuple[Any, int, int], list[Lane]] = {}
         """By device, scenes and substeps; made by the first action of so many scenes."""
         self._world, self._cfg = world, cfg
         self._arguments = {**FIELDS, **_STATE, **_COMMAND}
@@ -339,16 +343,59 @@ class Simulator:
         results = self._callable(*(arrays[name] for name in self._arguments), output_dims=dims)
         return dict(zip(self._results, results, strict=True))
 
+    def prepared(self, scenes: int, substeps: int) -> "list[Lane]":
+        """What computes so many scenes on the current device; minutes pass where kernels are to be
+        built."""
+        key = (wp.get_device().alias, scenes, substeps)
+        if key not in self.lanes:
+            self.lanes[key] = _lanes(self._world, self._cfg, scenes, substeps)
+        return self.lanes[key]
+
     def _run(self, *arrays: wp.array) -> None:
-        inputs, outputs = arrays[: len(self._arguments)], arrays[len(self._arguments) :]
-        control = inputs[list(self._arguments).index("control")]
-        device, (scenes, substeps, _) = control.device, control.shape
-        with wp.ScopedDevice(device):
-            batch = self.batches.get((device.alias, scenes, substeps))
-            if batch is None:
-                batch = Batch(self._world, self._cfg, scenes, substeps)
-                self.batches[device.alias, scenes, substeps] = batch
-            batch.run(inputs, outputs)
+        control = arrays[list(self._arguments).index("control")]
+        scenes, substeps, _ = control.shape
+        with wp.ScopedDevice(control.device):
+            lanes = self.prepared(scenes, substeps)
+            side_by_side(lanes, lambda lane: lane.batch.run(*self._part(lane, arrays)))
+
+    def _part(self, lane: "Lane", arrays: Sequence[wp.array]) -> tuple[list[wp.array], ...]:
+        """A lane's rows of arguments and of results, leaves [E, ...]."""
+        rows = [array[lane.rows] for array in arrays]
+        return rows[: len(self._arguments)], rows[len(self._arguments) :]
+
+
+class Lane(NamedTuple):
+    """A part of the scenes."""
+
+    rows: slice
+    batch: Batch
+    stream: wp.Stream | None  # None: the caller's
+
+
+def _lanes(world: World, cfg: SimConfig, scenes: int, substeps: int) -> list[Lane]:
+    """All scenes, in parts of like size."""
+    ends = np.linspace(0, scenes, min(LANES, scenes) + 1).astype(int)
+    streams = wp.get_device().is_cuda and LANES > 1
+    return [
+        Lane(
+            slice(int(first), int(end)),
+            Batch(world, cfg, int(end - first), substeps),
+            wp.Stream() if streams else None,
+        )
+        for first, end in itertools.pairwise(ends)
+    ]
+
+
+def side_by_side(lanes: Sequence[Lane], call: Callable[[Lane], None]) -> None:
+    """Calls it for every lane on the lane's stream. The caller's stream waits for all."""
+    streams = [lane.stream for lane in lanes if lane.stream is not None]
+    for stream in streams:
+        stream.wait_stream(wp.get_stream())
+    for lane in lanes:
+        with wp.ScopedStream(lane.stream, sync_enter=False):
+            call(lane)
+    for stream in streams:
+        wp.wait_stream(stream)
 
 
 def _annotated(
