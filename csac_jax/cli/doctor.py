@@ -80,7 +80,7 @@ def _build_kernels(cfg: Config) -> dict[str, Any]:
 
     begun = time.perf_counter()
     made: Any = physics.make(model.build(cfg.scene, cfg.sim), cfg.sim)
-    made.simulator.prepared(cfg.train.scenes, cfg.sim.substeps)
+    made.simulator.prepared(cfg.train.scenes)
     seconds = time.perf_counter() - begun
     print(f"kernels    {seconds:.1f} s for {cfg.train.scenes} scenes of {cfg.preset} on Warp")
     return {"kernels_seconds": seconds}

@@ -13,8 +13,9 @@ import functools
 import gc
 import inspect
 import itertools
+import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -29,6 +30,7 @@ from csac_jax.scene import layout
 from csac_jax.scene.model import World
 
 GRAPH_SUBSTEPS = 10  # most substeps in one recorded graph
+STEP = 0.0051  # s, longest physics step (ours: outcomes stay those of C's 4 ms)
 LANES = 2  # parts of the scenes that CUDA computes side by side (ours)
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
@@ -46,6 +48,12 @@ FIELDS = {
     "dof_invweight0": wp.array2d[float],
 }
 """Fields of MuJoCo's model that differ per scene, [E, ...]."""
+OBJECT_FIELDS = {
+    "geom_dataid": wp.array2d[int],
+    "geom_quat": wp.array2d[wp.quat],
+    "body_iquat": wp.array2d[wp.quat],
+}
+"""Those that differ besides where there are objects."""
 _STATE = {"qpos": wp.array2d[float], "qvel": wp.array2d[float]}
 _COMMAND = {
     "control": wp.array3d[float],  # [E, T, nu]
@@ -173,9 +181,10 @@ def _observe(
 class Batch:
     """Model, data and trace of E scenes on the current device, and the recorded substeps."""
 
-    def __init__(self, world: World, cfg: SimConfig, scenes: int, substeps: int) -> None:
-        self.substeps = substeps
-        self.model, self.data = _put(world.model, cfg, scenes)
+    def __init__(self, world: World, cfg: SimConfig, scenes: int) -> None:
+        self.substeps = substeps = steps(cfg)
+        self.fields = FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
+        self.model, self.data = _put(world.model, cfg, scenes, self.fields)
         slots, parts = len(world.slots), len(world.hand_geoms)
         part_of_geom = np.full(world.model.ngeom, -1)
         part_of_geom[world.hand_geoms] = np.arange(parts)
@@ -183,7 +192,7 @@ class Batch:
             wp.array(each, dtype=int) for each in (world.slot_of_geom, part_of_geom)
         ]
         self._constants = [
-            sum(cfg.grasp_phases[:2]),
+            round(sum(cfg.grasp_phases[:2]) * substeps / cfg.substeps),
             _LOST_CONTACTS,
             world.finger_qpos,
             wp.array(world.block_qpos[:, 0], dtype=int),
@@ -195,7 +204,7 @@ class Batch:
         self._control = wp.zeros((scenes, substeps, world.model.nu), dtype=float)
         self._in_play = wp.zeros((scenes, slots), dtype=wp.bool)
         state = [self._qpos, self._qvel, self._control, self._in_play]
-        self._given = [*(getattr(self.model, name) for name in FIELDS), *state]
+        self._given = [*(getattr(self.model, name) for name in self.fields), *state]
         self._touching = wp.zeros((scenes, parts, slots), dtype=int)
         self._done = wp.zeros(scenes, dtype=int)
         self._trace = [
@@ -264,14 +273,24 @@ def _repeat(call: Callable[[], None], times: int) -> None:
         call()
 
 
-def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int) -> tuple[Any, Any]:
-    """Warp's model, whose FIELDS every scene has its own of, and its data.
+def steps(cfg: SimConfig) -> int:
+    """Physics steps of a primitive: of at most STEP, as many as graphs hold, but no shorter than
+    those of the config."""
+    least = math.ceil(cfg.substeps * cfg.timestep / STEP - 1e-6)
+    return min(cfg.substeps, -(-least // GRAPH_SUBSTEPS) * GRAPH_SUBSTEPS)
+
+
+def _put(
+    model: mujoco.MjModel, cfg: SimConfig, scenes: int, fields: Iterable[str]
+) -> tuple[Any, Any]:
+    """Warp's model, whose `fields` every scene has its own of, and its data.
 
     By this flag Warp takes C's function for two boxes, not the general one for convex shapes.
     """
     model = copy.copy(model)
+    model.opt.timestep = cfg.substeps * cfg.timestep / steps(cfg)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-    put = mjw.put_model(model, batch_sizes=dict.fromkeys(FIELDS, scenes))
+    put = mjw.put_model(model, batch_sizes=dict.fromkeys(fields, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
     data = mjw.make_data(
@@ -318,15 +337,17 @@ def _no_garbage_collection() -> Iterator[None]:
 class Simulator:
     """A function of the arrays of E scenes, for JAX to call.
 
-    It takes FIELDS, qpos [E, nq], qvel [E, nv], control [E, T, nu] and in_play [E, N] by these
-    names. It returns qpos, qvel and the leaves of `outcome.Trace`.
+    It takes FIELDS, with objects OBJECT_FIELDS too, qpos [E, nq], qvel [E, nv], control [E, T, nu]
+    and in_play [E, N] by these names. It returns qpos, qvel and the leaves of `outcome.Trace`.
     """
 
     def __init__(self, world: World, cfg: SimConfig) -> None:
-        self.lanes: dict[tuple[Any, int, int], list[Lane]] = {}
-        """By device, scenes and substeps; made by the first action of so many scenes."""
+        self.substeps = steps(cfg)
+        self.lanes: dict[tuple[Any, int], list[Lane]] = {}
+        """By device and scenes; made by the first action of so many scenes."""
         self._world, self._cfg = world, cfg
-        self._arguments = {**FIELDS, **_STATE, **_COMMAND}
+        fields = FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
+        self._arguments = {**fields, **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
         self._callable = wp.jax_callable(
             _annotated(self._run, list(self._arguments.items()), list(self._results.items())),
@@ -343,19 +364,17 @@ class Simulator:
         results = self._callable(*(arrays[name] for name in self._arguments), output_dims=dims)
         return dict(zip(self._results, results, strict=True))
 
-    def prepared(self, scenes: int, substeps: int) -> "list[Lane]":
+    def prepared(self, scenes: int) -> "list[Lane]":
         """What computes so many scenes on the current device; minutes pass where kernels are to be
         built."""
-        key = (wp.get_device().alias, scenes, substeps)
+        key = (wp.get_device().alias, scenes)
         if key not in self.lanes:
-            self.lanes[key] = _lanes(self._world, self._cfg, scenes, substeps)
+            self.lanes[key] = _lanes(self._world, self._cfg, scenes)
         return self.lanes[key]
 
     def _run(self, *arrays: wp.array) -> None:
-        control = arrays[list(self._arguments).index("control")]
-        scenes, substeps, _ = control.shape
-        with wp.ScopedDevice(control.device):
-            lanes = self.prepared(scenes, substeps)
+        with wp.ScopedDevice(arrays[0].device):
+            lanes = self.prepared(arrays[0].shape[0])
             side_by_side(lanes, lambda lane: lane.batch.run(*self._part(lane, arrays)))
 
     def _part(self, lane: "Lane", arrays: Sequence[wp.array]) -> tuple[list[wp.array], ...]:
@@ -372,14 +391,14 @@ class Lane(NamedTuple):
     stream: wp.Stream | None  # None: the caller's
 
 
-def _lanes(world: World, cfg: SimConfig, scenes: int, substeps: int) -> list[Lane]:
+def _lanes(world: World, cfg: SimConfig, scenes: int) -> list[Lane]:
     """All scenes, in parts of like size."""
     ends = np.linspace(0, scenes, min(LANES, scenes) + 1).astype(int)
     streams = wp.get_device().is_cuda and LANES > 1
     return [
         Lane(
             slice(int(first), int(end)),
-            Batch(world, cfg, int(end - first), substeps),
+            Batch(world, cfg, int(end - first)),
             wp.Stream() if streams else None,
         )
         for first, end in itertools.pairwise(ends)

@@ -66,7 +66,7 @@ def _warp(physics: WarpPhysics, scenes: Scene, joints: JointTrajectory) -> Calla
     from csac_jax.sim.warp_action import Lane
 
     jax.block_until_ready(jax.jit(jax.vmap(physics.run))(scenes, joints))  # copies them in
-    lanes = physics.simulator.prepared(*joints.control.shape[:2])
+    lanes = physics.simulator.prepared(len(joints.control))
     steps = {lane.rows.start: lane.batch.recorded(lane.batch.step) for lane in lanes}
 
     def run(lane: Lane) -> None:

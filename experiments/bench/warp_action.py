@@ -1,14 +1,17 @@
 """Physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--blocks N ...]
-[--lanes L ...] [--repeats N] [--pool N] [--task clear|target] [--kernels] [--repeatable]`.
+[--lanes L ...] [--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--kernels]
+[--repeatable]`.
 
-For each number of scenes (2048), of blocks (those of the preset `fast`) and of lanes (ours):
-seconds of an action of the environment (`env`), of physics alone (`physics`), and of a bare loop of
-Warp's own steps with the same blocks and set-points, recorded in graphs and lanes as ours are
-(`bare`). They alternate; each is the median of N (5) rounds after one that does not count. `share`
-is bare / env. `first_action` is the time from the start of the process for the first row, of which
-`scenes_ready` went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp's
-pool held so far. `calls` counts the calls of Warp that a scan of two steps makes, which are to be
-two. `bits_differ` is the number of leaves in which a second run of the same action differs.
+For each number of scenes (2048), of blocks (those of the preset `fast`) and of lanes, and for each
+longest step in ms (both ours): seconds of an action of the environment (`env`), of physics alone
+(`physics`), and of a bare loop of Warp's own steps with the same blocks and set-points, recorded in
+graphs and lanes as ours are (`bare`). They alternate; each is the median of N (5) rounds after one
+that does not count. `share` is bare / env.
+
+`first_action` is the time from the start of the process for the first row, of which `scenes_ready`
+went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp's pool held so far.
+`calls` counts the calls of Warp that a scan of two steps makes, which are to be two. `bits_differ`
+is the number of leaves in which a second run of the same action differs.
 
 --kernels adds milliseconds and launches of each kernel in an action of the first lane, whose
 substeps are launched one by one: only then can Warp time them. --repeatable asks Warp for the same
@@ -54,19 +57,20 @@ def _config(scenes: int, blocks: int, pool: int, task: str) -> Config:
     return cfg if blocks == len(cfg.scene.slots) else with_blocks(cfg, blocks)
 
 
-def measure(cfg: Config, lanes: int, repeats: int, kernels: bool) -> dict[str, Any]:
-    """One number of scenes, blocks and lanes."""
+def measure(cfg: Config, lanes: int, longest: float, repeats: int, kernels: bool) -> dict[str, Any]:
+    """One number of scenes, blocks and lanes, one longest step, ms."""
     from csac_jax.sim import warp_action
 
     scenes = cfg.train.scenes
-    env = environment.make_env(cfg)
+    with mock.patch.object(warp_action, "STEP", 1e-3 * longest):
+        env = environment.make_env(cfg)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
     grasp = functools.partial(oracle.grasp, cfg)
     actions = jax.jit(jax.vmap(grasp))(states.scene, states.obs.height)
     joints = jax.block_until_ready(_bare.joint_trajectories(cfg, states.obs.height, actions))
     begun = {"scenes_ready": _seconds_since_start()}
     step = jax.jit(jax.vmap(env.step))
-    with mock.patch.object(warp_action, "LANES", lanes):
+    with mock.patch.multiple(warp_action, LANES=lanes, STEP=1e-3 * longest):
         first = jax.device_get(step(states, actions))
     begun["first_action"] = _seconds_since_start()
     run = jax.jit(jax.vmap(env.physics.run))
@@ -74,6 +78,7 @@ def measure(cfg: Config, lanes: int, repeats: int, kernels: bool) -> dict[str, A
     calls = {"env": lambda: step(states, actions), "physics": lambda: run(states.scene, joints)}
     seconds = medians({**calls, "bare": bare}, repeats)
     row = {"scenes": scenes, "blocks": len(cfg.scene.slots), "lanes": lanes, "seconds": seconds}
+    row |= {"steps": env.physics.simulator.substeps}
     row |= {"actions_per_second": scenes / seconds["env"], **begun, **_bytes()}
     row |= {"share": seconds["bare"] / seconds["env"], "calls": _calls(env, states, actions)}
     row |= {"bits_differ": _differing(first, jax.device_get(step(states, actions)))}
@@ -107,10 +112,10 @@ def _calls(env: environment.Env, states: environment.State, actions: Action) -> 
 def _kernels(env: environment.Env, joints: Any) -> dict[str, list[float]]:
     """Milliseconds and launches of each kernel in an action of the first lane, longest first; none
     without CUDA."""
-    lane = env.physics.simulator.prepared(*joints.control.shape[:2])[0]
+    lane = env.physics.simulator.prepared(len(joints.control))[0]
     lane.batch.restart()
     wp.timing_begin(wp.TIMING_ALL)
-    for _ in range(joints.control.shape[1]):
+    for _ in range(lane.batch.substeps):
         lane.batch.substep()
     found: dict[str, list[float]] = collections.defaultdict(lambda: [0.0, 0])
     for each in wp.timing_end():
@@ -134,6 +139,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--scenes", type=int, nargs="+", default=[2048])
     parser.add_argument("--blocks", type=int, nargs="+", default=[10])
     parser.add_argument("--lanes", type=int, nargs="+", default=None)
+    parser.add_argument("--step", type=float, nargs="+", default=None)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pool", type=int, default=64)
     parser.add_argument("--task", choices=("clear", "target"), default="clear")
@@ -144,15 +150,18 @@ def main(arguments: list[str]) -> None:
         wp.config.deterministic = wp.DeterministicMode.RUN_TO_RUN  # before its kernels are read
     from csac_jax.sim import warp_action
 
-    lanes = options.lanes or [warp_action.LANES]
+    lanes, steps = options.lanes or [warp_action.LANES], options.step or [1e3 * warp_action.STEP]
     rows = [
         measure(
             _config(scenes, blocks, options.pool, options.task),
             each,
+            longest,
             options.repeats,
             options.kernels,
         )
-        for scenes, blocks, each in itertools.product(options.scenes, options.blocks, lanes)
+        for scenes, blocks, each, longest in itertools.product(
+            options.scenes, options.blocks, lanes, steps
+        )
     ]
     print(
         json.dumps({"repeatable": options.repeatable, "runs": rows} | provenance.record(), indent=2)
