@@ -1,5 +1,5 @@
 """Physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--blocks N ...]
-[--lanes L ...] [--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--kernels]
+[--lanes L ...] [--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details]
 [--repeatable]`.
 
 For each number of scenes (2048), of blocks (those of the preset `fast`) and of lanes, and for each
@@ -10,12 +10,11 @@ that does not count. `share` is bare / env.
 
 `first_action` is the time from the start of the process for the first row, of which `scenes_ready`
 went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp's pool held so far.
-`calls` counts the calls of Warp that a scan of two steps makes, which are to be two. `bits_differ`
-is the number of leaves in which a second run of the same action differs.
+`bits_differ` is the number of leaves in which a second run of the same action differs.
 
---kernels adds milliseconds and launches of each kernel in an action of the first lane, whose
-substeps are launched one by one: only then can Warp time them. --repeatable asks Warp for the same
-bits in every run.
+--details adds the `calls` of Warp that a scan of two steps makes, which are to be two, and
+milliseconds and launches of each kernel in an action of the first lane, whose substeps are launched
+one by one: only then can Warp time them. --repeatable asks Warp for the same bits in every run.
 """
 
 import collections
@@ -57,7 +56,7 @@ def _config(scenes: int, blocks: int, pool: int, task: str) -> Config:
     return cfg if blocks == len(cfg.scene.slots) else with_blocks(cfg, blocks)
 
 
-def measure(cfg: Config, lanes: int, longest: float, repeats: int, kernels: bool) -> dict[str, Any]:
+def measure(cfg: Config, lanes: int, longest: float, repeats: int, details: bool) -> dict[str, Any]:
     """One number of scenes, blocks and lanes, one longest step, ms."""
     from csac_jax.sim import warp_action
 
@@ -80,11 +79,13 @@ def measure(cfg: Config, lanes: int, longest: float, repeats: int, kernels: bool
     row = {"scenes": scenes, "blocks": len(cfg.scene.slots), "lanes": lanes, "seconds": seconds}
     row |= {"steps": env.physics.simulator.substeps}
     row |= {"actions_per_second": scenes / seconds["env"], **begun, **_bytes()}
-    row |= {"share": seconds["bare"] / seconds["env"], "calls": _calls(env, states, actions)}
+    row |= {"share": seconds["bare"] / seconds["env"]}
     row |= {"bits_differ": _differing(first, jax.device_get(step(states, actions)))}
     row |= {"overflows": int(first.info.contact_overflow.sum())}
     row |= {"diverged": int(first.info.physics_diverged.sum())}
-    return row | ({"kernels": _kernels(env, joints)} if kernels else {})
+    if details:
+        row |= {"calls": _calls(env, states, actions), "kernels": _kernels(env, joints)}
+    return row
 
 
 def _differing(one: Any, other: Any) -> int:
@@ -143,7 +144,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pool", type=int, default=64)
     parser.add_argument("--task", choices=("clear", "target"), default="clear")
-    parser.add_argument("--kernels", action="store_true")
+    parser.add_argument("--details", action="store_true")
     parser.add_argument("--repeatable", action="store_true")
     options = parser.parse_args(arguments)
     if options.repeatable:
@@ -157,7 +158,7 @@ def main(arguments: list[str]) -> None:
             each,
             longest,
             options.repeats,
-            options.kernels,
+            options.details,
         )
         for scenes, blocks, each, longest in itertools.product(
             options.scenes, options.blocks, lanes, steps
