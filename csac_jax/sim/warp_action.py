@@ -7,17 +7,12 @@ launched until the primitive is over. Parts of the scenes run side by side, each
 own: most kernels are too short to fill a GPU.
 """
 
-import contextlib
 import copy
-import functools
-import gc
 import inspect
 import itertools
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
-from unittest import mock
 
 import jax
 import mujoco
@@ -28,8 +23,8 @@ from mujoco.mjx.third_party import mujoco_warp as mjw
 from csac_jax.config import SimConfig
 from csac_jax.scene import layout
 from csac_jax.scene.model import World
+from csac_jax.sim import warp_graph
 
-GRAPH_SUBSTEPS = 10  # most substeps in one recorded graph
 STEP = 0.0051  # s, longest physics step (ours: outcomes stay those of C's 4 ms)
 LANES = 2  # parts of the scenes that CUDA computes side by side (ours)
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
@@ -232,17 +227,9 @@ class Batch:
         self._touching.zero_()
 
     def recorded(self, substep: Callable[[], None]) -> Callable[[], None]:
-        """A function that runs `substep` as often as a primitive does, on CUDA as graphs."""
-        load_kernels(substep)  # which a recording must not
-        if not wp.get_device().is_cuda:
-            return functools.partial(_repeat, substep, self.substeps)
+        """A function that runs `substep` as often as a primitive does."""
         self.restart()
-        substep()
-        each = max(n for n in range(1, GRAPH_SUBSTEPS + 1) if self.substeps % n == 0)
-        with _no_garbage_collection(), wp.ScopedCapture() as capture:
-            _repeat(substep, each)
-        launch = functools.partial(wp.capture_launch, capture.graph)
-        return functools.partial(_repeat, launch, self.substeps // each)
+        return warp_graph.repeated(substep, self.substeps)
 
     def step(self) -> None:
         """One physics step with the set-points of the substep."""
@@ -268,16 +255,11 @@ class Batch:
         )
 
 
-def _repeat(call: Callable[[], None], times: int) -> None:
-    for _ in range(times):
-        call()
-
-
 def steps(cfg: SimConfig) -> int:
     """Physics steps of a primitive: of at most STEP, as many as graphs hold, but no shorter than
     those of the config."""
     least = math.ceil(cfg.substeps * cfg.timestep / STEP - 1e-6)
-    return min(cfg.substeps, -(-least // GRAPH_SUBSTEPS) * GRAPH_SUBSTEPS)
+    return min(cfg.substeps, -(-least // warp_graph.LONGEST) * warp_graph.LONGEST)
 
 
 def _put(
@@ -301,37 +283,6 @@ def _put(
         njmax=4 * cfg.contacts + 32,  # the edges of friction pyramids; joints and limits
     )
     return put, data
-
-
-def load_kernels(substep: Callable[[], None]) -> None:
-    """Builds and loads what `substep` launches, on all cores.
-
-    Launches load kernels one by one; the first time, when they are built, that takes minutes.
-    """
-    modules: dict[int, dict[Any, None]] = {}
-
-    def note(kernel: Any, *_: Any, block_dim: int = 256, **__: Any) -> None:  # Warp's default
-        modules.setdefault(block_dim, {})[kernel.module] = None
-
-    def once(_: Any, while_body: Callable[..., None], **given: Any) -> None:
-        while_body(**given)
-
-    with mock.patch.multiple(wp, launch=note, launch_tiled=note, capture_while=once):
-        substep()
-    for block_dim, used in modules.items():
-        wp.force_load(wp.get_device(), list(used), block_dim, max_workers=os.cpu_count())
-
-
-@contextlib.contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """CUDA ends the process where a program is freed while a graph is recorded."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
 
 
 class Simulator:
