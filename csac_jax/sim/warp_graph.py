@@ -59,8 +59,7 @@ def _load_kernels(step: Callable[[], None]) -> None:
     def any_size(*_: Any) -> tuple[int, int]:
         return 256, 1
 
-    patched = {"launch": note, "launch_tiled": note, "get_suggested_block_size": any_size}
-    with mock.patch.multiple(wp, **patched):
+    with mock.patch.multiple(wp, launch=note, launch_tiled=note, get_suggested_block_size=any_size):
         step()
     for block_dim, used in modules.items():
         wp.force_load(wp.get_device(), list(used), block_dim, max_workers=os.cpu_count())

@@ -128,7 +128,7 @@ def _of_objects(world: World, own: Bodies, fields: ObjectFields) -> Iterator[tup
     def known(rows: np.ndarray) -> jax.Array:
         return jnp.asarray(rows, rows.dtype if rows.dtype == bool else jnp.float32)[number]
 
-    part = PartFields(*map(known, own.parts))
+    part: PartFields = jax.tree.map(known, own.parts)
     meshes = jnp.asarray(own.meshes, jnp.int32)[number]
     yield "geom_dataid", geoms, jnp.where(known(own.tables.present), meshes, -1)
     yield "geom_pos", geoms, part.position
