@@ -178,8 +178,8 @@ class Batch:
 
     def __init__(self, world: World, cfg: SimConfig, scenes: int) -> None:
         self.substeps = substeps = steps(cfg)
-        self.fields = FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
-        self.model, self.data = _put(world.model, cfg, scenes, self.fields)
+        own = fields(world)
+        self.model, self.data = _put(world.model, cfg, scenes, own)
         slots, parts = len(world.slots), len(world.hand_geoms)
         part_of_geom = np.full(world.model.ngeom, -1)
         part_of_geom[world.hand_geoms] = np.arange(parts)
@@ -199,7 +199,7 @@ class Batch:
         self._control = wp.zeros((scenes, substeps, world.model.nu), dtype=float)
         self._in_play = wp.zeros((scenes, slots), dtype=wp.bool)
         state = [self._qpos, self._qvel, self._control, self._in_play]
-        self._given = [*(getattr(self.model, name) for name in self.fields), *state]
+        self._given = [*(getattr(self.model, name) for name in own), *state]
         self._touching = wp.zeros((scenes, parts, slots), dtype=int)
         self._done = wp.zeros(scenes, dtype=int)
         self._trace = [
@@ -255,6 +255,11 @@ class Batch:
         )
 
 
+def fields(world: World) -> dict[str, Any]:
+    """Fields of MuJoCo's model that differ per scene, and their types."""
+    return FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
+
+
 def steps(cfg: SimConfig) -> int:
     """Physics steps of a primitive: of at most STEP, as many as graphs hold, but no shorter than
     those of the config."""
@@ -262,17 +267,15 @@ def steps(cfg: SimConfig) -> int:
     return min(cfg.substeps, -(-least // warp_graph.LONGEST) * warp_graph.LONGEST)
 
 
-def _put(
-    model: mujoco.MjModel, cfg: SimConfig, scenes: int, fields: Iterable[str]
-) -> tuple[Any, Any]:
-    """Warp's model, whose `fields` every scene has its own of, and its data.
+def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str]) -> tuple[Any, Any]:
+    """Warp's model, whose fields `own` every scene has its own of, and its data.
 
     By this flag Warp takes C's function for two boxes, not the general one for convex shapes.
     """
     model = copy.copy(model)
     model.opt.timestep = cfg.substeps * cfg.timestep / steps(cfg)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-    put = mjw.put_model(model, batch_sizes=dict.fromkeys(fields, scenes))
+    put = mjw.put_model(model, batch_sizes=dict.fromkeys(own, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
     data = mjw.make_data(
@@ -297,8 +300,7 @@ class Simulator:
         self.lanes: dict[tuple[Any, int], list[Lane]] = {}
         """By device and scenes; made by the first action of so many scenes."""
         self._world, self._cfg = world, cfg
-        fields = FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
-        self._arguments = {**fields, **_STATE, **_COMMAND}
+        self._arguments = {**fields(world), **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
         self._callable = wp.jax_callable(
             _annotated(self._run, list(self._arguments.items()), list(self._results.items())),
