@@ -22,6 +22,7 @@ import functools
 import itertools
 import json
 import re
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,15 @@ def _bytes() -> dict[str, Any]:
     return {"warp_bytes": wp.get_mempool_used_mem_high(device), "jax_bytes": by_jax}
 
 
+def _ask_for_same_bits() -> None:
+    """Of the kernels that are read already, and of those to come."""
+    mode = wp.DeterministicMode.RUN_TO_RUN
+    wp.config.deterministic = mode
+    for name, module in list(sys.modules.items()):
+        if "mujoco_warp" in name:
+            wp.set_module_options({"deterministic": mode}, module)
+
+
 def main(arguments: list[str]) -> None:
     """Prints the result."""
     parser = Parser(prog="bench warp_action", allow_abbrev=False)
@@ -148,7 +158,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--repeatable", action="store_true")
     options = parser.parse_args(arguments)
     if options.repeatable:
-        wp.config.deterministic = wp.DeterministicMode.RUN_TO_RUN  # before its kernels are read
+        _ask_for_same_bits()
     from csac_jax.sim import warp_action
 
     lanes, steps = options.lanes or [warp_action.LANES], options.step or [1e3 * warp_action.STEP]
