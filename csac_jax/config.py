@@ -633,8 +633,8 @@ class Config(Section):
         _require(rotations % 2 == 0, "net.rotations: must be even")
         _require(rotations <= most, f"net.rotations: at most {most} for heightmap.size {size}")
         self.net.check_canvas(size)
-        fits = not self.scene.has_objects or self.sim.physics in ("c", "auto")
-        _require(fits, "sim.physics: objects that differ between scenes need c or auto")
+        fits = not self.scene.has_objects or self.sim.physics != "mjx"
+        _require(fits, "sim.physics: objects that differ between scenes need c, warp or auto")
         if self.sim.physics == "warp":
             alike = self.scene.size_jitter[1] == 0.0 or not set(MESH_KINDS) & set(self.scene.slots)
             _require(alike, "scene.size_jitter: the second must be 0 where sim.physics is warp")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import output, parsing, train
-from csac_jax.cli.failures import complain
+from csac_jax.cli.failures import BadArgumentsError, complain
 from csac_jax.config import Config
 from csac_jax.errors import FailedError
 
@@ -23,6 +23,8 @@ class DoctorOptions:
 
     preset: str | None = None
     """Preset, with settings as for `train`: also prints the memory that a run's state takes."""
+    build: bool = False
+    """Also builds the kernels of physics on Warp: of the preset, or else of fast."""
     json: Path | None = None
     """File to write the result to, as JSON."""
 
@@ -41,8 +43,9 @@ def run(arguments: list[str]) -> int:
         verdict = "ok" if check.passed else "FAILED"
         print(f"{verdict:<10} {check.name}: error {check.error:.1e}, bound {check.bound:.0e}")
     print(f"self-test  {time.perf_counter() - begun:.1f} s")
+    built = {} if cfg is None or "--build" not in arguments else _build_kernels(cfg)
     tests = [{**check._asdict(), "passed": check.passed} for check in checks]
-    output.write_result(options.json, {**guard, "self_test": tests, **needs}, cfg)
+    output.write_result(options.json, {**guard, "self_test": tests, **needs, **built}, cfg)
     if failed := "; ".join(check.name for check in checks if not check.passed):
         raise FailedError(f"self-test failed: {failed}; do not trust these versions here")
     return 0
@@ -51,9 +54,36 @@ def run(arguments: list[str]) -> int:
 def _read(arguments: list[str]) -> tuple[DoctorOptions | train.TrainOptions, Config | None]:
     """The options, and with --preset the config of such a run."""
     preset, others = parsing.take(arguments, "--preset")
-    if preset is None or parsing.asks_help(arguments):
+    build, others = "--build" in others, [each for each in others if each != "--build"]
+    if parsing.asks_help(arguments) or (preset is None and not build):
         return parsing.parse(DoctorOptions, arguments, "doctor"), None
-    return train.read([preset, *others])
+    options, cfg = train.read([preset or "fast", *others])
+    return options, _on_warp(cfg) if build else cfg
+
+
+def _on_warp(cfg: Config) -> Config:
+    """The config with the physics of this machine, which are to be Warp's."""
+    from csac_jax.sim import backend
+
+    cfg = backend.resolve(cfg)
+    if cfg.sim.physics != "warp":
+        raise BadArgumentsError(
+            f"--build: only warp has kernels to build, and sim.physics is {cfg.sim.physics} here"
+        )
+    return cfg
+
+
+def _build_kernels(cfg: Config) -> dict[str, Any]:
+    """Builds what Warp needs for such a run; returns the seconds for the JSON."""
+    from csac_jax.scene import model
+    from csac_jax.sim import physics
+
+    begun = time.perf_counter()
+    made: Any = physics.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    made.simulator.prepared(cfg.train.scenes)
+    seconds = time.perf_counter() - begun
+    print(f"kernels    {seconds:.1f} s for {cfg.train.scenes} scenes of {cfg.preset} on Warp")
+    return {"kernels_seconds": seconds}
 
 
 def _print_memory(cfg: Config) -> dict[str, Any]:

@@ -26,6 +26,20 @@ class ObjectFields(NamedTuple):
     friction: jax.Array  # [M] sliding friction
 
 
+class PartFields(NamedTuple):
+    """What MuJoCo's compiler derives from the meshes of objects, [O, P, ...].
+
+    The frame of a mesh is that of its inertia. Its size reaches from the frame's origin to the
+    farthest corner along each axis. Its radius is the norm of that size.
+    """
+
+    position: np.ndarray  # [O, P, 3] m, of the frame in the body
+    quaternion: np.ndarray  # [O, P, 4] (w, x, y, z) of the frame in the body
+    size: np.ndarray  # [O, P, 3] m
+    radius: np.ndarray  # [O, P] m
+    box: np.ndarray  # [O, P, 2, 3] m, centre and half size of the bounding box in the frame
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Bodies:
     """The bodies of objects in a compiled model. M = slots, O = objects, P = parts of one."""
@@ -35,7 +49,7 @@ class Bodies:
     bodies: np.ndarray  # [M] body ids
     geoms: np.ndarray  # [M, P] geom ids
     meshes: np.ndarray  # [O, P] mesh ids, that of the first part where there is no such part
-    boxes: np.ndarray  # [O, P, 2, 3] m, lowest and highest corner of these meshes, in their frames
+    parts: PartFields
 
 
 def add_meshes(spec: mujoco.MjSpec, objects: Library) -> None:
@@ -77,25 +91,27 @@ def read(model: mujoco.MjModel, slots: np.ndarray, bodies: np.ndarray, objects: 
     starts = model.mesh_vertadr[meshes[0, 0] :]
     corners = model.mesh_vert.astype(np.float64)
     low, high = (each.reduceat(corners, starts) for each in (np.minimum, np.maximum))
-    boxes = np.stack([low, high], axis=1)[meshes - meshes[0, 0]]
-    return Bodies(found, slots, bodies, geoms, meshes, boxes)
+    boxes = np.stack([low, high], axis=1)[meshes - meshes[0, 0]]  # [O, P, 2, 3]
+    size = np.abs(boxes).max(axis=2)
+    parts = PartFields(
+        model.mesh_pos[meshes],
+        model.mesh_quat[meshes],
+        size,
+        np.linalg.norm(size, axis=2),
+        np.stack([boxes.mean(axis=2), 0.5 * np.ptp(boxes, axis=2)], axis=2),
+    )
+    return Bodies(found, slots, bodies, geoms, meshes, parts)
 
 
 def put(model: mujoco.MjModel, own: Bodies, fields: ObjectFields) -> None:
-    """Writes the objects of a scene into a model, but for what `mj_setConst` derives from them.
-
-    As MuJoCo's compiler: the frame of a mesh is that of its inertia, its size reaches from the
-    frame's origin to the farthest corner along each axis, its radius is the norm of that size.
-    """
+    """Writes the objects of a scene into a model, but for what `mj_setConst` derives from them."""
     number = np.asarray(fields.number)
-    geoms, meshes, present = own.geoms, own.meshes[number], own.tables.present[number]
-    boxes = own.boxes[number]  # [M, P, 2, 3]
-    size = np.abs(boxes).max(axis=2)
-    model.geom_dataid[geoms] = meshes
-    model.geom_pos[geoms], model.geom_quat[geoms] = model.mesh_pos[meshes], model.mesh_quat[meshes]
-    model.geom_size[geoms], model.geom_rbound[geoms] = size, np.linalg.norm(size, axis=2)
-    model.geom_aabb[geoms, :3] = boxes.mean(axis=2)
-    model.geom_aabb[geoms, 3:] = 0.5 * np.ptp(boxes, axis=2)
+    geoms, present = own.geoms, own.tables.present[number]
+    part = PartFields(*(leaf[number] for leaf in own.parts))
+    model.geom_dataid[geoms] = own.meshes[number]
+    model.geom_pos[geoms], model.geom_quat[geoms] = part.position, part.quaternion
+    model.geom_size[geoms], model.geom_rbound[geoms] = part.size, part.radius
+    model.geom_aabb[geoms] = part.box.reshape(*geoms.shape, 6)
     model.geom_friction[geoms, 0] = np.asarray(fields.friction)[:, None]
     model.geom_contype[geoms[~present]] = model.geom_conaffinity[geoms[~present]] = 0
     density = np.asarray(fields.density, np.float64)

@@ -16,12 +16,12 @@ def resolve(cfg: Config, devices: int = 1, runs: int = 1) -> Config:
 
     `runs` configs of this kind share one program. C MuJoCo serves a single CPU device, where it
     is several times as fast as MJX. Warp serves a single CUDA device where it was measured to be
-    faster, is installed and can do the scene. MJX serves the rest. Objects need C.
+    faster, is installed and can do the scene. MJX serves the rest, and C objects.
     """
     if cfg.sim.physics != "auto":
         return cfg
     if cfg.scene.has_objects:
-        return cfg.change(sim={"physics": "c"})  # no other gives each scene its own meshes
+        return cfg.change(sim={"physics": "c"})  # Warp's speed with them is not known
     platform = jax.default_backend() if devices == 1 else None
     if platform == "cpu":
         return cfg.change(sim={"physics": "c"})

@@ -3,18 +3,16 @@
 Model and data of E scenes stay on the device. A call copies in what an action changes: the fields
 of the blocks, the state and the set-points. After every substep, kernels of our own hold parked
 blocks, limit speeds and extend the trace. On CUDA several substeps are one recorded graph, which is
-launched until the primitive is over.
+launched until the primitive is over. Parts of the scenes run side by side, each on a stream of its
+own: most kernels are too short to fill a GPU.
 """
 
-import contextlib
 import copy
-import functools
-import gc
 import inspect
-import os
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
-from unittest import mock
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -25,8 +23,10 @@ from mujoco.mjx.third_party import mujoco_warp as mjw
 from csac_jax.config import SimConfig
 from csac_jax.scene import layout
 from csac_jax.scene.model import World
+from csac_jax.sim import warp_graph
 
-GRAPH_SUBSTEPS = 10  # most substeps in one recorded graph
+STEP = 0.0051  # s, longest physics step (ours: outcomes stay those of C's 4 ms)
+LANES = 2  # parts of the scenes that CUDA computes side by side (ours)
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
 FIELDS = {
@@ -43,6 +43,12 @@ FIELDS = {
     "dof_invweight0": wp.array2d[float],
 }
 """Fields of MuJoCo's model that differ per scene, [E, ...]."""
+OBJECT_FIELDS = {
+    "geom_dataid": wp.array2d[int],
+    "geom_quat": wp.array2d[wp.quat],
+    "body_iquat": wp.array2d[wp.quat],
+}
+"""Those that differ besides where there are objects."""
 _STATE = {"qpos": wp.array2d[float], "qvel": wp.array2d[float]}
 _COMMAND = {
     "control": wp.array3d[float],  # [E, T, nu]
@@ -170,9 +176,10 @@ def _observe(
 class Batch:
     """Model, data and trace of E scenes on the current device, and the recorded substeps."""
 
-    def __init__(self, world: World, cfg: SimConfig, scenes: int, substeps: int) -> None:
-        self.substeps = substeps
-        self.model, self.data = _put(world.model, cfg, scenes)
+    def __init__(self, world: World, cfg: SimConfig, scenes: int) -> None:
+        self.substeps = substeps = steps(cfg)
+        own = fields(world)
+        self.model, self.data = _put(world.model, cfg, scenes, own)
         slots, parts = len(world.slots), len(world.hand_geoms)
         part_of_geom = np.full(world.model.ngeom, -1)
         part_of_geom[world.hand_geoms] = np.arange(parts)
@@ -180,7 +187,7 @@ class Batch:
             wp.array(each, dtype=int) for each in (world.slot_of_geom, part_of_geom)
         ]
         self._constants = [
-            sum(cfg.grasp_phases[:2]),
+            round(sum(cfg.grasp_phases[:2]) * substeps / cfg.substeps),
             _LOST_CONTACTS,
             world.finger_qpos,
             wp.array(world.block_qpos[:, 0], dtype=int),
@@ -192,7 +199,7 @@ class Batch:
         self._control = wp.zeros((scenes, substeps, world.model.nu), dtype=float)
         self._in_play = wp.zeros((scenes, slots), dtype=wp.bool)
         state = [self._qpos, self._qvel, self._control, self._in_play]
-        self._given = [*(getattr(self.model, name) for name in FIELDS), *state]
+        self._given = [*(getattr(self.model, name) for name in own), *state]
         self._touching = wp.zeros((scenes, parts, slots), dtype=int)
         self._done = wp.zeros(scenes, dtype=int)
         self._trace = [
@@ -220,17 +227,9 @@ class Batch:
         self._touching.zero_()
 
     def recorded(self, substep: Callable[[], None]) -> Callable[[], None]:
-        """A function that runs `substep` as often as a primitive does, on CUDA as graphs."""
-        if not wp.get_device().is_cuda:
-            return functools.partial(_repeat, substep, self.substeps)
-        load_kernels(substep)  # which a recording must not
+        """A function that runs `substep` as often as a primitive does."""
         self.restart()
-        substep()
-        each = max(n for n in range(1, GRAPH_SUBSTEPS + 1) if self.substeps % n == 0)
-        with _no_garbage_collection(), wp.ScopedCapture() as capture:
-            _repeat(substep, each)
-        launch = functools.partial(wp.capture_launch, capture.graph)
-        return functools.partial(_repeat, launch, self.substeps // each)
+        return warp_graph.repeated(substep, self.substeps)
 
     def step(self) -> None:
         """One physics step with the set-points of the substep."""
@@ -256,20 +255,29 @@ class Batch:
         )
 
 
-def _repeat(call: Callable[[], None], times: int) -> None:
-    for _ in range(times):
-        call()
+def fields(world: World) -> dict[str, Any]:
+    """Fields of MuJoCo's model that differ per scene, and their types."""
+    return FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
 
 
-def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int) -> tuple[Any, Any]:
-    """Warp's model, whose FIELDS every scene has its own of, and its data.
+def steps(cfg: SimConfig) -> int:
+    """Physics steps of a primitive: of at most STEP, as many as graphs hold, but no shorter than
+    those of the config."""
+    least = math.ceil(cfg.substeps * cfg.timestep / STEP - 1e-6)
+    return min(cfg.substeps, -(-least // warp_graph.LONGEST) * warp_graph.LONGEST)
+
+
+def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str]) -> tuple[Any, Any]:
+    """Warp's model, whose fields `own` every scene has its own of, and its data.
 
     By this flag Warp takes C's function for two boxes, not the general one for convex shapes.
     """
     model = copy.copy(model)
+    model.opt.timestep = cfg.substeps * cfg.timestep / steps(cfg)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-    put = mjw.put_model(model, batch_sizes=dict.fromkeys(FIELDS, scenes))
+    put = mjw.put_model(model, batch_sizes=dict.fromkeys(own, scenes))
     put.opt.warn_overflow = 0  # the trace counts
+    put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
     data = mjw.make_data(
         model,
         nworld=scenes,
@@ -280,49 +288,19 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int) -> tuple[Any, Any]:
     return put, data
 
 
-def load_kernels(substep: Callable[[], None]) -> None:
-    """Builds and loads what `substep` launches, on all cores.
-
-    Launches load kernels one by one; the first time, when they are built, that takes minutes.
-    """
-    modules: dict[int, dict[Any, None]] = {}
-
-    def note(kernel: Any, *_: Any, block_dim: int = 256, **__: Any) -> None:  # Warp's default
-        modules.setdefault(block_dim, {})[kernel.module] = None
-
-    def once(_: Any, while_body: Callable[..., None], **given: Any) -> None:
-        while_body(**given)
-
-    with mock.patch.multiple(wp, launch=note, launch_tiled=note, capture_while=once):
-        substep()
-    for block_dim, used in modules.items():
-        wp.force_load(wp.get_device(), list(used), block_dim, max_workers=os.cpu_count())
-
-
-@contextlib.contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """CUDA ends the process where a program is freed while a graph is recorded."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
 class Simulator:
     """A function of the arrays of E scenes, for JAX to call.
 
-    It takes FIELDS, qpos [E, nq], qvel [E, nv], control [E, T, nu] and in_play [E, N] by these
-    names. It returns qpos, qvel and the leaves of `outcome.Trace`.
+    It takes FIELDS, with objects OBJECT_FIELDS too, qpos [E, nq], qvel [E, nv], control [E, T, nu]
+    and in_play [E, N] by these names. It returns qpos, qvel and the leaves of `outcome.Trace`.
     """
 
     def __init__(self, world: World, cfg: SimConfig) -> None:
-        self.batches: dict[tuple[Any, int, int], Batch] = {}
-        """By device, scenes and substeps; made by the first action of so many scenes."""
+        self.substeps = steps(cfg)
+        self.lanes: dict[tuple[Any, int], list[Lane]] = {}
+        """By device and scenes; made by the first action of so many scenes."""
         self._world, self._cfg = world, cfg
-        self._arguments = {**FIELDS, **_STATE, **_COMMAND}
+        self._arguments = {**fields(world), **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
         self._callable = wp.jax_callable(
             _annotated(self._run, list(self._arguments.items()), list(self._results.items())),
@@ -339,16 +317,57 @@ class Simulator:
         results = self._callable(*(arrays[name] for name in self._arguments), output_dims=dims)
         return dict(zip(self._results, results, strict=True))
 
+    def prepared(self, scenes: int) -> "list[Lane]":
+        """What computes so many scenes on the current device; minutes pass where kernels are to be
+        built."""
+        key = (wp.get_device().alias, scenes)
+        if key not in self.lanes:
+            self.lanes[key] = _lanes(self._world, self._cfg, scenes)
+        return self.lanes[key]
+
     def _run(self, *arrays: wp.array) -> None:
-        inputs, outputs = arrays[: len(self._arguments)], arrays[len(self._arguments) :]
-        control = inputs[list(self._arguments).index("control")]
-        device, (scenes, substeps, _) = control.device, control.shape
-        with wp.ScopedDevice(device):
-            batch = self.batches.get((device.alias, scenes, substeps))
-            if batch is None:
-                batch = Batch(self._world, self._cfg, scenes, substeps)
-                self.batches[device.alias, scenes, substeps] = batch
-            batch.run(inputs, outputs)
+        with wp.ScopedDevice(arrays[0].device):
+            lanes = self.prepared(arrays[0].shape[0])
+            side_by_side(lanes, lambda lane: lane.batch.run(*self._part(lane, arrays)))
+
+    def _part(self, lane: "Lane", arrays: Sequence[wp.array]) -> tuple[list[wp.array], ...]:
+        """A lane's rows of arguments and of results, leaves [E, ...]."""
+        rows = [array[lane.rows] for array in arrays]
+        return rows[: len(self._arguments)], rows[len(self._arguments) :]
+
+
+class Lane(NamedTuple):
+    """A part of the scenes."""
+
+    rows: slice
+    batch: Batch
+    stream: wp.Stream | None  # None: the caller's
+
+
+def _lanes(world: World, cfg: SimConfig, scenes: int) -> list[Lane]:
+    """All scenes, in parts of like size."""
+    ends = np.linspace(0, scenes, min(LANES, scenes) + 1).astype(int)
+    streams = wp.get_device().is_cuda and LANES > 1
+    return [
+        Lane(
+            slice(int(first), int(end)),
+            Batch(world, cfg, int(end - first)),
+            wp.Stream() if streams else None,
+        )
+        for first, end in itertools.pairwise(ends)
+    ]
+
+
+def side_by_side(lanes: Sequence[Lane], call: Callable[[Lane], None]) -> None:
+    """Calls it for every lane on the lane's stream. The caller's stream waits for all."""
+    streams = [lane.stream for lane in lanes if lane.stream is not None]
+    for stream in streams:
+        stream.wait_stream(wp.get_stream())
+    for lane in lanes:
+        with wp.ScopedStream(lane.stream, sync_enter=False):
+            call(lane)
+    for stream in streams:
+        wp.wait_stream(stream)
 
 
 def _annotated(

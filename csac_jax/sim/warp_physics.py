@@ -1,12 +1,14 @@
 """Primitives on MuJoCo Warp: all substeps of many scenes are one call, see `warp_action`.
 
-Meshes have one size in all scenes. Results are not repeatable bit for bit.
+The meshes of blocks have one size in all scenes; those of objects differ between scenes. Results
+are not repeatable bit for bit. Steps are longer than C's, by which outcomes do not change: the
+set-points of a primitive are read at Warp's own times.
 """
 
 import dataclasses
 import functools
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -16,6 +18,7 @@ import numpy as np
 from csac_jax.config import MESH_KINDS, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import layout
+from csac_jax.scene.bodies import Bodies, ObjectFields, PartFields
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World, scene_fields
 from csac_jax.sim.outcome import Trace
@@ -39,7 +42,8 @@ class WarpPhysics:
         world = self.world
         scene = layout.park(scene, scene.in_play)  # where nothing meets them
         inputs = {**_model_fields(world, scene), **_start(world, scene, joints)}
-        inputs |= {"control": joints.control, "in_play": scene.in_play}
+        inputs |= {"control": _resampled(joints.control, self.simulator.substeps)}
+        inputs |= {"in_play": scene.in_play}
         results = self._simulate(jax.tree.map(lambda leaf: leaf[None], inputs))
         results = jax.tree.map(lambda leaf: leaf[0], results)
         for name in ("gap_closed", "gap_end"):
@@ -87,25 +91,70 @@ def _model_fields(world: World, scene: Scene) -> dict[str, jax.Array]:
     bounds = jnp.stack([jnp.zeros_like(fields.size), fields.size], axis=1)  # centre, half size
     bounds = jnp.where(is_mesh[:, None, None], model.geom_aabb[geoms].reshape(-1, 2, 3), bounds)
     mass = jnp.asarray(model.body_mass, jnp.float32)
-    added_mass = jnp.sum(fields.mass - mass[bodies])
-    subtree = jnp.asarray(model.body_subtreemass, jnp.float32).at[0].add(added_mass)
 
     def base(name: str) -> jax.Array:
         return jnp.asarray(getattr(model, name), jnp.float32)
 
-    return {
+    found = {
         "geom_size": base("geom_size").at[geoms].set(fields.size),
         "geom_pos": base("geom_pos").at[geoms].set(fields.centre),
         "geom_aabb": base("geom_aabb").reshape(-1, 2, 3).at[geoms].set(bounds),
         "geom_rbound": base("geom_rbound").at[geoms].set(fields.rbound),
         "geom_friction": base("geom_friction").at[geoms, 0].set(fields.friction),
         "body_mass": mass.at[bodies].set(fields.mass),
-        "body_subtreemass": subtree.at[bodies].set(fields.mass),
         "body_inertia": base("body_inertia").at[bodies].set(fields.inertia),
         "body_ipos": base("body_ipos").at[bodies].set(fields.com),
         "body_invweight0": base("body_invweight0").at[bodies].set(fields.body_invweight),
         "dof_invweight0": base("dof_invweight0").at[dofs].set(fields.dof_invweight),
     }
+    if world.objects is not None and fields.objects is not None:
+        found |= {name: base(name) for name in ("geom_quat", "body_iquat")}
+        found["geom_dataid"] = jnp.asarray(model.geom_dataid)
+        for name, index, values in _of_objects(world, world.objects, fields.objects):
+            found[name] = found[name].at[index].set(values)
+    own = base("body_subtreemass").at[bodies].set(found["body_mass"][bodies])
+    added = jnp.sum(found["body_mass"][bodies] - mass[bodies])
+    return found | {"body_subtreemass": own.at[0].add(added)}
+
+
+def _of_objects(world: World, own: Bodies, fields: ObjectFields) -> Iterator[tuple[str, Any, Any]]:
+    """Fields of the model, where objects have theirs, and what is there in a scene.
+
+    Parts that an object lacks have no mesh. A body's frame is at its centre of mass, so that a push
+    there turns it no way: its inverse weights are 1/m and the mean of 1/I.
+    """
+    number, (bodies, geoms) = fields.number, (own.bodies, own.geoms)
+
+    def known(rows: np.ndarray) -> jax.Array:
+        return jnp.asarray(rows, rows.dtype if rows.dtype == bool else jnp.float32)[number]
+
+    part: PartFields = jax.tree.map(known, own.parts)
+    meshes = jnp.asarray(own.meshes, jnp.int32)[number]
+    yield "geom_dataid", geoms, jnp.where(known(own.tables.present), meshes, -1)
+    yield "geom_pos", geoms, part.position
+    yield "geom_quat", geoms, part.quaternion
+    yield "geom_size", geoms, part.size
+    yield "geom_rbound", geoms, part.radius
+    yield "geom_aabb", geoms, part.box
+    yield "geom_friction", (geoms, 0), fields.friction[:, None]
+    mass = fields.density * known(own.tables.volume)
+    inertia = fields.density[:, None] * known(own.tables.moments)
+    yield "body_mass", bodies, mass
+    yield "body_inertia", bodies, inertia
+    yield "body_iquat", bodies, known(own.tables.axes)
+    yield "body_ipos", bodies, 0.0
+    weights = jnp.stack([1.0 / mass, jnp.mean(1.0 / inertia, axis=1)], axis=1)
+    yield "body_invweight0", bodies, weights
+    yield "dof_invweight0", world.block_dofs[own.slots], jnp.repeat(weights, 3, axis=1)
+
+
+def _resampled(control: jax.Array, substeps: int) -> jax.Array:
+    """Set-points [T, U] at as many times as there are `substeps`, the last time the same."""
+    given = len(control)
+    time = np.arange(1, substeps + 1) * (given / substeps) - 1.0  # in rows of the set-points
+    before = np.minimum(time.astype(int), given - 1)
+    after, share = np.minimum(before + 1, given - 1), (time - before)[:, None]
+    return control[before] + jnp.asarray(share, jnp.float32) * (control[after] - control[before])
 
 
 def _start(world: World, scene: Scene, joints: JointTrajectory) -> dict[str, jax.Array]:

@@ -62,14 +62,19 @@ def _mjx(physics: MjxPhysics, scenes: Scene, joints: JointTrajectory) -> Callabl
 def _warp(physics: WarpPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
     import warp as wp
 
+    from csac_jax.sim import warp_action
+    from csac_jax.sim.warp_action import Lane
+
     jax.block_until_ready(jax.jit(jax.vmap(physics.run))(scenes, joints))  # copies them in
-    batches = physics.simulator.batches.values()
-    (batch,) = (each for each in batches if each.data.nworld == len(joints.reachable))
-    steps = batch.recorded(batch.step)
+    lanes = physics.simulator.prepared(len(joints.control))
+    steps = {lane.rows.start: lane.batch.recorded(lane.batch.step) for lane in lanes}
+
+    def run(lane: Lane) -> None:
+        lane.batch.restart()
+        steps[lane.rows.start]()
 
     def call() -> None:
-        batch.restart()
-        steps()
+        warp_action.side_by_side(lanes, run)
         wp.synchronize()
 
     return call

@@ -67,3 +67,22 @@ def config(name: str, preset: str, flags: Sequence[str]) -> Config:
         return settings.parse(_Run, f"bench {name}", settings.base(preset, flags), flags)[1]
     except BadArgumentsError as error:
         raise BadArgumentsError(f"bench {name}: {error}") from None
+
+
+def with_blocks(cfg: Config, num: int) -> Config:
+    """The config with `num` blocks of its kinds in turn, all of them dropped, and contacts to
+    match."""
+    slots = cfg.scene.slots
+    share = num / len(slots)
+    return cfg.change(
+        scene={
+            "slots": tuple(slots[i % len(slots)] for i in range(num)),
+            "min_blocks": num,
+            "pool": min(cfg.scene.pool, 64),
+            "arranged": 0.0,
+        },
+        sim={
+            "geom_pairs": max(round(share * cfg.sim.geom_pairs), 4),
+            "contacts": max(round(share * cfg.sim.contacts), 16),
+        },
+    )

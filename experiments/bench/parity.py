@@ -1,8 +1,9 @@
 """Does MJX move blocks as C MuJoCo does? Prints JSON.
 
-`csac-jax bench parity [--primitives N] [--poses N] [--warp]`: N grasps and N pushes in piles of 6
-and of 10, and N poses of each shape alone. --warp measures MJX on Warp, on CUDA, instead of MJX on
-JAX; meshes then have their nominal size.
+`csac-jax bench parity [--primitives N] [--poses N] [--warp] [--off]`: N grasps and N pushes in
+piles of 6 and of 10, and N poses of each shape alone. --off puts the grasps of piles at random
+places near the planner's, so that some fail. --warp measures MJX on Warp, on CUDA, instead of MJX
+on JAX; meshes then have their nominal size.
 
 Both engines get the same settled scenes and actions. The planner that reads poses makes the grasps:
 its share of lifts is the ceiling that physics allows. Pushes go through a random block.
@@ -41,6 +42,8 @@ STREAM = 9001  # of drops: neither training's nor an evaluation's
 PUSH_RUN_UP = 0.07  # m from the place of a push to the block's centre
 REFERENCE = "c"
 NUDGE = 1e-6  # m
+OFF = np.float32([0.012, 0.012, 0.35])  # m, m, rad, standard deviations
+MOVED = 0.01  # m, a push that moves a block by as much has had an effect
 TEN = presets.get("fast")
 Engine = Callable[[Scene, jax.Array, Action], Any]  # scenes, heights [E, H, W] m, actions
 
@@ -124,8 +127,13 @@ def _push(key: jax.Array, scene: Scene) -> Action:
     return Action(primitive=jnp.int32(Primitive.PUSH), pose=jnp.append(place, yaw))
 
 
+def _beside(key: jax.Array, action: Action) -> Action:
+    """The action at another place and yaw, normally distributed about those given."""
+    return action.replace(pose=action.pose + OFF * jax.random.normal(key, (3,)))
+
+
 def piles(
-    in_play: int, slots: tuple[SlotKind, ...], count: int, physics: PhysicsKind
+    in_play: int, slots: tuple[SlotKind, ...], count: int, physics: PhysicsKind, off: bool
 ) -> dict[str, Any]:
     """Grasps and pushes in settled piles."""
     cfg = pile_config(slots, in_play, physics)
@@ -135,6 +143,7 @@ def piles(
     for number, scenes in enumerate(_batches(settled, min(BATCH, count))):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(0), number), len(scenes.target))
         grasps = bench.oracle(scenes, bench.heights(scenes))
+        grasps = jax.vmap(_beside)(keys, grasps) if off else grasps
         pushes = bench.push(keys, scenes)
         rows.append((scenes, *(bench.run(engines, scenes, act) for act in (grasps, pushes))))
     starts = np.concatenate([row[0].position for row in rows])
@@ -165,9 +174,15 @@ def piles(
 def _agreement(
     starts: np.ndarray, grasped: tuple[list, list], pushed: tuple[list, list]
 ) -> dict[str, Any]:
-    """Agreement in grasps and in pushes, each a pair: runs of an engine and of the reference."""
+    """Agreement in grasps and in pushes, each a pair: runs of an engine and of the reference.
+
+    A push has an effect if it moves some block by MOVED.
+    """
+    effect, wanted = (np.linalg.norm(run[0] - starts, axis=2).max(axis=1) > MOVED for run in pushed)
     return {
         "grasp_outcome_equal": float(np.mean(grasped[0][1] == grasped[1][1])),
+        "push_effect_equal": float(np.mean(effect == wanted)),
+        "pushes_with_effect": [float(effect.mean()), float(wanted.mean())],
         "pushed_block_apart_mm": _distances(starts, *pushed),
     }
 
@@ -247,13 +262,15 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = read("parity", arguments, primitives=512, poses=125, warp=False)
+    options = read("parity", arguments, primitives=512, poses=125, warp=False, off=False)
     physics: PhysicsKind = "warp" if options["warp"] else "mjx"
     if options["warp"]:
         gc.disable()  # CUDA ends the process where a program is freed while Warp records a graph
     begun = time.perf_counter()
     result: dict[str, Any] = {"physics": physics, "shapes": shapes(options["poses"], physics)}
-    result["piles_of_6"] = piles(6, TEN.scene.slots[:6], options["primitives"], physics)
-    result["piles_of_10"] = piles(10, TEN.scene.slots, options["primitives"], physics)
+    for num in (6, 10):
+        result[f"piles_of_{num}"] = piles(
+            num, TEN.scene.slots[:num], options["primitives"], physics, bool(options["off"])
+        )
     result["seconds"] = time.perf_counter() - begun
     print(json.dumps(result | provenance.record(), indent=2))

@@ -46,7 +46,7 @@ from csac_jax.sim.primitives import Action
 from csac_jax.training import step
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
-from experiments.bench._options import Parser, config, split
+from experiments.bench._options import Parser, config, split, with_blocks
 from experiments.bench._timing import medians
 
 CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
@@ -321,7 +321,6 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
 
 def _at(cfg: Config, curve: str, value: int) -> Config:
     """The config with `value` scenes, blocks, cells along a side or transitions."""
-    scene, sim = cfg.scene, cfg.sim
     if curve == "scenes":
         capacity = max(cfg.replay.capacity, value)
         return cfg.change(train={"scenes": value}, replay={"capacity": capacity})
@@ -329,14 +328,7 @@ def _at(cfg: Config, curve: str, value: int) -> Config:
         return cfg.change(heightmap={"size": value})
     if curve == "capacity":
         return cfg.change(replay={"capacity": value})
-    share = value / len(scene.slots)
-    slots = tuple(scene.slots[i % len(scene.slots)] for i in range(value))
-    pairs = max(round(share * sim.geom_pairs), 4)
-    contacts = max(round(share * sim.contacts), 16)
-    return cfg.change(
-        scene={"slots": slots, "min_blocks": value, "pool": min(scene.pool, 64)},
-        sim={"geom_pairs": pairs, "contacts": contacts},
-    )
+    return with_blocks(cfg, value)
 
 
 def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dict[str, Any]:

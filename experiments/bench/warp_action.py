@@ -1,17 +1,28 @@
-"""Physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--repeats N]
-[--pool N]`.
+"""Physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--blocks N ...]
+[--lanes L ...] [--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details]
+[--repeatable]`.
 
-For each number of scenes (2048) of the preset `fast`: seconds of an action of the environment
-(`env`), of physics alone (`physics`), and of a bare loop of Warp's own steps with the same blocks
-and set-points, recorded in graphs as ours are (`bare`). They alternate; each is the median of N (5)
-rounds after one that does not count. `share` is bare / env. `first_action` is the time from the
-start of the process for the first number of scenes, of which `scenes_ready` went into settling and
-reading N (64) scenes. `warp_bytes` is the most that Warp's pool held so far. `calls` counts the
-calls of Warp that a scan of two steps makes, which are to be two.
+For each number of scenes (2048), of blocks (those of the preset `fast`) and of lanes, and for each
+longest step in ms (both ours): seconds of an action of the environment (`env`), of physics alone
+(`physics`), and of a bare loop of Warp's own steps with the same blocks and set-points, recorded in
+graphs and lanes as ours are (`bare`). They alternate; each is the median of N (5) rounds after one
+that does not count. `share` is bare / env.
+
+`first_action` is the time from the start of the process for the first row, of which `scenes_ready`
+went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp's pool held so far.
+`bits_differ` is the number of leaves in which a second run of the same action differs.
+
+--details adds the `calls` of Warp that a scan of two steps makes, which are to be two, and
+milliseconds and launches of each kernel in an action of the first lane, whose substeps are launched
+one by one: only then can Warp time them. --repeatable asks Warp for the same bits in every run.
 """
 
+import collections
 import functools
+import itertools
 import json
+import re
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -25,9 +36,8 @@ from csac_jax.config import Config
 from csac_jax.runtime import provenance
 from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
-from csac_jax.sim.warp_action import Batch
 from experiments.bench import _bare
-from experiments.bench._options import Parser
+from experiments.bench._options import Parser, with_blocks
 from experiments.bench._timing import medians
 
 
@@ -37,46 +47,84 @@ def _seconds_since_start() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / 100.0
 
 
-def _config(scenes: int, pool: int) -> Config:
-    return presets.get("fast").change(
+def _config(scenes: int, blocks: int, pool: int, task: str) -> Config:
+    cfg = presets.get("fast").change(
         sim={"physics": "warp"},
         scene={"pool": pool},
+        task={"kind": task},
         train={"scenes": scenes, "learning_starts": max(scenes, 64)},
     )
+    return cfg if blocks == len(cfg.scene.slots) else with_blocks(cfg, blocks)
 
 
-def measure(scenes: int, pool: int, repeats: int) -> dict[str, Any]:
-    """One number of scenes."""
-    cfg = _config(scenes, pool)
-    env = environment.make_env(cfg)
+def measure(cfg: Config, lanes: int, longest: float, repeats: int, details: bool) -> dict[str, Any]:
+    """One number of scenes, blocks and lanes, one longest step, ms."""
+    from csac_jax.sim import warp_action
+
+    scenes = cfg.train.scenes
+    with mock.patch.object(warp_action, "STEP", 1e-3 * longest):
+        env = environment.make_env(cfg)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
     grasp = functools.partial(oracle.grasp, cfg)
     actions = jax.jit(jax.vmap(grasp))(states.scene, states.obs.height)
     joints = jax.block_until_ready(_bare.joint_trajectories(cfg, states.obs.height, actions))
     begun = {"scenes_ready": _seconds_since_start()}
     step = jax.jit(jax.vmap(env.step))
-    jax.block_until_ready(step(states, actions))
+    with mock.patch.multiple(warp_action, LANES=lanes, STEP=1e-3 * longest):
+        first = jax.device_get(step(states, actions))
     begun["first_action"] = _seconds_since_start()
     run = jax.jit(jax.vmap(env.physics.run))
     bare = _bare.loop(env.physics, states.scene, joints)
     calls = {"env": lambda: step(states, actions), "physics": lambda: run(states.scene, joints)}
     seconds = medians({**calls, "bare": bare}, repeats)
-    row = {"scenes": scenes, "seconds": seconds, **begun, **_bytes()}
-    row |= {"actions_per_second": scenes / seconds["env"]}
-    return row | {"share": seconds["bare"] / seconds["env"], "calls": _calls(env, states, actions)}
+    row = {"scenes": scenes, "blocks": len(cfg.scene.slots), "lanes": lanes, "seconds": seconds}
+    row |= {"steps": env.physics.simulator.substeps}
+    row |= {"actions_per_second": scenes / seconds["env"], **begun, **_bytes()}
+    row |= {"share": seconds["bare"] / seconds["env"]}
+    row |= {"bits_differ": _differing(first, jax.device_get(step(states, actions)))}
+    row |= {"overflows": int(first.info.contact_overflow.sum())}
+    row |= {"diverged": int(first.info.physics_diverged.sum())}
+    if details:
+        row |= {"calls": _calls(env, states, actions), "kernels": _kernels(env, joints)}
+    return row
+
+
+def _differing(one: Any, other: Any) -> int:
+    """Leaves that are not equal bit for bit."""
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return sum(a.tobytes() != b.tobytes() for a, b in pairs)
 
 
 def _calls(env: environment.Env, states: environment.State, actions: Action) -> int:
     """Calls of Warp in a scan of two steps that keeps what training keeps."""
+    from csac_jax.sim.warp_action import Simulator
 
     def step(states: environment.State, _: None) -> tuple[environment.State, Any]:
         after = jax.vmap(env.step)(states, actions)
         return after, after.info
 
-    with mock.patch.object(Batch, "run", autospec=True, side_effect=Batch.run) as counted:
+    with mock.patch.object(
+        Simulator, "prepared", autospec=True, side_effect=Simulator.prepared
+    ) as counted:
         scan = jax.jit(lambda states: jax.lax.scan(step, states, length=2))
         jax.block_until_ready(scan(states))
     return counted.call_count
+
+
+def _kernels(env: environment.Env, joints: Any) -> dict[str, list[float]]:
+    """Milliseconds and launches of each kernel in an action of the first lane, longest first; none
+    without CUDA."""
+    lane = env.physics.simulator.prepared(len(joints.control))[0]
+    lane.batch.restart()
+    wp.timing_begin(wp.TIMING_ALL)
+    for _ in range(lane.batch.substeps):
+        lane.batch.substep()
+    found: dict[str, list[float]] = collections.defaultdict(lambda: [0.0, 0])
+    for each in wp.timing_end():
+        name = re.sub(r"_[0-9a-f]{8}\b|__locals__\w*kernel", "", each.name.split(" ")[-1])
+        found[name][0] += each.elapsed
+        found[name][1] += 1
+    return dict(sorted(found.items(), key=lambda item: -item[1][0]))
 
 
 def _bytes() -> dict[str, Any]:
@@ -87,12 +135,45 @@ def _bytes() -> dict[str, Any]:
     return {"warp_bytes": wp.get_mempool_used_mem_high(device), "jax_bytes": by_jax}
 
 
+def _ask_for_same_bits() -> None:
+    """Of the kernels that are read already, and of those to come."""
+    mode = wp.DeterministicMode.RUN_TO_RUN
+    wp.config.deterministic = mode
+    for name, module in list(sys.modules.items()):
+        if "mujoco_warp" in name:
+            wp.set_module_options({"deterministic": mode}, module)
+
+
 def main(arguments: list[str]) -> None:
     """Prints the result."""
     parser = Parser(prog="bench warp_action", allow_abbrev=False)
     parser.add_argument("--scenes", type=int, nargs="+", default=[2048])
+    parser.add_argument("--blocks", type=int, nargs="+", default=[10])
+    parser.add_argument("--lanes", type=int, nargs="+", default=None)
+    parser.add_argument("--step", type=float, nargs="+", default=None)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pool", type=int, default=64)
+    parser.add_argument("--task", choices=("clear", "target"), default="clear")
+    parser.add_argument("--details", action="store_true")
+    parser.add_argument("--repeatable", action="store_true")
     options = parser.parse_args(arguments)
-    rows = [measure(scenes, options.pool, options.repeats) for scenes in options.scenes]
-    print(json.dumps({"runs": rows} | provenance.record(), indent=2))
+    if options.repeatable:
+        _ask_for_same_bits()
+    from csac_jax.sim import warp_action
+
+    lanes, steps = options.lanes or [warp_action.LANES], options.step or [1e3 * warp_action.STEP]
+    rows = [
+        measure(
+            _config(scenes, blocks, options.pool, options.task),
+            each,
+            longest,
+            options.repeats,
+            options.details,
+        )
+        for scenes, blocks, each, longest in itertools.product(
+            options.scenes, options.blocks, lanes, steps
+        )
+    ]
+    print(
+        json.dumps({"repeatable": options.repeatable, "runs": rows} | provenance.record(), indent=2)
+    )

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+import types
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +17,7 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, api, cli, presets
-from csac_jax.cli import bench, evaluation, play, settings, sweep, train
+from csac_jax.cli import bench, evaluation, failures, play, settings, sweep, train
 from csac_jax.config import BetaReplay, Config, DenseNet121, SceneConfig, Section, UniformReplay
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
@@ -169,6 +170,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench step smoke --learn.update 2", "bench step: Unrecognized options: --learn.update"),
         ("doctor --preset", "Missing value for argument '--preset'"),
         ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
+        ("doctor --build", "--build: only warp has kernels to build, and sim.physics is c here"),
         ("doctor --preset quick --learn.tau 2", "learn.tau: must be above 0, at most 1"),
         ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
         ("bench closed_loop --episodes 0", "bench closed_loop: --episodes: must be at least 1"),
@@ -826,6 +828,23 @@ def test_doctor_shows_memory(
         cells * obs * (3 + 2 + 1) + 4 + 12 + 4 + 1 + 4
     )  # packed maps, action, reward, end, priority
     assert result["memory"]["bytes"]["replay"] == 128 * transition + 8  # head and size
+
+
+def test_doctor_builds_kernels(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `doctor --build` makes what Warp needs for as many scenes as the preset has."""
+    from csac_jax.runtime import selftest
+    from csac_jax.sim import physics
+
+    made: list[int] = []
+    fake = types.SimpleNamespace(prepared=made.append)
+    make = lambda world, cfg: types.SimpleNamespace(simulator=fake)  # noqa: E731
+    monkeypatch.setitem(physics.PHYSICS, "warp", make)
+    monkeypatch.setattr(failures, "check_physics", lambda cfg: None)
+    monkeypatch.setattr(selftest, "CHECKS", ())
+    flags = "--build --sim.physics warp --train.scenes 64"
+    assert cli.main(["doctor", *flags.split()]) == 0
+    assert made == [64]
+    assert "for 64 scenes of fast on Warp" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("found", "said"), [(True, "second library"), (False, "default library")])

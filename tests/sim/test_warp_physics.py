@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import importlib.util
 import sys
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from csac_jax import presets
 from csac_jax.config import Config, PhysicsKind, SlotKind
 from csac_jax.constants import Outcome
 from csac_jax.errors import SceneError
-from csac_jax.scene import layout, model, pool
+from csac_jax.scene import layout, model, pool, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, physics as simulation, primitives, warp_physics
 from csac_jax.sim.outcome import Trace, grasp_outcome
@@ -24,6 +25,7 @@ from csac_jax.vision import observe
 from tests.sim.conftest import CASES, CONFIG
 
 SCENES = 4
+OWN_STEP = 0.0051  # s, the longest of Warp's
 SLOTS: tuple[SlotKind, ...] = ("box", "arch", "prism", "cylinder")
 
 
@@ -72,6 +74,15 @@ def test_meshes_of_two_sizes_are_refused():
         cfg.change(scene={"size_jitter": (0.1, 0.1)})
     boxes = {"slots": ("box", "arch"), "min_blocks": 2, "size_jitter": (0.1, 0.1)}
     assert cfg.change(scene=boxes).sim.physics == "warp"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def steps_of_c() -> Iterator[None]:
+    """Warp's steps are as long as C's, so that states can be compared."""
+    with pytest.MonkeyPatch.context() as patch:
+        if importlib.util.find_spec("warp") is not None:
+            patch.setattr("csac_jax.sim.warp_action.STEP", CONFIG.sim.timestep)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -186,6 +197,35 @@ def test_grasps_go_as_in_c():
 
 
 @needs_warp
+def test_longer_steps_end_alike(ran: Ran, monkeypatch: pytest.MonkeyPatch):
+    """Claim: Warp's own steps, a fifth fewer than C's, end as C's do: the same blocks lie or
+    hang within 3 mm of where C leaves them, and traces say the same."""
+    monkeypatch.setattr("csac_jax.sim.warp_action.STEP", OWN_STEP)
+    physics: Any = _physics("warp")
+    assert physics.simulator.substeps == 150
+    well = np.array(list(CASES)) != "nan"
+    scene, joints = _at((ran.scene, ran.joints), well)
+    after, trace = jax.jit(jax.vmap(physics.run))(scene, joints)
+    after_c, trace_c = _at(ran.c, well)
+    for leaf in ("touched", "held"):
+        np.testing.assert_array_equal(getattr(trace, leaf), getattr(trace_c, leaf))
+    for leaf in ("gap_closed", "gap_end"):
+        np.testing.assert_allclose(getattr(trace, leaf), getattr(trace_c, leaf), atol=2e-3)
+    apart = np.linalg.norm(after.position - after_c.position, axis=2).max(axis=1)
+    assert np.median(apart) < 3e-3
+
+
+def test_set_points_keep_their_times():
+    """Claim: set-points read at other times lie on the same lines and end at the same place."""
+    control = np.cumsum(np.ones((190, 2), np.float32), axis=0)  # those of a steady motion
+    found = warp_physics._resampled(jnp.asarray(control), 130)
+    wanted = np.arange(1, 131)[:, None] * (190 / 130) * np.ones(2)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    same = warp_physics._resampled(jnp.asarray(control), 190)
+    np.testing.assert_array_equal(same, control)
+
+
+@needs_warp
 def test_spinning_block_goes_as_in_c():
     """Claim: blocks that spin in the air, lighter than the model has them, are after some substeps
     as fast as in C."""
@@ -235,3 +275,49 @@ def _end(cfg: Config) -> tuple[np.ndarray, np.ndarray, Trace]:
     rise = plan.start[:, 2] - jnp.min(plan.control[:, :, 2], axis=1)
     outcome = jax.vmap(grasp_outcome)(trace, plan.surface, rise)
     return np.asarray(outcome), np.asarray(after.position), jax.tree.map(np.asarray, trace)
+
+
+@needs_warp
+def test_objects_go_as_in_c():
+    """Claim: every scene has its own objects, which turn, land and meet as in C MuJoCo, within a
+    millimetre; parts that an object lacks are not there."""
+    cfg = presets.get("quick").change(
+        scene={"slots": ("object",) * 2, "min_blocks": 2, "objects": "made:0:12"},
+        sim={"physics": "warp", "grasp_phases": (23, 1, 1), "contacts": 96},
+    )
+    scene = _thrown_objects(cfg)
+    start = np.float32([0.0, 0.0, 0.4, 0.0, 0.05, 0.05])
+    control = np.tile(start[:5], (cfg.sim.substeps, 1))
+    joints = _stack(*[JointTrajectory(start, control, np.ones((), bool))] * SCENES)
+    runs = [jax.jit(jax.vmap(_physics(kind, cfg).run))(scene, joints) for kind in ("warp", "c")]
+    (after, trace), (after_c, _) = runs
+    assert not trace.contact_overflow.any()
+    changed = np.abs(np.asarray(after_c.velocity[:, :, 3:]) - scene.velocity[:, :, 3:])
+    assert (changed.max(axis=(1, 2)) > 1.0).all()  # rad/s: each met something
+    np.testing.assert_allclose(after.position, after_c.position, atol=1e-3)
+    turned = np.abs(np.sum(np.asarray(after.quaternion) * np.asarray(after_c.quaternion), axis=2))
+    np.testing.assert_allclose(turned, 1.0, atol=1e-3)
+
+
+def _thrown_objects(cfg: Config) -> Scene:
+    """Scenes of two objects, others in each, of few parts and of many: at first one falls on the
+    other in the air, in the last two both turn and land."""
+    rng, known = np.random.default_rng(0), stock.table(cfg.scene)
+    order = np.argsort(known.present.sum(axis=1))
+    scenes = []
+    for row, pair in enumerate(zip(order[:SCENES], order[-SCENES:], strict=True)):
+        scene = stock.hold(layout.parked(cfg.scene.slots), np.arange(2), np.array(pair), known)
+        turns = rng.normal(size=(2, 4))
+        above, aside = [[0.0, 0.0, 0.3], [0.005, 0.0, 0.4]], [[-0.15, 0.0, 0.08], [0.15, 0.0, 0.08]]
+        falling, thrown = [[0.0] * 6, [0.0, 0.0, -1.5, 0.0, 0.0, 0.0]], rng.normal(0.0, 3.0, (2, 6))
+        thrown[:, :3] = [0.0, 0.0, -0.5]
+        scenes.append(
+            scene.replace(
+                position=np.float32(above if row < 2 else aside),
+                quaternion=np.float32(turns / np.linalg.norm(turns, axis=1, keepdims=True)),
+                velocity=np.float32(falling if row < 2 else thrown),
+                density=np.float32([500.0, 800.0]),
+                in_play=np.ones(2, bool),
+            )
+        )
+    return _stack(*scenes)
