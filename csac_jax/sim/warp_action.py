@@ -25,8 +25,8 @@ from csac_jax.scene import layout
 from csac_jax.scene.model import World
 from csac_jax.sim import warp_graph
 
-STEP = 0.0051  # s, longest physics step (ours: outcomes stay those of C's 4 ms)
-LANES = 2  # parts of the scenes that CUDA computes side by side (ours)
+STEP = 0.004  # s, longest physics step
+LANES = 1  # parts of the scenes that CUDA computes side by side
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
 FIELDS = {

@@ -1,8 +1,8 @@
 """Primitives on MuJoCo Warp: all substeps of many scenes are one call, see `warp_action`.
 
 The meshes of blocks have one size in all scenes; those of objects differ between scenes. Results
-are not repeatable bit for bit. Steps are longer than C's, by which outcomes do not change: the
-set-points of a primitive are read at Warp's own times.
+are not repeatable bit for bit. The set-points of a primitive are read at Warp's own times, see
+`warp_action.STEP`.
 """
 
 import dataclasses
