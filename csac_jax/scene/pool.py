@@ -202,7 +202,8 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
     ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * extent
-    ok &= (speed.max(axis=1) < layout.STILL) & (position[:, 2] > 0.0) & np.isfinite(pose).all(axis=1)
+    ok &= (speed.max(axis=1) < layout.STILL) & (position[:, 2] > 0.0)
+    ok &= np.isfinite(pose).all(axis=1)
     if not np.all(ok | ~scene.in_play):
         return None
     in_play, upright = scene.in_play[:, None], np.array([1, 0, 0, 0], np.float32)

@@ -125,9 +125,6 @@ class Simulator:
         if world.objects is not None:
             self.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
             self.model.opt.sleep_tolerance = layout.STILL
-            # Faster, measured: few parts an object, and few contacts while most objects sleep.
-            self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
-            self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         self.data = mujoco.MjData(self.model)
         self.engine = rollout.Rollout(nthread=0)  # MuJoCo's own loop, run in the calling thread
 
