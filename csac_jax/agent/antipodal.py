@@ -8,6 +8,7 @@ K = yaws over half a turn, S = cells along a side of the rotated maps, D = cells
 the hand to the far side of a finger.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -20,9 +21,10 @@ from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.grippers import Gripper
 from csac_jax.sim.outcome import BARE
-from csac_jax.sim.primitives import Action, grasp_depth, lowest
+from csac_jax.sim.primitives import Action, grasp_depth, lowest, reachable
 
 YAWS = 16  # over half a turn: the hand is symmetric
+CANDIDATES = 1024  # best grasps, of which the best within reach is chosen
 
 
 @struct.dataclass
@@ -56,7 +58,7 @@ def grasp(
     failures: jax.Array,
     weights: Weights,
 ) -> Action:
-    """The best antipodal grasp of a height map.
+    """The best antipodal grasp of a height map, within the robot's reach.
 
     Args: height [H, W] m; wanted [H, W] bool, where the middle of the hand may be; failures [],
     actions in a row that lifted nothing.
@@ -69,10 +71,14 @@ def grasp(
     there = _sampled(cfg, wanted.astype(jnp.float32), places) > 0.5
     noise = weights.noise * failures.astype(jnp.float32)
     score += noise * jax.random.uniform(key, score.shape)
-    best = jnp.argmax(jnp.where(there & inside, score, -jnp.inf))
-    yaw = jnp.asarray(yaws, jnp.float32)[best // maps[0].size]
-    pose = jnp.append(jnp.asarray(places, jnp.float32).reshape(-1, 2)[best], yaw)
-    return Action(primitive=jnp.int32(Primitive.GRASP), pose=pose)
+    allowed = jnp.where(there & inside, score, -jnp.inf)
+    values, cells = jax.lax.top_k(allowed.reshape(-1), CANDIDATES)
+    xy = jnp.asarray(places, jnp.float32).reshape(-1, 2)[cells]
+    yaw = jnp.asarray(yaws, jnp.float32)[cells // maps[0].size]
+    kind = jnp.int32(Primitive.GRASP)
+    reached = jax.vmap(functools.partial(reachable, cfg.sim, cfg.heightmap, kind))(xy, yaw)
+    best = jnp.argmax(jnp.where(reached, values, -jnp.inf))
+    return Action(primitive=kind, pose=jnp.append(xy[best], yaw[best]))
 
 
 def _places(cfg: Config, yaws: np.ndarray) -> np.ndarray:

@@ -19,10 +19,11 @@ FACTORS = (0.0, 0.5, 2.0)
 
 def measure(episodes: int, seed: int) -> dict[str, Any]:
     """Grasp success of every variant tried, and the weights in the end."""
-    cfg = rollout.configured(presets.get("objects"), "c", "hand")
+    cfg = presets.get("objects")
     parts: dict[str, Any] = {}
     for suite in SUITES:
         seen = suites.with_objects(cfg, suite, None, "train")
+        seen = rollout.configured(seen, "c", "hand")
         parts |= suites.environments(seen, suite, episodes, seed)
         print(f"{suite}: scenes at rest", file=sys.stderr, flush=True)
     rows: list[dict[str, Any]] = []
