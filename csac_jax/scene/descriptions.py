@@ -74,7 +74,6 @@ def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
         mesh = trimesh.creation.cylinder(size[0], 2.0 * size[1])
     elif kind == _Geom.mjGEOM_CAPSULE:
         mesh = trimesh.creation.capsule(2.0 * size[1], size[0])
-        mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])
     else:
         raise ValueError(f"has a geom of kind {_Geom(kind).name[7:].lower()}; give it a mesh")
     place = np.eye(4)
