@@ -51,6 +51,8 @@ class CPhysics:
         stored = np.empty(mujoco.mj_sizeModel(self.world.model), np.uint8)
         mujoco.mj_saveModel(self.world.model, None, stored)
         told = repr((self.world.slots, self.cfg, mujoco.__version__))
+        if (own := self.world.objects) is not None:  # densities are not in the model
+            told += repr(own.tables.heaviness.tolist())
         return hashlib.sha256(stored.tobytes() + told.encode()).hexdigest()
 
     @functools.cached_property

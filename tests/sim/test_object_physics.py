@@ -1,6 +1,7 @@
 """Actions among objects of a library: what moves them, and the planner that reads their poses."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 
 from csac_jax.config import Config
 from csac_jax.env import Env
+from csac_jax.objects import families, library
 from csac_jax.scene import model, pool
 from csac_jax.sim import backend, c_physics, oracle, physics, primitives
+from csac_jax.sim.c_physics import CPhysics
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
 CONFIG = Config().change(
@@ -117,3 +120,15 @@ def test_a_scene_moves_the_same_after_any_other(env: Env):
         again = c_physics._rollout(world, used, *row)
         fresh = c_physics._rollout(world, c_physics.Simulator(world), *row)
         np.testing.assert_array_equal(again.qpos, fresh.qpos)
+
+
+def test_heavier_objects_are_another_physics(tmp_path: Path):
+    """Claim: programs kept on disk tell libraries of the same shapes and other densities apart."""
+    light = families.draw(3, 2)
+    keys = []
+    for name, density in (("light", 600.0), ("heavy", 1200.0)):
+        made = [dataclasses.replace(one, density=density) for one in light]
+        library.save(tmp_path / name, made)
+        cfg = CONFIG.change(scene={"objects": str(tmp_path / name), "split": "all"})
+        keys.append(CPhysics(model.build(cfg.scene, cfg.sim), cfg.sim)._key)
+    assert keys[0] != keys[1]
