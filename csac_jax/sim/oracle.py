@@ -53,14 +53,15 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | in
     if cfg.scene.has_objects:
         ways.append(_of_objects(cfg, scene, height))
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *ways)
-    chosen = _in_turn(every, len(cfg.scene.slots), jnp.sum(scene.in_play), jnp.int32(failures))
+    chosen = _in_turn(every, len(cfg.scene.slots), jnp.int32(failures))
     return Action(primitive=jnp.int32(Primitive.GRASP), pose=every.pose[chosen])
 
 
-def _in_turn(ways: Ways, slots: int, blocks_left: jax.Array, failures: jax.Array) -> jax.Array:
+def _in_turn(ways: Ways, slots: int, failures: jax.Array) -> jax.Array:
     """Number [] of the next way to try: the best first."""
-    order = jnp.argsort(-jax.ops.segment_max(ways.score, ways.slot, slots))
-    around = jnp.maximum(blocks_left, 1)
+    best = jax.ops.segment_max(ways.score, ways.slot, slots)
+    order = jnp.argsort(-best)
+    around = jnp.maximum(jnp.sum(best > -jnp.inf), 1)  # blocks that there is a way to take
     own = (ways.slot == order[failures % around]) & (ways.score > -jnp.inf)
     ranked = jnp.argsort(-jnp.where(own, ways.score, -jnp.inf))
     return ranked[(failures // around * OTHER_WAY) % jnp.maximum(jnp.sum(own), 1)]
