@@ -29,7 +29,7 @@ CANDIDATES = 1024  # best grasps, of which the best within reach is chosen
 
 @struct.dataclass
 class Weights:
-    """What a grasp's flaws cost (ours, tuned on objects that train and seeds of no result)."""
+    """What a grasp's flaws cost (ours; `csac-jax bench geometric` compares others)."""
 
     tilt: float = 1.0  # of an edge against the pad, per rad
     offset: float = 10.0  # of the middle of what is held from the hand's, along the closing, per m

@@ -229,7 +229,7 @@ def _object(entry: dict[str, Any], parts: list[Part]) -> Object:
         name: str(entry[name]) for name in ("name", "family", "source", "source_sha256")
     }
     volume, scale = float(entry["volume"]), float(entry["scale"])
-    numbers = {"volume": volume, "scale": scale, "density": density}
+    numbers: dict[str, Any] = {"volume": volume, "scale": scale, "density": density}
     found = Object(parts=own, inertia=inertia, **numbers, **texts)
     if fault := body.faults(found):
         raise ValueError(f"object '{found.name[:60]}' {fault}")
