@@ -174,6 +174,8 @@ class SimConfig(Section, section="sim"):
     """Where the arm's base stands: x, y and z, m, and its yaw, rad (ours: scenes/README.md)."""
     adapter: float = _bounded(0.0, 0.0, 0.3)
     """Length of what is mounted between the arm's flange and the gripper, m."""
+    clearance: float = _bounded(0.0, 0.0, 0.05)
+    """Least height of the finger tips above the table, m; 0: the gripper's own."""
     grasp_phases: tuple[int, int, int] = _bounded((60, 50, 80), 1)
     """Substeps of a grasp: descend, close the fingers, lift."""
     geom_pairs: int = _bounded(12, 1)  # Geom pairs examined per collision function, nearest first.

@@ -135,6 +135,23 @@ def shipped() -> list[str]:
     return sorted(path.parent.name for path in assets().glob(f"grippers/*/{NUMBERS}"))
 
 
+_TOLD: dict[str, Gripper] = {}  # of folders that are not here, by their paths
+
+
+def numbers(source: str) -> dict[str, Any] | None:
+    """What a gripper.json of one's own says; None for a gripper that comes with the package."""
+    path = Path(source) / NUMBERS
+    return _read(path) if source not in shipped() and path.is_file() else None
+
+
+def remember(source: str, given: dict[str, Any]) -> None:
+    """What a gripper.json says stands in for the folder `source` where there is none: all but
+    physics and pictures need no more. Raises ValueError for numbers that are none."""
+    gripper = _gripper(Path(source), given)
+    _check(gripper)
+    _TOLD[source] = gripper
+
+
 @functools.lru_cache
 def load(source: str) -> Gripper:
     """The gripper of this name or in this folder.
@@ -143,6 +160,8 @@ def load(source: str) -> Gripper:
     """
     folder = assets() / "grippers" / source if source in shipped() else Path(source)
     path = folder / NUMBERS
+    if not path.is_file() and source in _TOLD:
+        return _TOLD[source]
     if not path.is_file():
         known = ", ".join(shipped())
         fault = f"'{source}' is neither one of {known} nor a folder with a {NUMBERS}"

@@ -204,6 +204,11 @@ BENCHES = {
         "--sim.physics c --seed 20`",
         "bench between_cells RUN",
     ),
+    "objects/cpu": ("objects against blocks; much other work on both cores", "bench objects"),
+    "grasp_depth/cpu": (
+        "how low and how deep the tips should go among objects",
+        "bench grasp_depth --episodes 40",
+    ),
     "serve/cpu": ("decisions over HTTP; other work on both cores", "bench serve"),
     "soak/h200": (
         "100,000 random actions: nothing lost, nothing infinite",

@@ -25,6 +25,7 @@ def step_metrics(scenes: int, loss: Any = 0.0, **given: Any) -> StepMetrics:
         gap_disagrees=no,
         contact_overflow=none,
         physics_diverged=no,
+        unreachable=no,
         learned=jnp.array(True),
         **dict.fromkeys(("critic_loss", "actor_loss", "td_error", "q_mean"), loss),
         finite=jnp.array(True),

@@ -69,8 +69,8 @@ ONLY_IN = {
     "wandb": ("report/trackers.py",),
     "mlflow": ("report/trackers.py",),
     "yaml": ("io/config_file.py",),
-    "trimesh": ("objects/importing.py", "render/viewer.py"),
-    "coacd": ("objects/importing.py",),
+    "trimesh": ("objects/conversion.py", "scene/descriptions.py", "render/viewer.py"),
+    "coacd": ("objects/conversion.py",),
 }
 JIT_IN = (
     *("training", "sweeps", "evaluation", "deploy"),

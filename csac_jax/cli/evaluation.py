@@ -24,9 +24,9 @@ class EvalOptions:
     which: str = "last"
     """Checkpoint of the run: last, the newest sound one; best, of a run trained with --eval-every;
     or a step."""
-    policy: Literal["learned", "random", "oracle"] = "learned"
-    """What acts: the networks; grasps at random places above blocks; or a planner that reads the
-    blocks' poses."""
+    policy: Literal["learned", "random", "geometric", "oracle"] = "learned"
+    """What acts: the networks; grasps at random places above blocks; antipodal grasps from the
+    edges of the height map; or a planner that reads the blocks' poses."""
     suite: str = "in_distribution"
     """Scenes: in_distribution (like the training's), random10, random30, cases, target (needs a
     policy of that task), packed, camera (random10 through ever worse cameras), pile,

@@ -6,7 +6,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from csac_jax import grippers
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 
 PROGRAM = "csac-jax"
 
@@ -50,7 +52,9 @@ def exists(folder: Path) -> BadArgumentsError:
 
 
 def check_physics(cfg: Config, devices: int = 1) -> None:
-    """C MuJoCo serves one device, Warp needs CUDA."""
+    """The gripper is known, C MuJoCo serves one device, Warp needs CUDA."""
+    with as_bad_arguments(SettingsError):
+        grippers.load(cfg.sim.gripper)
     if cfg.sim.physics == "c" and devices > 1:
         raise BadArgumentsError(
             "--sim.physics: c computes on the host's cores, for one device; "

@@ -37,8 +37,9 @@ class MakeOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ImportOptions:
-    """Makes a library of mesh files: .obj, .stl, .ply and .glb. Each is split into convex parts,
-    which takes seconds to a minute. Files that cannot be taken are named and left out."""
+    """Makes a library of mesh files: .obj, .stl, .ply and .glb, or of URDF and MJCF. Each is split
+    into convex parts, which takes seconds to a minute. Files that cannot be taken are named and
+    left out. In a folder with URDF or MJCF, the meshes are parts of these."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Files, and folders of them."""
@@ -47,6 +48,8 @@ class ImportOptions:
     is finished: the same command goes on from there."""
     scale: float = 1.0
     """Metres per unit of the files: 0.001 for millimetres."""
+    density: float = 600.0
+    """Density of the objects, kg/m^3. Scenes draw theirs around it, as around 600."""
     jobs: int = 0
     """Files at a time; 0 for one per core."""
     json: Path | None = None
@@ -97,17 +100,23 @@ def _import(arguments: list[str]) -> int:
     _check_new(options.out)
     if not (0.0 < options.scale < 1e6 and 0 <= options.jobs <= 1024):
         raise BadArgumentsError("--scale must be positive, --jobs lie in 0 .. 1024")
-    from csac_jax.objects import importing, library
+    from csac_jax.objects import body, conversion, importing, library
+    from csac_jax.scene import descriptions
 
+    least, most = body.DENSITIES
+    if not least <= options.density <= most:
+        raise BadArgumentsError(f"--density: must lie in {least:g} .. {most:g} kg/m^3")
     for module in importing.MODULES:
         check_extra("objects import", module, "objects")
     with as_bad_arguments(ValueError):
-        paths = importing.files(list(options.paths))
+        paths = importing.files(list(options.paths), descriptions.SUFFIXES)
     if len(paths) > library.MOST_OBJECTS:
         raise BadArgumentsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
     jobs, kept = options.jobs or importing.cores(), Path(f"{options.out}.partial")
     with _progress_bar() as show:
-        found = importing.run(paths, options.scale, jobs, kept, show)
+        readers = tuple((suffix, descriptions.read) for suffix in descriptions.SUFFIXES)
+        how = conversion.How(options.scale, options.density, readers)
+        found = importing.run(paths, how, jobs, kept, show)
     for line in found.refused:
         print(f"{PROGRAM}: {line}", file=sys.stderr)
     if not found.objects:
@@ -166,14 +175,13 @@ def _show(arguments: list[str]) -> int:
 
 def _row(one: Any) -> dict[str, Any]:
     """What is said of an object."""
-    from csac_jax.objects import library
 
     size = one.bounds[1] - one.bounds[0]
     return {
         "name": one.name,
         "size_mm": [round(1e3 * float(side), 1) for side in size],
         "narrowest_mm": round(1e3 * one.narrowest, 1),
-        "mass_g": round(1e3 * library.DENSITY * one.volume, 1),
+        "mass_g": round(1e3 * one.density * one.volume, 1),
         "parts": len(one.parts),
         "split": "held_out" if one.held_out else "train",
     }

@@ -26,7 +26,7 @@ VIEW: dict[str, tuple[str, ...]] = {
     "heightmap": (),
     "camera": (),
     "sensor": (),
-    "sim": ("gripper", "base", "adapter"),
+    "sim": ("gripper", "base", "adapter", "clearance"),
 }
 """Sections that say how a policy sees and what hand it moves, () or some of their settings; `eval`
 and `play` take them for any policy."""

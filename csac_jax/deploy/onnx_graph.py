@@ -275,7 +275,7 @@ def _stations(graph: Graph, cfg: Config, primitive: str, pose: str) -> str:
     yaw = graph.op("Slice", pose, _axes(graph, 2), _axes(graph, 3))
     depth = choose(value(primitives.grasp_depth(sim, gripper)), value(sim.push_depth))
     surface = _local_top(graph, cfg, xy, gripper.finger[1])
-    low = graph.op("Max", graph.op("Sub", surface, depth), value(gripper.clearance))
+    low = graph.op("Max", graph.op("Sub", surface, depth), value(primitives.lowest(sim, gripper)))
     around = _local_top(graph, cfg, xy, 2.0 * gripper.radius)
     clear = graph.op("Add", around, value(primitives.START_GAP))
     high = graph.op("Max", graph.op("Add", low, value(sim.approach)), clear)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent import actor_critic, antipodal, maps, policy
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
@@ -125,6 +125,22 @@ class OraclePolicy:
         return oracle.grasp(self.cfg, scene.scene, scene.obs.height, failures)
 
 
+@struct.dataclass
+class GeometricPolicy:
+    """Antipodal grasps from the height map's edges, without networks; see `agent.antipodal`."""
+
+    cfg: Config = struct.field(pytree_node=False)
+    weights: antipodal.Weights = antipodal.Weights()
+
+    @jax.jit
+    def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
+        obs, failures = _seen(scene)
+        if isinstance(scene, State):  # it may have moved without being lifted
+            failed = (scene.actions > 0) & (scene.info.cleared == 0)
+            failures = jnp.maximum(failures, jnp.int32(failed))
+        return antipodal.grasp(key, self.cfg, obs.height, obs.target, failures, self.weights)
+
+
 def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:
     """Observations and actions in a row without change [...], none after a bare observation."""
     if isinstance(scenes, State):
@@ -134,7 +150,9 @@ def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:
 
 def in_world(policy: Policy, cfg: Config) -> Policy:
     """The policy for an environment of this config; a policy of the user's own as it is."""
-    if isinstance(policy, LearnedPolicy | LearnerPolicy | RandomPolicy | OraclePolicy):
+    if isinstance(
+        policy, LearnedPolicy | LearnerPolicy | RandomPolicy | GeometricPolicy | OraclePolicy
+    ):
         return dataclasses.replace(policy, cfg=cfg)
     return policy
 
@@ -195,6 +213,7 @@ def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
 POLICIES: dict[str, Callable[..., Policy]] = {
     "learned": lambda source, which="last": load(source, which=which),
     "random": lambda source, which="last": RandomPolicy(load_config(source, which)),
+    "geometric": lambda source, which="last": GeometricPolicy(load_config(source, which)),
     "oracle": lambda source, which="last": OraclePolicy(load_config(source, which)),
 }
 """Kinds of policy by name: each made from a source, whose config it takes, see `load`."""

@@ -16,6 +16,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from csac_jax import grippers
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
@@ -33,6 +34,7 @@ _SHA256 = {
     SHIPPED["shipped_camera"]: "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
 }
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
+_GRIPPER = "gripper"  # remark of a policy whose gripper is the user's own
 
 
 class PolicyFileError(FailedError):
@@ -46,6 +48,8 @@ def save(path: Path, params: Params, cfg: Config) -> None:
     check_finite(path, tensors)
     versions = json.dumps(provenance.versions())
     remarks = {_CONFIG: json.dumps(configs.to_dict(cfg)), _VERSIONS: versions}
+    if (gripper := grippers.numbers(cfg.sim.gripper)) is not None:
+        remarks[_GRIPPER] = json.dumps(gripper)  # its folder is not where the policy goes
     remarks[_DIGEST] = _digest(remarks, tensors)
     files.replace(path, safetensors.numpy.save(tensors, remarks))
 
@@ -113,6 +117,8 @@ def load(path: Path) -> tuple[Config, Params]:
         raise PolicyFileError(f"{path} is damaged: its digest differs; give another file")
     try:
         cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG))
+        if _GRIPPER in remarks:
+            grippers.remember(cfg.sim.gripper, files.parse(remarks[_GRIPPER], _GRIPPER))
         made = files.parse(remarks.get(_VERSIONS, "{}"), _VERSIONS)
         if not ours:
             provenance.warn_if_other(made, str(path))

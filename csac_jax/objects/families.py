@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
-from csac_jax.objects import library, solid
-from csac_jax.objects.library import Object
+from csac_jax.objects import body, solid
+from csac_jax.objects.body import Object
 from csac_jax.objects.solid import Part
 
 SIDES = 6  # of walls of hollow things
@@ -246,5 +246,5 @@ def draw(seed: int, count: int) -> list[Object]:
     for i in range(count):
         family = names[i % len(names)]
         parts = FAMILIES[family](np.random.default_rng([seed, i]))
-        found.append(library.make(f"{family}-{seed}-{i}", parts, family=family))
+        found.append(body.make(f"{family}-{seed}-{i}", parts, family=family))
     return found

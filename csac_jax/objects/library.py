@@ -2,8 +2,6 @@
 
 LIB/objects.json  format, a digest of all that follows, and of each object what `Object` says
 LIB/parts.npz     corners, triangles and half-spaces of all convex parts, one after the other
-
-An object's frame has the axes of its file and its origin at the centre of mass.
 """
 
 import dataclasses
@@ -21,78 +19,20 @@ from typing import Any, Literal
 import numpy as np
 
 from csac_jax.errors import FailedError
-from csac_jax.objects import solid
+from csac_jax.objects import body, solid
+from csac_jax.objects.body import DENSITY, Object
 from csac_jax.objects.solid import Part
 
 Split = Literal["train", "held_out", "all"]
 FORMAT = 1
 INDEX, ARRAYS = "objects.json", "parts.npz"
-HELD_OUT = 0.2  # share of the names
-MOST_OBJECTS, MOST_PARTS = 4096, 32
-LARGEST = 0.4  # m, of a side: more than fits on the table
-DENSITY = 600.0  # kg/m^3, of stored masses; scenes draw their own
+MOST_OBJECTS = 4096
 _MOST_BYTES = 2**28  # of a file
 _DTYPES = {"vertices": np.float32, "triangles": np.int32, "planes": np.float32, "counts": np.int32}
 
 
 class LibraryError(FailedError):
     """A library that is missing, damaged or of another format; the message has the remedy."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Object:
-    """A rigid body. Its origin is the centre of mass."""
-
-    name: str
-    parts: tuple[Part, ...]  # the largest first
-    volume: float  # m^3, of the body, from which its mass follows
-    inertia: np.ndarray  # [3, 3] m^5, of density 1
-    family: str = ""
-    source: str = ""  # file that it was read from
-    source_sha256: str = ""
-    scale: float = 1.0  # m per unit of that file
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Lowest and highest corner of the bounding box [2, 3] m."""
-        points = np.concatenate([part.vertices for part in self.parts])
-        return np.stack([points.min(axis=0), points.max(axis=0)])
-
-    @property
-    def narrowest(self) -> float:
-        """Least width, m, between two parallel planes, one of them along a face of the hull."""
-        return solid.narrowest(self.parts)
-
-    @property
-    def held_out(self) -> bool:
-        """Kept for evaluation: decided by the digest of the family, or of the object's name or
-        file, never by hand."""
-        return any(_drawn(name) for name in (self.source_sha256 or self.name, self.family) if name)
-
-
-def _drawn(name: str) -> bool:
-    number = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
-    return number < HELD_OUT * 2**64
-
-
-def renamed(one: Object, name: str) -> Object:
-    """The object under another name."""
-    return dataclasses.replace(one, name=name)
-
-
-def make(name: str, parts: Sequence[Part], **more: Any) -> Object:
-    """The object of convex parts that do not overlap, shifted such that its centre of mass is the
-    origin."""
-    whole = solid.joined(map(solid.moments, parts))
-    return centred(name, parts, whole, **more)
-
-
-def centred(name: str, parts: Sequence[Part], whole: solid.Moments, **more: Any) -> Object:
-    """The object of these parts whose integrals are `whole`."""
-    com = whole.first / whole.volume
-    shifted = [solid.moved(part, -com) for part in parts]
-    shifted.sort(key=lambda part: -np.linalg.norm(np.ptp(part.vertices, axis=0)))
-    return Object(name, tuple(shifted), whole.volume, solid.inertia(whole), **more)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -184,19 +124,15 @@ def _index(objects: Iterable[Object], arrays: bytes) -> bytes:
             "scale": each.scale,
             "size": np.ptp(each.bounds, axis=0).tolist(),
             "volume": each.volume,
-            "mass": DENSITY * each.volume,
-            "inertia": (DENSITY * each.inertia).tolist(),
+            "density": each.density,
+            "mass": each.density * each.volume,
+            "inertia": (each.density * each.inertia).tolist(),
             "parts": len(each.parts),
             "held_out": each.held_out,
         }
         for each in objects
     ]
-    content = {
-        "format": FORMAT,
-        "density": DENSITY,
-        "sha256": _digest(entries, arrays),
-        "objects": entries,
-    }
+    content = {"format": FORMAT, "sha256": _digest(entries, arrays), "objects": entries}
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
@@ -284,38 +220,17 @@ def _parts(packed: bytes) -> list[Part]:
 def _object(entry: dict[str, Any], parts: list[Part]) -> Object:
     """The object of an entry; takes its parts off the end."""
     count = int(entry["parts"])
-    if not 1 <= count <= min(MOST_PARTS, len(parts)):
-        raise ValueError(f"1 to {MOST_PARTS} parts an object, not {count}")
+    if not 1 <= count <= min(body.MOST_PARTS, len(parts)):
+        raise ValueError(f"1 to {body.MOST_PARTS} parts an object, not {count}")
     own = tuple(parts.pop() for _ in range(count))
-    inertia = np.array(entry["inertia"], np.float64) / DENSITY
+    density = float(entry.get("density", DENSITY))  # the first libraries had no other
+    inertia = np.array(entry["inertia"], np.float64) / density
     texts: dict[str, Any] = {
         name: str(entry[name]) for name in ("name", "family", "source", "source_sha256")
     }
     volume, scale = float(entry["volume"]), float(entry["scale"])
-    found = Object(parts=own, volume=volume, inertia=inertia, scale=scale, **texts)
-    if fault := faults(found):
+    numbers: dict[str, Any] = {"volume": volume, "scale": scale, "density": density}
+    found = Object(parts=own, inertia=inertia, **numbers, **texts)
+    if fault := body.faults(found):
         raise ValueError(f"object '{found.name[:60]}' {fault}")
     return found
-
-
-def faults(one: Object) -> str | None:
-    """What keeps an object from being simulated; None if nothing does."""
-    if not (one.name.isprintable() and 1 <= len(one.name) <= 100):
-        return "has no name of 1 to 100 printable characters"
-    size = np.ptp(one.bounds, axis=0)
-    if not (size.min() >= 1e-3 and size.max() <= LARGEST):
-        sides = f"{1e3 * size.min():.3g} to {1e3 * size.max():.3g}"
-        return f"has sides of {sides} mm, not 1 to {1e3 * LARGEST:g}"
-    if (
-        len(one.parts) > MOST_PARTS
-        or max(len(part.planes) for part in one.parts) > solid.MOST_FACES
-    ):
-        return f"has more than {MOST_PARTS} parts, or a part of more than {solid.MOST_FACES} faces"
-    if not (0.0 < one.volume <= 1.01 * np.prod(size)):
-        return "has a volume that is not positive, or larger than its bounding box"
-    if one.inertia.shape != (3, 3) or not np.isfinite(one.inertia).all():
-        return "has no inertia of 3 x 3 numbers"
-    low, middle, high = np.linalg.eigvalsh(one.inertia)
-    if not (low > 0.0 and low + middle >= 0.999 * high):
-        return "has an inertia that no body can have"
-    return None

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from csac_jax.objects import families, library
+from csac_jax.objects.body import DENSITY, Object
 from csac_jax.objects.library import Library, LibraryError, Split
 
 CHUNK = 6  # faces, as many as a box has
@@ -32,6 +33,7 @@ class Tables(NamedTuple):
     centre: np.ndarray  # [O, 3] float32 m, middle of the bounding box
     half: np.ndarray  # [O, 3] float32 m, half of the bounding box
     volume: np.ndarray  # [O] m^3
+    heaviness: np.ndarray  # [O] density relative to that of objects of which nothing is said
     moments: np.ndarray  # [O, 3] m^5, principal moments of inertia of density 1
     axes: np.ndarray  # [O, 4] unit quaternions (w, x, y, z), principal axes to object
     radius: float  # m, largest distance of a corner from its object's `centre`
@@ -86,6 +88,7 @@ def of(source: Library) -> Tables:
         centre=bounds.mean(axis=1),
         half=0.5 * np.ptp(bounds, axis=1),
         volume=np.array([one.volume for one in objects]),
+        heaviness=np.array([one.density / DENSITY for one in objects]),
         moments=moments,
         axes=Rotation.from_matrix(axes).as_quat(scalar_first=True),
         radius=max(map(_radius, objects)),
@@ -95,7 +98,7 @@ def of(source: Library) -> Tables:
 _NO_PLANE = np.array([0.0, 0.0, 0.0, NO_FACE], np.float32)
 
 
-def _chunks(one: library.Object) -> list[tuple[int, np.ndarray]]:
+def _chunks(one: Object) -> list[tuple[int, np.ndarray]]:
     """The chunks of an object, each with the number of its part."""
     found = []
     for number, part in enumerate(one.parts):
@@ -109,6 +112,6 @@ def _middle(points: np.ndarray) -> np.ndarray:
     return 0.5 * (points.min(axis=0) + points.max(axis=0))
 
 
-def _radius(one: library.Object) -> float:
+def _radius(one: Object) -> float:
     points = np.concatenate([part.vertices for part in one.parts])
     return float(np.linalg.norm(points - one.bounds.mean(axis=0), axis=1).max())

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from csac_jax.objects.library import Object
+from csac_jax.objects.body import Object
 from csac_jax.render import media
 from csac_jax.scene import blocks
 from csac_jax.vision import camera

@@ -114,7 +114,7 @@ def put(model: mujoco.MjModel, own: Bodies, fields: ObjectFields) -> None:
     model.geom_aabb[geoms] = part.box.reshape(*geoms.shape, 6)
     model.geom_friction[geoms, 0] = np.asarray(fields.friction)[:, None]
     model.geom_contype[geoms[~present]] = model.geom_conaffinity[geoms[~present]] = 0
-    density = np.asarray(fields.density, np.float64)
+    density = np.asarray(fields.density, np.float64) * own.tables.heaviness[number]
     model.body_mass[own.bodies] = density * own.tables.volume[number]
     model.body_inertia[own.bodies] = density[:, None] * own.tables.moments[number]
     model.body_iquat[own.bodies], model.body_ipos[own.bodies] = own.tables.axes[number], 0.0

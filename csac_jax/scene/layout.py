@@ -16,6 +16,7 @@ NOMINAL_FRICTION = 0.8
 SPEED_LIMIT = np.array([5, 5, 5, 50, 50, 50], np.float32)
 """Fastest block after a substep, m/s and rad/s (ours). A thin block squeezed from under the hand
 spins faster; the explicit gyroscopic torque would then drive it to NaN."""
+STILL = 0.008  # m/s, ours: slower counts as at rest
 ANY = -1  # `Scene.target` in the clearing task
 
 

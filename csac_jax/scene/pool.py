@@ -29,7 +29,6 @@ from csac_jax.scene.model import BlockFields, World
 TRAIN_STREAM = 0
 _VERSION = 5  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
-_STILL = 0.008  # m/s: slower counts as at rest
 _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
@@ -203,7 +202,8 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
     ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * extent
-    ok &= (speed.max(axis=1) < _STILL) & (position[:, 2] > 0.0) & np.isfinite(pose).all(axis=1)
+    ok &= (speed.max(axis=1) < layout.STILL) & (position[:, 2] > 0.0)
+    ok &= np.isfinite(pose).all(axis=1)
     if not np.all(ok | ~scene.in_play):
         return None
     in_play, upright = scene.in_play[:, None], np.array([1, 0, 0, 0], np.float32)

@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull
 from csac_jax.config import SceneConfig
 from csac_jax.errors import SceneError
 from csac_jax.objects import tables
+from csac_jax.objects.body import DENSITY
 from csac_jax.objects.library import Library
 from csac_jax.objects.tables import Tables
 from csac_jax.scene import blocks
@@ -93,7 +94,7 @@ def fingerprint(cfg: SceneConfig, scenes: Scene) -> str:
     content = hashlib.sha256()
     for number, held in zip(scenes.numbers.ravel(), scenes.in_play.ravel(), strict=True):
         one = objects[number]
-        text = f"{one.name} {one.source_sha256} {one.volume:.4e} {held};"
+        text = f"{one.name} {one.source_sha256} {one.volume * one.density / DENSITY:.4e} {held};"
         content.update(text.encode())
     for leaf in (scenes.density, scenes.friction, scenes.colour):
         content.update(np.ascontiguousarray(leaf).tobytes())

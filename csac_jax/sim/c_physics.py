@@ -51,6 +51,8 @@ class CPhysics:
         stored = np.empty(mujoco.mj_sizeModel(self.world.model), np.uint8)
         mujoco.mj_saveModel(self.world.model, None, stored)
         told = repr((self.world.slots, self.cfg, mujoco.__version__))
+        if (own := self.world.objects) is not None:  # densities are not in the model
+            told += repr(own.tables.heaviness.tolist())
         return hashlib.sha256(stored.tobytes() + told.encode()).hexdigest()
 
     @functools.cached_property
@@ -64,7 +66,7 @@ class CPhysics:
         try:
             simulator = self._idle.pop()
         except IndexError:
-            simulator = Simulator(self.world.model)
+            simulator = Simulator(self.world)
         yield simulator
         self._idle.append(simulator)
 
@@ -114,11 +116,17 @@ class CPhysics:
 
 
 class Simulator:
-    """What moves one scene at a time; made in a sixteenth of the time that ten blocks take."""
+    """What moves one scene at a time; made in a sixteenth of the time that ten blocks take.
 
-    def __init__(self, world_model: mujoco.MjModel) -> None:
-        self.model = copy.copy(world_model)  # holds the blocks of the last scene
+    Objects of many parts sleep: what is at rest costs nothing until something that moves meets it.
+    """
+
+    def __init__(self, world: World) -> None:
+        self.model = copy.copy(world.model)  # holds the blocks of the last scene
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # after a warning
+        if world.objects is not None:
+            self.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+            self.model.opt.sleep_tolerance = layout.STILL
         self.data = mujoco.MjData(self.model)
         self.engine = rollout.Rollout(nthread=0)  # MuJoCo's own loop, run in the calling thread
 
@@ -136,7 +144,7 @@ def trajectory(
 ) -> Trajectory:
     """Every state of one scene, of NumPy arrays; no substep where the robot cannot follow."""
     if joints.reachable:
-        return _rollout(world, Simulator(world.model), scene, fields, joints)
+        return _rollout(world, Simulator(world), scene, fields, joints)
     sizes = world.model.nq, world.model.nv, world.model.nsensordata
     return Trajectory(*(np.zeros((0, size)) for size in sizes))
 
@@ -151,6 +159,7 @@ def _rollout(
     own.geom_conaffinity[:] = np.where(is_parked, 0, world.model.geom_conaffinity)
     # MuJoCo derives the bodies' contact masks here: the geoms' come first.
     model.with_blocks(world, fields, into=(own, simulator.data))
+    mujoco.mj_resetData(own, simulator.data)  # what slept in the last scene
     start = np.concatenate([[0.0], world.model.qpos0, np.zeros(own.nv)])
     start[1 + world.robot_qpos] = joints.start
     start[1 + world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
@@ -171,7 +180,8 @@ def _simulate(
     `speeds` [..., 6] are the places of block velocities in a state: after every substep they are
     held to SPEED_LIMIT. MuJoCo's own loop cannot do that, so a call ends with the first substep
     after which a block is too fast. The next call starts from the limited velocities and the
-    solver's warm start, which gives the same bits as a loop that never ended.
+    solver's warm start, which gives the same bits as a loop that never ended; but objects that
+    sleep may wake.
     """
     own, data = simulator.model, simulator.data
     parts, done, ahead, warm = [], 0, _CALL_SUBSTEPS, np.zeros(own.nv)

@@ -12,7 +12,7 @@ from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
 from csac_jax.scene import blocks, stock
 from csac_jax.scene.layout import ANY, Scene
-from csac_jax.sim.primitives import Action, grasp_depth, local_top
+from csac_jax.sim.primitives import Action, grasp_depth, local_top, lowest, reachable
 
 YAWS = 32  # over half a turn: the hand is symmetric
 SHIFTS = (-0.6, 0.0, 0.6)  # of the grasp, in shares of the way to the block's end
@@ -42,7 +42,7 @@ class Ways(NamedTuple):
 
 def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | int = 0) -> Action:
     """The best grasp: room for both fingers as they go down and close, faces square to the pads, a
-    high and narrow block.
+    high and narrow block. Ways that the robot does not reach are left out.
 
     With a target, the best grasp is the target's, else that of the block nearest to it. After each
     of several `failures` [] in a row, another block's turn comes, then another way to take it.
@@ -53,14 +53,15 @@ def grasp(cfg: Config, scene: Scene, height: jax.Array, failures: jax.Array | in
     if cfg.scene.has_objects:
         ways.append(_of_objects(cfg, scene, height))
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *ways)
-    chosen = _in_turn(every, len(cfg.scene.slots), jnp.sum(scene.in_play), jnp.int32(failures))
+    chosen = _in_turn(every, len(cfg.scene.slots), jnp.int32(failures))
     return Action(primitive=jnp.int32(Primitive.GRASP), pose=every.pose[chosen])
 
 
-def _in_turn(ways: Ways, slots: int, blocks_left: jax.Array, failures: jax.Array) -> jax.Array:
+def _in_turn(ways: Ways, slots: int, failures: jax.Array) -> jax.Array:
     """Number [] of the next way to try: the best first."""
-    order = jnp.argsort(-jax.ops.segment_max(ways.score, ways.slot, slots))
-    around = jnp.maximum(blocks_left, 1)
+    best = jax.ops.segment_max(ways.score, ways.slot, slots)
+    order = jnp.argsort(-best)
+    around = jnp.maximum(jnp.sum(best > -jnp.inf), 1)  # blocks that there is a way to take
     own = (ways.slot == order[failures % around]) & (ways.score > -jnp.inf)
     ranked = jnp.argsort(-jnp.where(own, ways.score, -jnp.inf))
     return ranked[(failures // around * OTHER_WAY) % jnp.maximum(jnp.sum(own), 1)]
@@ -117,7 +118,7 @@ def _ways(
     """Grasps of bodies, leaves [B, ...], at YAWS and `shifts`; n = B YAWS len(shifts)."""
     sim, gripper, cells = cfg.sim, grippers.load(cfg.sim.gripper), cell_centres(cfg.heightmap)
     beside, (along, across_pad) = gripper.half[1] + 0.5 * gripper.finger[0], gripper.footprint
-    slots = jnp.arange(len(cfg.scene.slots))
+    slots, kind = jnp.arange(len(cfg.scene.slots)), jnp.int32(Primitive.GRASP)
 
     def place(body: Body, yaw: jax.Array, shift: jax.Array) -> jax.Array:
         """Where the hand closes: `shift` of the way from the middle to the body's end."""
@@ -132,7 +133,7 @@ def _ways(
         width = body.offset[high] + body.offset[low]
         centre = place(body, yaw, shift)
         top = local_top(cfg.heightmap, height, centre, gripper.finger[1])
-        tip = jnp.maximum(top - grasp_depth(sim, gripper), gripper.clearance)
+        tip = jnp.maximum(top - grasp_depth(sim, gripper), lowest(sim, gripper))
         local = jnp.abs(rotate2d(-yaw, cells - centre[None, None]))
         finger = (jnp.abs(local[..., 0] - beside) < along) & (local[..., 1] < across_pad)
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
@@ -151,7 +152,8 @@ def _ways(
         away = jnp.linalg.norm(centre - scene.position[scene.target, :2])
         asked = jnp.where(scene.target == body.slot, 3.0, -4.0 * away)
         wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[body.slot, 2], asked)
-        return jnp.where(scene.in_play[body.slot], wanted - cost, -jnp.inf)
+        possible = scene.in_play[body.slot] & reachable(sim, cfg.heightmap, kind, centre, yaw)
+        return jnp.where(possible, wanted - cost, -jnp.inf)
 
     def of_body(body: Body) -> Ways:
         every = jax.vmap(score, (None, 0, 0))(body, *ways)

@@ -74,7 +74,7 @@ def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: 
     gripper = grippers.load(cfg.gripper)
     surface = local_top(heightmap, height, xy, gripper.finger[1])
     depth = jnp.where(is_grasp, grasp_depth(cfg, gripper), cfg.push_depth)
-    low = jnp.maximum(surface - depth, gripper.clearance)
+    low = jnp.maximum(surface - depth, lowest(cfg, gripper))
     around = local_top(heightmap, height, xy, 2.0 * gripper.radius)
     high = jnp.maximum(low + cfg.approach, around + START_GAP)
     end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
@@ -99,7 +99,7 @@ def reachable(
     """
     if cfg.robot == "hand":
         return jnp.ones((), bool)
-    low, is_push = grippers.load(cfg.gripper).clearance, primitive == Primitive.PUSH
+    low, is_push = lowest(cfg, grippers.load(cfg.gripper)), primitive == Primitive.PUSH
     ends = xy, jnp.where(is_push, _push_end(cfg, heightmap, xy, yaw), xy)
     tips = [jnp.append(end, z) for end in ends for z in (low, low + cfg.approach + BLOCK)]
     return kinematics.reaches(kinematics.arm(cfg), jnp.stack(tips), yaw)
@@ -116,6 +116,11 @@ def _push_end(
 def grasp_depth(cfg: SimConfig, gripper: Gripper) -> float:
     """How far the tips go below the surface that they grasp, m; no palm comes down on it."""
     return min(cfg.grasp_depth, gripper.deepest)
+
+
+def lowest(cfg: SimConfig, gripper: Gripper) -> float:
+    """Least height of the tips above the table, m."""
+    return cfg.clearance or gripper.clearance
 
 
 def _progress(phases: tuple[int, int, int]) -> np.ndarray:

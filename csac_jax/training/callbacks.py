@@ -30,6 +30,7 @@ class Record:
     gap_disagrees: int  # grasps whose outcome the finger gap alone names differently
     contact_overflow: int  # substeps in which contacts may have been dropped
     physics_diverged: int  # scenes whose physics failed
+    unreachable: int  # actions that the robot could not follow, so that nothing moved
     critic_loss: float | None  # None during the warm-up, as the next three
     actor_loss: float | None
     td_error: float | None

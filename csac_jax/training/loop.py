@@ -22,7 +22,10 @@ from csac_jax.training import memory
 from csac_jax.training.callbacks import SILENT, Callback, Record, RunInfo, Summary
 
 LOSSES = ("critic_loss", "actor_loss")
-SUMS = "cleared blocks_lost terminated truncated gap_disagrees contact_overflow physics_diverged"
+SUMS = (
+    "cleared blocks_lost terminated truncated gap_disagrees contact_overflow physics_diverged "
+    "unreachable"
+)
 MEANS = "critic_loss actor_loss td_error q_mean"
 DIVERGED_SHARE = 1e-3  # of a chunk's actions: diverged physics beyond it is told; 1e-5 is common
 

@@ -4,6 +4,7 @@ Observe, act, simulate, replace finished scenes, remember, learn. E = scenes, B 
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -25,6 +26,7 @@ from csac_jax.replay.ring import ReplayState
 from csac_jax.replay.samplers import Sampler
 from csac_jax.runtime import compiler
 from csac_jax.scene import layout
+from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
 from csac_jax.training import sharding
 from csac_jax.vision import heightmap
@@ -56,6 +58,7 @@ class StepMetrics(NamedTuple):
     gap_disagrees: jax.Array  # [E] bool, finger gap and ground truth name different outcomes
     contact_overflow: jax.Array  # [E] int32, substeps with every contact slot in use
     physics_diverged: jax.Array  # [E] bool, physics failed: transition dropped, scene replaced
+    unreachable: jax.Array  # [E] bool, the robot cannot follow the action, so that nothing moved
     learned: jax.Array  # [] bool, False during the warm-up
     critic_loss: jax.Array  # [] float32
     actor_loss: jax.Array  # [] float32
@@ -164,6 +167,9 @@ def train_step(
         gap_disagrees=(action.primitive == Primitive.GRASP) & (info.outcome != info.outcome_by_gap),
         contact_overflow=info.contact_overflow,
         physics_diverged=info.physics_diverged,
+        unreachable=~jax.vmap(functools.partial(simulation.reachable, cfg))(
+            scenes.obs.height, action
+        ),
         learned=ready,
         finite=_is_finite(learned),
         **losses,

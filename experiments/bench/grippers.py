@@ -5,6 +5,7 @@ With each gripper that comes with the package: the planner that reads the blocks
 shipped policy, which was trained with the RG2 alone and is told nothing of the gripper.
 """
 
+import sys
 from typing import Any
 
 from csac_jax import grippers
@@ -26,12 +27,16 @@ def measure(episodes: int) -> dict[str, Any]:
     """Both policies with every gripper."""
     shipped = policies.load("shipped")
     kinds = {"oracle": policies.OraclePolicy(shipped.cfg), "shipped": shipped}
-    return {
-        gripper: {kind: _measured(policy, gripper, episodes) for kind, policy in kinds.items()}
-        for gripper in grippers.shipped()
-    }
+    rows = []
+    for gripper in grippers.shipped():
+        for kind, policy in kinds.items():
+            found = _measured(policy, gripper, episodes)
+            rows.append({"gripper": gripper, "policy": kind, **found})
+            share = found["grasp_success"]["value"]
+            print(f"{gripper} {kind}: grasp_success {share:.3f}", file=sys.stderr, flush=True)
+    return {"episodes": episodes, "rows": rows}
 
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    timed("grippers", arguments, measure, episodes=100)
+    timed("grippers", arguments, measure, episodes=50)

@@ -156,6 +156,8 @@ def run_dir(tmp_path: Path) -> Path:
             "train smoke --sim.physics warp --scene.size-jitter 0.1 0",
             "--sim.physics: warp computes on CUDA",
         ),
+        ("train smoke --sim.gripper rg3", "sim.gripper: 'rg3' is neither one of 2f85, franka_hand"),
+        ("eval shipped --sim.gripper rg3", "sim.gripper: 'rg3' is neither one of 2f85, franka_"),
         ("bench", "bench: unknown benchmark ''; choose one of: "),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),
         ("bench step slow", "bench step: give one preset of: smoke, quick, fast"),

@@ -53,6 +53,7 @@ REFUSED = {
     "no files": (["import", "nowhere", "--out", "x"], 2, "nowhere does not exist"),
     "no meshes": (["import", ".", "--out", "x"], 2, "no mesh file; known are: .obj"),
     "scale": (["import", ".", "--out", "x", "--scale", "0"], 2, "--scale must be positive"),
+    "density": (["import", ".", "--out", "x", "--density", "5"], 2, "--density: must lie in 50"),
 }
 
 

@@ -12,7 +12,7 @@ from csac_jax.agent import actor_critic, policy
 from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import policies
-from csac_jax.evaluation.policies import LearnedPolicy, OraclePolicy, RandomPolicy
+from csac_jax.evaluation.policies import GeometricPolicy, LearnedPolicy, OraclePolicy, RandomPolicy
 from csac_jax.io import policy_file
 
 pytestmark = pytest.mark.mjx
@@ -76,7 +76,7 @@ def test_observation_serves_for_a_state(learned, states):
     """Claim: learned and random policy act on a bare observation as in the state; without a state
     no action counts as one without change."""
     state, other = _scene(states, 0), _scene(states, 1)
-    for one in (learned, RandomPolicy(CFG)):
+    for one in (learned, RandomPolicy(CFG), GeometricPolicy(CFG)):
         a, b = (one(seen, jax.random.key(1)) for seen in (state, state.obs))
         jax.tree.map(np.testing.assert_array_equal, a, b)
     assert learned(other, jax.random.key(1)).primitive == Primitive.PUSH
@@ -93,7 +93,7 @@ def test_oracle_asks_for_a_state(states):
         OraclePolicy(CFG)(state.obs, jax.random.key(1))
 
 
-@pytest.mark.parametrize("kind", [RandomPolicy, OraclePolicy])
+@pytest.mark.parametrize("kind", [RandomPolicy, GeometricPolicy, OraclePolicy])
 def test_policies_are_pure(kind, states):
     """Claim: a policy can be vmapped and jitted, itself an argument; it is as in each scene."""
     batch = jax.jit(lambda one, *at: jax.vmap(one)(*at))(kind(CFG), states, _keys())

@@ -1,6 +1,8 @@
 """Policies as files."""
 
+import dataclasses
 import json
+import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -11,12 +13,13 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from csac_jax import presets
+from csac_jax import grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import DenseNet121
 from csac_jax.errors import DataWarning
 from csac_jax.io import configs, policy_file, weights
+from csac_jax.io.policy_file import PolicyFileError
 
 CFG = presets.get("smoke")
 
@@ -49,6 +52,26 @@ def test_what_is_read_is_what_was_written(tmp_path: Path, params: Params):
     assert jax.tree.structure(again) == jax.tree.structure(params)
     jax.tree.map(np.testing.assert_array_equal, again, params)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_policy_brings_its_own_gripper(tmp_path: Path, params: Params):
+    """Claim: a policy for a gripper of one's own needs no more of it than its file; numbers that
+    are none are one line."""
+    folder, path = tmp_path / "mine", tmp_path / "policy.safetensors"
+    shutil.copytree(grippers.load("2f85").folder, folder)
+    policy_file.save(path, params, CFG.change(sim={"gripper": str(folder)}))
+    shutil.rmtree(folder)
+    cfg, _ = policy_file.load(path)
+    here, there = grippers.load(cfg.sim.gripper), grippers.load("2f85")
+    assert here == dataclasses.replace(there, folder=folder)
+
+    def spoil(_: dict[str, Any], remarks: dict[str, str]) -> None:
+        remarks["gripper"] = json.dumps({"format": 1})
+
+    _rewrite(path, spoil)
+    with pytest.raises(PolicyFileError, match="'actuator' is missing"):
+        policy_file.load(path)
 
 
 @pytest.mark.parametrize(

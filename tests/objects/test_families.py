@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from csac_jax import grippers
-from csac_jax.objects import families, library, solid, tables
-from csac_jax.objects.library import Object
+from csac_jax.objects import body, families, solid, tables
+from csac_jax.objects.body import Object
 
 MADE = families.draw(3, 8 * len(families.FAMILIES))
 
@@ -26,7 +26,7 @@ def test_there_are_twelve_families_and_more():
 def test_shapes_can_be_simulated_and_held(family: str):
     """Claim: shapes of a family are sound, of few faces, and pass between the fingers."""
     for one in (each for each in MADE if each.family == family):
-        assert library.faults(one) is None
+        assert body.faults(one) is None
         assert len(one.parts) <= 12
         assert solid.narrowest(one.parts) < grippers.load("rg2").opening[1] - 0.02
 

@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from csac_jax import cli
-from csac_jax.objects import importing, library, solid
+from csac_jax.objects import conversion, importing, library, solid
+from csac_jax.objects.conversion import How
 
 pytest.importorskip("coacd")
 
@@ -24,7 +25,7 @@ def _box(sides: tuple[float, float, float] = (0.03, 0.04, 0.05)) -> trimesh.Trim
 @pytest.mark.parametrize("kind", ["obj", "stl", "ply", "glb"])
 def test_every_format_gives_the_same_box(tmp_path: Path, kind: str):
     """Claim: a box of any format is one part with the closed form of volume and inertia."""
-    one, share = importing.convert(_file(tmp_path, _box(), f"mesh.{kind}"), "box", 1.0)
+    one, share = conversion.convert(_file(tmp_path, _box(), f"mesh.{kind}"), "box", How())
     assert len(one.parts) == 1
     assert len(one.parts[0].planes) == 6
     assert share == pytest.approx(1.0, rel=1e-3)
@@ -38,7 +39,7 @@ def test_a_ring_keeps_its_hole(tmp_path: Path):
     of the ring, about its centre of mass."""
     ring = trimesh.creation.annulus(0.02, 0.03, 0.03)
     ring.apply_translation([0.1, 0.2, 0.3])
-    one, share = importing.convert(_file(tmp_path, ring), "ring", 1.0)
+    one, share = conversion.convert(_file(tmp_path, ring), "ring", How())
     assert len(one.parts) >= 4
     assert importing.SOUND[0] <= share <= importing.SOUND[1]
     assert not any((part.planes[:, 3] > 0.0).all() for part in one.parts)  # the middle is outside
@@ -63,7 +64,7 @@ def test_a_small_hole_is_mended(tmp_path: Path):
     """Claim: a mesh that lacks one triangle is closed."""
     box = _box()
     holed = trimesh.Trimesh(box.vertices, box.faces[1:], process=False)
-    one, _ = importing.convert(_file(tmp_path, holed), "box", 1.0)
+    one, _ = conversion.convert(_file(tmp_path, holed), "box", How())
     assert one.volume == pytest.approx(6e-5, rel=1e-4)
 
 
@@ -111,7 +112,7 @@ def test_what_cannot_be_taken_is_named(tmp_path: Path, name: str):
     """Claim: a file that is open, damaged, hostile or in another unit is one line with a reason."""
     make, message = REFUSED[name]
     with pytest.raises(ValueError, match=message) as caught:
-        importing.convert(make(tmp_path), name, 1.0)
+        conversion.convert(make(tmp_path), name, How())
     assert "\n" not in str(caught.value)
 
 
@@ -121,7 +122,7 @@ def test_a_file_names_no_other_file(tmp_path: Path):
     mesh = _file(tmp_path, _box(), "mesh.obj")
     mesh.write_text("mtllib secret.mtl\nusemtl a\n" + mesh.read_text())
     (tmp_path / "secret.mtl").chmod(0)
-    assert importing.convert(mesh, "box", 1.0)[0].volume > 0
+    assert conversion.convert(mesh, "box", How())[0].volume > 0
 
 
 @pytest.mark.slow
@@ -135,10 +136,10 @@ def test_the_command_writes_what_it_can(tmp_path: Path, capsys: pytest.CaptureFi
     bad = _text(folder, "c.ply", _PLY)
     out = tmp_path / "lib"
     partial = Path(f"{out}.partial")
-    importing.run([folder / "a.stl"], 1.0, 1, partial, lambda *_: None)
+    importing.run([folder / "a.stl"], How(), 1, partial, lambda *_: None)
     (kept,) = partial.iterdir()
     before = kept.stat().st_mtime_ns
-    found = importing.run(importing.files([folder]), 1.0, 2, partial, lambda *_: None)
+    found = importing.run(importing.files([folder]), How(), 2, partial, lambda *_: None)
     assert [one.name for one in found.objects] == ["a", "b"]
     assert len(found.refused) == 1
     assert kept.stat().st_mtime_ns == before

@@ -1,5 +1,6 @@
 """Objects of a library in C MuJoCo: other ones in every scene of one model."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -8,13 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from csac_jax import grippers
 from csac_jax.config import Config
-from csac_jax.objects import families, library, solid
+from csac_jax.objects import body, families, library, solid
 from csac_jax.scene import model, pool, stock
 from csac_jax.scene.layout import Scene
 from tests.scene import placed
 
 SLOTS = [0, 2, 4]  # of objects
+HEAVY = 1500.0  # kg/m^3, of all but the first object
 
 
 @pytest.fixture(scope="module")
@@ -22,9 +25,10 @@ def cfg(tmp_path_factory: pytest.TempPathFactory) -> Config:
     """A library that begins with a tiny cube, with which the model is compiled: its frame is the
     body's and its size small, which holds for no other."""
     cube = 0.004 * np.array([*itertools.product((0.0, 1.0), repeat=3)])
-    tiny = library.make("tiny", [solid.convex(cube)])
+    tiny = body.make("tiny", [solid.convex(cube)])
     folder = tmp_path_factory.mktemp("library") / "lib"
-    library.save(folder, [tiny, *families.draw(1, 28)])
+    made = [dataclasses.replace(one, density=HEAVY) for one in families.draw(1, 28)]
+    library.save(folder, [tiny, *made])
     kinds = ("object", "box", "object", "prism", "object")
     scene = {"slots": kinds, "min_blocks": 5, "objects": str(folder), "split": "all"}
     return Config().change(scene=scene, sim={"physics": "c"})
@@ -42,11 +46,12 @@ def dropped(cfg: Config, seed: int) -> Scene:
 
 def compiled(cfg: Config, scene: Scene) -> mujoco.MjModel:
     """A model whose object slots were given the scene's objects before it was compiled."""
-    spec, known = model._spec(cfg.scene, cfg.sim), stock.library(cfg.scene).objects
+    spec = model._spec(cfg.scene, cfg.sim, grippers.load("rg2"))
+    known = stock.library(cfg.scene).objects
     for slot in SLOTS:
         number = int(scene.object_id[slot])
         body = spec.body(f"block{slot}")
-        density = float(scene.density[slot])
+        density = float(scene.density[slot]) * known[number].density / 600.0
         body.mass, inertia = density * known[number].volume, density * known[number].inertia
         body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         for part, geom in enumerate(body.geoms):
@@ -132,7 +137,7 @@ def test_mass_and_inertia_are_the_objects(cfg: Config, world: model.World):
             mesh = spec.add_mesh(name=f"{number}", uservert=part.vertices.ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
             geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{number}")
-            geom.density = float(scene.density[slot])
+            geom.density = float(scene.density[slot]) * HEAVY / 600.0
         reference = spec.compile()
         here = world.block_bodies[slot]
         np.testing.assert_allclose(exact.body_mass[here], reference.body_mass[1], rtol=1e-5)

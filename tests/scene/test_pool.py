@@ -12,7 +12,7 @@ from scipy import stats
 
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import blocks, model, pool
+from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene, parking
 from tests.scene import placed
 
@@ -54,7 +54,7 @@ def test_settled_blocks_are_at_rest(world: model.World, scenes: Scene):
         exact, data = _placed(world, scenes, index)
         mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
         moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
-        assert moved.max() < 0.5 * pool._STILL, f"scene {index}: {moved}"
+        assert moved.max() < 0.5 * layout.STILL, f"scene {index}: {moved}"
 
 
 def test_settled_blocks_do_not_overlap(world: model.World, scenes: Scene):
@@ -231,7 +231,7 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         exact, data = _placed(world, scenes, index)
         mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
         moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
-        assert moved.max() < 0.5 * pool._STILL, f"scene {index}: {moved}"
+        assert moved.max() < 0.5 * layout.STILL, f"scene {index}: {moved}"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
     again = pool.settled(Config(scene=PILE), 1, 3, poured=True)
     np.testing.assert_array_equal(again.position, scenes.position)

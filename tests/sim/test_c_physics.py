@@ -206,9 +206,9 @@ def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed
         c_physics._rollout(c_world, simulator, *row)
         return placed.model_bytes(simulator.model)
 
-    wanted = [after(Simulator(c_world.model), row) for row in rows]
+    wanted = [after(Simulator(c_world), row) for row in rows]
     assert len(set(wanted)) == len(rows)
-    used = Simulator(c_world.model)
+    used = Simulator(c_world)
     for i in (0, 1, 2, 3, 2, 1, 3, 0, 2, 0):
         assert after(used, rows[i]) == wanted[i]
 

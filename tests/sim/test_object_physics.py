@@ -1,6 +1,7 @@
 """Actions among objects of a library: what moves them, and the planner that reads their poses."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 
 from csac_jax.config import Config
 from csac_jax.env import Env
+from csac_jax.objects import families, library
 from csac_jax.scene import model, pool
-from csac_jax.sim import backend, oracle, physics
+from csac_jax.sim import backend, c_physics, oracle, physics, primitives
+from csac_jax.sim.c_physics import CPhysics
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
 CONFIG = Config().change(
@@ -81,3 +84,50 @@ def test_objects_need_a_library():
         dataclasses.replace(CONFIG.scene, objects="")
     with pytest.raises(ValueError, match=r"scene\.arranged: must be 0"):
         dataclasses.replace(CONFIG.scene, arranged=0.5)
+
+
+def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
+    """Claim: while the hand is far away nothing moves at all, to the bit; what it grasps moves."""
+    scene = jax.tree.map(lambda leaf: leaf[0], env.scenes)
+    state = jax.jit(env.reset_to)(scene)
+    grasp = oracle.grasp(CONFIG, state.scene, state.obs.height)
+    plan = primitives.plan(CONFIG.sim, CONFIG.heightmap, state.obs.height, grasp)
+    joints = jax.device_get(primitives.joint_trajectory(CONFIG.sim, plan))
+    world = env.physics.world
+    fields = jax.device_get(model.scene_fields(world, scene))
+    seen = c_physics.trajectory(world, fields, scene, joints)
+    speed = np.abs(seen.qvel[:, world.block_dofs]).max(axis=(1, 2))
+    asleep = slice(20, 35)  # of the 60 substeps that the hand comes down in
+    assert (speed[asleep] == 0.0).all()
+    assert speed[60:].max() > 0.05
+
+
+def test_a_scene_moves_the_same_after_any_other(env: Env):
+    """Claim: what slept in a simulator's last scene does not show in the next one, to the bit."""
+    state = jax.jit(jax.vmap(env.reset_to))(env.scenes)
+    height = state.obs.height
+    grasps = jax.vmap(lambda one, seen: oracle.grasp(CONFIG, one, seen))(state.scene, height)
+    plans = jax.vmap(lambda seen, one: primitives.plan(CONFIG.sim, CONFIG.heightmap, seen, one))(
+        height, grasps
+    )
+    joints = jax.vmap(lambda one: primitives.joint_trajectory(CONFIG.sim, one))(plans)
+    world, used = env.physics.world, c_physics.Simulator(env.physics.world)
+    fields = jax.vmap(lambda one: model.scene_fields(world, one))(env.scenes)
+    batch = jax.device_get((env.scenes, fields, joints))
+    for i in range(len(height)):
+        row = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
+        again = c_physics._rollout(world, used, *row)
+        fresh = c_physics._rollout(world, c_physics.Simulator(world), *row)
+        np.testing.assert_array_equal(again.qpos, fresh.qpos)
+
+
+def test_heavier_objects_are_another_physics(tmp_path: Path):
+    """Claim: programs kept on disk tell libraries of the same shapes and other densities apart."""
+    light = families.draw(3, 2)
+    keys = []
+    for name, density in (("light", 600.0), ("heavy", 1200.0)):
+        made = [dataclasses.replace(one, density=density) for one in light]
+        library.save(tmp_path / name, made)
+        cfg = CONFIG.change(scene={"objects": str(tmp_path / name), "split": "all"})
+        keys.append(CPhysics(model.build(cfg.scene, cfg.sim), cfg.sim)._key)
+    assert keys[0] != keys[1]

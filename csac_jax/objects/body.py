@@ -1,0 +1,102 @@
+"""An object: a rigid body of convex parts, and what keeps one from being simulated.
+
+Its frame has the axes of its file and its origin at the centre of mass.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from csac_jax.objects import solid
+from csac_jax.objects.solid import Part
+
+HELD_OUT = 0.2  # share of the names
+MOST_PARTS = 32
+DENSITY = 600.0  # kg/m^3, of objects of which nothing else is said
+DENSITIES = 50.0, 25_000.0  # kg/m^3, least and most
+LARGEST = 0.4  # m, of a side: more than fits on the table
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Object:
+    """A rigid body. Its origin is the centre of mass."""
+
+    name: str
+    parts: tuple[Part, ...]  # the largest first
+    volume: float  # m^3, of the body, from which its mass follows
+    inertia: np.ndarray  # [3, 3] m^5, of density 1
+    family: str = ""
+    source: str = ""  # file that it was read from
+    source_sha256: str = ""
+    scale: float = 1.0  # m per unit of that file
+    density: float = DENSITY  # kg/m^3; scenes draw theirs relative to DENSITY
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest corner of the bounding box [2, 3] m."""
+        points = np.concatenate([part.vertices for part in self.parts])
+        return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    @property
+    def narrowest(self) -> float:
+        """Least width, m, between two parallel planes, one of them along a face of the hull."""
+        return solid.narrowest(self.parts)
+
+    @property
+    def held_out(self) -> bool:
+        """Kept for evaluation: decided by the digest of the family, or of the object's name or
+        file, never by hand."""
+        return any(_drawn(name) for name in (self.source_sha256 or self.name, self.family) if name)
+
+
+def _drawn(name: str) -> bool:
+    number = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
+    return number < HELD_OUT * 2**64
+
+
+def renamed(one: Object, name: str) -> Object:
+    """The object under another name."""
+    return dataclasses.replace(one, name=name)
+
+
+def make(name: str, parts: Sequence[Part], **more: Any) -> Object:
+    """The object of convex parts that do not overlap, shifted such that its centre of mass is the
+    origin."""
+    whole = solid.joined(map(solid.moments, parts))
+    return centred(name, parts, whole, **more)
+
+
+def centred(name: str, parts: Sequence[Part], whole: solid.Moments, **more: Any) -> Object:
+    """The object of these parts whose integrals are `whole`."""
+    com = whole.first / whole.volume
+    shifted = [solid.moved(part, -com) for part in parts]
+    shifted.sort(key=lambda part: -np.linalg.norm(np.ptp(part.vertices, axis=0)))
+    return Object(name, tuple(shifted), whole.volume, solid.inertia(whole), **more)
+
+
+def faults(one: Object) -> str | None:
+    """What keeps an object from being simulated; None if nothing does."""
+    if not (one.name.isprintable() and 1 <= len(one.name) <= 100):
+        return "has no name of 1 to 100 printable characters"
+    size = np.ptp(one.bounds, axis=0)
+    if not (size.min() >= 1e-3 and size.max() <= LARGEST):
+        sides = f"{1e3 * size.min():.3g} to {1e3 * size.max():.3g}"
+        return f"has sides of {sides} mm, not 1 to {1e3 * LARGEST:g}"
+    if (
+        len(one.parts) > MOST_PARTS
+        or max(len(part.planes) for part in one.parts) > solid.MOST_FACES
+    ):
+        return f"has more than {MOST_PARTS} parts, or a part of more than {solid.MOST_FACES} faces"
+    if not (0.0 < one.volume <= 1.01 * np.prod(size)):
+        return "has a volume that is not positive, or larger than its bounding box"
+    if not DENSITIES[0] <= one.density <= DENSITIES[1]:
+        return f"has a density of {one.density:.3g} kg/m^3, not 50 to 25000"
+    if one.inertia.shape != (3, 3) or not np.isfinite(one.inertia).all():
+        return "has no inertia of 3 x 3 numbers"
+    low, middle, high = np.linalg.eigvalsh(one.inertia)
+    if not (low > 0.0 and low + middle >= 0.999 * high):
+        return "has an inertia that no body can have"
+    return None

@@ -1,0 +1,92 @@
+"""A robot description, URDF or MJCF, as one closed mesh: MuJoCo reads it, trimesh joins its geoms.
+
+Nothing may move in it but the whole: an object of a library is one rigid body.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+SUFFIXES = (".urdf", ".xml")
+_LARGEST = 2**22  # bytes of a description
+_FREE = 6  # degrees of freedom of the whole
+_Geom = mujoco.mjtGeom
+
+
+def read(path: Path) -> Any:
+    """The mesh, as trimesh has it, of what collides in a description; of all geoms if nothing does.
+
+    Raises ValueError, one line with what to change.
+    """
+    if path.stat().st_size > _LARGEST:
+        raise ValueError(f"is larger than {_LARGEST >> 20} MiB; keep its meshes in files")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        _check_files(spec, path.parent.resolve())
+        model = spec.compile()
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        raise ValueError(" ".join(str(error).split())[:200]) from None
+    if model.nv not in (0, _FREE) or model.njnt > 1:
+        raise ValueError(f"has {model.njnt} joints that move; an object is one rigid body")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    collides = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    meshes = [_placed(model, data, int(geom)) for geom in _either(collides, model.ngeom)]
+    if not meshes:
+        raise ValueError("has no geom")
+    return _joined(meshes)
+
+
+def _either(collides: np.ndarray, geoms: int) -> np.ndarray:
+    return collides if collides.size else np.arange(geoms)
+
+
+def _check_files(spec: mujoco.MjSpec, folder: Path) -> None:
+    """The meshes lie in the description's own folder, wherever its text points."""
+    for mesh in spec.meshes:
+        file = (folder / spec.meshdir / mesh.file).resolve()
+        if mesh.file and not file.is_relative_to(folder):
+            raise ValueError(
+                f"names '{mesh.file}', which lies outside of its folder; move it there"
+            )
+
+
+def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
+    """One geom where the description has it, m."""
+    import trimesh
+
+    size, kind = model.geom_size[geom], int(model.geom_type[geom])
+    if kind == _Geom.mjGEOM_MESH:
+        number = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
+        begin, faces = model.mesh_faceadr[number], model.mesh_facenum[number]
+        corners, triangles = model.mesh_vert[first:][:count], model.mesh_face[begin:][:faces]
+        mesh = trimesh.Trimesh(corners, triangles, process=False)
+    elif kind == _Geom.mjGEOM_BOX:
+        mesh = trimesh.creation.box(2.0 * size)
+    elif kind == _Geom.mjGEOM_SPHERE:
+        mesh = trimesh.creation.icosphere(3, size[0])
+    elif kind == _Geom.mjGEOM_ELLIPSOID:
+        mesh = trimesh.creation.icosphere(3, 1.0).apply_scale(size)
+    elif kind == _Geom.mjGEOM_CYLINDER:
+        mesh = trimesh.creation.cylinder(size[0], 2.0 * size[1])
+    elif kind == _Geom.mjGEOM_CAPSULE:
+        mesh = trimesh.creation.capsule(2.0 * size[1], size[0])
+    else:
+        raise ValueError(f"has a geom of kind {_Geom(kind).name[7:].lower()}; give it a mesh")
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+    return mesh.apply_transform(place)
+
+
+def _joined(meshes: list[Any]) -> Any:
+    """One mesh of all; what lies in several counts once, where they are closed."""
+    import trimesh
+
+    if len(meshes) == 1:
+        return meshes[0]
+    if all(mesh.is_volume for mesh in meshes):
+        return trimesh.boolean.union(meshes)
+    return trimesh.util.concatenate(meshes)

@@ -1,0 +1,118 @@
+"""URDF and MJCF files as one closed mesh."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from csac_jax.objects import conversion, importing
+from csac_jax.objects.conversion import How
+from csac_jax.scene import descriptions
+
+pytest.importorskip("coacd")
+HOW = How(readers=tuple((suffix, descriptions.read) for suffix in descriptions.SUFFIXES))
+_URDF = """<robot name="a"><link name="one">
+<visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>
+<collision><origin xyz="0.01 0 0" rpy="0.3 0 1"/>
+<geometry><mesh filename="{mesh}" scale="0.001 0.001 0.001"/></geometry></collision>
+</link>{more}</robot>"""
+_HINGE = """<link name="two"><collision><geometry><sphere radius="0.01"/></geometry></collision>
+</link>
+<joint name="turn" type="continuous"><parent link="one"/><child link="two"/></joint>"""
+_MJCF = "<mujoco><worldbody>{}</worldbody></mujoco>"
+
+
+def _text(folder: Path, name: str, text: str) -> Path:
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def _described(folder: Path, more: str = "") -> tuple[Path, trimesh.Trimesh]:
+    """A URDF of a bent mesh in millimetres, and what it describes."""
+    corner = trimesh.boolean.union(
+        [
+            trimesh.creation.box((60, 20, 20)),
+            trimesh.creation.box((20, 40, 20)).apply_translation((20, 20, 0)),
+        ]
+    )
+    (folder / "meshes").mkdir()
+    corner.export(folder / "meshes" / "corner.obj")
+    path = _text(folder, "a.urdf", _URDF.format(mesh="meshes/corner.obj", more=more))
+    place = trimesh.transformations.euler_matrix(0.3, 0.0, 1.0)
+    return path, corner.apply_scale(1e-3).apply_transform(place)
+
+
+def test_a_urdf_has_the_volume_and_inertia_of_its_mesh(tmp_path: Path):
+    """Claim: what collides in a URDF, where its origin puts it, has trimesh's volume, inertia and
+    size."""
+    path, wanted = _described(tmp_path)
+    one, share = conversion.convert(path, "a", HOW)
+    assert one.volume == pytest.approx(wanted.volume, rel=1e-4)
+    np.testing.assert_allclose(one.inertia, wanted.moment_inertia, rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(one.bounds[1] - one.bounds[0], wanted.extents, atol=1e-3)
+    assert share == pytest.approx(1.0, abs=0.1)
+
+
+def test_geoms_of_an_mjcf_count_once_where_they_overlap(tmp_path: Path):
+    """Claim: two boxes that share a third have the closed form of the volume of both."""
+    boxes = "".join(f'<geom type="box" size=".015 .01 .01" pos="{x} 0 0"/>' for x in (0, 0.02))
+    path = _text(tmp_path, "a.xml", _MJCF.format(boxes))
+    one, _ = conversion.convert(path, "a", HOW)
+    assert one.volume == pytest.approx(0.05 * 0.02 * 0.02, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "volume"),
+    [
+        ("sphere", ".02", 4.0 / 3.0 * np.pi * 0.02**3),
+        ("cylinder", ".02 .03", np.pi * 0.02**2 * 0.06),
+        ("capsule", ".02 .03", np.pi * 0.02**2 * (0.06 + 4.0 / 3.0 * 0.02)),
+        ("ellipsoid", ".01 .02 .03", 4.0 / 3.0 * np.pi * 6e-6),
+    ],
+)
+def test_every_kind_of_geom_has_its_volume(tmp_path: Path, kind: str, size: str, volume: float):
+    """Claim: a geom's mesh has the closed form's volume, but for flat faces, and its middle."""
+    body = f'<body pos="0 0 1"><geom type="{kind}" size="{size}" pos="0.1 0 0"/></body>'
+    mesh = descriptions.read(_text(tmp_path, "a.xml", _MJCF.format(body)))
+    assert mesh.is_watertight
+    assert 0.95 * volume < mesh.volume <= volume
+    np.testing.assert_allclose(mesh.center_mass, [0.1, 0.0, 1.0], atol=1e-6)
+
+
+REFUSED = {
+    "plane": ("a.xml", _MJCF.format('<geom type="plane" size="1 1 1"/>'), "kind plane; give it a"),
+    "nothing": ("a.xml", _MJCF.format(""), "has no geom"),
+    "garbage": ("a.urdf", "<robot", "XML|Error"),
+    "elsewhere": (
+        "a.urdf",
+        _URDF.format(mesh="../b.obj", more=""),
+        "lies outside of its folder; move it",
+    ),
+    "missing": ("a.urdf", _URDF.format(mesh="b.obj", more=""), "b.obj"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_description_that_is_no_object_is_named(tmp_path: Path, name: str):
+    """Claim: geoms without a mesh, damaged files and meshes elsewhere are one line."""
+    file, text, message = REFUSED[name]
+    trimesh.creation.box((20, 20, 20)).export(tmp_path / "b.obj")
+    (tmp_path / "inside").mkdir()
+    with pytest.raises(ValueError, match=message) as caught:
+        descriptions.read(_text(tmp_path / "inside", file, text))
+    assert "\n" not in str(caught.value)
+
+
+def test_joints_that_move_are_refused(tmp_path: Path):
+    """Claim: a description of two bodies that a hinge joins is no object."""
+    path, _ = _described(tmp_path, _HINGE)
+    with pytest.raises(ValueError, match="has 1 joints that move; an object is one rigid body"):
+        descriptions.read(path)
+
+
+def test_meshes_in_a_folder_of_descriptions_are_parts_of_them(tmp_path: Path):
+    """Claim: a folder with a URDF gives that, not the mesh it names; without one its meshes."""
+    path, _ = _described(tmp_path)
+    assert importing.files([tmp_path], descriptions.SUFFIXES) == [path]
+    assert importing.files([tmp_path / "meshes"], descriptions.SUFFIXES)[0].name == "corner.obj"
