@@ -178,6 +178,7 @@ def _run_command(line: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.optax
 def test_robot_page_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the policy of docs/robot.md learns from the page's own record, in a few updates, and
     the next command takes it. The commands that train from nothing are good ones."""
