@@ -25,7 +25,7 @@ from csac_jax.replay import ring, samplers
 from csac_jax.runtime import provenance
 
 BATCH = 64
-REPEATS = 101
+REPEATS = 31
 STEPS = 25  # in one call: short, so that most calls are not interrupted
 SORTED = 2**15  # items that one call of a sampler that sorts the ring sorts at least
 ITEM = {
