@@ -17,6 +17,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
     os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(2**32)  # with a limit, JAX locks the folder
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # else XLA logs a line for each one found
 
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 

@@ -15,7 +15,10 @@ import pytest
 from csac_jax.runtime import cache
 
 ROOT = Path(cache.__file__).parents[2]
-NO_FOLDER = {"JAX_COMPILATION_CACHE_DIR": ""}  # the session's is left out
+NO_FOLDER = {  # the session's is left out, and XLA logs what it would log to a user
+    "JAX_COMPILATION_CACHE_DIR": "",
+    "TF_CPP_MIN_LOG_LEVEL": "1",
+}
 
 PROGRAM = """
 import csac_jax, hashlib, json
