@@ -19,7 +19,7 @@ from csac_jax.replay import ring
 from csac_jax.replay.ring import ReplayState
 
 _TRIES = 8  # candidates for a gamma variate, accepted with 0.95 each: none in 1 of 10^10 draws
-SORTED = 2**16  # slots of the largest ring whose ranks are exact (ours): its sort takes 6 ms
+SORTED = 2**16  # slots of the largest ring whose ranks are exact (ours)
 CANDIDATES = 2**12  # of a larger ring (ours); a power of 2, times which a float32 is exact
 RADIX = 8  # nodes summed into one; few enough to be added one by one
 BELOW_ONE = 1.0 - 2.0**-23  # largest uniform draw; times any float32 sum it stays below that sum
@@ -125,8 +125,8 @@ def beta_slots(
     values share their ranks at random: by slot, the oldest would be preferred. NaN is ranked first.
 
     A ring of more than SORTED slots is not sorted: the ranks are those among CANDIDATES random
-    slots, drawn for each batch. The law is then blurred by 1 / (2 sqrt(CANDIDATES)) of all ranks at
-    most; of the laws of CSAC sec. 4.3, no decile's share changes by 0.001. No memory is kept.
+    slots, drawn for each batch. The rank among all then has a standard deviation of n / (2
+    sqrt(CANDIDATES)) at most; of the laws of CSAC sec. 4.3, no decile's share changes by 0.001.
 
     Args: values [C], any beyond `size`; size [] filled slots.
     Returns: [num] int32 slots, with repetition, all filled; slot 0 .. C - 1 if nothing is stored.
