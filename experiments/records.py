@@ -171,6 +171,7 @@ BENCHES = {
     "act/cpu": ("dense Q maps of DenseNet-121", "bench act --pixels 64 --states 4 --repeats 7"),
     "act/h200": ("dense Q maps of DenseNet-121 and VPG's way in PyTorch", "bench act"),
     "replay/cpu": ("the samplers and flashbax's; other work on both cores", "bench replay"),
+    "replay/cpu-20": ("a million transitions; other work on both cores", "bench replay 20 20"),
     "replay/h200-12": ("the samplers and flashbax's", "bench replay 12 17"),
     "replay/h200-18": ("the same, larger rings", "bench replay 18 20"),
     "raycast/cpu": ("our rays and `mjx.ray`", "bench raycast --size 64 --scenes 32 --repeats 7"),

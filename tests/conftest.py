@@ -1,14 +1,23 @@
-"""Strict JAX in every test."""
+"""Strict JAX in every test, and one cache of programs for the session."""
 
+import atexit
 import contextlib
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 
 import pytest
 
-os.environ.setdefault(
-    "JAX_ENABLE_COMPILATION_CACHE", "0"
-)  # tests compile what they test, their own processes too
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    # What this session compiles, its workers and their processes compile once. JAX finds a program
+    # by all that it is made of: a test of another program than before has it compiled.
+    folder = tempfile.mkdtemp(prefix="csac-jax-programs-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(2**32)  # with a limit, JAX locks the folder
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # else XLA logs a line for each one found
 
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 

@@ -168,10 +168,13 @@ def test_other_blocks_parse(page: Path):
 
 
 def _run_command(line: str) -> None:
-    """Runs a line of a page: a file of examples/, or csac-jax."""
+    """Runs a line of a page: a file of examples/, or csac-jax; in a process of its own what draws,
+    since OpenGL ends one that has loaded CoACD."""
     program, *arguments = shlex.split(line, comments=True)
     if program == "python":
         runpy.run_path(str(ROOT / arguments[0]))["main"](*arguments[1:])
+    elif arguments[0] == "play":
+        subprocess.run([sys.executable, "-m", "csac_jax", *arguments], check=True)
     else:
         assert program == "csac-jax"
         assert cli.main(arguments) == 0, line

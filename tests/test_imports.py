@@ -4,6 +4,7 @@ Imports point back along the data path: a module imports from its own stage and 
 """
 
 import ast
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -217,6 +218,20 @@ def test_policies_need_no_mujoco(module: str):
     """Claim: what sees, thinks and reads policies is imported without MuJoCo installed."""
     code = f"import sys; sys.modules['mujoco'] = None; import csac_jax.{module}"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_training_in_c_needs_no_mjx():
+    """Claim: where C MuJoCo moves, neither MJX nor Warp is imported, nor SciPy's statistics before
+    something is measured."""
+    code = (
+        "import sys; sys.modules['mujoco.mjx'] = sys.modules['warp'] = None\n"
+        "from csac_jax import api, presets\nfrom csac_jax.sim import backend, physics\n"
+        "from csac_jax.scene import model\ncfg = backend.resolve(presets.quick())\n"
+        "physics.make(model.build(cfg.scene, cfg.sim), cfg.sim)\n"
+        "assert 'scipy.stats' not in sys.modules"
+    )
+    variables = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=variables)
 
 
 def test_checker_reads_the_package():

@@ -5,6 +5,7 @@ the lower of their values in each cell.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -231,16 +232,16 @@ def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> ja
     """
     cfg, frames = learner.cfg.target, learner.frames
 
-    def of(primitive: Primitive) -> tuple[jax.Array, jax.Array, jax.Array]:
-        mean = maps.normalise(frames, actor.pose(frames, state, primitive))
+    def of(primitive: jax.Array, one: DenseMaps) -> tuple[jax.Array, jax.Array, jax.Array]:
+        mean = maps.normalise(frames, actor.pose(frames, one, 0))
         key_noise = jax.random.fold_in(key, primitive)
         noisy, log_density = losses.noisy_actions(key_noise, cfg, mean)
         poses = jax.vmap(maps.denormalise, (None, 0))(frames, noisy)
         read = jax.vmap(maps.read_valid, (None, None, None, 0))
-        return *read(frames, state, primitive, poses), log_density
+        return *read(frames, one, 0, poses), log_density
 
-    sampled = map(of, maps.allowed_primitives(learner.cfg.policy))
-    q, valid, log_density = (jnp.concatenate(leaves) for leaves in zip(*sampled, strict=True))
+    sampled = maps.of_each_primitive(of, state, maps.allowed_primitives(learner.cfg.policy))
+    q, valid, log_density = (leaf.reshape(-1) for leaf in sampled)
     shown = valid | ~jnp.any(valid)
     return losses.softmax(
         jnp.where(shown, q, learner.bounds[0]),
@@ -338,16 +339,15 @@ def update_actor(
     frames, chosen = learner.frames, maps.allowed_primitives(learner.cfg.policy)
     q, features = jax.lax.stop_gradient(_critic_maps(learner, state.online.critic, obs))
 
-    def value(state_maps: DenseMaps, primitive: Primitive) -> jax.Array:
-        pose = actor.pose(frames, state_maps, primitive)
-        return maps.read_q(frames, state_maps, jnp.int32(primitive), pose)
+    def value(_: jax.Array, one: DenseMaps) -> jax.Array:
+        return maps.read_q(frames, one, jnp.int32(0), actor.pose(frames, one, 0))
 
     def loss(learned: Any) -> tuple[jax.Array, Any]:
         variables = {**state.online.actor, **learned}
         correction, statistics = networks.train(frames.networks.head, variables, features)
         batch_maps = _dense_maps(learner, obs, q, correction)
-        values = [jax.vmap(value, (0, None))(batch_maps, primitive) for primitive in chosen]
-        return -jnp.mean(jnp.stack(values)), statistics
+        of_each = functools.partial(maps.of_each_primitive, value, chosen=chosen)
+        return -jnp.mean(jax.vmap(of_each)(batch_maps)), statistics
 
     before = networks.learned(state.online.actor)
     (actor_loss, statistics), gradient = jax.value_and_grad(loss, has_aux=True)(before)

@@ -7,6 +7,8 @@ action is trilinear: bilinear in the two frames next to its yaw, linear between 
 
 import dataclasses
 import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -107,6 +109,15 @@ class DenseMaps:
     terms: jax.Array | None = None  # [P, K, h, w, T] float32, see `offsets`; None: Q is trilinear
 
 
+def of_each_primitive(
+    call: Callable[[jax.Array, DenseMaps], Any], state: DenseMaps, chosen: Sequence[Primitive]
+) -> Any:
+    """What `call(p, one)` gives for each primitive p of `chosen`, leaves [len(chosen), ...]; `one`
+    holds the maps of p alone, as those of primitive 0. All are one trace and one loop."""
+    ones = jax.tree.map(lambda leaf: jnp.stack([leaf[p][None] for p in chosen]), state)
+    return jax.vmap(call)(jnp.array(chosen, jnp.int32), ones)
+
+
 def input_maps(frames: Frames, obs: Observation) -> jax.Array:
     """The net's input maps [..., H, W, I] of an observation, in the workspace's own frame."""
     target = obs.target if frames.shows_target else None
@@ -186,8 +197,8 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
         offset = jnp.stack([first_row, jnp.zeros_like(first_row)])
         return rotate.bilinear(maps.reshape(-1, side), row_col + offset)
 
-    k = lower.astype(jnp.int32)
-    return (1.0 - upper_weight) * at(k) + upper_weight * at(k + 1)
+    below, above = jax.vmap(at)(lower.astype(jnp.int32) + np.arange(2, dtype=np.int32))
+    return (1.0 - upper_weight) * below + upper_weight * above
 
 
 def read_q(frames: Frames, state: DenseMaps, primitive: jax.Array, pose: jax.Array) -> jax.Array:

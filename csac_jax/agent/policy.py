@@ -33,12 +33,13 @@ def candidates(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> jax.Ar
 def _best_poses(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
     """What the search finds for each primitive, leaves [P, ...]."""
     search = POSE_SEARCHES[learner.cfg.policy.place]
-    found = [search(jax.random.fold_in(key, p), learner, state, p) for p in Primitive]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    return maps.of_each_primitive(
+        lambda p, one: search(jax.random.fold_in(key, p), learner, one), state, tuple(Primitive)
+    )
 
 
-def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps, primitive: Primitive) -> CEMResult:
-    """Maximises Q over the pose by the cross-entropy method, Algorithm 1 lines 8-13.
+def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
+    """Maximises the only Q over the pose by the cross-entropy method, Algorithm 1 lines 8-13.
 
     Poses with nothing to act on cost the range of returns. There are as many best cells as elites.
     """
@@ -46,22 +47,20 @@ def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps, primitive: Prim
 
     def score(u: jax.Array) -> jax.Array:
         pose = maps.denormalise(frames, u)
-        value, valid = maps.read_valid(frames, state, primitive, pose)
+        value, valid = maps.read_valid(frames, state, 0, pose)
         return jnp.where(valid, value, value - learner.return_range)
 
-    mean = maps.normalise(frames, actor.pose(frames, state, primitive))
-    cells = maps.best_cells(state.q[primitive], state.valid[primitive], cfg.elites)
+    mean = maps.normalise(frames, actor.pose(frames, state, 0))
+    cells = maps.best_cells(state.q[0], state.valid[0], cfg.elites)
     poses = jax.vmap(lambda cell: maps.normalise(frames, maps.cell_pose(frames, cell)))(cells)
     return cem.maximise(key, cfg, score, *CEM_STARTS[cfg.start](mean, poses))
 
 
-def _best_cell(
-    key: jax.Array, learner: ActorCritic, state: DenseMaps, primitive: Primitive
-) -> CEMResult:
-    """The valid cell of largest Q as it is (VPG)."""
-    cell = maps.best_cells(state.q[primitive], state.valid[primitive], 1)[0]
+def _best_cell(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
+    """The valid cell of the only Q where it is largest, as it is (VPG)."""
+    cell = maps.best_cells(state.q[0], state.valid[0], 1)[0]
     u = maps.normalise(learner.frames, maps.cell_pose(learner.frames, cell))
-    return CEMResult(u, state.q[primitive].reshape(-1)[cell], u[None])
+    return CEMResult(u, state.q[0].reshape(-1)[cell], u[None])
 
 
 POSE_SEARCHES = {"cem": _cem, "argmax": _best_cell}
@@ -93,14 +92,14 @@ def random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array
     Where Q varies inside cells, a random pose nearest to that cell: else no offset is ever seen.
     """
 
-    def place(p: Primitive) -> jax.Array:
-        cell = explore.random_cell(jax.random.fold_in(key, p), valid[p].reshape(-1))
+    def place(p: jax.Array, valid: jax.Array) -> jax.Array:
+        cell = explore.random_cell(jax.random.fold_in(key, p), valid.reshape(-1))
         pose = maps.cell_pose(frames, cell)
         if frames.networks.terms > 1:
             pose = pose + _random_offset(jax.random.fold_in(key, len(Primitive) + p), frames, pose)
         return maps.normalise(frames, pose)
 
-    return jnp.stack([place(primitive) for primitive in Primitive])
+    return jax.vmap(place)(jnp.arange(len(Primitive)), valid)
 
 
 def act(

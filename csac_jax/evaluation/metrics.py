@@ -29,7 +29,7 @@ episodes, blocks, pushes, grasps, and blocks taken and lost.
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy  # of whose parts each is imported when it is first used
 
 from csac_jax.constants import OUTCOMES, Outcome, Primitive
 

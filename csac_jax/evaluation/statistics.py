@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy  # of whose parts each is imported when it is first used
 
 RESAMPLES = 10_000
 

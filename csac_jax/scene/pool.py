@@ -1,7 +1,8 @@
 """The scenes that an environment draws from: packed arrangements, and blocks that were dropped.
 
 C MuJoCo settles those on all cores, bit-identical for any number of threads. They are cached on
-disk. `stream` numbers the stream of random numbers: training takes 0, evaluation others.
+disk; those of the preset `quick` come with the package. `stream` numbers the stream of random
+numbers: training takes 0, evaluation others.
 """
 
 import contextlib
@@ -67,10 +68,12 @@ def settled(
     Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
+    name = f"{_digest(cfg, scene, stream, count, poured, packed)}.npz"
     cache = cache_folder.private("pools")
-    path = cache and cache / f"{_digest(cfg, scene, stream, count, poured, packed)}.npz"
-    if path and (cached := _read(path)) is not None:
-        return cached
+    path = cache and cache / name
+    for stored in (shipped() / name, path):
+        if stored and (known := _read(stored)) is not None:
+            return known
     world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
     fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
     rng = np.random.default_rng([stream, 20221])
@@ -211,6 +214,11 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
         position=np.where(in_play, position, scene.position),
         quaternion=np.where(in_play, quaternion, upright),
     )
+
+
+def shipped() -> Path:
+    """Folder of the pools that come with the package; `experiments.pools` settles them."""
+    return assets() / "pools"
 
 
 def _digest(

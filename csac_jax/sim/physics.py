@@ -11,7 +11,7 @@ from csac_jax.config import Config, SimConfig
 from csac_jax.scene import blocks, layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World
-from csac_jax.sim import c_physics, mjx_physics, primitives, warp_physics
+from csac_jax.sim import c_physics, primitives, warp_physics
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, JointTrajectory, Plan
 
@@ -27,8 +27,14 @@ class Physics(Protocol):
         """
 
 
+def _make_mjx(world: World, cfg: SimConfig) -> Physics:
+    from csac_jax.sim import mjx_physics  # to import MJX takes longer than all else of the package
+
+    return mjx_physics.make(world, cfg)
+
+
 PHYSICS: dict[str, Callable[[World, SimConfig], Physics]] = {
-    "mjx": mjx_physics.make,
+    "mjx": _make_mjx,
     "warp": warp_physics.make,
     "c": c_physics.CPhysics,
 }

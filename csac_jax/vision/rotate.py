@@ -69,8 +69,7 @@ def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
     left = jnp.clip(jnp.floor(col).astype(jnp.int32), 0, width - 2)
     down, right = row - top.astype(row.dtype), col - left.astype(col.dtype)
 
-    def read(r: jax.Array) -> jax.Array:
-        a, b = (values.at[r, c].get(mode="promise_in_bounds") for c in (left, left + 1))
-        return (1.0 - right) * a + right * b
-
-    return (1.0 - down) * read(top) + down * read(top + 1)
+    rows, cols = (first + np.arange(2, dtype=np.int32) for first in (top, left))
+    corners = values.at[rows[:, None], cols[None]].get(mode="promise_in_bounds")  # [2, 2]
+    above, below = (1.0 - right) * corners[:, 0] + right * corners[:, 1]
+    return (1.0 - down) * above + down * below

@@ -125,7 +125,12 @@ def test_search_finds_the_top_between_cells(learner, start):
     cfg = learner.cfg.change(cem={"start": start, "candidates": 64, "elites": 6, "rounds": 6})
     own = dataclasses.replace(learner, cfg=cfg)
     frames, searched, cells = own.frames, [], []
-    search = jax.jit(lambda key, state: policy._cem(key, own, state, Primitive.GRASP).action)
+
+    @jax.jit
+    def search(key: jax.Array, state: maps.DenseMaps) -> jax.Array:
+        grasps = jax.tree.map(lambda leaf: leaf[Primitive.GRASP][None], state)
+        return policy._cem(key, own, grasps).action
+
     for seed, top in enumerate(np.random.default_rng(0).uniform(-0.12, 0.12, (12, 2))):
         state = _hill(frames, top)
         found = maps.denormalise(frames, search(jax.random.key(seed), state))

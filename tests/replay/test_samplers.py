@@ -96,6 +96,48 @@ def test_beta_draws_follow_scipys_law(a, b):
     assert stats.kstest(np.asarray(draws, np.float64), stats.beta(a, b).cdf).pvalue > P
 
 
+LARGE = samplers.SORTED + 8000  # capacity of a ring that is not sorted
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.5, 0.5), (1.0, 1.0), (1.0, 2.0), (1.0, 4.0), (1.0, 12.0)])
+def test_candidates_keep_the_law(a, b):
+    """Claim: ranks among CANDIDATES slots change no decile's share by 0.001.
+
+    The j-th of m uniform numbers follows Beta(j + 1, m - j), the share of rank j among them is that
+    of the law between j / m and (j + 1) / m.
+    """
+    num, edges = samplers.CANDIDATES, np.linspace(0.0, 1.0, 11)
+    share = np.diff(special.betainc(a, b, np.arange(num + 1) / num))[:, None]
+    rank = np.arange(num)[:, None]
+    of_rank = np.diff(special.betainc(rank + 1.0, num - rank, edges[None]), axis=1)
+    exact = np.diff(special.betainc(a, b, edges))
+    assert np.abs(np.sum(share * of_rank, axis=0) - exact).max() < 0.001
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.5, 0.5), (1.0, 12.0)])
+def test_large_rings_follow_the_beta_law(a, b):
+    """Claim: the ranks drawn from a ring that is not sorted follow the law to 0.01 a decile, and
+    only filled slots are drawn."""
+    size = LARGE - 3000
+    values = np.random.default_rng(0).permutation(LARGE).astype(np.float32)
+    values[size:] = LARGE
+    draw = jax.jit(jax.vmap(lambda key: samplers.beta_slots(
+        key, jnp.array(values), jnp.int32(size), a, b, 64)))  # fmt: skip
+    slots = np.asarray(draw(jax.random.split(jax.random.key(0), 400))).ravel()
+    assert slots.max() < size
+    decile = (ranks(values[:size], slots) * 10) // size
+    exact = np.diff(special.betainc(a, b, np.linspace(0.0, 1.0, 11)))
+    np.testing.assert_allclose(np.bincount(decile, minlength=10) / decile.size, exact, atol=0.01)
+
+
+def test_large_rings_of_equal_values():
+    """Claim: slots of equal values are drawn alike from a ring that is not sorted."""
+    draw = jax.jit(jax.vmap(lambda key: samplers.beta_slots(
+        key, jnp.ones(LARGE), jnp.int32(LARGE), 1.0, 12.0, 64)))  # fmt: skip
+    slots = np.asarray(draw(jax.random.split(jax.random.key(0), 400))).ravel()
+    assert stats.kstest(slots / LARGE, "uniform").pvalue > P
+
+
 def test_drawing_has_no_open_loop():
     """Claim: no sampler has a loop of unknown length, whose condition a GPU hands to the host at
     every turn."""

@@ -1,17 +1,24 @@
-"""The cache of compiled programs, in fresh processes; the suite itself runs without it."""
+"""The cache of compiled programs, in fresh processes; the suite itself has one for a session."""
 
 import json
 import os
 import subprocess
 import sys
+import tempfile
+import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from csac_jax.runtime import cache
 
 ROOT = Path(cache.__file__).parents[2]
+NO_FOLDER = {  # the session's is left out, and XLA logs what it would log to a user
+    "JAX_COMPILATION_CACHE_DIR": "",
+    "TF_CPP_MIN_LOG_LEVEL": "1",
+}
 
 PROGRAM = """
 import csac_jax, hashlib, json
@@ -35,7 +42,7 @@ print(json.dumps({"folder": folder and str(folder), "hits": before, "result": re
 def _run(tmp_path: Path, **variables: str) -> dict:
     """What PROGRAM prints in a fresh process whose cache directory is `tmp_path`; nothing may be on
     stderr."""
-    settings = {"XDG_CACHE_HOME": str(tmp_path), "JAX_ENABLE_COMPILATION_CACHE": "1", **variables}
+    settings = {"XDG_CACHE_HOME": str(tmp_path), **NO_FOLDER, **variables}
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", PROGRAM],
         env={**os.environ, **settings},
@@ -115,7 +122,7 @@ def _sizes(tmp_path: Path, limit: int, *powers: int) -> list[tuple[int, int]]:
     """Hits and bytes in the cache after each program of LIMITED."""
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, str(limit), *map(str, powers)],
-        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_ENABLE_COMPILATION_CACHE": "1"},
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), **NO_FOLDER},
         capture_output=True,
         text=True,
         timeout=120,
@@ -140,7 +147,34 @@ def test_full_cache_drops_what_is_unused_for_longest(tmp_path: Path, dated: bool
     assert [hits for hits, _ in _sizes(tmp_path, whole, 2, 3)] == [1, 0]
 
 
-def test_suite_runs_without_the_cache():
-    """Claim: the tests compile what they test."""
-    assert cache.enable() is None
-    assert jax.config.jax_compilation_cache_dir is None
+def test_suite_keeps_programs_for_a_session():
+    """Claim: the tests' programs come from this session: their folder is new, and nobody else's."""
+    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    assert cache.enable() == folder
+    assert folder.parent == Path(tempfile.gettempdir())
+    assert folder.stat().st_mode & 0o77 == 0
+    age = time.time() - min(path.stat().st_mtime for path in (folder, *folder.iterdir()))
+    assert age < 3600.0
+
+
+def test_changed_program_is_compiled():
+    """Claim: the session's cache gives a program only for what is the same in every instruction and
+    option: one that updates its argument in place is not taken for one that does not."""
+    cache.enable()
+    rows = jnp.arange(100_000.0)
+
+    def compiled(donated: tuple[int, ...]) -> tuple[int, int]:
+        """Programs found, and bytes updated in place."""
+        before = cache.hits()
+        grow = jax.jit(lambda rows: jnp.sort(rows) + 1.0, donate_argnums=donated)
+        memory = grow.lower(rows).compile().memory_analysis()
+        return cache.hits() - before, memory.alias_size_in_bytes
+
+    shortest = jax.config.jax_persistent_cache_min_compile_time_secs
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    try:
+        assert compiled(()) == (0, 0)
+        assert compiled(()) == (1, 0)
+        assert compiled((0,)) == (0, rows.nbytes)
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from csac_jax import presets
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, layout, model, pool
@@ -249,3 +250,45 @@ def test_poured_blocks_that_leave_are_dropped_anew():
         )
         assert poured is not None
         assert (np.linalg.norm(poured.position[:, :2], axis=1) <= 0.5 * EXTENT).all()
+
+
+def test_quick_begins_without_settling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: the scenes that `quick` trains in come with the package. Where this fails, run
+    `python -m experiments.pools`."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(pool, "_settle", None)  # must not be called
+    cfg = presets.quick()
+    assert len(pool.scenes(cfg, pool.TRAIN_STREAM).position) == cfg.scene.pool
+
+
+def test_shipped_scenes_are_what_settling_gives(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: a run has the same scenes with and without the pool that comes with the package; of
+    another processor, whose last bits differ, nearly all are alike to 2 mm."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(pool, "_ROUND", 24)
+    cfg = presets.quick()
+    given = pool.scenes(cfg, pool.TRAIN_STREAM)
+    settled = pool.settled(cfg, pool.TRAIN_STREAM, 20)  # the first of those 1,024
+    fits = np.abs(settled.position - given.position[:20]).max(axis=(1, 2)) < 0.002
+    assert fits.mean() > 0.8
+    for name in ("half_size", "density", "friction", "colour"):
+        np.testing.assert_array_equal(getattr(settled, name)[fits], getattr(given, name)[:20][fits])
+
+
+def test_damaged_shipped_pool_is_settled(small: Config, monkeypatch, tmp_path: Path):
+    """Claim: a pool that comes with the package is used if it is whole, else the scenes are
+    settled."""
+    wanted = pool.settled(small, pool.TRAIN_STREAM, 4)
+    (cached,) = (tmp_path / "csac_jax" / "pools").glob("*.npz")
+    folder = tmp_path / "shipped"
+    folder.mkdir()
+    monkeypatch.setattr(pool, "shipped", lambda: folder)
+    content = cached.read_bytes()
+    cached.unlink()
+    with monkeypatch.context() as patch:
+        (folder / cached.name).write_bytes(content)
+        patch.setattr(pool, "_settle", None)  # must not be called
+        found = pool.settled(small, pool.TRAIN_STREAM, 4)
+    (folder / cached.name).write_bytes(content[:-100])
+    for scenes in (found, pool.settled(small, pool.TRAIN_STREAM, 4)):
+        jax.tree.map(np.testing.assert_array_equal, wanted, scenes)

@@ -97,7 +97,7 @@ print(before, *program(x).tolist())
 def test_second_process_finds_the_program(tmp_path: Path):
     """Claim: a program that calls the host is taken from the cache by the next process, and calls
     that process's function."""
-    settings = {"XDG_CACHE_HOME": str(tmp_path), "JAX_ENABLE_COMPILATION_CACHE": "1"}
+    settings = {"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
     found = [
         subprocess.run(
             [sys.executable, "-W", "ignore", "-c", PROGRAM, factor],
