@@ -382,6 +382,7 @@ def test_old_names_are_read_as_todays(tmp_path: Path):
     config = _config("csac_beta", 0, reward__lost_block_penalty=0.5)
     old = json.loads(json.dumps(config))
     assert old.pop("format") == 2
+    old["sim"]["clearance"] = 0.012  # m: the setting of then, today the gripper's
     old["reward"]["left"] = old["reward"].pop("lost_block_penalty")
     start, end = old["explore"].pop("epsilon_primitive")
     old["explore"] |= {"primitive_start": start, "primitive_end": end}

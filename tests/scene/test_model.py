@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from csac_jax import grippers
 from csac_jax.config import RobotKind, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import blocks, layout, model, robots
@@ -44,7 +45,7 @@ def _compiled(monkeypatch: pytest.MonkeyPatch, scene: Scene, scale: float) -> mu
     spec."""
     with monkeypatch.context() as patch:
         patch.setattr(model, "LARGEST", scale)
-        spec = model._spec(CONFIG, SimConfig())
+        spec = model._spec(CONFIG, SimConfig(), grippers.load("rg2"))
     for slot in range(len(SLOTS)):
         for geom in spec.body(f"block{slot}").geoms:
             geom.density = scene.density[slot]
