@@ -210,6 +210,10 @@ BENCHES = {
         "how low and how deep the tips should go among objects",
         "bench grasp_depth --episodes 40",
     ),
+    "finetune/cpu": (
+        "fine-tuning on 500 recorded grasps of a gripper that opens less; other work on both cores",
+        "bench finetune",
+    ),
     "serve/cpu": ("decisions over HTTP; other work on both cores", "bench serve"),
     "soak/h200": (
         "100,000 random actions: nothing lost, nothing infinite",
