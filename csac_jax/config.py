@@ -322,7 +322,8 @@ class DenseNet121(Section, section="net"):
     """The paper's (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/32."""
 
     dtype = SmallNet.dtype
-    block_growth = 32  # channels that each dense layer adds (Huang et al., table 1)
+    block_layers = (6, 12, 24, 16)  # dense layers of each (Huang et al., arXiv:1608.06993, table 1)
+    block_growth = 32  # channels that each dense layer adds (the same)
     STRIDE = 32  # pixels of the input per cell of the features, along each axis
     output_stride = (
         4  # map cells per cell of the outputs (ours; the paper 1, at 16 times the memory)
@@ -336,8 +337,6 @@ class DenseNet121(Section, section="net"):
     head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
     norm: Literal["group", "batch"] = "group"
     """`batch`, as in the paper, or `group`, which is the same while acting and while learning."""
-    block_layers: tuple[int, int, int, int] = _bounded((6, 12, 24, 16), 1)
-    """Dense layers of each block (Huang et al., arXiv:1608.06993, table 1)."""
     zoom: int = _bounded(1, 1)  # Pixels of the input per cell of the map, along each axis (VPG 2).
 
     def check(self) -> None:

@@ -101,9 +101,9 @@ def _without_constants(values: dict[str, Any]) -> dict[str, Any]:
     values = dict(values)
     for name in renames.CONSTANTS:
         section, field = name.split(".")
-        if isinstance(stored := values.get(section), dict) and field in stored:
-            now = list(getattr(type(getattr(Config, section)), field))
-            _require_same(name, stored[field], now)
+        stored = values.get(section)
+        if isinstance(stored, dict) and field in stored and hasattr(_kind(section, stored), field):
+            _require_same(name, stored[field], getattr(_kind(section, stored), field))
             values[section] = {key: value for key, value in stored.items() if key != field}
     return values
 
@@ -138,6 +138,7 @@ def _from_format_1(values: dict[str, Any]) -> dict[str, Any]:
 
 def _require_same(name: str, value: Any, now: Any) -> None:
     """Raises ValueError unless a file has today's value of what is no setting any more."""
+    value, now = (list(one) if isinstance(one, tuple) else one for one in (value, now))
     close = isinstance(value, float) and isinstance(now, float) and math.isclose(value, now)
     if value != now and not close:
         raise ValueError(f"{name}: is {now} now and cannot be {value}")

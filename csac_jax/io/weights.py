@@ -24,7 +24,4 @@ def read(cfg: DenseNet121, path: Path) -> Any:
     try:
         return torchvision.variables(cfg, tensors)
     except ValueError as error:
-        raise ValueError(
-            f"in {path}, {error}; "
-            "bring torchvision's densenet121 with the layers of net.block_layers"
-        ) from error
+        raise ValueError(f"in {path}, {error}; bring torchvision's densenet121") from error

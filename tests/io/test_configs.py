@@ -99,6 +99,12 @@ def test_first_configs_of_format_2_are_read():
     stored["reward"]["eta"] = [0.5, 1.0]
     with pytest.raises(ValueError, match=r"^reward\.eta: is \[0\.0, 1\.0\] now"):
         configs.from_dict(stored)
+    paper = configs.to_dict(presets.paper())
+    paper["net"]["block_layers"] = [6, 12, 24, 16]
+    assert configs.from_dict(paper) == presets.paper()
+    paper["net"]["block_layers"] = [6, 12, 48, 32]
+    with pytest.raises(ValueError, match=r"^net\.block_layers: is \[6, 12, 24, 16\] now"):
+        configs.from_dict(paper)
 
 
 @pytest.mark.parametrize("file", ["format-1.json", "format-2-first.json"])

@@ -17,7 +17,7 @@ from csac_jax.config import DenseNet121
 from csac_jax.nets import densenet, networks
 from tests.sections import with_constants
 
-TINY = with_constants(DenseNet121(block_layers=(1, 1, 1, 1), head=8), block_growth=4)
+TINY = with_constants(DenseNet121(head=8), block_layers=(1, 1, 1, 1), block_growth=4)
 PARAMETERS = 7_037_504  # of a trunk without the top, running statistics included
 KERAS = {"norm1": "0_bn", "conv1": "1_conv", "norm2": "1_bn", "conv2": "2_conv"}
 
@@ -90,7 +90,7 @@ def _scale(entry: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
     """Compares every module with Keras's in both modes of batch norm; returns how many outputs were
     compared."""
-    cfg = DenseNet121(norm="batch", block_layers=block_layers)
+    cfg = with_constants(DenseNet121(norm="batch"), block_layers=block_layers)
     trunk = densenet.DenseNetTrunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(4, size, size, 3)), jnp.float32)

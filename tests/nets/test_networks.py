@@ -17,7 +17,7 @@ from tests.sections import with_constants
 TINY = {
     "small": SmallNet(margin=0.5, rotations=4),
     "densenet121": with_constants(
-        DenseNet121(margin=0.5, rotations=4, block_layers=(1, 1, 1, 1), head=8), block_growth=4
+        DenseNet121(margin=0.5, rotations=4, head=8), block_layers=(1, 1, 1, 1), block_growth=4
     ),
 }
 
@@ -52,7 +52,7 @@ def _config(size: int = 224, **net: Any) -> Config:
         ),
         (224, {"zoom": 3}, "net.zoom: must divide 8"),
         (224, {"zoom": 16}, "net.zoom: must divide 8"),
-        (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: must be at least 1, not 0"),
+        (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: unknown setting"),
         (224, {"norm": "layer"}, "net.norm: 'layer' is not one of: group, batch"),
         (224, {"kind": "resnet"}, "net.kind: 'resnet' is not one of: small, densenet121"),
         (224, {"stem": 16}, "net.stem: unknown setting"),

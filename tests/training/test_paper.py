@@ -25,12 +25,13 @@ TRUNK = 7_037_504
 
 
 class Tiny(DenseNet121):
-    """The network with few channels."""
+    """The network with few channels and layers."""
 
+    block_layers: ClassVar[tuple[int, int, int, int]] = (1, 1, 1, 1)
     block_growth: ClassVar[int] = 4
 
 
-TINY = Tiny(rotations=4, margin=0.0, head=8, block_layers=(1, 1, 1, 1), zoom=2)
+TINY = Tiny(rotations=4, margin=0.0, head=8, zoom=2)
 
 
 class Still(Env):
