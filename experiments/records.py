@@ -107,6 +107,36 @@ BENCHES = {
         "train fast --train.scenes 8192 --train.actions 491520 --learn.updates 128 "
         "--learn.batch 128 --net.head 48 --net.growth 32 --net.stem 32",
     ),
+    "train/h100-fast": ("a whole run of `fast` in steps of 5.1 ms", "train fast"),
+    "train/h100-fast-4ms": (
+        "the same in steps of 4 ms, with STEP = 0.004; ten cores were busy",
+        "train fast",
+    ),
+    "train/h100-fast-4096": (
+        "the first, more scenes and a smaller net",
+        "train fast --net.head 48 --net.growth 32 --net.stem 32 --learn.updates 96 "
+        "--train.scenes 4096 --train.actions 327680",
+    ),
+    "start/xeon-quick": (
+        "how soon `quick` learns, and did in commit 71c8723; five seeds side by side",
+        "bench start quick --runs 5 --cores 2 --other CHECKOUT",
+    ),
+    "warp_action/h100-2048": (
+        "an action on Warp, kernel by kernel",
+        "bench warp_action --repeats 3 --details",
+    ),
+    "warp_action/h100-lanes": (
+        "halves and quarters of the scenes on CUDA streams of their own; no longer in the code",
+        "bench warp_action --lanes 2 4 --repeats 3",
+    ),
+    "warp_action/h100-scenes": (
+        "an action against scenes",
+        "bench warp_action --scenes 512 4096 8192 --repeats 2",
+    ),
+    "warp_action/h100-target": (
+        "an action of the target task",
+        "bench warp_action --task target --repeats 2",
+    ),
     "step/xeon-quick": ("a step of `quick` and its stages, Intel Xeon", "bench step quick"),
     "step/epyc-quick": ("the same, AMD EPYC", "bench step quick"),
     "step/epyc-quick-scenes": (
@@ -187,6 +217,10 @@ BENCHES = {
     "parity/h200-warp": (
         "Warp against C MuJoCo, whole actions",
         "bench parity --warp --primitives 500 --poses 25",
+    ),
+    "parity/h100-warp-off": (
+        "Warp against C MuJoCo, grasps of which some fail, steps of 5.1 ms",
+        "bench parity --warp --off --primitives 384 --poses 1",
     ),
     "one_step/cpu": ("MJX against C MuJoCo, one step", "bench one_step --states 1000"),
     "labels/cpu": ("outcomes by finger gap and by ground truth", "bench labels"),

@@ -43,8 +43,8 @@ def cholesky_error() -> float:
 
 
 CHECKS: tuple[tuple[str, Callable[[], float], float], ...] = (
-    # Bounds are ten times what float32 gives, or more.
-    ("rows of a vmapped matrix product against NumPy", rows_error, 1e-5),
+    # Bounds are ten times what float32 gives, or more; for products, what a GPU's TF32 gives.
+    ("rows of a vmapped matrix product against NumPy", rows_error, 5e-3),
     ("batched Cholesky against NumPy", cholesky_error, 1e-4),
     ("batched MJX against C MuJoCo", physics.largest_error, 5e-4),
 )

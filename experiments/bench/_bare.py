@@ -1,6 +1,7 @@
 """What physics costs by itself: plain steps from an action's first state with its set-points."""
 
 import concurrent.futures
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,8 @@ from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
 from csac_jax.sim.warp_physics import WarpPhysics
 
+AT_ONCE = 128  # scenes; XLA wants gigabytes for thousands
+
 
 def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:
     """How the robot moves in actions chosen from the height maps [E, H, W] m; leaves [E, ...]."""
@@ -27,7 +30,8 @@ def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> Joint
         plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
         return primitives.joint_trajectory(cfg.sim, plan)
 
-    return jax.jit(jax.vmap(joints))(height, actions)
+    rows = functools.partial(jax.lax.map, lambda row: joints(*row), batch_size=AT_ONCE)
+    return jax.jit(rows)((height, actions))
 
 
 def loop(physics: Physics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
@@ -62,19 +66,13 @@ def _mjx(physics: MjxPhysics, scenes: Scene, joints: JointTrajectory) -> Callabl
 def _warp(physics: WarpPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
     import warp as wp
 
-    from csac_jax.sim import warp_action
-    from csac_jax.sim.warp_action import Lane
-
     jax.block_until_ready(jax.jit(jax.vmap(physics.run))(scenes, joints))  # copies them in
-    lanes = physics.simulator.prepared(len(joints.control))
-    steps = {lane.rows.start: lane.batch.recorded(lane.batch.step) for lane in lanes}
-
-    def run(lane: Lane) -> None:
-        lane.batch.restart()
-        steps[lane.rows.start]()
+    batch = physics.simulator.prepared(len(joints.control))
+    steps = batch.recorded(batch.step)
 
     def call() -> None:
-        warp_action.side_by_side(lanes, run)
+        batch.restart()
+        steps()
         wp.synchronize()
 
     return call

@@ -1,11 +1,12 @@
 """How soon a run learns, as JSON: `csac-jax bench start [PRESET] [--runs 5] [--other CHECKOUT]
-[SETTINGS]`.
+[--cores N] [SETTINGS]`.
 
 Each run is a process of `csac-jax train PRESET SETTINGS` with an empty cache, which goes to its
 end, and another of the same config, stopped at its first action, which finds what the first has
 cached. Runs of this checkout and of another one take turns, so that what else the machine does hits
 both alike. Times are from the start of the process, s; seed i is run i. The first action begins as
-the program is compiled.
+the program is compiled. With --cores, on Linux, every seed has N cores of its own, and as many
+seeds run side by side as the machine has such cores for.
 
 Parts: `first_action` with an empty cache, `first_action_cached`, `success` when 90 % of the last
 200 grasps lift a block, `end`. The last two leave out what the host does between chunks.
@@ -13,12 +14,14 @@ Parts: `first_action` with an empty cache, `first_action_cached`, `success` when
 
 import json
 import os
+import queue
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +38,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser = _options.Parser(prog="bench start", allow_abbrev=False)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--other", type=Path)
+    parser.add_argument("--cores", type=int)
     preset, options, flags = _options.split(parser, list(arguments))
     train = [preset, *flags]
     checkouts = {"this": HERE}
@@ -42,18 +46,45 @@ def main(arguments: Sequence[str] = ()) -> None:
         if not (options.other / "csac_jax").is_dir():
             raise BadArgumentsError(f"bench start: --other: {options.other} is no checkout")
         checkouts["other"] = options.other.resolve()
-    print(json.dumps(measure(train, options.runs, checkouts), indent=2))
+    shares = _shares(options.cores)[: options.runs]
+    print(json.dumps(measure(train, options.runs, checkouts, shares), indent=2))
 
 
-def measure(train: list[str], runs: int, checkouts: dict[str, Path]) -> dict[str, Any]:
+def _shares(cores: int | None) -> list[set[int]]:
+    """Sets of so many cores each, none in two; None is one set of all that this process may use."""
+    every = sorted(os.sched_getaffinity(0))
+    if cores is None:
+        return [set(every)]
+    if not 1 <= cores <= len(every):
+        raise BadArgumentsError(f"bench start: --cores: must be from 1 to {len(every)}")
+    firsts = range(0, len(every) - cores + 1, cores)
+    return [set(every[first : first + cores]) for first in firsts]
+
+
+def measure(
+    train: list[str], runs: int, checkouts: dict[str, Path], shares: list[set[int]]
+) -> dict[str, Any]:
     """Times of every run by checkout, their medians, and how many times sooner this one is."""
-    every: dict[str, list[dict[str, Any]]] = {name: [] for name in checkouts}
-    for seed in range(runs):
+    free: queue.SimpleQueue[set[int]] = queue.SimpleQueue()
+    for share in shares:
+        free.put(share)
+
+    def one(seed: int) -> dict[str, dict[str, Any]]:
+        share = free.get()
+        os.sched_setaffinity(0, share)  # of this thread, and so of the processes that it starts
+        found = {}
         for name, checkout in checkouts.items():
-            every[name].append(_run(train, seed, checkout))
-            print(f"{name} {seed}: {every[name][-1]}", file=sys.stderr)
+            found[name] = _run(train, seed, checkout)
+            print(f"{name} {seed}: {found[name]}", file=sys.stderr)
+        free.put(share)
+        return found
+
+    with ThreadPoolExecutor(len(shares)) as threads:
+        seeds = list(threads.map(one, range(runs)))
+    every = {name: [found[name] for found in seeds] for name in checkouts}
     median = {name: _median(times) for name, times in every.items()}
-    result: dict[str, Any] = {"train": train, "runs": every, "median": median}
+    result: dict[str, Any] = {"train": train, "cores": len(shares[0]), "side_by_side": len(shares)}
+    result |= {"runs": every, "median": median}
     if "other" in median:
         result["times_sooner"] = {
             part: _ratio(median["other"][part], median["this"][part]) for part in median["this"]
@@ -101,7 +132,8 @@ def _train(
     run_dir = folder / name
     command = [sys.executable, "-u", "-m", "csac_jax", "train", *train, "--seed", str(seed)]
     without = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
-    variables = {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(checkout)}
+    modules = os.pathsep.join([str(checkout), *filter(None, [os.environ.get("PYTHONPATH")])])
+    variables = {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": modules}
     begun = time.perf_counter()
     with subprocess.Popen(
         [*command, "--run-dir", str(run_dir)],

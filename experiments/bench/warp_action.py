@@ -1,20 +1,19 @@
 """Physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--blocks N ...]
-[--lanes L ...] [--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details]
-[--repeatable]`.
+[--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details] [--repeatable]`.
 
-For each number of scenes (2048), of blocks (those of the preset `fast`) and of lanes, and for each
-longest step in ms (both ours): seconds of an action of the environment (`env`), of physics alone
-(`physics`), and of a bare loop of Warp's own steps with the same blocks and set-points, recorded in
-graphs and lanes as ours are (`bare`). They alternate; each is the median of N (5) rounds after one
-that does not count. `share` is bare / env.
+For each number of scenes (2048), of blocks (those of the preset `fast`), and for each longest step
+in ms (ours): seconds of an action of the environment (`env`), of physics alone (`physics`), and of
+a bare loop of Warp's own steps with the same blocks and set-points, recorded in graphs as ours are
+(`bare`). They alternate; each is the median of N (5) rounds after one that does not count. `share`
+is bare / env.
 
 `first_action` is the time from the start of the process for the first row, of which `scenes_ready`
 went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp's pool held so far.
 `bits_differ` is the number of leaves in which a second run of the same action differs.
 
 --details adds the `calls` of Warp that a scan of two steps makes, which are to be two, and
-milliseconds and launches of each kernel in an action of the first lane, whose substeps are launched
-one by one: only then can Warp time them. --repeatable asks Warp for the same bits in every run.
+milliseconds and launches of each kernel in an action whose substeps are launched one by one: only
+then can Warp time them. --repeatable asks Warp for the same bits in every run.
 """
 
 import collections
@@ -33,7 +32,7 @@ import warp as wp
 
 from csac_jax import env as environment, presets
 from csac_jax.config import Config
-from csac_jax.runtime import provenance
+from csac_jax.runtime import cache, provenance
 from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
 from experiments.bench import _bare
@@ -57,8 +56,8 @@ def _config(scenes: int, blocks: int, pool: int, task: str) -> Config:
     return cfg if blocks == len(cfg.scene.slots) else with_blocks(cfg, blocks)
 
 
-def measure(cfg: Config, lanes: int, longest: float, repeats: int, details: bool) -> dict[str, Any]:
-    """One number of scenes, blocks and lanes, one longest step, ms."""
+def measure(cfg: Config, longest: float, repeats: int, details: bool) -> dict[str, Any]:
+    """One number of scenes and of blocks, one longest step, ms."""
     from csac_jax.sim import warp_action
 
     scenes = cfg.train.scenes
@@ -66,18 +65,19 @@ def measure(cfg: Config, lanes: int, longest: float, repeats: int, details: bool
         env = environment.make_env(cfg)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
     grasp = functools.partial(oracle.grasp, cfg)
-    actions = jax.jit(jax.vmap(grasp))(states.scene, states.obs.height)
+    planned = functools.partial(jax.lax.map, lambda row: grasp(*row), batch_size=_bare.AT_ONCE)
+    actions = jax.jit(planned)((states.scene, states.obs.height))
     joints = jax.block_until_ready(_bare.joint_trajectories(cfg, states.obs.height, actions))
     begun = {"scenes_ready": _seconds_since_start()}
     step = jax.jit(jax.vmap(env.step))
-    with mock.patch.multiple(warp_action, LANES=lanes, STEP=1e-3 * longest):
+    with mock.patch.object(warp_action, "STEP", 1e-3 * longest):
         first = jax.device_get(step(states, actions))
     begun["first_action"] = _seconds_since_start()
     run = jax.jit(jax.vmap(env.physics.run))
     bare = _bare.loop(env.physics, states.scene, joints)
     calls = {"env": lambda: step(states, actions), "physics": lambda: run(states.scene, joints)}
     seconds = medians({**calls, "bare": bare}, repeats)
-    row = {"scenes": scenes, "blocks": len(cfg.scene.slots), "lanes": lanes, "seconds": seconds}
+    row = {"scenes": scenes, "blocks": len(cfg.scene.slots), "seconds": seconds}
     row |= {"steps": env.physics.simulator.substeps}
     row |= {"actions_per_second": scenes / seconds["env"], **begun, **_bytes()}
     row |= {"share": seconds["bare"] / seconds["env"]}
@@ -112,13 +112,12 @@ def _calls(env: environment.Env, states: environment.State, actions: Action) -> 
 
 
 def _kernels(env: environment.Env, joints: Any) -> dict[str, list[float]]:
-    """Milliseconds and launches of each kernel in an action of the first lane, longest first; none
-    without CUDA."""
-    lane = env.physics.simulator.prepared(len(joints.control))[0]
-    lane.batch.restart()
+    """Milliseconds and launches of each kernel in an action, longest first; none without CUDA."""
+    batch = env.physics.simulator.prepared(len(joints.control))
+    batch.restart()
     wp.timing_begin(wp.TIMING_ALL)
-    for _ in range(lane.batch.substeps):
-        lane.batch.substep()
+    for _ in range(batch.substeps):
+        batch.substep()
     found: dict[str, list[float]] = collections.defaultdict(lambda: [0.0, 0])
     for each in wp.timing_end():
         name = re.sub(r"_[0-9a-f]{8}\b|__locals__\w*kernel", "", each.name.split(" ")[-1])
@@ -149,7 +148,6 @@ def main(arguments: list[str]) -> None:
     parser = Parser(prog="bench warp_action", allow_abbrev=False)
     parser.add_argument("--scenes", type=int, nargs="+", default=[2048])
     parser.add_argument("--blocks", type=int, nargs="+", default=[10])
-    parser.add_argument("--lanes", type=int, nargs="+", default=None)
     parser.add_argument("--step", type=float, nargs="+", default=None)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pool", type=int, default=64)
@@ -157,23 +155,18 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--details", action="store_true")
     parser.add_argument("--repeatable", action="store_true")
     options = parser.parse_args(arguments)
+    cache.enable()
     if options.repeatable:
         _ask_for_same_bits()
     from csac_jax.sim import warp_action
 
-    lanes, steps = options.lanes or [warp_action.LANES], options.step or [1e3 * warp_action.STEP]
-    rows = [
-        measure(
-            _config(scenes, blocks, options.pool, options.task),
-            each,
-            longest,
-            options.repeats,
-            options.details,
-        )
-        for scenes, blocks, each, longest in itertools.product(
-            options.scenes, options.blocks, lanes, steps
-        )
-    ]
+    steps = options.step or [1e3 * warp_action.STEP]
+    rows = []
+    for scenes, blocks, longest in itertools.product(options.scenes, options.blocks, steps):
+        cfg = _config(scenes, blocks, options.pool, options.task)
+        rows.append(measure(cfg, longest, options.repeats, options.details))
+        done = {name: value for name, value in rows[-1].items() if name != "kernels"}
+        print(f"{longest} ms: {done}", file=sys.stderr, flush=True)
     print(
         json.dumps({"repeatable": options.repeatable, "runs": rows} | provenance.record(), indent=2)
     )

@@ -697,6 +697,46 @@ def test_settings_of_a_step():
     assert found == ["c", "mjx", "mjx", "c"]
 
 
+def test_cores_are_shared_out(monkeypatch: pytest.MonkeyPatch):
+    """Claim: `bench start --cores` gives every seed as many cores, none to two, and refuses more
+    than there are."""
+    from experiments.bench import start
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {4, 1, 0, 7, 9}, raising=False)
+    assert start._shares(None) == [{0, 1, 4, 7, 9}]
+    assert start._shares(2) == [{0, 1}, {4, 7}]
+    assert start._shares(5) == [{0, 1, 4, 7, 9}]
+    for cores in (0, 6):
+        with pytest.raises(failures.BadArgumentsError, match="--cores: must be from 1 to 5"):
+            start._shares(cores)
+
+
+def test_median_start():
+    """Claim: a part that half of the runs never reach has no median, and so no ratio."""
+    from experiments.bench import start
+
+    times = [{"success": 3.0}, {"success": None}, {"success": 1.0}]
+    assert start._median(times) == {"success": 3.0}
+    assert start._median([*times, {"success": None}]) == {"success": None}
+    assert start._ratio(6.0, 3.0) == 2.0
+    assert start._ratio(None, 3.0) is start._ratio(3.0, None) is None
+
+
+@pytest.mark.slow
+def test_start_benchmark(capfd: pytest.CaptureFixture):
+    """Claim: `bench start` prints when runs of this checkout and of another one get where."""
+    flags = ["--runs", "1", "--other", str(ROOT), "--cores", "1"]
+    assert cli.main(["bench", "start", "smoke", *flags]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert (result["cores"], result["side_by_side"]) == (1, 1)
+    for name in ("this", "other"):
+        (times,) = result["runs"][name]
+        assert result["median"][name] == times
+        assert 0.0 < times["first_action_cached"] < times["first_action"] < times["end"]
+    ratio = result["median"]["other"]["end"] / result["median"]["this"]["end"]
+    assert result["times_sooner"]["end"] == ratio
+
+
 @pytest.mark.slow
 def test_replay_benchmark(capsys: pytest.CaptureFixture):
     """Claim: `bench replay` prints JSON with the times of every sampler and where they come

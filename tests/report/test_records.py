@@ -16,7 +16,7 @@ RESULTS = ROOT / "experiments" / "results"
 RUN = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/seed-\d+/(config|train|eval[\w-]*)\.json")
 SWEEP = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/(sweep|summary|train)\.json")
 SEARCH = re.compile(r"search/[a-z_]+/[a-z_]+\.json")
-BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h200)[\w-]*\.json")
+BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h100|h200)[\w-]*\.json")
 
 
 def test_results_page_is_what_report_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -25,7 +25,6 @@ from csac_jax.vision import observe
 from tests.sim.conftest import CASES, CONFIG
 
 SCENES = 4
-OWN_STEP = 0.0051  # s, the longest of Warp's
 SLOTS: tuple[SlotKind, ...] = ("box", "arch", "prism", "cylinder")
 
 
@@ -77,12 +76,16 @@ def test_meshes_of_two_sizes_are_refused():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def steps_of_c() -> Iterator[None]:
-    """Warp's steps are as long as C's, so that states can be compared."""
+def own_step() -> Iterator[float]:
+    """Warp's own longest step, s. Its steps are as long as C's, so that states can be compared."""
     with pytest.MonkeyPatch.context() as patch:
+        own = 0.0
         if importlib.util.find_spec("warp") is not None:
-            patch.setattr("csac_jax.sim.warp_action.STEP", CONFIG.sim.timestep)
-        yield
+            from csac_jax.sim import warp_action
+
+            own = warp_action.STEP
+            patch.setattr(warp_action, "STEP", CONFIG.sim.timestep)
+        yield own
 
 
 @pytest.fixture(scope="module")
@@ -197,10 +200,10 @@ def test_grasps_go_as_in_c():
 
 
 @needs_warp
-def test_longer_steps_end_alike(ran: Ran, monkeypatch: pytest.MonkeyPatch):
+def test_longer_steps_end_alike(ran: Ran, own_step: float, monkeypatch: pytest.MonkeyPatch):
     """Claim: Warp's own steps, a fifth fewer than C's, end as C's do: the same blocks lie or
     hang within 3 mm of where C leaves them, and traces say the same."""
-    monkeypatch.setattr("csac_jax.sim.warp_action.STEP", OWN_STEP)
+    monkeypatch.setattr("csac_jax.sim.warp_action.STEP", own_step)
     physics: Any = _physics("warp")
     assert physics.simulator.substeps == 150
     well = np.array(list(CASES)) != "nan"
