@@ -245,8 +245,12 @@ BENCHES = {
         "bench grasp_depth --episodes 40",
     ),
     "finetune/cpu": (
-        "fine-tuning on 500 recorded grasps of a gripper that opens less; other work on both cores",
+        "fine-tuning on 500 recorded grasps of fingers that open 65 mm; other work on both cores",
         "bench finetune",
+    ),
+    "finetune/cpu-85": (
+        "the same of one that opens 85 mm",
+        "bench finetune --opening-mm 85 --episodes 16",
     ),
     "serve/cpu": ("decisions over HTTP; other work on both cores", "bench serve"),
     "soak/h200": (

@@ -2,11 +2,11 @@
 [--seeds N] [--grasps N] [--opening-mm N] [--episodes N] [--updates N] [--batch N] [--policy SOURCE]
 [--learning-rate X] [--camera above|side]`.
 
-The shipped policy was trained with fingers that open 110 mm. Here they open OPENING-MM (85, as
-those of a Robotiq 2F-85). For each of SEEDS (3): the policy acts through `deploy.Policy` on images
-of MuJoCo's renderer, random10, until GRASPS (500) are recorded as `act --record` does; it learns
-from them as `csac-jax finetune` does; and both policies act in EPISODES (16) other scenes, through
-the same camera. Gains are means over the seeds, with Student's interval.
+The shipped policy was trained with fingers that open 110 mm. Here they open OPENING-MM (65). For
+each of SEEDS (3): the policy acts through `deploy.Policy` on images of MuJoCo's renderer, random10,
+until GRASPS (500) are recorded as `act --record` does; it learns from them as `csac-jax finetune`
+does; and both policies act in EPISODES (24) other scenes, through the same camera. Gains are means
+over the seeds, with Student's interval.
 """
 
 import json
@@ -19,7 +19,7 @@ from csac_jax.render import gl
 from csac_jax.runtime import cache, provenance
 from experiments.bench._options import Parser
 
-COUNTS = {"seeds": 3, "grasps": 500, "opening-mm": 85, "episodes": 16, "updates": 150, "batch": 16}
+COUNTS = {"seeds": 3, "grasps": 500, "opening-mm": 65, "episodes": 24, "updates": 150, "batch": 16}
 
 
 def main(arguments: list[str]) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +15,13 @@ from csac_jax import presets
 from csac_jax.agent import actor_critic, csac, rewards
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import UpdateInfo
-from csac_jax.config import PrioritisedReplay
+from csac_jax.config import Config, PrioritisedReplay
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env
 from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
+from csac_jax.sim import physics as simulation
+from csac_jax.sim.primitives import Action
 from csac_jax.training import step
 from csac_jax.training.step import Program, StepMetrics, TrainState
 from csac_jax.vision.heightmap import Observation
@@ -46,6 +49,12 @@ def copy(state: TrainState) -> TrainState:
     return jax.tree.map(jnp.copy, state)
 
 
+def half_in_reach(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
+    """In place of `physics.reachable`, which is true for a floating hand."""
+    del cfg, height
+    return action.pose[0] < 0.0
+
+
 @pytest.fixture(scope="module")
 def run() -> Run:
     """Three chunks of one compiled program; the warm-up ends in the first."""
@@ -55,7 +64,7 @@ def run() -> Run:
         if event == "/jax/core/compile/backend_compile_duration":
             counted.append(event)
 
-    with jax.debug_key_reuse(True):
+    with jax.debug_key_reuse(True), mock.patch.object(simulation, "reachable", half_in_reach):
         program = step.make(CFG)
         states = [step.init(program)]
         traced = step.compile_chunk(program, T).trace(states[0])
@@ -302,6 +311,15 @@ def test_every_action_is_stored(run):
     done = np.concatenate([m.terminated | m.truncated for m in metrics])[:-1]
     assert not np.all(done)
     np.testing.assert_array_equal(items.next_obs.height[:-1][~done], items.obs.height[1:][~done])
+
+
+def test_actions_out_of_reach_are_counted(run):
+    """Claim: the metrics say which actions the robot could not follow."""
+    size = int(run.states[-1].replay.size)
+    x = np.asarray(run.states[-1].replay.items.action.pose[:size, 0])
+    counted = np.concatenate([metrics.unreachable for metrics in run.metrics])
+    np.testing.assert_array_equal(counted.ravel(), x >= 0.0)
+    assert 0 < counted.sum() < size
 
 
 def test_finished_scenes_are_replaced(run):
