@@ -62,6 +62,7 @@ RUNS = {
     "paper/csac_beta": "the paper's protocol with DenseNet-121",
     "paper/csac_beta-2": "more seeds of it",
     "paper/csac_beta-3": "more seeds of it",
+    "objects/csac_beta": "what `objects` learns on two CPU cores; other work on both",
     "fast/csac_beta": "what `fast` learns on one GPU",
     "fast/long": "three times as many actions",
     "fast/scenes_4096": "twice as many scenes, six times as many actions, a smaller net",

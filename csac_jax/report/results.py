@@ -262,19 +262,29 @@ def world(config: Json) -> tuple[str, str]:
 
 def command(one: RecordedRun | Evaluation, trained: Json | None = None) -> str:
     """The command that makes such a run or evaluation, from what its record says; of a policy of
-    the config `trained`, with the view that it was given in place of its own."""
+    the config `trained`, with the view and the objects that it was given in place of its own."""
     physics, robot = world(one.config)
     if isinstance(one, Evaluation):
         episodes = one.metrics.get("counts", {}).get("episodes")
         asked = f"--policy {one.policy} --suite {one.suite} --episodes {episodes} --seed {one.seed}"
         view = _flags(_view(one.config, trained or one.config))
-        return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}{view}"
+        objects = _objects(one.config, trained or one.config)
+        return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}{objects}{view}"
     preset, algo, changed = one.variant
     flags = _flags(changed)
     seed = f"--seed {one.config.get('seed', 0)} --sim.physics {physics}"
     if robot != SimConfig().robot:
         seed += f" --sim.robot {robot}"
     return f"csac-jax train {preset} --algo {algo} {seed}{flags}"
+
+
+def _objects(config: Json, trained: Json) -> str:
+    """Options of `eval` for a library other than `trained`'s and a split other than its default."""
+    library, split = (config.get("scene", {}).get(name, "") for name in ("objects", "split"))
+    if not library:
+        return ""
+    asked = "" if library == trained.get("scene", {}).get("objects") else f" --objects {library}"
+    return asked if split == "held_out" else f"{asked} --split {split}"
 
 
 def _view(config: Json, trained: Json) -> Iterator[tuple[str, str]]:

@@ -436,6 +436,20 @@ def test_command_of_an_evaluation_gives_its_view_back():
     assert "--camera" not in results.command(one, seen)
 
 
+def test_command_of_an_evaluation_names_its_objects():
+    """Claim: an evaluation's command has the library that is not the policy's, and its split."""
+    scene = {"scene__slots": ["object"], "scene__min_blocks": 1, "scene__split": "all"}
+    trained = _config("csac_beta", 0, **scene, scene__objects="made:1:9")
+    seen = _config("csac_beta", 0, **scene, scene__objects="made:2:9")
+    given = (Path("x"), seen, results.variant(seen), "learned", "pile", "pile", 3)
+    one = results.Evaluation(*given, {"counts": {"episodes": 5}}, {})
+    assert results.command(one, trained).endswith(" --objects made:2:9 --split all")
+    assert results.command(one, seen).endswith(" --split all")
+    seen["scene"]["split"] = "held_out"
+    assert results.command(one, trained).endswith(" --objects made:2:9")
+    assert "--split" not in results.command(one, seen)
+
+
 def test_what_is_missing_is_said(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: an empty folder, runs of different lengths, one of a kind, one not evaluated: one line
     each."""

@@ -99,7 +99,7 @@ def test_an_xla_without_it_is_asked_for_nothing(
     """Claim: where XLA does not know the library, training goes on without it."""
     monkeypatch.setattr(compiler, "LIBRARY", asked)
     assert not compiler.has_library()
-    assert compiler.options(presets.quick()) is None
+    assert compiler.options(presets.quick()) == compiler.LEVEL
 
 
 @pytest.mark.usefixtures("forgotten")
@@ -113,9 +113,10 @@ def test_a_library_that_is_wrong_is_not_used(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.usefixtures("forgotten")
 def test_library_is_for_the_small_net_on_a_cpu(monkeypatch: pytest.MonkeyPatch):
-    """Claim: it is asked for with the small net, not with DenseNet-121, and on no accelerator."""
-    assert compiler.options(presets.quick()) == compiler.LIBRARY
-    assert compiler.options(presets.paper()) is None
+    """Claim: it is asked for with the small net, not with DenseNet-121, and on no accelerator; so
+    is the level, with any net."""
+    assert compiler.options(presets.quick()) == compiler.LIBRARY | compiler.LEVEL
+    assert compiler.options(presets.paper()) == compiler.LEVEL
     compiler.has_library.cache_clear()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert compiler.options(presets.quick()) is None
