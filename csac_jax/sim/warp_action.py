@@ -23,7 +23,7 @@ from csac_jax.scene import layout
 from csac_jax.scene.model import World
 from csac_jax.sim import warp_graph
 
-STEP = 0.0051  # s, longest physics step; outcomes then agree with C's as those of 4 ms do
+STEP = 0.0051  # s, longest physics step; compared with C's in docs/benchmarks/physics-parity.md
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
 FIELDS = {

@@ -51,10 +51,10 @@ def main(arguments: Sequence[str] = ()) -> None:
 
 
 def _shares(cores: int | None) -> list[set[int]]:
-    """Sets of so many cores each, none in two; None is one set of all that this process may use."""
-    every = sorted(os.sched_getaffinity(0))
+    """Sets of so many cores each, none in two; None is one empty set, for any core."""
     if cores is None:
-        return [set(every)]
+        return [set()]
+    every = sorted(os.sched_getaffinity(0))
     if not 1 <= cores <= len(every):
         raise BadArgumentsError(f"bench start: --cores: must be from 1 to {len(every)}")
     firsts = range(0, len(every) - cores + 1, cores)
@@ -71,7 +71,8 @@ def measure(
 
     def one(seed: int) -> dict[str, dict[str, Any]]:
         share = free.get()
-        os.sched_setaffinity(0, share)  # of this thread, and so of the processes that it starts
+        if share:  # of this thread, and so of the processes that it starts
+            os.sched_setaffinity(0, share)
         found = {}
         for name, checkout in checkouts.items():
             found[name] = _run(train, seed, checkout)
@@ -83,8 +84,8 @@ def measure(
         seeds = list(threads.map(one, range(runs)))
     every = {name: [found[name] for found in seeds] for name in checkouts}
     median = {name: _median(times) for name, times in every.items()}
-    result: dict[str, Any] = {"train": train, "cores": len(shares[0]), "side_by_side": len(shares)}
-    result |= {"runs": every, "median": median}
+    result: dict[str, Any] = {"train": train, "runs": every, "median": median}
+    result |= {"cores": len(shares[0]) or None, "side_by_side": len(shares)}
     if "other" in median:
         result["times_sooner"] = {
             part: _ratio(median["other"][part], median["this"][part]) for part in median["this"]
