@@ -2,7 +2,7 @@
 
 On a CPU, XLA has a second library for convolutions, about twice as fast as Eigen at those of the
 small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
-LLVM's second level of optimisation compiles a quarter faster than the third, to as fast a program.
+LLVM's second level of optimisation compiles sooner than the third, to as fast a program.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
