@@ -272,6 +272,7 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str])
     model = copy.copy(model)
     model.opt.timestep = cfg.substeps * cfg.timestep / steps(cfg)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # Warp refuses it
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(own, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
