@@ -21,5 +21,12 @@ def run(arguments: list[str]) -> int:
         return 0
     if name not in scripts:
         raise BadArgumentsError(f"bench: {unknown('benchmark', name, scripts)}")
-    runpy.run_path(str(scripts[name]))["main"](rest)
+    try:
+        script = runpy.run_path(str(scripts[name]))
+    except ModuleNotFoundError as error:
+        raise BadArgumentsError(
+            f"bench {name} needs the module {error.name}; install the extra that brings it, of those "
+            "in pyproject.toml: pip install 'csac-jax[EXTRA]'"
+        ) from None
+    script["main"](rest)
     return 0

@@ -272,7 +272,9 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str])
     model = copy.copy(model)
     model.opt.timestep = cfg.substeps * cfg.timestep / steps(cfg)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
-    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # Warp refuses it
+    # Warp refuses both, which C has with objects: the flag, and dense Jacobians of many blocks.
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(own, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none

@@ -199,6 +199,15 @@ def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: s
     assert message in line
 
 
+def test_benchmark_without_its_extra(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: a benchmark whose package is not installed names it on one line."""
+    monkeypatch.setitem(sys.modules, "warp", None)  # importing it raises ModuleNotFoundError
+    code, line = _fails(capsys, "bench", "warp_action")
+    assert (code, "bench warp_action needs the module warp;" in line) == (2, True)
+
+
 READERS = ["train --resume {}", "eval {}", "export {} p.safetensors", "play --policy {}"]
 
 

@@ -302,6 +302,20 @@ def test_objects_go_as_in_c():
     np.testing.assert_allclose(turned, 1.0, atol=1e-3)
 
 
+@needs_warp
+def test_many_objects_fit_on_warp():
+    """Claim: Warp takes scenes of more objects than its dense matrices hold."""
+    cfg = presets.get("objects").change(
+        scene={"slots": ("object",) * 10, "min_blocks": 10, "objects": "made:0:12"},
+        sim={"physics": "warp"},
+    )
+    world = model.build(cfg.scene, cfg.sim)
+    from csac_jax.sim import warp_action
+
+    placed, _ = warp_action._put(world.model, cfg.sim, 1, warp_action.fields(world))
+    assert placed.nv == 66
+
+
 def _thrown_objects(cfg: Config) -> Scene:
     """Scenes of two objects, others in each, of few parts and of many: at first one falls on the
     other in the air, in the last two both turn and land."""
