@@ -95,8 +95,10 @@ def train(
             how = (cfg, plan, follower, terminal.say, network, learner)
             follower = followers.joined([follower, _checked(monitor.Monitor, *how)])
 
+        begin = step.compile_init(program)
+
         def first_state() -> step.TrainState:
-            state = step.init(program)
+            state = begin()
             return state if start is None else state.replace(learner=start(state.learner))
 
         summary = loop.run(

@@ -31,13 +31,13 @@ C's physics are the fastest for one scene. The paper does not say after how many
 reset in training; 25 is ours. Pushes are labelled by the critic of now (ours): early ones would
 stay "worse" for ever.
 """
-WIDE_NET = {
+SMALL_NET = {
     "stride": 4,
     "subcells": 4,
     "dilations": (1, 2, 1),
-    "stem": 48,
-    "growth": 64,
-    "head": 96,
+    "stem": 32,
+    "growth": 32,
+    "head": 48,
 }
 
 
@@ -49,12 +49,11 @@ def quick() -> Config:
     on a part of the batch, and the net's features lie 28 mm apart, not 14; its maps' cells still
     14, and its layers see as far. What it costs: docs/benchmarks/speed-cpu.md.
     """
-    net = {"stride": 4, "subcells": 2, "dilations": (1, 2, 1), "stem": 32, "growth": 32, "head": 48}
     return Config().change(
         preset="quick",
         scene={"size_jitter": (0.0, 0.0), "density": (600.0, 600.0), "friction": (0.8, 0.8)},
         sim={"physics": "auto"},
-        net=net,
+        net=SMALL_NET | {"subcells": 2},
         target={"gamma": 0.2},
         learn={"actor_batch": 8},
         replay={"end": (1.0, 4.0)},
@@ -62,7 +61,7 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, most scenes packed, 2,048 side by side, for one GPU.
+    """Ten blocks of all eight shapes, most scenes packed, 4,096 side by side, for one GPU.
 
     Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A
     failed grasp costs more than a poor push, half of the random primitives are pushes, and blocks
@@ -70,18 +69,18 @@ def fast() -> Config:
     What it learns so, and otherwise: docs/benchmarks/learning-ablations.md.
     """
     packed = {"pool": 4096, "arranged": 0.75, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)}
-    length = {"actions": 163840, "learning_starts": 4096, "chunk": 2, "save_every": 20}
+    length = {"actions": 327680, "learning_starts": 4096, "chunk": 2, "save_every": 20}
     return TEN_BLOCKS.change(
         preset="fast",
         scene=packed,
         sim={"physics": "auto"},
-        net=WIDE_NET,
+        net=SMALL_NET,
         target={"gamma": 0.2},
         reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
-        explore={"epsilon_primitive": (0.5, 0.2), "push_fraction": 0.5, "decay": 0.9999},
-        learn={"batch": 64, "updates": 64, "augment_shift": 8, "critics": 2, "loss": "squared"},
+        explore={"epsilon_primitive": (0.5, 0.2), "push_fraction": 0.5, "decay": 0.9998},
+        learn={"batch": 64, "updates": 96, "augment_shift": 8, "critics": 2, "loss": "squared"},
         replay={"capacity": 65536, "end": (1.0, 4.0)},
-        train={"scenes": 2048, **length},
+        train={"scenes": 4096, **length},
     )
 
 
@@ -155,7 +154,7 @@ def paper_small() -> Config:
     return PROTOCOL.change(
         preset="paper_small",
         scene={"size_jitter": (0.1, 0.0)},
-        net=WIDE_NET,
+        net=SMALL_NET | {"stem": 48, "growth": 64, "head": 96},
         target={"gamma": 0.2},
         learn={"updates": 1, "augment_shift": 8, "critics": 2, "loss": "squared"},
     )

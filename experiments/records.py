@@ -64,13 +64,15 @@ RUNS = {
     "paper/csac_beta-3": "more seeds of it",
     "objects/csac_beta": "what `objects` learns on two CPU cores; other work on both",
     "fast/csac_beta": "what `fast` learns on one GPU",
-    "fast/long": "three times as many actions",
-    "fast/scenes_4096": "twice as many scenes, six times as many actions, a smaller net",
+    "fast/slow_decay": "exploration that ends later",
+    "fast/scenes_4096": "exploration that ends later, three times as many actions",
+    "fast/scenes_2048": "half the scenes, fewer updates, a net with three times the parameters",
+    "fast/long": "the same, three times as many actions",
     "fast/shipped": "the shipped policy (seed 0) on every suite",
     "fast/camera": "the policy `shipped_camera`, by `--init shipped`",
     "fast/camera_heights": "the same of heights alone, from nothing; stopped at 159,744 actions",
-    "fast/updates_128": "twice as many updates",
-    "fast/small_net": "a net with a third of the parameters",
+    "fast/updates_128": "2,048 scenes, the wide net, 128 updates",
+    "fast/small_net": "the same with the net of `fast`",
     "fast/target": "the target task",
     "fast/target_grasp_only": "the target task without pushes, Grasping-only",
     "fast/target_no_pushes": "the target task without pushes, CSAC-beta",
@@ -80,6 +82,11 @@ RUNS = {
 SEARCHES = ("paper_small",)
 """Presets whose settings were searched."""
 
+_NET = "--net.head 96 --net.growth 64 --net.stem 48"
+_WIDE = f"--train.scenes 2048 --learn.updates 64 {_NET}"
+_FORMER = f"train fast {_WIDE} --train.actions 163840 --explore.decay 0.9999"
+"""What `fast` was when these were recorded."""
+
 BENCHES = {
     "train/xeon-quick": ("time of `quick`, Intel Xeon", "train quick"),
     "train/epyc-quick": ("time of `quick`, AMD EPYC", "train quick"),
@@ -87,37 +94,40 @@ BENCHES = {
     "train/h200-paper-cached": ("the same from the cache", "train paper --train.actions 50"),
     "train/h200-fast-cold": (
         "compilation of `fast` in MJX",
-        "train fast --sim.physics mjx --train.actions 4096",
+        f"train fast --sim.physics mjx --train.actions 4096 {_WIDE}",
     ),
     "train/h200-fast-cached": (
         "the same from the cache",
-        "train fast --sim.physics mjx --train.actions 4096",
+        f"train fast --sim.physics mjx --train.actions 4096 {_WIDE}",
     ),
-    "train/h200-fast-warp": ("a whole run of `fast`", "train fast"),
+    "train/h200-fast-warp": ("a whole run of a wide net in 2,048 scenes", _FORMER),
     "train/h200-fast-4096": (
         "the same, more scenes and a smaller net",
-        "train fast --train.scenes 4096 --net.head 48 --net.growth 32 --net.stem 32",
+        "train fast --train.actions 163840 --learn.updates 64 --explore.decay 0.9999",
     ),
     "train/h200-fast-4096-long": (
         "three times as many actions",
-        "train fast --train.scenes 4096 --train.actions 491520 --net.head 48 --net.growth 32 "
-        "--net.stem 32",
+        "train fast --train.actions 491520 --learn.updates 64 --explore.decay 0.9999",
     ),
     "train/h200-fast-8192-long": (
         "more scenes, larger updates",
         "train fast --train.scenes 8192 --train.actions 491520 --learn.updates 128 "
-        "--learn.batch 128 --net.head 48 --net.growth 32 --net.stem 32",
+        "--learn.batch 128 --explore.decay 0.9999",
     ),
-    "train/h100-fast": ("a whole run of `fast` in steps of 5.1 ms", "train fast"),
+    "train/h100-fast": ("a wide net in 2,048 scenes, in steps of 5.1 ms", _FORMER),
     "train/h100-fast-4ms": (
         "the same in steps of 4 ms, with STEP = 0.004; ten cores were busy",
-        "train fast",
+        _FORMER,
     ),
     "train/h100-fast-4096": (
         "the first, more scenes and a smaller net",
-        "train fast --net.head 48 --net.growth 32 --net.stem 32 --learn.updates 96 "
-        "--train.scenes 4096 --train.actions 327680",
+        "train fast --explore.decay 0.9999",
     ),
+    "train/h100-fast-target": (
+        "the target task with a wide net in 2,048 scenes; a busy host",
+        f"train fast --task.kind target {_WIDE} --train.actions 61440 --explore.decay 0.9999",
+    ),
+    "doctor/h100": ("Warp's kernels of `fast`, built from nothing", "doctor --build"),
     "start/xeon-quick": (
         "how soon `quick` learns, and did in commit 71c8723; five seeds side by side",
         "bench start quick --runs 5 --cores 2 --other CHECKOUT",
@@ -126,6 +136,8 @@ BENCHES = {
         "an action on Warp, kernel by kernel",
         "bench warp_action --repeats 3 --details",
     ),
+    "warp_action/h100-16384": ("16,384 scenes", "bench warp_action --scenes 16384"),
+    "warp_action/h100-blocks": ("5 and 20 blocks", "bench warp_action --blocks 5 20"),
     "warp_action/h100-lanes": (
         "halves and quarters of the scenes on CUDA streams of their own; no longer in the code",
         "bench warp_action --lanes 2 4 --repeats 3",
@@ -157,8 +169,8 @@ BENCHES = {
         "bench step quick --repeats 3 --curve capacity --smallest 1024 --largest 16384",
     ),
     "step/h200-fast": (
-        "a step of `fast` on Warp and its stages",
-        "bench step fast --physics warp --repeats 3",
+        "a step of a wide net in 2,048 scenes on Warp, and its stages",
+        f"bench step fast --physics warp --repeats 3 {_WIDE}",
     ),
     "sweep/epyc-quick": (
         "seeds of `quick` one after another",
@@ -179,25 +191,25 @@ BENCHES = {
     "sweep/h200-fast-seeds": (
         "seeds over GPUs, 512 scenes each, 128 updates",
         "bench sweep fast --physics mjx --steps 1 --devices 1 2 4 --seeds 4 "
-        "--train.scenes 512 --learn.updates 128",
+        f"--train.scenes 512 --learn.updates 128 {_NET}",
     ),
     "sweep/h200-fast-seeds2048": (
         "seeds over GPUs, 2,048 scenes each",
-        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 4",
+        f"bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 4 {_WIDE}",
     ),
     "sweep/h200-fast-seeds8": (
         "eight seeds over GPUs",
-        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 8",
+        f"bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 8 {_WIDE}",
     ),
     "sweep/h200-fast-scenes": (
         "scenes of one seed over GPUs, 128 updates",
         "bench sweep fast --physics mjx --steps 1 --devices 1 2 4 --seeds 1 "
-        "--shard scenes --learn.updates 128",
+        f"--shard scenes --train.scenes 2048 --learn.updates 128 {_NET}",
     ),
     "sweep/h200-fast-scenes8192": (
         "8,192 scenes of one seed over GPUs",
         "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 1 "
-        "--shard scenes --train.scenes 8192",
+        f"--shard scenes --train.scenes 8192 --learn.updates 64 {_NET}",
     ),
     "act/cpu": ("dense Q maps of DenseNet-121", "bench act --pixels 64 --states 4 --repeats 7"),
     "act/h200": ("dense Q maps of DenseNet-121 and VPG's way in PyTorch", "bench act"),

@@ -25,8 +25,8 @@ def run(arguments: list[str]) -> int:
         script = runpy.run_path(str(scripts[name]))
     except ModuleNotFoundError as error:
         raise BadArgumentsError(
-            f"bench {name} needs the module {error.name}; install the extra that brings it, of those "
-            "in pyproject.toml: pip install 'csac-jax[EXTRA]'"
+            f"bench {name} needs the module {error.name}; install the extra of pyproject.toml that "
+            "brings it: pip install 'csac-jax[EXTRA]'"
         ) from None
     script["main"](rest)
     return 0

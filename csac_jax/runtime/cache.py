@@ -10,6 +10,7 @@ import functools
 import hashlib
 import os
 import platform
+import threading
 from pathlib import Path
 
 import jax
@@ -23,6 +24,7 @@ _ASKED = "/jax/compilation_cache/compile_requests_use_cache"
 _HIT = "/jax/compilation_cache/cache_hits"
 _PROCESSOR = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU part")
 _events: collections.Counter[str] = collections.Counter()  # of JAX's, in this process
+_hits: collections.Counter[int] = collections.Counter()  # programs found, by thread
 
 
 def enable() -> Path | None:
@@ -65,8 +67,8 @@ def _compress_with_checksum() -> None:
 
 
 def hits() -> int:
-    """Programs found in the cache since `enable`, by this process."""
-    return _events[_HIT]
+    """Programs found in the cache since `enable`, by this thread."""
+    return _hits[threading.get_ident()]
 
 
 @functools.cache
@@ -78,6 +80,7 @@ def _on_event(event: str, **_: object) -> None:
     """Counts JAX's events; silences XLA's C++ log when the first program is looked for on a CPU,
     unless the user has chosen a level: it has a spurious warning for each. Failures still raise."""
     _events[event] += 1
+    _hits[threading.get_ident()] += event == _HIT
     first = event == _ASKED and _events[event] == 1
     if first and jax.default_backend() == "cpu" and "JAX_LOGGING_LEVEL" not in os.environ:
         jax.config.update("jax_logging_level", "CRITICAL")

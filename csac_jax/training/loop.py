@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -51,6 +52,15 @@ class Progress(NamedTuple):
     grasps: list[int]  # the last GRASP_WINDOW grasps, oldest first: 1 for a lift, else 0
 
 
+class _Start(NamedTuple):
+    """Where a run begins. XLA compiles what makes the state while Python traces the chunk."""
+
+    step: int
+    progress: Progress
+    shapes: Any  # of the state
+    state: Future[Any]
+
+
 def total_steps(cfg: Config) -> int:
     """Training steps of a run, rounded up to whole chunks, so that one program serves all."""
     return math.ceil(cfg.train.steps / cfg.train.chunk) * cfg.train.chunk
@@ -69,22 +79,22 @@ def run(
 ) -> Summary:
     """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
 
-    Args: run_dir, exists if `resume`, else is made; init, gives the first state, a pytree with
-    `step` [] int32; compile_chunk, takes the number of steps and gives a jitted function state ->
-    (state, StepMetrics [T, ...]) that may use up its argument; at, the step to resume from, by
-    default the newest sound one; callback, which follows the run. Raises TrainingError on a loss or
-    parameter that is not finite, CheckpointError if there is nothing sound to resume from or the
-    disc is full, LockedError if another process trains in `run_dir`.
+    Args: run_dir, exists if `resume`, else is made; init, gives the first state in a thread of its
+    own, a pytree with `step` [] int32 that is 0; compile_chunk, takes the number of steps and gives
+    a jitted function state -> (state, StepMetrics [T, ...]) that may use up its argument; at, the
+    step to resume from, by default the newest sound one; callback, which follows the run. Raises
+    TrainingError on a loss or parameter that is not finite, CheckpointError if there is nothing
+    sound to resume from or the disc is full, LockedError if another process trains in `run_dir`.
     """
     checkpoint.check_path(run_dir)
     if not resume:
         run_dir.mkdir(parents=True)
-    with lock.exclusive(run_dir):
-        state, progress = _begin(cfg, run_dir, init, resume, at)
-        callback.begin(RunInfo(cfg, run_dir, int(state.step)))
+    with lock.exclusive(run_dir), ThreadPoolExecutor(1) as thread:
+        start = _begin(cfg, run_dir, init, resume, at, thread)
+        callback.begin(RunInfo(cfg, run_dir, start.step))
         how = (compile_chunk, reporter, stop, resume, callback)
         try:
-            summary = _go_on(cfg, run_dir, state, progress, *how)
+            summary = _go_on(cfg, run_dir, start, *how)
         except Exception:
             callback.end(None)
             raise
@@ -95,22 +105,23 @@ def run(
 def _go_on(
     cfg: Config,
     run_dir: Path,
-    state: Any,
-    progress: Progress,
+    start: _Start,
     compile_chunk: Callable[[int], Any],
     reporter: Reporter,
     stop: Stop,
     resumed: bool,
     callback: Callback,
 ) -> Summary:
-    """Trains from this state on, see `run`; nobody else writes in the folder."""
-    step, total, scenes = int(state.step), total_steps(cfg), cfg.train.scenes
+    """Trains from there on, see `run`; nobody else writes in the folder."""
+    step, progress = start.step, start.progress
+    total, scenes = total_steps(cfg), cfg.train.scenes
     if resumed:
         reporter.say(f"resumed {run_dir} at step {step} ({step * scenes} actions)")
     chunk, compile_seconds, doubted, saved = None, 0.0, False, step if resumed else None
     while step < total and stop.signal is None:
         if chunk is None:
-            chunk, compile_seconds = compile_program(cfg, compile_chunk, state, reporter)
+            chunk, compile_seconds = compile_program(cfg, compile_chunk, start.shapes, reporter)
+            state = start.state.result()
             continue  # a signal may have come meanwhile
         state, metrics, seconds = timed(chunk, state)
         step += cfg.train.chunk
@@ -126,6 +137,7 @@ def _go_on(
             saved = _save(cfg, run_dir, step, state, progress)
         callback.chunk(record, state)
     if saved != step:
+        state = start.state.result() if chunk is None else state
         _save(cfg, run_dir, step, state, progress)
     stopped = f"stopped and saved at step {step}; go on with: csac-jax train --resume {run_dir}"
     done = f"done: {step * scenes} actions; saved in {run_dir}"
@@ -137,19 +149,27 @@ def _go_on(
 
 
 def _begin(
-    cfg: Config, run_dir: Path, init: Callable, resume: bool, at: int | None
-) -> tuple[Any, Progress]:
-    """The first state, or that of a checkpoint, to which the log is cut."""
+    cfg: Config,
+    run_dir: Path,
+    init: Callable[[], Any],
+    resume: bool,
+    at: int | None,
+    thread: ThreadPoolExecutor,
+) -> _Start:
+    """The first state, on its way, or that of a checkpoint, to which the log is cut."""
     if resume:
         check_resumable(cfg, run_dir, at)
     files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
-    if resume:
-        state, extra = checkpoint.restore(run_dir, jax.eval_shape(init), at)
-        checkpoint.set_aside(run_dir, at)
-    else:
-        state, extra = init(), Progress(0.0, [])._asdict()
-    files.truncate_log(run_dir / files.METRICS, int(state.step))
-    return state, Progress(extra["seconds"], extra["grasps"])
+    shapes = jax.eval_shape(init)
+    if not resume:
+        files.truncate_log(run_dir / files.METRICS, 0)
+        return _Start(0, Progress(0.0, []), shapes, thread.submit(init))
+    state, extra = checkpoint.restore(run_dir, shapes, at)
+    checkpoint.set_aside(run_dir, at)
+    step = int(state.step)
+    files.truncate_log(run_dir / files.METRICS, step)
+    progress = Progress(extra["seconds"], extra["grasps"])
+    return _Start(step, progress, shapes, thread.submit(lambda: state))
 
 
 def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress) -> int:

@@ -5,6 +5,7 @@ Observe, act, simulate, replace finished scenes, remember, learn. E = scenes, B 
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -284,7 +285,12 @@ def _keys(key: jax.Array, num: int) -> jax.Array:
 
 def init(program: Program) -> TrainState:
     """The state before the first step; a fixed point of types."""
-    return jax.jit(lambda: init_state(program, jax.random.key(program.cfg.seed)))()
+    return compile_init(program)()
+
+
+def compile_init(program: Program) -> Callable[[], TrainState]:
+    """A jitted `init`; its shapes and its state are of one trace."""
+    return jax.jit(lambda: init_state(program, jax.random.key(program.cfg.seed)))
 
 
 def init_state(

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,23 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run_dir = tmp_path_factory.mktemp("whole") / "run"
     _run(run_dir, Listener(), Fake())
     return run_dir
+
+
+def test_state_is_made_beside_the_compilation(tmp_path: Path):
+    """Claim: the first state is made while the chunk is compiled, not before."""
+    compiling, waited, listener, fake = threading.Event(), [], Listener(), Fake()
+
+    def init() -> State:
+        if threading.current_thread() is not threading.main_thread():
+            waited.append(compiling.wait(20.0))
+        return _init()
+
+    def compile_chunk(num_steps: int) -> Any:
+        compiling.set()
+        return fake.compile_chunk(num_steps)
+
+    loop.run(CFG, tmp_path / "run", init, compile_chunk, listener, listener.stop)
+    assert waited == [True]
 
 
 def test_run_ends_complete(tmp_path: Path):
