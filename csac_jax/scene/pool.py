@@ -1,7 +1,7 @@
 """The scenes that an environment draws from: packed arrangements, and blocks that were dropped.
 
-C MuJoCo settles those on all cores, bit-identical for any number of threads. They are cached on
-disk; those of the preset `quick` come with the package. `stream` numbers the stream of random
+C MuJoCo settles those on all cores, bit-identical for any number of threads. Both are cached on
+disk; the scenes of the preset `quick` come with the package. `stream` numbers the stream of random
 numbers: training takes 0, evaluation others.
 """
 
@@ -28,7 +28,7 @@ from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World
 
 TRAIN_STREAM = 0
-_VERSION = 5  # raise when the meaning of a cached pool changes
+_VERSION = 5  # raise when the meaning or the making of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
@@ -50,8 +50,9 @@ def scenes(cfg: Config, stream: int, count: int | None = None) -> Scene:
     arranged = round(cfg.scene.arranged * each)
     parts = [settled(cfg, stream, each - arranged)] if arranged < each else []
     if arranged:
-        number, extent = arranged * block_counts, cfg.heightmap.extent
-        parts.append(arrange.arrangements(cfg.scene, extent, stream, number))
+        how = (cfg.scene, cfg.heightmap.extent, stream, arranged * block_counts)
+        name = _digest(cfg, stream, how[-1], "arranged")
+        parts.append(_stored(name, lambda: arrange.arrangements(*how)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
@@ -68,20 +69,31 @@ def settled(
     Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
-    name = f"{_digest(cfg, scene, stream, count, poured, packed)}.npz"
-    cache = cache_folder.private("pools")
+
+    def settle() -> Scene:
+        world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
+        fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
+        rng = np.random.default_rng([stream, 20221])
+        draw = _stand if packed else _drop
+        drops = [
+            functools.partial(draw, scene, rng, number)
+            for number in range(scene.min_blocks, len(scene.slots) + 1)
+        ]
+        parts = [_settle(world, drop, fall, count, poured or packed) for drop in drops]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    how = [*["poured"] * poured, *["packed"] * packed]
+    return _stored(_digest(cfg, stream, count, *how), settle)
+
+
+def _stored(digest: str, make: Callable[[], Scene]) -> Scene:
+    """The scenes of that digest: those that come with the package, or of the cache, or new ones."""
+    name, cache = f"{digest}.npz", cache_folder.private("pools")
     path = cache and cache / name
     for stored in (shipped() / name, path):
         if stored and (known := _read(stored)) is not None:
             return known
-    world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
-    fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
-    rng = np.random.default_rng([stream, 20221])
-    block_counts = range(scene.min_blocks, len(scene.slots) + 1)
-    draw = _stand if packed else _drop
-    drops = [functools.partial(draw, scene, rng, num) for num in block_counts]
-    parts = [_settle(world, drop, fall, count, poured or packed) for drop in drops]
-    scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    scenes = make()
     if path:
         _write(path, scenes)
     return scenes
@@ -221,17 +233,14 @@ def shipped() -> Path:
     return assets() / "pools"
 
 
-def _digest(
-    cfg: Config, scene: SceneConfig, stream: int, count: int, poured: bool, packed: bool
-) -> str:
-    """Name of a pool: hash of everything that decides its content."""
+def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
+    """Hash of everything that decides the content of a pool; `how` its scenes are made."""
+    scene = dataclasses.replace(cfg.scene, arranged=0.0)
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     if scene.has_objects:  # what is in a library counts, not where it lies
         scene = dataclasses.replace(scene, objects=stock.library(scene).sha256)
     relevant = (_VERSION, mujoco.__version__, repr(scene), *numbers)
-    content = hashlib.sha256(
-        repr((*relevant, *(["poured"] * poured), *(["packed"] * packed))).encode()
-    )
+    content = hashlib.sha256(repr((*relevant, *how)).encode())
     for name in ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml"):
         content.update((assets() / name).read_bytes())
     return content.hexdigest()[:32]

@@ -133,6 +133,19 @@ def test_streams_share_no_scene(small: Config):
     assert len({scene.tobytes() for scenes in both for scene in scenes}) == 32
 
 
+def test_arrangements_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: packed scenes, too, are made once; another stream or number has its own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cfg = presets.get("fast").change(scene={"arranged": 1.0, "pool": 6})
+    anew = pool.scenes(cfg, 0)
+    with monkeypatch.context() as once:
+        once.setattr(pool.arrange, "arrangements", None)  # must not be called
+        jax.tree.map(np.testing.assert_array_equal, anew, pool.scenes(cfg, 0))
+    others = [pool.scenes(cfg, 1), pool.scenes(cfg, 0, 5)]
+    assert [len(other.position) for other in others] == [6, 5]
+    assert not np.array_equal(others[0].position, anew.position)
+
+
 @pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
 def test_damaged_cache_is_settled_anew(small: Config, tmp_path: Path, damage: str):
     """Claim: a cache file that was cut short or changed is noticed, and its scenes are settled
