@@ -165,7 +165,7 @@ class SimConfig(Section, section="sim"):
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
-    `warp` on one CUDA device where it is known to be faster, else `mjx`; for objects always `c`."""
+    `warp` on one CUDA device where it is known to be faster, else `mjx`, or `c` for objects."""
     robot: RobotKind = "hand"
     """`hand`: the gripper alone, floating, for training. `ur5`, `ur5e`: on that arm."""
     gripper: str = "rg2"

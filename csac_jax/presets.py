@@ -103,7 +103,7 @@ def objects() -> Config:
             "friction": SceneConfig.friction,
         },
         task={"max_actions": 20},
-        sim={"clearance": 0.004},
+        sim={"clearance": 0.004, "contacts": 128},
         reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
         explore={"decay": 0.9995},
         learn={"augment_shift": 8},

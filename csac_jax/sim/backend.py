@@ -5,7 +5,7 @@ import importlib.util
 
 import jax
 
-from csac_jax.config import Config
+from csac_jax.config import Config, PhysicsKind
 
 WARP_SCENES = 1024
 """Scenes at a time, of all runs, from which Warp was measured to be faster."""
@@ -16,12 +16,11 @@ def resolve(cfg: Config, devices: int = 1, runs: int = 1) -> Config:
 
     `runs` configs of this kind share one program. C MuJoCo serves a single CPU device, where it
     is several times as fast as MJX. Warp serves a single CUDA device where it was measured to be
-    faster, is installed and can do the scene. MJX serves the rest, and C objects.
+    faster, is installed and can do the scene. MJX serves the rest, but C objects.
     """
     if cfg.sim.physics != "auto":
         return cfg
-    if cfg.scene.has_objects:
-        return cfg.change(sim={"physics": "c"})  # Warp's speed with them is not known
+    others: PhysicsKind = "c" if cfg.scene.has_objects else "mjx"
     platform = jax.default_backend() if devices == 1 else None
     if platform == "cpu":
         return cfg.change(sim={"physics": "c"})
@@ -29,4 +28,4 @@ def resolve(cfg: Config, devices: int = 1, runs: int = 1) -> Config:
     if faster_on_warp and importlib.util.find_spec("warp") is not None:
         with contextlib.suppress(ValueError):  # the config refuses scenes that Warp cannot do
             return cfg.change(sim={"physics": "warp"})
-    return cfg.change(sim={"physics": "mjx"})
+    return cfg.change(sim={"physics": others})

@@ -67,6 +67,18 @@ def test_choice(
         assert backend.resolve(cfg, 1, 2).sim.physics == "warp"
 
 
+@pytest.mark.parametrize(
+    ("platform", "scenes", "chosen"), [("gpu", 1024, "warp"), ("gpu", 8, "c"), ("cpu", 1024, "c")]
+)
+def test_choice_for_objects(monkeypatch: pytest.MonkeyPatch, platform, scenes, chosen):
+    """Claim: objects are on Warp in many scenes on one GPU, else in C MuJoCo; never in MJX."""
+    monkeypatch.setattr(backend.jax, "default_backend", lambda: platform)
+    monkeypatch.setattr(backend.importlib.util, "find_spec", lambda name: object())
+    cfg = presets.get("objects").change(train={"scenes": scenes}, replay={"capacity": 2048})
+    assert backend.resolve(cfg).sim.physics == chosen
+    assert backend.resolve(cfg, 2).sim.physics == "c"
+
+
 def test_other_choices_stay():
     """Claim: what the user has chosen stays."""
     for kind in ("mjx", "warp", "c"):
