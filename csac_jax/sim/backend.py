@@ -16,7 +16,7 @@ def resolve(cfg: Config, devices: int = 1, runs: int = 1) -> Config:
 
     `runs` configs of this kind share one program. C MuJoCo serves a single CPU device, where it
     is several times as fast as MJX. Warp serves a single CUDA device where it was measured to be
-    faster, is installed and can do the scene. MJX serves the rest, but C objects.
+    faster, is installed and can do the scene. The rest goes to MJX, with objects to C.
     """
     if cfg.sim.physics != "auto":
         return cfg
