@@ -3,10 +3,11 @@
 python -m tests.faults.toy_cli train smoke ...
 """
 
+import functools
+import sys
+from collections.abc import Callable
+
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
-
-import sys  # isort: skip
-
 from csac_jax import cli
 from csac_jax.config import Config
 from csac_jax.training import memory, step
@@ -19,8 +20,8 @@ def _make(cfg: Config, **_: object) -> Config:
     return cfg
 
 
-def _init(cfg: Config) -> toy.State:
-    return toy.first_state(cfg.seed)
+def _compile_init(cfg: Config) -> Callable[[], toy.State]:
+    return functools.partial(toy.first_state, cfg.seed)
 
 
 def _compile_chunk(cfg: Config, num_steps: int) -> object:
@@ -28,6 +29,6 @@ def _compile_chunk(cfg: Config, num_steps: int) -> object:
 
 
 if __name__ == "__main__":
-    step.make, step.init, step.compile_chunk = _make, _init, _compile_chunk  # type: ignore
+    step.make, step.compile_init, step.compile_chunk = _make, _compile_init, _compile_chunk  # type: ignore
     memory.check = lambda *_: None  # type: ignore
     sys.exit(cli.main(sys.argv[1:]))
