@@ -179,7 +179,7 @@ class SimConfig(Section, section="sim"):
     grasp_phases: tuple[int, int, int] = _bounded((60, 50, 80), 1)
     """Substeps of a grasp: descend, close the fingers, lift."""
     geom_pairs: int = _bounded(12, 1)  # Geom pairs examined per collision function, nearest first.
-    contacts: int = _bounded(48, 1)  # Contacts that MJX keeps per step, deepest first.
+    contacts: int = _bounded(48, 1)  # Contacts that MJX and Warp keep per step.
 
     @property
     def substeps(self) -> int:

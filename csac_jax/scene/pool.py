@@ -23,12 +23,12 @@ from csac_jax import cache_folder
 from csac_jax.assets import assets
 from csac_jax.config import Config, SceneConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import arrange, blocks, layout, model, stock
+from csac_jax.scene import arrange, blocks, families, layout, model, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World
 
 TRAIN_STREAM = 0
-_VERSION = 5  # raise when the meaning or the making of a cached pool changes
+_VERSION = 5  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
@@ -241,8 +241,10 @@ def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
         scene = dataclasses.replace(scene, objects=stock.library(scene).sha256)
     relevant = (_VERSION, mujoco.__version__, repr(scene), *numbers)
     content = hashlib.sha256(repr((*relevant, *how)).encode())
-    for name in ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml"):
-        content.update((assets() / name).read_bytes())
+    code = [arrange.__file__, families.__file__] if "arranged" in how else []
+    bodies = ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml")
+    for path in (*(assets() / name for name in bodies), *map(Path, code)):
+        content.update(path.read_bytes())
     return content.hexdigest()[:32]
 
 

@@ -134,7 +134,7 @@ def test_streams_share_no_scene(small: Config):
 
 
 def test_arrangements_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Claim: packed scenes, too, are made once; another stream or number has its own."""
+    """Claim: packed scenes, too, are made once; another stream, number or code has its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     cfg = presets.get("fast").change(scene={"arranged": 1.0, "pool": 6})
     anew = pool.scenes(cfg, 0)
@@ -143,6 +143,11 @@ def test_arrangements_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     for stream, count in ((1, 6), (0, 5)):
         with pytest.raises(TypeError):
             pool.scenes(cfg, stream, count)
+    changed = tmp_path / "families.py"
+    changed.write_text("")
+    monkeypatch.setattr(pool.families, "__file__", str(changed))
+    with pytest.raises(TypeError):
+        pool.scenes(cfg, 0)
 
 
 @pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
