@@ -2,7 +2,7 @@
 [--warp]`.
 
 An action, with the observation after it, and an observation alone, of ten blocks of the preset
-`fast`, of ten of our own shapes, and of ten of those with seven to ten convex parts. C MuJoCo, or
+`fast`, of ten of our own shapes, and of ten of those with as many convex parts each. C MuJoCo, or
 Warp with room for three times as many contacts of objects; one grasp above a block in each of
 `scenes` poured scenes side by side. Calls alternate and the median counts. `overflows` counts the
 substeps that may have lost contacts.
@@ -29,20 +29,25 @@ from experiments.bench._options import timed
 from experiments.bench._timing import medians
 
 SHAPES = 200
+PARTS = ((1, 1), (2, 3), (4, 6), (7, 10))  # fewest and most convex parts of an object, a row each
 SETTLED = 64  # scenes, then the same again
 
 
 def _configs(folder: Path, kind: PhysicsKind) -> dict[str, Config]:
     blocks = presets.get("fast").change(scene={"arranged": 0.0}, sim={"physics": kind})
-    made = families.draw(0, SHAPES)
-    library.save(folder / "parts", [one for one in made if 7 <= len(one.parts) <= 10])
     held: dict[str, Any] = {"slots": ("object",) * 10, "split": "all"}
     roomy = blocks.change(sim={"contacts": 3 * blocks.sim.contacts})
-    return {
+    configs = {
         "blocks": blocks,
         "objects": roomy.change(scene={**held, "objects": f"made:0:{SHAPES}"}),
-        "objects_of_7_to_10_parts": roomy.change(scene={**held, "objects": str(folder / "parts")}),
     }
+    made = families.draw(0, SHAPES)
+    for low, high in PARTS:
+        path = folder / f"{low}_to_{high}"
+        library.save(path, [one for one in made if low <= len(one.parts) <= high])
+        name = f"objects_of_{low}_to_{high}_parts"
+        configs[name] = roomy.change(scene={**held, "objects": str(path)})
+    return configs
 
 
 def _calls(cfg: Config, scenes: int) -> dict[str, Callable[[], Any]]:
