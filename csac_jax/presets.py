@@ -69,7 +69,7 @@ def fast() -> Config:
     What it learns so, and otherwise: docs/benchmarks/learning-ablations.md.
     """
     packed = {"pool": 4096, "arranged": 0.75, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)}
-    length = {"actions": 327680, "learning_starts": 4096, "chunk": 2, "save_every": 20}
+    length = {"actions": 655360, "learning_starts": 4096, "chunk": 2, "save_every": 20}
     return TEN_BLOCKS.change(
         preset="fast",
         scene=packed,

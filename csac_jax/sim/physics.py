@@ -49,6 +49,12 @@ def make(world: World, cfg: SimConfig) -> Physics:
     return PHYSICS[cfg.physics](world, cfg)
 
 
+def prepare(physics: Physics, scenes: int) -> None:
+    """Does ahead, maybe in another thread, what else delays the first action of so many scenes."""
+    if isinstance(physics, warp_physics.WarpPhysics):
+        physics.prepare(scenes)
+
+
 def execute(
     physics: Physics, cfg: Config, scene: Scene, height: jax.Array, action: Action
 ) -> tuple[Scene, Trace, Plan]:

@@ -9,6 +9,7 @@ launched until the primitive is over.
 import copy
 import inspect
 import math
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -62,6 +63,7 @@ _TRACE = {  # leaves of `outcome.Trace`; gaps are positions of the finger's join
 }
 
 _STOPPED_EARLY = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS  # by design
+_ONE_AT_A_TIME = threading.Lock()  # threads that prepare scenes: `warp_graph` patches Warp
 _LOST_CONTACTS = int(mjw.OverflowType.ALL & ~_STOPPED_EARLY)
 
 wp.config.log_level = wp.LOG_WARNING  # not a line for each kernel
@@ -298,7 +300,7 @@ class Simulator:
     def __init__(self, world: World, cfg: SimConfig) -> None:
         self.substeps = steps(cfg)
         self.batches: dict[tuple[Any, int], Batch] = {}
-        """By device and scenes; made by the first action of so many scenes."""
+        """By device and scenes; made by the first action of so many scenes, or ahead of it."""
         self._world, self._cfg = world, cfg
         self._arguments = {**fields(world), **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
@@ -321,9 +323,11 @@ class Simulator:
         """What computes so many scenes on the current device; minutes pass where kernels are to be
         built."""
         key = (wp.get_device().alias, scenes)
-        if key not in self.batches:
-            self.batches[key] = Batch(self._world, self._cfg, scenes)
-        return self.batches[key]
+        with _ONE_AT_A_TIME:
+            if key not in self.batches:
+                self.batches[key] = Batch(self._world, self._cfg, scenes)
+                wp.synchronize_device()  # others may use it on another stream
+            return self.batches[key]
 
     def _run(self, *arrays: wp.array) -> None:
         count = len(self._arguments)

@@ -5,6 +5,7 @@ import functools
 import importlib.util
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -127,6 +128,22 @@ def test_scripted_primitives_go_as_in_c(ran: Ran):
     assert trace_c.touched.any()
     assert trace_c.held.any()
     assert not trace.contact_overflow.any()
+
+
+@needs_warp
+def test_what_was_prepared_ahead_is_used(ran: Ran, monkeypatch: pytest.MonkeyPatch):
+    """Claim: an action of as many scenes as a thread has prepared prepares nothing, and goes like
+    one that was not prepared."""
+    from csac_jax.sim import warp_action
+
+    physics = _physics("warp")
+    scenes = len(ran.joints.reachable)
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(simulation.prepare, physics, scenes).result()
+    monkeypatch.setattr(warp_action, "Batch", None)
+    after, trace = jax.jit(jax.vmap(physics.run))(ran.scene, ran.joints)
+    np.testing.assert_allclose(after.position, ran.warp[0].position, atol=1e-6)
+    np.testing.assert_array_equal(trace.touched, ran.warp[1].touched)
 
 
 @needs_warp
