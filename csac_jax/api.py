@@ -190,12 +190,15 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
         return lambda state: actor_critic.with_trunk(state, trunk)
     policy = policies.load(source)
     assert isinstance(policy, LearnedPolicy)
-    if leaves.layout(policy.params) != leaves.layout(actor_critic.abstract_params(cfg)):
+    params, wanted = policy.params, actor_critic.abstract_params(cfg)
+    if cfg.task.kind == "target":
+        params = actor_critic.with_target_input(params, wanted)
+    if leaves.layout(params) != leaves.layout(wanted):
         raise SettingsError(
             f"--init {source}: its networks are not those of these settings; "
             "leave out --net, --learn.critics and --task.kind"
         )
-    return lambda state: actor_critic.with_params(state, policy.params)
+    return lambda state: actor_critic.with_params(state, params)
 
 
 def with_networks_of(cfg: Config, source: str | Path) -> Config:

@@ -68,9 +68,12 @@ RUNS = {
     "objects/from_shipped_gpu": "by `--init shipped` on a GPU; stopped at 278,528 actions",
     "objects/oracle": "a planner that reads the objects' poses",
     "fast/csac_beta": "what `fast` learns on one GPU",
-    "fast/slow_decay": "exploration that ends later",
-    "fast/scenes_4096": "exploration that ends later, three times as many actions",
-    "fast/scenes_2048": "half the scenes, fewer updates, a net with three times the parameters",
+    "fast/short": "half as many actions",
+    "fast/half_rate": "half the learning rate",
+    "fast/scenes_8192": "twice as many scenes, hence half as many updates",
+    "fast/slow_decay": "half as many actions, exploration that ends later",
+    "fast/scenes_4096": "exploration that ends later, half as many actions again",
+    "fast/scenes_2048": "half the scenes, fewer actions, a net with three times the parameters",
     "fast/long": "the same, three times as many actions",
     "fast/shipped": "the shipped policy (seed 0) on every suite",
     "fast/camera": "the policy `shipped_camera`, by `--init shipped`",
@@ -125,11 +128,23 @@ BENCHES = {
     ),
     "train/h100-fast-4096": (
         "the first, more scenes and a smaller net",
-        "train fast --explore.decay 0.9999",
+        "train fast --train.actions 327680 --explore.decay 0.9999",
     ),
     "train/h100-fast-target": (
-        "the target task with a wide net in 2,048 scenes; a busy host",
-        f"train fast --task.kind target {_WIDE} --train.actions 61440 --explore.decay 0.9999",
+        "the target task",
+        "train fast --task.kind target --train.actions 61440",
+    ),
+    "train/h100-fast-alone": (
+        "a process, nothing beside it",
+        "train fast --seed 3 --train.actions 122880",
+    ),
+    "train/h100-fast-pair-0": (
+        "with CUDA_VISIBLE_DEVICES=0, at the same time as the next",
+        "train fast --seed 4 --train.actions 122880",
+    ),
+    "train/h100-fast-pair-1": (
+        "with CUDA_VISIBLE_DEVICES=1",
+        "train fast --seed 4 --train.actions 122880",
     ),
     "doctor/h100": ("Warp's kernels of `fast`, built from nothing", "doctor --build"),
     "start/xeon-quick": (
@@ -255,6 +270,10 @@ BENCHES = {
         "what search between cells lifts; RUN by `train quick --net.kind offset --cem.start actor "
         "--sim.physics c --seed 20`",
         "bench between_cells RUN",
+    ),
+    "objects/h100": (
+        "objects against blocks on Warp, by convex parts an object",
+        "bench objects --warp --scenes 1024",
     ),
     "objects/cpu": ("objects against blocks; much other work on both cores", "bench objects"),
     "grasp_depth/cpu": (

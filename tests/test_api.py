@@ -24,6 +24,7 @@ from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
 from csac_jax.training import step
 from csac_jax.training.callbacks import Record
+from csac_jax.vision.heightmap import Observation
 
 SMOKE = presets.smoke().change(sim={"physics": "c"})  # compiles in half of the time
 
@@ -109,6 +110,25 @@ def test_first_states_of_several_runs_have_the_networks_of_the_policy(tmp_path: 
         _assert_starts_from(own, params, fresh)
 
 
+def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
+    """Claim: networks of the task `clear` start the task `target`; until they learn, their maps
+    are the same, whatever is the target."""
+    params = _policy(tmp_path / "policy.safetensors", SMOKE)
+    target = SMOKE.change(task={"kind": "target"})
+    start = api.starting(target, tmp_path / "policy.safetensors")
+    assert start is not None
+    state = start(_learner_state(target))
+    rows = (3, SMOKE.heightmap.size, SMOKE.heightmap.size)
+    rng = np.random.default_rng(1)
+    colour, height = rng.uniform(size=(*rows, 3)), 0.1 * rng.uniform(size=rows)
+    mask = rng.uniform(size=rows) < np.array([0.0, 0.5, 1.0])[:, None, None]
+    obs = Observation(jnp.float32(colour), jnp.float32(height), jnp.array(mask))
+    found = actor_critic.dense_maps(actor_critic.make(target), state.online, obs)
+    wanted = actor_critic.dense_maps(actor_critic.make(SMOKE), params, obs)
+    np.testing.assert_allclose(found.q, wanted.q, rtol=1e-5, atol=1e-5)
+    _assert_same(state.target, state.online)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -117,7 +137,9 @@ def test_first_states_of_several_runs_have_the_networks_of_the_policy(tmp_path: 
         {"net": {"colour": False}},
         {"net": {"kind": "densenet121", "margin": 0.0}},
         {"learn": {"critics": 2}},
-        {"task": {"kind": "target"}},
+        {"learn": {"critics": 2}, "task": {"kind": "target"}},
+        {"net": {"growth": 8}, "task": {"kind": "target"}},
+        {"net": {"kind": "densenet121", "margin": 0.0}, "task": {"kind": "target"}},
     ],
 )
 def test_other_networks_are_refused(tmp_path: Path, changes: dict[str, Any]):

@@ -113,6 +113,20 @@ def with_params(state: LearnerState, params: Params) -> LearnerState:
     return state.replace(online=online, target=jax.tree.map(jnp.copy, online))
 
 
+def with_target_input(params: Params, wanted: Params) -> Params:
+    """Networks of the task `clear` with the input of the task `target`, whose weights are 0: they
+    see the same until they learn. Those that do not fit `wanted` so come back as they are."""
+    if jax.tree.structure(params) != jax.tree.structure(wanted):
+        return params
+
+    def widened(leaf: jax.Array, like: jax.Array) -> jax.Array:
+        missing = [(0, more - have) for have, more in zip(leaf.shape, like.shape, strict=True)]
+        lacks_one = missing == [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]  # input, output
+        return jnp.pad(leaf, missing) if lacks_one else leaf
+
+    return jax.tree.map(widened, params, wanted)
+
+
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
     """The state before the first update, every trunk of the critics being `trunk`, see
     `torchvision.variables`."""
