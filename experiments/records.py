@@ -276,6 +276,10 @@ BENCHES = {
         "bench objects --warp --scenes 1024",
     ),
     "objects/cpu": ("objects against blocks; much other work on both cores", "bench objects"),
+    "grippers/cpu": (
+        "the planner and the shipped policy with each gripper; other work on both cores",
+        "bench grippers",
+    ),
     "grasp_depth/cpu": (
         "how low and how deep the tips should go among objects",
         "bench grasp_depth --episodes 40",
