@@ -67,6 +67,9 @@ RUNS = {
     "objects/from_shipped_slow": "the same, smaller steps and less exploration",
     "objects/from_shipped_gpu": "by `--init shipped` on a GPU; stopped at 278,528 actions",
     "objects/oracle": "a planner that reads the objects' poses",
+    "objects/target": "what `objects_target` learns on two CPU cores; other work on both",
+    "objects/target_oracle": "the planner in the target task",
+    "objects/target_random": "random places above the target",
     "fast/csac_beta": "what `fast` learns on one GPU",
     "fast/short": "half as many actions",
     "fast/half_rate": "half the learning rate",
@@ -275,7 +278,7 @@ BENCHES = {
         "objects against blocks on Warp, by convex parts an object",
         "bench objects --warp --scenes 1024",
     ),
-    "objects/cpu": ("objects against blocks; much other work on both cores", "bench objects"),
+    "objects/cpu": ("objects against blocks, by convex parts an object", "bench objects"),
     "grippers/cpu": (
         "the planner and the shipped policy with each gripper; other work on both cores",
         "bench grippers",
