@@ -67,6 +67,7 @@ RUNS = {
     "objects/from_shipped_slow": "the same, smaller steps and less exploration",
     "objects/from_shipped_gpu": "by `--init shipped` on a GPU; stopped at 278,528 actions",
     "objects/oracle": "a planner that reads the objects' poses",
+    "objects/geometric": "antipodal grasps from the edges of the height map",
     "objects/target": "what `objects_target` learns on two CPU cores; other work on both",
     "objects/target_oracle": "the planner in the target task",
     "objects/target_random": "random places above the target",
@@ -279,6 +280,10 @@ BENCHES = {
         "bench objects --warp --scenes 1024",
     ),
     "objects/cpu": ("objects against blocks, by convex parts an object", "bench objects"),
+    "geometric/cpu": (
+        "weights of the geometric baseline, one after another; their terms `gap` and `margin` went",
+        "bench geometric --episodes 40",
+    ),
     "grippers/cpu": (
         "the planner and the shipped policy with each gripper; other work on both cores",
         "bench grippers",
