@@ -116,7 +116,8 @@ def with_params(state: LearnerState, params: Params) -> LearnerState:
 def with_target_input(params: Params, wanted: Params) -> Params:
     """Networks of the task `clear` with the input of the task `target`, whose weights are 0: they
     see the same until they learn. Those that do not fit `wanted` so come back as they are."""
-    if jax.tree.structure(params) != jax.tree.structure(wanted):
+    found: Any = jax.tree.structure(params)
+    if found != jax.tree.structure(wanted):
         return params
 
     def widened(leaf: jax.Array, like: jax.Array) -> jax.Array:
