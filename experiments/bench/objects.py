@@ -2,7 +2,7 @@
 [--warp]`.
 
 An action, with the observation after it, and an observation alone, of ten blocks of the preset
-`fast`, of ten of our own shapes, and of ten of those with as many convex parts each. C MuJoCo, or
+`fast`, of ten of our own shapes, and of ten of those of few and of many convex parts. C MuJoCo, or
 Warp with room for three times as many contacts of objects; one grasp above a block in each of
 `scenes` poured scenes side by side. Calls alternate and the median counts. `overflows` counts the
 substeps that may have lost contacts.
