@@ -20,7 +20,7 @@ from csac_jax.io import leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
 from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, cluster, provenance, signals
-from csac_jax.sim import backend, physics as simulation
+from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
@@ -99,7 +99,7 @@ def train(
 
         def first_state() -> step.TrainState:
             state = begin()
-            simulation.prepare(program.env.physics, cfg.train.scenes)
+            step.prepare(program)
             return state if start is None else state.replace(learner=start(state.learner))
 
         summary = loop.run(

@@ -293,6 +293,11 @@ def compile_init(program: Program) -> Callable[[], TrainState]:
     return jax.jit(lambda: init_state(program, jax.random.key(program.cfg.seed)))
 
 
+def prepare(program: Program) -> None:
+    """Does ahead, maybe in another thread, what else delays the first step."""
+    simulation.prepare(program.env.physics, program.cfg.train.scenes)
+
+
 def init_state(
     program: Program, key: jax.Array, hyperparams: Hyperparams | None = None
 ) -> TrainState:

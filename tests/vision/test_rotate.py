@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from csac_jax import geometry
 from csac_jax.config import HeightmapConfig
@@ -98,8 +98,10 @@ def test_integer_maps_keep_their_type():
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, _K - 1), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15))
+@example(2, 0.11138523104556389, 0.11138523104556389)
 def test_a_block_appears_where_to_cell_says(k, x, y):
-    """Claim: a block at (x, y) is seen in frame k where `to_cell` says, to a cell."""
+    """Claim: a block at (x, y) is seen in frame k where `to_cell` says, up to whole cells: half a
+    cell along each axis of the map, which a turn may add up, and half a cell in the frame."""
     cfg = HeightmapConfig(64)
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     block = raycast.Polytopes(
@@ -114,7 +116,7 @@ def test_a_block_appears_where_to_cell_says(k, x, y):
     seen = np.argwhere(np.asarray(frame)[..., 0] > 0.02).mean(0)
     yaw, xy = jnp.asarray(_yaw(k), jnp.float32), jnp.array([x, y], jnp.float32)
     place = rotate.to_cell(tables.canvas, tables.cell, yaw, xy)
-    np.testing.assert_allclose(place, seen, atol=1.0)
+    np.testing.assert_allclose(place, seen, atol=np.hypot(0.5, 0.5) + 0.5)
 
 
 @jax.jit
