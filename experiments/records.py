@@ -76,7 +76,7 @@ RUNS = {
     "fast/half_rate": "half the learning rate",
     "fast/scenes_8192": "twice as many scenes, hence half as many updates",
     "fast/slow_decay": "half as many actions, exploration that ends later",
-    "fast/scenes_4096": "exploration that ends later, half as many actions again",
+    "fast/scenes_4096": "exploration that ends later, one and a half times as many actions",
     "fast/scenes_2048": "half the scenes, fewer actions, a net with three times the parameters",
     "fast/long": "the same, three times as many actions",
     "fast/shipped": "the shipped policy (seed 0) on every suite",

@@ -79,8 +79,7 @@ def _build_kernels(cfg: Config) -> dict[str, Any]:
     from csac_jax.sim import physics
 
     begun = time.perf_counter()
-    made: Any = physics.make(model.build(cfg.scene, cfg.sim), cfg.sim)
-    made.simulator.prepared(cfg.train.scenes)
+    physics.prepare(physics.make(model.build(cfg.scene, cfg.sim), cfg.sim), cfg.train.scenes)
     seconds = time.perf_counter() - begun
     print(f"kernels    {seconds:.1f} s for {cfg.train.scenes} scenes of {cfg.preset} on Warp")
     return {"kernels_seconds": seconds}

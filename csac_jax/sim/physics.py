@@ -50,9 +50,10 @@ def make(world: World, cfg: SimConfig) -> Physics:
 
 
 def prepare(physics: Physics, scenes: int) -> None:
-    """Does ahead, maybe in another thread, what else delays the first action of so many scenes."""
+    """Does ahead, maybe in another thread, what else delays the first action of so many scenes:
+    Warp's kernels are loaded, or built for minutes, and its substeps recorded."""
     if isinstance(physics, warp_physics.WarpPhysics):
-        physics.prepare(scenes)
+        physics.simulator.prepared(scenes)
 
 
 def execute(

@@ -37,11 +37,6 @@ class WarpPhysics:
     def _simulate(self) -> Callable[[dict[str, jax.Array]], dict[str, jax.Array]]:
         return _flat_vmap(lambda inputs: self.simulator(**inputs))
 
-    def prepare(self, scenes: int) -> None:
-        """Loads kernels and records the substeps of so many scenes, which else their first action
-        does; minutes pass where kernels are to be built."""
-        self.simulator.prepared(scenes)
-
     def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
         """See `physics.Physics`."""
         world = self.world

@@ -884,11 +884,11 @@ def test_doctor_shows_memory(
 def test_doctor_builds_kernels(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: `doctor --build` makes what Warp needs for as many scenes as the preset has."""
     from csac_jax.runtime import selftest
-    from csac_jax.sim import physics
+    from csac_jax.sim import physics, warp_physics
 
     made: list[int] = []
     fake = types.SimpleNamespace(prepared=made.append)
-    make = lambda world, cfg: types.SimpleNamespace(simulator=fake)  # noqa: E731
+    make = lambda world, cfg: warp_physics.WarpPhysics(world, fake)  # noqa: E731
     monkeypatch.setitem(physics.PHYSICS, "warp", make)
     monkeypatch.setattr(failures, "check_physics", lambda cfg: None)
     monkeypatch.setattr(selftest, "CHECKS", ())
