@@ -1,5 +1,6 @@
 """What the commands do, as functions; the package root exports them."""
 
+import dataclasses
 import datetime
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from rich.console import Console
 from csac_jax import algorithms
 from csac_jax.agent import actor_critic
 from csac_jax.agent.learner import Learner
-from csac_jax.config import Config, DenseNet121
+from csac_jax.config import Config, DenseNet121, SmallNet
 from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import monitor, policies, rollout
@@ -191,8 +192,8 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
     policy = policies.load(source)
     assert isinstance(policy, LearnedPolicy)
     params, wanted = policy.params, actor_critic.abstract_params(cfg)
-    if cfg.task.kind == "target":
-        params = actor_critic.with_target_input(params, wanted)
+    if policy.cfg.task.kind != "target":  # whose input is the last
+        params = actor_critic.with_inputs(params, wanted)
     if leaves.layout(params) != leaves.layout(wanted):
         raise SettingsError(
             f"--init {source}: its networks are not those of these settings; "
@@ -207,7 +208,10 @@ def with_networks_of(cfg: Config, source: str | Path) -> Config:
         return cfg
     given = policies.load_config(source)
     learn = {"critics": given.learn.critics, "actor": given.learn.actor}
-    return cfg.change(net=given.net, learn=learn)
+    net = given.net
+    if isinstance(net, SmallNet) and isinstance(cfg.net, SmallNet) and cfg.net.gripper:
+        net = dataclasses.replace(net, gripper=True)
+    return cfg.change(net=net, learn=learn)
 
 
 def new_folder(name: str) -> Path:

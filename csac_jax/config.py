@@ -169,7 +169,8 @@ class SimConfig(Section, section="sim"):
     robot: RobotKind = "hand"
     """`hand`: the gripper alone, floating, for training. `ur5`, `ur5e`: on that arm."""
     gripper: str = "rg2"
-    """`rg2`, `2f85`, `franka_hand`, or a folder with gripper.json and gripper.xml of your own."""
+    """`rg2`, `2f85`, `franka_hand`, or a folder with gripper.json and gripper.xml of your own.
+    `varied` has another opening and other fingers in every episode."""
     base: tuple[float, float, float, float] = _bounded((0.6, 0.0, 0.35, 0.0), -math.pi, math.pi)
     """Where the arm's base stands: x, y and z, m, and its yaw, rad (ours: scenes/README.md)."""
     adapter: float = _bounded(0.0, 0.0, 0.3)
@@ -289,6 +290,7 @@ class SmallNet(Section, section="net"):
     """`small`; `offset`: Q varies inside cells; `densenet121`: the paper's, 100 times the work."""
     rotations: int = _bounded(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
     colour: bool = True  # Whether the net sees colours, or heights alone.
+    gripper: bool = False  # Whether it sees the gripper's opening and the size of its fingers.
     margin: float = _bounded(0.125, 0.0, 0.5)
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
     head: int = _bounded(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
@@ -324,6 +326,7 @@ class DenseNet121(Section, section="net"):
     dtype = SmallNet.dtype
     block_layers = (6, 12, 24, 16)  # dense layers of each (Huang et al., arXiv:1608.06993, table 1)
     block_growth = 32  # channels that each dense layer adds (the same)
+    gripper = False  # no trunk sees the gripper
     STRIDE = 32  # pixels of the input per cell of the features, along each axis
     output_stride = (
         4  # map cells per cell of the outputs (ours; the paper 1, at 16 times the memory)
@@ -421,13 +424,12 @@ class RewardConfig(Section, section="reward"):
 
     distance_cap = 1.0  # m; beyond it the distance's penalty is constant (ours: bounds returns)
     dead_band = 0.1  # gain in the best grasp's value that a good push must exceed (ours)
+    distance_weight = 0.0  # w: penalty per metre from the place to the block (eq. 10, sign turned)
     push_level = 0.0  # s_c of eq. 13, the push's level
     grasp_level = 1.0  # s_g of eq. 13, the grasp's level, which is s_max
     eta = (0.0, 1.0)  # eta_0 and eta_1 of eq. 13, for which no numbers are given
 
     success_bonus: float = 1.0  # r2 of eq. 11: the hand comes back with a block.
-    distance_weight: float = _bounded(0.0, 0.0)
-    """w: penalty per metre between the place and where the tips acted (eq. 10, sign turned)."""
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
     push_effect: Literal["value", "renewed", "change"] = "value"
@@ -448,9 +450,9 @@ class RewardConfig(Section, section="reward"):
     def check(self) -> None:
         rising = list(self.grasp_levels) == sorted(self.grasp_levels)
         _require(rising, "reward.grasp_levels: no level may be below the one before it")
-        for name in ("distance_weight", "lost_block_penalty") if self.source == "sensed" else ():
-            unseen = f"reward.{name}: must be 0 where reward.source is sensed, which cannot see it"
-            _require(getattr(self, name) == 0.0, unseen)
+        unseen = "must be 0 where reward.source is sensed, which cannot see it"
+        seen = self.source == "truth" or self.lost_block_penalty == 0.0
+        _require(seen, f"reward.lost_block_penalty: {unseen}")
 
 
 class ExploreConfig(Section, section="explore"):

@@ -17,8 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from csac_jax import grippers
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
+from csac_jax.grippers import Gripper
 from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, outcome, physics as simulation
@@ -42,6 +44,7 @@ class ArraySpec:
         return jnp.all((values >= self.minimum) & (values <= self.maximum))
 
 
+_FINGERS = np.uint32(2**30)  # distinct from what else is drawn from a scene's key
 _Spec: Any = ArraySpec  # stands where a pytree has an array
 
 
@@ -90,6 +93,11 @@ class Env:
     max_failures: int = 0  # failed grasps in a row that end an episode of an evaluation; 0: none
 
     @property
+    def gripper(self) -> Gripper:
+        """The config's."""
+        return grippers.load(self.cfg.sim.gripper)
+
+    @property
     def observation_spec(self) -> Observation:
         """The ArraySpec of each leaf of an observation."""
         rows = (self.cfg.heightmap.size, self.cfg.heightmap.size)
@@ -97,6 +105,7 @@ class Env:
             colour=_Spec((*rows, 3), np.float32, 0.0, 1.0),
             height=_Spec(rows, np.float32, 0.0, VIEW_HEIGHT),
             target=_Spec(rows, np.bool_, False, True),
+            fingers=_Spec((3,), np.float32, 0.0, 1.0) if self.cfg.net.gripper else None,
         )
 
     @property
@@ -121,6 +130,10 @@ class Env:
         no, none = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         zero = jnp.zeros((), jnp.float32)
         info = Info(none, none, zero, zero, none, none, none, no)
+        gripper = self.gripper
+        if gripper.varies is not None and scene.fingers is None:
+            own = jax.tree.map(jnp.float32, gripper.fingers)
+            scene = scene.replace(fingers=own)
         noise_key = sensor.episode_key(key, self.cfg.sensor)
         obs = self._observe(scene, noise_key, none)
         return State(scene, obs, zero, no, no, none, none, info, noise_key)
@@ -146,7 +159,8 @@ class Env:
         cfg, task, spec = self.cfg, self.cfg.task, self.observation_spec
         valid = simulation.healthy(state.scene) & spec.height.contains(state.obs.height)
         valid &= spec.colour.contains(state.obs.colour)
-        before = _select(valid, state.scene, layout.parked(cfg.scene.slots))
+        blank = layout.parked(cfg.scene.slots).replace(fingers=state.scene.fingers)
+        before = _select(valid, state.scene, blank)
         after, trace, plan = simulation.execute(self.physics, cfg, before, state.obs.height, action)
         diverged = ~(valid & simulation.healthy(after))
         after = _select(diverged, before, after)
@@ -196,9 +210,11 @@ class Env:
         )
 
     def randomise_pose(self, key: jax.Array, scene: Scene) -> Scene:
-        """The scene as episodes start with it: at a random yaw, with a target or none."""
+        """The scene as episodes start with it: at a random yaw, with a target or none, and with
+        fingers of the gripper's ranges where it has some."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
-        return layout.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+        placed = layout.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+        return layout.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
 
     def _sample_scene(self, key: jax.Array) -> Scene:
         key_index, key_pose = jax.random.split(key)
@@ -208,7 +224,10 @@ class Env:
 
     def _observe(self, scene: Scene, root: jax.Array | None, actions: jax.Array) -> Observation:
         key = None if root is None else jax.random.fold_in(root, actions)
-        return observe.observe(self.cfg, scene, key)
+        obs = observe.observe(self.cfg, scene, key)
+        if not self.cfg.net.gripper:
+            return obs
+        return obs.replace(fingers=jnp.stack(layout.fingers(scene, self.gripper)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

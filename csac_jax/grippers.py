@@ -12,7 +12,7 @@ import functools
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,9 +36,28 @@ _LENGTHS = {  # key -> its parts, () for one number; m, up to 1
     "hand_capsule": ("from", "to", "radius"),
 }
 _WORDS = ("name", "body", "palm")
+_VARIES = "varies"
 _KEYS = ("format", *_WORDS, "pads", "actuator", "joints", *_LENGTHS, "arc_radius", "sources")
 
 Ends = tuple[float, float]  # closed, open
+
+
+class Fingers(NamedTuple):
+    """What of a gripper may differ between episodes: numbers, or arrays [...], m."""
+
+    opening: Any  # between the open pads
+    thickness: Any  # of a finger, along the closing
+    width: Any  # across it
+
+    @property
+    def footprint(self) -> tuple[Any, Any]:
+        """Half the sides of the floor that a finger needs, along the closing and across, m."""
+        return 0.5 * self.thickness + _FINGER_ROOM, 0.5 * self.width + _FINGER_ROOM
+
+    @property
+    def beside(self) -> Any:
+        """From the middle of the open hand to that of a finger, m."""
+        return 0.5 * self.opening + 0.5 * self.thickness
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +84,17 @@ class Gripper:
     hand_capsule: tuple[
         float, float, float
     ]  # m, about palm and fingers: back from the tips, radius
+    varies: tuple[Fingers, Fingers] | None = None  # least and most of an episode's; None: the same
+
+    @property
+    def fingers(self) -> Fingers:
+        """Its own, the largest where they vary."""
+        return Fingers(self.opening[1], *self.finger[:2])
 
     @property
     def footprint(self) -> tuple[float, float]:
         """Half the sides of the floor that a finger needs, along the closing and across, m."""
-        return 0.5 * self.finger[0] + _FINGER_ROOM, 0.5 * self.finger[1] + _FINGER_ROOM
+        return self.fingers.footprint
 
     @property
     def deepest(self) -> float:
@@ -185,8 +210,8 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _gripper(folder: Path, given: dict[str, Any]) -> Gripper:
     """The gripper of these numbers, whatever they are. Raises ValueError by name of a wrong key."""
-    for name in sorted(given.keys() - set(_KEYS)):
-        raise ValueError(f"'{name}' is unknown; the keys are: {', '.join(_KEYS)}")
+    for name in sorted(given.keys() - {*_KEYS, _VARIES}):
+        raise ValueError(f"'{name}' is unknown; the keys are: {', '.join((*_KEYS, _VARIES))}")
     _require(_need(given, "format") == FORMAT, f"'format' must be {FORMAT}")
     actuator, joints = (_object(_need(given, name), name) for name in ("actuator", "joints"))
     pads, arc = _need(given, "pads"), _need(given, "arc_radius")
@@ -207,6 +232,7 @@ def _gripper(folder: Path, given: dict[str, Any]) -> Gripper:
             for joint, ends in joints.items()
         ),
         arc_radius=None if arc is None else _number(arc, "arc_radius"),
+        varies=_ranges(given) if _VARIES in given else None,
         **words,
         **lengths,
     )
@@ -221,6 +247,16 @@ def _check(gripper: Gripper) -> None:
     _require(gripper.finger[2] > _PALM_ROOM, f"'finger.length' must be above {_PALM_ROOM}")
     _require(min(gripper.finger) > 0.0 < min(gripper.depth), "'finger' and 'depth' must be above 0")
     _require(gripper.radius >= gripper.half[1], "'radius' must hold the open fingers")
+    if gripper.varies is not None:
+        low, high = gripper.varies
+        rising = all(0.0 < least <= most for least, most in zip(low, high, strict=True))
+        _require(rising, f"'{_VARIES}' must be ranges [least, most] above 0")
+        _require(
+            low.opening > gripper.opening[0], f"'{_VARIES}.opening' must exceed the closed one"
+        )
+        largest = f"the most of '{_VARIES}' must be the MJCF's: 'opening.open' and 'finger'"
+        _require(high == gripper.fingers, largest)
+        _require(gripper.arc_radius is None, f"'{_VARIES}' needs pads that close along a line")
     if gripper.arc_radius is None:
         same = gripper.depth[0] == gripper.depth[1]
         _require(same, "'depth' must be the same at both ends without an 'arc_radius'")
@@ -229,6 +265,20 @@ def _check(gripper: Gripper) -> None:
     _require(gripper.arc_radius > 0.5 * chord, f"'arc_radius' must be above {0.5 * chord:.4f}")
     turns = -0.5 * math.pi < gripper.angles[0] < gripper.angles[1] < 0.5 * math.pi
     _require(turns, "'arc_radius', 'opening' and 'depth': the links would turn beyond 90 degrees")
+
+
+def _ranges(given: dict[str, Any]) -> tuple[Fingers, Fingers]:
+    """Least and most of what varies."""
+    stored = _object(given[_VARIES], _VARIES)
+    for name in sorted(stored.keys() - set(Fingers._fields)):
+        raise ValueError(f"'{_VARIES}.{name}' is unknown; there are: {', '.join(Fingers._fields)}")
+    ends = []
+    for name in Fingers._fields:
+        pair, key = _need(stored, name, _VARIES), f"{_VARIES}.{name}"
+        _require(isinstance(pair, list) and len(pair) == 2, f"'{key}' must be [least, most]")
+        ends.append([_number(one, key) for one in pair])
+    low, high = zip(*ends, strict=True)
+    return Fingers(*low), Fingers(*high)
 
 
 def _require(condition: bool, message: str) -> None:

@@ -67,6 +67,8 @@ class Interface:
         }
         if self.env.cfg.task.kind == "target":
             parts["target"] = spaces.Box(0, 1, spec.target.shape, np.uint8)
+        if spec.fingers is not None:
+            parts["fingers"] = spaces.Box(0.0, 1.0, spec.fingers.shape, np.float32)
         return spaces.Dict(parts)
 
     @property
@@ -98,6 +100,7 @@ class Interface:
             "colour": np.round(255.0 * np.asarray(obs.colour)).astype(np.uint8),
             "height": np.array(obs.height),
             "target": np.asarray(obs.target).astype(np.uint8),
+            "fingers": np.asarray(obs.fingers),
         }
         return {name: parts[name] for name in self.observation_space.spaces}
 

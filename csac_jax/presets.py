@@ -117,6 +117,24 @@ def objects_target() -> Config:
     return objects().change(preset="objects_target", task={"kind": "target"})
 
 
+def grippers() -> Config:
+    """Learns to clear ten blocks with any gripper: its opening and its fingers differ in every
+    episode, and the net sees them. Made for a start from a policy of blocks, `--init shipped`.
+    """
+    return TEN_BLOCKS.change(
+        preset="grippers",
+        scene={"pool": 512, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)},
+        sim={"physics": "auto", "gripper": "varied"},
+        net=SMALL_NET | {"subcells": 2, "gripper": True},
+        target={"gamma": 0.2},
+        reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
+        explore={"decay": 0.9995},
+        learn={"actor_batch": 8, "augment_shift": 8},
+        replay={"capacity": 16384, "end": (1.0, 4.0)},
+        train={"actions": 12000, "learning_starts": 128, "chunk": 20, "save_every": 10},
+    )
+
+
 def paper() -> Config:
     """The target protocol of the paper, for one GPU, with DenseNet-121 on maps of 224 cells.
 
@@ -180,7 +198,7 @@ Preset = Callable[[], Config]
 
 PRESETS: dict[str, Preset] = {
     preset.__name__: preset
-    for preset in (smoke, quick, fast, objects, objects_target, paper, paper_small)
+    for preset in (smoke, quick, fast, objects, objects_target, grippers, paper, paper_small)
 }
 
 

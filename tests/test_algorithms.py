@@ -104,7 +104,7 @@ def test_unknown_algorithm_names_the_known():
         (lambda: TargetConfig(value="mean"), "target.value"),
         (lambda: TargetConfig(gamma=1.0), "target.gamma"),
         (lambda: RewardConfig(push_effect="depth"), "reward.push_effect"),
-        (lambda: RewardConfig(distance_weight=-1.0), "reward.distance_weight"),
+        (lambda: RewardConfig(lost_block_penalty=-1.0), "reward.lost_block_penalty"),
         (lambda: ExploreConfig(push_fraction=1.5), "explore.push_fraction"),
         (lambda: LearnConfig(loss="mse"), "learn.loss"),
         (lambda: LearnConfig(critics=0), "learn.critics"),

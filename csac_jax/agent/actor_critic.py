@@ -88,7 +88,8 @@ def init(key: jax.Array, learner: ActorCritic) -> LearnerState:
     key_critic, key_actor = jax.random.split(key)
     cfg, nets = learner.cfg, learner.frames.networks
     rows = (cfg.heightmap.size, cfg.heightmap.size)
-    obs = Observation(jnp.zeros((*rows, 3)), jnp.zeros(rows), jnp.zeros(rows, bool))
+    fingers = jnp.zeros(3) if cfg.net.gripper else None
+    obs = Observation(jnp.zeros((*rows, 3)), jnp.zeros(rows), jnp.zeros(rows, bool), fingers)
     blank = maps.rotated_inputs(learner.frames, obs)[:1]  # [1, C, C, I]
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key_critic, jnp.arange(cfg.learn.critics))
     (_, features), critic = jax.vmap(nets.critic.init_with_output, (0, None))(keys, blank)
@@ -113,17 +114,18 @@ def with_params(state: LearnerState, params: Params) -> LearnerState:
     return state.replace(online=online, target=jax.tree.map(jnp.copy, online))
 
 
-def with_target_input(params: Params, wanted: Params) -> Params:
-    """Networks of the task `clear` with the input of the task `target`, whose weights are 0: they
-    see the same until they learn. Those that do not fit `wanted` so come back as they are."""
+def with_inputs(params: Params, wanted: Params) -> Params:
+    """Networks with the inputs of `wanted` that they lack, the last ones, whose weights are 0: they
+    see the same until they learn. Those that do not fit so come back as they are."""
     found: Any = jax.tree.structure(params)
     if found != jax.tree.structure(wanted):
         return params
 
     def widened(leaf: jax.Array, like: jax.Array) -> jax.Array:
         missing = [(0, more - have) for have, more in zip(leaf.shape, like.shape, strict=True)]
-        lacks_one = missing == [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]  # input, output
-        return jnp.pad(leaf, missing) if lacks_one else leaf
+        others = [more for axis, (_, more) in enumerate(missing) if axis != leaf.ndim - 2]
+        fits = leaf.ndim >= 2 and missing[-2][1] > 0 and not any(others)  # ..., input, output
+        return jnp.pad(leaf, missing) if fits else leaf
 
     return jax.tree.map(widened, params, wanted)
 

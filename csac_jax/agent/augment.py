@@ -22,6 +22,8 @@ def apply_symmetry(
     """The transition with x mirrored, then y mirrored, then x and y swapped; flags [] bool."""
 
     def view(field: jax.Array) -> jax.Array:  # rows are y, columns x
+        if field.ndim < 2:  # no map
+            return field
         field = jnp.where(mirror_x, field[:, ::-1], field)
         field = jnp.where(mirror_y, field[::-1], field)
         return jnp.where(swap, jnp.swapaxes(field, 0, 1), field)
@@ -94,6 +96,7 @@ def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
         colour=take(obs.colour),
         height=jnp.where(inside, take(obs.height), jnp.uint16(0)),
         target=jnp.where(inside, take(obs.target), jnp.all(obs.target)),
+        fingers=obs.fingers,
     )
 
 

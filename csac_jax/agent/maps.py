@@ -121,7 +121,7 @@ def of_each_primitive(
 def input_maps(frames: Frames, obs: Observation) -> jax.Array:
     """The net's input maps [..., H, W, I] of an observation, in the workspace's own frame."""
     target = obs.target if frames.shows_target else None
-    return frames.networks.inputs(obs.colour, obs.height, target)
+    return frames.networks.inputs(obs.colour, obs.height, target, obs.fingers)
 
 
 def rotated_inputs(frames: Frames, obs: Observation) -> jax.Array:

@@ -36,7 +36,8 @@ def from_maps(cfg: Config, params: Params) -> tuple[Callable[..., Outputs], tupl
 
     def decide(colour: jax.Array, height: jax.Array, *target: jax.Array) -> Outputs:
         marked = target[0] if target else jnp.ones(rows, bool)
-        return _outputs(cfg, params, Observation(colour, height, marked), has_target)
+        obs = Observation(colour, height, marked, program.fingers(cfg))
+        return _outputs(cfg, params, obs, has_target)
 
     shapes = _ARRAY((*rows, 3), np.float32), _ARRAY(rows, np.float32), _ARRAY(rows, np.bool_)
     return decide, shapes if has_target else shapes[:2]

@@ -19,6 +19,7 @@ from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import Frames
 from csac_jax.config import Config, SmallNet
 from csac_jax.constants import Primitive
+from csac_jax.deploy import program
 from csac_jax.errors import SettingsError
 from csac_jax.nets import dense, networks
 from csac_jax.sim import primitives
@@ -70,7 +71,8 @@ def make(cfg: Config, params: Params) -> bytes:
         raise SettingsError("--format onnx: knows --net.kind small only; take stablehlo")
     graph, frames = Graph(), actor_critic.make(cfg).frames
     has_target = frames.shows_target
-    q = _q_maps(graph, cfg.net, frames, jax.device_get(params.critic)["params"])
+    variables = jax.device_get(params.critic)["params"]
+    q = _q_maps(graph, cfg.net, frames, variables, program.fingers(cfg))
     valid = _valid(graph, frames, has_target)
     primitive, cell, score, is_valid = _best(graph, cfg, q, valid)
     poses = np.concatenate(
@@ -125,7 +127,7 @@ def _rotated(graph: Graph, frames: Frames, maps: str, channels: int) -> str:
     return graph.reshape(kept, -1, canvas, canvas, channels)
 
 
-def _inputs(graph: Graph, frames: Frames) -> tuple[str, int]:
+def _inputs(graph: Graph, frames: Frames, fingers: Any) -> tuple[str, int]:
     """The net's input maps [H, W, I] and I; see `Networks.inputs`."""
     nets = frames.networks
     side = round(frames.extent / frames.tables.cell)
@@ -137,15 +139,18 @@ def _inputs(graph: Graph, frames: Frames) -> tuple[str, int]:
         scaled = graph.op("Div", graph.op("Sub", "colour", graph.const(mean)), graph.const(std))
         covered = graph.op("Greater", column, graph.const(networks.BARE))
         maps.insert(0, graph.op("Where", covered, scaled, graph.const(0.0)))
+    if fingers is not None:
+        own = (np.asarray(fingers) - networks.FINGERS_MEAN) / networks.FINGERS_STD
+        maps.append(graph.const(np.broadcast_to(own, (side, side, 3))))
     if frames.shows_target:
         maps.append(graph.to_float(graph.reshape("target", side, side, 1)))
-    channels = 1 + 3 * nets.colour + frames.shows_target
+    channels = 1 + 3 * (nets.colour + (fingers is not None)) + frames.shows_target
     return graph.op("Concat", *maps, axis=-1), channels
 
 
-def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any) -> str:
+def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any, fingers: Any) -> str:
     """Q [P, K, h, w], the lower of the critics."""
-    maps, channels = _inputs(graph, frames)
+    maps, channels = _inputs(graph, frames, fingers)
     rotated = _rotated(graph, frames, maps, channels)
     image = graph.op("Transpose", rotated, perm=[0, 3, 1, 2])
     num = len(jax.tree.leaves(variables)[0])

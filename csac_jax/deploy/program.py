@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax import geometry
+from csac_jax import geometry, grippers
 from csac_jax.agent import actor_critic, maps, policy
 from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.agent.maps import DenseMaps
@@ -41,7 +41,14 @@ def observe(cfg: Config, points: Any, valid: Any, colour: Any, target: Any) -> O
     marked = jnp.ones(cells.source.shape, bool)
     if target is not None:
         marked = target.at[cells.source].get(mode="promise_in_bounds")
-    return heightmap.observation(cells, seen, marked, jnp.array(target is None))
+    obs = heightmap.observation(cells, seen, marked, jnp.array(target is None))
+    return obs.replace(fingers=fingers(cfg))
+
+
+def fingers(cfg: Config) -> jax.Array | None:
+    """The gripper's, as the networks see it [3] m; None where they do not."""
+    own = grippers.load(cfg.sim.gripper).fingers
+    return jnp.array(own, jnp.float32) if cfg.net.gripper else None
 
 
 def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool) -> DenseMaps:

@@ -127,7 +127,8 @@ def episode(env: Env, policy: Policy, seed: int) -> Iterator[StepRecord]:
 def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> StepRecord:
     """One action in one scene."""
     action = policy(state, key)
-    plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action)
+    fingers = state.scene.fingers
+    plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action, fingers)
     joints = primitives.joint_trajectory(env.cfg.sim, plan)
     after = env.step(state, action)
     if not isinstance(policy, LearnedPolicy):

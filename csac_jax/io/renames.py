@@ -69,7 +69,7 @@ GONE = {
 }
 """Settings of format 1 whose part is gone: a file must hold this value."""
 
-CONSTANTS = ("reward.eta", "net.block_layers")
+CONSTANTS = ("reward.eta", "reward.distance_weight", "net.block_layers")
 """Settings of format 2 that are constants now: a file must hold their value."""
 
 ALGORITHMS = {"vpg": ("vpg_episodic", "bootstrap")}

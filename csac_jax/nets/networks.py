@@ -13,11 +13,14 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets import dense, densenet
 
 BARE = 0.002  # m: lower cells are bare table, of which no net sees the colour
+FINGERS_MEAN = np.array([0.1, 0.014, 0.02], np.float32)  # m, `grippers.Fingers`; ours
+FINGERS_STD = np.array([0.025, 0.004, 0.004], np.float32)
 _FULL = 640  # px, ours: side of passes of which one state is seen at a time
 
 
@@ -35,16 +38,26 @@ class Networks:
     terms: int = 1  # numbers of each output in a cell, `dense.TERMS` where Q varies inside cells
     one_vector: bool = False  # the optimiser sees one vector: a GPU is slow with many small arrays
 
-    def inputs(self, colour: jax.Array, height: jax.Array, target: jax.Array | None) -> jax.Array:
-        """The critic's input maps [..., H, W, I]: 3 of colour or none, 1 of height, 1 of target.
+    def inputs(
+        self,
+        colour: jax.Array,
+        height: jax.Array,
+        target: jax.Array | None,
+        fingers: jax.Array | None = None,
+    ) -> jax.Array:
+        """The critic's input maps [..., H, W, I]: 3 of colour or none, 1 of height, 3 of the
+        fingers or none, 1 of target or none.
 
         Bare table is 0, like cells outside of a rotated map. Args: colour [..., H, W, 3] in 0..1;
-        height [..., H, W] m; target [..., H, W] bool or None.
+        height [..., H, W] m; target [..., H, W] bool or None; fingers [..., 3] m or None.
         """
         maps = [jnp.maximum(height, 0.0)[..., None] / self.height_scale]
         if self.colour:
             mean, std = (jnp.broadcast_to(leaf, colour.shape) for leaf in self.colour_scale)
             maps.insert(0, jnp.where(height[..., None] > BARE, (colour - mean) / std, 0.0))
+        if fingers is not None:
+            scaled = (fingers - FINGERS_MEAN) / FINGERS_STD
+            maps.append(jnp.broadcast_to(scaled[..., None, None, :], (*height.shape, 3)))
         if target is not None:
             maps.append(target[..., None].astype(height.dtype))
         return jnp.concatenate(maps, axis=-1)

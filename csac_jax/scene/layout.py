@@ -9,6 +9,7 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.config import SlotKind
+from csac_jax.grippers import Fingers, Gripper
 from csac_jax.scene import blocks
 
 NOMINAL_DENSITY = 600.0  # kg/m^3, wood
@@ -34,6 +35,7 @@ class Scene:
     in_play: jax.Array  # [N] bool
     target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
     object_id: jax.Array | None = None  # [N] int32, which of the library's; None without objects
+    fingers: Fingers | None = None  # [] float32 m, the episode's; None: the gripper's own
 
     @property
     def numbers(self) -> jax.Array:
@@ -87,6 +89,19 @@ def rotate(scene: Scene, yaw: jax.Array) -> Scene:
         quaternion=multiply(geometry.quat_from_yaw(yaw), scene.quaternion),
     )
     return park(rotated, scene.in_play)
+
+
+def with_fingers(key: jax.Array, scene: Scene, gripper: Gripper) -> Scene:
+    """The scene with fingers drawn for an episode, where the gripper has ranges of them."""
+    if gripper.varies is None:
+        return scene
+    low, high = (np.array(ends, np.float32) for ends in gripper.varies)
+    return scene.replace(fingers=Fingers(*jax.random.uniform(key, (3,), minval=low, maxval=high)))
+
+
+def fingers(scene: Scene, gripper: Gripper) -> Fingers:
+    """Those of the episode, or the gripper's own."""
+    return gripper.fingers if scene.fingers is None else scene.fingers
 
 
 def mark_target(key: jax.Array, scene: Scene) -> Scene:

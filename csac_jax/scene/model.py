@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from csac_jax import grippers
 from csac_jax.assets import assets
 from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig, SlotKind
 from csac_jax.errors import SceneError
-from csac_jax.grippers import Gripper
+from csac_jax.grippers import Fingers, Gripper
 from csac_jax.scene import blocks, bodies as objects, layout, lint, robots, stock
 from csac_jax.scene.blocks import Parts
 from csac_jax.scene.bodies import Bodies, ObjectFields
@@ -169,6 +170,14 @@ def _align_inertia(model: mujoco.MjModel) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
+class PadFields(NamedTuple):
+    """The boxes at the finger tips: size, place and bounding sphere."""
+
+    size: jax.Array  # [2, 3] m, half sizes
+    position: jax.Array  # [2, 3] m, in the finger's frame, which lies on the inner face
+    radius: jax.Array  # [2] m
+
+
 @struct.dataclass
 class BlockFields:
     """Model fields that differ per scene. N = slots, G = parts, M = meshes."""
@@ -184,6 +193,7 @@ class BlockFields:
     dof_invweight: jax.Array  # [N, 6] the same for the six dofs
     mesh_scale: jax.Array  # [M] relative to the compiled mesh
     objects: ObjectFields | None = None  # their rows of the other leaves mean nothing
+    pads: PadFields | None = None  # where the fingers vary
 
 
 def scene_fields(world: World, scene: Scene) -> BlockFields:
@@ -195,10 +205,24 @@ def scene_fields(world: World, scene: Scene) -> BlockFields:
     """
     scene = jax.tree.map(jnp.asarray, scene)
     fields = _with_meshes(world, scene, _box_fields(world, scene))
+    if scene.fingers is not None:
+        fields = fields.replace(pads=_pads(world, scene.fingers))
     if world.objects is None:
         return fields
     held = (scene.numbers, scene.density, scene.friction)
     return fields.replace(objects=ObjectFields(*(leaf[world.objects.slots] for leaf in held)))
+
+
+def _pads(world: World, fingers: Fingers) -> PadFields:
+    """Pads of these fingers: thinner and narrower ones than the compiled keep their inner faces."""
+    model, pads = world.model, world.hand_geoms[1:]
+    length = jnp.full(2, model.geom_size[pads, 2], jnp.float32)
+    half = jnp.stack([jnp.full(2, 0.5 * fingers.thickness), jnp.full(2, 0.5 * fingers.width)])
+    size = jnp.column_stack([*half, length])
+    outward = np.sign(model.geom_pos[pads, 0])
+    along = outward * size[:, 0]
+    position = jnp.asarray(model.geom_pos[pads], jnp.float32).at[:, 0].set(along)
+    return PadFields(size, position, jnp.linalg.norm(size, axis=1))
 
 
 def _box_fields(world: World, scene: Scene) -> BlockFields:
@@ -291,6 +315,9 @@ def with_blocks(
     counts = model.mesh_vertnum[: len(fields.mesh_scale)]  # the blocks' meshes come first
     scales = np.repeat(fields.mesh_scale, counts)  # of corners, mesh by mesh
     model.mesh_vert[: len(scales)] = world.model.mesh_vert[: len(scales)] * scales[:, None]
+    if fields.pads is not None:
+        pads = world.hand_geoms[1:]
+        model.geom_size[pads], model.geom_pos[pads], model.geom_rbound[pads] = fields.pads
     if world.objects is not None and fields.objects is not None:
         objects.put(model, world.objects, fields.objects)
     mujoco.mj_setConst(model, scratch)

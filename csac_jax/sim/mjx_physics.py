@@ -63,7 +63,7 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
         for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
     ]
     model = model.replace(_impl=model._impl.replace(mesh_convex=tuple(meshes)))
-    return model.replace(
+    model = model.replace(
         geom_size=model.geom_size.at[geoms].set(fields.size),
         geom_pos=model.geom_pos.at[geoms].set(fields.centre),
         geom_rbound=model.geom_rbound.at[geoms].set(fields.rbound),
@@ -74,6 +74,14 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
         body_ipos=model.body_ipos.at[bodies].set(fields.com),
         body_invweight0=model.body_invweight0.at[bodies].set(fields.body_invweight),
         dof_invweight0=model.dof_invweight0.at[dofs].set(fields.dof_invweight),
+    )
+    if fields.pads is None:
+        return model
+    pads, (size, position, radius) = world.hand_geoms[1:], fields.pads
+    return model.replace(
+        geom_size=model.geom_size.at[pads].set(size),
+        geom_pos=model.geom_pos.at[pads].set(position),
+        geom_rbound=model.geom_rbound.at[pads].set(radius),
     )
 
 

@@ -10,7 +10,7 @@ from csac_jax import grippers
 from csac_jax.config import Config, SlotKind
 from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
-from csac_jax.scene import blocks, stock
+from csac_jax.scene import blocks, layout, stock
 from csac_jax.scene.layout import ANY, Scene
 from csac_jax.sim.primitives import Action, grasp_depth, local_top, lowest, reachable
 
@@ -117,7 +117,8 @@ def _ways(
 ) -> Ways:
     """Grasps of bodies, leaves [B, ...], at YAWS and `shifts`; n = B YAWS len(shifts)."""
     sim, gripper, cells = cfg.sim, grippers.load(cfg.sim.gripper), cell_centres(cfg.heightmap)
-    beside, (along, across_pad) = gripper.half[1] + 0.5 * gripper.finger[0], gripper.footprint
+    fingers = layout.fingers(scene, gripper)
+    beside, (along, across_pad) = fingers.beside, fingers.footprint
     slots, kind = jnp.arange(len(cfg.scene.slots)), jnp.int32(Primitive.GRASP)
 
     def place(body: Body, yaw: jax.Array, shift: jax.Array) -> jax.Array:
@@ -132,18 +133,18 @@ def _ways(
         low, high = jnp.argmin(cosine), jnp.argmax(cosine)  # the faces most square to the pads
         width = body.offset[high] + body.offset[low]
         centre = place(body, yaw, shift)
-        top = local_top(cfg.heightmap, height, centre, gripper.finger[1])
+        top = local_top(cfg.heightmap, height, centre, fingers.width)
         tip = jnp.maximum(top - grasp_depth(sim, gripper), lowest(sim, gripper))
         local = jnp.abs(rotate2d(-yaw, cells - centre[None, None]))
         finger = (jnp.abs(local[..., 0] - beside) < along) & (local[..., 1] < across_pad)
         blocked = jnp.max(jnp.where(finger, height, 0.0)) > tip - 0.002
         beyond = local[..., 0] > 0.5 * width + OWN
-        way = beyond & (local[..., 0] < beside) & (local[..., 1] < 0.5 * gripper.finger[1])
+        way = beyond & (local[..., 0] < beside) & (local[..., 1] < 0.5 * fingers.width)
         caught = jnp.max(jnp.where(way, height, 0.0)) > tip
         off = jnp.abs(rotate2d(-yaw, scene.position[:, :2] - centre[None]))
         inside = (off[:, 0] < beside) & (off[:, 1] < across_pad) & (scene.position[:, 2] > tip)
         caught |= jnp.any(inside & scene.in_play & (slots != body.slot))
-        fits = width < gripper.opening[1] - OPENING_ROOM
+        fits = width < fingers.opening - OPENING_ROOM
         square = jnp.minimum(cosine[high], -cosine[low])
         askew = jnp.maximum(1.0 - square - ALIGNED, 0.0)
         cost = 4.0 * blocked + 2.0 * caught + 4.0 * ~fits + 20.0 * askew + 10.0 * width

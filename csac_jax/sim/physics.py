@@ -63,7 +63,7 @@ def execute(
 
     Args: height [H, W] m, the map the action was chosen from.
     """
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
     joints = primitives.joint_trajectory(cfg.sim, plan)
     after, trace = physics.run(scene, joints)
     unmoved = layout.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)

@@ -1,5 +1,7 @@
 """Push and grasp as one fixed-length sequence of set-points: both run in the same scan."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from flax import struct
 from csac_jax import geometry, grippers
 from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.constants import Primitive
-from csac_jax.grippers import Gripper
+from csac_jax.grippers import Fingers, Gripper
 from csac_jax.sim import kinematics
 
 BLOCK = 0.05  # m, height of a common block
@@ -56,37 +58,44 @@ class JointTrajectory:
     reachable: jax.Array  # [] bool, False where the robot cannot follow the whole plan
 
 
-def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: float) -> jax.Array:
+def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: Any) -> jax.Array:
     """Highest surface [] m of the map [H, W] m in a square window of `side` m about `xy` [2] m."""
     distance = jnp.max(jnp.abs(geometry.cell_centres(cfg) - xy[None, None]), axis=-1)
-    return jnp.max(jnp.where(distance <= 0.5 * max(side, cfg.cell), height, 0.0))
+    return jnp.max(jnp.where(distance <= 0.5 * jnp.maximum(side, cfg.cell), height, 0.0))
 
 
-def plan(cfg: SimConfig, heightmap: HeightmapConfig, height: jax.Array, action: Action) -> Plan:
+def plan(
+    cfg: SimConfig,
+    heightmap: HeightmapConfig,
+    height: jax.Array,
+    action: Action,
+    fingers: Fingers | None = None,
+) -> Plan:
     """Set-points of a primitive, one of VPG's two (arXiv:1803.09956).
 
     Grasp: straight down with open fingers to `grasp_depth` below the surface, close, lift. Push:
     down with closed fingers to `push_depth` below the surface, then `push_length` along the yaw,
-    the end clipped to the workspace, then lift.
+    the end clipped to the workspace, then lift. `fingers` are the gripper's own, or others.
     """
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
     gripper = grippers.load(cfg.gripper)
-    surface = local_top(heightmap, height, xy, gripper.finger[1])
+    fingers = fingers or gripper.fingers
+    surface = local_top(heightmap, height, xy, fingers.width)
     depth = jnp.where(is_grasp, grasp_depth(cfg, gripper), cfg.push_depth)
     low = jnp.maximum(surface - depth, lowest(cfg, gripper))
     around = local_top(heightmap, height, xy, 2.0 * gripper.radius)
     high = jnp.maximum(low + cfg.approach, around + START_GAP)
     end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
-    closed, opened = gripper.half
-    opening = jnp.where(is_grasp, opened, closed)
+    closed = gripper.half[0]
+    opening = jnp.where(is_grasp, 0.5 * fingers.opening, closed)
 
     phases = jnp.where(is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases))
     descend, act, lift = phases  # [T] each
     z = high + (low - high) * descend + (high - low) * lift
     place = xy[None] + act[:, None] * (end - xy)[None]
-    fingers = closed + (opening - closed) * (1.0 - jnp.minimum(1.3 * act, 1.0))  # before the lift
-    control = jnp.column_stack([place, z, jnp.full_like(z, yaw), fingers])
+    half = closed + (opening - closed) * (1.0 - jnp.minimum(1.3 * act, 1.0))  # before the lift
+    control = jnp.column_stack([place, z, jnp.full_like(z, yaw), half])
     return Plan(control=control, start=jnp.hstack([xy, high, yaw, opening]), surface=surface)
 
 

@@ -107,6 +107,13 @@ def _model_fields(world: World, scene: Scene) -> dict[str, jax.Array]:
         "body_invweight0": base("body_invweight0").at[bodies].set(fields.body_invweight),
         "dof_invweight0": base("dof_invweight0").at[dofs].set(fields.dof_invweight),
     }
+    if fields.pads is not None:
+        pads, (size, position, radius) = world.hand_geoms[1:], fields.pads
+        found["geom_size"] = found["geom_size"].at[pads].set(size)
+        found["geom_pos"] = found["geom_pos"].at[pads].set(position)
+        found["geom_rbound"] = found["geom_rbound"].at[pads].set(radius)
+        bounds = jnp.stack([jnp.zeros_like(size), size], axis=1)
+        found["geom_aabb"] = found["geom_aabb"].at[pads].set(bounds)
     if world.objects is not None and fields.objects is not None:
         found |= {name: base(name) for name in ("geom_quat", "body_iquat")}
         found["geom_dataid"] = jnp.asarray(model.geom_dataid)

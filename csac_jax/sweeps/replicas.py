@@ -26,7 +26,7 @@ from csac_jax.training.step import Hyperparams, Program, StepMetrics, TrainState
 
 _TRACED = {
     "target": "gamma",
-    "reward": "success_bonus distance_weight grasp_levels push_levels lost_block_penalty",
+    "reward": "success_bonus grasp_levels push_levels lost_block_penalty",
     "explore": "noise_std epsilon_primitive epsilon_place decay push_fraction",
     "learn": "learning_rate actor_learning_rate lr_final_fraction tau",
     "replay": "start middle end",

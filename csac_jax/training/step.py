@@ -317,7 +317,8 @@ def example(cfg: Config) -> Transition:
     def build() -> Transition:
         rows = (cfg.heightmap.size, cfg.heightmap.size)
         colour, target = jnp.zeros((*rows, 3)), jnp.zeros(rows, bool)
-        obs = Observation(colour=colour, height=jnp.zeros(rows), target=target)
+        fingers = jnp.zeros(3) if cfg.net.gripper else None
+        obs = Observation(colour, jnp.zeros(rows), target, fingers)
         action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
         packed = heightmap.pack(obs)
         label = jnp.zeros((), bool) if cfg.reward.renewed else None

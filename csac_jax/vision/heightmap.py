@@ -22,6 +22,7 @@ class Observation:
     colour: jax.Array  # [H, W, 3] float32, 0 .. 1
     height: jax.Array  # [H, W] float32, m above the table
     target: jax.Array  # [H, W] bool, the block to get is seen; all True if any block will do
+    fingers: jax.Array | None = None  # [3] float32 m, `grippers.Fingers`; None where unseen
 
 
 @struct.dataclass
@@ -31,6 +32,7 @@ class PackedObservation:
     colour: jax.Array  # [H, W, 3] uint8, 255 = 1
     height: jax.Array  # [H, W] uint16, tenths of a millimetre above the table
     target: jax.Array  # [H, W] bool, as in Observation
+    fingers: jax.Array | None = None  # [3] float32 m, likewise
 
 
 class Cells(NamedTuple):
@@ -80,13 +82,14 @@ def pack(obs: Observation) -> PackedObservation:
     """Rounds to a colour level and to 0.1 mm; clips heights to 0 .. 6.5535 m."""
     counts = jnp.clip(jnp.round(obs.height / _HEIGHT_UNIT), 0.0, 65535.0)
     levels = jnp.clip(jnp.round(obs.colour * 255.0), 0.0, 255.0)
-    return PackedObservation(levels.astype(jnp.uint8), counts.astype(jnp.uint16), obs.target)
+    packed = levels.astype(jnp.uint8), counts.astype(jnp.uint16)
+    return PackedObservation(*packed, obs.target, obs.fingers)
 
 
 def unpack(packed: PackedObservation) -> Observation:
     """The packed observation, to half a colour level and 0.05 mm."""
     colour, height = (leaf.astype(jnp.float32) for leaf in (packed.colour, packed.height))
-    return Observation(colour / 255.0, height * _HEIGHT_UNIT, packed.target)
+    return Observation(colour / 255.0, height * _HEIGHT_UNIT, packed.target, packed.fingers)
 
 
 def moved_area(cfg: HeightmapConfig, before: jax.Array, after: jax.Array) -> jax.Array:

@@ -13,7 +13,7 @@ went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp
 
 --details adds the `calls` of Warp that a scan of two steps makes, which are to be two, and
 milliseconds and launches of each kernel in an action whose substeps are launched one by one: only
-then can Warp time them. --repeatable asks Warp for the same bits in every run.
+then can Warp time them. --repeatable asks Warp for the same bits in every run, see `_same_bits`.
 """
 
 import collections
@@ -134,15 +134,6 @@ def _bytes() -> dict[str, Any]:
     return {"warp_bytes": wp.get_mempool_used_mem_high(device), "jax_bytes": by_jax}
 
 
-def _ask_for_same_bits() -> None:
-    """Of the kernels that are read already, and of those to come."""
-    mode = wp.DeterministicMode.RUN_TO_RUN
-    wp.config.deterministic = mode
-    for name, module in list(sys.modules.items()):
-        if "mujoco_warp" in name:
-            wp.set_module_options({"deterministic": mode}, module)
-
-
 def main(arguments: list[str]) -> None:
     """Prints the result."""
     parser = Parser(prog="bench warp_action", allow_abbrev=False)
@@ -153,11 +144,13 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--pool", type=int, default=64)
     parser.add_argument("--task", choices=("clear", "target"), default="clear")
     parser.add_argument("--details", action="store_true")
-    parser.add_argument("--repeatable", action="store_true")
+    parser.add_argument("--repeatable", nargs="*", metavar="STAGE")
     options = parser.parse_args(arguments)
     cache.enable()
-    if options.repeatable:
-        _ask_for_same_bits()
+    if options.repeatable is not None:
+        from experiments.bench import _same_bits
+
+        _same_bits.ask(options.repeatable or _same_bits.STAGES)
     from csac_jax.sim import warp_action
 
     steps = options.step or [1e3 * warp_action.STEP]

@@ -66,7 +66,7 @@ def test_push_ignores_the_outcome_of_a_grasp(outcome):
 def test_distance_is_a_loss():
     """Claim: r = r2 - w r1: 0.2 m at w = 2 cost 0.4, of a push and of a grasp, and beyond 1 m no
     more than at 1 m."""
-    cfg = RewardConfig(distance_weight=2.0)
+    cfg = with_constants(RewardConfig(), distance_weight=2.0)
     near = with_constants(cfg, distance_cap=0.1)
     np.testing.assert_allclose(reward(cfg, Primitive.GRASP, Outcome.LIFTED, 0.2), 1.6, rtol=1e-6)
     np.testing.assert_allclose(reward(cfg, Primitive.PUSH, distance=0.2, after=1.0), 0.1, rtol=1e-5)
@@ -100,7 +100,7 @@ def test_scale():
     "cfg",
     [
         CFG,
-        with_constants(RewardConfig(distance_weight=1.5), eta=(0.5, 1.0)),
+        with_constants(RewardConfig(), distance_weight=1.5, eta=(0.5, 1.0)),
         RewardConfig(
             push_levels=(2.0, 9.0), grasp_levels=(1.0, 1.0, 1.0, 1.0, 1.0), success_bonus=0.0
         ),
@@ -110,7 +110,8 @@ def test_scale():
         with_constants(RewardConfig(), eta=(0.0, -2.0)),
         RewardConfig(lost_block_penalty=1.5),
         with_constants(
-            RewardConfig(distance_weight=3.0),
+            RewardConfig(),
+            distance_weight=3.0,
             eta=(0.1, 1.0),
             distance_cap=0.5,
             push_level=-2.0,

@@ -19,7 +19,6 @@ pytestmark = pytest.mark.optax
 OTHER = {
     "target.gamma": 0.4,
     "reward.success_bonus": 0.5,
-    "reward.distance_weight": 0.2,
     "reward.grasp_levels": (-2.0, -0.9, -0.3, 0.2, 3.0),
     "reward.push_levels": (-0.4, 0.6),
     "reward.lost_block_penalty": 0.7,
