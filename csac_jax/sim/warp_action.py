@@ -198,7 +198,8 @@ class Batch:
         self._control = wp.zeros((scenes, substeps, world.model.nu), dtype=float)
         self._in_play = wp.zeros((scenes, slots), dtype=wp.bool)
         state = [self._qpos, self._qvel, self._control, self._in_play]
-        self._given = [*(getattr(self.model, name) for name in own), *state]
+        self.given = [*(getattr(self.model, name) for name in own), *state]
+        """Where the arrays that a simulator is given go, in the order of its arguments."""
         self._touching = wp.zeros((scenes, parts, slots), dtype=int)
         self._done = wp.zeros(scenes, dtype=int)
         self._trace = [
@@ -208,7 +209,7 @@ class Batch:
 
     def run(self, inputs: Sequence[wp.array], outputs: Sequence[wp.array]) -> None:
         """One primitive; arrays in the order of a simulator's arguments and results."""
-        for target, given in zip(self._given, inputs, strict=True):
+        for target, given in zip(self.given, inputs, strict=True):
             wp.copy(target, given)
         self.restart()
         self._advance()
@@ -302,10 +303,10 @@ class Simulator:
         self.batches: dict[tuple[Any, int], Batch] = {}
         """By device and scenes; made by the first action of so many scenes, or ahead of it."""
         self._world, self._cfg = world, cfg
-        self._arguments = {**fields(world), **_STATE, **_COMMAND}
+        self.arguments = {**fields(world), **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
         self._callable = wp.jax_callable(
-            _annotated(self._run, list(self._arguments.items()), list(self._results.items())),
+            _annotated(self._run, list(self.arguments.items()), list(self._results.items())),
             num_outputs=len(self._results),
             graph_mode=wp.JaxCallableGraphMode.NONE,  # `Batch` records, without buffers of XLA
         )
@@ -316,7 +317,7 @@ class Simulator:
         shapes = {name: (scenes, slots)[: kind.ndim] for name, kind in _TRACE.items()}
         shapes |= {"qpos": (scenes, model.nq), "qvel": (scenes, model.nv)}
         dims = {f"{name}_out": shape for name, shape in shapes.items()}
-        results = self._callable(*(arrays[name] for name in self._arguments), output_dims=dims)
+        results = self._callable(*(arrays[name] for name in self.arguments), output_dims=dims)
         return dict(zip(self._results, results, strict=True))
 
     def prepared(self, scenes: int) -> Batch:
@@ -330,7 +331,7 @@ class Simulator:
             return self.batches[key]
 
     def _run(self, *arrays: wp.array) -> None:
-        count = len(self._arguments)
+        count = len(self.arguments)
         with wp.ScopedDevice(arrays[0].device):
             self.prepared(arrays[0].shape[0]).run(arrays[:count], arrays[count:])
 

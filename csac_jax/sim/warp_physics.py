@@ -41,10 +41,8 @@ class WarpPhysics:
         """See `physics.Physics`."""
         world = self.world
         scene = layout.park(scene, scene.in_play)  # where nothing meets them
-        inputs = {**_model_fields(world, scene), **_start(world, scene, joints)}
-        inputs |= {"control": _resampled(joints.control, self.simulator.substeps)}
-        inputs |= {"in_play": scene.in_play}
-        results = self._simulate(jax.tree.map(lambda leaf: leaf[None], inputs))
+        given = inputs(self, scene, joints)
+        results = self._simulate(jax.tree.map(lambda leaf: leaf[None], given))
         results = jax.tree.map(lambda leaf: leaf[0], results)
         for name in ("gap_closed", "gap_end"):
             results[name] = world.gripper.gap(results[name], jnp)
@@ -64,6 +62,14 @@ def make(world: World, cfg: SimConfig) -> WarpPhysics:
     from csac_jax.sim import warp_action
 
     return WarpPhysics(world, warp_action.Simulator(world, cfg))
+
+
+def inputs(physics: WarpPhysics, scene: Scene, joints: JointTrajectory) -> dict[str, jax.Array]:
+    """What a simulator is given of a scene whose blocks out of play are parked."""
+    world = physics.world
+    control = _resampled(joints.control, physics.simulator.substeps)
+    start = _start(world, scene, joints)
+    return {**_model_fields(world, scene), **start, "control": control, "in_play": scene.in_play}
 
 
 def _flat_vmap(function: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -1,0 +1,137 @@
+"""What bounds physics on Warp? As JSON: `csac-jax bench warp_kernels [--scenes E] [--substeps N]`.
+
+Counters of the GPU, by NVIDIA's `ncu`, which must be on the PATH, in N (10) substeps of E (4096)
+scenes of `fast` that grasp, half of them as the hand comes down, half as it closes. For each
+kernel: `launches`, its `share` of the time, `us` of a launch. `bandwidth` is the share of the
+memory's most that it moves; `active` that of the multiprocessors' warps which are there while it
+runs; `issued` that of the instructions which they could issue. `all` weighs them by time.
+
+ncu cannot follow what XLA launches. JAX makes the scenes on the host's cores here.
+"""
+
+import collections
+import csv
+import ctypes
+import functools
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from typing import Any
+
+from csac_jax.errors import SettingsError
+from experiments.bench._options import Parser
+
+FEW = 64  # scenes, which are repeated
+FIRST = (60, 100)  # substeps before each half
+METRICS = {
+    "seconds": "gpu__time_duration.sum",
+    "bytes": "dram__bytes.sum",
+    "active": "sm__warps_active.avg.pct_of_peak_sustained_active",
+    "issued": "sm__inst_executed.avg.pct_of_peak_sustained_elapsed",
+    "bandwidth": "dram__throughput.avg.pct_of_peak_sustained_elapsed",
+}
+_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "byte": 1.0, "Kbyte": 1e3, "Mbyte": 1e6, "Gbyte": 1e9}
+_UNITS["%"] = 0.01
+
+
+def launch(scenes: int, substeps: int) -> None:
+    """The substeps, which a profiler counts."""
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    import jax
+    import numpy as np
+    import warp as wp
+
+    from csac_jax import env as environment, presets
+    from csac_jax.sim import oracle, warp_physics
+    from experiments.bench import _bare
+
+    few = min(scenes, FEW)
+    cfg = presets.get("fast").change(
+        sim={"physics": "warp"}, scene={"pool": few}, train={"scenes": few, "learning_starts": few}
+    )
+    env: Any = environment.make_env(cfg)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), few))
+    grasp = functools.partial(oracle.grasp, cfg)
+    planned = jax.jit(lambda *given: jax.lax.map(lambda row: grasp(*row), given))
+    actions = planned(states.scene, states.obs.height)
+    joints = _bare.joint_trajectories(cfg, states.obs.height, actions)
+    inputs = functools.partial(warp_physics.inputs, env.physics)
+    given = jax.device_get(jax.jit(jax.vmap(inputs))(states.scene, joints))
+    simulator = env.physics.simulator
+    batch = simulator.prepared(scenes)
+    repeated = [
+        np.resize(given[name], (scenes, *given[name].shape[1:])) for name in simulator.arguments
+    ]
+    for target, values in zip(batch.given, repeated, strict=True):
+        wp.copy(target, wp.array(values, dtype=target.dtype, ndim=target.ndim))
+    cuda, done = ctypes.CDLL("libcuda.so.1"), 0
+    batch.restart()
+    for first in FIRST:
+        for _ in range(first - done):
+            batch.substep()
+        wp.synchronize()
+        cuda.cuProfilerStart()
+        for _ in range(substeps // len(FIRST)):
+            batch.substep()
+        wp.synchronize()
+        cuda.cuProfilerStop()
+        done = first + substeps // len(FIRST)
+
+
+def table(text: str) -> list[dict[str, Any]]:
+    """Kernels by name, longest first, of what ncu writes as CSV; `all` comes first."""
+    launches: dict[str, dict[str, Any]] = {}
+    for row in csv.DictReader(io.StringIO(text[text.index('"ID"') :])):
+        one = launches.setdefault(row["ID"], {"kernel": row["Kernel Name"]})
+        value = float(row["Metric Value"].replace(",", ""))
+        one[row["Metric Name"]] = value * _UNITS[row["Metric Unit"]]
+    sums: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    for one in launches.values():
+        name = re.sub(r"_[0-9a-f]{8}\b.*|__locals__.*", "", one["kernel"])
+        seconds = one[METRICS["seconds"]]
+        for group in ("all", name):
+            sums[group].update({"launches": 1, "seconds": seconds, "bytes": one[METRICS["bytes"]]})
+            weighed = ("active", "issued", "bandwidth")
+            sums[group].update({key: seconds * one[METRICS[key]] for key in weighed})
+    whole = sums["all"]["seconds"]
+    return [
+        {
+            "kernel": name,
+            "launches": found["launches"],
+            "share": found["seconds"] / whole,
+            "us": 1e6 * found["seconds"] / found["launches"],
+            "terabytes_per_second": 1e-12 * found["bytes"] / found["seconds"],
+            **{key: found[key] / found["seconds"] for key in ("bandwidth", "active", "issued")},
+        }
+        for name, found in sorted(sums.items(), key=lambda item: -item[1]["seconds"])
+    ]
+
+
+def main(arguments: list[str]) -> None:
+    """Prints the result."""
+    parser = Parser(prog="bench warp_kernels", allow_abbrev=False)
+    parser.add_argument("--scenes", type=int, default=4096)
+    parser.add_argument("--substeps", type=int, default=10)
+    parser.add_argument("--counted", action="store_true", help="under ncu")
+    options = parser.parse_args(arguments)
+    if options.counted:
+        launch(options.scenes, options.substeps)
+        return
+    if shutil.which("ncu") is None:
+        raise SettingsError("bench warp_kernels: ncu is not on the PATH; CUDA's toolkit has it")
+    ncu = ["ncu", "--profile-from-start", "off", "--cache-control", "none"]
+    ncu += ["--clock-control", "none", "--metrics", ",".join(METRICS.values()), "--csv"]
+    own = [sys.executable, "-m", "csac_jax", "bench", "warp_kernels", "--counted"]
+    own += ["--scenes", str(options.scenes), "--substeps", str(options.substeps)]
+    found = subprocess.run([*ncu, *own], check=False, capture_output=True, text=True)
+    if '"ID"' not in found.stdout:
+        said = (found.stderr or found.stdout).strip().splitlines()
+        raise SettingsError(f"bench warp_kernels: ncu counted nothing: {' '.join(said[-1:])}")
+    from csac_jax.runtime import provenance
+
+    sizes = {"scenes": options.scenes, "substeps": options.substeps}
+    print(json.dumps({**sizes, "kernels": table(found.stdout), **provenance.record()}, indent=2))

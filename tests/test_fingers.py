@@ -1,0 +1,246 @@
+"""A gripper whose opening and fingers differ in every episode, and what knows of them."""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from csac_jax import api, deploy, grippers, presets
+from csac_jax.agent import actor_critic, augment
+from csac_jax.agent.actor_critic import Params
+from csac_jax.agent.learner import Transition
+from csac_jax.config import Config, PhysicsKind
+from csac_jax.env import Env, State, make_env
+from csac_jax.errors import SettingsError
+from csac_jax.grippers import Fingers
+from csac_jax.io import policy_file
+from csac_jax.scene import layout, model
+from csac_jax.scene.layout import Scene
+from csac_jax.sim import oracle, primitives
+from csac_jax.sim.primitives import Action
+from csac_jax.vision import heightmap
+
+CONFIG = presets.smoke().change(sim={"physics": "c", "gripper": "varied"}, net={"gripper": True})
+VARIED = grippers.load("varied")
+THIN = Fingers(0.08, 0.009, 0.015)  # m
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Env:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
+        return make_env(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def states(env: Env) -> State:
+    """The first states of 64 episodes."""
+    return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
+
+
+def _networks(cfg: Config) -> Params:
+    """Untrained ones."""
+    return actor_critic.init(jax.random.key(1), actor_critic.make(cfg)).online
+
+
+def _scene(fingers: Fingers = THIN) -> Scene:
+    """Nothing on the table."""
+    scene = jax.tree.map(jnp.asarray, layout.parked(CONFIG.scene.slots))
+    return scene.replace(fingers=jax.tree.map(jnp.float32, fingers))
+
+
+def _fields(world: model.World, fingers: Fingers) -> model.BlockFields:
+    return jax.tree.map(np.asarray, model.scene_fields(world, _scene(fingers)))
+
+
+def test_every_episode_has_its_own(env: Env, states: State):
+    """Claim: fingers of an episode lie within the gripper's ranges and fill them, no two episodes
+    have the same, and the net is shown them; a gripper without ranges has one kind."""
+    drawn = np.stack(states.scene.fingers, axis=1)
+    low, high = (np.array(ends, np.float32) for ends in VARIED.varies)
+    assert (drawn >= low).all()
+    assert (drawn <= high).all()
+    assert (np.ptp(drawn, axis=0) > 0.9 * (high - low)).all()
+    assert len(np.unique(drawn[:, 0])) == len(drawn)
+    np.testing.assert_array_equal(states.obs.fingers, drawn)
+    assert all(env.observation_spec.fingers.contains(row) for row in drawn)
+    plain = dataclasses.replace(env, cfg=CONFIG.change(sim={"gripper": "rg2"}))
+    one = plain.reset(jax.random.key(0))
+    assert one.scene.fingers is None
+    np.testing.assert_allclose(one.obs.fingers, [0.11, 0.012, 0.02])
+    blind = dataclasses.replace(env, cfg=CONFIG.change(net={"gripper": False}))
+    assert blind.reset(jax.random.key(0)).obs.fingers is None
+
+
+def test_fingers_stay_for_the_episode(env: Env, states: State):
+    """Claim: a step keeps the fingers, also where physics fails; the next episode has others; and a
+    scene that is given has the largest, or those that it comes with."""
+    first = jax.tree.map(lambda leaf: leaf[0], states)
+    spoilt = first.replace(obs=first.obs.replace(height=first.obs.height.at[0, 0].set(jnp.nan)))
+    step = jax.jit(env.step)
+    for state in (first, spoilt):
+        after = step(state, Action.grasp(0.0, 0.0, 0.0))
+        np.testing.assert_array_equal(after.scene.fingers, first.scene.fingers)
+        np.testing.assert_array_equal(after.obs.fingers, first.obs.fingers)
+    following = env.auto_reset(jax.random.key(7), first)
+    assert (np.stack(following.scene.fingers) != np.stack(first.scene.fingers)).all()
+    given = env.reset_to(first.scene.replace(fingers=None))
+    np.testing.assert_allclose(given.scene.fingers, VARIED.fingers, rtol=1e-6)
+    np.testing.assert_array_equal(env.reset_to(first.scene).scene.fingers, first.scene.fingers)
+
+
+@pytest.mark.parametrize("fingers", [THIN, VARIED.fingers, VARIED.varies[0]])
+def test_pads_in_mujoco(fingers: Fingers):
+    """Claim: in C MuJoCo, opened as a grasp begins, the pads' inner faces are the opening apart.
+    The pads are as thick and wide as the fingers, and their bounding spheres hold them."""
+    world = model.build(CONFIG.scene, CONFIG.sim)
+    own = model.with_blocks(world, _fields(world, fingers))
+    data = mujoco.MjData(own)
+    plan = _plan(fingers)
+    data.qpos[world.robot_qpos] = primitives.joint_trajectory(CONFIG.sim, plan).start
+    mujoco.mj_kinematics(own, data)
+    low, high = world.hand_geoms[1:]
+    apart = np.linalg.norm((data.geom_xpos[high] - data.geom_xpos[low])[:2])
+    np.testing.assert_allclose(apart - fingers.thickness, fingers.opening, atol=1e-6)
+    for pad in (low, high):
+        half = 0.5 * fingers.thickness, 0.5 * fingers.width, 0.030
+        np.testing.assert_allclose(own.geom_size[pad], half, rtol=1e-6)
+        np.testing.assert_allclose(own.geom_rbound[pad], np.linalg.norm(half), rtol=1e-6)
+
+
+def _plan(fingers: Fingers | None) -> primitives.Plan:
+    """Of a grasp at a cube in the middle."""
+    height = jnp.zeros((32, 32)).at[14:18, 14:18].set(0.05)
+    grasp = Action.grasp(0.0, 0.0, 0.3)
+    return primitives.plan(CONFIG.sim, CONFIG.heightmap, height, grasp, fingers)
+
+
+def test_hand_opens_as_far_as_the_fingers():
+    """Claim: a grasp begins with the episode's opening and ends closed; a push stays closed."""
+    plan = _plan(THIN)
+    assert plan.start[4] == plan.control[:, 4].max() == np.float32(0.04)
+    assert plan.control[-1, 4] == 0.0
+    assert _plan(None).start[4] == np.float32(0.07)
+    push = primitives.plan(
+        CONFIG.sim, CONFIG.heightmap, jnp.zeros((32, 32)), Action.push(0.0, 0.0, 0.0), THIN
+    )
+    assert push.control[:, 4].max() == 0.0
+
+
+@pytest.mark.mjx
+@pytest.mark.parametrize("physics", ["mjx", "warp"])
+def test_other_physics_have_the_same_pads(physics: PhysicsKind):
+    """Claim: size, place and bounds of the pads in MJX and on Warp are those in C MuJoCo."""
+    sim = dataclasses.replace(CONFIG.sim, physics=physics)
+    world, scene = model.build(CONFIG.scene, sim), _scene()
+    wanted = model.with_blocks(world, _fields(world, THIN))
+    if physics == "mjx":
+        from csac_jax.sim import mjx_physics
+
+        found = vars(mjx_physics.scene_model(mjx_physics.make(world, sim), scene))
+    else:
+        from csac_jax.sim import warp_physics
+
+        found = warp_physics._model_fields(world, scene)
+        bounds = found["geom_aabb"][world.hand_geoms[1:]]
+        np.testing.assert_allclose(bounds[:, 1], wanted.geom_size[world.hand_geoms[1:]], rtol=1e-6)
+    for name in ("geom_size", "geom_pos", "geom_rbound"):
+        np.testing.assert_allclose(found[name], getattr(wanted, name), rtol=1e-6, err_msg=name)
+
+
+def test_oracle_takes_what_fits(env: Env):
+    """Claim: the planner takes a block whole where the hand opens wide, and across its narrow side
+    where it does not."""
+    scene = _scene()
+    half = scene.half_size.at[0].set(jnp.array([0.045, 0.015, 0.02]))
+    scene = scene.replace(
+        half_size=half,
+        position=scene.position.at[0].set(jnp.array([0.0, 0.0, 0.02])),
+        in_play=jnp.array([True, False, False]),
+    )
+
+    def across(opening: float) -> float:
+        """Of the block's long side that the hand closes along, 0 to 1."""
+        own = scene.replace(fingers=Fingers(jnp.float32(opening), *scene.fingers[1:]))
+        height = env.reset_to(own).obs.height
+        return abs(float(jnp.cos(oracle.grasp(CONFIG, own, height).pose[2])))
+
+    assert across(0.07) < 0.2
+    assert across(0.06) < 0.2
+
+
+def test_net_sees_the_fingers(states: State):
+    """Claim: Q follows the fingers, and nothing else tells the nets of two grippers apart."""
+    learner, params = actor_critic.make(CONFIG), _networks(CONFIG)
+    look = jax.jit(functools.partial(actor_critic.dense_maps, learner, params))
+    obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
+    same = obs.replace(fingers=obs.fingers[:1].repeat(2, axis=0))
+    other = same.replace(fingers=same.fingers + 0.004)
+    assert float(jnp.abs(look(other).q - look(same).q).max()) > 1e-3
+    packed = heightmap.unpack(heightmap.pack(obs))
+    np.testing.assert_array_equal(packed.fingers, obs.fingers)
+
+
+def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State):
+    """Claim: networks that see no gripper, or no gripper and no target, go on from what they know:
+    Q is the same for all fingers until they learn. A policy that sees a target is refused, whose
+    input is not the last; and so are settings of other networks."""
+    blind = presets.smoke().change(sim={"physics": "c"})
+    params = _networks(blind)
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, params, blind)
+    for cfg in (CONFIG, CONFIG.change(task={"kind": "target"})):
+        start: Any = api.starting(cfg, path)
+        learner = actor_critic.make(cfg)
+        found = start(actor_critic.init(jax.random.key(3), learner)).online
+        obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
+        seen = actor_critic.dense_maps(actor_critic.make(blind), params, obs.replace(fingers=None))
+        both = actor_critic.dense_maps(learner, found, obs)
+        np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
+    aimed = blind.change(task={"kind": "target"})
+    policy_file.save(path, _networks(aimed), aimed)
+    with pytest.raises(SettingsError, match="its networks are not those of these settings"):
+        api.starting(CONFIG.change(task={"kind": "target"}), path)
+
+
+def test_sizes_of_a_start_keep_the_gripper():
+    """Claim: with `init` the nets have the sizes of that policy and still see the gripper."""
+    assert api.with_networks_of(CONFIG, "shipped").net.gripper
+    assert not api.with_networks_of(CONFIG.change(net={"gripper": False}), "shipped").net.gripper
+
+
+def test_augmentation_keeps_the_fingers(states: State):
+    """Claim: mirrored and shifted transitions are of the same gripper."""
+    packed = heightmap.pack(jax.tree.map(lambda leaf: leaf[0], states.obs))
+    none = jnp.zeros(())
+    stored = Transition(packed, Action.grasp(0.0, 0.0, 0.0), none, packed, jnp.zeros((), bool))
+    cfg = CONFIG.change(learn={"augment_shift": 2})
+    for seed in range(4):
+        new = augment.augment(jax.random.key(seed), cfg, stored)
+        np.testing.assert_array_equal(new.obs.fingers, packed.fingers)
+        np.testing.assert_array_equal(new.next_obs.fingers, packed.fingers)
+
+
+def test_gymnasium_shows_the_fingers(monkeypatch: pytest.MonkeyPatch, env: Env):
+    """Claim: an environment whose nets see the gripper has it in its observations."""
+    monkeypatch.setattr("csac_jax.gym.make_env", lambda cfg: env)
+    single = gymnasium.make("csac_jax/Clutter-v0", config=CONFIG)
+    seen, _ = single.reset(seed=0)
+    assert seen["fingers"].shape == (3,)
+    assert single.observation_space.contains(seen)
+
+
+def test_robot_has_one_gripper(tmp_path: Path):
+    """Claim: a policy for any gripper asks which one the robot has."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, _networks(CONFIG), CONFIG)
+    with pytest.raises(SettingsError, match="gripper: name the robot's, one of 2f85, franka_hand"):
+        deploy.Policy.load(path)
+    assert deploy.Policy.load(path, gripper="2f85").cfg.sim.gripper == "2f85"
