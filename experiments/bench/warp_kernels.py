@@ -40,7 +40,6 @@ _UNITS["%"] = 0.01
 
 def launch(scenes: int, substeps: int) -> None:
     """The substeps, which a profiler counts."""
-    os.environ["JAX_PLATFORMS"] = "cpu"
     import jax
     import numpy as np
     import warp as wp
@@ -51,7 +50,7 @@ def launch(scenes: int, substeps: int) -> None:
 
     few = min(scenes, FEW)
     cfg = presets.get("fast").change(
-        sim={"physics": "warp"}, scene={"pool": few}, train={"scenes": few, "learning_starts": few}
+        sim={"physics": "warp"}, scene={"pool": few}, train={"scenes": few, "learning_starts": FEW}
     )
     env: Any = environment.make_env(cfg)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), few))
@@ -63,10 +62,8 @@ def launch(scenes: int, substeps: int) -> None:
     given = jax.device_get(jax.jit(jax.vmap(inputs))(states.scene, joints))
     simulator = env.physics.simulator
     batch = simulator.prepared(scenes)
-    repeated = [
-        np.resize(given[name], (scenes, *given[name].shape[1:])) for name in simulator.arguments
-    ]
-    for target, values in zip(batch.given, repeated, strict=True):
+    for target, name in zip(batch.given, simulator.arguments, strict=True):
+        values = np.resize(given[name], (scenes, *given[name].shape[1:]))
         wp.copy(target, wp.array(values, dtype=target.dtype, ndim=target.ndim))
     cuda, done = ctypes.CDLL("libcuda.so.1"), 0
     batch.restart()
@@ -127,7 +124,8 @@ def main(arguments: list[str]) -> None:
     ncu += ["--clock-control", "none", "--metrics", ",".join(METRICS.values()), "--csv"]
     own = [sys.executable, "-m", "csac_jax", "bench", "warp_kernels", "--counted"]
     own += ["--scenes", str(options.scenes), "--substeps", str(options.substeps)]
-    found = subprocess.run([*ncu, *own], check=False, capture_output=True, text=True)
+    on_host = os.environ | {"JAX_PLATFORMS": "cpu"}
+    found = subprocess.run([*ncu, *own], check=False, capture_output=True, text=True, env=on_host)
     if '"ID"' not in found.stdout:
         said = (found.stderr or found.stdout).strip().splitlines()
         raise SettingsError(f"bench warp_kernels: ncu counted nothing: {' '.join(said[-1:])}")
