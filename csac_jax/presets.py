@@ -128,10 +128,10 @@ def grippers() -> Config:
         net=SMALL_NET | {"subcells": 2, "gripper": True},
         target={"gamma": 0.2},
         reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
-        explore={"decay": 0.9995},
-        learn={"actor_batch": 8, "augment_shift": 8},
+        explore={"epsilon_primitive": (0.2, 0.1), "epsilon_place": (0.2, 0.0), "decay": 0.9995},
+        learn={"actor_batch": 8, "augment_shift": 8, "updates": 1, "learning_rate": 5e-4},
         replay={"capacity": 16384, "end": (1.0, 4.0)},
-        train={"actions": 12000, "learning_starts": 128, "chunk": 20, "save_every": 10},
+        train={"actions": 6000, "learning_starts": 128, "chunk": 20, "save_every": 10},
     )
 
 

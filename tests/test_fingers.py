@@ -16,6 +16,7 @@ from csac_jax import api, deploy, grippers, presets
 from csac_jax.agent import actor_critic, augment
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Transition
+from csac_jax.cli import main
 from csac_jax.config import Config, PhysicsKind
 from csac_jax.env import Env, State, make_env
 from csac_jax.errors import SettingsError
@@ -29,6 +30,7 @@ from csac_jax.vision import heightmap
 
 CONFIG = presets.smoke().change(sim={"physics": "c", "gripper": "varied"}, net={"gripper": True})
 VARIED = grippers.load("varied")
+ASKED = "gripper: name the robot's, one of 2f85, franka_hand, rg2"
 THIN = Fingers(0.08, 0.009, 0.015)  # m
 
 
@@ -79,14 +81,16 @@ def test_every_episode_has_its_own(env: Env, states: State):
     assert blind.reset(jax.random.key(0)).obs.fingers is None
 
 
+@pytest.mark.mjx
 def test_fingers_stay_for_the_episode(env: Env, states: State):
     """Claim: a step keeps the fingers, also where physics fails; the next episode has others; and a
     scene that is given has the largest, or those that it comes with."""
     first = jax.tree.map(lambda leaf: leaf[0], states)
     spoilt = first.replace(obs=first.obs.replace(height=first.obs.height.at[0, 0].set(jnp.nan)))
     step = jax.jit(env.step)
-    for state in (first, spoilt):
+    for state, fails in ((first, False), (spoilt, True)):
         after = step(state, Action.grasp(0.0, 0.0, 0.0))
+        assert bool(after.info.physics_diverged) == fails
         np.testing.assert_array_equal(after.scene.fingers, first.scene.fingers)
         np.testing.assert_array_equal(after.obs.fingers, first.obs.fingers)
     following = env.auto_reset(jax.random.key(7), first)
@@ -110,7 +114,7 @@ def test_pads_in_mujoco(fingers: Fingers):
     apart = np.linalg.norm((data.geom_xpos[high] - data.geom_xpos[low])[:2])
     np.testing.assert_allclose(apart - fingers.thickness, fingers.opening, atol=1e-6)
     for pad in (low, high):
-        half = 0.5 * fingers.thickness, 0.5 * fingers.width, 0.030
+        half = 0.5 * fingers.thickness, 0.5 * fingers.width, 0.00925
         np.testing.assert_allclose(own.geom_size[pad], half, rtol=1e-6)
         np.testing.assert_allclose(own.geom_rbound[pad], np.linalg.norm(half), rtol=1e-6)
 
@@ -155,6 +159,7 @@ def test_other_physics_have_the_same_pads(physics: PhysicsKind):
         np.testing.assert_allclose(found[name], getattr(wanted, name), rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.mjx
 def test_oracle_takes_what_fits(env: Env):
     """Claim: the planner takes a block whole where the hand opens wide, and across its narrow side
     where it does not."""
@@ -237,10 +242,19 @@ def test_gymnasium_shows_the_fingers(monkeypatch: pytest.MonkeyPatch, env: Env):
     assert single.observation_space.contains(seen)
 
 
-def test_robot_has_one_gripper(tmp_path: Path):
-    """Claim: a policy for any gripper asks which one the robot has."""
-    path = tmp_path / "policy.safetensors"
+@pytest.mark.mjx
+def test_robot_has_one_gripper(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Claim: a policy for any gripper can be exported as it is. What decides for a robot, or is a
+    program, asks which gripper that has, in one line."""
+    path, program_file = tmp_path / "policy.safetensors", tmp_path / "program.onnx"
     policy_file.save(path, _networks(CONFIG), CONFIG)
-    with pytest.raises(SettingsError, match="gripper: name the robot's, one of 2f85, franka_hand"):
-        deploy.Policy.load(path)
-    assert deploy.Policy.load(path, gripper="2f85").cfg.sim.gripper == "2f85"
+    assert main(["export", str(path), str(tmp_path / "copy.safetensors")]) == 0
+    with pytest.raises(SettingsError, match=f"^{ASKED}"):
+        deploy.Policy.load(path).warm_up(64, 48)
+    deploy.Policy.load(path, gripper="2f85").warm_up(64, 48)
+    given = ["export", str(path), str(program_file), "--format", "onnx"]
+    capsys.readouterr()
+    assert main(given) == 2
+    assert ASKED in capsys.readouterr().err
+    assert not program_file.exists()
+    assert main([*given, "--gripper", "2f85"]) == 0

@@ -23,6 +23,8 @@ class ExportOptions:
     format: Literal["safetensors", "stablehlo", "onnx"] = "safetensors"
     """safetensors: a policy file for the other commands. stablehlo: a program that jax runs alone.
     onnx: one that onnxruntime runs alone, of the small net; it takes the best cell."""
+    gripper: str | None = None
+    """The robot's gripper, by name or folder; by default that of the training."""
     input: Literal["maps", "image"] = "maps"
     """What a program takes: colour and height map, or (stablehlo) a camera's image and pose."""
     size: tuple[int, int] = (640, 480)
@@ -36,7 +38,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax import deploy
     from csac_jax.io import files, policy_file
 
-    policy = deploy.Policy.load(options.policy)
+    policy = deploy.Policy.load(options.policy, gripper=options.gripper)
     if options.format == "safetensors":
         policy_file.save(options.file, policy.params, policy.cfg)
     else:

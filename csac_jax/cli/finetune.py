@@ -25,6 +25,8 @@ class FinetuneOptions:
     """A policy file, shipped for the policy that comes with the package, or a run's folder."""
     record: tyro.conf.Positional[Path]
     """Folder that act or serve wrote with --record."""
+    gripper: str | None = None
+    """The robot's gripper, by name or folder; by default that of the training."""
     out: Path = Path("finetuned.safetensors")
     """Policy file to write, which must not exist."""
     updates: int = 150
@@ -52,7 +54,7 @@ def run(arguments: list[str]) -> int:
         ) from None
     from csac_jax.io import policy_file
 
-    policy = Policy.load(options.policy)
+    policy = Policy.load(options.policy, gripper=options.gripper)
     values = (options.updates, options.learning_rate, options.batch, options.seed)
     settings = finetune.Settings(*values)
     tuned, done = finetune.run(policy, options.record, settings, _printer(), stop)

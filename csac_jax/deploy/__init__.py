@@ -60,8 +60,8 @@ class Policy:
         """The policy `shipped`, of a policy file, or of a run's folder, which needs MuJoCo.
 
         Args: workspace_pose, 4 x 4, workspace to robot frame; the identity by default. gripper, the
-        robot's, by name or folder; by default the one that the policy was trained with, which one
-        for any gripper has not.
+        robot's, by name or folder; by default the one that the policy was trained with. One for
+        any gripper needs to know it before it decides.
         Raises FileNotFoundError, PolicyFileError, CheckpointError or SettingsError.
         """
         path = policy_file.find(source)
@@ -70,9 +70,6 @@ class Policy:
         if gripper is not None:
             grippers.load(gripper)  # refuses what is none
             cfg = cfg.change(sim={"gripper": gripper})
-        if grippers.load(cfg.sim.gripper).varies is not None:
-            known = ", ".join(grippers.shipped())
-            raise SettingsError(f"gripper: name the robot's, one of {known}, or its folder")
         return cls(cfg, jax.device_put(params), pose)
 
     def decide(

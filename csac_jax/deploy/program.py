@@ -13,6 +13,7 @@ from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
+from csac_jax.errors import SettingsError
 from csac_jax.sim import primitives
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
@@ -46,9 +47,13 @@ def observe(cfg: Config, points: Any, valid: Any, colour: Any, target: Any) -> O
 
 
 def fingers(cfg: Config) -> jax.Array | None:
-    """The gripper's, as the networks see it [3] m; None where they do not."""
-    own = grippers.load(cfg.sim.gripper).fingers
-    return jnp.array(own, jnp.float32) if cfg.net.gripper else None
+    """The gripper's, as the networks see it [3] m; None where they do not. Raises SettingsError
+    for a gripper that is none, but many."""
+    gripper = grippers.load(cfg.sim.gripper)
+    if gripper.varies is not None:
+        known = ", ".join(grippers.shipped())
+        raise SettingsError(f"gripper: name the robot's, one of {known}, or its folder")
+    return jnp.array(gripper.fingers, jnp.float32) if cfg.net.gripper else None
 
 
 def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool) -> DenseMaps:
