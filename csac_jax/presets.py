@@ -131,7 +131,7 @@ def grippers() -> Config:
         explore={"epsilon_primitive": (0.2, 0.1), "epsilon_place": (0.2, 0.0), "decay": 0.9995},
         learn={"actor_batch": 8, "augment_shift": 8, "updates": 1, "learning_rate": 5e-4},
         replay={"capacity": 16384, "end": (1.0, 4.0)},
-        train={"actions": 6000, "learning_starts": 128, "chunk": 20, "save_every": 10},
+        train={"actions": 6080, "learning_starts": 128, "chunk": 20, "save_every": 10},
     )
 
 

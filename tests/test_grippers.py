@@ -31,8 +31,9 @@ def _write(folder: Path, numbers: Any) -> str:
 
 
 def test_shipped_grippers_name_their_sources():
-    """Claim: three grippers come with the package, and each says where its lengths are from."""
-    assert grippers.shipped() == ["2f85", "franka_hand", "rg2"]
+    """Claim: three grippers come with the package, and a hand of many sizes; each says where its
+    lengths are from."""
+    assert grippers.shipped() == ["2f85", "franka_hand", "rg2", "varied"]
     for name in grippers.shipped():
         sources = _numbers(name)["sources"]
         assert {*sources} >= {*grippers._LENGTHS} - {"clearance"}
@@ -129,7 +130,7 @@ def test_files_that_are_no_numbers_are_refused(tmp_path: Path, text: str):
 @pytest.mark.parametrize("source", ["rg3", "", "/nowhere", "a\nb"])
 def test_no_gripper_is_one_line(source: str):
     """Claim: a name without a gripper says which there are."""
-    with pytest.raises(SettingsError, match="neither one of 2f85, franka_hand, rg2 nor a folder"):
+    with pytest.raises(SettingsError, match="neither one of 2f85, franka_hand, rg2, varied nor a folder"):
         grippers.load(source)
 
 
