@@ -165,6 +165,19 @@ BENCHES = {
         "halves and quarters of the scenes on CUDA streams of their own; no longer in the code",
         "bench warp_action --lanes 2 4 --repeats 3",
     ),
+    "warp_action/h100-contacts": (
+        "contacts in the same order in every run",
+        "bench warp_action --scenes 512 --repeats 2 --repeatable contacts",
+    ),
+    "warp_action/h100-rows": (
+        "and the rows of constraints",
+        "bench warp_action --scenes 512 --repeats 2 --repeatable contacts rows",
+    ),
+    "warp_action/h100-smooth": (
+        "and the sums over bodies",
+        "bench warp_action --scenes 512 --repeats 1 --repeatable contacts rows smooth",
+    ),
+    "warp_kernels/h100": ("physics' kernels by the GPU's counters", "bench warp_kernels"),
     "warp_action/h100-scenes": (
         "an action against scenes",
         "bench warp_action --scenes 512 4096 8192 --repeats 2",

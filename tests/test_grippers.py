@@ -130,7 +130,9 @@ def test_files_that_are_no_numbers_are_refused(tmp_path: Path, text: str):
 @pytest.mark.parametrize("source", ["rg3", "", "/nowhere", "a\nb"])
 def test_no_gripper_is_one_line(source: str):
     """Claim: a name without a gripper says which there are."""
-    with pytest.raises(SettingsError, match="neither one of 2f85, franka_hand, rg2, varied nor a folder"):
+    with pytest.raises(
+        SettingsError, match="neither one of 2f85, franka_hand, rg2, varied nor a folder"
+    ):
         grippers.load(source)
 
 

@@ -1,5 +1,6 @@
 """Physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--blocks N ...]
-[--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details] [--repeatable]`.
+[--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details]
+[--repeatable [STAGE ...]]`.
 
 For each number of scenes (2048), of blocks (those of the preset `fast`), and for each longest step
 in ms (ours): seconds of an action of the environment (`env`), of physics alone (`physics`), and of

@@ -88,7 +88,7 @@ def table(text: str) -> list[dict[str, Any]]:
         one[row["Metric Name"]] = value * _UNITS[row["Metric Unit"]]
     sums: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
     for one in launches.values():
-        name = re.sub(r"_[0-9a-f]{8}\b.*|__locals__.*", "", one["kernel"])
+        name = re.sub(r"_[0-9a-f]{8}(_cuda_kernel.*)?$|__locals__.*", "", one["kernel"])
         seconds = one[METRICS["seconds"]]
         for group in ("all", name):
             sums[group].update({"launches": 1, "seconds": seconds, "bytes": one[METRICS["bytes"]]})
