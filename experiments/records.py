@@ -66,6 +66,7 @@ RUNS = {
     "objects/from_shipped": "the same by `--init shipped`; other work on both",
     "objects/from_shipped_slow": "the same, smaller steps and less exploration",
     "objects/from_shipped_gpu": "by `--init shipped` on a GPU; stopped at 278,528 actions",
+    "grippers/from_shipped": "a gripper that varies, by `--init shipped` on two CPU cores",
     "objects/oracle": "a planner that reads the objects' poses",
     "objects/geometric": "antipodal grasps from the edges of the height map",
     "objects/target": "what `objects_target` learns on two CPU cores; other work on both",
