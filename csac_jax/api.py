@@ -192,7 +192,8 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
     policy = policies.load(source)
     assert isinstance(policy, LearnedPolicy)
     params, wanted = policy.params, actor_critic.abstract_params(cfg)
-    if policy.cfg.task.kind != "target":  # whose input is the last
+    only_last = policy.cfg.task.kind != "target" and policy.cfg.net.colour == cfg.net.colour
+    if only_last:  # inputs may be missing: colours, heights, gripper and target are in this order
         params = actor_critic.with_inputs(params, wanted)
     if leaves.layout(params) != leaves.layout(wanted):
         raise SettingsError(

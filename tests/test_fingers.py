@@ -161,24 +161,17 @@ def test_other_physics_have_the_same_pads(physics: PhysicsKind):
 
 @pytest.mark.mjx
 def test_oracle_takes_what_fits(env: Env):
-    """Claim: the planner takes a block whole where the hand opens wide, and across its narrow side
-    where it does not."""
-    scene = _scene()
-    half = scene.half_size.at[0].set(jnp.array([0.045, 0.015, 0.02]))
-    scene = scene.replace(
-        half_size=half,
-        position=scene.position.at[0].set(jnp.array([0.0, 0.0, 0.02])),
-        in_play=jnp.array([True, False, False]),
+    """Claim: the planner takes the high block of two where it is narrower than the opening by
+    OPENING_ROOM, else the low one, which still is."""
+    half = jnp.array([[0.026, 0.026, 0.06], [0.025, 0.025, 0.02], [0.02, 0.02, 0.02]])
+    position = jnp.array([[-0.08, 0.0, 0.06], [0.08, 0.0, 0.02], [3.6, 0.0, 1.0]])
+    scene = _scene().replace(
+        half_size=half, position=position, in_play=jnp.array([True, True, False])
     )
-
-    def across(opening: float) -> float:
-        """Of the block's long side that the hand closes along, 0 to 1."""
+    for opening, x in ((0.073, -0.08), (0.071, 0.08)):
         own = scene.replace(fingers=Fingers(jnp.float32(opening), *scene.fingers[1:]))
-        height = env.reset_to(own).obs.height
-        return abs(float(jnp.cos(oracle.grasp(CONFIG, own, height).pose[2])))
-
-    assert across(0.07) < 0.2
-    assert across(0.06) < 0.2
+        taken = oracle.grasp(CONFIG, own, env.reset_to(own).obs.height)
+        np.testing.assert_allclose(taken.pose[0], x, atol=0.005)
 
 
 def test_net_sees_the_fingers(states: State):
@@ -195,8 +188,8 @@ def test_net_sees_the_fingers(states: State):
 
 def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State):
     """Claim: networks that see no gripper, or no gripper and no target, go on from what they know:
-    Q is the same for all fingers until they learn. A policy that sees a target is refused, whose
-    input is not the last; and so are settings of other networks."""
+    Q is the same for all fingers until they learn. Refused are those that lack another input than
+    the last: a policy that sees a target and no gripper, and one that sees no colours."""
     blind = presets.smoke().change(sim={"physics": "c"})
     params = _networks(blind)
     path = tmp_path / "policy.safetensors"
@@ -209,10 +202,11 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
         seen = actor_critic.dense_maps(actor_critic.make(blind), params, obs.replace(fingers=None))
         both = actor_critic.dense_maps(learner, found, obs)
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
-    aimed = blind.change(task={"kind": "target"})
-    policy_file.save(path, _networks(aimed), aimed)
-    with pytest.raises(SettingsError, match="its networks are not those of these settings"):
-        api.starting(CONFIG.change(task={"kind": "target"}), path)
+    for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):
+        other = blind.change(**changes)
+        policy_file.save(path, _networks(other), other)
+        with pytest.raises(SettingsError, match="its networks are not those of these settings"):
+            api.starting(CONFIG.change(task={"kind": "target"}), path)
 
 
 def test_sizes_of_a_start_keep_the_gripper():
