@@ -131,13 +131,14 @@ def _random(cfg: Config, seed: int) -> tuple[Any, Observation]:
         height[row : row + 8, col : col + 6] = rng.uniform(0.02, 0.08)
         target[row : row + 8, col : col + 6] = number % 2 == 0
     colour = rng.uniform(size=(size, size, 3)).astype(np.float32)
-    return params, Observation(colour, height, target)
+    return params, Observation(colour, height, target, program.fingers(cfg))
 
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "quick": {"heightmap": {"size": 64}},
     "target": {"task": {"kind": "target"}, "learn": {"critics": 2}},
     "heights": {"net": {"colour": False, "stride": 4, "subcells": 2, "dilations": (1, 2)}},
+    "gripper": {"net": {"gripper": True}, "task": {"kind": "target"}, "sim": {"gripper": "2f85"}},
     "anywhere": {"policy": {"cells": "all"}, "net": {"growth": 4, "stem": 4}},
     "grasp": {
         "policy": {"primitive": "grasp"},
