@@ -38,6 +38,7 @@ _LENGTHS = {  # key -> its parts, () for one number; m, up to 1
 _WORDS = ("name", "body", "palm")
 _VARIES = "varies"
 _KEYS = ("format", *_WORDS, "pads", "actuator", "joints", *_LENGTHS, "arc_radius", "sources")
+_KEYS += (_VARIES,)  # which may be missing
 
 Ends = tuple[float, float]  # closed, open
 
@@ -210,8 +211,8 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _gripper(folder: Path, given: dict[str, Any]) -> Gripper:
     """The gripper of these numbers, whatever they are. Raises ValueError by name of a wrong key."""
-    for name in sorted(given.keys() - {*_KEYS, _VARIES}):
-        raise ValueError(f"'{name}' is unknown; the keys are: {', '.join((*_KEYS, _VARIES))}")
+    for name in sorted(given.keys() - set(_KEYS)):
+        raise ValueError(f"'{name}' is unknown; the keys are: {', '.join(_KEYS)}")
     _require(_need(given, "format") == FORMAT, f"'format' must be {FORMAT}")
     actuator, joints = (_object(_need(given, name), name) for name in ("actuator", "joints"))
     pads, arc = _need(given, "pads"), _need(given, "arc_radius")

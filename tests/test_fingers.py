@@ -197,7 +197,7 @@ def test_oracle_takes_what_fits(env: Env):
 
 
 def test_net_sees_the_fingers(states: State):
-    """Claim: Q follows the fingers, and nothing else tells the nets of two grippers apart."""
+    """Claim: Q follows the fingers, which a stored observation keeps."""
     learner, params = actor_critic.make(CONFIG), _networks(CONFIG)
     look = jax.jit(functools.partial(actor_critic.dense_maps, learner, params))
     obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)

@@ -157,6 +157,19 @@ def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
         _require_same(path, f"opening when {name}", opening, gripper.opening[end])
         below = float(gripper.drop(gripper.half[end]))
         _require_same(path, f"height of the tips when {name}", height, -below)
+    if gripper.varies is not None:
+        _check_pads(path, gripper)
+
+
+def _check_pads(path: Path, gripper: Gripper) -> None:
+    """Raises SceneError where an episode's fingers could not be put in place of the MJCF's."""
+    model, (thickness, width, _) = _compiled(path), gripper.finger
+    for name in gripper.pads:
+        pad = model.geom(name)
+        _require_same(path, f"thickness of {name}", 2.0 * pad.size[0], thickness)
+        _require_same(path, f"width of {name}", 2.0 * pad.size[1], width)
+        inner = abs(pad.pos[0]) - pad.size[0]
+        _require_same(path, f"inner face of {name} in its finger's frame", inner, 0.0)
 
 
 def _require_same(path: Path, what: str, found: float, wanted: float) -> None:

@@ -80,7 +80,7 @@ def plan(
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
     gripper = grippers.load(cfg.gripper)
-    fingers = fingers or gripper.fingers
+    fingers = gripper.fingers if fingers is None else fingers
     surface = local_top(heightmap, height, xy, fingers.width)
     depth = jnp.where(is_grasp, grasp_depth(cfg, gripper), cfg.push_depth)
     low = jnp.maximum(surface - depth, lowest(cfg, gripper))

@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 
 from csac_jax.config import Config
+from csac_jax.env import Env, State
 from csac_jax.scene import model
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import mjx_physics, primitives
+from csac_jax.sim import mjx_physics, oracle, primitives
 from csac_jax.sim.c_physics import CPhysics
 from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.physics import Physics
@@ -21,6 +22,16 @@ from csac_jax.sim.quiet_mjx import mjx
 from csac_jax.sim.warp_physics import WarpPhysics
 
 AT_ONCE = 128  # scenes; XLA wants gigabytes for thousands
+
+
+def grasping(cfg: Config, env: Env, scenes: int) -> tuple[State, Action, JointTrajectory]:
+    """First states of so many scenes, a grasp in each that the planner takes, and how the robot
+    moves; leaves [E, ...]."""
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
+    grasp = functools.partial(oracle.grasp, cfg)
+    planned = functools.partial(jax.lax.map, lambda row: grasp(*row), batch_size=AT_ONCE)
+    actions = jax.jit(planned)((states.scene, states.obs.height))
+    return states, actions, joint_trajectories(cfg, states.obs.height, actions)
 
 
 def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:

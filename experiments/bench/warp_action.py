@@ -18,7 +18,6 @@ then can Warp time them. --repeatable asks Warp for the same bits in every run, 
 """
 
 import collections
-import functools
 import itertools
 import json
 import re
@@ -34,9 +33,8 @@ import warp as wp
 from csac_jax import env as environment, presets
 from csac_jax.config import Config
 from csac_jax.runtime import cache, provenance
-from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
-from experiments.bench import _bare
+from experiments.bench import _bare, _same_bits
 from experiments.bench._options import Parser, with_blocks
 from experiments.bench._timing import medians
 
@@ -64,11 +62,7 @@ def measure(cfg: Config, longest: float, repeats: int, details: bool) -> dict[st
     scenes = cfg.train.scenes
     with mock.patch.object(warp_action, "STEP", 1e-3 * longest):
         env = environment.make_env(cfg)
-    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
-    grasp = functools.partial(oracle.grasp, cfg)
-    planned = functools.partial(jax.lax.map, lambda row: grasp(*row), batch_size=_bare.AT_ONCE)
-    actions = jax.jit(planned)((states.scene, states.obs.height))
-    joints = jax.block_until_ready(_bare.joint_trajectories(cfg, states.obs.height, actions))
+    states, actions, joints = jax.block_until_ready(_bare.grasping(cfg, env, scenes))
     begun = {"scenes_ready": _seconds_since_start()}
     step = jax.jit(jax.vmap(env.step))
     with mock.patch.object(warp_action, "STEP", 1e-3 * longest):
@@ -145,12 +139,10 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--pool", type=int, default=64)
     parser.add_argument("--task", choices=("clear", "target"), default="clear")
     parser.add_argument("--details", action="store_true")
-    parser.add_argument("--repeatable", nargs="*", metavar="STAGE")
+    parser.add_argument("--repeatable", nargs="*", choices=_same_bits.STAGES)
     options = parser.parse_args(arguments)
     cache.enable()
     if options.repeatable is not None:
-        from experiments.bench import _same_bits
-
         _same_bits.ask(options.repeatable or _same_bits.STAGES)
     from csac_jax.sim import warp_action
 

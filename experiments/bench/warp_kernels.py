@@ -1,10 +1,10 @@
-"""What bounds physics on Warp? As JSON: `csac-jax bench warp_kernels [--scenes E] [--substeps N]`.
+"""What bounds physics on Warp? As JSON: `csac-jax bench warp_kernels [--scenes E]`.
 
-Counters of the GPU, by NVIDIA's `ncu`, which must be on the PATH, in N (10) substeps of E (4096)
-scenes of `fast` that grasp, half of them as the hand comes down, half as it closes. For each
-kernel: `launches`, its `share` of the time, `us` of a launch. `bandwidth` is the share of the
-memory's most that it moves; `active` that of the multiprocessors' warps which are there while it
-runs; `issued` that of the instructions which they could issue. `all` weighs them by time.
+Counters of the GPU, by NVIDIA's `ncu`, which must be on the PATH. They are of ten substeps of E
+(4096) scenes of `fast`: five while the fingers close, five while the hand lifts. For each kernel:
+`launches`, its `share` of the time, `us` of a launch. `bandwidth` is the share of the memory's most
+that it moves. `active` is that of the multiprocessors' warps which are there while it runs;
+`issued` that of the instructions which they could issue. `all` weighs them by time.
 
 ncu cannot follow what XLA launches. JAX makes the scenes on the host's cores here.
 """
@@ -23,10 +23,10 @@ import sys
 from typing import Any
 
 from csac_jax.errors import SettingsError
-from experiments.bench._options import Parser
+from experiments.bench._options import read
 
 FEW = 64  # scenes, which are repeated
-FIRST = (60, 100)  # substeps before each half
+COUNTED = (range(60, 65), range(100, 105))  # substeps
 METRICS = {
     "seconds": "gpu__time_duration.sum",
     "bytes": "dram__bytes.sum",
@@ -34,18 +34,18 @@ METRICS = {
     "issued": "sm__inst_executed.avg.pct_of_peak_sustained_elapsed",
     "bandwidth": "dram__throughput.avg.pct_of_peak_sustained_elapsed",
 }
-_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "byte": 1.0, "Kbyte": 1e3, "Mbyte": 1e6, "Gbyte": 1e9}
-_UNITS["%"] = 0.01
+_BYTES = {"byte": 1.0, "Kbyte": 1e3, "Mbyte": 1e6, "Gbyte": 1e9}
+_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "%": 0.01, **_BYTES}
 
 
-def launch(scenes: int, substeps: int) -> None:
+def launch(scenes: int) -> None:
     """The substeps, which a profiler counts."""
     import jax
     import numpy as np
     import warp as wp
 
     from csac_jax import env as environment, presets
-    from csac_jax.sim import oracle, warp_physics
+    from csac_jax.sim import warp_physics
     from experiments.bench import _bare
 
     few = min(scenes, FEW)
@@ -53,11 +53,7 @@ def launch(scenes: int, substeps: int) -> None:
         sim={"physics": "warp"}, scene={"pool": few}, train={"scenes": few, "learning_starts": FEW}
     )
     env: Any = environment.make_env(cfg)
-    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), few))
-    grasp = functools.partial(oracle.grasp, cfg)
-    planned = jax.jit(lambda *given: jax.lax.map(lambda row: grasp(*row), given))
-    actions = planned(states.scene, states.obs.height)
-    joints = _bare.joint_trajectories(cfg, states.obs.height, actions)
+    states, _, joints = _bare.grasping(cfg, env, few)
     inputs = functools.partial(warp_physics.inputs, env.physics)
     given = jax.device_get(jax.jit(jax.vmap(inputs))(states.scene, joints))
     simulator = env.physics.simulator
@@ -65,18 +61,16 @@ def launch(scenes: int, substeps: int) -> None:
     for target, name in zip(batch.given, simulator.arguments, strict=True):
         values = np.resize(given[name], (scenes, *given[name].shape[1:]))
         wp.copy(target, wp.array(values, dtype=target.dtype, ndim=target.ndim))
-    cuda, done = ctypes.CDLL("libcuda.so.1"), 0
+    cuda = ctypes.CDLL("libcuda.so.1")
     batch.restart()
-    for first in FIRST:
-        for _ in range(first - done):
-            batch.substep()
+    for substep in range(COUNTED[-1].stop):
+        is_counted = any(substep in one for one in COUNTED)
+        if is_counted:
+            cuda.cuProfilerStart()
+        batch.substep()
         wp.synchronize()
-        cuda.cuProfilerStart()
-        for _ in range(substeps // len(FIRST)):
-            batch.substep()
-        wp.synchronize()
-        cuda.cuProfilerStop()
-        done = first + substeps // len(FIRST)
+        if is_counted:
+            cuda.cuProfilerStop()
 
 
 def table(text: str) -> list[dict[str, Any]]:
@@ -110,20 +104,16 @@ def table(text: str) -> list[dict[str, Any]]:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    parser = Parser(prog="bench warp_kernels", allow_abbrev=False)
-    parser.add_argument("--scenes", type=int, default=4096)
-    parser.add_argument("--substeps", type=int, default=10)
-    parser.add_argument("--counted", action="store_true", help="under ncu")
-    options = parser.parse_args(arguments)
-    if options.counted:
-        launch(options.scenes, options.substeps)
+    options = read("warp_kernels", arguments, scenes=4096, counted=False)
+    if options["counted"]:  # by ncu, which runs this process
+        launch(options["scenes"])
         return
     if shutil.which("ncu") is None:
         raise SettingsError("bench warp_kernels: ncu is not on the PATH; CUDA's toolkit has it")
     ncu = ["ncu", "--profile-from-start", "off", "--cache-control", "none"]
     ncu += ["--clock-control", "none", "--metrics", ",".join(METRICS.values()), "--csv"]
     own = [sys.executable, "-m", "csac_jax", "bench", "warp_kernels", "--counted"]
-    own += ["--scenes", str(options.scenes), "--substeps", str(options.substeps)]
+    own += ["--scenes", str(options["scenes"])]
     on_host = os.environ | {"JAX_PLATFORMS": "cpu"}
     found = subprocess.run([*ncu, *own], check=False, capture_output=True, text=True, env=on_host)
     if '"ID"' not in found.stdout:
@@ -131,5 +121,5 @@ def main(arguments: list[str]) -> None:
         raise SettingsError(f"bench warp_kernels: ncu counted nothing: {' '.join(said[-1:])}")
     from csac_jax.runtime import provenance
 
-    sizes = {"scenes": options.scenes, "substeps": options.substeps}
-    print(json.dumps({**sizes, "kernels": table(found.stdout), **provenance.record()}, indent=2))
+    counted = {"scenes": options["scenes"], "kernels": table(found.stdout)}
+    print(json.dumps(counted | provenance.record(), indent=2))

@@ -114,3 +114,31 @@ def test_wide_hand_in_numbers_only_is_refused(tmp_path: Path):
     (Path(folder) / grippers.NUMBERS).write_text(json.dumps(numbers))
     with pytest.raises(SceneError, match=r"opening when open is 110\.0 mm, by gripper\.json 85\.0"):
         _built(folder)
+
+
+VARIED = '"finger_low" gravcomp="1">'
+CANNOT_VARY = {
+    "narrow": ([("0.010 0.013", "0.010 0.012")], "width of pad_low is 24.0 mm, by gripper.json 26"),
+    "thin": ([('size="0.010 ', 'size="0.007 '), ("0.010 0 0.009", "0.007 0 0.009")], "thickness"),
+    "frame": (
+        [(VARIED, VARIED[:-1] + ' pos="0.004 0 0">'), ("-0.010 0 0.009", "-0.014 0 0.009")],
+        "inner face of pad_low in its finger's frame is 4.0 mm",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CANNOT_VARY)
+def test_pads_that_cannot_vary_are_refused(tmp_path: Path, case: str):
+    """Claim: where fingers vary, MJCF whose pads are not the largest, or do not lie with their
+    inner faces on the fingers' frames, gives one line: pads of an episode would be elsewhere."""
+    changes, says = CANNOT_VARY[case]
+    folder = tmp_path / "mine"
+    shutil.copytree(grippers.load("varied").folder, folder)
+    text = (folder / grippers.MJCF).read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / grippers.MJCF).write_text(text)
+    with pytest.raises(SceneError, match=re.escape(says)) as error:
+        _built(str(folder))
+    assert "\n" not in str(error.value)
