@@ -95,7 +95,8 @@ def _compiled(kind: Any, cfg: Config, physics: Any, any_yaw: bool) -> tuple[Call
     """`_begin` and `_step` of an environment, whatever its scenes are: parts of a suite that share
     config and physics share them."""
     env = kind(cfg, physics, None, any_yaw)  # without scenes, as it never resets
-    return jax.jit(functools.partial(_begin, env)), jax.jit(functools.partial(_step, env))
+    step = jax.jit(functools.partial(_step, env), static_argnums=0)
+    return jax.jit(functools.partial(_begin, env)), step
 
 
 class StepRecord(NamedTuple):
@@ -161,7 +162,8 @@ def _run(
     states = states.replace(truncated=jnp.asarray(numbers >= episodes))
     records, failures = [], np.zeros(len(numbers), np.int32)
     for action in range(1, task.max_actions + 1):
-        states, record = step(_pytree(policy), jax.random.fold_in(key, action), numbers, states)
+        step_key = jax.random.fold_in(key, action)
+        states, record = step(type(policy), _pytree(policy), step_key, numbers, states)
         records.append(jax.device_get(record))
         failures = failures_in_a_row(failures, records[-1])
         if env.max_failures:
@@ -208,9 +210,14 @@ def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: Scene) -> State
 
 
 def _step(
-    env: Env, policy: Policy, key: jax.Array, numbers: jax.Array, states: State
+    env: Env, kind: type, policy: Policy, key: jax.Array, numbers: jax.Array, states: State
 ) -> tuple[State, Episodes]:
-    """One action in every scene and what it did, [E], 0 after the end; finished scenes stay."""
+    """One action in every scene and what it did, [E], 0 after the end; finished scenes stay.
+
+    `kind`, the policy's type, is static: JAX takes dataclasses of equal fields for equal whatever
+    their types are, and would at times run the program of the one for the other.
+    """
+    del kind
     running = ~states.done
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
     action = policies.act(policy, states, keys)

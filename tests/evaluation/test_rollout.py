@@ -32,15 +32,16 @@ class ShortTask(TaskConfig):
 CFG = dataclasses.replace(presets.smoke(), task=ShortTask(max_actions=6))
 ORACLE, RANDOM = OraclePolicy(CFG), RandomPolicy(CFG)
 EPISODES = 5
-REACH = 0.012  # m
 
 
 class Magnet(Env):
-    """No physics: a grasp within REACH of a block's centre takes it, all else does nothing."""
+    """No physics: a grasp within reach of a block's centre takes it, all else does nothing."""
+
+    reach: ClassVar[float] = 0.012  # m
 
     def step(self, state: State, action: Action) -> State:
         off = jnp.linalg.norm(state.scene.position[:, :2] - action.pose[None, :2], axis=1)
-        taken = state.scene.in_play & (off < REACH) & (action.primitive == Primitive.GRASP)
+        taken = state.scene.in_play & (off < self.reach) & (action.primitive == Primitive.GRASP)
         scene = layout.park(state.scene, ~taken)
         actions, steps_without_change = (
             state.actions + 1,
@@ -65,6 +66,16 @@ class Magnet(Env):
                 moved=jnp.where(jnp.any(taken), 25.0, 0.0),
             ),
         )
+
+
+class StrongMagnet(Magnet):
+    """Pushes take blocks too, and from so far that other places take other blocks."""
+
+    reach = 0.05
+
+    def step(self, state: State, action: Action) -> State:
+        grasp = jnp.full_like(action.primitive, Primitive.GRASP)
+        return super().step(state, action.replace(primitive=grasp))
 
 
 def _compiled(env: Env):
@@ -200,12 +211,32 @@ def test_learned_needs_its_networks_only(magnet):
 @pytest.mark.slow
 def test_networks_are_arguments(magnet):
     """Claim: other weights of the same networks compile nothing again, and act otherwise."""
+    strong = StrongMagnet(magnet.cfg, magnet.physics, magnet.scenes)
     first, other = (learned_policy(seed) for seed in (0, 1))
-    one = rollout.rollout(magnet, first, EPISODES, 0)
-    compiled = _compiled(magnet)[1]._cache_size()
-    two = rollout.rollout(magnet, other, EPISODES, 0)
-    assert _compiled(magnet)[1]._cache_size() == compiled
+    one = rollout.rollout(strong, first, EPISODES, 0)
+    compiled = _compiled(strong)[1]._cache_size()
+    two = rollout.rollout(strong, other, EPISODES, 0)
+    assert _compiled(strong)[1]._cache_size() == compiled
     assert any(not np.array_equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+def test_policies_of_equal_fields_are_told_apart(magnet, monkeypatch):
+    """Claim: what a policy's program is found by holds its type: JAX takes the structures of
+    dataclasses with equal fields for equal, and runs the program of the one for the other where
+    their hashes share seven bits."""
+    begin, step = _compiled(magnet)
+    kinds = []
+
+    def spied(*args: object) -> object:
+        kinds.append([leaf for leaf in jax.tree.leaves(args) if isinstance(leaf, type)])
+        return step(*args)
+
+    monkeypatch.setattr(rollout, "_compiled", lambda *_: (begin, spied))
+    for policy in (ORACLE, RANDOM):
+        kinds.clear()
+        rollout.rollout(magnet, policy, EPISODES, 0)
+        assert all(kind == [type(policy)] for kind in kinds)
+        assert kinds
 
 
 def test_function_is_a_policy(magnet):
