@@ -45,17 +45,20 @@ def quick() -> Config:
     """Learns to clear five blocks on a 2-core CPU; what was measured is in experiments/results.
 
     Blocks of one shape are alike in size, density and friction. Discount and the end of the Beta
-    law are not the literature's; neither is shown to be needed. For cheaper passes the actor learns
-    on a part of the batch, and the net's features lie 28 mm apart, not 14; its maps' cells still
-    14, and its layers see as far. What it costs: docs/benchmarks/speed-cpu.md.
+    law are not the literature's; neither is shown to be needed. Two cores can afford few passes: a
+    large step of the critic follows each step of all scenes, and exploration ends after some 500
+    actions. The actor learns on a part of the batch, and the net's features lie 28 mm apart, not
+    14; its maps' cells still 14, and its layers see as far. What it costs:
+    docs/benchmarks/speed-cpu.md.
     """
     return Config().change(
         preset="quick",
         scene={"size_jitter": (0.0, 0.0), "density": (600.0, 600.0), "friction": (0.8, 0.8)},
         sim={"physics": "auto"},
-        net=SMALL_NET | {"subcells": 2},
+        net=SMALL_NET | {"subcells": 2, "growth": 24},
         target={"gamma": 0.2},
-        learn={"actor_batch": 8},
+        explore={"decay": 0.995},
+        learn={"actor_batch": 8, "updates": 1, "learning_rate": 4e-3},
         replay={"end": (1.0, 4.0)},
     )
 
@@ -89,7 +92,7 @@ def objects() -> Config:
 
     The shapes are our own, of the families and seeds that train. They lie in piles and apart. The
     tips go lower than for blocks, which low and hollow things need (`csac-jax bench grasp_depth`).
-    The net is that of `quick`, the rewards are those of `fast`.
+    The net is that of `quick` with wider layers, the rewards are those of `fast`.
     """
     return quick().change(
         preset="objects",
@@ -104,9 +107,10 @@ def objects() -> Config:
         },
         task={"max_actions": 20},
         sim={"clearance": 0.004, "contacts": 128},
+        net={"growth": SMALL_NET["growth"]},
         reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
         explore={"decay": 0.9995},
-        learn={"augment_shift": 8},
+        learn={"augment_shift": 8, "updates": 2, "learning_rate": 1e-3},
         replay={"capacity": 16384},
         train={"actions": 24000, "learning_starts": 128, "chunk": 20, "save_every": 10},
     )
@@ -165,7 +169,7 @@ def paper_small() -> Config:
     Also ours: batches of 32, and with them Adam 1e-3; one update an action, and shifts of what is
     drawn from the replay, so that 2,500 actions are not learned by heart; the squared error of
     Algorithm 1 line 21; discount 0.2; SD3's twin critics; random places at first, and exploration
-    that ends after some 1,000 actions, as in `quick`. Meshes are of one size, which
+    that ends after some 1,000 actions. Meshes are of one size, which
     `sim.physics warp` needs. What each is worth: docs/benchmarks/learning-ablations.md;
     results: experiments/results/paper_small.
     """

@@ -16,6 +16,7 @@ from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
 from csac_jax.objects.library import Split
+from csac_jax.runtime import compiler
 from csac_jax.scene import stock
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, physics as simulation, primitives
@@ -95,8 +96,8 @@ def _compiled(kind: Any, cfg: Config, physics: Any, any_yaw: bool) -> tuple[Call
     """`_begin` and `_step` of an environment, whatever its scenes are: parts of a suite that share
     config and physics share them."""
     env = kind(cfg, physics, None, any_yaw)  # without scenes, as it never resets
-    step = jax.jit(functools.partial(_step, env), static_argnums=0)
-    return jax.jit(functools.partial(_begin, env)), step
+    jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
+    return jit(functools.partial(_begin, env)), jit(functools.partial(_step, env), static_argnums=0)
 
 
 class StepRecord(NamedTuple):

@@ -2,7 +2,9 @@
 
 On a CPU, XLA has a second library for convolutions, about twice as fast as Eigen at those of the
 small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
-LLVM's second level of optimisation compiles sooner than the third, to as fast a program.
+LLVM's second level of optimisation compiles sooner than the third, to as fast a program. So do
+XLA's former emitters of kernels, where it still has them: its new ones build an MLIR module for
+each of more than a thousand kernels.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
@@ -10,6 +12,7 @@ That takes half of the compilation, and the vendor's library is as fast (`experi
 
 import functools
 import gc
+import os
 from typing import Any
 
 import jax
@@ -21,7 +24,7 @@ from csac_jax.config import Config, SmallNet
 from csac_jax.nets.convolution import conv2d
 
 LIBRARY = {_guard.FUSION_FLAG.lstrip("-"): "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"}
-LEVEL = {"xla_backend_optimization_level": 2}
+SOONER = {"xla_backend_optimization_level": 2, "xla_cpu_use_fusion_emitters": False}
 VENDOR = {"xla_gpu_enable_triton_gemm": False}
 _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float32 gives some 1e-5
 
@@ -41,19 +44,23 @@ def lower(jitted: Any, *given: Any) -> Any:
 def options(cfg: Config) -> dict[str, Any] | None:
     """Options of `jax.jit` for the config's training program, None for the defaults.
 
-    The second library is slow at kernel gradients, which `conv2d` keeps from it.
+    The second library is slow at kernel gradients, which `conv2d` keeps from it. A level and
+    emitters that XLA_FLAGS asks for stay.
     """
     if jax.default_backend() == "cpu":
-        return LEVEL | (LIBRARY if isinstance(cfg.net, SmallNet) and has_library() else {})
+        flags = os.environ.get("XLA_FLAGS", "")
+        ours = {name: value for name, value in SOONER.items() if f"--{name}=" not in flags}
+        known = {name: value for name, value in ours.items() if _knows(name, value)}
+        return known | (LIBRARY if isinstance(cfg.net, SmallNet) and has_library() else {})
     vendor = jax.default_backend() == "gpu" and not isinstance(cfg.net, SmallNet)
-    return dict(VENDOR) if vendor and _knows_vendor() else None
+    return dict(VENDOR) if vendor and all(map(_knows, VENDOR, VENDOR.values())) else None
 
 
 @functools.cache
-def _knows_vendor() -> bool:
-    """Whether this XLA can leave matrix products to the vendor's library."""
+def _knows(name: str, value: Any) -> bool:
+    """Whether this XLA has such an option."""
     try:
-        jax.jit(jnp.negative, compiler_options=VENDOR).lower(0.0).compile()
+        jax.jit(jnp.negative, compiler_options={name: value}).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True

@@ -139,7 +139,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "reward": jit(reward),
         "remember": jax.jit(remember, donate_argnums=0),
         "learn": jit(
-            lambda key, nets, replay: step._learn(program, key, nets, replay, nets.updates)
+            lambda key, nets, replay: step.learn(program, key, nets, replay, nets.updates)
         ),
         "replace": jax.jit(replace),
     }

@@ -170,6 +170,8 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
         ("bench step --learn.tau 2", "bench step: learn.tau: must be above 0, at most 1"),
         ("bench step smoke --learn.update 2", "bench step: Unrecognized options: --learn.update"),
+        ("bench learner paper", "bench learner: paper has no small net; give quick or fast"),
+        ("bench learner --repeats 0", "bench learner: --repeats: at least 1"),
         ("doctor --preset", "Missing value for argument '--preset'"),
         ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
         ("doctor --build", "--build: only warp has kernels to build, and sim.physics is c here"),
@@ -760,7 +762,8 @@ def test_replay_benchmark(capsys: pytest.CaptureFixture):
     result = json.loads(capsys.readouterr().out)
     assert [row["capacity"] for row in result["capacities"]] == [64, 128]
     for row in result["capacities"]:
-        assert row["median_seconds"].keys() == {"uniform", "prioritised", "beta", "flashbax"}
+        names = {"uniform", "prioritised", "beta", "beta_sorted", "flashbax"}
+        assert row["median_seconds"].keys() == names
         assert min(row["median_seconds"].values()) > 0.0
     assert {"device", "versions", "commit", "item", "batch", "repeats"} <= result.keys()
 

@@ -17,8 +17,9 @@ TAKEN = "__ynn_fusion"  # what the library computes is called in a compiled prog
 
 
 @pytest.fixture
-def forgotten():
-    """No memory of what was found before, nor after."""
+def forgotten(monkeypatch: pytest.MonkeyPatch):
+    """No memory of what was found before, nor after, and no level chosen by the user."""
+    monkeypatch.setenv("XLA_FLAGS", "")
     compiler.has_library.cache_clear()
     yield
     compiler.has_library.cache_clear()
@@ -99,7 +100,7 @@ def test_an_xla_without_it_is_asked_for_nothing(
     """Claim: where XLA does not know the library, training goes on without it."""
     monkeypatch.setattr(compiler, "LIBRARY", asked)
     assert not compiler.has_library()
-    assert compiler.options(presets.quick()) == compiler.LEVEL
+    assert compiler.options(presets.quick()) == compiler.SOONER
 
 
 @pytest.mark.usefixtures("forgotten")
@@ -114,12 +115,23 @@ def test_a_library_that_is_wrong_is_not_used(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.usefixtures("forgotten")
 def test_library_is_for_the_small_net_on_a_cpu(monkeypatch: pytest.MonkeyPatch):
     """Claim: it is asked for with the small net, not with DenseNet-121, and on no accelerator; so
-    is the level, with any net."""
-    assert compiler.options(presets.quick()) == compiler.LIBRARY | compiler.LEVEL
-    assert compiler.options(presets.paper()) == compiler.LEVEL
+    is what compiles sooner, with any net."""
+    assert compiler.options(presets.quick()) == compiler.LIBRARY | compiler.SOONER
+    assert compiler.options(presets.paper()) == compiler.SOONER
     compiler.has_library.cache_clear()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert compiler.options(presets.quick()) is None
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_what_xla_flags_asks_for_stays(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a level that the user chose is not overridden; an option that this XLA does not have
+    is left out."""
+    level, emitters = compiler.SOONER
+    monkeypatch.setenv("XLA_FLAGS", f"--{level}=0")
+    assert set(compiler.options(presets.paper())) == {emitters}
+    monkeypatch.setattr(compiler, "SOONER", {**compiler.SOONER, "xla_no_such_option": 1})
+    assert set(compiler.options(presets.paper())) == {emitters}
 
 
 @pytest.mark.parametrize(
@@ -132,9 +144,7 @@ def test_products_of_densenet_are_the_vendors_on_a_gpu(
     be asked to."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(compiler, "VENDOR", asked)
-    compiler._knows_vendor.cache_clear()
     assert compiler.options(presets.paper()) == (asked if known else None)
-    compiler._knows_vendor.cache_clear()
 
 
 def test_library_is_right_in_groups():
