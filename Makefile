@@ -8,7 +8,6 @@ JOBS ?= 2
 RUN ?= $(firstword $(shell ls -1dt runs/*/ 2>/dev/null))
 VIEWED ?= shipped
 ARGS ?=
-SOONER := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -33,8 +32,8 @@ eval: $(STAMP)  ## evaluate RUN (the newest) with POLICY (learned) over EPISODES
 	@test -n "$(RUN)" || { echo "eval: there is no run under runs/; run 'make train' first or set RUN=DIR" >&2; exit 1; }
 	$(BIN)/csac-jax eval $(RUN) --policy $(POLICY) --episodes $(EPISODES) --json $(RUN:/=)/eval-$(POLICY).json $(ARGS)
 
-test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run little, hence XLA's flags
-	XLA_FLAGS="$(XLA_FLAGS) $(SOONER)" $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile $(ARGS)
+test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run little, hence XLA's flag
+	XLA_FLAGS="$(XLA_FLAGS) --xla_backend_optimization_level=1" $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile $(ARGS)
 
 test-slow: $(STAMP)  ## slow tests
 	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)

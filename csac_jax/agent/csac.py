@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.agent import actor_critic, policy, rewards
-from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.learner import Learner, Transition, UpdateInfo
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config, RewardConfig
@@ -56,8 +56,10 @@ class CSAC(Learner):
     ) -> tuple[jax.Array, jax.Array]:
         """Eqs. 10-16, phi by the target critic."""
         pushed = result.primitive == Primitive.PUSH
-        best_grasps = self._chunked(_best_grasps, at_once=1)
-        before, after = best_grasps(state.target, obs, next_obs, pushed)
+        views = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), obs, next_obs)  # [2 E, ...]
+        # In chunks of one run, each part of the states is still skipped that has no push.
+        best_grasps = self._chunked(actor_critic.best_grasps, at_once=1)
+        before, after = jnp.split(best_grasps(state.target, views, jnp.tile(pushed, 2)), 2)
         return rewards.rewards_of(cfg, result._replace(phi_before=before, phi_after=after))
 
     def update(
@@ -85,20 +87,3 @@ class CSAC(Learner):
         if self.networks_at_once is None:
             return bound
         return chunked_vmap.vmap_in_chunks(bound, at_once or self.networks_at_once)
-
-
-def _best_grasps(
-    parts: ActorCritic, target: Params, before: Observation, after: Observation, pushed: jax.Array
-) -> jax.Array:
-    """phi_g before and after the action [2, E], eq. 16; zeros if no scene was `pushed` [E] bool.
-
-    Vmapped over runs, both sides of the branch are computed; in chunks of one it stays a branch.
-    """
-    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, after)
-
-    def phi(obs: Observation) -> jax.Array:
-        return jax.vmap(actor_critic.best_grasp)(actor_critic.dense_maps(parts, target, obs))
-
-    return jax.lax.cond(
-        jnp.any(pushed), lambda: jax.lax.map(phi, views), lambda: jnp.zeros((2, *pushed.shape))
-    )

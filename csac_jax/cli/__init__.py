@@ -16,6 +16,7 @@ from csac_jax import algorithms, presets
 from csac_jax.cli import (
     act,
     bench,
+    benchmark,
     calibrate,
     doctor,
     evaluation,
@@ -37,6 +38,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
     "sweep": sweep.run,
     "eval": evaluation.run,
+    "benchmark": benchmark.run,
     "play": play.run,
     "calibrate": calibrate.run,
     "act": act.run,
@@ -58,6 +60,7 @@ A robot learns to push and grasp in clutter.
   sweep PRESET       train several seeds and settings side by side, in one program
                      --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
+  benchmark          measure what ships and its baselines in every suite
   play               run one episode, as text, picture and video
   calibrate          find the camera's pose by a printed board
   act POLICY         decide where to grasp or push in a camera's image

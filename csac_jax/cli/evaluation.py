@@ -96,14 +96,14 @@ def _evaluate(options: EvalOptions, policy: Any, seen: Config) -> tuple[Config, 
     with as_bad_arguments(ValueError):
         cfg = rollout.configured(seen, options.physics, options.robot)
     count, seed, learned = options.episodes, options.seed, options.policy == "learned"
-    with _progress_bar() as show:
+    with progress_bar() as show:
         with as_bad_arguments(ValueError):
             parts = suites.environments(cfg, options.suite, count, seed, learned)
         return cfg, rollout.measure(policy, parts, count, seed, show)
 
 
 @contextlib.contextmanager
-def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A line on the terminal with the part and its finished episodes; nothing elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn

@@ -4,7 +4,8 @@ On a CPU, XLA has a second library for convolutions, about twice as fast as Eige
 small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
 LLVM's second level of optimisation compiles sooner than the third, to as fast a program. So do
 XLA's former emitters of kernels, where it still has them: its new ones build an MLIR module for
-each of more than a thousand kernels.
+each of more than a thousand kernels. Searches by CEM end alike to the bit. At level 0 they do not
+with the former emitters, so nothing here asks for both.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).

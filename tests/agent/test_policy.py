@@ -12,6 +12,7 @@ from csac_jax.agent import box, maps, policy
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import CEMConfig, ExploreConfig
 from csac_jax.constants import Primitive
+from csac_jax.runtime import compiler
 from csac_jax.sim.outcome import BARE
 
 KEYS = 20
@@ -238,6 +239,23 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, learner, start, 
 
     share = np.mean(jax.jit(jax.vmap(reached))(jnp.arange(1000)))
     assert least <= share <= most, share
+
+
+def test_search_is_the_same_compiled_sooner(cfg, frames, learner):
+    """Claim: with the options that a training program is compiled with on a CPU, 200 searches end
+    where they do by XLA's own."""
+
+    def found(i: jax.Array) -> jax.Array:
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(5), i))
+        state, both = _peaked(keys[0], frames), cfg.change(cem=CEMConfig(start="both"))
+        return policy.greedy(keys[1], _learner(learner, both), state, jnp.int32(0)).values
+
+    own = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+    sooner, by_default = (
+        jax.jit(jax.vmap(found), compiler_options=options)(jnp.arange(200))
+        for options in (compiler.SOONER, {name: own[name] for name in compiler.SOONER})
+    )
+    np.testing.assert_allclose(sooner, by_default, rtol=0.0, atol=1e-5)
 
 
 def test_random_places_reach_all_that_is_valid(frames):

@@ -170,6 +170,9 @@ def run_dir(tmp_path: Path) -> Path:
         ("bench step --repeats 0", "bench step: --steps, --repeats: at least 1"),
         ("bench step --learn.tau 2", "bench step: learn.tau: must be above 0, at most 1"),
         ("bench step smoke --learn.update 2", "bench step: Unrecognized options: --learn.update"),
+        ("benchmark --share 0", "--share: above 0, at most 1"),
+        ("benchmark --suites piles", "invalid choice 'piles' for argument '--suites"),
+        ("benchmark --suites target --policies shipped", "--policies: none of them can act in"),
         ("bench learner paper", "bench learner: paper has no small net; give quick or fast"),
         ("bench learner --repeats 0", "bench learner: --repeats: at least 1"),
         ("doctor --preset", "Missing value for argument '--preset'"),
@@ -959,7 +962,7 @@ def test_progress_is_for_terminals(capsys: pytest.CaptureFixture, monkeypatch: p
     monkeypatch.setenv("TERM", "xterm")
     for terminal in ("", "1"):
         monkeypatch.setenv("FORCE_COLOR", terminal)  # Rich takes this for a terminal
-        with evaluation._progress_bar() as show:
+        with evaluation.progress_bar() as show:
             show("row", 3, 50)
         shown = capsys.readouterr()
         assert shown.out == ""

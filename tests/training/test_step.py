@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, csac, rewards
+from csac_jax.agent import actor_critic, rewards
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import UpdateInfo
 from csac_jax.config import Config, PrioritisedReplay
@@ -428,12 +428,23 @@ def _pictures(count: int, seed: int) -> Observation:
     )
 
 
-def test_only_pushes_ask_for_the_best_grasps():
-    """Claim: phi_g before and after an action is the target critic's as soon as one scene was
-    pushed, else 0."""
+def test_only_pushes_ask_for_the_best_grasps(monkeypatch: pytest.MonkeyPatch):
+    """Claim: phi_g before and after an action is the target critic's of a scene that was pushed,
+    and 0 of any other."""
     learner, state = _opinions()
     before, after = _pictures(2, seed=1), _pictures(2, seed=2)
-    around = jax.jit(lambda pushed: csac._best_grasps(learner, state.target, before, after, pushed))
+
+    def told(_: object, result: rewards.ActionResult) -> tuple[jax.Array, jax.Array]:
+        return result.phi_before, result.phi_after
+
+    monkeypatch.setattr(rewards, "rewards_of", told)
+
+    @jax.jit
+    def around(pushed: jax.Array) -> jax.Array:
+        primitive = jnp.where(pushed, Primitive.PUSH, Primitive.GRASP)
+        none, zeros, no = jnp.zeros(2, jnp.int32), jnp.zeros(2), jnp.zeros(2, bool)
+        result = rewards.ActionResult(primitive, none, zeros, zeros, zeros, no, none)
+        return jnp.stack(CSAC(learner).reward(CFG.reward, state, before, after, result))
 
     @jax.jit
     def one(obs: Observation) -> jax.Array:
@@ -442,8 +453,9 @@ def test_only_pushes_ask_for_the_best_grasps():
 
     wanted = np.stack([one(before), one(after)])
     assert np.all(np.abs(wanted) > 1e-3)
-    np.testing.assert_allclose(around(jnp.array([False, True])), wanted, rtol=1e-4, atol=1e-5)
-    assert not np.any(around(jnp.array([False, False])))
+    for pushed in ([False, True], [True, True], [False, False]):
+        found = around(jnp.array(pushed))
+        np.testing.assert_allclose(found, np.where(pushed, wanted, 0.0), rtol=1e-4, atol=1e-5)
 
 
 def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):

@@ -1,0 +1,169 @@
+"""The benchmark of record: what ships and its baselines, in every suite, beside published numbers.
+
+A cell is a policy in a suite, measured in C MuJoCo and kept in a file of its own, so that a
+benchmark that was stopped goes on. Scenes follow from the seed and the share of the episodes.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from csac_jax.evaluation import policies, rollout, suites
+from csac_jax.evaluation.policies import LearnedPolicy, Policy
+from csac_jax.evaluation.statistics import Band
+from csac_jax.io import files, policy_file
+from csac_jax.report import tables
+
+SEED = 0
+OBJECTS = "made:7:400"  # the library whose held-out shapes suites of objects draw from
+EPISODES = {  # of every part of a suite, in the whole benchmark
+    "random10": 500,
+    "random30": 100,
+    "packed": 250,
+    "cases": 250,
+    "target": 250,
+    "pile": 1000,
+    "objects_packed": 1000,
+    "objects10": 500,
+    "target_objects": 500,
+}
+METRICS = ("grasp_success", "completion", "declutter_rate", "action_efficiency")
+_TITLES = ("grasp success", "completion", "objects taken", "objects per action")
+
+
+class Published(NamedTuple):
+    """Numbers of others, of their own simulators, scenes and objects; None: not given."""
+
+    method: str
+    source: str
+    grasp_success: float | None = None
+    completion: float | None = None
+    declutter_rate: float | None = None
+    action_efficiency: float | None = None
+
+
+PUBLISHED: dict[str, tuple[Published, ...]] = {
+    "random30": (
+        Published("VPG, 30 blocks", "arXiv:1803.09956", 0.677, 1.0, None, 0.61),
+        Published("SPOT, 30 blocks", "arXiv:1909.11730", 0.84, 1.0, None, 0.74),
+    ),
+    "cases": (
+        Published("VPG, as CSAC's authors ran it", "doi:10.3390/electronics11132065", None, 0.6),
+        Published("CSAC-beta", "doi:10.3390/electronics11132065", None, 0.9),
+    ),
+    "pile": (
+        Published("OrbitGrasp, random view", "arXiv:2407.03531", 0.967, None, 0.979),
+        Published("NeuGraspNet, top view", "arXiv:2306.07392", 0.865, None, 0.835),
+    ),
+    "objects_packed": (
+        Published("OrbitGrasp, random view", "arXiv:2407.03531", 0.983, None, 0.988),
+        Published("NeuGraspNet, top view", "arXiv:2306.07392", 0.977, None, 0.932),
+    ),
+}
+
+
+def _grasps_alone() -> Policy:
+    """The shipped policy, which never pushes."""
+    policy = policies.load("shipped")
+    assert isinstance(policy, LearnedPolicy)
+    cfg = policy.cfg.change(policy={"primitive": "grasp"}, explore={"push_fraction": 0.0})
+    return dataclasses.replace(policy, cfg=cfg)
+
+
+POLICIES: dict[str, Callable[[], Policy]] = {
+    "shipped": lambda: policies.load("shipped"),
+    "shipped_grasp_only": _grasps_alone,
+    "shipped_camera": lambda: policies.load("shipped_camera"),
+    "geometric": lambda: policies.POLICIES["geometric"]("shipped"),
+    "random": lambda: policies.POLICIES["random"]("shipped"),
+    "oracle": lambda: policies.POLICIES["oracle"]("shipped"),
+}
+
+
+class Cell(NamedTuple):
+    """A policy in a suite."""
+
+    suite: str
+    policy: str
+    episodes: int  # of every part
+
+    def path(self, folder: Path) -> Path:
+        """Where it is kept."""
+        return folder / self.suite / f"{self.policy}.json"
+
+    def asked(self) -> dict[str, Any]:
+        """What its numbers follow from."""
+        source = self.policy if self.policy in policy_file.SHIPPED else "shipped"
+        digest = hashlib.sha256(policy_file.SHIPPED[source].read_bytes()).hexdigest()
+        held = {"objects": OBJECTS} if suites.SUITES[self.suite].objects else {}
+        return {**self._asdict(), "seed": SEED, "physics": "c", "policy_sha256": digest, **held}
+
+
+def cells(share: float, of: tuple[str, ...] = (), by: tuple[str, ...] = ()) -> Iterator[Cell]:
+    """The cells of these suites and policies, by default of all, with a share of the episodes, at
+    least one. A learned policy that knows no targets is left out where there are some."""
+    for suite, episodes in EPISODES.items():
+        for policy in POLICIES:
+            unfit = policy.startswith("shipped") and suites.SUITES[suite].target
+            if suite in (of or EPISODES) and policy in (by or POLICIES) and not unfit:
+                yield Cell(suite, policy, max(1, round(share * episodes)))
+
+
+def kept(cell: Cell, folder: Path) -> dict[str, Any] | None:
+    """The result of a cell in the folder, if it was measured as asked for now."""
+    if not cell.path(folder).exists():
+        return None
+    found = files.read_object(cell.path(folder))
+    return found if cell.asked().items() <= found.items() else None
+
+
+def measure(cell: Cell, progress: rollout.Progress | None = None) -> dict[str, Any]:
+    """The result of a cell, see `rollout.evaluate`."""
+    asked = cell.asked()
+    result = rollout.evaluate(
+        POLICIES[cell.policy](),
+        cell.suite,
+        cell.episodes,
+        SEED,
+        "c",
+        progress=progress,
+        objects=asked.get("objects"),
+    )
+    return {**asked, **result}
+
+
+def markdown(results: list[dict[str, Any]]) -> str:
+    """A table of results and, below those of each suite, the published numbers."""
+    rows = [("suite", "method", "episodes", *_TITLES), ("---",) * (3 + len(_TITLES))]
+    for suite in EPISODES:
+        for result in (one for one in results if one["suite"] == suite):
+            for part, summary in result.get("parts", {suite: result}).items():
+                measured = (summary[metric] for metric in METRICS)
+                shown = _shown(Band(**one) if one["n"] else None for one in measured)
+                name = part if part == suite else f"{suite}, {part}"
+                rows.append((name, result["policy"], str(result["episodes"]), *shown))
+        for other in PUBLISHED.get(suite, ()):
+            given = (getattr(other, metric) for metric in METRICS)
+            shown = _shown(None if v is None else Band(v, None, None, 0) for v in given)
+            rows.append((suite, f"{other.method} ({other.source})", "published", *shown))
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    note = (
+        "In brackets: 95 % intervals. Published numbers are of other simulators, scenes, objects "
+        "and cameras."
+    )
+    return "\n".join([*lines, "", note, ""])
+
+
+def _shown(bands: Iterable[Band | None]) -> list[str]:
+    """A band of each metric, as text."""
+    return [tables.shown(band, metric=m) for band, m in zip(bands, METRICS, strict=True)]
+
+
+def write_table(folder: Path, share: float) -> Path:
+    """Writes the table of all that the folder holds at this share of the episodes."""
+    found = [kept(cell, folder) for cell in cells(share)]
+    path = folder / "benchmark.md"
+    files.replace(path, markdown([one for one in found if one is not None]))
+    return path

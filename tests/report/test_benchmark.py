@@ -1,0 +1,129 @@
+"""The benchmark of record: its cells, what is kept, its table."""
+
+import json
+import typing
+
+import jax
+import numpy as np
+import pytest
+
+from csac_jax import cli
+from csac_jax.cli import benchmark as command
+from csac_jax.evaluation import suites
+from csac_jax.report import benchmark
+
+
+def _share(value: float | None, n: int = 10) -> dict[str, typing.Any]:
+    return {"value": value, "low": value, "high": value, "n": 0 if value is None else n}
+
+
+def _result(grasps: float, **parts: float) -> dict[str, typing.Any]:
+    """A result of one part, or of these parts, with this success of grasps."""
+    if parts:
+        return {"parts": {name: _result(value) for name, value in parts.items()}}
+    metrics = dict.fromkeys(benchmark.METRICS, _share(0.5))
+    return {**metrics, "grasp_success": _share(grasps), "declutter_rate": _share(None)}
+
+
+def test_names_of_the_command():
+    """Claim: the command names every suite and policy of the benchmark, and each suite is one."""
+    assert typing.get_args(command.SuiteName) == tuple(benchmark.EPISODES)
+    assert typing.get_args(command.PolicyName) == tuple(benchmark.POLICIES)
+    assert benchmark.EPISODES.keys() <= suites.SUITES.keys()
+    assert benchmark.PUBLISHED.keys() <= benchmark.EPISODES.keys()
+
+
+def test_cells():
+    """Claim: a share of the episodes, at least one, of each suite and policy; no policy that knows
+    no targets where there are some."""
+    every = list(benchmark.cells(1.0))
+    assert {cell.suite for cell in every} == benchmark.EPISODES.keys()
+    assert all(cell.episodes == benchmark.EPISODES[cell.suite] for cell in every)
+    of_targets = {cell.policy for cell in every if cell.suite in ("target", "target_objects")}
+    assert of_targets == {"geometric", "random", "oracle"}
+    assert [cell.episodes for cell in benchmark.cells(0.1, ("pile",), ("random",))] == [100]
+    assert [cell.episodes for cell in benchmark.cells(1e-9, ("pile",), ("random",))] == [1]
+
+
+def test_grasps_alone_are_the_shipped_policys():
+    """Claim: the policy that never pushes has the networks of the shipped one."""
+    alone, shipped = (benchmark.POLICIES[name]() for name in ("shipped_grasp_only", "shipped"))
+    assert (alone.cfg.policy.primitive, shipped.cfg.policy.primitive) == ("grasp", "argmax")
+    for a, b in zip(*(jax.tree.leaves(policy) for policy in (alone, shipped)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_table_by_hand():
+    """Claim: a row for each part, a dash for what has no cases, published numbers below those of
+    their suite."""
+    results = [
+        {"suite": "pile", "policy": "random", "episodes": 7, **_result(0.25)},
+        {"suite": "cases", "policy": "oracle", "episodes": 3, **_result(0.0, row=1.0, hole=0.75)},
+    ]
+    rows = [line.split("|")[1:-1] for line in benchmark.markdown(results).splitlines()[:-2]]
+    cells = [[cell.strip() for cell in row] for row in rows]
+    assert cells[2][:3] == ["random30", "VPG, 30 blocks (arXiv:1803.09956)", "published"]
+    named = {(row[0], row[1]): row[2:] for row in cells[2:]}
+    assert named["cases, row", "oracle"][:2] == ["3", "100.0 % (100.0 to 100.0)"]
+    assert named["cases, hole", "oracle"][1] == "75.0 % (75.0 to 75.0)"
+    assert named["pile", "random"] == [
+        "7",
+        "25.0 % (25.0 to 25.0)",
+        "50.0 % (50.0 to 50.0)",
+        "-",
+        "0.500 (0.500 to 0.500)",
+    ]
+    orbit = named["pile", "OrbitGrasp, random view (arXiv:2407.03531)"]
+    assert orbit == ["published", "96.7 %", "-", "97.9 %", "-"]
+    order = [row[0] for row in cells[2:]]
+    assert order.index("pile") > order.index("cases, hole")
+
+
+def test_the_command_goes_on_where_it_was(
+    tmp_path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    """Claim: each cell is measured once, written with its provenance, and the table with it;
+    another share, or another policy file, is measured anew."""
+    measured = []
+
+    def measure(cell: benchmark.Cell, progress: object) -> dict[str, typing.Any]:
+        measured.append(cell)
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        return {**cell.asked(), **_result(0.9)}
+
+    monkeypatch.setattr(benchmark, "measure", measure)
+    monkeypatch.setattr("csac_jax.runtime.cache.enable", lambda: None)
+    asked = ["benchmark", "--out", str(tmp_path / "b"), "--suites", "pile", "--policies"]
+    both = [*asked, "random", "oracle", "--share", "0.01"]
+    assert cli.main(both) == 130
+    first = json.loads((tmp_path / "b/pile/random.json").read_text())
+    assert (first["episodes"], first["physics"], first["objects"]) == (10, "c", benchmark.OBJECTS)
+    assert {"commit", "versions", "seconds"} <= first.keys()
+    assert "| pile | random | 10 | 90.0 %" in (tmp_path / "b/benchmark.md").read_text()
+    capsys.readouterr()
+    assert cli.main(both) == 0
+    assert "1 of 2: random in pile, kept from before" in capsys.readouterr().out
+    assert [cell.policy for cell in measured] == ["random", "oracle", "oracle"]
+    assert cli.main(both) == 0
+    assert len(measured) == 3
+    assert cli.main([*asked, "random", "--share", "0.02"]) == 0
+    assert measured[3:] == [benchmark.Cell("pile", "random", 20)]
+    shipped = tmp_path / "other.safetensors"
+    shipped.write_bytes(b"another policy")
+    monkeypatch.setitem(benchmark.policy_file.SHIPPED, "shipped", shipped)
+    assert cli.main([*asked, "random", "--share", "0.02"]) == 0
+    assert len(measured) == 5
+
+
+@pytest.mark.slow
+def test_a_cell_is_the_evaluation():
+    """Claim: a cell's result is that of `evaluate` with its policy, suite and library."""
+    from csac_jax.evaluation import rollout
+
+    cell = next(benchmark.cells(0.001, ("pile",), ("random",)))
+    result = benchmark.measure(cell)
+    other = rollout.evaluate(
+        benchmark.POLICIES["random"](), "pile", 1, 0, "c", objects=benchmark.OBJECTS
+    )
+    assert result == {**cell.asked(), **other}
