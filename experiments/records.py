@@ -99,9 +99,14 @@ _WIDE = f"--train.scenes 2048 --learn.updates 64 {_NET}"
 _FORMER = f"train fast {_WIDE} --train.actions 163840 --explore.decay 0.9999"
 """What `fast` was when these were recorded."""
 
+_QUICK = (
+    "quick --net.growth 32 --learn.updates 2 --learn.learning_rate 1e-3 --explore.decay 0.998"
+)
+"""What `quick` was when these were recorded."""
+
 BENCHES = {
-    "train/xeon-quick": ("time of `quick`, Intel Xeon", "train quick"),
-    "train/epyc-quick": ("time of `quick`, AMD EPYC", "train quick"),
+    "train/xeon-quick": ("a run as `quick` was, Intel Xeon", f"train {_QUICK}"),
+    "train/epyc-quick": ("the same, AMD EPYC", f"train {_QUICK}"),
     "train/h200-paper-cold": ("compilation of `paper`", "train paper --train.actions 50"),
     "train/h200-paper-cached": ("the same from the cache", "train paper --train.actions 50"),
     "train/h200-fast-cold": (
@@ -187,23 +192,27 @@ BENCHES = {
         "an action of the target task",
         "bench warp_action --task target --repeats 2",
     ),
-    "step/xeon-quick": ("a step of `quick` and its stages, Intel Xeon", "bench step quick"),
-    "step/epyc-quick": ("the same, AMD EPYC", "bench step quick"),
+    "step/epyc-quick": ("a step of `quick` and its stages", "bench step quick"),
+    "learner/epyc-quick": (
+        "share of the float32 peak that the parts of an update of `quick` reach",
+        "bench learner",
+    ),
+    "step/xeon-quick": ("a step as `quick` was, Intel Xeon", f"bench step {_QUICK}"),
     "step/epyc-quick-scenes": (
-        "a step against scenes",
-        "bench step quick --repeats 3 --curve scenes --smallest 4 --largest 32",
+        "such a step against scenes",
+        f"bench step {_QUICK} --repeats 3 --curve scenes --smallest 4 --largest 32",
     ),
     "step/epyc-quick-map": (
         "a step against cells of the map",
-        "bench step quick --repeats 3 --curve map --smallest 32 --largest 128",
+        f"bench step {_QUICK} --repeats 3 --curve map --smallest 32 --largest 128",
     ),
     "step/epyc-quick-blocks": (
         "a step against blocks",
-        "bench step quick --repeats 3 --curve blocks --smallest 2 --largest 8",
+        f"bench step {_QUICK} --repeats 3 --curve blocks --smallest 2 --largest 8",
     ),
     "step/epyc-quick-capacity": (
         "a step against the replay's capacity",
-        "bench step quick --repeats 3 --curve capacity --smallest 1024 --largest 16384",
+        f"bench step {_QUICK} --repeats 3 --curve capacity --smallest 1024 --largest 16384",
     ),
     "step/h200-fast": (
         "a step of a wide net in 2,048 scenes on Warp, and its stages",
@@ -211,7 +220,7 @@ BENCHES = {
     ),
     "sweep/epyc-quick": (
         "seeds of `quick` one after another",
-        "bench sweep quick --seeds 1 4 --steps 10 --repeats 2",
+        f"bench sweep {_QUICK} --seeds 1 4 --steps 10 --repeats 2",
     ),
     "sweep/h200-paper_small": (
         "seeds of `paper_small` side by side",

@@ -32,7 +32,7 @@ class BenchmarkOptions:
     out: Path = Path("benchmark")
     """Folder for a file of each policy in each suite, and the table benchmark.md."""
     share: float = 1.0
-    """Share of the episodes, above 0, at most 1: 0.1 takes some 20 minutes on two cores."""
+    """Share of the episodes, above 0, at most 1."""
     suites: tuple[SuiteName, ...] = ()
     """Only these suites."""
     policies: tuple[PolicyName, ...] = ()
