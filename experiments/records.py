@@ -99,9 +99,7 @@ _WIDE = f"--train.scenes 2048 --learn.updates 64 {_NET}"
 _FORMER = f"train fast {_WIDE} --train.actions 163840 --explore.decay 0.9999"
 """What `fast` was when these were recorded."""
 
-_QUICK = (
-    "quick --net.growth 32 --learn.updates 2 --learn.learning_rate 1e-3 --explore.decay 0.998"
-)
+_QUICK = "quick --net.growth 32 --learn.updates 2 --learn.learning_rate 1e-3 --explore.decay 0.998"
 """What `quick` was when these were recorded."""
 
 BENCHES = {
@@ -158,8 +156,8 @@ BENCHES = {
     ),
     "doctor/h100": ("Warp's kernels of `fast`, built from nothing", "doctor --build"),
     "start/xeon-quick": (
-        "how soon `quick` learns, and did in commit 71c8723; five seeds side by side",
-        "bench start quick --runs 5 --cores 2 --other CHECKOUT",
+        "how soon `quick` as it was learned, and did in commit 71c8723; five seeds side by side",
+        f"bench start {_QUICK} --runs 5 --cores 2 --other CHECKOUT",
     ),
     "warp_action/h100-2048": (
         "an action on Warp, kernel by kernel",

@@ -69,7 +69,7 @@ def run_dir(tmp_path: Path) -> Path:
     [
         (
             "trian quick",
-            "unknown command 'trian'; did you mean train? choose one of: train, sweep, eval, play",
+            "unknown command 'trian'; did you mean train? choose one of: train, sweep, eval, bench",
         ),
         ("train", "give a preset first, one of: smoke, quick"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),

@@ -27,7 +27,7 @@ def test_state_is_exact():
     stored = sum(leaf.nbytes for leaf in jax.tree.leaves(small))
     # head and size are no slots
     assert known["replay"] == (stored - 8) * quick.replay.capacity // 64 + 8
-    parameters = 70_524 + 6_780  # of critic and actor
+    parameters = 50_316 + 5_628  # of critic and actor
     counters = 5  # two in each optimiser, one of updates
     # online, target and Adam's two moments
     assert known["networks"] == 4 * (4 * parameters + counters)
