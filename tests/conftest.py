@@ -2,7 +2,6 @@
 
 import atexit
 import contextlib
-import importlib.metadata
 import os
 import shutil
 import tempfile
@@ -20,15 +19,9 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # else XLA logs a line for each one found
 
-from csac_jax import _guard  # before JAX: the package sets up the thread pool
+import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 
-# Where XLA still has its former emitters of kernels, it compiles in two thirds of the time by them.
-_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
-_has_them = importlib.metadata.version("jaxlib").startswith(_guard.FUSION_SERIES)
-if _has_them and _EMITTERS not in os.environ["XLA_FLAGS"]:
-    os.environ["XLA_FLAGS"] += f" {_EMITTERS}"
-
-import jax  # noqa: E402  isort: skip
+import jax  # isort: skip
 
 
 @pytest.fixture(autouse=True)

@@ -50,6 +50,7 @@ def run(arguments: list[str]) -> int:
     cells = list(benchmark.cells(options.share, options.suites, options.policies))
     if not cells:
         raise BadArgumentsError("--policies: none of them can act in these suites")
+    options.out.mkdir(parents=True, exist_ok=True)  # before hours of work, if it cannot be
     cache.enable()
     for number, cell in enumerate(cells, 1):
         title = f"{number} of {len(cells)}: {cell.policy} in {cell.suite}"

@@ -113,10 +113,11 @@ def cells(share: float, of: tuple[str, ...] = (), by: tuple[str, ...] = ()) -> I
 
 
 def kept(cell: Cell, folder: Path) -> dict[str, Any] | None:
-    """The result of a cell in the folder, if it was measured as asked for now."""
-    if not cell.path(folder).exists():
+    """The result of a cell in the folder, if it is whole and was measured as asked for now."""
+    try:
+        found = files.read_object(cell.path(folder))
+    except (FileNotFoundError, ValueError):
         return None
-    found = files.read_object(cell.path(folder))
     return found if cell.asked().items() <= found.items() else None
 
 

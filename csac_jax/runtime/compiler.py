@@ -4,8 +4,8 @@ On a CPU, XLA has a second library for convolutions, about twice as fast as Eige
 small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
 LLVM's second level of optimisation compiles sooner than the third, to as fast a program. So do
 XLA's former emitters of kernels, where it still has them: its new ones build an MLIR module for
-each of more than a thousand kernels. Searches by CEM end alike to the bit. At level 0 they do not
-with the former emitters, so nothing here asks for both.
+each of more than a thousand kernels. Functions are as exact with them. At level 0 some searches by
+CEM end elsewhere with them, and nothing here asks for both.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
@@ -13,7 +13,6 @@ That takes half of the compilation, and the vendor's library is as fast (`experi
 
 import functools
 import gc
-import os
 from typing import Any
 
 import jax
@@ -45,13 +44,10 @@ def lower(jitted: Any, *given: Any) -> Any:
 def options(cfg: Config) -> dict[str, Any] | None:
     """Options of `jax.jit` for the config's training program, None for the defaults.
 
-    The second library is slow at kernel gradients, which `conv2d` keeps from it. A level and
-    emitters that XLA_FLAGS asks for stay.
+    The second library is slow at kernel gradients, which `conv2d` keeps from it.
     """
     if jax.default_backend() == "cpu":
-        flags = os.environ.get("XLA_FLAGS", "")
-        ours = {name: value for name, value in SOONER.items() if f"--{name}=" not in flags}
-        known = {name: value for name, value in ours.items() if _knows(name, value)}
+        known = {name: value for name, value in SOONER.items() if _knows(name, value)}
         return known | (LIBRARY if isinstance(cfg.net, SmallNet) and has_library() else {})
     vendor = jax.default_backend() == "gpu" and not isinstance(cfg.net, SmallNet)
     return dict(VENDOR) if vendor and all(map(_knows, VENDOR, VENDOR.values())) else None

@@ -83,7 +83,7 @@ def test_the_command_goes_on_where_it_was(
     tmp_path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
     """Claim: each cell is measured once, written with its provenance, and the table with it;
-    another share, or another policy file, is measured anew."""
+    another share, another policy file and a damaged result are measured again."""
     measured = []
 
     def measure(cell: benchmark.Cell, progress: object) -> dict[str, typing.Any]:
@@ -114,6 +114,9 @@ def test_the_command_goes_on_where_it_was(
     monkeypatch.setitem(benchmark.policy_file.SHIPPED, "shipped", shipped)
     assert cli.main([*asked, "random", "--share", "0.02"]) == 0
     assert len(measured) == 5
+    (tmp_path / "b/pile/random.json").write_text('{"suite": "pi')
+    assert cli.main([*asked, "random", "--share", "0.02"]) == 0
+    assert len(measured) == 6
 
 
 @pytest.mark.slow
