@@ -111,7 +111,8 @@ class SceneConfig(Section, section="scene"):
     """Which of its objects: those for training, those kept for evaluation, or all."""
     min_blocks: int = _bounded(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = _bounded(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
-    arranged: float = _bounded(0.0, 0.0, 1.0)  # Share of packed scenes; the others are dropped.
+    arranged: float = _bounded(0.0, 0.0, 1.0)
+    """Share of packed scenes, arranged blocks or objects side by side; the others are dropped."""
     size_jitter: tuple[float, float] = _bounded((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of block sizes between scenes: boxes and arches, and the other kinds.
     The latter are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
@@ -132,7 +133,8 @@ class SceneConfig(Section, section="scene"):
             _require(low <= high, f"scene.{name}: low <= high is needed")
         if self.has_objects:
             _require(self.objects != "", "scene.objects: slots of kind object need a library")
-            _require(self.arranged == 0.0, "scene.arranged: must be 0 with slots of kind object")
+            alike = set(self.slots) == {"object"} or self.arranged == 0.0
+            _require(alike, "scene.arranged: must be 0 where slots hold objects and blocks")
 
     @property
     def has_objects(self) -> bool:

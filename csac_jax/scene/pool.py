@@ -33,6 +33,7 @@ _SPACING = 0.13  # m between the centres of blocks as they are dropped: none tou
 _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
+_DRAWS = 20  # of objects, for which there must be room side by side
 _MAX_PAUSES = 3  # per block, until pouring a scene is given up; for a few, 2 and the settling
 
 Drop = Callable[[], Scene]
@@ -42,14 +43,18 @@ Fall = Callable[[Scene, BlockFields], Scene | None]
 def scenes(cfg: Config, stream: int, count: int | None = None) -> Scene:
     """At least `count` scenes at rest, NumPy leaves [P, N, ...], as many of each number of blocks.
 
-    The last `scene.arranged` of them are arrangements. Without a count, `scene.pool` of each number
-    of blocks. Raises SceneError where blocks do not come to rest or allow no arrangement.
+    The last `scene.arranged` of them are arrangements, or objects of a library side by side in the
+    largest square of `scene.drop_extent`. Without a count, `scene.pool` of each number of blocks.
+    Raises SceneError where blocks do not come to rest or allow no arrangement.
     """
     block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     each = cfg.scene.pool if count is None else -(-count // block_counts)
     arranged = round(cfg.scene.arranged * each)
     parts = [settled(cfg, stream, each - arranged)] if arranged < each else []
-    if arranged:
+    if arranged and cfg.scene.has_objects:
+        widest = cfg.change(scene={"drop_extent": (cfg.scene.drop_extent[1],) * 2})
+        parts.append(settled(widest, stream, arranged, packed=True))
+    elif arranged:
         how = (cfg.scene, cfg.heightmap.extent, stream, arranged * block_counts)
         name = _digest(cfg, stream, how[-1], "arranged")
         parts.append(_stored(name, lambda: arrange.arrangements(*how)))
@@ -151,7 +156,11 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 
 
 def _stand(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
-    """A random scene of `count` objects that stand beside one another."""
+    """A random scene of `count` objects that stand beside one another, of some for which there is
+    room."""
+    for _ in range(_DRAWS - 1):
+        with contextlib.suppress(SceneError):
+            return stock.packed(rng, cfg, _drop(cfg, rng, count))
     return stock.packed(rng, cfg, _drop(cfg, rng, count))
 
 

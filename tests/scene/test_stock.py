@@ -52,6 +52,35 @@ def test_few_objects_are_drawn_more_than_once():
     assert sorted(np.bincount(scene.object_id)) == [2, 3]
 
 
+@pytest.mark.usefixtures("cache")
+def test_share_of_objects_side_by_side():
+    """Claim: `scene.arranged` of the scenes are objects side by side in the largest square, of
+    which some are drawn again where there is no room; the others are dropped, as without."""
+    wide = dataclasses.replace(CONFIG.scene, drop_extent=(0.1, 0.3), arranged=0.5, pool=4)
+    mixed = pool.scenes(CONFIG.change(scene=wide), 0)
+    apart = pool.settled(CONFIG, 0, 2, packed=True)
+    np.testing.assert_array_equal(mixed.position[2:], apart.position)
+    dropped = pool.settled(CONFIG.change(scene={"drop_extent": (0.1, 0.3)}), 0, 2)
+    np.testing.assert_array_equal(mixed.position[:2], dropped.position)
+
+
+def test_objects_for_which_there_is_no_room_are_drawn_again():
+    """Claim: of scenes too narrow for some draws, all stand; one too narrow for any is refused."""
+    narrow = dataclasses.replace(CONFIG.scene, drop_extent=(0.21, 0.21))
+    rooms = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        assert pool._stand(narrow, rng, 5).in_play.all()
+        try:
+            stock.packed(rng, narrow, pool._drop(narrow, rng, 5))
+            rooms.append(True)
+        except SceneError:
+            rooms.append(False)
+    assert not all(rooms)
+    with pytest.raises(SceneError, match="no room"):
+        pool._stand(dataclasses.replace(narrow, drop_extent=(0.05, 0.05)), rng, 5)
+
+
 def test_packed_objects_stand_apart():
     """Claim: packed objects stand on the table as in their files, within the square, outlines GAP
     or more apart."""

@@ -78,12 +78,12 @@ def test_objects_choose_c():
 
 
 def test_objects_need_a_library():
-    """Claim: slots of kind object without a library, and packed arrangements of blocks among them,
-    are refused in a line with the setting."""
+    """Claim: slots of kind object without a library, and packed scenes of blocks and objects, are
+    refused in a line with the setting."""
     with pytest.raises(ValueError, match=r"scene\.objects: slots of kind object need a library"):
         dataclasses.replace(CONFIG.scene, objects="")
     with pytest.raises(ValueError, match=r"scene\.arranged: must be 0"):
-        dataclasses.replace(CONFIG.scene, arranged=0.5)
+        dataclasses.replace(CONFIG.scene, slots=("box", "object"), min_blocks=2, arranged=0.5)
 
 
 def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
