@@ -59,7 +59,7 @@ A robot learns to push and grasp in clutter.
   train --resume DIR go on with a run that was stopped
   sweep PRESET       train several seeds and settings side by side, in one program
                      --seeds N, --vary NAME=A,B
-  eval POLICY        measure a policy: a run's folder, a policy file, or the one shipped
+  eval POLICY        measure a policy: a run's folder, a policy file, or one that is shipped
   benchmark          measure what ships and its baselines in every suite
   play               run one episode, as text, picture and video
   calibrate          find the camera's pose by a printed board

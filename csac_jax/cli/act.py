@@ -16,7 +16,7 @@ class ActOptions:
     """Decides where to grasp or push in a camera's image. Needs no simulator."""
 
     policy: tyro.conf.Positional[str]
-    """A policy file, shipped for the policy that comes with the package, or a run's folder."""
+    """A policy file, one that comes with the package, such as shipped, or a run's folder."""
     rgb: Path
     """Colour image."""
     depth: Path

@@ -20,7 +20,14 @@ SuiteName = Literal[
     "target_objects",
 ]
 PolicyName = Literal[
-    "shipped", "shipped_grasp_only", "shipped_camera", "geometric", "random", "oracle"
+    "shipped",
+    "shipped_grasp_only",
+    "shipped_camera",
+    "shipped_objects",
+    "shipped_target",
+    "geometric",
+    "random",
+    "oracle",
 ]
 
 

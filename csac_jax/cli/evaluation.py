@@ -20,7 +20,7 @@ class EvalOptions:
     has the same gripper, unless other settings are given."""
 
     source: tyro.conf.Positional[str]
-    """A run's folder, a policy file, or shipped for the policy that comes with the package."""
+    """A run's folder, a policy file, or one that comes with the package, such as shipped."""
     which: str = "last"
     """Checkpoint of the run: last, the newest sound one; best, of a run trained with --eval-every;
     or a step."""

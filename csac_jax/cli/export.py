@@ -17,7 +17,7 @@ class ExportOptions:
     """Writes a policy, networks and config, into one file."""
 
     policy: tyro.conf.Positional[str]
-    """Folder of a run, a policy file, or shipped for the policy that comes with the package."""
+    """Folder of a run, a policy file, or one that comes with the package, such as shipped."""
     file: tyro.conf.Positional[Path]
     """File to write, which must not exist, such as policy.safetensors."""
     format: Literal["safetensors", "stablehlo", "onnx"] = "safetensors"

@@ -22,7 +22,7 @@ class FinetuneOptions:
     is simulated."""
 
     policy: tyro.conf.Positional[str]
-    """A policy file, shipped for the policy that comes with the package, or a run's folder."""
+    """A policy file, one that comes with the package, such as shipped, or a run's folder."""
     record: tyro.conf.Positional[Path]
     """Folder that act or serve wrote with --record."""
     gripper: str | None = None

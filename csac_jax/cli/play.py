@@ -25,8 +25,8 @@ class PlayOptions:
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """What moves the gripper: nothing, it floats; or an arm."""
     policy: str = "oracle"
-    """What acts: oracle (reads the blocks' poses), random (a random place above a block), shipped
-    (learned, comes with the package), the folder of a run or a policy file."""
+    """What acts: oracle (reads the blocks' poses), random (a random place above a block), one that
+    comes with the package, such as shipped, the folder of a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
     """What moves the blocks: C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None

@@ -18,7 +18,7 @@ class ServeOptions:
     /version."""
 
     policy: tyro.conf.Positional[str]
-    """A policy file, shipped for the policy that comes with the package, or a run's folder."""
+    """A policy file, one that comes with the package, such as shipped, or a run's folder."""
     port: int = 8000
     """Port to listen on; 0 takes a free one."""
     host: str = "127.0.0.1"

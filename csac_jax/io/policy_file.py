@@ -1,8 +1,8 @@
 """A policy in a .safetensors file: its networks' variables and the config they were trained with.
 
 Nothing in such a file is executed. It holds a digest of all its content, and the versions that made
-it. Those of `SHIPPED` come with the package; their digests stand here, so that a replaced file is
-noticed: `shipped` has seen exact maps from above, `shipped_camera` those of a noisy oblique camera.
+it. Those of `SHIPPED` come with the package, see docs/policies.md; their digests stand here, so that
+a replaced file is noticed.
 """
 
 import hashlib
@@ -28,10 +28,16 @@ _FOLDER = Path(__file__).parents[1] / "policies"
 SHIPPED = {
     "shipped": _FOLDER / "clear.safetensors",
     "shipped_camera": _FOLDER / "camera.safetensors",
+    "shipped_grippers": _FOLDER / "grippers.safetensors",
+    "shipped_objects": _FOLDER / "objects.safetensors",
+    "shipped_target": _FOLDER / "target.safetensors",
 }
 _SHA256 = {
     SHIPPED["shipped"]: "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c",
     SHIPPED["shipped_camera"]: "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
+    SHIPPED["shipped_grippers"]: "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
+    SHIPPED["shipped_objects"]: "24d5c82d18be8517b90fb205619916fc720de04f44e2d1ee70aac789f90e5419",
+    SHIPPED["shipped_target"]: "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",
 }
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
 _GRIPPER = "gripper"  # remark of a policy whose gripper is the user's own

@@ -77,6 +77,8 @@ POLICIES: dict[str, Callable[[], Policy]] = {
     "shipped": lambda: policies.load("shipped"),
     "shipped_grasp_only": _grasps_alone,
     "shipped_camera": lambda: policies.load("shipped_camera"),
+    "shipped_objects": lambda: policies.load("shipped_objects"),
+    "shipped_target": lambda: policies.load("shipped_target"),
     "geometric": lambda: policies.POLICIES["geometric"]("shipped"),
     "random": lambda: policies.POLICIES["random"]("shipped"),
     "oracle": lambda: policies.POLICIES["oracle"]("shipped"),
@@ -104,11 +106,13 @@ class Cell(NamedTuple):
 
 def cells(share: float, of: tuple[str, ...] = (), by: tuple[str, ...] = ()) -> Iterator[Cell]:
     """The cells of these suites and policies, by default of all, with a share of the episodes, at
-    least one. A learned policy that knows no targets is left out where there are some."""
+    least one. A learned policy acts where there are targets if it was trained for them, else where
+    there are none."""
     for suite, episodes in EPISODES.items():
         for policy in POLICIES:
-            unfit = policy.startswith("shipped") and suites.SUITES[suite].target
-            if suite in (of or EPISODES) and policy in (by or POLICIES) and not unfit:
+            fits = suites.SUITES[suite].target == (policy == "shipped_target")
+            acts = fits or not policy.startswith("shipped")
+            if suite in (of or EPISODES) and policy in (by or POLICIES) and acts:
                 yield Cell(suite, policy, max(1, round(share * episodes)))
 
 

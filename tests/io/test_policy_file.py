@@ -22,6 +22,7 @@ from csac_jax.io import configs, policy_file, weights
 from csac_jax.io.policy_file import PolicyFileError
 
 CFG = presets.get("smoke")
+PAGE = Path(__file__).parents[2] / "docs" / "policies.md"
 
 
 @pytest.fixture(scope="module")
@@ -133,16 +134,27 @@ def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: 
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("name", "view"), [("shipped", "ortho"), ("shipped_camera", "oblique")])
-def test_shipped_policy(name: str, view: str):
+@pytest.mark.parametrize(
+    ("name", "preset", "task", "view", "gripper"),
+    [
+        ("shipped", "fast", "clear", "ortho", "rg2"),
+        ("shipped_camera", "fast", "clear", "oblique", "rg2"),
+        ("shipped_grippers", "fast", "clear", "ortho", "varied"),
+        ("shipped_objects", "objects", "clear", "ortho", "rg2"),
+        ("shipped_target", "objects_target", "target", "ortho", "rg2"),
+    ],
+)
+def test_shipped_policy(name: str, preset: str, task: str, view: str, gripper: str):
     """Claim: a policy that comes with the package is at most 5 MB, what its digest says, and of
-    this version; no version of JAX is warned of."""
+    this version; no version of JAX is warned of. Each is named here and in docs/policies.md."""
     path = policy_file.find(name)
     assert path.stat().st_size <= 5e6
     cfg, params = policy_file.load(path)
-    assert (cfg.preset, cfg.task.kind, cfg.net.kind) == ("fast", "clear", "small")
-    assert cfg.heightmap.view == view
+    assert (cfg.preset, cfg.task.kind, cfg.net.kind) == (preset, task, "small")
+    assert (cfg.heightmap.view, cfg.sim.gripper) == (view, gripper)
+    assert cfg.net.gripper == (gripper == "varied")
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+    assert f"`{name}`" in PAGE.read_text()
 
 
 def test_old_file_without_digest_loads_with_a_warning(tmp_path: Path, params: Params):
