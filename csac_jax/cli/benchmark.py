@@ -37,7 +37,7 @@ class BenchmarkOptions:
     written after each; a benchmark that was stopped goes on where it was."""
 
     out: Path = Path("benchmark")
-    """Folder for a file of each policy in each suite, and the table benchmark.md."""
+    """Folder for a file of each policy in each suite, and for all in benchmark.md and .json."""
     share: float = 1.0
     """Share of the episodes, above 0, at most 1."""
     suites: tuple[SuiteName, ...] = ()

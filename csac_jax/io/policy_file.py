@@ -1,8 +1,8 @@
 """A policy in a .safetensors file: its networks' variables and the config they were trained with.
 
 Nothing in such a file is executed. It holds a digest of all its content, and the versions that made
-it. Those of `SHIPPED` come with the package, see docs/policies.md; their digests stand here, so that
-a replaced file is noticed.
+it. Those of `SHIPPED` come with the package, see docs/policies.md. Their digests stand here, so
+that a replaced file is noticed.
 """
 
 import hashlib

@@ -6,10 +6,12 @@ benchmark that was stopped goes on. Scenes follow from the seed and the share of
 
 import dataclasses
 import hashlib
+import json
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from csac_jax import presets
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.evaluation.policies import LearnedPolicy, Policy
 from csac_jax.evaluation.statistics import Band
@@ -29,6 +31,7 @@ EPISODES = {  # of every part of a suite, in the whole benchmark
     "objects10": 500,
     "target_objects": 500,
 }
+CLEARANCE = presets.objects().sim.clearance  # of every policy among them, baselines too
 CSAC = "doi:10.3390/electronics11132065"
 METRICS = ("grasp_success", "completion", "declutter_rate", "action_efficiency")
 _TITLES = ("grasp success", "completion", "objects taken", "objects per action")
@@ -100,8 +103,20 @@ class Cell(NamedTuple):
         """What its numbers follow from."""
         source = self.policy if self.policy in policy_file.SHIPPED else "shipped"
         digest = hashlib.sha256(policy_file.SHIPPED[source].read_bytes()).hexdigest()
-        held = {"objects": OBJECTS} if suites.SUITES[self.suite].objects else {}
+        held = {"objects": OBJECTS, "clearance": CLEARANCE} if self.has_objects else {}
         return {**self._asdict(), "seed": SEED, "physics": "c", "policy_sha256": digest, **held}
+
+    @property
+    def has_objects(self) -> bool:
+        """The suite draws objects of a library."""
+        return suites.SUITES[self.suite].objects
+
+    def acting(self) -> Policy:
+        """The policy; among objects its tips go as low as objects need it, see CLEARANCE."""
+        policy = POLICIES[self.policy]()
+        if not self.has_objects:
+            return policy
+        return policies.in_world(policy, policy.cfg.change(sim={"clearance": CLEARANCE}))
 
 
 def cells(share: float, of: tuple[str, ...] = (), by: tuple[str, ...] = ()) -> Iterator[Cell]:
@@ -129,7 +144,7 @@ def measure(cell: Cell, progress: rollout.Progress | None = None) -> dict[str, A
     """The result of a cell, see `rollout.evaluate`."""
     asked = cell.asked()
     result = rollout.evaluate(
-        POLICIES[cell.policy](),
+        cell.acting(),
         cell.suite,
         cell.episodes,
         SEED,
@@ -168,8 +183,10 @@ def _shown(bands: Iterable[Band | None]) -> list[str]:
 
 
 def write_table(folder: Path, share: float) -> Path:
-    """Writes the table of all that the folder holds at this share of the episodes."""
-    found = [kept(cell, folder) for cell in cells(share)]
+    """Writes the table of all that the folder holds at this share of the episodes, and the results
+    themselves in one file, benchmark.json. Returns the table's path."""
+    found = [one for cell in cells(share) if (one := kept(cell, folder)) is not None]
     path = folder / "benchmark.md"
-    files.replace(path, markdown([one for one in found if one is not None]))
+    files.replace(path, markdown(found))
+    files.replace(path.with_suffix(".json"), json.dumps({"share": share, "results": found}))
     return path

@@ -9,7 +9,7 @@ import pytest
 
 from csac_jax import cli
 from csac_jax.cli import benchmark as command
-from csac_jax.evaluation import suites
+from csac_jax.evaluation import policies, suites
 from csac_jax.report import benchmark
 
 
@@ -53,6 +53,17 @@ def test_grasps_alone_are_the_shipped_policys():
     assert (alone.cfg.policy.primitive, shipped.cfg.policy.primitive) == ("grasp", "argmax")
     for a, b in zip(*(jax.tree.leaves(policy) for policy in (alone, shipped)), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("policy", ["shipped", "oracle", "shipped_objects"])
+def test_tips_go_as_low_for_all(policy: str):
+    """Claim: among objects every policy grasps as low as `shipped_objects` learned to; among blocks
+    as its config says."""
+    trained = policies.load_config("shipped_objects").sim.clearance
+    among = {suite: benchmark.Cell(suite, policy, 1).acting() for suite in ("pile", "random10")}
+    assert among["pile"].cfg.sim.clearance == trained
+    own = policies.load_config(policy if policy.startswith("shipped") else "shipped")
+    assert among["random10"].cfg.sim.clearance == own.sim.clearance
 
 
 def test_the_table_by_hand():
@@ -103,6 +114,7 @@ def test_the_command_goes_on_where_it_was(
     assert (first["episodes"], first["physics"], first["objects"]) == (10, "c", benchmark.OBJECTS)
     assert {"commit", "versions", "seconds"} <= first.keys()
     assert "| pile | random | 10 | 90.0 %" in (tmp_path / "b/benchmark.md").read_text()
+    assert json.loads((tmp_path / "b/benchmark.json").read_text())["results"] == [first]
     capsys.readouterr()
     assert cli.main(both) == 0
     assert "1 of 2: random in pile, kept from before" in capsys.readouterr().out
