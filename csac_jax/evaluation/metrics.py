@@ -1,9 +1,10 @@
 """What an evaluation reports, from arrays of episodes; no JAX.
 
 Every metric is `{"value", "low", "high", "n"}`: value, 95 % interval, number of cases. Without
-cases `n` is 0 and the others are None. Shares have Wilson intervals over the cases named; the
-efficiencies have bootstrap intervals over episodes, whose actions depend on one another. In the
-target task only the target counts as a block.
+cases `n` is 0 and the others are None. Shares have Wilson intervals over the cases named. Actions
+of one episode depend on one another: their shares have the intervals of `clustered`, and the
+efficiencies bootstrap intervals over episodes. In the target task only the target counts as a
+block.
 
 `grasp_success`                lifted / grasps.
 `completion`                   episodes in which the hand took every block / episodes. A lost block
@@ -66,6 +67,28 @@ def wilson(successes: int, n: int) -> dict[str, Any]:
     return {"value": successes / n, "low": float(low), "high": float(high), "n": n}
 
 
+def clustered(hits: np.ndarray, cases: np.ndarray) -> dict[str, Any]:
+    """The share of hits among cases, counts of each episode [M], with a 95 % interval.
+
+    It is Wilson's for as many independent cases as these are worth: their number over the design
+    effect (Kish, Survey Sampling, 1965), the variance of the ratio between episodes over that of
+    independent cases, at least 1. One object that cannot be grasped fails many grasps in a row.
+    """
+    total, episodes = int(cases.sum()), np.count_nonzero(cases)
+    if total == 0:
+        return dict(NO_CASES)
+    share = float(hits.sum()) / total
+    between = np.square(hits - share * cases).sum() * episodes / max(episodes - 1, 1)
+    effect = max(1.0, between / (total * share * (1.0 - share))) if 0.0 < share < 1.0 else 1.0
+    worth = total / effect
+    z = scipy.stats.norm.ppf(0.975)
+    middle = (share + 0.5 * z**2 / worth) / (1.0 + z**2 / worth)
+    spread = np.sqrt(share * (1.0 - share) / worth + (0.5 * z / worth) ** 2)
+    half = z * spread / (1.0 + z**2 / worth)
+    low, high = min(share, middle - half), max(share, middle + half)  # at 0 and 1 but for rounding
+    return {"value": share, "low": float(low), "high": float(high), "n": total}
+
+
 def bootstrap_ratio(above: np.ndarray, below: np.ndarray, n: int, seed: int = 0) -> dict[str, Any]:
     """sum(above) / sum(below) over cases [M], with a 95 % percentile bootstrap interval.
 
@@ -92,7 +115,7 @@ def summarise(episodes: Episodes) -> dict[str, Any]:
     tried, lifted = grasps.sum(axis=1), (grasps & (episodes.outcome == Outcome.LIFTED)).sum(axis=1)
     pushes = actions - tried
     return {
-        "grasp_success": wilson(int(outcomes[Outcome.LIFTED]), int(grasps.sum())),
+        "grasp_success": clustered(lifted, tried),
         "completion": _share(took_all),
         "completion_reachable": _share(completed),
         "declutter_rate": bootstrap_ratio(taken, blocks, int(blocks.sum())),
@@ -120,9 +143,10 @@ def _mean(values: np.ndarray) -> dict[str, Any]:
 
 
 def _share(true: np.ndarray, of: np.ndarray | None = None) -> dict[str, Any]:
-    """The share of the cases `of`, bool, all if None, in which `true` holds."""
-    of = np.ones_like(true) if of is None else of
-    return wilson(int((true & of).sum()), int(of.sum()))
+    """The share of episodes [M], or of the actions `of` [M, T], in which `true` holds."""
+    if of is None:
+        return wilson(int(true.sum()), true.size)
+    return clustered((true & of).sum(axis=1), of.sum(axis=1))
 
 
 def _failures(episodes: Episodes, grasps: np.ndarray) -> dict[str, dict[str, Any]]:
@@ -141,7 +165,7 @@ def _failures(episodes: Episodes, grasps: np.ndarray) -> dict[str, dict[str, Any
         # Of actions, those that the robot cannot follow: nothing moved.
         "action_unreachable": _share(episodes.unreachable, episodes.valid),
         # Of blocks at the start, those that left the workspace.
-        "block_lost": wilson(int(episodes.blocks_lost.sum()), int(episodes.blocks.sum())),
+        "block_lost": clustered(episodes.blocks_lost, episodes.blocks),
         # Of episodes:
         "episode_action_cap": ended["action_cap"],  # stopped at `task.max_actions`
         "episode_no_change_cap": ended["no_change_cap"],  # at `task.max_steps_without_change`

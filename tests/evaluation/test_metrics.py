@@ -29,6 +29,7 @@ def test_no_cases_no_value():
     """Claim: where there are no cases, n is 0 and there is no value."""
     assert metrics.wilson(0, 0) == {"value": None, "low": None, "high": None, "n": 0}
     assert metrics.bootstrap_ratio(np.zeros(0), np.zeros(0), 0)["value"] is None
+    assert metrics.clustered(np.zeros(3), np.zeros(3))["value"] is None
 
 
 def test_bootstrap_covers_the_truth():
@@ -40,6 +41,25 @@ def test_bootstrap_covers_the_truth():
         got = metrics.bootstrap_ratio(drawn.binomial(actions, 0.6), actions, 60, seed)
         covered += got["low"] <= 0.6 <= got["high"]
     assert 180 <= covered <= 198  # 190 +- 3 deviations of a binomial
+
+
+def test_grasps_of_one_episode_are_alike():
+    """Claim: where episodes differ, the interval of their grasps' share holds the truth in about 95
+    of 100 repetitions, Wilson's of as many independent grasps in far fewer; where grasps are
+    independent, or all alike, it is no narrower than Wilson's."""
+    drawn = np.random.default_rng(0)
+    covered = dict.fromkeys(("clustered", "wilson"), 0)
+    for _ in range(400):
+        grasps = drawn.integers(5, 25, 80)
+        lifted = drawn.binomial(grasps, drawn.beta(3.0, 1.0, 80))  # 0.75 on average
+        total = metrics.wilson(int(lifted.sum()), int(grasps.sum()))
+        for name, one in (("clustered", metrics.clustered(lifted, grasps)), ("wilson", total)):
+            covered[name] += one["low"] <= 0.75 <= one["high"]
+    assert 368 <= covered["clustered"] <= 392  # 380 +- 3 deviations of a binomial
+    assert covered["wilson"] < 300
+    for lifted, n in ((6, 10), (10, 10), (0, 10)):
+        got = metrics.clustered(np.full(50, lifted), np.full(50, n))
+        assert got == pytest.approx(metrics.wilson(50 * lifted, 50 * n), abs=1e-12)
 
 
 def test_bootstrap_repeats():
