@@ -128,7 +128,7 @@ def run_dir(tmp_path: Path) -> Path:
             "train quick --run-dir .",
             ". exists; give another --run-dir, or go on with it by --resume",
         ),
-        ("eval", "A run's folder, a policy file, or shipped"),
+        ("eval", "A run's folder, a policy file, or one that comes"),
         ("eval . --policy best", "invalid choice 'best' for argument '--policy'"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed -2", "--seed: must lie in"),
