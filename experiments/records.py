@@ -199,6 +199,10 @@ BENCHES = {
         "share of the float32 peak that the parts of an update of `quick` reach",
         "bench learner",
     ),
+    "benchmark/epyc-tenth": (
+        "what ships and its baselines in every suite",
+        "benchmark --share 0.1",
+    ),
     "step_kernels/h100-fast": ("kernels of a step by what they do", "bench step_kernels fast"),
     "step/xeon-quick": ("a step as `quick` was, Intel Xeon", f"bench step {_QUICK}"),
     "step/epyc-quick-scenes": (
