@@ -57,6 +57,8 @@ def run(arguments: list[str]) -> int:
     cells = list(benchmark.cells(options.share, options.suites, options.policies))
     if not cells:
         raise BadArgumentsError("--policies: none of them can act in these suites")
+    if options.out.exists() and not options.out.is_dir():
+        raise BadArgumentsError(f"--out: {options.out} is a file; give a folder")
     options.out.mkdir(parents=True, exist_ok=True)  # before hours of work, if it cannot be
     cache.enable()
     for number, cell in enumerate(cells, 1):

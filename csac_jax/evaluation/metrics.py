@@ -27,10 +27,10 @@ exceed 1. A metric that does not charge for pushes never stands alone where meth
 episodes, blocks, pushes, grasps, and blocks taken and lost.
 """
 
+import statistics
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # of whose parts each is imported when it is first used
 
 from csac_jax.constants import OUTCOMES, Outcome, Primitive
 
@@ -41,6 +41,7 @@ PER_ACTION = ("action_efficiency", "action_efficiency_completed")  # blocks per 
 PER_EPISODE = ("actions_per_episode", "pushes_per_episode")  # counts, no shares
 NO_CASES = {"value": None, "low": None, "high": None, "n": 0}
 RESAMPLES = 2000
+_Z = statistics.NormalDist().inv_cdf(0.975)
 
 
 class Episodes(NamedTuple):
@@ -61,10 +62,7 @@ class Episodes(NamedTuple):
 
 def wilson(successes: int, n: int) -> dict[str, Any]:
     """A share with Wilson's 95 % interval, which holds for few cases and near 0 and 1."""
-    if n == 0:
-        return dict(NO_CASES)
-    low, high = scipy.stats.binomtest(successes, n).proportion_ci(method="wilson")
-    return {"value": successes / n, "low": float(low), "high": float(high), "n": n}
+    return _wilson(successes / n, n, n) if n else dict(NO_CASES)
 
 
 def clustered(hits: np.ndarray, cases: np.ndarray) -> dict[str, Any]:
@@ -80,13 +78,16 @@ def clustered(hits: np.ndarray, cases: np.ndarray) -> dict[str, Any]:
     share = float(hits.sum()) / total
     between = np.square(hits - share * cases).sum() * episodes / max(episodes - 1, 1)
     effect = max(1.0, between / (total * share * (1.0 - share))) if 0.0 < share < 1.0 else 1.0
-    worth = total / effect
-    z = scipy.stats.norm.ppf(0.975)
-    middle = (share + 0.5 * z**2 / worth) / (1.0 + z**2 / worth)
-    spread = np.sqrt(share * (1.0 - share) / worth + (0.5 * z / worth) ** 2)
-    half = z * spread / (1.0 + z**2 / worth)
-    low, high = min(share, middle - half), max(share, middle + half)  # at 0 and 1 but for rounding
-    return {"value": share, "low": float(low), "high": float(high), "n": total}
+    return _wilson(share, total, total / effect)
+
+
+def _wilson(share: float, n: int, worth: float) -> dict[str, Any]:
+    """The share of n cases with Wilson's interval for `worth` independent ones (Wilson 1927)."""
+    shrink = 1.0 + _Z**2 / worth
+    middle = (share + 0.5 * _Z**2 / worth) / shrink
+    half = _Z * np.sqrt(share * (1.0 - share) / worth + (0.5 * _Z / worth) ** 2) / shrink
+    low, high = min(share, middle - half), max(share, middle + half)  # rounding, at 0 and 1
+    return {"value": share, "low": float(low), "high": float(high), "n": n}
 
 
 def bootstrap_ratio(above: np.ndarray, below: np.ndarray, n: int, seed: int = 0) -> dict[str, Any]:

@@ -82,9 +82,9 @@ def find(source: str | Path) -> Path:
     """The policy file or run's folder that `source` names. Raises FileNotFoundError."""
     path = SHIPPED.get(str(source), Path(source))
     if not path.exists():
-        known = " or ".join(SHIPPED)
+        known = ", ".join(SHIPPED)
         raise FileNotFoundError(
-            f"there is no folder {path}; give the folder of a run, a policy file, or {known}"
+            f"there is no folder {path}; give the folder of a run, a policy file, or one of {known}"
         )
     return path
 

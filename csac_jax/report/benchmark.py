@@ -31,7 +31,7 @@ EPISODES = {  # of every part of a suite, in the whole benchmark
     "objects10": 500,
     "target_objects": 500,
 }
-CLEARANCE = presets.objects().sim.clearance  # of every policy among them, baselines too
+CLEARANCE = presets.objects().sim.clearance  # of every policy among objects, baselines too
 CSAC = "doi:10.3390/electronics11132065"
 METRICS = ("grasp_success", "completion", "declutter_rate", "action_efficiency")
 _TITLES = ("grasp success", "completion", "objects taken", "objects per action")
@@ -188,5 +188,6 @@ def write_table(folder: Path, share: float) -> Path:
     found = [one for cell in cells(share) if (one := kept(cell, folder)) is not None]
     path = folder / "benchmark.md"
     files.replace(path, markdown(found))
-    files.replace(path.with_suffix(".json"), json.dumps({"share": share, "results": found}))
+    text = json.dumps({"share": share, "results": found}, indent=1)
+    files.replace(path.with_suffix(".json"), text + "\n")
     return path

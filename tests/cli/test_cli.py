@@ -173,6 +173,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("benchmark --share 0", "--share: above 0, at most 1"),
         ("benchmark --suites piles", "invalid choice 'piles' for argument '--suites"),
         ("benchmark --suites target --policies shipped", "--policies: none of them can act in"),
+        ("benchmark --out /dev/null", "--out: /dev/null is a file; give a folder"),
         ("bench learner paper", "bench learner: paper has no small net; give quick or fast"),
         ("bench learner --repeats 0", "bench learner: --repeats: at least 1"),
         ("doctor --preset", "Missing value for argument '--preset'"),
