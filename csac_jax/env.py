@@ -73,6 +73,7 @@ class State:
     truncated: jax.Array  # [] bool, a cap was reached or physics diverged
     actions: jax.Array  # [] int32, actions in this episode
     steps_without_change: jax.Array  # [] int32, actions in a row without visible change
+    failed_grasps: jax.Array  # [] int32, grasps in a row, pushes aside, that lifted nothing
     info: Info
     noise_key: jax.Array | None = None  # [] root of the episode's sensor noise; None without noise
 
@@ -90,7 +91,7 @@ class Env:
     physics: Physics
     scenes: Scene  # NumPy leaves [P, N, ...], at rest
     any_yaw: bool = True  # False: `reset` rotates scenes by quarter turns only
-    max_failures: int = 0  # failed grasps in a row that end an episode of an evaluation; 0: none
+    max_failures: int = 0  # failed grasps in a row that truncate an episode; 0: as many as it likes
 
     @property
     def gripper(self) -> Gripper:
@@ -136,7 +137,7 @@ class Env:
             scene = scene.replace(fingers=own)
         noise_key = sensor.episode_key(key, self.cfg.sensor)
         obs = self._observe(scene, noise_key, none)
-        return State(scene, obs, zero, no, no, none, none, info, noise_key)
+        return State(scene, obs, zero, no, no, none, none, none, info, noise_key)
 
     def auto_reset(self, key: jax.Array, state: State) -> State:
         """The first state after the episode that ended in `state`.
@@ -180,7 +181,11 @@ class Env:
         changed = moved > CHANGE_AREA
         unchanged_steps = jnp.where(changed, 0, state.steps_without_change + 1)
         terminated = ~jnp.any(after.in_play & layout.is_target(after))
+        failed = jnp.where(jnp.any(lifted), 0, state.failed_grasps + 1)
+        failed_grasps = jnp.where(is_grasp, failed, state.failed_grasps)
         capped = (actions >= task.max_actions) | (unchanged_steps >= task.max_steps_without_change)
+        if self.max_failures:
+            capped |= failed_grasps >= self.max_failures
         distance = jnp.linalg.norm(before.position[:, :2] - action.pose[:2], axis=1)
         wrong = jnp.any(lifted) & ~jnp.any(success)
         best = jnp.where(wrong, jnp.int32(Outcome.TOUCHED), jnp.int32(Outcome.LIFTED))
@@ -205,6 +210,7 @@ class Env:
             truncated=(capped & ~terminated) | diverged,
             actions=actions,
             steps_without_change=unchanged_steps,
+            failed_grasps=failed_grasps,
             info=info,
             noise_key=state.noise_key,
         )

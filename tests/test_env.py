@@ -33,6 +33,7 @@ CONFIG = Config(
     scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=16, settle_time=1.5),
     task=ShortTask(max_actions=6),
 )
+FAILED = 3  # grasps before the actions of `_CASES`
 SCENES = 8
 BARE = (0.15, 0.15, 0.0)  # x, y and yaw of a place where nothing lies
 
@@ -154,10 +155,12 @@ def stepped(lab: Lab) -> State:
         jnp.array([case[i] for case in _CASES.values()], jnp.int32) for i in (1, 2)
     )
     action = _actions(*((kind, pose) for *_, kind, pose in _CASES.values()))
-    return lab.step(
-        dataclasses.replace(first, actions=actions, steps_without_change=steps_without_change),
-        action,
-    )
+    counts = {
+        "actions": actions,
+        "steps_without_change": steps_without_change,
+        "failed_grasps": jnp.full(len(_CASES), FAILED, jnp.int32),
+    }
+    return lab.step(dataclasses.replace(first, **counts), action)
 
 
 _CASES = {  # the cube's place, actions and steps without change so far, the action
@@ -267,6 +270,24 @@ def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
         assert (new.done, new.reward, new.actions) == (False, 0.0, 0)
         assert new.obs.target.any()
         assert not new.obs.target.all()
+
+
+def test_failed_grasps_are_counted(state_of):
+    """Claim: a grasp that lifts nothing adds one to the failures in a row, one that lifts any block
+    ends the row, and pushes leave it."""
+    after = {name: int(state_of(name).failed_grasps) for name in _CASES}
+    pushes = dict.fromkeys(("on", "moved", "out"), FAILED)
+    failures = dict.fromkeys(("cap", "steps_without_change"), FAILED + 1)
+    assert after == pushes | failures | dict.fromkeys(("last chance", "got", "wrong"), 0)
+
+
+@pytest.mark.parametrize(("failed", "stops"), [(0, False), (1, True)])
+def test_failures_end_an_episode(lab: Lab, failed: int, stops: bool):
+    """Claim: with `max_failures` that many failed grasps in a row truncate an episode."""
+    env = dataclasses.replace(lab.env, max_failures=2)
+    state = env.reset_to(_cube(0.0, 0.0)).replace(failed_grasps=jnp.int32(failed))
+    after = jax.jit(env.step)(state, Action.grasp(*BARE))
+    assert (bool(after.truncated), bool(after.terminated)) == (stops, False)
 
 
 def test_action_cap_truncates(state_of):

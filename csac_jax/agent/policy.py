@@ -126,6 +126,18 @@ def best_action(
     return Action(primitive=best.primitive, pose=pose)
 
 
+def after_failures(
+    key: jax.Array, learner: ActorCritic, state: DenseMaps, failed_grasps: jax.Array
+) -> DenseMaps:
+    """The maps to act by after `failed_grasps` [] in a row: Q plus Gumbel noise, by which the best
+    cell is one drawn by Boltzmann's law."""
+    if learner.cfg.policy.retry == 0.0:
+        return state
+    temperature = learner.cfg.policy.retry * failed_grasps.astype(jnp.float32)
+    noise = jax.random.gumbel(jax.random.fold_in(key, len(Primitive)), state.q.shape)
+    return state.replace(q=state.q + temperature * noise)
+
+
 def random_grasp(key: jax.Array, frames: Frames, valid: jax.Array) -> Action:
     """A grasp at a random valid cell, with a random yaw; `valid` [P, K, h, w]."""
     u = random_places(key, frames, valid)[Primitive.GRASP]

@@ -58,7 +58,7 @@ def run(arguments: list[str]) -> int:
     env, steps = _play(options, _policy(options.policy), view)
     from csac_jax.render import episode
 
-    print(episode.summary(env.cfg, steps))
+    print(episode.summary(env, steps))
     if drawn or options.viewer:
         stage = episode.Stage(env.cfg, steps[0].before, options.size, opengl, options.views)
         episode.record(stage, steps, options.png, options.video)

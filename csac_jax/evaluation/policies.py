@@ -47,7 +47,7 @@ class PolicyDebug(NamedTuple):
 @struct.dataclass
 class LearnedPolicy:
     """The greedy policy of trained networks, without exploration. With `policy.primitive rule`,
-    which pushes after no visible change, it needs a State."""
+    which pushes after no visible change, and with `policy.retry`, it needs a State."""
 
     cfg: Config = struct.field(pytree_node=False)
     params: Params
@@ -63,6 +63,8 @@ class LearnedPolicy:
         scenes that fit the memory; under vmap they would see all."""
         parts, (obs, unchanged) = actor_critic.make(self.cfg, self.network), _seen(scenes)
         dense_maps = actor_critic.dense_maps(parts, self.params, obs)
+        each = keys, parts, dense_maps, _failed(scenes)
+        dense_maps = jax.vmap(policy.after_failures, (0, None, 0, 0))(*each)
         return jax.vmap(policy.best_action, (0, None, 0, 0))(keys, parts, dense_maps, unchanged)
 
     @jax.jit
@@ -74,7 +76,9 @@ class LearnedPolicy:
         dense_maps = jax.tree.map(lambda leaf: leaf[0], batch)
         places = geometry.cell_centres(self.cfg.heightmap)
         q = maps.best_over_yaws(parts.frames, dense_maps, places)
-        candidates = policy.candidates(key, parts, dense_maps)
+        candidates = policy.candidates(
+            key, parts, policy.after_failures(key, parts, dense_maps, _failed(scene))
+        )
         return PolicyDebug(q, candidates, actor_critic.best_grasp(dense_maps))
 
 
@@ -146,6 +150,13 @@ def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:
     if isinstance(scenes, State):
         return scenes.obs, scenes.steps_without_change
     return scenes, jnp.zeros(scenes.height.shape[:-2], jnp.int32)
+
+
+def _failed(scenes: Observation | State) -> jax.Array:
+    """Failed grasps in a row [...], none after a bare observation."""
+    if isinstance(scenes, State):
+        return scenes.failed_grasps
+    return jnp.zeros(scenes.height.shape[:-2], jnp.int32)
 
 
 def in_world(policy: Policy, cfg: Config) -> Policy:

@@ -10,7 +10,7 @@ import numpy as np
 
 from csac_jax.agent import rewards
 from csac_jax.config import Config, PhysicsKind, RobotKind
-from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
+from csac_jax.constants import CHANGE_AREA
 from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
@@ -92,10 +92,12 @@ def rollout(
 
 
 @functools.lru_cache(maxsize=2)
-def _compiled(kind: Any, cfg: Config, physics: Any, any_yaw: bool) -> tuple[Callable, Callable]:
+def _compiled(
+    kind: Any, cfg: Config, physics: Any, any_yaw: bool, max_failures: int
+) -> tuple[Callable, Callable]:
     """`_begin` and `_step` of an environment, whatever its scenes are: parts of a suite that share
     config and physics share them."""
-    env = kind(cfg, physics, None, any_yaw)  # without scenes, as it never resets
+    env = kind(cfg, physics, None, any_yaw, max_failures)  # without scenes, as it never resets
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     return jit(functools.partial(_begin, env)), jit(functools.partial(_step, env), static_argnums=0)
 
@@ -153,7 +155,7 @@ def _run(
     env: Env, policy: Policy, episodes: int, seed: int, numbers: np.ndarray, progress: Count | None
 ) -> Episodes:
     """The episodes `numbers` [E] of a rollout; those beyond its `episodes` end at once."""
-    static: Any = (type(env), env.cfg, env.physics, env.any_yaw)
+    static: Any = (type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
     begin, step = _compiled(*static)
     task, key = env.cfg.task, jax.random.key(seed)
     rows = np.minimum(numbers, episodes - 1) * env.scenes.position.shape[0] // episodes
@@ -161,15 +163,11 @@ def _run(
     states = begin(jax.random.fold_in(key, 0), numbers, scenes)
     blocks = np.asarray(states.scene.in_play.sum(axis=1))
     states = states.replace(truncated=jnp.asarray(numbers >= episodes))
-    records, failures = [], np.zeros(len(numbers), np.int32)
+    records = []
     for action in range(1, task.max_actions + 1):
         step_key = jax.random.fold_in(key, action)
         states, record = step(type(policy), _pytree(policy), step_key, numbers, states)
         records.append(jax.device_get(record))
-        failures = failures_in_a_row(failures, records[-1])
-        if env.max_failures:
-            given_up = (failures >= env.max_failures) & ~np.asarray(states.done)
-            states = states.replace(truncated=states.truncated | given_up)
         if progress is not None:
             progress(min(int(numbers[0] + np.sum(states.done)), episodes), episodes)
         if np.all(states.done):
@@ -180,26 +178,20 @@ def _run(
         blocks_lost=steps.blocks_lost.sum(axis=1),
         blocks=np.ones_like(blocks) if task.kind == "target" else blocks,
         completed=np.asarray(states.terminated),
-        ending=np.where(
-            (failures >= (env.max_failures or np.inf)) & ~np.asarray(states.terminated),
-            ENDINGS.index("failed_grasps"),
-            endings(env.cfg, states),
-        ),
+        ending=endings(env, states),
     )
 
 
-def failures_in_a_row(before: np.ndarray, record: Episodes) -> np.ndarray:
-    """Grasps [E] that lifted nothing since the last one that did; a push is none."""
-    grasped = record.valid & (record.primitive == Primitive.GRASP)
-    after = np.where(record.outcome == Outcome.LIFTED, 0, before + 1)
-    return np.where(grasped, after, before)
-
-
-def endings(cfg: Config, last: State) -> np.ndarray:
+def endings(env: Env, last: State) -> np.ndarray:
     """Why the episodes of these last states, leaves [...], ended: indices into ENDINGS [...]."""
-    capped = last.actions >= cfg.task.max_actions
-    held = jax.device_get([last.terminated, last.info.physics_diverged, capped])
-    numbers = [ENDINGS.index(name) for name in ("terminated", "physics_diverged", "action_cap")]
+    reasons = {
+        "terminated": last.terminated,
+        "physics_diverged": last.info.physics_diverged,
+        "failed_grasps": last.failed_grasps >= (env.max_failures or np.inf),
+        "action_cap": last.actions >= env.cfg.task.max_actions,
+    }
+    held = jax.device_get([*reasons.values()])
+    numbers = [ENDINGS.index(name) for name in reasons]
     return np.select(held, numbers, ENDINGS.index("no_change_cap")).astype(np.int32)
 
 

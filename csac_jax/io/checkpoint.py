@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 import tensorstore
 
@@ -141,7 +142,9 @@ def restore(
     """
     folder = sound(run_dir, step)
     record = _read(folder, extra=ocp.args.JsonRestore())["extra"]
-    wanted, layout = leaves.named(abstract_state), leaves.layout(abstract_state)
+    every, layout = leaves.named(abstract_state), leaves.layout(abstract_state)
+    added = [name for name in renames.ADDED if name in every and name not in record["layout"]]
+    wanted = {name: leaf for name, leaf in every.items() if name not in added}
     old = {name: _old_name(name, record["layout"]) for name in wanted}
     found = leaves.difference(record["layout"], {old[name]: layout[name] for name in wanted})
     if found is not None:
@@ -155,7 +158,10 @@ def restore(
     arrays = _read(folder, state=ocp.args.StandardRestore(arrays))["state"]
     if (found_step := _own_step(arrays)) not in (None, int(folder.name)):
         raise CheckpointError(f"checkpoint {folder} holds step {found_step}; remove that folder")
-    state = [_typed(arrays[old[name]], leaf) for name, leaf in wanted.items()]
+    state = [
+        _zeros(leaf) if name in added else _typed(arrays[old[name]], leaf)
+        for name, leaf in every.items()
+    ]
     return jax.tree.unflatten(jax.tree.structure(abstract_state), state), record["extra"]
 
 
@@ -317,6 +323,11 @@ def _abstract_array(leaf: Any) -> jax.ShapeDtypeStruct:
     place = leaf.sharding or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     array = jax.eval_shape(_untyped, leaf)
     return jax.ShapeDtypeStruct(array.shape, array.dtype, sharding=place)
+
+
+def _zeros(leaf: Any) -> jax.Array:
+    array = _abstract_array(leaf)
+    return jnp.zeros(array.shape, array.dtype, device=array.sharding)
 
 
 def _typed(array: Any, leaf: Any) -> Any:

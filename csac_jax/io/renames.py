@@ -24,6 +24,9 @@ STATE = {
 }
 """Leaves of a checkpoint."""
 
+ADDED = ("scenes.failed_grasps",)
+"""Leaves that older checkpoints lack: they are 0 there."""
+
 SETTINGS = {
     "cem.spread": "cem.std_estimator",
     "learn.copy_every": "learn.target_update_period",

@@ -228,6 +228,40 @@ def brick(rng: Generator) -> list[Part]:
     return [_prism(_circle(rng.uniform(0.018, 0.04), sides), 0.0, rng.uniform(0.025, 0.08))]
 
 
+def assembly(rng: Generator) -> list[Part]:
+    """One to three storeys of slanted, tapered or straight blocks, one or two on the one below."""
+    storeys = int(rng.integers(1, 4))
+    parts: list[Part] = []
+    below = np.zeros((1, 2))
+    heights = np.cumsum([0.0, *rng.uniform(0.01, 0.01 + 0.07 / storeys, storeys)])
+    for storey in range(storeys):
+        if storey and rng.random() < 0.4:  # two, towards the ends of the longer side
+            axis = int(np.argmax(np.ptp(below, axis=0)))
+            ends = below[[below[:, axis].argmin(), below[:, axis].argmax()]]
+            middles, reach = (0.2 * ends[::-1] + 0.8 * ends), 0.28 * np.ptp(ends[:, axis])
+        else:
+            middles, reach = rng.dirichlet(np.ones(len(below)), 1) @ below, np.float64(0.042)
+        feet = [middle + _footprint(rng, reach) for middle in middles]
+        for foot in feet:
+            middle, half = foot.mean(axis=0), 0.5 * np.ptp(foot, axis=0)
+            scale = rng.uniform(0.1, 1.1, 2)
+            slant = rng.uniform(-1.0, 1.0, 2) * np.maximum(1.0 - scale, 0.0) * half
+            below = middle + scale * (foot - middle) + slant
+            parts.append(_frustum(foot, below, *heights[storey : storey + 2]))
+    return parts
+
+
+def _footprint(rng: Generator, reach: float) -> np.ndarray:
+    """A rectangle or a convex polygon of three to seven corners [n, 2] around the origin, which lie
+    at most `reach` away from it along each axis."""
+    half = reach * rng.uniform(0.2, 1.0, 2)
+    if rng.integers(2):
+        return half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    corners = int(rng.integers(3, 8))
+    angle = 2.0 * np.pi * (np.arange(corners) + rng.uniform(-0.2, 0.2, corners)) / corners
+    return half * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 Family = Callable[[Generator], list[Part]]
 FAMILIES: dict[str, Family] = {
     family.__name__: family
@@ -241,10 +275,18 @@ FAMILIES: dict[str, Family] = {
 def draw(seed: int, count: int) -> list[Object]:
     """`count` objects, family by family in turn; the same for the same seed. A longer list begins
     with the shorter one."""
-    names = [*FAMILIES]
-    found = []
-    for i in range(count):
-        family = names[i % len(names)]
-        parts = FAMILIES[family](np.random.default_rng([seed, i]))
-        found.append(body.make(f"{family}-{seed}-{i}", parts, family=family))
-    return found
+    families = [*FAMILIES.values()]
+    return [_one(families[i % len(families)], seed, i) for i in range(count)]
+
+
+def draw_mixed(seed: int, count: int) -> list[Object]:
+    """`count` objects, those of `draw` and assemblies in turn."""
+    families = [*FAMILIES.values()]
+    kinds = (families[i // 2 % len(families)] if i % 2 == 0 else assembly for i in range(count))
+    return [_one(kind, seed, i // 2) for i, kind in enumerate(kinds)]
+
+
+def _one(family: Family, seed: int, number: int) -> Object:
+    name = family.__name__
+    parts = family(np.random.default_rng([seed, number]))
+    return body.make(f"{name}-{seed}-{number}", parts, family=name)

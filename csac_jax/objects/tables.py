@@ -14,7 +14,7 @@ from csac_jax.objects.library import Library, LibraryError, Split
 
 CHUNK = 6  # faces, as many as a box has
 NO_FACE = 1e3  # m, offset of a face that is not there: every point lies inside it
-_MADE = re.compile(r"made:(\d{1,9}):(\d{1,4})")
+_MADE = re.compile(r"(made|mixed):(\d{1,9}):(\d{1,4})")
 
 
 class Tables(NamedTuple):
@@ -40,17 +40,23 @@ class Tables(NamedTuple):
 
 
 def find(source: str, split: Split) -> Library:
-    """The objects of a split of the library in the folder `source`, or of `made:SEED:COUNT`, our
-    own shapes. Raises LibraryError."""
-    made = _MADE.fullmatch(source)
-    return _chosen(_made(*map(int, made.groups())) if made else library.load(Path(source)), split)
+    """The objects of a split of the library in the folder `source`, or of our own shapes:
+    `made:SEED:COUNT`, or `mixed:SEED:COUNT` with assemblies among them. Raises LibraryError."""
+    if made := _MADE.fullmatch(source):
+        kind, seed, count = made.groups()
+        return _chosen(_made(kind, int(seed), int(count)), split)
+    return _chosen(library.load(Path(source)), split)
 
 
 @functools.lru_cache(maxsize=8)
-def _made(seed: int, count: int) -> Library:
+def _made(kind: str, seed: int, count: int) -> Library:
     if not 1 <= count <= library.MOST_OBJECTS:
-        raise LibraryError(f"made:{seed}:{count}: 1 to {library.MOST_OBJECTS} objects can be made")
-    return library.of(families.draw(seed, count))
+        most = library.MOST_OBJECTS
+        raise LibraryError(f"{kind}:{seed}:{count}: 1 to {most} objects can be made")
+    return library.of(DRAWS[kind](seed, count))
+
+
+DRAWS = {"made": families.draw, "mixed": families.draw_mixed}
 
 
 _chosen = functools.lru_cache(maxsize=16)(library.chosen)

@@ -9,7 +9,7 @@ import numpy as np
 
 from csac_jax.config import Config, RobotKind
 from csac_jax.constants import Outcome, Primitive
-from csac_jax.env import State
+from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, rollout
 from csac_jax.evaluation.rollout import StepRecord
 from csac_jax.render import media, panels, picture, viewer
@@ -26,6 +26,7 @@ STOPPED = {
     "action_cap": "stopped at the action limit",
     "no_change_cap": "stopped since nothing changed any more",
     "physics_diverged": "stopped since physics diverged",
+    "failed_grasps": "stopped after failed grasps in a row",
 }
 HOLD = 20  # pictures of an action's end
 
@@ -111,11 +112,11 @@ def line(number: int, step: StepRecord) -> str:
     return f"{number:3d} {done}; reward {float(step.reward):+.2f}; {left} left"
 
 
-def summary(cfg: Config, steps: list[StepRecord]) -> str:
+def summary(env: Env, steps: list[StepRecord]) -> str:
     """How the episode ended, and what became of the blocks."""
     last = steps[-1].after
     if not last.terminated:
-        ending = STOPPED[metrics.ENDINGS[rollout.endings(cfg, last)]]
+        ending = STOPPED[metrics.ENDINGS[rollout.endings(env, last)]]
     elif last.scene.target != layout.ANY:
         ending = "the target is taken" if completed(steps) else "the target is lost"
     else:

@@ -158,6 +158,32 @@ def test_choice_of_primitive(rule, values, steps_without_change, expected):
     assert (got, got.dtype) == (expected, jnp.int32)
 
 
+@pytest.mark.parametrize("failed", [0, 2])
+def test_retries_follow_boltzmann(cfg, frames, learner, failed):
+    """Claim: after failed grasps a cell is drawn with exp(Q / T), T = failures * `policy.retry`;
+    without a failure it is the best one."""
+    grasps = algorithms.configure(cfg, "grasp_only")
+    own = grasps.change(policy={"place": "argmax", "retry": 0.25})
+    values = np.array([1.0, 0.8, 0.5, -0.2])
+    cells = np.argwhere(frames.inside)[[5, 500, 1000, 1900]]
+    grasp = (Primitive.GRASP, *cells.T)
+    shape = (2, *frames.inside.shape)
+    q = jnp.zeros(shape).at[grasp].set(values)
+    state = DenseMaps(q, 10.0 * q, jnp.zeros(shape, bool).at[grasp].set(True))
+    parts = _learner(learner, own)
+
+    def act(key: jax.Array) -> jax.Array:
+        seen = policy.after_failures(key, parts, state, jnp.int32(failed))
+        return policy.best_action(key, parts, seen, jnp.int32(0)).pose[:2]
+
+    places = np.asarray(jax.jit(jax.vmap(act))(jax.random.split(jax.random.key(3), 4000)))
+    off = np.linalg.norm(places[:, None] - frames.xy[tuple(cells.T)], axis=-1)
+    assert off.min(axis=1).max() < 1e-6
+    share = np.bincount(off.argmin(axis=1), minlength=4) / len(off)
+    wanted = np.exp(values / 0.5) if failed else np.array([1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(share, wanted / wanted.sum(), atol=0.03 if failed else 0.0)
+
+
 @pytest.mark.parametrize("steps_without_change", [0, 1])
 @pytest.mark.slow
 def test_rule_reaches_the_action(cfg, frames, learner, steps_without_change):

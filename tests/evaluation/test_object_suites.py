@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.constants import Outcome, Primitive
+from csac_jax.constants import Outcome
 from csac_jax.evaluation import metrics, policies, rollout, suites
-from csac_jax.evaluation.metrics import Episodes
 from csac_jax.scene import pool
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
@@ -24,24 +23,6 @@ def test_a_library_fits_the_suite(suite: str, objects: str | None, message: str)
     """Claim: a suite of objects without a library, and a library for another suite, are refused."""
     with pytest.raises(ValueError, match=message):
         suites.with_objects(SMOKE, suite, objects, "held_out")
-
-
-def test_only_failed_grasps_count():
-    """Claim: failures in a row are grasps that lift nothing; a lift ends the row, a push and an
-    episode that is over leave it."""
-    lifted, touched = int(Outcome.LIFTED), int(Outcome.TOUCHED)
-    grasp, push = int(Primitive.GRASP), int(Primitive.PUSH)
-    record = Episodes(
-        valid=np.array([True, True, True, False]),
-        primitive=np.array([grasp, grasp, push, grasp]),
-        outcome=np.array([touched, lifted, 0, touched]),
-        cleared=None,
-        blocks_lost=None,
-        changed=None,
-        wrong=None,
-        unreachable=None,
-    )
-    assert rollout.failures_in_a_row(np.full(4, 1), record).tolist() == [2, 0, 1, 1]
 
 
 @pytest.mark.slow

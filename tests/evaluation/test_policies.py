@@ -72,6 +72,26 @@ def test_learned_acts_like_the_agent(learned, states):
         np.testing.assert_allclose(one.pose, expected.pose[number], atol=1e-4)
 
 
+def test_failures_lead_to_other_places(learned, states):
+    """Claim: with `policy.retry` an action after failed grasps is drawn, another one for another
+    key; without failures, or from an observation, it is the best one whatever the setting."""
+    greedy = CFG.change(policy={"place": "argmax"})
+    learned, bold = (
+        dataclasses.replace(learned, cfg=cfg)
+        for cfg in (greedy, greedy.change(policy={"retry": 10.0}))
+    )
+    state, key = _scene(states, 0), jax.random.key
+    failed = state.replace(failed_grasps=jnp.int32(3))
+    for seen in (state, failed.obs):
+        jax.tree.map(np.testing.assert_array_equal, bold(seen, key(0)), learned(state, key(0)))
+    calm = [learned(failed, key(seed)).pose for seed in range(3)]
+    drawn = [bold(failed, key(seed)).pose for seed in range(3)]
+    assert max(np.ptp(np.stack(calm)[:, :2], axis=0)) < 0.02
+    assert max(np.ptp(np.stack(drawn)[:, :2], axis=0)) > 0.02
+    tried = bold.debug(failed, key(0)).candidates.reshape(-1, 3)
+    assert np.abs(tried - drawn[0]).max(axis=1).min() < 1e-5
+
+
 def test_observation_serves_for_a_state(learned, states):
     """Claim: learned and random policy act on a bare observation as in the state; without a state
     no action counts as one without change."""

@@ -80,7 +80,7 @@ class StrongMagnet(Magnet):
 
 def _compiled(env: Env):
     """What rollouts in this environment call, see `rollout._compiled`."""
-    return rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw)
+    return rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
 
 
 def learned_policy(seed: int) -> LearnedPolicy:

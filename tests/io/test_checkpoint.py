@@ -398,9 +398,23 @@ def test_new_names_of_leaves_are_read(tmp_path: Path):
         checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
 
 
+def test_added_leaves_are_zero_in_older_checkpoints(tmp_path: Path):
+    """Claim: leaves of `renames.ADDED` that a checkpoint lacks are zeros; those that it has are as
+    they were saved."""
+    first, second = jnp.full(3, 7, jnp.int32), jnp.full(3, 2, jnp.int32)
+    older = {"scenes.actions": first, "step": jnp.int32(4)}
+    newer = older | {"step": jnp.int32(8)} | dict.fromkeys(renames.ADDED, second)
+    abstract = jax.eval_shape(lambda: _tree(newer))
+    for step, saved in ((4, older), (8, newer)):
+        checkpoint.save(tmp_path, step, _tree(saved), CFG, {})
+        state, _ = checkpoint.restore(tmp_path, abstract, step)
+        wanted = dict.fromkeys(renames.ADDED, jnp.zeros_like(second)) | saved
+        assert _same_leaves(state, _tree(wanted))
+
+
 def test_states_leaves_have_the_names_of_today():
-    """Claim: `renames.STATE` leads to leaves that a run's state has."""
+    """Claim: `renames.STATE` and `renames.ADDED` name leaves that a run's state has."""
     cfg = CFG.change(sensor={"dropped": 0.1})  # only with noise there is a key of noise
     names = leaves.named(training.abstract_state(cfg)).keys()
-    assert set(renames.STATE.values()) <= names
+    assert {*renames.STATE.values(), *renames.ADDED} <= names
     assert not set(renames.STATE) & names

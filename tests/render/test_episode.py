@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax import cli, presets
+from csac_jax.env import Env
 from csac_jax.render import episode, gl
 from csac_jax.scene import layout
 
@@ -73,6 +74,7 @@ def _step(
     target: int = layout.ANY,
     actions: int = 1,
     diverged: bool = False,
+    failed: int = 0,
 ) -> Any:
     """What an episode's summary reads of a step."""
     info = SimpleNamespace(
@@ -84,6 +86,7 @@ def _step(
         reward=reward,
         scene=SimpleNamespace(target=target),
         actions=np.int32(actions),
+        failed_grasps=np.int32(failed),
     )
     return SimpleNamespace(after=after)
 
@@ -110,6 +113,7 @@ def _step(
         ),
         ([_step(actions=30)], "stopped at the action limit after 1 action: 0 blocks taken"),
         ([_step()], "stopped since nothing changed any more after 1 action: 0 blocks taken"),
+        ([_step(failed=2)], "stopped after failed grasps in a row after 1 action: 0 blocks taken"),
         ([_step(diverged=True)], "stopped since physics diverged after 1 action: 0 blocks taken"),
     ],
 )
@@ -117,7 +121,8 @@ def test_summary_says_what_became_of_the_blocks(steps: list[Any], said: str):
     """Claim: the last line of an episode tells blocks taken from blocks lost, and why it ended."""
     cfg = presets.smoke()
     task = dataclasses.replace(cfg.task, max_actions=30)
-    assert episode.summary(dataclasses.replace(cfg, task=task), steps) == said
+    env = Env(dataclasses.replace(cfg, task=task), None, None, max_failures=2)
+    assert episode.summary(env, steps) == said
     taken = ("the table is clear", "the target is taken")
     assert episode.completed(steps) == said.startswith(taken)
 

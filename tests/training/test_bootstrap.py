@@ -31,7 +31,7 @@ def state(blocks: jax.Array, event: jax.Array) -> State:
     info = Info(outcome, outcome, moved, zero, lifted.astype(jnp.int32), none, none, no)
     shown = Observation(colour=zero, height=blocks.astype(jnp.float32), target=no)
     over = (blocks == 0) & lifted
-    return State(None, shown, zero, over, no, none, none, info)
+    return State(None, shown, zero, over, no, none, none, none, info)
 
 
 def values(algo: str) -> np.ndarray:

@@ -25,7 +25,7 @@ def _after(outcome: jax.Array, by_gap: jax.Array) -> State:
     zero, none = jnp.zeros(outcome.shape), jnp.zeros(outcome.shape, jnp.int32)
     no = jnp.zeros(outcome.shape, bool)
     info = Info(outcome, by_gap, zero, zero, none, none, none, no)
-    return State(None, Observation(zero, zero, no), zero, no, no, none, none, info)
+    return State(None, Observation(zero, zero, no), zero, no, no, none, none, none, info)
 
 
 def _paid(cfg: Config, after: State) -> tuple[np.ndarray, np.ndarray]:
