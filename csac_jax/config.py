@@ -105,8 +105,8 @@ class SceneConfig(Section, section="scene"):
     """Kind of each slot; a box slot draws a cube, cuboid, plank or tile in every scene, an object
     slot any object of the library."""
     objects: str = ""
-    """Library that slots of kind object draw from: a folder, or made:SEED:COUNT for our own
-    shapes."""
+    """Library that slots of kind object draw from: a folder, or our own shapes, made:SEED:COUNT, or
+    mixed:SEED:COUNT with random assemblies among them."""
     split: Literal["train", "held_out", "all"] = "train"
     """Which of its objects: those for training, those kept for evaluation, or all."""
     min_blocks: int = _bounded(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.

@@ -31,6 +31,8 @@ class MakeOptions:
     """Number that the shapes follow from."""
     count: int = 200
     """Objects, family by family in turn."""
+    mixed: bool = False
+    """Make every other object an assembly of random blocks: more shapes to train on."""
     json: Path | None = None
     """File to write the list of objects to, as JSON."""
 
@@ -61,7 +63,7 @@ class ShowOptions:
     """Lists the objects of a library; draws them if asked to."""
 
     library: tyro.conf.Positional[str]
-    """The library: a folder, or made:SEED:COUNT."""
+    """The library: a folder, made:SEED:COUNT or mixed:SEED:COUNT."""
     png: Path | None = None
     """File to write a contact sheet to, with names and sizes: .png, .jpg, .webp or .gif."""
     json: Path | None = None
@@ -88,7 +90,8 @@ def _make(arguments: list[str]) -> int:
     if not 1 <= options.count <= library.MOST_OBJECTS:
         raise BadArgumentsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
     _check_new(options.out)
-    made = library.save(options.out, families.draw(options.seed, options.count))
+    draw = families.draw_mixed if options.mixed else families.draw
+    made = library.save(options.out, draw(options.seed, options.count))
     _list(made.objects)
     print(f"wrote {options.out}")
     output.write_result(options.json, {"objects": [_row(one) for one in made.objects]})

@@ -21,7 +21,8 @@ RECORD = "train.json"  # device, versions and commit: in the folder of a run or 
 SKIPPED = ("checkpoints", "tensorboard", "wandb", "best")
 NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
 HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
-VIEW = ("camera.", "sensor.", "heightmap.view")  # what may be another in an evaluation
+# What may be another in an evaluation.
+VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance")
 LENGTH = "train."  # settings of a run's length and shape do not make it another method
 METRICS = {
     "grasp_success": "grasp success",
@@ -288,7 +289,7 @@ def _objects(config: Json, trained: Json) -> str:
 
 
 def _view(config: Json, trained: Json) -> Iterator[tuple[str, str]]:
-    """Names and texts of a config's settings of the camera that are other than `trained`'s."""
+    """Names and texts of a config's settings of VIEW that are other than `trained`'s."""
     own = configs.flat(trained)
     for name, value in configs.flat(config).items():
         if name.startswith(VIEW) and value != own.get(name, value):

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: the first asks the loop to save and end, a second of its kind ends at once.
+"""SIGINT and SIGTERM: the first asks the loop to save and end, a later one ends it at once.
 
 Python runs its own signal handlers between bytecodes, so not while XLA compiles or a chunk runs.
 The C handler behind `signal.set_wakeup_fd` does not wait: it writes the signal's number into a
@@ -10,8 +10,10 @@ import signal
 import socket
 import sys
 import threading
+import time
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+ECHO = 0.3  # s, in which another one is the same: timeout(1) signals a process and its group
 
 
 class Stop:
@@ -40,13 +42,13 @@ def install() -> Stop:
 
 def _listen(stop: Stop, reader: socket.socket, writer: socket.socket) -> None:
     """Reads signal numbers for ever. It holds `writer`, which must stay open."""
-    seen: set[int] = set()
+    seen: dict[int, float] = {}
     while writer.fileno() >= 0:
         for number in reader.recv(64):
-            if number in seen:
+            if number in seen and time.monotonic() - seen[number] > ECHO:
                 os._exit(128 + number)
-            if number in SIGNALS:
-                seen.add(number)
+            if number in SIGNALS and number not in seen:
+                seen[number] = time.monotonic()
                 stop.signal = stop.signal or number
                 said = f"{signal.Signals(number).name}: saving after this chunk"
                 print(f"{said}; once more to end at once", file=sys.stderr, flush=True)

@@ -6,8 +6,9 @@
 
 Shapes and colours are the names in `blocks`. In place of a shape stands `"object": "NAME",
 "library": "LIB"` for an object of a library, the folder as seen from that of the file, or
-made:SEED:COUNT. A position, in metres, is that of the centre of the bounding box. A quaternion
-(w, x, y, z) is normalised. `target` is optional. Sizes, densities and frictions are nominal.
+made:SEED:COUNT, or mixed:SEED:COUNT. A position, in metres, is that of the centre of the bounding
+box. A quaternion (w, x, y, z) is normalised. `target` is optional. Sizes, densities and frictions
+are nominal.
 """
 
 import itertools
@@ -202,7 +203,7 @@ def _with_objects(case: Case, entries: list[dict[str, Any]], folder: Path) -> Ca
     if len(libraries) > 1:
         raise ValueError(f"objects of {len(libraries)} libraries; take all from one")
     (name,) = libraries
-    source = name if name.startswith("made:") else str(folder / name)
+    source = name if name.startswith(("made:", "mixed:")) else str(folder / name)
     objects, slots = tables.find(source, "all"), np.flatnonzero(blocks.is_object(case.slots))
     numbers = [objects.number(entries[slot]["object"]) for slot in slots]
     known = tables.of(objects)

@@ -29,6 +29,10 @@ def test_make_and_show(tmp_path: Path, capsys: Capture):
     rows = json.loads(out.read_text())["objects"]
     assert rows[0]["name"] == "bottle-0-0"
     assert len(rows[0]["size_mm"]) == 3
+    mixed = tmp_path / "mixed"
+    assert cli.main(["objects", "make", "--mixed", "--count", "4", "--out", str(mixed)]) == 0
+    names = [one.name for one in library.load(mixed).objects]
+    assert names == ["bottle-0-0", "assembly-0-0", "bowl-0-1", "assembly-0-1"]
 
 
 def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capture):

@@ -16,6 +16,7 @@ flag = signals.install()
 print("ready", flush=True)
 hashlib.pbkdf2_hmac("sha256", b"", b"", int(sys.argv[1]))
 time.sleep(1.0)  # so that the thread that listens has had its turn
+print("ended", flush=True)
 sys.exit(flag.exit_code)
 """
 SHORT, LONG = 1_000_000, 200_000_000  # rounds: about 0.3 s and a minute
@@ -54,6 +55,18 @@ def test_second_signal_of_a_kind_ends_at_once():
     process.communicate(timeout=15)
     assert process.returncode == 130
     assert time.monotonic() - begun < 10.0
+
+
+def test_echo_of_a_signal_is_the_same():
+    """Claim: two signals of a kind within moments, as of timeout(1), which signals the process and
+    then its group, let the program come to its end."""
+    process = _start(SHORT)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=20)
+    assert (process.returncode, said) == (130, "ended\n")
+    assert errors.count("SIGINT") == 1
 
 
 def test_signal_of_another_kind_does_not_end_at_once():
