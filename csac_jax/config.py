@@ -401,8 +401,8 @@ class PolicyConfig(Section, section="policy"):
     """Where actions may begin: where there is something to act on (SPOT); or everywhere (CSAC),
     so that a grasp may meet nothing, eq. 15's lowest level."""
     retry: float = _bounded(0.0, 0.0, 10.0)
-    """Temperature, in units of Q, for each failed grasp in a row: so the place is then drawn, about
-    by Boltzmann's law, and no failure is repeated for ever. Of the policy without exploration."""
+    """Temperature, in units of Q, that each failed grasp in a row adds: the next place is drawn by
+    it, about by Boltzmann's law, where the policy does not explore anyway. 0: the best place."""
 
 
 class TargetConfig(Section, section="target"):

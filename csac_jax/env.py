@@ -91,7 +91,7 @@ class Env:
     physics: Physics
     scenes: Scene  # NumPy leaves [P, N, ...], at rest
     any_yaw: bool = True  # False: `reset` rotates scenes by quarter turns only
-    max_failures: int = 0  # failed grasps in a row that truncate an episode; 0: as many as it likes
+    max_failures: int = 0  # failed grasps in a row that truncate an episode; 0: no limit
 
     @property
     def gripper(self) -> Gripper:
