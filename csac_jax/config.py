@@ -411,11 +411,11 @@ class TargetConfig(Section, section="target"):
     inverse_temperature = 20.0  # beta of the softmax; it is divided by the range of returns (ours)
     std = 0.2  # of the noise of target actions, in CEM's units (SD3)
     clip = 0.5  # bound of that noise (SD3)
+    samples = 50  # noisy target actions per primitive in the softmax (SD3)
 
     value: Literal["softmax", "max"] = "softmax"
     """V(s'): softmax over noisy target actions (line 17), or the dense map's maximum (eq. 9)."""
     gamma: float = _bounded(0.5, 0.0, 1.0)  # Discount (VPG).
-    samples: int = _bounded(50, 1)  # Noisy target actions per primitive in the softmax (SD3).
     bootstrap: Literal["episodic", "continuing"] = "episodic"
     """Where V(s') is 0: after the end of an episode; or, as in VPG's code, where an action neither
     changed nor lifted anything, and an episode's end bootstraps from the next one's first state."""

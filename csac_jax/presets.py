@@ -191,7 +191,6 @@ def smoke() -> Config:
         heightmap={"size": 32},
         net={"rotations": 4, "growth": 4, "dilations": (1, 2), "stem": 4, "head": 4},
         cem={"candidates": 16, "elites": 4, "rounds": 2},
-        target={"samples": 8},
         learn={"batch": 8, "updates": 1},
         replay={"capacity": 64},
         train={"scenes": 2, "actions": 64, "learning_starts": 8, "chunk": 4, "save_every": 2},

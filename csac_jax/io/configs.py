@@ -99,11 +99,12 @@ def _adapter(kind: Any) -> Any:
 def _without_constants(values: dict[str, Any]) -> dict[str, Any]:
     """The values of a config of format 2 without what is no setting any more."""
     values = dict(values)
-    for name in renames.CONSTANTS:
+    for name in (*renames.CONSTANTS, *renames.DROPPED):
         section, field = name.split(".")
         stored = values.get(section)
         if isinstance(stored, dict) and field in stored and hasattr(_kind(section, stored), field):
-            _require_same(name, stored[field], getattr(_kind(section, stored), field))
+            if name in renames.CONSTANTS:
+                _require_same(name, stored[field], getattr(_kind(section, stored), field))
             values[section] = {key: value for key, value in stored.items() if key != field}
     return values
 

@@ -297,7 +297,7 @@ def test_next_value_lies_within_the_map(learner):
     low, high = float(state.q.min()), float(state.q.max())
     means = []
     for beta in (0.0, 1e5):
-        target = with_constants(TargetConfig(samples=256), inverse_temperature=beta)
+        target = with_constants(TargetConfig(), samples=256, inverse_temperature=beta)
         own = _changed(learner, target=target)
         run = jax.jit(jax.vmap(lambda key, own=own: actor_critic.next_value(own, key, state)))
         values = np.asarray(run(jax.random.split(jax.random.key(1), 16)))

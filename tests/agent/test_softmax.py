@@ -12,7 +12,7 @@ from tests.agent.reference import exact_softmax
 from tests.sections import with_constants
 
 NUM = 20_000
-CFG = TargetConfig(samples=NUM)
+CFG = with_constants(TargetConfig(), samples=NUM)
 
 noisy_actions = jax.jit(losses.noisy_actions, static_argnums=1)
 
@@ -131,7 +131,7 @@ def test_exact_by_hand():
 def test_expectation_is_that_of_the_continuous_softmax(beta):
     """Claim: the estimate's mean is the softmax over all actions in reach, found by summing over a
     fine grid."""
-    cfg = with_constants(TargetConfig(samples=4096), std=0.2, clip=0.5)
+    cfg = with_constants(TargetConfig(), samples=4096, std=0.2, clip=0.5)
     mean = (0.8, -0.3, 0.9)
     key_wave, key_phase, key_sample = jax.random.split(jax.random.key(5), 3)
     waves = 6.0 * jax.random.normal(key_wave, (8, 2))

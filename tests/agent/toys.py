@@ -29,6 +29,7 @@ from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Info, State
 from csac_jax.sim.primitives import Action
 from csac_jax.vision.heightmap import Observation
+from tests.sections import with_constants
 
 GRID = 4  # places per side
 HEIGHT = 0.05  # m, of a block
@@ -143,7 +144,7 @@ def config(algo: str, actions: int, max_actions: int, push: float | None = None)
         heightmap=HeightmapConfig(size=16),
         net=SmallNet(rotations=4, growth=8, dilations=(1,), stem=8, head=16, margin=0.25),
         cem=CEMConfig(candidates=16, elites=4, rounds=2),
-        target=TargetConfig(samples=16),
+        target=with_constants(TargetConfig(), samples=16),
         explore=ExploreConfig(push_fraction=0.5, epsilon_place=(0.5, 0.1)),
         learn=LearnConfig(learning_rate=5e-3, batch=32, updates=2, tau=0.1),
         replay=BetaReplay(capacity=1024),

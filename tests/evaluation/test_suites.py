@@ -73,7 +73,7 @@ def test_cases_share_their_compilation():
     assert all(env.cfg == first.cfg and env.physics is first.physics for env in others)
     begun = rollout._compiled.cache_info().misses
     for env in (first, *others):
-        rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw)
+        rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
     assert rollout._compiled.cache_info().misses == begun + 1
 
 

@@ -96,8 +96,10 @@ def test_every_format_is_read(number: int):
 
 def test_first_configs_of_format_2_are_read():
     """Claim: so is one of format 2 with settings that are constants now, unless its value is
-    another."""
+    another that a policy acts by."""
     stored = json.loads((FORMATS / "format-2-first.json").read_text())
+    assert configs.from_dict(stored) == SAVED
+    stored["target"]["samples"] = 8
     assert configs.from_dict(stored) == SAVED
     stored["reward"]["eta"] = [0.5, 1.0]
     with pytest.raises(ValueError, match=r"^reward\.eta: is \[0\.0, 1\.0\] now"):
