@@ -17,6 +17,7 @@ from csac_jax.objects.solid import Part
 
 SIDES = 6  # of walls of hollow things
 _ROUND = 12  # sides of full round things
+_REACH = 0.042  # m, from the middle of a block of an assembly to its farthest side: the hand fits
 
 
 def _circle(radius: float, sides: int = _ROUND) -> np.ndarray:
@@ -238,10 +239,10 @@ def assembly(rng: Generator) -> list[Part]:
         if storey and rng.random() < 0.4:  # two, towards the ends of the longer side
             axis = int(np.argmax(np.ptp(below, axis=0)))
             ends = below[[below[:, axis].argmin(), below[:, axis].argmax()]]
-            middles, reach = (0.2 * ends[::-1] + 0.8 * ends), 0.28 * np.ptp(ends[:, axis])
+            middles, room = 0.2 * ends[::-1] + 0.8 * ends, 0.28 * float(np.ptp(ends[:, axis]))
         else:
-            middles, reach = rng.dirichlet(np.ones(len(below)), 1) @ below, np.float64(0.042)
-        feet = [middle + _footprint(rng, reach) for middle in middles]
+            middles, room = rng.dirichlet(np.ones(len(below)), 1) @ below, _REACH
+        feet = [middle + _footprint(rng, room) for middle in middles]
         for foot in feet:
             middle, half = foot.mean(axis=0), 0.5 * np.ptp(foot, axis=0)
             scale = rng.uniform(0.1, 1.1, 2)
@@ -281,9 +282,8 @@ def draw(seed: int, count: int) -> list[Object]:
 
 def draw_mixed(seed: int, count: int) -> list[Object]:
     """`count` objects, those of `draw` and assemblies in turn."""
-    families = [*FAMILIES.values()]
-    kinds = (families[i // 2 % len(families)] if i % 2 == 0 else assembly for i in range(count))
-    return [_one(kind, seed, i // 2) for i, kind in enumerate(kinds)]
+    pairs = ((one, _one(assembly, seed, i)) for i, one in enumerate(draw(seed, -(-count // 2))))
+    return [*itertools.chain.from_iterable(pairs)][:count]
 
 
 def _one(family: Family, seed: int, number: int) -> Object:
