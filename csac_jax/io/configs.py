@@ -111,7 +111,8 @@ def _without_constants(values: dict[str, Any]) -> dict[str, Any]:
 
 def _from_format_1(values: dict[str, Any]) -> dict[str, Any]:
     """The values of a config of format 1 under today's names."""
-    old = {name: value for name, value in flat(values).items() if "." in name}
+    every = {name: value for name, value in flat(values).items() if "." in name}
+    old = {name: value for name, value in every.items() if name not in renames.DROPPED}
     if old.pop("learn.target_update", "soft") == "hard":
         old["learn.tau"] = 1.0
     else:

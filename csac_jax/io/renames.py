@@ -76,8 +76,8 @@ CONSTANTS = ("reward.eta", "reward.distance_weight", "net.block_layers")
 """Settings of format 2 that are constants now: a file must hold their value."""
 
 DROPPED = ("target.samples",)
-"""Settings of format 2 that are constants now, which files may hold other values of: a policy acts
-without them."""
+"""Settings that are constants now, of which files may hold other values: a policy acts without
+them."""
 
 ALGORITHMS = {"vpg": ("vpg_episodic", "bootstrap")}
 """Algorithm that has changed -> its former name now, and the setting of `target` that files which

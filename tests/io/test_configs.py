@@ -140,6 +140,7 @@ def test_newest_format_is_stored():
         ({"camera.scale": 0.5}, {"camera.size": (320, 240), "camera.centre": (159.5, 119.5)}),
         ({"scene.drop_extent": 0.2}, {"scene.drop_extent": (0.2, 0.2)}),
         ({"train.max_idle": 10}, {}),
+        ({"target.samples": 8}, {}),
     ],
 )
 def test_format_1_is_translated(changes: dict[str, Any], expected: dict[str, Any]):
