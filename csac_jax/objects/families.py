@@ -18,6 +18,7 @@ from csac_jax.objects.solid import Part
 SIDES = 6  # of walls of hollow things
 _ROUND = 12  # sides of full round things
 _REACH = 0.042  # m, from the middle of a block of an assembly to its farthest side: the hand fits
+_THIN = 0.003  # m, the same to its nearest side, at least
 
 
 def _circle(radius: float, sides: int = _ROUND) -> np.ndarray:
@@ -230,12 +231,16 @@ def brick(rng: Generator) -> list[Part]:
 
 
 def assembly(rng: Generator) -> list[Part]:
-    """One to three storeys of slanted, tapered or straight blocks, one or two on the one below."""
+    """One to three storeys of slanted, tapered or straight blocks, one or two on the one below. The
+    last storey may be a wall along the outline of what it stands on."""
     storeys = int(rng.integers(1, 4))
     parts: list[Part] = []
     below = np.zeros((1, 2))
     heights = np.cumsum([0.0, *rng.uniform(0.01, 0.01 + 0.07 / storeys, storeys)])
     for storey in range(storeys):
+        bottom, top = heights[storey : storey + 2]
+        if storey == storeys - 1 and rng.random() < 0.4:
+            return [*parts, *_fence(rng, below if storey else _footprint(rng, _REACH), bottom, top)]
         if storey and rng.random() < 0.4:  # two, towards the ends of the longer side
             axis = int(np.argmax(np.ptp(below, axis=0)))
             ends = below[[below[:, axis].argmin(), below[:, axis].argmax()]]
@@ -248,14 +253,31 @@ def assembly(rng: Generator) -> list[Part]:
             scale = rng.uniform(0.1, 1.1, 2)
             slant = rng.uniform(-1.0, 1.0, 2) * np.maximum(1.0 - scale, 0.0) * half
             below = middle + scale * (foot - middle) + slant
-            parts.append(_frustum(foot, below, *heights[storey : storey + 2]))
+            parts.append(_frustum(foot, below, bottom, top))
+    return parts
+
+
+def _fence(rng: Generator, outline: np.ndarray, bottom: float, top: float) -> list[Part]:
+    """A wall inside a convex outline [n, 2], upright or leaning; a block where there is no room."""
+    middle = outline.mean(axis=0)
+    corners = outline - middle
+    sides = np.roll(corners, -1, axis=0) - corners
+    across = corners[:, 0] * sides[:, 1] - corners[:, 1] * sides[:, 0]
+    apothem = np.min(np.abs(across) / np.linalg.norm(sides, axis=1))
+    inner, flare = 1.0 - rng.uniform(0.004, 0.008) / apothem, rng.uniform(0.7, 1.2)
+    if inner < 0.3:
+        return [_frustum(outline, middle + flare * corners, bottom, top)]
+    parts = []
+    for side in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        low = np.concatenate([side, inner * np.array(side[::-1])])
+        parts.append(_frustum(middle + low, middle + flare * low, bottom, top))
     return parts
 
 
 def _footprint(rng: Generator, reach: float) -> np.ndarray:
     """A rectangle or a convex polygon of three to seven corners [n, 2] around the origin, which lie
-    at most `reach` away from it along each axis."""
-    half = reach * rng.uniform(0.2, 1.0, 2)
+    at most `reach` away from it along each axis, and at least _THIN."""
+    half = np.maximum(reach * rng.uniform(0.1, 1.0, 2), _THIN)
     if rng.integers(2):
         return half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     corners = int(rng.integers(3, 8))
