@@ -72,7 +72,7 @@ def _vpg(cfg: Config) -> Config:
         policy={"place": "argmax", "primitive": "argmax"},
         target={"value": "max", "gamma": 0.5},
         explore={"noise_std": 0.0, "epsilon_primitive": (0.5, 0.1), "push_fraction": 0.5},
-        learn={"actor": False, "tau": 1.0, "target_update_period": 1},
+        learn={"actor": False, "tau": 1.0},
     )
 
 

@@ -403,6 +403,9 @@ class PolicyConfig(Section, section="policy"):
     retry: float = _bounded(0.0, 0.0, 10.0)
     """Temperature, in units of Q, that each failed grasp in a row adds: the next place is drawn by
     it, about by Boltzmann's law, where the policy does not explore anyway. 0: the best place."""
+    augment: bool = False
+    """Where the policy does not explore, Q is the mean over mirror images of the view and over the
+    critics (test-time augmentation): fewer grasps fail, at four times the networks' work."""
 
 
 class TargetConfig(Section, section="target"):
@@ -498,7 +501,6 @@ class LearnConfig(Section, section="learn"):
     actor: bool = True  # Learn the policy network; without it, mu(s) is read off the critic's map.
     tau: float = _bounded(0.02, 0.0, 1.0, above=True)
     """Share of the online network in a target update (Algorithm 1 lines 24-26); 1 copies."""
-    target_update_period: int = _bounded(1, 1)  # C of sec. 3.4, critic updates per target update.
     loss: Literal["huber", "squared"] = "huber"
     """Of the TD error: Huber (CSAC sec. 4) or squared (Algorithm 1 line 21)."""
 
@@ -636,6 +638,8 @@ class Config(Section):
             is_off = getattr(self.sensor, name) == getattr(SensorConfig, name)
             fits = is_off or self.heightmap.view == "oblique"
             _require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
+        plain = not (self.policy.augment and isinstance(self.net, OffsetNet))
+        _require(plain, "policy.augment: not where net.kind is offset, whose slopes have a side")
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         _require(rotations % 2 == 0, "net.rotations: must be even")

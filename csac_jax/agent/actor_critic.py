@@ -139,7 +139,22 @@ def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
 
 def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
     """Dense maps of a batch of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
-    q, features = _critic_maps(learner, params.critic, obs)
+    return _corrected(learner, params, obs, *_critic_maps(learner, params.critic, obs))
+
+
+def decision_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
+    """What a policy that does not explore acts on: `dense_maps`, or with `policy.augment` Q's mean
+    over mirror images and critics."""
+    if not learner.cfg.policy.augment:
+        return dense_maps(learner, params, obs)
+    q, features = _of_passes(learner, params.critic, obs, networks.apply_mirrored)
+    return _corrected(learner, params, obs, jnp.mean(q, axis=0), features)
+
+
+def _corrected(
+    learner: ActorCritic, params: Params, obs: Observation, q: jax.Array, features: jax.Array
+) -> DenseMaps:
+    """The maps of all yaws from Q and features in the frames of the passes."""
     correction: Any = jnp.zeros_like(q[..., : dense.OUTPUTS])
     if learner.cfg.learn.actor:
         correction = learner.frames.networks.head.apply(params.actor, features)
@@ -149,13 +164,22 @@ def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseM
 def _critic_maps(learner: ActorCritic, critic: Any, obs: Observation) -> tuple[jax.Array, Any]:
     """Q [B, K / 2, h, w, OUTPUTS], the lower of both critics in each cell of the passes' frames,
     and the first one's features [B, K / 2, ., ., F]."""
+    q, features = _of_passes(learner, critic, obs, networks.apply)
+    if learner.frames.networks.terms > 1:
+        return offsets.lower(q, dense.OUTPUTS), features
+    return jnp.min(q, axis=0), features
+
+
+def _of_passes(
+    learner: ActorCritic, critic: Any, obs: Observation, apply: Callable[..., Any]
+) -> tuple[jax.Array, Any]:
+    """What `apply` makes of the passes of states by each critic: Q [M, B, K / 2, h, w, OUTPUTS],
+    and the first one's features [B, K / 2, ., ., F]."""
     rotated = jax.vmap(maps.rotated_inputs, (None, 0))(learner.frames, obs)
     q, features = _of_each_critic(
-        lambda variables: networks.apply(learner.frames.networks, variables, rotated), critic
+        lambda variables: apply(learner.frames.networks, variables, rotated), critic
     )
-    if learner.frames.networks.terms > 1:
-        return offsets.lower(q, dense.OUTPUTS), features[0]
-    return jnp.min(q, axis=0), features[0]
+    return q, features[0]
 
 
 def _of_each_critic(call: Callable[[Any], Any], variables: Any) -> Any:
@@ -338,7 +362,7 @@ def update_critic(
     step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)
     online = state.online.replace(critic={**optax.apply_updates(before, step), **statistics})
     updates = state.updates + 1
-    target = losses.update_target(cfg.learn, online, state.target, updates)
+    target = losses.update_target(cfg.learn, online, state.target)
     state = state.replace(online=online, target=target, critic_optimiser=optimiser, updates=updates)
     return state, UpdateInfo(critic_loss, jnp.mean(q), y - q)
 

@@ -38,11 +38,12 @@ class CSAC(Learner):
         actions_taken: jax.Array | None = None,
     ) -> Action:
         """By default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13)."""
-        maps = self._chunked(actor_critic.dense_maps)(state.online, obs)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(steps_without_change)))
         if actions_taken is None:
+            maps = self._chunked(actor_critic.decision_maps)(state.online, obs)
             best = jax.vmap(policy.best_action, (0, None, 0, 0))
             return best(keys, self.parts, maps, steps_without_change)
+        maps = self._chunked(actor_critic.dense_maps)(state.online, obs)
         act = jax.vmap(policy.act, (0, None, 0, 0, None))
         return act(keys, self.parts, maps, steps_without_change, actions_taken)
 

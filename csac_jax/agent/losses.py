@@ -75,9 +75,6 @@ def td_target(
     return jax.lax.stop_gradient(reward + gamma * jnp.where(terminated, 0.0, next_value))
 
 
-def update_target(cfg: LearnConfig, online: Any, target: Any, updates: jax.Array) -> Any:
-    """Target networks after the critic's update number `updates` [] int32, counted from 1."""
-    followed = optax.incremental_update(online, target, cfg.tau)  # Algorithm 1 lines 24-26
-    if cfg.target_update_period == 1:
-        return followed
-    return optax.periodic_update(followed, target, updates, cfg.target_update_period)  # sec. 3.4
+def update_target(cfg: LearnConfig, online: Any, target: Any) -> Any:
+    """Target networks after an update of the critic, Algorithm 1 lines 24-26."""
+    return optax.incremental_update(online, target, cfg.tau)

@@ -72,7 +72,7 @@ def make(cfg: Config, params: Params) -> bytes:
     graph, frames = Graph(), actor_critic.make(cfg).frames
     has_target = frames.shows_target
     variables = jax.device_get(params.critic)["params"]
-    q = _q_maps(graph, cfg.net, frames, variables, program.fingers(cfg))
+    q = _q_maps(graph, cfg.net, frames, variables, cfg)
     valid = _valid(graph, frames, has_target)
     primitive, cell, score, is_valid = _best(graph, cfg, q, valid)
     poses = np.concatenate(
@@ -148,23 +148,44 @@ def _inputs(graph: Graph, frames: Frames, fingers: Any) -> tuple[str, int]:
     return graph.op("Concat", *maps, axis=-1), channels
 
 
-def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any, fingers: Any) -> str:
-    """Q [P, K, h, w], the lower of the critics."""
-    maps, channels = _inputs(graph, frames, fingers)
+def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any, cfg: Config) -> str:
+    """Q [P, K, h, w], the lower of the critics; see `actor_critic.decision_maps`."""
+    maps, channels = _inputs(graph, frames, program.fingers(cfg))
     rotated = _rotated(graph, frames, maps, channels)
     image = graph.op("Transpose", rotated, perm=[0, 3, 1, 2])
     num = len(jax.tree.leaves(variables)[0])
-    each = [
-        _critic(graph, net, image, jax.tree.map(lambda leaf, m=m: np.asarray(leaf[m]), variables))
-        for m in range(num)
-    ]
-    lower = graph.op("Min", *each)  # [K / 2, OUTPUTS, h, w]
-    ahead, back, grasp = (
-        graph.op("Gather", lower, graph.const(output, np.int64), axis=1)
+    of_each = [jax.tree.map(lambda leaf, m=m: np.asarray(leaf[m]), variables) for m in range(num)]
+    if cfg.policy.augment:
+        q = _mirrored(graph, net, image, of_each)
+    else:
+        q = graph.op("Min", *(_critic(graph, net, image, each) for each in of_each))
+    ahead, back, grasp = (  # of [K / 2, OUTPUTS, h, w]
+        graph.op("Gather", q, graph.const(output, np.int64), axis=1)
         for output in range(dense.OUTPUTS)
     )
     every = [_all_frames(graph, ahead, back), _all_frames(graph, grasp, grasp)]
     return graph.op("Concat", *(graph.op("Unsqueeze", q, _axes(graph, 0)) for q in every), axis=0)
+
+
+def _mirrored(graph: Graph, net: SmallNet, image: str, of_each: list[Any]) -> str:
+    """Q [K / 2, OUTPUTS, h, w], see `networks.apply_mirrored`; the mean of the critics."""
+    parts = []
+    for axes in ((), (2,), (3,), (2, 3)):
+        shown = _flipped(graph, image, axes)
+        for variables in of_each:
+            q = _flipped(graph, _critic(graph, net, shown, variables), axes)
+            order = graph.const([1, 0, 2], np.int64)  # pushes ahead and back are swapped
+            parts.append(graph.op("Gather", q, order, axis=1) if 3 in axes else q)
+    return graph.op("Mean", *parts)
+
+
+def _flipped(graph: Graph, value: str, axes: tuple[int, ...]) -> str:
+    """The array turned round along axes."""
+    if not axes:
+        return value
+    last, end, step = ([number] * len(axes) for number in (-1, _BACKWARDS, -1))
+    bounds = _axes(graph, *last), _axes(graph, *end), _axes(graph, *axes), _axes(graph, *step)
+    return graph.op("Slice", value, *bounds)
 
 
 def _axes(graph: Graph, *axes: int) -> str:
@@ -173,9 +194,7 @@ def _axes(graph: Graph, *axes: int) -> str:
 
 def _all_frames(graph: Graph, ahead: str, back: str) -> str:
     """See `maps._all_frames`: [K / 2, h, w] twice -> [K, h, w]."""
-    ends, steps = _axes(graph, _BACKWARDS, _BACKWARDS), _axes(graph, -1, -1)
-    turned = graph.op("Slice", back, _axes(graph, -1, -1), ends, _axes(graph, 1, 2), steps)
-    return graph.op("Concat", ahead, turned, axis=0)
+    return graph.op("Concat", ahead, _flipped(graph, back, (1, 2)), axis=0)
 
 
 def _critic(graph: Graph, net: SmallNet, image: str, variables: Any) -> str:

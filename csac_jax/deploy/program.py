@@ -60,7 +60,7 @@ def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool)
     """Dense maps of one state. With `only_target` a policy of the task `clear`, whose networks see
     no target, may only grasp, and only the target."""
     learner = actor_critic.make(cfg)
-    batch = actor_critic.dense_maps(learner, params, jax.tree.map(lambda leaf: leaf[None], obs))
+    batch = actor_critic.decision_maps(learner, params, jax.tree.map(lambda leaf: leaf[None], obs))
     state = jax.tree.map(lambda leaf: leaf[0], batch)
     if not only_target or learner.frames.shows_target:
         return state

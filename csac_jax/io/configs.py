@@ -102,9 +102,12 @@ def _without_constants(values: dict[str, Any]) -> dict[str, Any]:
     for name in (*renames.CONSTANTS, *renames.DROPPED):
         section, field = name.split(".")
         stored = values.get(section)
-        if isinstance(stored, dict) and field in stored and hasattr(_kind(section, stored), field):
-            if name in renames.CONSTANTS:
-                _require_same(name, stored[field], getattr(_kind(section, stored), field))
+        if not isinstance(stored, dict) or field not in stored:
+            continue
+        constant = name in renames.CONSTANTS and hasattr(_kind(section, stored), field)
+        if constant:
+            _require_same(name, stored[field], getattr(_kind(section, stored), field))
+        if constant or name in renames.DROPPED:
             values[section] = {key: value for key, value in stored.items() if key != field}
     return values
 
@@ -115,8 +118,6 @@ def _from_format_1(values: dict[str, Any]) -> dict[str, Any]:
     old = {name: value for name, value in every.items() if name not in renames.DROPPED}
     if old.pop("learn.target_update", "soft") == "hard":
         old["learn.tau"] = 1.0
-    else:
-        old.pop("learn.copy_every", None)
     old.pop("net.weights", None)
     for name, kept in renames.GONE.items():
         _require_same(name, old.pop(name, kept), kept)

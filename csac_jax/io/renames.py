@@ -29,7 +29,6 @@ ADDED = ("scenes.failed_grasps",)
 
 SETTINGS = {
     "cem.spread": "cem.std_estimator",
-    "learn.copy_every": "learn.target_update_period",
     "learn.rate_end": "learn.lr_final_fraction",
     "replay.beta_end": "replay.end",
     "replay.beta_middle": "replay.middle",
@@ -75,9 +74,8 @@ GONE = {
 CONSTANTS = ("reward.eta", "reward.distance_weight", "net.block_layers")
 """Settings of format 2 that are constants now: a file must hold their value."""
 
-DROPPED = ("target.samples",)
-"""Settings that are constants now, of which files may hold other values: a policy acts without
-them."""
+DROPPED = ("target.samples", "learn.copy_every", "learn.target_update_period")
+"""Settings that are no more, of which files may hold any values: a policy acts without them."""
 
 ALGORITHMS = {"vpg": ("vpg_episodic", "bootstrap")}
 """Algorithm that has changed -> its former name now, and the setting of `target` that files which

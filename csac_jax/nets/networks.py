@@ -21,6 +21,7 @@ from csac_jax.nets import dense, densenet
 BARE = 0.002  # m: lower cells are bare table, of which no net sees the colour
 FINGERS_MEAN = np.array([0.1, 0.014, 0.02], np.float32)  # m, `grippers.Fingers`; ours
 FINGERS_STD = np.array([0.025, 0.004, 0.004], np.float32)
+_AHEAD_AND_BACK = np.array([1, 0, 2])  # `dense.OUTPUTS`, pushes swapped
 _FULL = 640  # px, ours: side of passes of which one state is seen at a time
 
 
@@ -103,6 +104,21 @@ def apply(networks: Networks, variables: Any, maps: jax.Array) -> tuple[jax.Arra
         return jax.lax.map(of_state, maps, batch_size=group if group > 1 else None)
     flat: Any = critic.apply(variables, maps.reshape(-1, *maps.shape[2:]))
     return jax.tree.map(lambda leaf: leaf.reshape(*maps.shape[:2], *leaf.shape[1:]), flat)
+
+
+def apply_mirrored(
+    networks: Networks, variables: Any, maps: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """As `apply`, but Q is the mean over four mirror images of each pass, along and across its
+    frame. A mirror along it swaps pushes ahead and back."""
+    images = [(), (2,), (3,), (2, 3)]  # axes that are turned; columns lie along the frame
+    shown = jnp.concatenate([jnp.flip(maps, axes) for axes in images], axis=1)
+    q, features = apply(networks, variables, shown)
+    turned_back = [
+        jnp.flip(part, axes)[..., _AHEAD_AND_BACK if 3 in axes else slice(None)]
+        for part, axes in zip(jnp.split(q, len(images), axis=1), images, strict=True)
+    ]
+    return jnp.mean(jnp.stack(turned_back), axis=0), features[:, : maps.shape[1]]
 
 
 def train(net: nn.Module, variables: Any, maps: jax.Array) -> tuple[Any, Any]:
