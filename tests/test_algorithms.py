@@ -13,6 +13,7 @@ from csac_jax.config import (
     Config,
     ExploreConfig,
     LearnConfig,
+    OffsetNet,
     PolicyConfig,
     RewardConfig,
     TargetConfig,
@@ -63,7 +64,7 @@ def test_vpg_by_hand(name):
     cfg = algorithms.configure(presets.quick(), name)
     assert (cfg.target.gamma, cfg.target.value, cfg.policy.place) == (0.5, "max", "argmax")
     assert (cfg.explore.epsilon_primitive, cfg.explore.push_fraction) == ((0.5, 0.1), 0.5)
-    assert (cfg.learn.tau, cfg.learn.target_update_period, cfg.learn.actor) == (1.0, 1, False)
+    assert (cfg.learn.tau, cfg.learn.actor) == (1.0, False)
 
 
 @pytest.mark.parametrize("preset", list(presets.PRESETS))
@@ -109,9 +110,9 @@ def test_unknown_algorithm_names_the_known():
         (lambda: LearnConfig(loss="mse"), "learn.loss"),
         (lambda: LearnConfig(critics=0), "learn.critics"),
         (lambda: LearnConfig(critics=3), "learn.critics"),
-        (lambda: LearnConfig(target_update_period=0), "learn.target_update_period"),
         (lambda: LearnConfig(tau=0.0), "learn.tau"),
         (lambda: Config(policy=PolicyConfig(primitive="grasp")), "explore.push_fraction"),
+        (lambda: Config(policy=PolicyConfig(augment=True), net=OffsetNet()), "policy.augment"),
     ],
 )
 def test_bad_settings_are_refused(build, field):

@@ -87,7 +87,6 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("learn.batch", [0]),
         ("learn.updates", [0]),
         ("learn.tau", [0.0, 1.1]),
-        ("learn.target_update_period", [0]),
         ("replay.rank_by", ["age"]),
         ("replay.capacity", [0, 1, 2**30 + 1, float("nan")]),
         ("replay.start", [(0.0, 1.0)]),

@@ -40,6 +40,9 @@ class EvalOptions:
     """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """What moves the gripper: nothing, it floats as in training; or an arm."""
+    augment: Literal["on", "off"] | None = None
+    """Whether Q is the mean over mirror images of the view, see `policy.augment` of `csac-jax train
+    --help-all`; by default as the policy's."""
     episodes: int = 50
     """Episodes of every part of the suite, each with a fresh scene where the part has several."""
     seed: int = 0
@@ -60,6 +63,8 @@ def run(arguments: list[str]) -> int:
     from csac_jax.evaluation import policies, suites
 
     policy = policies.POLICIES[options.policy](options.source, which)
+    if options.augment is not None:
+        view = {**view, "policy": {"augment": options.augment == "on"}}
     begun = time.time()
     with as_bad_arguments(ValueError):
         seen = suites.with_objects(

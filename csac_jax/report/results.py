@@ -268,9 +268,9 @@ def command(one: RecordedRun | Evaluation, trained: Json | None = None) -> str:
     if isinstance(one, Evaluation):
         episodes = one.metrics.get("counts", {}).get("episodes")
         asked = f"--policy {one.policy} --suite {one.suite} --episodes {episodes} --seed {one.seed}"
-        view = _flags(_view(one.config, trained or one.config))
-        objects = _objects(one.config, trained or one.config)
-        return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}{objects}{view}"
+        both = one.config, trained or one.config
+        options = _objects(*both) + _augment(*both) + _flags(_view(*both))
+        return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}{options}"
     preset, algo, changed = one.variant
     flags = _flags(changed)
     seed = f"--seed {one.config.get('seed', 0)} --sim.physics {physics}"
@@ -286,6 +286,12 @@ def _objects(config: Json, trained: Json) -> str:
         return ""
     asked = "" if library == trained.get("scene", {}).get("objects") else f" --objects {library}"
     return asked if split == "held_out" else f"{asked} --split {split}"
+
+
+def _augment(config: Json, trained: Json) -> str:
+    """Option of `eval` for a `policy.augment` other than `trained`'s; older files have none."""
+    asked, own = (one.get("policy", {}).get("augment", False) for one in (config, trained))
+    return "" if asked == own else " --augment on" if asked else " --augment off"
 
 
 def _view(config: Json, trained: Json) -> Iterator[tuple[str, str]]:

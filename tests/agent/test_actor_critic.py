@@ -417,20 +417,27 @@ def test_squared_loss_reaches_the_update(learner, state, batch):
     np.testing.assert_allclose(info.critic_loss, np.mean(np.asarray(info.error) ** 2), rtol=1e-5)
 
 
-@pytest.mark.slow
-def test_hard_targets_reach_the_update(learner, state, batch):
-    """Claim: with tau = 1 and C = 2, the targets stay after one update and are the networks
-    after two."""
-    run = _run(_changed(learner, learn={"tau": 1.0, "target_update_period": 2}))
-    first, _ = run(state, batch)
-    jax.tree.map(np.testing.assert_array_equal, first.target, state.target)
-    second, _ = run(first, batch)
-    jax.tree.map(np.testing.assert_array_equal, second.target, second.online)
-
-
 def _one(params: Params, m: int) -> Params:
     """The networks with critic `m` alone."""
     return params.replace(critic=jax.tree.map(lambda leaf: leaf[m : m + 1], params.critic))
+
+
+def test_decisions_see_the_mean_of_the_critics(learner, observations, randomised):
+    """Claim: with `policy.augment` Q is the mean of what each critic says alone, not the lower; its
+    maps are where and what `dense_maps` are besides. Without, they are `dense_maps`."""
+    twin = _changed(learner, policy={"augment": True}, learn={"critics": 2})
+    with jax.numpy_dtype_promotion("standard"):
+        params = randomised(actor_critic.init(jax.random.key(0), twin)).online
+    obs = observations(2, 4)
+    look = jax.jit(lambda params: actor_critic.decision_maps(twin, params, obs))
+    both, single = look(params), [look(_one(params, m)) for m in (0, 1)]
+    np.testing.assert_allclose(both.q, 0.5 * (single[0].q + single[1].q), atol=1e-5)
+    plain = jax.jit(lambda params: actor_critic.dense_maps(twin, params, obs))(params)
+    np.testing.assert_array_equal(both.valid, plain.valid)
+    assert np.abs(np.asarray(both.q - plain.q)).max() > 0.05
+    off = _changed(twin, policy={"augment": False})
+    same = jax.jit(lambda params: actor_critic.decision_maps(off, params, obs))(params)
+    jax.tree.map(np.testing.assert_array_equal, same, plain)
 
 
 @pytest.mark.slow

@@ -595,6 +595,27 @@ def test_any_policy_sees_through_another_camera(
     )
 
 
+@pytest.mark.parametrize(("flag", "expected"), [([], False), (["--augment", "on"], True)])
+def test_eval_averages_mirror_images(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, flag: list[str], expected: bool
+):
+    """Claim: `eval --augment on` makes any policy act on the mean over mirror images; without it,
+    the policy does as it was trained to."""
+    asked = []
+
+    def build(cfg, *_):
+        asked.append(cfg)
+        raise ValueError("enough")
+
+    monkeypatch.setitem(suites.SUITES, "random10", suites.Suite(build))
+    code, _ = _fails(capsys, "eval", "shipped", "--suite", "random10", *flag)
+    assert code == 2
+    assert (
+        asked[0].policy
+        == policies.load_config("shipped").change(policy={"augment": expected}).policy
+    )
+
+
 def test_settings_of_a_view_are_those_given():
     """Claim: a setting that is given counts, also where it is the package's default; no other."""
     flags = ["shipped", "--sensor.dropped=0.0", "--camera.look_at", "0", "0", "0"]

@@ -139,6 +139,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "target": {"task": {"kind": "target"}, "learn": {"critics": 2}},
     "heights": {"net": {"colour": False, "stride": 4, "subcells": 2, "dilations": (1, 2)}},
     "gripper": {"net": {"gripper": True}, "task": {"kind": "target"}, "sim": {"gripper": "2f85"}},
+    "mirrored": {"policy": {"augment": True}, "learn": {"critics": 2}, "net": {"subcells": 2}},
     "anywhere": {"policy": {"cells": "all"}, "net": {"growth": 4, "stem": 4}},
     "grasp": {
         "policy": {"primitive": "grasp"},

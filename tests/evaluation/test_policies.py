@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.agent import actor_critic, policy
+from csac_jax.agent import actor_critic, csac, policy
 from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import policies
@@ -70,6 +70,27 @@ def test_learned_acts_like_the_agent(learned, states):
         one = learned(_scene(states, number), _keys()[number])
         assert one.primitive == expected.primitive[number]
         np.testing.assert_allclose(one.pose, expected.pose[number], atol=1e-4)
+
+
+def test_mirror_images_reach_the_policy(learned, states):
+    """Claim: with `policy.augment` a policy, a learner without exploration and what is drawn of them
+    follow `decision_maps`, by which they act otherwise than without."""
+    off = CFG.change(
+        policy={"place": "argmax", "primitive": "grasp"}, explore={"push_fraction": 0.0}
+    )
+    cfg = off.change(policy={"augment": True})
+    parts, key = actor_critic.make(cfg), jax.random.key(0)
+    state = jax.jit(lambda key: actor_critic.init(key, parts))(key)
+    look = jax.jit(lambda obs: actor_critic.decision_maps(parts, state.online, obs))
+    best = jax.vmap(policy.best_action, (0, None, 0, 0))
+    expected = best(_keys(), parts, look(states.obs), states.steps_without_change).pose
+    mirrored, plain = (LearnedPolicy(one, state.online) for one in (cfg, off))
+    np.testing.assert_allclose(mirrored.batched(states, _keys()).pose, expected, atol=1e-5)
+    agent = csac.CSAC(parts).act(key, state, states.obs, states.steps_without_change)
+    np.testing.assert_allclose(agent.pose, expected, atol=1e-5)
+    tried = mirrored.debug(_scene(states, 0), key).candidates
+    assert np.abs(tried - expected[0]).max(axis=-1).min() < 1e-5
+    assert np.abs(plain.batched(states, _keys()).pose - expected).max() > 0.005
 
 
 def test_failures_lead_to_other_places(learned, states):

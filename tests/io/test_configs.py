@@ -131,10 +131,7 @@ def test_newest_format_is_stored():
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        (
-            {"learn.target_update": "hard", "learn.copy_every": 7},
-            {"learn.tau": 1.0, "learn.target_update_period": 7},
-        ),
+        ({"learn.target_update": "hard", "learn.copy_every": 7}, {"learn.tau": 1.0}),
         ({"replay.sampler": "uniform"}, {"replay": UniformReplay()}),
         ({"reward.left": 3.0, "reward.lifted": 2.0}, {"reward.lost_block_penalty": 3.0}),
         ({"camera.scale": 0.5}, {"camera.size": (320, 240), "camera.centre": (159.5, 119.5)}),

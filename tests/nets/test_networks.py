@@ -195,3 +195,37 @@ def test_looks_at_any_number_of_states_share_products(kind: str):
 
     assert products(1)
     assert (products(1) == products(8)) == (kind == "densenet121")
+
+
+def test_mirrored_maps_are_the_mean_of_four_looks():
+    """Claim: of a scene in a mirror along or across the frame, the mirrored Q is the mirror of the
+    scene's Q, pushes ahead and back swapped along it; and it is the mean of four looks."""
+    nets = networks.make(TINY["small"])
+    passes = jax.random.normal(jax.random.key(0), (2, 3, 24, 24, 4))
+    variables = nets.critic.init(jax.random.key(1), passes[0])
+    noise = iter(jax.random.split(jax.random.key(2), 100))
+    variables = jax.tree.map(
+        lambda leaf: 0.3 * jax.random.normal(next(noise), leaf.shape), variables
+    )
+    q, features = networks.apply_mirrored(nets, variables, passes)
+    plain, expected = networks.apply(nets, variables, passes)
+    np.testing.assert_allclose(features, expected, atol=1e-5)
+
+    def along(q: Any) -> np.ndarray:
+        return np.asarray(q)[:, :, :, ::-1][..., [1, 0, 2]]
+
+    def across(q: Any) -> np.ndarray:
+        return np.asarray(q)[:, :, ::-1]
+
+    turned = networks.apply_mirrored(nets, variables, passes[:, :, :, ::-1])[0]
+    np.testing.assert_allclose(turned, along(q), atol=1e-5)
+    turned = networks.apply_mirrored(nets, variables, passes[:, :, ::-1])[0]
+    np.testing.assert_allclose(turned, across(q), atol=1e-5)
+    looks = [
+        plain,
+        across(networks.apply(nets, variables, passes[:, :, ::-1])[0]),
+        along(networks.apply(nets, variables, passes[:, :, :, ::-1])[0]),
+        across(along(networks.apply(nets, variables, passes[:, :, ::-1, ::-1])[0])),
+    ]
+    np.testing.assert_allclose(q, np.mean(looks, axis=0), atol=1e-5)
+    assert np.abs(np.asarray(q - plain)).max() > 0.1

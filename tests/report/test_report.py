@@ -436,6 +436,24 @@ def test_command_of_an_evaluation_gives_its_view_back():
     assert "--camera" not in results.command(one, seen)
 
 
+def test_command_of_an_evaluation_says_whether_it_augments():
+    """Claim: an evaluation's command has `--augment` where the policy's config is
+    another, also one from before that setting."""
+    on, off = (_config("csac_beta", 0, policy__augment=one) for one in (True, False))
+    before = {**off, "policy": {"place": "cem"}}
+
+    def command(seen: Any, trained: Any) -> list[str]:
+        given = (Path("x"), seen, results.variant(seen), "learned", "random10", "random10", 3)
+        one = results.Evaluation(*given, {"counts": {"episodes": 5}}, {})
+        return results.command(one, trained).split()
+
+    for seen, trained, expected in ((on, off, "on"), (on, before, "on"), (off, on, "off")):
+        _, _, *flags = command(seen, trained)
+        assert settings.parse_view(EvalOptions, "eval", flags)[0].augment == expected
+    for seen, trained in ((on, on), (off, before), (before, off)):
+        assert not any("augment" in flag for flag in command(seen, trained))
+
+
 def test_command_of_an_evaluation_names_its_objects():
     """Claim: an evaluation's command has the library that is not the policy's, and its split."""
     scene = {"scene__slots": ["object"], "scene__min_blocks": 1, "scene__split": "all"}
