@@ -135,11 +135,14 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
         {"net": {"growth": 8}},
         {"net": {"dilations": (1, 2, 1)}},
         {"net": {"colour": False}},
-        {"net": {"kind": "densenet121", "margin": 0.0}},
+        pytest.param({"net": {"kind": "densenet121", "margin": 0.0}}, marks=pytest.mark.slow),
         {"learn": {"critics": 2}},
         {"learn": {"critics": 2}, "task": {"kind": "target"}},
         {"net": {"growth": 8}, "task": {"kind": "target"}},
-        {"net": {"kind": "densenet121", "margin": 0.0}, "task": {"kind": "target"}},
+        pytest.param(
+            {"net": {"kind": "densenet121", "margin": 0.0}, "task": {"kind": "target"}},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_other_networks_are_refused(tmp_path: Path, changes: dict[str, Any]):

@@ -84,6 +84,7 @@ def test_every_episode_has_its_own(env: Env, states: State):
     assert blind.reset(jax.random.key(0)).obs.fingers is None
 
 
+@pytest.mark.slow
 @pytest.mark.mjx
 def test_fingers_stay_for_the_episode(env: Env, states: State):
     """Claim: a step keeps the fingers, also where physics fails; the next episode has others; and a
@@ -181,6 +182,7 @@ def test_other_physics_have_the_same_pads(physics: PhysicsKind):
         np.testing.assert_allclose(found[name], getattr(wanted, name), rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.mjx
 def test_oracle_takes_what_fits(env: Env):
     """Claim: the planner takes the high block of two where it is narrower than the opening by

@@ -58,6 +58,7 @@ def _python(source: str, timeout: float = 60.0, **variables: str) -> subprocess.
     )
 
 
+@pytest.mark.slow
 def test_batched_mjx_does_not_hang():
     """Claim: with the package imported, batched MJX runs to its end on any number of cores."""
     done = _python(BATCHED_STEPS, timeout=180.0)

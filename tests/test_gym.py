@@ -83,6 +83,7 @@ def test_continuous_action_fills_the_workspace(single):
         np.testing.assert_allclose(action.pose, np.array(given[1:]) * [half, half, np.pi])
 
 
+@pytest.mark.slow
 def test_batch_is_many_single_ones(single, batch):
     """Claim: a batch steps as single environments do, scene by scene; an episode that ends gives
     way to a new one in the same step, and `final_obs` keeps what it ended with."""

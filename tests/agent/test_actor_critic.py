@@ -77,6 +77,7 @@ def _constant(params: Params, value: float) -> Params:
     return params.replace(critic=constant)
 
 
+@pytest.mark.slow
 def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
     """Claim: Q(s, a) of the loss, from two passes, is the dense maps of the same parameters read at
     the action.
@@ -134,6 +135,7 @@ def test_losses_are_weighted(learner, state, batch, update):
     jax.tree.map(np.testing.assert_array_equal, after.online, other.online)
 
 
+@pytest.mark.slow
 def test_target_carries_no_gradient(learner, state, batch):
     """Claim: the critic's loss has exactly no gradient in the target networks and the reward, but
     one in its own."""
@@ -307,6 +309,7 @@ def test_next_value_lies_within_the_map(learner):
     assert high - means[1] < 0.05 * (high - low)
 
 
+@pytest.mark.slow
 def test_inverse_temperature_follows_the_range_of_q(learner):
     """Claim: ten times the rewards at ten times the range give ten times the softmax value, and
     twice the inverse temperature at twice the range gives the same."""

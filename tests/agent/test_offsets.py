@@ -141,6 +141,7 @@ def test_search_finds_the_top_between_cells(learner, start):
     assert np.mean(cells) > 0.15
 
 
+@pytest.mark.slow
 def test_random_places_lie_anywhere_in_their_cells(learner):
     """Claim: a random pose fills its cell and its share of the yaws evenly, where Q varies inside
     cells; with any other net it is a cell's own pose."""

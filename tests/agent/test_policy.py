@@ -267,6 +267,7 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, learner, start, 
     assert least <= share <= most, share
 
 
+@pytest.mark.slow
 def test_search_is_the_same_compiled_sooner(cfg, frames, learner):
     """Claim: with the options that a training program is compiled with on a CPU, 200 searches end
     where they do by XLA's own."""
@@ -294,6 +295,7 @@ def test_random_places_reach_all_that_is_valid(frames):
     assert np.all(np.abs(u[..., :2]).max(axis=0) > 0.9)
 
 
+@pytest.mark.slow
 def test_candidates_are_those_of_the_search(cfg, frames, learner):
     """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
     key."""

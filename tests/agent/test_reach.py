@@ -20,6 +20,7 @@ def frames() -> maps.Frames:
     return maps.frames(FAR, networks.make(FAR.net))
 
 
+@pytest.mark.slow
 def test_cells_out_of_reach_are_masked(frames: maps.Frames):
     """Claim: with an arm that stands too far away, cells are valid where the arm can follow a
     grasp or push over a bare table, and random grasps are among them."""

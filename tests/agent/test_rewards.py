@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -125,12 +126,11 @@ def test_scale():
 def test_bounds_hold_and_are_reached(cfg, gamma):
     """Claim: every discounted return of one action done 1 to 200 times lies within, and some reach
     both ends."""
-    single = [
-        reward(cfg, primitive, outcome, distance, 0.0, after, changed, left)
-        for primitive, outcome, distance, after, changed, left in itertools.product(
-            (0, 1), Outcome, (0.0, 1.0, 3.0), (0.0, 1.0), (False, True), (0, 1)
-        )
-    ]
+    every = itertools.product(
+        *((0, 1), map(int, Outcome), (0.0, 1.0, 3.0), (0.0,), (0.0, 1.0), (False, True), (0, 1))
+    )
+    results = rewards.ActionResult(*map(jnp.asarray, zip(*every, strict=True)))
+    single = jax.vmap(rewards.reward, (None, 0))(cfg, results)
     lengths = np.cumsum(gamma ** np.arange(200))  # 1, 1 + gamma, ...
     returns = np.outer(single, lengths)
     low, high = rewards.bounds(cfg, gamma)

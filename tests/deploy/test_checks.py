@@ -158,6 +158,7 @@ def test_shadows_are_seen():
     assert checks.coverage(_view(scenes.take(wall)), MAP) == 1.0
 
 
+@pytest.mark.slow
 def test_swapped_colours_are_noticed():
     """Claim: of ten images with red and blue swapped all are warned of, and none as they are."""
     rng = np.random.default_rng(1)

@@ -103,6 +103,7 @@ def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
     assert done.action.primitive.tolist() == [1, 1, 1, 1]
 
 
+@pytest.mark.slow
 def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
     """Claim: Q of a stored transition is the score that its decision was taken for."""
     recorder = Recorder(tmp_path, "test")

@@ -129,6 +129,7 @@ def _blocks(env: Env) -> np.ndarray:
     return in_play[[0, 1, 2, 3, 4]]
 
 
+@pytest.mark.slow
 def test_oracle_by_hand(magnet):
     """Claim: where a grasp above a block always takes it, the oracle takes one block with each
     action, and all."""

@@ -52,7 +52,7 @@ class Fault:
     name: str
     tries: int  # of the whole suite
     inject: Callable[[np.random.Generator, int, Path], Tally]
-    slow: bool = False  # compiles the real training: no part of it is in `make test`
+    slow: bool = False  # takes long: no part of it is in `make test`
 
 
 FAULTS: dict[str, Fault] = {}

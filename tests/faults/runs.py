@@ -144,7 +144,7 @@ def _chosen(rng: np.random.Generator, calls: list, tries: int) -> list:
     return [calls[i] for i in sorted(rng.choice(len(calls), tries, replace=False))]
 
 
-@fault("SIGKILL at a system call of a save", tries=400)
+@fault("SIGKILL at a system call of a save", tries=400, slow=True)
 def sigkill_in_save(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
     """Every call that writes, of a chunk, its log and its save."""
     tally = Tally()

@@ -91,6 +91,7 @@ def test_net_is_numpys(cfg: SmallNet):
     np.testing.assert_allclose(got, _numpy_net(params, maps, cfg), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_half_precision_is_near(params):
     """Claim: in bfloat16, 8 bits of mantissa, maps stay float32 and within 2 % of their spread;
     gradients too."""

@@ -152,6 +152,7 @@ def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: boo
     assert isinstance(critic, densenet.DenseNetCritic if kind == "densenet121" else dense.Critic)
 
 
+@pytest.mark.slow
 def test_states_of_densenet_are_seen_in_groups():
     """Claim: DenseNet-121 sees one state of 640 px at a time, four of 320, and what it says of each
     is what it says of its passes by themselves; the small net sees all at once."""

@@ -328,6 +328,7 @@ def test_top_down_is_the_floating_hand():
         )
 
 
+@pytest.mark.slow
 def test_whole_workspace_is_reachable():
     """Claim: over every cell, with the tips 0.01 to 0.35 m above the table and at 16 yaws, a clear
     branch counts."""

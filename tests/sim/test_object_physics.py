@@ -102,6 +102,7 @@ def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
     assert speed[60:].max() > 0.05
 
 
+@pytest.mark.slow
 def test_a_scene_moves_the_same_after_any_other(env: Env):
     """Claim: what slept in a simulator's last scene does not show in the next one, to the bit."""
     state = jax.jit(jax.vmap(env.reset_to))(env.scenes)

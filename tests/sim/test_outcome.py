@@ -147,6 +147,7 @@ def test_lifted_blocks(held: bool, rise: float, lifted: bool):
     ]
 
 
+@pytest.mark.slow
 def test_gap_agrees_with_the_truth_where_it_can(executed):
     """Claim: in physics the finger gap tells a lifted from a missed block."""
     for name in ("nothing", "empty", "dropped", "lifted"):

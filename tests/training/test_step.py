@@ -105,6 +105,7 @@ def equal(first: Any, other: Any) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_state_is_a_fixed_point_of_types(run):
     """Claim: a step changes no shape, dtype or weak type of the state, so that its output fits its
     program."""
@@ -183,6 +184,7 @@ class Losing(Env):
         return state.replace(info=state.info.replace(blocks_lost=jnp.int32(1)))
 
 
+@pytest.mark.slow
 def test_blocks_that_left_reach_the_reward(run):
     """Claim: a step takes `reward.lost_block_penalty` where a block has left, from grasps of
     nothing and worthless pushes alike."""

@@ -55,6 +55,7 @@ def test_what_is_not_sensed_costs_nothing():
         presets.smoke().change(reward={"source": "sensed", "lost_block_penalty": 1.0})
 
 
+@pytest.mark.slow
 @pytest.mark.mjx
 def test_switches_combine(monkeypatch: pytest.MonkeyPatch):
     """Claim: sensed rewards and actions anywhere can be trained with the oblique camera, its noise
