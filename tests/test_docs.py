@@ -290,7 +290,7 @@ def test_readme_has_the_recorded_numbers():
         bounds = [float(numbers[2][0]), float(numbers[2][-1])]
         assert bounds == pytest.approx([min(rates), max(rates)], abs=0.0051)
     (row,) = [row for row in README.read_text().splitlines() if "**shipped_objects**" in row]
-    pile = folder.parents[2] / "objects" / "gpu_mixed" / "seed-0" / "eval-pile.json"
+    pile = folder.parents[2] / "objects" / "gpu_hollow" / "seed-0" / "eval-pile.json"
     measured = json.loads(pile.read_text())
     values = [measured[name]["value"] for name in ("completion", "grasp_success")]
     said = [float(number) for number in re.findall(r"[\d.]+", row.split("new shapes")[1])]
