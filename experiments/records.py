@@ -67,7 +67,7 @@ RUNS = {
     "objects/from_shipped_slow": "the same, smaller steps and less exploration",
     "objects/gpu": "five to ten objects of families alone, `--init shipped`, on a GPU",
     "objects/gpu_mixed": "the same, half of them assemblies, which had no walls yet",
-    "objects/gpu_hollow": "the policy `shipped_objects`: on from `objects/gpu_mixed`, assemblies with walls",
+    "objects/gpu_hollow": "the policy `shipped_objects`: from `gpu_mixed`, assemblies with walls",
     "objects/gpu_hollow_large_steps": "the same, steps 2.5 times as large",
     "objects/gpu_mixed_uniform": "the same, replay uniform and of 131,072",
     "objects/gpu_fine": "from nothing, on maps of 96 cells",

@@ -185,9 +185,12 @@ def _curve_notes(curve: Curve) -> Iterator[str]:
 
 
 def label(variant: Variant, preset: bool = True, most: int | None = None) -> str:
-    """Name of a variant, with at most `most` of the settings that it changes."""
+    """Name of a variant, with at most `most` of the settings that it changes. Without such a bound
+    it is of many the name of its folder, whose command says what they are."""
     name = NAMES.get(variant.algo, variant.algo)
     changed = [f"{setting} {value}" for setting, value in variant.changed]
+    if most is None and variant.is_long:
+        changed = [variant.source]
     if most is not None and len(changed) > most:
         changed[most:] = [f"others ({len(changed) - most})"]
     return ", ".join([f"{name} ({variant.preset})" if preset else name, *changed])

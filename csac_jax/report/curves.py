@@ -1,5 +1,6 @@
 """Training curves: success against actions, and what all figures share."""
 
+import dataclasses
 import functools
 import textwrap
 from collections.abc import Sequence
@@ -114,7 +115,9 @@ def shared_changes(variants: Sequence[Variant]) -> Changes:
 
 def without(variant: Variant, shared: Changes) -> Variant:
     """The variant without changes that a figure names once for all."""
-    return variant._replace(changed=tuple(one for one in variant.changed if one not in shared))
+    return dataclasses.replace(
+        variant, changed=tuple(one for one in variant.changed if one not in shared)
+    )
 
 
 def say_shared(figure: Figure, shared: Changes) -> None:

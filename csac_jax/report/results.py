@@ -5,6 +5,7 @@ A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSO
 """
 
 import contextlib
+import dataclasses
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,6 +24,7 @@ NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by thems
 HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
 # What may be another in an evaluation.
 VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance")
+_MOST = 6  # changes that name a variant
 LENGTH = "train."  # settings of a run's length and shape do not make it another method
 METRICS = {
     "grasp_success": "grasp success",
@@ -51,12 +53,19 @@ _METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": _COUNTS, "failures": {}}
 _EVALUATION = {"policy": str, "suite": str, "seed": int, "seconds": _NUMBER, "parts": {}}
 
 
-class Variant(NamedTuple):
+@dataclasses.dataclass(frozen=True, order=True)
+class Variant:
     """What runs have in common that differ in their seed alone."""
 
     preset: str
     algo: str
     changed: tuple[tuple[str, str], ...]  # settings that differ from the preset's, and their values
+    source: str = dataclasses.field(default="", compare=False)  # name of the folder or file
+
+    @property
+    def is_long(self) -> bool:
+        """There are too many changes to name a variant by: it is named by its source."""
+        return len(self.changed) > _MOST and bool(self.source)
 
     @property
     def unchanged(self) -> bool:
@@ -169,7 +178,7 @@ def _add_run(path: Path, results: Results) -> None:
         names = ("actions", "grasp_success", "grasps_counted", "seconds")
         columns = [np.array([line[name] for line in lines], float) for name in names]
         record = {"wall_seconds": float(columns[-1][-1]), **_record(path.parent, config)}
-        fields = (path, config, variant(config), *columns, record, _totals(every))
+        fields = (path, config, _variant(path, config), *columns, record, _totals(every))
         results.runs.append(RecordedRun._make(fields))
 
 
@@ -211,7 +220,7 @@ def _evaluations(path: Path) -> list[Evaluation]:
             if not _SHARE.keys() <= share.keys():
                 raise ValueError("a share lacks its interval")
     config, policy, seed = content["config"], content["policy"], content.get("seed", 0)
-    asked = path, config, variant(config), policy, suite
+    asked = path, config, _variant(path, config), policy, suite
     return [
         Evaluation(*asked, part, seed, _per_episode(found) | found, record)
         for part, found in parts.items()
@@ -237,6 +246,15 @@ def _without_evaluation(results: Results) -> Iterator[str]:
         folder, own = run.path.parent, (run.variant, run.config.get("seed"))
         if (folder / "checkpoints").exists() and own not in measured:
             yield f"{folder}: not evaluated; run: csac-jax eval {folder} --json {folder}/eval.json"
+
+
+def _variant(path: Path, config: Json) -> Variant:
+    """The variant of a file of a run's folder: by name the folder, of several seeds the one above,
+    and the file where it is an evaluation."""
+    folder = path.resolve().parent
+    name = folder.parent.name if folder.name.startswith("seed-") else folder.name
+    source = name if path.name == files.METRICS else f"{name}, {path.stem}"
+    return dataclasses.replace(variant(config), source=source)
 
 
 def variant(config: Json) -> Variant:
@@ -271,12 +289,12 @@ def command(one: RecordedRun | Evaluation, trained: Json | None = None) -> str:
         both = one.config, trained or one.config
         options = _objects(*both) + _augment(*both) + _flags(_view(*both))
         return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}{options}"
-    preset, algo, changed = one.variant
-    flags = _flags(changed)
+    variant = one.variant
+    flags = _flags(variant.changed)
     seed = f"--seed {one.config.get('seed', 0)} --sim.physics {physics}"
     if robot != SimConfig().robot:
         seed += f" --sim.robot {robot}"
-    return f"csac-jax train {preset} --algo {algo} {seed}{flags}"
+    return f"csac-jax train {variant.preset} --algo {variant.algo} {seed}{flags}"
 
 
 def _objects(config: Json, trained: Json) -> str:

@@ -1,5 +1,6 @@
 """Methods by task and number of actions: one table and one figure of an evaluated sweep."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -43,7 +44,7 @@ def _cell(score: Score, curve: Curve | None) -> Cell:
     if task.get("kind") == "target":
         name = "target" if name == "clear" else f"target, {name}"
     changed = tuple(change for change in score.variant.changed if change[0] not in AXES)
-    method = label(score.variant._replace(changed=changed), preset=False)
+    method = label(dataclasses.replace(score.variant, changed=changed), preset=False)
     return Cell(name, train.get("actions", 0), method, score.variant.algo, score, curve)
 
 

@@ -94,7 +94,8 @@ def _score_json(score: Score, part: str) -> recorded.Json:
 
 
 def _named(variant: Variant) -> recorded.Json:
-    return variant._asdict() | {"changed": dict(variant.changed)}
+    named = {"preset": variant.preset, "algo": variant.algo}
+    return named | {"changed": dict(variant.changed)}
 
 
 def _plain(bands: Mapping[str, Band | None]) -> recorded.Json:
@@ -237,11 +238,12 @@ def provenance(report: Report) -> Table:
     """Where every number comes from, a row per file."""
     every: list[RecordedRun | Evaluation] = [*report.results.runs, *report.results.evaluations]
     by_path = {one.path: one for one in every}
+    trained = {run.path.parent: run.config for run in report.results.runs}
     root = os.path.commonpath([path.parent for path in by_path]) if by_path else ""
     return [
         {
             "file": os.path.relpath(path, root),
-            "settings as a command": recorded.command(one),
+            "settings as a command": recorded.command(one, trained.get(path.parent)),
             "device": one.record.get("device") or "-",
             "versions": _versions(one.record) or "-",
             "commit": str(one.record.get("commit") or "-")[:10],
@@ -277,6 +279,8 @@ def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
 EXPLAINED = (
     "Several runs: the interquartile mean, and in brackets its 95 % band. The bootstrap is "
     "hierarchical: it draws seeds, then the hosts that a drawn seed ran on. "
+    "A method that changes many settings has the name of its folder, an evaluation of it also that "
+    "of its file; their commands stand under provenance. "
     "One run: its value; where it was evaluated, the 95 % interval of its episodes. "
     f"Final success: over the last {GRASP_WINDOW} grasps. "
     "Area under the curve: of that success over all actions, divided by their number. "

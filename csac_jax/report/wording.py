@@ -25,6 +25,8 @@ WORDS = {
 def name_of(variant: Variant) -> str:
     """A variant in words."""
     changed = [f"{words(name)} {_value(value)}" for name, value in variant.changed]
+    if variant.is_long:
+        changed = [variant.source]
     return ", ".join([NAMES.get(variant.algo, variant.algo), *changed])
 
 

@@ -67,6 +67,22 @@ def test_a_tube_has_its_closed_form():
     assert one.volume == pytest.approx(area * np.ptp(corners[:, 2]), rel=1e-4)
 
 
+@pytest.mark.parametrize(("half", "parts"), [(0.03, 4), (0.007, 1)])
+def test_a_wall_has_its_closed_form(half: float, parts: int):
+    """Claim: a wall inside a square is the frustum of the square less that of a bore, which leaves 4
+    to 8 mm; a square of less than some 10 mm is full. Some assemblies have a wall."""
+    square, height = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), 0.05
+    wall = families._fence(np.random.default_rng(2), 0.01 + square, 0.02, 0.02 + height)
+    thick, flare = np.random.default_rng(2).uniform([0.004, 0.7], [0.008, 1.2])
+    full = 4.0 * half**2 * height * (1.0 + flare + flare**2) / 3.0
+    bore = ((half - thick) / half) ** 2 if parts == 4 else 0.0
+    assert len(wall) == parts
+    assert sum(solid.moments(part).volume for part in wall) == pytest.approx(
+        full * (1.0 - bore), rel=1e-5
+    )
+    assert 3 < sum(len(one.parts) > 5 for one in ASSEMBLIES) < 20  # a block has no more
+
+
 def test_bodies_are_centred():
     """Claim: the origin of an object is its centre of mass."""
     for one in MADE:

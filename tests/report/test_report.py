@@ -1,6 +1,7 @@
 """`csac-jax report` from recorded files to tables, figures and page."""
 
 import base64
+import dataclasses
 import json
 import os
 import re
@@ -216,6 +217,23 @@ def test_numbers_as_json(recorded: Path):
     )
 
 
+def test_provenance_has_what_an_evaluation_changes(tmp_path: Path):
+    """Claim: the command of an evaluation in a run's folder names the gripper and the library that
+    are not the run's; and it is the one that is named by its file, if the run changes much."""
+    many = {"net__head": 16, "learn__batch": 4, "learn__tau": 0.5, "cem__rounds": 1}
+    config = _config("csac_beta", 0, **many, learn__updates=9, target__gamma=0.1, train__actions=90)
+    _run(tmp_path / "wide" / "seed-0", config, [0.5])
+    config["sim"] = {**config["sim"], "gripper": "2f85"}
+    _evaluation(tmp_path / "wide" / "seed-0" / "eval-2f85.json", config, 5)
+    report = comparison.build(results.read([tmp_path]))
+    commands = {row["file"]: row["settings as a command"] for row in tables.provenance(report)}
+    assert commands["eval-2f85.json"].endswith(" --sim.gripper 2f85")
+    assert {row["policy"] for row in tables.evaluation(report)} == {
+        f"CSAC-beta ({config['preset']}), wide, eval-2f85"
+    }
+    assert report.curves[0].variant.source == "wide"
+
+
 def test_evaluation_ends_with_the_mean_of_the_parts(recorded: Path):
     """Claim: after the parts of a suite a row has their mean, over all episodes."""
     rows = tables.evaluation(comparison.build(results.read([recorded])))
@@ -360,7 +378,7 @@ def test_profiles_are_drawn_of_several_seeds(recorded: Path):
 
 def test_labels():
     """Claim: settings that no result depends on name no variant; a label in a figure names as many
-    as it is told to."""
+    as it is told to; one of more than six is named by its folder where none is told."""
     assert results.variant(_config("vpg", 0, train__chunk=7, train__save_every=3)).changed == ()
     changed = {"net__head": 16, "net__zoom": 1, "learn__batch": 4, "learn__tau": 0.5}
     variant = results.variant(_config("vpg", 0, **changed))
@@ -370,6 +388,12 @@ def test_labels():
         "learn.batch 4",
         "learn.tau 0.5",
     }
+    many = changed | {"cem__rounds": 1, "learn__updates": 9, "target__gamma": 0.1}
+    variant_of_many = results.variant(_config("vpg", 0, **many))
+    assert comparison.label(variant_of_many).count(", ") == 7
+    own = dataclasses.replace(variant_of_many, source="own")
+    assert comparison.label(own) == f"VPG ({variant.preset}), own"
+    assert comparison.label(dataclasses.replace(variant, source="own")).count(", ") == 4
     short = comparison.label(variant, preset=False, most=3)
     assert (short.count(", "), short[-12:]) == (4, ", others (1)")
     assert comparison.label(variant, preset=False, most=4) == comparison.label(
