@@ -69,8 +69,8 @@ def test_a_tube_has_its_closed_form():
 
 @pytest.mark.parametrize(("half", "parts"), [(0.03, 4), (0.007, 1)])
 def test_a_wall_has_its_closed_form(half: float, parts: int):
-    """Claim: a wall inside a square is the frustum of the square less that of a bore, which leaves 4
-    to 8 mm; a square of less than some 10 mm is full. Some assemblies have a wall."""
+    """Claim: a wall inside a square is the frustum of the square less that of a bore, which leaves
+    4 to 8 mm; a square of less than some 10 mm is full. Some assemblies have a wall."""
     square, height = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), 0.05
     wall = families._fence(np.random.default_rng(2), 0.01 + square, 0.02, 0.02 + height)
     thick, flare = np.random.default_rng(2).uniform([0.004, 0.7], [0.008, 1.2])
