@@ -120,7 +120,7 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
         before = networks.learned(state.online.critic)
         moved, optimiser = parts.critic_optimiser.update(gradient, state.critic_optimiser)
         online = state.online.replace(critic=optax.apply_updates(before, moved))
-        return losses.update_target(cfg.learn, online, state.target, state.updates), optimiser
+        return losses.update_target(cfg.learn, online, state.target), optimiser
 
     forward_of = jit(nets.critic.apply)
     dense_maps = jit(lambda params, obs: actor_critic.dense_maps(parts, params, obs))

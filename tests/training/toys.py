@@ -75,7 +75,7 @@ def train_step(
     change, optimiser = learner.critic_optimiser.update(50.0 * gradient, state.learner["optimiser"])
     slow, actor = learner.actor_optimiser.update(gradient, state.learner["actor"])
     online = state.learner["online"] + change + slow
-    target = losses.update_target(cfg.learn, online, state.learner["target"], state.step + 1)
+    target = losses.update_target(cfg.learn, online, state.learner["target"])
     replay = jax.lax.cond(
         state.step < 2, lambda ring: ring, lambda ring: ring.at[0].add(1.0), state.replay
     )
