@@ -405,7 +405,7 @@ class PolicyConfig(Section, section="policy"):
     it, about by Boltzmann's law, where the policy does not explore anyway. 0: the best place."""
     augment: bool = False
     """Where the policy does not explore, Q is the mean over mirror images of the view and over the
-    critics (test-time augmentation): fewer grasps fail, at four times the networks' work."""
+    critics (test-time augmentation), at four times the networks' work."""
 
 
 class TargetConfig(Section, section="target"):

@@ -170,11 +170,11 @@ def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any, cfg: Co
 def _mirrored(graph: Graph, net: SmallNet, image: str, of_each: list[Any]) -> str:
     """Q [K / 2, OUTPUTS, h, w], see `networks.apply_mirrored`; the mean of the critics."""
     parts = []
-    for axes in ((), (2,), (3,), (2, 3)):
+    for axes in networks.MIRRORS:
         shown = _flipped(graph, image, axes)
         for variables in of_each:
             q = _flipped(graph, _critic(graph, net, shown, variables), axes)
-            order = graph.const([1, 0, 2], np.int64)  # pushes ahead and back are swapped
+            order = graph.const(networks.AHEAD_AND_BACK, np.int64)
             parts.append(graph.op("Gather", q, order, axis=1) if 3 in axes else q)
     return graph.op("Mean", *parts)
 

@@ -21,7 +21,8 @@ from csac_jax.nets import dense, densenet
 BARE = 0.002  # m: lower cells are bare table, of which no net sees the colour
 FINGERS_MEAN = np.array([0.1, 0.014, 0.02], np.float32)  # m, `grippers.Fingers`; ours
 FINGERS_STD = np.array([0.025, 0.004, 0.004], np.float32)
-_AHEAD_AND_BACK = np.array([1, 0, 2])  # `dense.OUTPUTS`, pushes swapped
+MIRRORS = ((), (2,), (3,), (2, 3))  # axes of passes that are turned; columns lie along the frame
+AHEAD_AND_BACK = (1, 0, 2)  # `dense.OUTPUTS`, pushes swapped, as in a mirror along the frame
 _FULL = 640  # px, ours: side of passes of which one state is seen at a time
 
 
@@ -111,12 +112,11 @@ def apply_mirrored(
 ) -> tuple[jax.Array, jax.Array]:
     """As `apply`, but Q is the mean over four mirror images of each pass, along and across its
     frame. A mirror along it swaps pushes ahead and back."""
-    images = [(), (2,), (3,), (2, 3)]  # axes that are turned; columns lie along the frame
-    shown = jnp.concatenate([jnp.flip(maps, axes) for axes in images], axis=1)
+    shown = jnp.concatenate([jnp.flip(maps, axes) for axes in MIRRORS], axis=1)
     q, features = apply(networks, variables, shown)
     turned_back = [
-        jnp.flip(part, axes)[..., _AHEAD_AND_BACK if 3 in axes else slice(None)]
-        for part, axes in zip(jnp.split(q, len(images), axis=1), images, strict=True)
+        jnp.flip(part, axes)[..., np.array(AHEAD_AND_BACK) if 3 in axes else slice(None)]
+        for part, axes in zip(jnp.split(q, len(MIRRORS), axis=1), MIRRORS, strict=True)
     ]
     return jnp.mean(jnp.stack(turned_back), axis=0), features[:, : maps.shape[1]]
 

@@ -214,5 +214,5 @@ def test_trained_policy_acts_between_cells(kind):
         assert moved > 0.6
         assert success > 0.2
     else:
-        assert moved < 0.25
+        assert moved < 0.1
         assert success == 0.0
