@@ -181,6 +181,16 @@ def run_sweep(
         return result._replace(stopped_by=stopped)
 
 
+def evaluate_sweep(folder: Path, suite: str, episodes: int, stop: signals.Stop) -> int | None:
+    """Evaluates the final policies of a sweep, see `sweeps.final.measure`."""
+    cache.enable()
+    plan = runner.read_plan(folder)._replace(episodes=episodes)
+    with Terminal(Console()) as terminal, lock.exclusive(folder):
+        stopped = final.measure(plan, folder, terminal, stop, suite)
+        terminal.say("stopped; the same command goes on" if stopped else f"saved in {folder}")
+        return stopped
+
+
 def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
     """What puts the networks of `source`, see `train`, into a learner's first state. Raises
     SettingsError where they are not those of the config."""

@@ -12,6 +12,8 @@ import tyro
 from csac_jax.cli import output, parsing, settings
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
 from csac_jax.config import Config
+from csac_jax.io import files
+from csac_jax.runtime import signals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +22,8 @@ class EvalOptions:
     has the same gripper, unless other settings are given."""
 
     source: tyro.conf.Positional[str]
-    """A run's folder, a policy file, or one that comes with the package, such as shipped."""
+    """A run's folder, a policy file, or one that comes with the package, such as shipped; or a
+    sweep's folder: all its final policies, each result beside its run."""
     which: str = "last"
     """Checkpoint of the run: last, the newest sound one; best, of a run trained with --eval-every;
     or a step."""
@@ -60,6 +63,8 @@ def run(arguments: list[str]) -> int:
         raise BadArgumentsError("--episodes: at least 1")
     check_seed(options.seed)
     which = _which(options.which)
+    if (Path(options.source) / files.SWEEP_PLAN).exists():
+        return _evaluate_sweep(options, view)
     from csac_jax.evaluation import policies, suites
 
     policy = policies.POLICIES[options.policy](options.source, which)
@@ -80,6 +85,22 @@ def run(arguments: list[str]) -> int:
         asked |= {"objects": seen.scene.objects, "split": seen.scene.split}
     output.write_result(options.json, {**asked, "seconds": seconds, **result}, cfg)
     return 0
+
+
+def _evaluate_sweep(options: EvalOptions, view: Any) -> int:
+    """Measures the final policies of a sweep that are left; returns the exit code."""
+    mine = dataclasses.fields(EvalOptions)
+    changed = {field.name for field in mine if getattr(options, field.name) != field.default}
+    if changed - {"source", "suite", "episodes"} or any(view.values()):
+        raise BadArgumentsError(
+            "eval SWEEP: takes --suite and --episodes alone; give one of its runs for other options"
+        )
+    from csac_jax import api
+
+    stop = signals.install()
+    with as_bad_arguments(ValueError):
+        stopped = api.evaluate_sweep(Path(options.source), options.suite, options.episodes, stop)
+    return 0 if stopped is None else 128 + stopped
 
 
 def _which(text: str) -> Any:

@@ -16,7 +16,8 @@ class ReportOptions:
     """Tables of recorded runs and evaluations over their seeds; reads only, needs no JAX."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of runs, or of folders of runs, and files that `eval --json` wrote."""
+    """Folders of runs, or of folders of runs, archives of them (.tar.xz), and files that `eval
+    --json` wrote."""
     out: Path | None = None
     """Folder to write a page to, index.html, with curves and the pictures and videos that lie in
     the folders; needs the extra `report`."""

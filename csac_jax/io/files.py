@@ -23,6 +23,7 @@ from csac_jax.io import renames
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
 EVALUATIONS = "evaluations.jsonl"
+SWEEP_PLAN = "sweep.json"
 BEST = "best"
 LARGEST = 2**30  # bytes of a file that is read at once
 

@@ -1,4 +1,5 @@
-"""Recorded runs and evaluations, read from folders. Needs neither JAX nor an accelerator.
+"""Recorded runs and evaluations, read from folders and archives. Needs neither JAX nor an
+accelerator.
 
 A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSON file that
 `csac-jax eval --json` wrote. Other files are passed over.
@@ -6,7 +7,10 @@ A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSO
 
 import contextlib
 import dataclasses
+import lzma
 import os
+import tarfile
+import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -18,6 +22,7 @@ from csac_jax import algorithms, presets
 from csac_jax.config import SimConfig, shown
 from csac_jax.io import configs, files, renames
 
+ARCHIVE = ".tar.xz"  # of folders of runs: hundreds of logs are alike, so it is small
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
 SKIPPED = ("checkpoints", "tensorboard", "wandb", "best")
 NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
@@ -110,22 +115,55 @@ class Results(NamedTuple):
 
 
 def read(paths: Sequence[Path]) -> Results:
-    """The runs and evaluations in folders and files. Raises ValueError for a path of neither."""
+    """The runs and evaluations in folders, files and archives; an archive inside a folder is passed
+    over. Raises ValueError for a path that is none of them."""
     results = Results([], [], [])
     for path in paths:
         before = len(results.runs) + len(results.evaluations)
-        for file in _files(path):
-            try:
-                if file.name == files.METRICS:
-                    _add_run(file, results)
-                else:
-                    results.evaluations.extend(_evaluations(file))
-            except (OSError, ValueError) as error:
-                results.notes.append(f"{file}: damaged ({files.first_line(error)}); left out")
+        with _opened(path) as folder:
+            for file in _files(folder):
+                _add(file, results)
         if len(results.runs) + len(results.evaluations) == before:
             results.notes.append(f"{path}: holds no {files.METRICS} and no result of `eval --json`")
     results.notes.extend(_without_evaluation(results))
     return results
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Path]:
+    """The path, or a folder that holds what an archive does, for as long as it is read."""
+    if not (path.name.endswith(ARCHIVE) and path.is_file()):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name).resolve()
+        try:
+            with tarfile.open(path) as archive:
+                for member in archive:
+                    _unpack(archive, member, folder)
+        except (OSError, EOFError, tarfile.TarError, lzma.LZMAError) as error:
+            raise ValueError(f"{path} is no archive of runs ({files.first_line(error)})") from None
+        yield folder
+
+
+def _unpack(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
+    """Writes a file of an archive; passes over what is none and what would lie elsewhere."""
+    place = (folder / member.name).resolve()
+    content = archive.extractfile(member) if member.isreg() else None
+    if content is not None and place.is_relative_to(folder):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(content.read())
+
+
+def _add(path: Path, results: Results) -> None:
+    """Adds what a file holds, or a note that it is damaged."""
+    try:
+        if path.name == files.METRICS:
+            _add_run(path, results)
+        else:
+            results.evaluations.extend(_evaluations(path))
+    except (OSError, ValueError) as error:
+        results.notes.append(f"{path}: damaged ({files.first_line(error)}); left out")
 
 
 def _files(path: Path) -> Iterator[Path]:

@@ -1,4 +1,5 @@
-"""The final policies of a sweep, measured without exploration: SWEEP/POINT/seed-K/eval.json.
+"""The final policies of a sweep, measured without exploration: SWEEP/POINT/seed-K/eval.json, and
+eval-SUITE.json for scenes other than those of a policy's own task.
 
 The file is that of `csac-jax eval --json`. A policy that has one is passed over, so an interrupted
 evaluation goes on where it was.
@@ -18,47 +19,54 @@ from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepRun, runs_of
 from csac_jax.training.loop import Reporter
 
-RESULT = "eval.json"
-SUITE = suites.IN_DISTRIBUTION  # every task has its own scenes, from other random numbers
+OWN = suites.IN_DISTRIBUTION  # every task has its own scenes, from other random numbers
 SEED = 0  # of the evaluation: all policies of a point meet the same scenes
 
 
-def measure(plan: SweepPlan, folder: Path, reporter: Reporter, stop: Stop) -> int | None:
-    """Evaluates the policies that are left, each in `plan.episodes` episodes of its task.
+def measure(
+    plan: SweepPlan, folder: Path, reporter: Reporter, stop: Stop, suite: str = OWN
+) -> int | None:
+    """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
 
-    A run that was given up has no policy. Returns the number of the signal that stopped it.
+    A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
+    ValueError as `suites.environments` does, before anything is measured there.
     """
     for point in plan.points:
-        runs = [run for run in runs_of(plan._replace(points=[point])) if _is_left(folder, run)]
-        if runs and stop.signal is None:
-            reporter.say(f"evaluating {point.name}: {len(runs)} policies")
-            _measure_point(plan, point, folder, runs, stop)
+        runs = runs_of(plan._replace(points=[point]))
+        left = [run for run in runs if _is_left(folder / run.folder, suite)]
+        if left and stop.signal is None:
+            reporter.say(f"evaluating {point.name}: {len(left)} policies")
+            _measure_point(plan.episodes, suite, point, folder, left, stop)
     return stop.signal
 
 
-def _is_left(folder: Path, run: SweepRun) -> bool:
-    path = folder / run.folder
-    return checkpoint.latest_step(path) is not None and not (path / RESULT).exists()
+def _result(suite: str) -> str:
+    return "eval.json" if suite == OWN else f"eval-{Path(suite).stem}.json"
+
+
+def _is_left(path: Path, suite: str) -> bool:
+    return checkpoint.latest_step(path) is not None and not (path / _result(suite)).exists()
 
 
 def _measure_point(
-    plan: SweepPlan, point: SweepPoint, folder: Path, runs: list[SweepRun], stop: Stop
+    episodes: int, suite: str, point: SweepPoint, folder: Path, runs: list[SweepRun], stop: Stop
 ) -> None:
     """Evaluates runs of one point, which share their scenes and the compiled episodes; in C MuJoCo
     if they were trained in it, on whatever device."""
     physics: PhysicsKind = "c" if point.cfg.sim.physics == "c" else "auto"
     cfg = rollout.configured(point.cfg, physics, point.cfg.sim.robot)
-    parts = suites.environments(cfg, SUITE, plan.episodes, SEED)
+    parts = suites.environments(cfg, suite, episodes, SEED)
     for run in runs:
         if stop.signal is not None:
             return
         begun, path = time.time(), folder / run.folder
-        found = rollout.measure(policies.load(path), parts, plan.episodes, SEED, None)
-        _write(path / RESULT, dataclasses.replace(cfg, seed=run.cfg.seed), found, begun)
+        found = rollout.measure(policies.load(path), parts, episodes, SEED, None)
+        measured = dataclasses.replace(cfg, seed=run.cfg.seed)
+        _write(path / _result(suite), suite, measured, found, begun)
 
 
-def _write(path: Path, cfg: Config, found: dict[str, Any], begun: float) -> None:
-    asked = {"policy": "learned", "suite": SUITE, "seed": SEED}
+def _write(path: Path, suite: str, cfg: Config, found: dict[str, Any], begun: float) -> None:
+    asked = {"policy": "learned", "suite": suite, "seed": SEED}
     seconds = {"seconds": round(time.time() - begun, 1)}
     config = {"config": configs.to_dict(cfg)}
     files.write_json(path, {**asked, **seconds, **found, **config, **provenance.record()})

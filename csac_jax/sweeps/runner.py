@@ -36,10 +36,9 @@ from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
 from csac_jax.training.callbacks import Record
 
-PLAN = "sweep.json"
 SUMMARY = "summary.json"
 DONE = "done"
-RESERVED = ("groups", PLAN, SUMMARY, "train.json")  # in the sweep's folder
+RESERVED = ("groups", files.SWEEP_PLAN, SUMMARY, "train.json")  # in the sweep's folder
 DIGEST = "sha256"  # key of the plan's own digest
 _NAME = re.compile(rf"[^./\\][^/\\]{{0,{grid.LONGEST - 1}}}")  # of a folder inside the sweep
 MOST_EPISODES = 100_000  # of an evaluation, ours: more is a slip of the pen
@@ -95,7 +94,7 @@ def run(
     cluster.wait("sweep")  # all have looked whether there is such a folder
     if not resume and cluster.is_first():
         folder.mkdir(parents=True)
-        files.replace(folder / PLAN, plan_text(plan))
+        files.replace(folder / files.SWEEP_PLAN, plan_text(plan))
     with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
         return _run(plan, folder, make_program, reporter, stop)
 
@@ -125,7 +124,7 @@ def _run(
 def read_plan(folder: Path) -> SweepPlan:
     """The plan of a sweep's folder. Raises SweepError if there is none that can be read."""
     try:
-        stored = files.read_object(folder / PLAN)
+        stored = files.read_object(folder / files.SWEEP_PLAN)
         if stored.pop(DIGEST, None) not in (None, _digest(stored)):  # old ones have none
             raise ValueError("it was changed after it had been written")
         if stored.keys() - {"episodes"} != {"seeds", "settings"}:
@@ -139,10 +138,14 @@ def read_plan(folder: Path) -> SweepPlan:
         _check_unchanged(plan, folder)
         return plan
     except FileNotFoundError:
-        raise SweepError(f"there is no {PLAN} in {folder}; give the folder of a sweep") from None
+        raise SweepError(
+            f"there is no {files.SWEEP_PLAN} in {folder}; give the folder of a sweep"
+        ) from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = files.first_line(error)
-        raise SweepError(f"{folder / PLAN} cannot be read ({reason}); begin a new sweep") from None
+        raise SweepError(
+            f"{folder / files.SWEEP_PLAN} cannot be read ({reason}); begin a new sweep"
+        ) from None
 
 
 def plan_text(plan: SweepPlan) -> str:

@@ -15,11 +15,10 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import sweep as command
 from csac_jax.config import Config
 from csac_jax.evaluation import metrics
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import final, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.sweeps.runner import SweepPlan
 from csac_jax.training import loop, step
 from tests.training import toys
 
@@ -158,7 +157,7 @@ def test_settings_reach_their_configs():
 def test_plan_survives_its_file(tmp_path: Path):
     """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
     _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.end=1:4,1:12"])
-    (tmp_path / runner.PLAN).write_text(runner.plan_text(plan))
+    (tmp_path / files.SWEEP_PLAN).write_text(runner.plan_text(plan))
     assert command.read(["--resume", str(tmp_path)])[1] == plan
 
 
@@ -168,12 +167,12 @@ def test_plans_without_evaluation_are_read(tmp_path: Path):
     _, plan = command.read(["smoke", "--evaluate", "7"])
     content = json.loads(runner.plan_text(plan))
     del content["sha256"]
-    (tmp_path / runner.PLAN).write_text(json.dumps(content))
+    (tmp_path / files.SWEEP_PLAN).write_text(json.dumps(content))
     assert command.read(["--resume", str(tmp_path)])[1].episodes == 7
     del content["episodes"]
-    (tmp_path / runner.PLAN).write_text(json.dumps(content))
+    (tmp_path / files.SWEEP_PLAN).write_text(json.dumps(content))
     assert command.read(["--resume", str(tmp_path)])[1] == plan._replace(episodes=0)
-    (tmp_path / runner.PLAN).write_text(json.dumps({**content, "episodes": "7"}))
+    (tmp_path / files.SWEEP_PLAN).write_text(json.dumps({**content, "episodes": "7"}))
     with pytest.raises(runner.SweepError, match="--evaluate: 0 to"):
         command.read(["--resume", str(tmp_path)])
 
@@ -237,6 +236,14 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     assert all(("100.0 % (100.0 to 100.0)" in line) == ("VPG" in line) for line in table[1:])
     assert all(("62.5 % (50.0 to 75.0)" in line) == ("CSAC-beta" in line) for line in table[1:])
     assert "table and figure" in capsys.readouterr().out
+    assert cli.main(["eval", "run", "--suite", "cases", "--episodes", "4"]) == 0
+    assert len(measured) == 2 * len(set(measured))
+    found = json.loads(Path(measured[-1], "eval-cases.json").read_text())
+    assert (found["suite"], found["seed"], found["completion"]["n"]) == ("cases", 0, 4)
+    assert cli.main(["eval", "run", "--suite", "cases", "--episodes", "4"]) == 0
+    assert len(measured) == 2 * len(set(measured))
+    assert cli.main(["eval", "run", "--seed", "1"]) == 2
+    assert "eval SWEEP: takes --suite and --episodes alone" in capsys.readouterr().err
 
 
 def test_policies_are_measured_with_their_own_robot(
@@ -248,8 +255,7 @@ def test_policies_are_measured_with_their_own_robot(
     monkeypatch.setattr(final.suites, "environments", note)
     for robot in ("ur5", "hand"):
         point = SweepPoint(robot, {}, presets.smoke().change(sim={"robot": robot}))
-        plan = SweepPlan(1, [point], 4)
-        final._measure_point(plan, point, tmp_path, [], signals.Stop())
+        final._measure_point(4, final.OWN, point, tmp_path, [], signals.Stop())
     assert seen == ["ur5", "hand"]
 
 

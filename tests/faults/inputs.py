@@ -118,8 +118,8 @@ def _policy(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
 
 
 def _sweep(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
-    (folder / runner.PLAN).write_text(runner.plan_text(_plan()))
-    return folder / runner.PLAN, lambda: runner.read_plan(folder), SweepError
+    (folder / files.SWEEP_PLAN).write_text(runner.plan_text(_plan()))
+    return folder / files.SWEEP_PLAN, lambda: runner.read_plan(folder), SweepError
 
 
 def _plan() -> SweepPlan:
@@ -454,7 +454,7 @@ def _cases(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
 @fault("hostile sweep.json", 300)
 def _plans(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
     """They are refused, or all their runs lie inside the sweep's folder, each in its own."""
-    tally, path = Tally(), folder / runner.PLAN
+    tally, path = Tally(), folder / files.SWEEP_PLAN
     valid = json.loads(runner.plan_text(_plan()))
     del valid[runner.DIGEST]
 

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -846,6 +847,28 @@ def test_damaged_record_is_left_out_with_a_note(
     assert any(line.startswith(f"- {bad}") and "damaged" in line for line in shown.splitlines())
     assert "| CSAC-beta" in shown
     assert complaint == ""
+
+
+def test_archive_is_read_as_its_folder(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    """Claim: an archive of runs gives the tables of the folder; what it would write elsewhere, and
+    links, are passed over; one that is cut off is one line and exit code 2."""
+    path = tmp_path / "runs.tar.xz"
+    with tarfile.open(path, "w:xz") as archive:
+        archive.add(recorded, "sweep")
+        archive.add(recorded / "vpg" / "metrics.jsonl", "../outside.jsonl")
+        link = tarfile.TarInfo("link.json")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+        archive.addfile(link)
+    assert cli.main(["report", str(recorded)]) == 0
+    wanted = capsys.readouterr().out
+    assert cli.main(["report", str(path)]) == 0
+    assert capsys.readouterr().out == wanted
+    assert not list(tmp_path.rglob("outside.jsonl"))
+    path.write_bytes(path.read_bytes()[:-400])
+    assert cli.main(["report", str(path)]) == 2
+    assert "is no archive of runs" in capsys.readouterr().err
 
 
 def test_pipes_and_devices_are_not_read(tmp_path: Path, capsys: pytest.CaptureFixture):
