@@ -1,6 +1,7 @@
-"""Episodes of a fixed policy, all at once in one compiled step, and what they measure."""
+"""Episodes of a fixed policy, many at once in one compiled step, and what they measure."""
 
 import functools
+import os
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -17,13 +18,14 @@ from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
 from csac_jax.objects.library import Split
 from csac_jax.runtime import compiler
-from csac_jax.scene import stock
+from csac_jax.scene import layout, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, physics as simulation, primitives
 from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.training import step as training
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
+PER_CORE = 4  # of them on a CPU: more gain nothing, and the last episodes keep all places busy
 
 Progress = Callable[[str, int, int], None]  # part of the suite, episodes finished, all episodes
 Count = Callable[[int, int], None]  # the same of one part
@@ -79,16 +81,84 @@ def rollout(
 ) -> Episodes:
     """Runs episodes of a policy, their scenes spread evenly over the environment's pool.
 
-    What an episode draws follows from the seed and its number, not from how many run at once. What
-    a network or MJX computes may still differ in the last bits.
+    Some run side by side, each in its place; where they end, the next ones begin. What an episode
+    draws follows from the seed and its number alone. What a network or MJX computes may still
+    differ in the last bits.
     """
-    size = -(-episodes // -(-episodes // SIDE_BY_SIDE))  # batches of one size: one compilation
-    batches = [
-        _run(env, policy, episodes, seed, np.arange(first, first + size), progress)
-        for first in range(0, episodes, size)
-    ]
-    joined = Episodes(*map(np.concatenate, zip(*batches, strict=True)))
-    return Episodes(*(leaf[:episodes] for leaf in joined))
+    most = min(SIDE_BY_SIDE, episodes)
+    if jax.default_backend() == "cpu":
+        most = min(most, PER_CORE * len(os.sched_getaffinity(0)))
+    few = max(1, most // 8)  # that begin at once, ours
+    places = most // few * few
+    begin, step = _compiled(type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
+    key = jax.random.key(seed)
+    rows = np.arange(episodes) * env.scenes.position.shape[0] // episodes
+    blocks = np.asarray(env.scenes.in_play.sum(axis=1))[rows]
+
+    def begun(numbers: np.ndarray) -> State:
+        scenes = jax.tree.map(lambda leaf: leaf[rows[numbers]], env.scenes)
+        return begin(jax.random.fold_in(key, 0), numbers, scenes)
+
+    numbers, actions = np.full(places, _NONE), np.zeros(places, int)
+    states = jax.tree.map(lambda leaf: leaf[np.zeros(places, int)], begun(np.zeros(few, int)))
+    history, waiting = [], np.arange(episodes)
+    while np.any(numbers != _NONE) or waiting.size:
+        free = np.flatnonzero(numbers == _NONE)[: waiting.size]
+        for some in np.split(free, np.arange(few, free.size, few)):
+            if some.size == few or some.size == waiting.size > 0:
+                chosen, waiting = waiting[: some.size], waiting[some.size :]
+                numbers[some], actions[some] = chosen, 0
+                padded = [np.resize(array, few) for array in (some, chosen)]
+                states = _put(states, padded[0], begun(padded[1]))
+        states, record = step(type(policy), _pytree(policy), key, np.maximum(numbers, 0), states)
+        record, done = jax.device_get((record, states.done))
+        over = done & (numbers != _NONE)
+        terminated, ending = np.asarray(states.terminated), endings(env, states)
+        history.append(_Step(numbers, actions, record, over, terminated, ending))
+        numbers, actions = np.where(over, _NONE, numbers), actions + 1
+        if progress is not None:
+            progress(episodes - waiting.size - int(np.sum(numbers != _NONE)), episodes)
+    return _joined(history, blocks, env.cfg)
+
+
+_NONE = -1  # number of the episode in a place that is free
+
+
+class _Step(NamedTuple):
+    """What one action of all places did; leaves [places], of several steps [S, places]."""
+
+    number: Any  # int, of the episode there
+    action: Any  # int, of that episode, from 0
+    record: Episodes
+    over: Any  # bool, the episode ended with it
+    terminated: Any  # bool
+    ending: Any  # int32, index into ENDINGS
+
+
+def _joined(history: list[_Step], blocks: np.ndarray, cfg: Config) -> Episodes:
+    """The episodes by number, from all steps in order; `blocks` [M] were in play at their start."""
+    steps = jax.tree.map(lambda *leaves: np.stack(leaves), *history)
+    held, order = steps.number != _NONE, np.argsort(steps.number[steps.over])
+    at = steps.number[held], steps.action[held]
+
+    def by_episode(leaf: np.ndarray) -> np.ndarray:
+        table = np.zeros((blocks.size, cfg.task.max_actions), leaf.dtype)
+        table[at] = leaf[held]
+        return table
+
+    records = jax.tree.map(by_episode, steps.record)
+    return records._replace(
+        blocks_lost=records.blocks_lost.sum(axis=1),
+        blocks=np.ones_like(blocks) if cfg.task.kind == "target" else blocks,
+        completed=steps.terminated[steps.over][order],
+        ending=steps.ending[steps.over][order],
+    )
+
+
+@jax.jit
+def _put(states: State, places: jax.Array, some: State) -> State:
+    """The states with others in these places; a place may come twice, with equal states."""
+    return jax.tree.map(lambda leaf, new: leaf.at[places].set(new), states, some)
 
 
 @functools.lru_cache(maxsize=2)
@@ -151,37 +221,6 @@ def _pytree(policy: Policy) -> Any:
     return jax.tree_util.Partial(policy) if jax.tree_util.all_leaves([policy]) else policy
 
 
-def _run(
-    env: Env, policy: Policy, episodes: int, seed: int, numbers: np.ndarray, progress: Count | None
-) -> Episodes:
-    """The episodes `numbers` [E] of a rollout; those beyond its `episodes` end at once."""
-    static: Any = (type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
-    begin, step = _compiled(*static)
-    task, key = env.cfg.task, jax.random.key(seed)
-    rows = np.minimum(numbers, episodes - 1) * env.scenes.position.shape[0] // episodes
-    scenes = jax.tree.map(lambda leaf: leaf[rows], env.scenes)
-    states = begin(jax.random.fold_in(key, 0), numbers, scenes)
-    blocks = np.asarray(states.scene.in_play.sum(axis=1))
-    states = states.replace(truncated=jnp.asarray(numbers >= episodes))
-    records = []
-    for action in range(1, task.max_actions + 1):
-        step_key = jax.random.fold_in(key, action)
-        states, record = step(type(policy), _pytree(policy), step_key, numbers, states)
-        records.append(jax.device_get(record))
-        if progress is not None:
-            progress(min(int(numbers[0] + np.sum(states.done)), episodes), episodes)
-        if np.all(states.done):
-            break
-    pad = ((0, 0), (0, task.max_actions - len(records)))
-    steps = jax.tree.map(lambda *leaves: np.pad(np.stack(leaves, axis=1), pad), *records)
-    return steps._replace(
-        blocks_lost=steps.blocks_lost.sum(axis=1),
-        blocks=np.ones_like(blocks) if task.kind == "target" else blocks,
-        completed=np.asarray(states.terminated),
-        ending=endings(env, states),
-    )
-
-
 def endings(env: Env, last: State) -> np.ndarray:
     """Why the episodes of these last states, leaves [...], ended: indices into ENDINGS [...]."""
     reasons = {
@@ -205,16 +244,18 @@ def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: Scene) -> State
 def _step(
     env: Env, kind: type, policy: Policy, key: jax.Array, numbers: jax.Array, states: State
 ) -> tuple[State, Episodes]:
-    """One action in every scene and what it did, [E], 0 after the end; finished scenes stay.
+    """One action in every scene and what it did, [E], 0 after the end; finished scenes stay, and
+    physics has nothing to do there.
 
     `kind`, the policy's type, is static: JAX takes dataclasses of equal fields for equal whatever
     their types are, and would at times run the program of the one for the other.
     """
     del kind
     running = ~states.done
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
-    action = policies.act(policy, states, keys)
-    after = jax.vmap(env.step)(states, action)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, key))(states.actions + 1)
+    action = policies.act(policy, states, jax.vmap(jax.random.fold_in)(keys, numbers))
+    cleared = jax.vmap(layout.park)(states.scene, running[:, None] & states.scene.in_play)
+    after = jax.vmap(env.step)(states.replace(scene=cleared), action)
     info, has_target = after.info, env.cfg.task.kind == "target"
     target_lost = (after.terminated & (after.reward == 0.0)).astype(jnp.int32)
     record = Episodes(
