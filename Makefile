@@ -61,6 +61,7 @@ pictures: $(STAMP)  ## draw the pictures of README and docs (4 minutes)
 figures: $(STAMP)  ## the figures, tables and index of the recorded results
 	$(BIN)/csac-jax report experiments/results --markdown docs/results.md > /dev/null
 	$(BIN)/python -m experiments.records
+	$(BIN)/python -m experiments.study
 	$(BIN)/python -m experiments.figures
 
 docs: $(STAMP)  ## build the site of docs/ into build/docs; no network is needed

@@ -14,6 +14,7 @@ from matplotlib import cycler, ticker
 from matplotlib.figure import Figure
 
 from csac_jax.report import charts, comparison, curves, results
+from experiments import study
 
 plt.rcParams["axes.prop_cycle"] = cycler(color=curves.PALETTE)
 
@@ -51,6 +52,9 @@ def figures() -> Iterator[tuple[str, Figure]]:
     yield "warp-action", warp_action()
     report = comparison.build(results.read([RESULTS]))
     yield from ((chart.name, chart.figure) for chart in charts.draw(report))
+    for name, path in study.archives().items():
+        part = comparison.build(results.read([path]))
+        yield from ((f"study-{name}-{chart.name}", chart.figure) for chart in charts.draw(part))
 
 
 def _read(pattern: str) -> list[dict[str, Any]]:

@@ -356,6 +356,7 @@ history of this folder.
 | `PRESET/VARIANT/seed-K/` | a run: `config.json`, `metrics.jsonl`, `eval*.json` |
 | `PRESET/VARIANT/*.json` | the sweep that made the runs, if one did |
 | `search/PRESET/METHOD.json` | what a search of settings tried |
+| `study/PART-TASK.tar.xz` | [study](../../docs/study.md) sweeps, read by `csac-jax report` |
 | `bench/NAME/DEVICE-*.json` | what `csac-jax bench NAME`, or a short `csac-jax train`, wrote |
 
 Files keep the names of settings and metrics that they were written with. A variant that ends in a

@@ -9,13 +9,15 @@ import pytest
 from PIL import Image
 
 from csac_jax import cli
-from experiments import figures, records
+from csac_jax.report import results
+from experiments import figures, records, study
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results"
 RUN = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/seed-\d+/(config|train|eval[\w-]*)\.json")
 SWEEP = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/(sweep|summary|train)\.json")
 SEARCH = re.compile(r"search/[a-z_]+/[a-z_]+\.json")
+STUDY = re.compile(r"study/\d-[a-z]+\.tar\.xz")
 BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h100|h200)[\w-]*\.json")
 
 
@@ -33,6 +35,17 @@ def test_index_is_what_records_writes():
     assert records.readme() == (RESULTS / "README.md").read_text()
 
 
+def test_study_has_the_tables_of_its_archives():
+    """Claim: the results in docs/study.md are generated; every archive is of a part that is named
+    there, and of seeds that are the study's."""
+    assert study.page() == study.PAGE.read_text()
+    assert sorted(study.ARCHIVES.iterdir()) == sorted(study.archives().values())
+    for path in study.archives().values():
+        found = results.read([path])
+        assert {run.config["seed"] for run in found.runs} <= set(range(100, 150))
+        assert not [note for note in found.notes if "damaged" in note or "not evaluated" in note]
+
+
 def test_every_record_has_a_claim():
     """Claim: the index names every folder of runs and every benchmark, and nothing else."""
     runs = {path.parent.parent for path in RESULTS.glob("*/*/seed-*/*.json")}
@@ -42,12 +55,13 @@ def test_every_record_has_a_claim():
 
 
 def test_records_lie_in_one_layout():
-    """Claim: a record is a run's, a sweep's, a search's or a benchmark's, each in its place."""
+    """Claim: a record is a run's, a sweep's, a search's, a benchmark's or one of the study's
+    archives, each in its place."""
     files = [path for path in RESULTS.rglob("*") if path.is_file() and path.name != "README.md"]
     assert len(files) > 400
     for path in files:
         name = path.relative_to(RESULTS).as_posix().replace("metrics.jsonl", "config.json")
-        assert any(pattern.fullmatch(name) for pattern in (RUN, SWEEP, SEARCH, BENCH)), name
+        assert any(pattern.fullmatch(name) for pattern in (RUN, SWEEP, SEARCH, BENCH, STUDY)), name
         if path.suffix == ".json":
             assert isinstance(json.loads(path.read_text()), dict)
 
