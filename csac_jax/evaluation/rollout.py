@@ -90,7 +90,8 @@ def rollout(
         most = min(most, PER_CORE * len(os.sched_getaffinity(0)))
     few = max(1, most // 8)  # that begin at once, ours
     places = most // few * few
-    begin, step = _compiled(type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
+    static: Any = (type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
+    begin, step = _compiled(*static)
     key = jax.random.key(seed)
     rows = np.arange(episodes) * env.scenes.position.shape[0] // episodes
     blocks = np.asarray(env.scenes.in_play.sum(axis=1))[rows]
@@ -101,7 +102,8 @@ def rollout(
 
     numbers, actions = np.full(places, _NONE), np.zeros(places, int)
     states = jax.tree.map(lambda leaf: leaf[np.zeros(places, int)], begun(np.zeros(few, int)))
-    history, waiting = [], np.arange(episodes)
+    history: list[_Step] = []
+    waiting = np.arange(episodes)
     while np.any(numbers != _NONE) or waiting.size:
         free = np.flatnonzero(numbers == _NONE)[: waiting.size]
         for some in np.split(free, np.arange(few, free.size, few)):
