@@ -102,8 +102,8 @@ def search(
     if not folder.exists():
         folder.mkdir(parents=True)
         files.write_json(folder / MADE_WITH, provenance.record())
-        files.replace(folder / runner.PLAN, runner.plan_text(wanted))
-    elif (folder / runner.PLAN).read_text() != runner.plan_text(wanted):
+        files.replace(folder / files.SWEEP_PLAN, runner.plan_text(wanted))
+    elif (folder / files.SWEEP_PLAN).read_text() != runner.plan_text(wanted):
         raise SettingsError(f"{folder} holds another search; give another folder")
     done = api.run_sweep(wanted, folder, None, "seeds", None, True, stop, resume=True)
     if done.stopped_by is None:
