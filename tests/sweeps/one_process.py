@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import csac_jax  # noqa: F401  (before JAX)
+from csac_jax.io import files
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import replicas, runner
@@ -41,7 +42,7 @@ def main(folder: str, after: str, shard: str, *place: str) -> int:
     plan = runner.SweepPlan(2, [SweepPoint("a", {}, toys.CFG)])
     last = not place or place[2] == "1"
     reporter = Reporter(stop, int(after) if last else 0)
-    resume = (Path(folder) / runner.PLAN).exists()
+    resume = (Path(folder) / files.SWEEP_PLAN).exists()
     cluster.wait("looked")
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
