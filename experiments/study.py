@@ -108,10 +108,11 @@ def _verdict(ours: Any, theirs: Any) -> str:
     gap = statistics.difference(ours, theirs)
     assert gap.low is not None
     assert gap.high is not None
-    if max(-gap.low, gap.high) <= POINT:
-        told = "equivalent"
+    small, differ = max(-gap.low, gap.high) <= POINT, not gap.low <= 0.0 <= gap.high
+    if differ:
+        told = "differ, by less than a point" if small else "differ"
     else:
-        told = "not told" if gap.low <= 0.0 <= gap.high else "differ"
+        told = "equivalent" if small else "not told"
     return f"{tables.shown(gap, sign='+')}: {told}"
 
 

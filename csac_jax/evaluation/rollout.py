@@ -110,8 +110,8 @@ def rollout(
             if some.size == few or some.size == waiting.size > 0:
                 chosen, waiting = waiting[: some.size], waiting[some.size :]
                 numbers[some], actions[some] = chosen, 0
-                padded = [np.resize(array, few) for array in (some, chosen)]
-                states = _put(states, padded[0], begun(padded[1]))
+                here = np.pad(some, (0, few - some.size), constant_values=places)
+                states = _put(states, here, begun(np.resize(chosen, few)))
         states, record = step(type(policy), _pytree(policy), key, np.maximum(numbers, 0), states)
         record, done = jax.device_get((record, states.done))
         over = done & (numbers != _NONE)
@@ -159,8 +159,8 @@ def _joined(history: list[_Step], blocks: np.ndarray, cfg: Config) -> Episodes:
 
 @jax.jit
 def _put(states: State, places: jax.Array, some: State) -> State:
-    """The states with others in these places; a place may come twice, with equal states."""
-    return jax.tree.map(lambda leaf, new: leaf.at[places].set(new), states, some)
+    """The states with others in these places; what is put beyond the last place is dropped."""
+    return jax.tree.map(lambda leaf, new: leaf.at[places].set(new, mode="drop"), states, some)
 
 
 @functools.lru_cache(maxsize=2)

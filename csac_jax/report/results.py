@@ -149,7 +149,8 @@ def _opened(path: Path) -> Iterator[Path]:
 def _unpack(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
     """Writes a file of an archive; passes over what is none and what would lie elsewhere."""
     place = (folder / member.name).resolve()
-    content = archive.extractfile(member) if member.isreg() else None
+    sound = member.isreg() and member.size <= files.LARGEST
+    content = archive.extractfile(member) if sound else None
     if content is not None and place.is_relative_to(folder):
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content.read())

@@ -34,6 +34,8 @@ def measure(
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))
         left = [run for run in runs if _is_left(folder / run.folder, suite)]
+        if kept := sum((folder / run.folder / _result(suite)).exists() for run in runs):
+            reporter.say(f"{point.name}: {kept} policies have their {_result(suite)} already")
         if left and stop.signal is None:
             reporter.say(f"evaluating {point.name}: {len(left)} policies")
             _measure_point(plan.episodes, suite, point, folder, left, stop)
@@ -54,7 +56,8 @@ def _measure_point(
     """Evaluates runs of one point, which share their scenes and the compiled episodes; in C MuJoCo
     if they were trained in it, on whatever device."""
     physics: PhysicsKind = "c" if point.cfg.sim.physics == "c" else "auto"
-    cfg = rollout.configured(point.cfg, physics, point.cfg.sim.robot)
+    seen = suites.with_objects(point.cfg, suite, None, "held_out")
+    cfg = rollout.configured(seen, physics, point.cfg.sim.robot)
     parts = suites.environments(cfg, suite, episodes, SEED)
     for run in runs:
         if stop.signal is not None:
