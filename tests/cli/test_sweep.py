@@ -242,6 +242,7 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     assert (found["suite"], found["seed"], found["completion"]["n"]) == ("cases", 0, 4)
     assert cli.main(["eval", "run", "--suite", "cases", "--episodes", "4"]) == 0
     assert len(measured) == 2 * len(set(measured))
+    assert "2 policies have their eval-cases.json already" in capsys.readouterr().out
     assert cli.main(["eval", "run", "--seed", "1"]) == 2
     assert "eval SWEEP: takes --suite and --episodes alone" in capsys.readouterr().err
 
