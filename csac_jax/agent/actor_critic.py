@@ -216,22 +216,23 @@ def best_grasps(
     """phi_g [B] of those observations, leaves [B, ...], that are `wanted` [B] bool; else 0.
 
     These come first, and are passed through the networks by a quarter of the batch at a time, ours;
-    a quarter with none of them costs nothing. Under vmap every one is computed.
+    quarters with none of them cost nothing. Under vmap as many are computed as the neediest asks.
     """
     num = wanted.shape[0]
     size = -(-num // _QUARTERS)
     places = jnp.argsort(~wanted, stable=True).astype(jnp.int32)
     rows = jnp.pad(places, (0, -num % size), constant_values=num).reshape(-1, size)
 
-    def phi(row: jax.Array) -> jax.Array:
-        part = jax.tree.map(lambda leaf: leaf.at[row].get(mode="clip"), obs)
-        return jax.vmap(best_grasp)(dense_maps(learner, params, part))
+    def left(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return carry[0] * size < jnp.sum(wanted)
 
-    def of_row(row: jax.Array) -> jax.Array:
-        asked = jnp.any(wanted.at[row].get(mode="fill", fill_value=False))
-        return jax.lax.cond(asked, phi, lambda row: jnp.zeros(row.shape), row)
+    def quarter(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        done, values = carry
+        part = jax.tree.map(lambda leaf: leaf.at[rows[done]].get(mode="clip"), obs)
+        phi = jax.vmap(best_grasp)(dense_maps(learner, params, part))
+        return done + 1, values.at[rows[done]].set(phi, mode="drop")
 
-    values = jnp.zeros(num).at[rows].set(jax.lax.map(of_row, rows), mode="drop")
+    _, values = jax.lax.while_loop(left, quarter, (jnp.int32(0), jnp.zeros(num)))
     return jnp.where(wanted, values, 0.0)
 
 

@@ -121,6 +121,32 @@ def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
         np.testing.assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
 
 
+def test_replicas_ask_for_the_neediests_quarters(
+    learner, randomised, observations, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: under vmap phi_g is what it is alone, in as many quarters as one replica asks for."""
+    state = randomised(actor_critic.init(jax.random.key(0), learner))
+    obs = observations(8, 3)
+    wanted = np.zeros((3, 8), bool)
+    wanted[0, [1, 6]] = wanted[1, [0, 3, 7]] = True  # one quarter of two, two quarters, none
+    every = jax.vmap(actor_critic.best_grasp)(
+        jax.jit(lambda: actor_critic.dense_maps(learner, state.target, obs))()
+    )
+    passed: list[int] = []
+    dense_maps = actor_critic.dense_maps
+
+    def counted(*args):
+        jax.debug.callback(lambda: passed.append(1))
+        return dense_maps(*args)
+
+    monkeypatch.setattr(actor_critic, "dense_maps", counted)
+    ask = functools.partial(actor_critic.best_grasps, learner, state.target, obs)
+    found = jax.jit(jax.vmap(ask))(jnp.asarray(wanted))
+    jax.effects_barrier()
+    np.testing.assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+    assert len(passed) == 2
+
+
 def test_relabelling_is_the_difference_of_two_rewards():
     """Claim: a renewed reward is what the action would have earned with the new label, whatever
     else it earned or lost."""

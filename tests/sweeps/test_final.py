@@ -31,5 +31,5 @@ def test_policies_are_measured_in_the_physics_of_their_training(
     stop.signal = 15  # no policy is read
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(suites, "environments", environments)
-    final._measure_point(plan, plan.points[0], Path("unused"), runs_of(plan), stop)
+    final._measure_point(4, final.OWN, plan.points[0], Path("unused"), runs_of(plan), stop)
     assert seen == [measured]
