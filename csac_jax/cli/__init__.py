@@ -5,10 +5,12 @@ A file per command, whose `run` takes its arguments and returns the exit code. J
 once the arguments are known to be good, so that help and complaints come at once.
 """
 
+import contextlib
+import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import csac_jax
@@ -82,10 +84,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command in `argv`, by default the process's arguments; returns the exit code."""
     if set(os.environ.get("COLUMNS", "")) == {"0"}:
         del os.environ["COLUMNS"]  # rich would print nothing
-    with output.unbroken(), warnings.catch_warnings():
+    with output.unbroken(), _logged(), warnings.catch_warnings():
         warnings.simplefilter("default", DataWarning)
         warnings.showwarning = _warn
         return _guarded(list(sys.argv[1:] if argv is None else argv))
+
+
+@contextlib.contextmanager
+def _logged() -> Iterator[None]:
+    """In the block stderr has a line for what the package logs about long work."""
+    logger, handler = logging.getLogger(csac_jax.__name__), logging.StreamHandler()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
 
 
 def _warn(message: object, category: type[Warning], *place: Any, **more: Any) -> None:

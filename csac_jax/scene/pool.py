@@ -9,7 +9,9 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import logging
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -34,7 +36,10 @@ _ROUND = 128  # scenes dropped per round
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
 _DRAWS = 20  # of objects, for which there must be room side by side
+_LOGGED_EVERY = 10.0  # s between lines about scenes that settle
 _MAX_PAUSES = 3  # per block, until pouring a scene is given up; for a few, 2 and the settling
+
+_LOG = logging.getLogger(__name__)
 
 Drop = Callable[[], Scene]
 Fall = Callable[[Scene, BlockFields], Scene | None]
@@ -71,7 +76,7 @@ def settled(
     centre, so a scene can be rotated by any yaw. Blocks drop all at once, stacked in the air, or if
     `poured` one after another, from `drop_height` above the pile; one that rolls off drops again.
     If `packed`, objects of a library stand on the table side by side, see `stock.packed`.
-    Raises SceneError where hardly any scene comes to rest.
+    Logs every few seconds how far it is. Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
 
@@ -84,7 +89,8 @@ def settled(
             functools.partial(draw, scene, rng, number)
             for number in range(scene.min_blocks, len(scene.slots) + 1)
         ]
-        parts = [_settle(world, drop, fall, count, poured or packed) for drop in drops]
+        counter = _Counter(count * len(drops))
+        parts = [_settle(world, drop, fall, count, poured or packed, counter) for drop in drops]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
     how = [*["poured"] * poured, *["packed"] * packed]
@@ -104,7 +110,23 @@ def _stored(digest: str, make: Callable[[], Scene]) -> Scene:
     return scenes
 
 
-def _settle(world: World, drop: Drop, fall: Fall, count: int, costly: bool) -> Scene:
+class _Counter:
+    """Logs now and then how many of `total` scenes are at rest."""
+
+    def __init__(self, total: int) -> None:
+        self._total, self._done, self._logged_at = total, 0, time.monotonic()
+
+    def count(self) -> None:
+        """One more is."""
+        self._done += 1
+        if time.monotonic() - self._logged_at >= _LOGGED_EVERY:
+            self._logged_at = time.monotonic()
+            _LOG.info("settling scenes, once: %d of %d", self._done, self._total)
+
+
+def _settle(
+    world: World, drop: Drop, fall: Fall, count: int, costly: bool, counter: _Counter
+) -> Scene:
     """`count` scenes that are at rest after their fall."""
     fields_of = jax.vmap(functools.partial(model.scene_fields, world))
     settled: list[Scene] = []
@@ -116,13 +138,16 @@ def _settle(world: World, drop: Drop, fall: Fall, count: int, costly: bool) -> S
         fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
         with ThreadPoolExecutor() as threads:
-            settled += [scene for scene in threads.map(fall, drops, rows) if scene is not None]
+            for scene in threads.map(fall, drops, rows):
+                if scene is not None and len(settled) < count:
+                    settled.append(scene)
+                    counter.count()
         dropped += num
         if dropped >= 20 * _ROUND and len(settled) < dropped / 50:
             found = f"only {len(settled)} of {dropped} dropped scenes came to rest in the workspace"
             remedy = "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
             raise SceneError(f"{found}; {remedy}")
-    return _stack(settled[:count])
+    return _stack(settled)
 
 
 def _stack(scenes: list[Scene]) -> Scene:

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import logging
 import os
 import re
 import subprocess
@@ -212,6 +213,15 @@ def test_benchmark_without_its_extra(
     monkeypatch.setitem(sys.modules, "warp", None)  # importing it raises ModuleNotFoundError
     code, line = _fails(capsys, "bench", "warp_action")
     assert (code, "bench warp_action needs the module warp;" in line) == (2, True)
+
+
+def test_long_work_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    """Claim: what the package logs about its work is a line on stderr while a command runs."""
+    logger = logging.getLogger("csac_jax.scene.pool")
+    monkeypatch.setitem(cli.COMMANDS, "doctor", lambda _: print("done") or logger.info("1 of 6"))
+    cli.main(["doctor"])
+    logger.info("2 of 6")
+    assert capsys.readouterr() == ("done\n", "1 of 6\n")
 
 
 READERS = ["train --resume {}", "eval {}", "export {} p.safetensors", "play --policy {}"]

@@ -202,6 +202,18 @@ def test_unwritable_cache_is_no_error(
     assert pool.settled(small, 0, 4).position.shape == (4, 1, 3)
 
 
+def test_settling_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch, small: Config, caplog):
+    """Claim: it counts the scenes of all numbers of blocks, each once, and none of a kept pool."""
+    monkeypatch.setattr(pool, "_LOGGED_EVERY", 0.0)
+    two = small.change(scene={"slots": ("box", "box")})
+    with caplog.at_level("INFO", "csac_jax"):
+        pool.settled(two, 0, 3)
+        pool.settled(two, 0, 3)
+    assert [line.rpartition(": ")[2] for line in caplog.messages] == [
+        f"{number} of 6" for number in range(1, 7)
+    ]
+
+
 def test_hopeless_configuration_is_one_line(small: Config):
     """Claim: a configuration whose blocks never come to rest ends with one line that names what to
     change."""
