@@ -1,6 +1,7 @@
 """Q that goes on inside cells: continuous in the action, and highest between cells if need be."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -191,8 +192,9 @@ def test_what_counts_as_between_cells(learner):
 @pytest.mark.parametrize("kind", ["offset", "small"])
 def test_trained_policy_acts_between_cells(kind):
     """Claim: where a block can be lifted only where cells meet, CEM on the trained net with slopes
-    leaves the best cell by more than half a cell in most states, and lifts in many of them; on the
-    trilinear one it does so in few, and lifts nothing."""
+    leaves the best cell by more than half a cell in most states, gains Q by it in a third of them,
+    and lifts in many; on the trilinear one it leaves for places as good as the cell alone, which
+    between yaws there are, and lifts nothing."""
     cfg = toys.config("csac", actions=2400, max_actions=1)
     cfg = cfg.change(net={"kind": kind}, cem={"candidates": 32, "elites": 6, "rounds": 4})
     toy = toys.precise(cfg)
@@ -209,10 +211,15 @@ def test_trained_policy_acts_between_cells(kind):
     grasp = dense_maps.q[:, Primitive.GRASP], dense_maps.valid[:, Primitive.GRASP]
     best = jax.vmap(lambda q, valid: maps.best_cells(q, valid, 1)[0])(*grasp)
     away = action.pose[:, :2] - learner.frames.xy.reshape(-1, 2)[best]
-    moved = np.mean(np.linalg.norm(away, axis=1) > 0.5 * learner.frames.cell)
+    moved = np.linalg.norm(away, axis=1) > 0.5 * learner.frames.cell
+    read = jax.jit(jax.vmap(functools.partial(maps.read_q, learner.frames)))
+    found = read(dense_maps, action.primitive, action.pose)
+    gain = found - jnp.max(jnp.where(grasp[1], grasp[0], -jnp.inf), axis=(1, 2, 3))
+    better = np.mean(moved & (gain > 0.05))  # a lift is worth more than 1
     if kind == "offset":
-        assert moved > 0.6
+        assert np.mean(moved) > 0.6
+        assert better > 1.0 / 3.0
         assert success > 0.2
     else:
-        assert moved < 0.1
+        assert better == 0.0
         assert success == 0.0
