@@ -121,7 +121,7 @@ class _Counter:
         self._done += 1
         if time.monotonic() - self._logged_at >= _LOGGED_EVERY:
             self._logged_at = time.monotonic()
-            _LOG.info("settling scenes, once: %d of %d", self._done, self._total)
+            _LOG.info("settling scenes: %d of %d", self._done, self._total)
 
 
 def _settle(

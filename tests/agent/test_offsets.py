@@ -192,9 +192,8 @@ def test_what_counts_as_between_cells(learner):
 @pytest.mark.parametrize("kind", ["offset", "small"])
 def test_trained_policy_acts_between_cells(kind):
     """Claim: where a block can be lifted only where cells meet, CEM on the trained net with slopes
-    leaves the best cell by more than half a cell in most states, gains Q by it in a third of them,
-    and lifts in many; on the trilinear one it leaves for places as good as the cell alone, which
-    between yaws there are, and lifts nothing."""
+    leaves the best cell by more than half a cell in most states, in most of all for a higher Q, and
+    lifts in many; on the trilinear one it never leaves for a higher Q, and lifts nothing."""
     cfg = toys.config("csac", actions=2400, max_actions=1)
     cfg = cfg.change(net={"kind": kind}, cem={"candidates": 32, "elites": 6, "rounds": 4})
     toy = toys.precise(cfg)
@@ -215,10 +214,10 @@ def test_trained_policy_acts_between_cells(kind):
     read = jax.jit(jax.vmap(functools.partial(maps.read_q, learner.frames)))
     found = read(dense_maps, action.primitive, action.pose)
     gain = found - jnp.max(jnp.where(grasp[1], grasp[0], -jnp.inf), axis=(1, 2, 3))
-    better = np.mean(moved & (gain > 0.05))  # a lift is worth more than 1
+    better = np.mean(moved & (gain > 0.02))  # less is a tie: outcomes are 0.25 apart
     if kind == "offset":
         assert np.mean(moved) > 0.6
-        assert better > 1.0 / 3.0
+        assert better > 0.5
         assert success > 0.2
     else:
         assert better == 0.0
