@@ -44,13 +44,14 @@ def test_counters_are_weighed_by_time():
         ("input_concatenate_fusion_7", "moves"),
         ("loop_convert_fusion_6", "moves"),
         ("input_reduce_select_fusion_4", "reductions"),
+        ("ncclDevKernel_AllReduce_Sum_f32_RING_LL", "exchanges"),
         ("sort_23_1", "sorts"),
         ("MemcpyD2D", "copies"),
         ("loop_add_fusion_46", "other"),
     ],
 )
 def test_kernels_by_what_they_do(kernel: str, kind: str):
-    """Claim: the names that XLA, cuDNN and Warp give tell what a kernel does."""
+    """Claim: the names that XLA, cuDNN, NCCL and Warp give tell what a kernel does."""
     assert step_kernels.kind(kernel) == kind
 
 

@@ -1,9 +1,11 @@
 """Kernels of a training step on a GPU by what they do, as JSON: `csac-jax bench step_kernels
-[PRESET] [SETTING ...]`, PRESET `quick` if none is given, settings as `csac-jax train` takes them.
+[PRESET] [--devices N] [SETTING ...]`, PRESET `quick` if none is given, settings as `csac-jax train`
+takes them. The scenes of the run lie on N (1) GPUs; the first one's kernels are listed.
 
 One step of a compiled loop, the third, as JAX's profiler traces it: `ms` and `launches` of
 `physics` on Warp, matrix `products` and convolutions, `reductions`, `sorts`, `copies` of memory,
-what `moves` or rearranges arrays, and `other` arithmetic. `busy` is the share of the step's time in
+what `moves` or rearranges arrays, `exchanges` between GPUs, in which they wait for one another, and
+`other` arithmetic. `busy` is the share of the step's time in
 which kernels run, `step_ms`.
 """
 
@@ -17,14 +19,18 @@ from typing import Any
 
 import jax
 from jax.profiler import ProfileData
+from jax.sharding import Mesh
 
+from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.errors import SettingsError
 from csac_jax.runtime import cache, provenance
 from csac_jax.sim import backend
-from csac_jax.training import step
+from csac_jax.sweeps import replicas
+from csac_jax.training import sharding, step
 from experiments.bench._options import Parser, config, split
 
 KINDS = {  # the first that a kernel's name holds
+    "exchanges": r"nccl|all.?reduce|all.?gather",
     "physics": r"_cuda_kernel|__locals__",
     "copies": r"memcpy|memset",
     "products": r"xmma|cutlass|nvjet|gemm|cudnn|convolution",
@@ -59,21 +65,38 @@ def table(kernels: Iterable[tuple[str, float, float]]) -> dict[str, Any]:
 
 
 def _traced(folder: Path) -> Iterable[tuple[str, float, float]]:
-    """What the GPU's streams did."""
+    """What the streams of the first GPU did."""
     (file,) = folder.rglob("*.xplane.pb")
     for plane in ProfileData.from_file(str(file)).planes:
-        for line in plane.lines if "GPU" in plane.name else ():
+        for line in plane.lines if plane.name.endswith("GPU:0") else ():
             for event in line.events if line.name.startswith("Stream") else ():
                 yield event.name, 1e-6 * event.start_ns, 1e-6 * event.end_ns
 
 
+def _compiled(program: step.Program, mesh: Mesh | None) -> tuple[Any, Any]:
+    """The state of a run and its compiled step."""
+    if mesh is None:
+        return step.init(program), step.compile_chunk(program, 1)
+    (group,) = replicas.group_configs([program.cfg])
+    one = replicas.SweepProgram(program, replicas.of_group(group), mesh, "scenes")
+    return one.init(), one.compile_chunk(1)
+
+
 def main(arguments: list[str]) -> None:
-    """Prints the result."""
-    preset, _, flags = split(Parser(prog="bench step_kernels", allow_abbrev=False), arguments)
-    cfg = backend.resolve(config("step_kernels", preset, flags).change(train={"chunk": 1}))
+    """Prints the result. Raises BadArgumentsError for devices that are not there, or do not divide
+    the scenes."""
+    parser = Parser(prog="bench step_kernels", allow_abbrev=False)
+    parser.add_argument("--devices", type=int, default=1)
+    preset, options, flags = split(parser, arguments)
+    cfg = config("step_kernels", preset, flags).change(train={"chunk": 1})
+    cfg = backend.resolve(cfg, options.devices)
+    try:
+        mesh = sharding.make(options.devices)
+        sharding.check(mesh, "scenes", 1, cfg.train.scenes, cfg.learn.batch)
+    except ValueError as error:
+        raise BadArgumentsError(f"bench step_kernels: {error}") from None
     cache.enable()
-    program = step.make(cfg)
-    state, chunk = step.init(program), step.compile_chunk(program, 1)
+    state, chunk = _compiled(step.make(cfg), mesh)
     for _ in range(2):
         state, _ = chunk(state)
     jax.block_until_ready(state)
@@ -81,4 +104,5 @@ def main(arguments: list[str]) -> None:
         with jax.profiler.trace(folder):
             jax.block_until_ready(chunk(state))
         found = table(_traced(Path(folder)))
-    print(json.dumps({"preset": preset, **found, **provenance.record()}, indent=2))
+    sizes = {"preset": preset, "devices": options.devices, "settings": flags}
+    print(json.dumps({**sizes, **found, **provenance.record()}, indent=2))
