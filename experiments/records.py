@@ -211,6 +211,14 @@ BENCHES = {
         "benchmark --share 0.1",
     ),
     "step_kernels/h100-fast": ("kernels of a step by what they do", "bench step_kernels fast"),
+    "step_kernels/h200-fast-8192": (
+        "the same in MJX's physics, 8,192 scenes",
+        "bench step_kernels fast --sim.physics mjx --train.scenes 8192",
+    ),
+    "step_kernels/h200-fast-8192-two": (
+        "the same, the scenes over two GPUs",
+        "bench step_kernels fast --sim.physics mjx --train.scenes 8192 --devices 2",
+    ),
     "step/xeon-quick": ("a step as `quick` was, Intel Xeon", f"bench step {_QUICK}"),
     "step/epyc-quick-scenes": (
         "such a step against scenes",

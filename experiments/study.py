@@ -17,7 +17,11 @@ ROOT = Path(__file__).resolve().parents[1]
 ARCHIVES = ROOT / "experiments" / "results" / "study"
 PAGE = ROOT / "docs" / "study.md"
 BEGIN = "<!-- The rest is written by `python -m experiments.study`. -->\n"
-PARTS = {"1-target": "Part 1, the target task"}
+PARTS = {
+    "1-target": "Part 1, the target task",
+    "1-clear": "Part 1, the table cleared",
+    "1-packed": "Part 1, packed scenes cleared",
+}
 """Name of an archive -> its title."""
 METRICS = ("completion", "grasp_success", "action_efficiency", "pushes_per_episode")
 SUITES = {IN_DISTRIBUTION: "scenes like the training's, 500 episodes", "target": "suite `target`"}
@@ -49,9 +53,10 @@ def page() -> str:
 
 def _part(name: str, path: Path) -> str:
     report = comparison.build(results.read([path]))
+    suites = [suite for suite in SUITES if _scores(report, suite)]
     titled = {"Training": _training(report)}
-    titled |= {f"Greedy: {title}": _greedy(report, suite) for suite, title in SUITES.items()}
-    titled["Differences"] = list(_differences(report))
+    titled |= {f"Greedy: {SUITES[suite]}": _greedy(report, suite) for suite in suites}
+    titled["Differences"] = list(_differences(report, suites))
     text = "".join(f"\n**{title}**\n\n{tables.table_text(one)}\n" for title, one in titled.items())
     return f"\n### {PARTS[name]}\n{text}"
 
@@ -86,31 +91,30 @@ def _methods(found: Sequence[Any]) -> dict[str, Any]:
     return {algo: by_algo[algo] for algo in NAMES if algo in by_algo}
 
 
-def _differences(report: Report) -> Iterator[dict[str, str]]:
+def _differences(report: Report, suites: Sequence[str]) -> Iterator[dict[str, str]]:
     curves = _methods(report.curves)
-    own, target = (_methods(_scores(report, suite)) for suite in SUITES)
-    known = curves.keys() & own.keys() & target.keys()
+    scores = {suite: _methods(_scores(report, suite)) for suite in suites}
     for a, b in PAIRS:
-        if {a, b} <= known:
-            yield {
-                "ahead": NAMES[a],
-                "of": NAMES[b],
-                "area": _verdict([curves[a].area], [curves[b].area]),
-                "completion": _verdict(*(own[one].strata("completion") for one in (a, b))),
-                "completion, suite `target`": _verdict(
-                    *(target[one].strata("completion") for one in (a, b))
-                ),
-            }
+        if all({a, b} <= known.keys() for known in (curves, *scores.values())):
+            row = {"method": NAMES[a], "less": NAMES[b]}
+            row["area"] = _verdict([curves[a].area], [curves[b].area])
+            for suite, known in scores.items():
+                where = "" if suite == IN_DISTRIBUTION else f", suite `{suite}`"
+                completions = (known[one].strata("completion") for one in (a, b))
+                row[f"completion{where}"] = _verdict(*completions)
+            yield row
 
 
 def _verdict(ours: Any, theirs: Any) -> str:
-    """A difference of strata, and what the protocol makes of it."""
+    """A difference of strata, and what the protocol makes of it; where they differ with the
+    probability of improvement, that a seed of ours is above one of theirs."""
     gap = statistics.difference(ours, theirs)
     assert gap.low is not None
     assert gap.high is not None
     small, differ = max(-gap.low, gap.high) <= POINT, not gap.low <= 0.0 <= gap.high
     if differ:
         told = "differ, by less than a point" if small else "differ"
+        told += f", P {100 * statistics.improvement(ours, theirs).value:.0f} %"
     else:
         told = "equivalent" if small else "not told"
     return f"{tables.shown(gap, sign='+')}: {told}"
