@@ -65,7 +65,7 @@ RUNS = {
     "objects/csac_beta": "what `objects` learns on two CPU cores; other work on both",
     "objects/from_shipped": "the same by `--init shipped`; other work on both",
     "objects/from_shipped_slow": "the same, smaller steps and less exploration",
-    "objects/from_shipped_retry": "from `shipped`, bolder retries, decisions by four mirror images",
+    "objects/from_shipped_retry": "from `shipped`, six objects, bolder retries",
     "objects/from_shipped_ten": "from `shipped`, five to ten objects, bolder retries",
     "objects/gpu": "five to ten objects of families alone, `--init shipped`, on a GPU",
     "objects/gpu_mixed": "the same, half of them assemblies, which had no walls yet",

@@ -24,7 +24,7 @@ from csac_jax.sim import backend, physics as simulation, primitives
 from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.training import step as training
 
-SIDE_BY_SIDE = 256  # most episodes that run at once
+SIDE_BY_SIDE = 64  # most episodes that run at once
 PER_CORE = 4  # of them on a CPU: more gain nothing, and the last episodes keep all places busy
 
 Progress = Callable[[str, int, int], None]  # part of the suite, episodes finished, all episodes

@@ -5,8 +5,7 @@ takes them. The scenes of the run lie on N (1) GPUs; the first one's kernels are
 One step of a compiled loop, the third, as JAX's profiler traces it: `ms` and `launches` of
 `physics` on Warp, matrix `products` and convolutions, `reductions`, `sorts`, `copies` of memory,
 what `moves` or rearranges arrays, `exchanges` between GPUs, in which they wait for one another, and
-`other` arithmetic. `busy` is the share of the step's time in
-which kernels run, `step_ms`.
+`other` arithmetic. `busy` is the share of the step's time, `step_ms`, in which kernels run.
 """
 
 import collections
