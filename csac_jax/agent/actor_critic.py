@@ -220,8 +220,9 @@ def best_grasps(
     """
     num = wanted.shape[0]
     size = -(-num // _QUARTERS)
-    places = jnp.argsort(~wanted, stable=True).astype(jnp.int32)
-    rows = jnp.pad(places, (0, -num % size), constant_values=num).reshape(-1, size)
+    # Not by argsort: on several devices, XLA without Shardy ends the process on keys that none reads.
+    places = jnp.nonzero(wanted, size=num + -num % size, fill_value=num)[0]
+    rows = places.astype(jnp.int32).reshape(-1, size)
 
     def left(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
         return carry[0] * size < jnp.sum(wanted)

@@ -14,6 +14,7 @@ busy machine ratios are worth less than those of `bench step`.
 import dataclasses
 import json
 import statistics
+import sys
 import time
 from typing import Any
 
@@ -99,12 +100,13 @@ def main(arguments: list[str]) -> None:
         if with_train
         else None
     )
-    rows = [
-        measure(program, seeds, devices, options.shard, options.steps, options.repeats)
-        for devices in options.devices
-        for seeds in options.seeds
-        if options.shard == "scenes" or seeds % devices == 0
-    ]
+    rows = []
+    for devices in options.devices:
+        for seeds in options.seeds:
+            if options.shard == "scenes" or seeds % devices == 0:
+                row = measure(program, seeds, devices, options.shard, options.steps, options.repeats)
+                print(f"bench sweep: {json.dumps(row)}", file=sys.stderr)
+                rows.append(row)
     sizes = {
         "scenes": cfg.train.scenes,
         "batch": cfg.learn.batch,
