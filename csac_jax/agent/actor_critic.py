@@ -220,7 +220,7 @@ def best_grasps(
     """
     num = wanted.shape[0]
     size = -(-num // _QUARTERS)
-    # Not by argsort: on several devices, XLA without Shardy ends the process on keys that none reads.
+    # Not by a sort: one whose keys nobody reads ends the process on several devices without Shardy.
     places = jnp.nonzero(wanted, size=num + -num % size, fill_value=num)[0]
     rows = places.astype(jnp.int32).reshape(-1, size)
 

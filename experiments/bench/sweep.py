@@ -8,10 +8,12 @@ them: its compilation and the median of REPEATS (3) rounds after one that is not
 seeds, numbers of seeds that the devices do not divide are left out. Beside a row of one seed on one
 device, `train` is its program as `csac-jax train` has it. `parts` is how many parts the seeds run
 in, see `Pipelined` in csac_jax/sweeps/replicas.py. Configurations follow one another, so that on a
-busy machine ratios are worth less than those of `bench step`.
+busy machine ratios are worth less than those of `bench step`. Rows are told on standard error as
+they come.
 """
 
 import dataclasses
+import itertools
 import json
 import statistics
 import sys
@@ -101,12 +103,11 @@ def main(arguments: list[str]) -> None:
         else None
     )
     rows = []
-    for devices in options.devices:
-        for seeds in options.seeds:
-            if options.shard == "scenes" or seeds % devices == 0:
-                row = measure(program, seeds, devices, options.shard, options.steps, options.repeats)
-                print(f"bench sweep: {json.dumps(row)}", file=sys.stderr)
-                rows.append(row)
+    for devices, seeds in itertools.product(options.devices, options.seeds):
+        if options.shard == "scenes" or seeds % devices == 0:
+            row = measure(program, seeds, devices, options.shard, options.steps, options.repeats)
+            print(f"bench sweep: {json.dumps(row)}", file=sys.stderr)
+            rows.append(row)
     sizes = {
         "scenes": cfg.train.scenes,
         "batch": cfg.learn.batch,

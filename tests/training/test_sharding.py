@@ -49,6 +49,13 @@ def test_eight_devices_are_one(tmp_path: Path):
     assert found["scenes"]["parts"] == [[2, 1], [2, 3]]
 
 
+def test_seeds_on_eight_devices_compile_without_shardy():
+    """Claim: the learner's step compiles with a seed on each device by the partitioner before
+    Shardy. It ended the process on a sort whose keys nobody read."""
+    found = _eight("tests.sweeps.eight_by_seeds", flags="--xla_backend_optimization_level=0")
+    assert found == {"devices": 8}
+
+
 @pytest.mark.slow
 def test_eight_devices_learn_as_one():
     """Claim: training steps of `smoke`, a scene on each of eight devices, give what one device
