@@ -220,6 +220,10 @@ BENCHES = {
         "the same, the scenes over two GPUs",
         "bench step_kernels fast --sim.physics mjx --train.scenes 8192 --devices 2",
     ),
+    "step_kernels/h200-fast-8192-four": (
+        "the same, the scenes over four GPUs",
+        "bench step_kernels fast --sim.physics mjx --train.scenes 8192 --devices 4",
+    ),
     "step/xeon-quick": ("a step as `quick` was, Intel Xeon", f"bench step {_QUICK}"),
     "step/epyc-quick-scenes": (
         "such a step against scenes",
@@ -277,8 +281,13 @@ BENCHES = {
     ),
     "sweep/h200-fast-scenes8192": (
         "8,192 scenes of one seed over GPUs",
-        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 1 "
-        f"--shard scenes --train.scenes 8192 --learn.updates 64 {_NET}",
+        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 4 --seeds 1 "
+        "--shard scenes --train.scenes 8192",
+    ),
+    "sweep/h100-fast-seeds1024": (
+        "eight seeds over GPUs, 1,024 scenes each",
+        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 4 --seeds 8 "
+        "--train.scenes 1024",
     ),
     "act/cpu": ("dense Q maps of DenseNet-121", "bench act --pixels 64 --states 4 --repeats 7"),
     "act/h200": ("dense Q maps of DenseNet-121 and VPG's way in PyTorch", "bench act"),

@@ -35,6 +35,10 @@ from csac_jax.cli import (
 )
 from csac_jax.cli.failures import PROGRAM, BadArgumentsError, complain
 from csac_jax.errors import DataWarning, DeviceError, FailedError, SettingsError
+from csac_jax.io import files
+
+_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # XLA's name for it
+_LESS = "lower --replay.capacity, --train.scenes, --learn.batch or --seeds, or raise --devices"
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
@@ -133,10 +137,13 @@ def _dispatch(arguments: list[str]) -> int:
         raise BadArgumentsError(algorithms.unknown("command", name, COMMANDS))
     try:
         return COMMANDS[name](_on_device(rest))
-    except (RuntimeError, AssertionError):
+    except (RuntimeError, AssertionError) as error:
         from csac_jax.runtime import devices
 
         devices.require()  # JAX may have started without a device
+        if _OUT_OF_MEMORY in str(error):
+            reason = files.first_line(error)
+            raise FailedError(f"the device is out of memory; {_LESS} ({reason})") from None
         raise
 
 

@@ -7,6 +7,8 @@ A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSO
 
 import contextlib
 import dataclasses
+import functools
+import json
 import lzma
 import os
 import tarfile
@@ -301,15 +303,28 @@ def variant(config: Json) -> Variant:
     preset, algo = config.get("preset", ""), configs.algorithm(config)
     base: Json = {}
     with contextlib.suppress(ValueError):  # a name that is no more
-        base = configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
+        base = _preset_settings(preset, algo)
+    settings = configs.flat(config)
     with contextlib.suppress(ValueError):  # written by a version that knew other settings
-        config = configs.to_dict(configs.from_dict(config))
+        settings = _settings(json.dumps({**config, "seed": 0}))
     changed = tuple(
         (name, _text(value))
-        for name, value in configs.flat(config).items()
+        for name, value in settings.items()
         if value != base.get(name, value) and name not in (*NAMED, *HOST)
     )
     return Variant(preset, algo, changed)
+
+
+@functools.cache
+def _preset_settings(preset: str, algo: str) -> Json:
+    """Settings by their dotted names. Raises ValueError if one of the names is unknown."""
+    return configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
+
+
+@functools.lru_cache(maxsize=64)  # ours: a folder's runs mostly differ in their seed
+def _settings(text: str) -> Json:
+    """Those of a recorded config. Raises ValueError if they are not of this version."""
+    return configs.flat(configs.to_dict(configs.from_dict(json.loads(text))))
 
 
 def world(config: Json) -> tuple[str, str]:

@@ -8,6 +8,7 @@ import threading
 import time
 from pathlib import Path
 
+import jax.numpy as jnp
 import pytest
 from rich.console import Console
 
@@ -64,6 +65,20 @@ def test_exit_codes(
     monkeypatch.setitem(cli.COMMANDS, "doctor", _raises(error))
     assert cli.main(["doctor"]) == code
     assert capsys.readouterr() == ("", f"csac-jax: {line}\n")
+
+
+def test_out_of_memory(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    """Claim: an allocation that XLA refuses is one line with what to lower; other errors of XLA are
+    not taken for it."""
+    monkeypatch.setitem(cli.COMMANDS, "doctor", lambda _: jnp.zeros(2**48).block_until_ready())
+    assert cli.main(["doctor"]) == 1
+    shown, complaint = capsys.readouterr()
+    assert shown == ""
+    assert complaint.startswith("csac-jax: the device is out of memory; lower --replay.capacity")
+    assert complaint.count("\n") == 1
+    monkeypatch.setitem(cli.COMMANDS, "doctor", _raises(RuntimeError("INTERNAL: no")))
+    with pytest.raises(RuntimeError, match="INTERNAL: no"):
+        cli.main(["doctor"])
 
 
 @pytest.mark.parametrize(("arguments", "code"), [([], 2), (["-h"], 0), (["--help"], 0)])
