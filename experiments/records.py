@@ -167,9 +167,9 @@ BENCHES = {
         "train fast --seed 4 --train.actions 122880",
     ),
     "doctor/h100": ("Warp's kernels of `fast`, built from nothing", "doctor --build"),
-    "start/xeon-quick": (
-        "how soon `quick` as it was learned, and did in commit 71c8723; five seeds side by side",
-        f"bench start {_QUICK} --runs 5 --cores 2 --other CHECKOUT",
+    "start/epyc-quick": (
+        "how soon `quick` learns, and did in commit 71c8723, one run after another",
+        "bench start quick --other CHECKOUT",
     ),
     "warp_action/h100-2048": (
         "an action on Warp, kernel by kernel",
