@@ -166,6 +166,17 @@ BENCHES = {
         "with CUDA_VISIBLE_DEVICES=1",
         "train fast --seed 4 --train.actions 122880",
     ),
+    "train/h200-fast-single": (
+        "a process on one of four H200s, nothing beside it",
+        "train fast --seed 0 --train.actions 163840",
+    ),
+    **{
+        f"train/h200-fast-four-{gpu}": (
+            f"with CUDA_VISIBLE_DEVICES={gpu}, four at the same time",
+            f"train fast --seed {gpu} --train.actions 163840",
+        )
+        for gpu in range(4)
+    },
     "doctor/h100": ("Warp's kernels of `fast`, built from nothing", "doctor --build"),
     "start/epyc-quick": (
         "how soon `quick` learns, and did in commit 71c8723, one run after another",
@@ -271,8 +282,9 @@ BENCHES = {
         f"bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 4 {_WIDE}",
     ),
     "sweep/h200-fast-seeds8": (
-        "eight seeds over GPUs",
-        f"bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 --seeds 8 {_WIDE}",
+        "eight seeds over GPUs, 2,048 scenes each",
+        "bench sweep fast --physics mjx --steps 1 --repeats 1 --devices 1 2 4 --seeds 8 "
+        "--train.scenes 2048",
     ),
     "sweep/h200-fast-scenes": (
         "scenes of one seed over GPUs, 128 updates",

@@ -1,6 +1,7 @@
 """Kernels of a training step on a GPU by what they do, as JSON: `csac-jax bench step_kernels
-[PRESET] [--devices N] [SETTING ...]`, PRESET `quick` if none is given, settings as `csac-jax train`
-takes them. The scenes of the run lie on N (1) GPUs; the first one's kernels are listed.
+[PRESET] [--devices N] [--seeds N] [SETTING ...]`, PRESET `quick` if none is given, settings as
+`csac-jax train` takes them. The scenes of a run, or the seeds if there are several, lie on N (1)
+GPUs; the first one's kernels are listed.
 
 One step of a compiled loop, the third, as JAX's profiler traces it: `ms` and `launches` of
 `physics` on Warp, matrix `products` and convolutions, `reductions`, `sorts`, `copies` of memory,
@@ -9,6 +10,7 @@ what `moves` or rearranges arrays, `exchanges` between GPUs, in which they wait 
 """
 
 import collections
+import dataclasses
 import json
 import re
 import tempfile
@@ -72,30 +74,39 @@ def _traced(folder: Path) -> Iterable[tuple[str, float, float]]:
                 yield event.name, 1e-6 * event.start_ns, 1e-6 * event.end_ns
 
 
-def _compiled(program: step.Program, mesh: Mesh | None) -> tuple[Any, Any]:
-    """The state of a run and its compiled step."""
-    if mesh is None:
+def _compiled(program: step.Program, mesh: Mesh | None, seeds: int) -> tuple[Any, Any]:
+    """The state of a run, or of several seeds, and its compiled step."""
+    if mesh is None and seeds == 1:
         return step.init(program), step.compile_chunk(program, 1)
-    (group,) = replicas.group_configs([program.cfg])
-    one = replicas.SweepProgram(program, replicas.of_group(group), mesh, "scenes")
-    return one.init(), one.compile_chunk(1)
+    configs = [dataclasses.replace(program.cfg, seed=seed) for seed in range(seeds)]
+    (group,) = replicas.group_configs(configs)
+    runs = replicas.SweepProgram(program, replicas.of_group(group), mesh, _shard(seeds))
+    return runs.init(), runs.compile_chunk(1)
+
+
+def _shard(seeds: int) -> sharding.Shard:
+    return "seeds" if seeds > 1 else "scenes"
 
 
 def main(arguments: list[str]) -> None:
     """Prints the result. Raises BadArgumentsError for devices that are not there, or do not divide
-    the scenes."""
+    the scenes or the seeds."""
     parser = Parser(prog="bench step_kernels", allow_abbrev=False)
-    parser.add_argument("--devices", type=int, default=1)
+    for name in ("--devices", "--seeds"):
+        parser.add_argument(name, type=int, default=1)
     preset, options, flags = split(parser, arguments)
     cfg = config("step_kernels", preset, flags).change(train={"chunk": 1})
-    cfg = backend.resolve(cfg, options.devices)
+    seeds = options.seeds
+    if seeds < 1:
+        raise BadArgumentsError("bench step_kernels: --seeds: at least 1")
+    cfg = backend.resolve(cfg, options.devices, seeds)
     try:
         mesh = sharding.make(options.devices)
-        sharding.check(mesh, "scenes", 1, cfg.train.scenes, cfg.learn.batch)
+        sharding.check(mesh, _shard(seeds), seeds, cfg.train.scenes, cfg.learn.batch)
     except ValueError as error:
         raise BadArgumentsError(f"bench step_kernels: {error}") from None
     cache.enable()
-    state, chunk = _compiled(step.make(cfg), mesh)
+    state, chunk = _compiled(step.make(cfg), mesh, seeds)
     for _ in range(2):
         state, _ = chunk(state)
     jax.block_until_ready(state)
@@ -103,5 +114,5 @@ def main(arguments: list[str]) -> None:
         with jax.profiler.trace(folder):
             jax.block_until_ready(chunk(state))
         found = table(_traced(Path(folder)))
-    sizes = {"preset": preset, "devices": options.devices, "settings": flags}
+    sizes = {"preset": preset, "devices": options.devices, "seeds": seeds, "settings": flags}
     print(json.dumps({**sizes, **found, **provenance.record()}, indent=2))
