@@ -98,13 +98,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _logged() -> Iterator[None]:
     """In the block stderr has a line for what the package logs about long work."""
     logger, handler = logging.getLogger(csac_jax.__name__), logging.StreamHandler()
-    before = logger.level
+    level, propagate = logger.level, logger.propagate
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
+    logger.propagate = False  # Orbax gives the root logger a handler
     try:
         yield
     finally:
-        logger.setLevel(before)
+        logger.setLevel(level)
+        logger.propagate = propagate
         logger.removeHandler(handler)
 
 

@@ -33,6 +33,7 @@ TRAIN_STREAM = 0
 _VERSION = 5  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _ROUND = 128  # scenes dropped per round
+_MOST_DROPPED = 12  # blocks that drop all at once: of 20, one scene in 24 stays in the workspace
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
 _DRAWS = 20  # of objects, for which there must be room side by side
@@ -73,8 +74,9 @@ def settled(
 
     NumPy leaves [P, N, ...], fewest blocks first; the same for the same arguments on every machine
     of one kind. Every block in play is at rest, its centre within extent / 2 of the workspace
-    centre, so a scene can be rotated by any yaw. Blocks drop all at once, stacked in the air, or if
-    `poured` one after another, from `drop_height` above the pile; one that rolls off drops again.
+    centre, so a scene can be rotated by any yaw. Up to 12 blocks drop all at once, stacked in the
+    air. More, or all if `poured`, drop one after another, from `drop_height` above the pile; one
+    that rolls off drops again.
     If `packed`, objects of a library stand on the table side by side, see `stock.packed`.
     Logs every few seconds how far it is. Raises SceneError where hardly any scene comes to rest.
     """
@@ -82,18 +84,22 @@ def settled(
 
     def settle() -> Scene:
         world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
-        fall = functools.partial(pour if poured else rest, world, scene, cfg.heightmap.extent)
         rng = np.random.default_rng([stream, 20221])
         draw = _stand if packed else _drop
-        drops = [
-            functools.partial(draw, scene, rng, number)
-            for number in range(scene.min_blocks, len(scene.slots) + 1)
-        ]
-        counter = _Counter(count * len(drops))
-        parts = [_settle(world, drop, fall, count, poured or packed, counter) for drop in drops]
+        numbers = range(scene.min_blocks, len(scene.slots) + 1)
+        counter = _Counter(count * len(numbers))
+        parts = []
+        for number in numbers:
+            drop = functools.partial(draw, scene, rng, number)
+            pouring = poured or (number > _MOST_DROPPED and not packed)
+            way = pour if pouring else rest
+            fall = functools.partial(way, world, scene, cfg.heightmap.extent)
+            parts.append(_settle(world, drop, fall, count, pouring or packed, counter))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
-    how = [*["poured"] * poured, *["packed"] * packed]
+    how = ["poured"] * poured + ["packed"] * packed
+    if len(scene.slots) > _MOST_DROPPED and not how:
+        how = [f"poured above {_MOST_DROPPED}"]
     return _stored(_digest(cfg, stream, count, *how), settle)
 
 

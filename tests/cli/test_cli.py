@@ -216,8 +216,10 @@ def test_benchmark_without_its_extra(
 
 
 def test_long_work_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
-    """Claim: what the package logs about its work is a line on stderr while a command runs."""
-    logger = logging.getLogger("csac_jax.scene.pool")
+    """Claim: what the package logs about its work is one line on stderr while a command runs, also
+    where a library has given the root logger a handler."""
+    logger, root = logging.getLogger("csac_jax.scene.pool"), logging.StreamHandler(sys.stderr)
+    monkeypatch.setattr(logging.getLogger(), "handlers", [root])
     monkeypatch.setitem(cli.COMMANDS, "doctor", lambda _: print("done") or logger.info("1 of 6"))
     cli.main(["doctor"])
     logger.info("2 of 6")
