@@ -1,0 +1,174 @@
+"""Traced training programs on disk: a run whose program was traced before begins without a trace.
+
+From a warm cache of compiled programs, tracing is more than half of what a start takes. JAX exports
+what it traced as StableHLO, next to the compiled programs. A file's name is a digest of all that
+decides the trace: settings but for the seed, sources of the package, versions, JAX's own settings,
+world and scenes. What has another name is traced. Only programs of one CPU are kept, in C's or
+MJX's physics.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from jax import export
+
+import csac_jax
+from csac_jax.env import Env
+from csac_jax.runtime import compiler, provenance
+from csac_jax.scene import stock
+from csac_jax.sim import c_physics, host_call
+from csac_jax.training import step
+from csac_jax.training.step import Program
+
+MOST = 64  # programs that are kept, of some MB each; those unused for longest go first
+_UNTRACED = ("cache", "logging")  # parts of names of JAX's settings that leave a trace as it is
+_CHECKSUM = 32  # bytes
+
+
+def compile_chunk(program: Program, num_steps: int) -> Any:
+    """As `step.compile_chunk`, for a program without parts of your own; what it gives has `lower`
+    alone, and traces only where no program of that name is kept."""
+    jitted, folder = step.compile_chunk(program, num_steps), _folder()
+    if folder is None or not (isinstance(program, Program) and _is_named(program)):
+        return jitted
+    return _Chunk(jitted, program, num_steps, folder)
+
+
+def _folder() -> Path | None:
+    """Where programs are kept; None where JAX keeps none on a disk."""
+    chosen = jax.config.jax_compilation_cache_dir
+    on = jax.config.jax_enable_compilation_cache and chosen and "://" not in chosen
+    return Path(chosen) / "traced" if on else None
+
+
+def _is_named(program: Program) -> bool:
+    """Whether a name holds all that the program is made of."""
+    one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
+    if not (one_cpu and program.mesh is None and type(program.env) is Env):
+        return False
+    if type(program.env.physics) is c_physics.CPhysics:
+        return True
+    if program.cfg.sim.physics != "mjx":
+        return False
+    from csac_jax.sim import mjx_physics  # slow to import; the program has done it
+
+    return type(program.env.physics) is mjx_physics.MjxPhysics
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Chunk:
+    """What lowers a chunk of a program."""
+
+    jitted: Any
+    program: Program
+    num_steps: int
+    folder: Path
+
+    def lower(self, state: Any) -> Any:
+        """The chunk lowered for such a state, as that of `step.compile_chunk` does it."""
+        leaves, tree = jax.tree.flatten(state)
+        path = self.folder / name(self.program, self.num_steps, leaves, tree)
+        kept = _read(path)
+        if kept is None:
+            kept = self._export(leaves, tree)
+            _write(path, kept)
+        else:
+            _register_calls(self.program, state)
+        exported = export.deserialize(bytearray(kept))
+        result = jax.tree.structure((tree.unflatten(leaves), _BLANK))
+
+        def chunk(state: Any) -> Any:
+            return jax.tree.unflatten(result, exported.call(*jax.tree.leaves(state)))
+
+        options = compiler.options(self.program.cfg)
+        return jax.jit(chunk, donate_argnums=0, compiler_options=options).lower(state)
+
+    def _export(self, leaves: list[Any], tree: Any) -> bytes:
+        """The traced chunk, from leaves to leaves: JAX does not export the classes of trees."""
+
+        def flat(*given: Any) -> list[Any]:
+            return jax.tree.leaves(self.jitted.__wrapped__(jax.tree.unflatten(tree, given)))
+
+        unchecked = [export.DisabledSafetyCheck.custom_call(host_call.TARGET)]
+        return bytes(export.export(jax.jit(flat), disabled_checks=unchecked)(*leaves).serialize())
+
+
+_BLANK = step.StepMetrics(*range(len(step.StepMetrics._fields)))
+
+
+def _register_calls(program: Program, state: Any) -> None:
+    """Makes the functions of the host known that the environment's step calls."""
+    env, shape = program.env, jax.ShapeDtypeStruct
+    scene = jax.tree.map(lambda leaf: shape(leaf.shape[1:], leaf.dtype), state.scenes)
+    action = jax.tree.map(lambda spec: shape(spec.shape, spec.dtype), env.action_spec)
+    jax.eval_shape(env.step, scene, action)
+
+
+def name(program: Program, num_steps: int, leaves: list[Any], tree: Any) -> str:
+    """A digest of all that decides the trace of a chunk, for a state of these leaves and tree."""
+    cfg, env = program.cfg, program.env
+    world = env.physics.world.model
+    stored = np.empty(mujoco.mj_sizeModel(world), np.uint8)
+    mujoco.mj_saveModel(world, None, stored)
+    settings = {
+        key: value
+        for key, value in jax.config.values.items()
+        if not any(part in key for part in _UNTRACED)
+    }
+    told = (
+        dataclasses.replace(cfg, seed=0, preset=""),
+        num_steps,
+        env.gripper,
+        (env.any_yaw, env.max_failures),
+        stock.library(cfg.scene).sha256 if cfg.scene.has_objects else "",
+        sorted(provenance.versions().items()),
+        sorted(settings.items()),
+        compiler.options(cfg),
+        [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
+        str(tree),
+        _sources(),
+    )
+    digest = hashlib.sha256(repr(told).encode())
+    for array in (stored, *jax.tree.leaves(env.scenes)):
+        digest.update(array.tobytes())
+    return digest.hexdigest()[:40]
+
+
+@functools.cache
+def _sources() -> str:
+    """Digest of the package's code."""
+    digest, root = hashlib.sha256(), Path(csac_jax.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> bytes | None:
+    """What is kept there; None if there is nothing, or it is damaged."""
+    try:
+        content = path.read_bytes()
+        os.utime(path)
+    except OSError:
+        return None
+    checksum, kept = content[:_CHECKSUM], content[_CHECKSUM:]
+    return kept if hashlib.sha256(kept).digest() == checksum else None
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Keeps it for later runs; a folder that cannot be written is no error."""
+    temporary = path.with_suffix(f".{os.getpid()}")
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
+        temporary.replace(path)
+        newest = sorted(path.parent.iterdir(), key=lambda kept: -kept.stat().st_mtime)
+        for old in newest[MOST:]:
+            old.unlink()
