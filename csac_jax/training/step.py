@@ -289,8 +289,9 @@ def init(program: Program) -> TrainState:
 
 
 def compile_init(program: Program) -> Callable[[], TrainState]:
-    """A jitted `init`; its shapes and its state are of one trace."""
-    return jax.jit(lambda: init_state(program, jax.random.key(program.cfg.seed)))
+    """A jitted `init`; its shapes and its state are of one trace, the same for every seed."""
+    begin = jax.jit(functools.partial(init_state, program))
+    return lambda: begin(jax.random.key(program.cfg.seed))
 
 
 def prepare(program: Program) -> None:
