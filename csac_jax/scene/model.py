@@ -2,6 +2,8 @@
 
 import copy
 import dataclasses
+import functools
+import hashlib
 from typing import NamedTuple
 
 import jax
@@ -42,6 +44,14 @@ class World:
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
     mesh_scale: float  # size of compiled meshes of blocks relative to nominal
     objects: Bodies | None = None  # what slots of kind object hold; None where there are none
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Of the model, the slots and their objects' densities; the same in every process."""
+        stored = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, stored)
+        own = () if self.objects is None else self.objects.tables.heaviness.tolist()
+        return hashlib.sha256(stored.tobytes() + repr((self.slots, own)).encode()).hexdigest()
 
     @property
     def finger_qpos(self) -> int:

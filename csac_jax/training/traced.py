@@ -16,8 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import mujoco
-import numpy as np
 from jax import export
 
 import csac_jax
@@ -115,9 +113,6 @@ def _register_calls(program: Program, state: Any) -> None:
 def name(program: Program, num_steps: int, leaves: list[Any], tree: Any) -> str:
     """A digest of all that decides the trace of a chunk, for a state of these leaves and tree."""
     cfg, env = program.cfg, program.env
-    world = env.physics.world.model
-    stored = np.empty(mujoco.mj_sizeModel(world), np.uint8)
-    mujoco.mj_saveModel(world, None, stored)
     settings = {
         key: value
         for key, value in jax.config.values.items()
@@ -126,6 +121,7 @@ def name(program: Program, num_steps: int, leaves: list[Any], tree: Any) -> str:
     told = (
         dataclasses.replace(cfg, seed=0, preset=""),
         num_steps,
+        env.physics.world.digest,
         env.gripper,
         (env.any_yaw, env.max_failures),
         stock.library(cfg.scene).sha256 if cfg.scene.has_objects else "",
@@ -137,7 +133,7 @@ def name(program: Program, num_steps: int, leaves: list[Any], tree: Any) -> str:
         _sources(),
     )
     digest = hashlib.sha256(repr(told).encode())
-    for array in (stored, *jax.tree.leaves(env.scenes)):
+    for array in jax.tree.leaves(env.scenes):
         digest.update(array.tobytes())
     return digest.hexdigest()[:40]
 
