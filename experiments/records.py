@@ -178,6 +178,10 @@ BENCHES = {
         for gpu in range(4)
     },
     "doctor/h100": ("Warp's kernels of `fast`, built from nothing", "doctor --build"),
+    "start/epyc-quick-first": (
+        "the first action of `quick`, and in commit 71c8723, one run after another",
+        "bench start quick --train.actions 80 --other CHECKOUT",
+    ),
     "start/epyc-quick": (
         "how soon `quick` learns, and did in commit 71c8723, one run after another",
         "bench start quick --other CHECKOUT",
