@@ -91,7 +91,7 @@ def train(
     with Terminal(Console(quiet=not verbose)) as terminal:
         terminal.say(_first_line(folder, cfg))
         program = step.make(cfg, learner=learner, sampler=sampler, network=network)
-        own = (learner, sampler, network) != (None,) * 3
+        own = any(part is not None for part in (learner, sampler, network))
         compile_chunk = step.compile_chunk if own else traced.compile_chunk
         follower = followers.joined(callbacks)
         if plan is not None:

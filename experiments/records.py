@@ -87,7 +87,7 @@ RUNS = {
     "fast/csac_beta": "what `fast` learns on one GPU",
     "fast/short": "half as many actions",
     "fast/half_rate": "half the learning rate",
-    "fast/scenes_8192": "twice as many scenes, hence half as many updates",
+    "fast/scenes_8192": "twice as many scenes, half as many updates",
     "fast/slow_decay": "half as many actions, exploration that ends later",
     "fast/scenes_4096": "exploration that ends later, one and a half times as many actions",
     "fast/scenes_2048": "half the scenes, fewer actions, a net with three times the parameters",
@@ -154,10 +154,7 @@ BENCHES = {
         "the target task",
         "train fast --task.kind target --train.actions 61440",
     ),
-    "train/h100-fast-alone": (
-        "a process, nothing beside it",
-        "train fast --seed 3 --train.actions 122880",
-    ),
+    "train/h100-fast-alone": ("a process alone", "train fast --seed 3 --train.actions 122880"),
     "train/h100-fast-pair-0": (
         "with CUDA_VISIBLE_DEVICES=0, at the same time as the next",
         "train fast --seed 4 --train.actions 122880",
@@ -167,7 +164,7 @@ BENCHES = {
         "train fast --seed 4 --train.actions 122880",
     ),
     "train/h200-fast-single": (
-        "a process on one of four H200s, nothing beside it",
+        "a process alone on one of four H200s",
         "train fast --seed 0 --train.actions 163840",
     ),
     **{

@@ -289,7 +289,8 @@ def init(program: Program) -> TrainState:
 
 
 def compile_init(program: Program) -> Callable[[], TrainState]:
-    """A jitted `init`; its shapes and its state are of one trace, the same for every seed."""
+    """What makes the first state, jitted: shapes and state are of one trace, and every seed of one
+    program."""
     begin = jax.jit(functools.partial(init_state, program))
     return lambda: begin(jax.random.key(program.cfg.seed))
 
