@@ -93,6 +93,8 @@ RUNS = {
     "fast/scenes_2048": "half the scenes, fewer actions, a net with three times the parameters",
     "fast/long": "the same, three times as many actions",
     "fast/shipped": "the shipped policy (seed 0) on every suite",
+    "fast/piles": "10 to 30 blocks, most of them poured, by `--init shipped`",
+    "fast/clutter": "the policy `shipped_clutter`, from `fast/piles`",
     "fast/camera": "the policy `shipped_camera`, by `--init shipped`",
     "fast/camera_heights": "the same of heights alone, from nothing; stopped at 159,744 actions",
     "fast/updates_128": "2,048 scenes, the wide net, 128 updates",
@@ -235,6 +237,18 @@ BENCHES = {
     "step_kernels/h200-fast-8192-four": (
         "the same, the scenes over four GPUs",
         "bench step_kernels fast --sim.physics mjx --train.scenes 8192 --devices 4",
+    ),
+    "step_kernels/h200-fast-seeds8": (
+        "the same, eight seeds of 2,048 scenes",
+        "bench step_kernels fast --sim.physics mjx --train.scenes 2048 --seeds 8",
+    ),
+    "step_kernels/h200-fast-seeds8-two": (
+        "the same, the seeds over two GPUs",
+        "bench step_kernels fast --sim.physics mjx --train.scenes 2048 --seeds 8 --devices 2",
+    ),
+    "step_kernels/h200-paper_small-16": (
+        "the same of 16 seeds of `paper_small`",
+        "bench step_kernels paper_small --sim.physics c --seeds 16",
     ),
     "step/xeon-quick": ("a step as `quick` was, Intel Xeon", f"bench step {_QUICK}"),
     "step/epyc-quick-scenes": (

@@ -23,6 +23,7 @@ PolicyName = Literal[
     "shipped",
     "shipped_grasp_only",
     "shipped_camera",
+    "shipped_clutter",
     "shipped_objects",
     "shipped_target",
     "geometric",

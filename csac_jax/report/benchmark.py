@@ -80,6 +80,7 @@ POLICIES: dict[str, Callable[[], Policy]] = {
     "shipped": lambda: policies.load("shipped"),
     "shipped_grasp_only": _grasps_alone,
     "shipped_camera": lambda: policies.load("shipped_camera"),
+    "shipped_clutter": lambda: policies.load("shipped_clutter"),
     "shipped_objects": lambda: policies.load("shipped_objects"),
     "shipped_target": lambda: policies.load("shipped_target"),
     "geometric": lambda: policies.POLICIES["geometric"]("shipped"),

@@ -139,6 +139,7 @@ def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: 
     [
         ("shipped", "fast", "clear", "ortho", "rg2"),
         ("shipped_camera", "fast", "clear", "oblique", "rg2"),
+        ("shipped_clutter", "fast", "clear", "ortho", "rg2"),
         ("shipped_grippers", "fast", "clear", "ortho", "varied"),
         ("shipped_objects", "objects", "clear", "ortho", "rg2"),
         ("shipped_target", "objects_target", "target", "ortho", "rg2"),
