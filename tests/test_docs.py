@@ -24,6 +24,7 @@ from csac_jax.io import checkpoint, configs
 
 ROOT = Path(csac_jax.__file__).parents[1]
 README = ROOT / "README.md"
+METRICS = ("completion", "grasp_success", "action_efficiency")
 ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
 OBJECTS = ROOT / "docs" / "objects.md"  # likewise
 GRIPPERS = ROOT / "docs" / "grippers.md"
@@ -273,29 +274,33 @@ def test_sentences_of_pages_are_short(folder: str):
     assert not [" ".join(words) for words in sentences if len(words) > SENTENCE]
 
 
-def test_readme_has_the_recorded_numbers():
+@pytest.mark.parametrize(
+    ("policy", "record"),
+    [
+        ("shipped", {"random10": "fast/shipped/seed-0/eval-random10-c.json"}),
+        (
+            "shipped_clutter",
+            {
+                "cases": "fast/clutter/seed-1/eval-cases.json",
+                "random30": "fast/clutter/seed-1/eval-random30.json",
+            },
+        ),
+        ("shipped_objects", {"pile": "objects/gpu_hollow/seed-0/eval-pile.json"}),
+    ],
+)
+def test_readme_has_the_recorded_numbers(policy: str, record: dict[str, str]):
     """Claim: what README says of the shipped policies is what was recorded."""
-    folder = ROOT / "experiments" / "results" / "fast" / "shipped" / "seed-0"
-    rows = [row.split("|") for row in README.read_text().splitlines() if "**shipped**" in row]
-    said = [[re.findall(r"[\d.]+", cell) for cell in row[3:6]] for row in rows]
-    for name, numbers in zip(("cases", "random30", "random10"), said, strict=True):
-        measured = json.loads((folder / f"eval-{name}-c.json").read_text())
+    lines = README.read_text().splitlines()
+    rows = [row.split("|")[3:6] for row in lines if f"**{policy}**" in row]
+    for (name, path), row in zip(record.items(), rows, strict=True):
+        said = [[float(number) for number in re.findall(r"[\d.]+", cell)] for cell in row]
+        measured = json.loads((ROOT / "experiments" / "results" / path).read_text())
         parts = measured.get("parts", {name: measured}).values()
-        for metric, shown in zip(("completion", "grasp_success"), numbers, strict=False):
-            values = [100 * part[metric]["value"] for part in parts]
-            assert [float(shown[0]), float(shown[-1])] == pytest.approx(
-                [min(values), max(values)], abs=0.5 if "." not in shown[0] else 0.06
-            )
-        rates = [part["action_efficiency"]["value"] for part in parts]
-        bounds = [float(numbers[2][0]), float(numbers[2][-1])]
-        assert bounds == pytest.approx([min(rates), max(rates)], abs=0.0051)
-    (row,) = [row for row in README.read_text().splitlines() if "**shipped_objects**" in row]
-    pile = folder.parents[2] / "objects" / "gpu_hollow" / "seed-0" / "eval-pile.json"
-    measured = json.loads(pile.read_text())
-    values = [measured[name]["value"] for name in ("completion", "grasp_success")]
-    said = [float(number) for number in re.findall(r"[\d.]+", row.split("new shapes")[1])]
-    assert said[:2] == pytest.approx([100 * value for value in values], abs=0.5)
-    assert said[2] == pytest.approx(measured["action_efficiency"]["value"], abs=0.0051)
+        for metric, shown, cell in zip(METRICS, said, row, strict=True):
+            per_cent = 100 if "%" in cell else 1
+            values = [per_cent * part[metric]["value"] for part in parts]
+            least = 0.0051 if per_cent == 1 else 0.06 if "." in cell else 0.5
+            assert [shown[0], shown[-1]] == pytest.approx([min(values), max(values)], abs=least)
 
 
 @pytest.mark.mjx
