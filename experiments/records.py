@@ -93,7 +93,7 @@ RUNS = {
     "fast/scenes_2048": "half the scenes, fewer actions, a net with three times the parameters",
     "fast/long": "the same, three times as many actions",
     "fast/shipped": "the shipped policy (seed 0) on every suite",
-    "fast/piles": "10 to 30 blocks, most of them poured, by `--init shipped`",
+    "fast/piles": "piles of up to 30 blocks and packed scenes, by `--init shipped`",
     "fast/clutter": "the policy `shipped_clutter`, from `fast/piles`",
     "fast/camera": "the policy `shipped_camera`, by `--init shipped`",
     "fast/camera_heights": "the same of heights alone, from nothing; stopped at 159,744 actions",
@@ -239,7 +239,7 @@ BENCHES = {
         "bench step_kernels fast --sim.physics mjx --train.scenes 8192 --devices 4",
     ),
     "step_kernels/h200-fast-seeds8": (
-        "the same, eight seeds of 2,048 scenes",
+        "the same, eight seeds of 2,048 scenes, with XLA_PYTHON_CLIENT_MEM_FRACTION=0.93",
         "bench step_kernels fast --sim.physics mjx --train.scenes 2048 --seeds 8",
     ),
     "step_kernels/h200-fast-seeds8-two": (
