@@ -1,41 +1,79 @@
 """Writes the tables of the study into docs/study.md, from archives in experiments/results/study.
 
-An archive PART-TASK.tar.xz holds sweeps of one task. `csac-jax report` reads it too.
+An archive PART-NAME.tar.xz holds sweeps of a part. `csac-jax report` reads it too.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.suites import IN_DISTRIBUTION
 from csac_jax.report import comparison, results, tables
-from csac_jax.report.comparison import NAMES, Report, Score
+from csac_jax.report.comparison import NAMES, Curve, Score
+from csac_jax.report.results import Variant
 from csac_jax.report.tables import Table
 
 ROOT = Path(__file__).resolve().parents[1]
 ARCHIVES = ROOT / "experiments" / "results" / "study"
 PAGE = ROOT / "docs" / "study.md"
 BEGIN = "<!-- The rest is written by `python -m experiments.study`. -->\n"
-PARTS = {
-    "1-target": "Part 1, the target task",
-    "1-clear": "Part 1, the table cleared",
-    "1-packed": "Part 1, packed scenes cleared",
-}
-"""Name of an archive -> its title."""
 METRICS = ("completion", "grasp_success", "action_efficiency", "pushes_per_episode")
-SUITES = {IN_DISTRIBUTION: "scenes like the training's, 500 episodes", "target": "suite `target`"}
-PAIRS = (
-    ("csac", "grasp_only"),
-    ("csac_per", "grasp_only"),
-    ("csac_beta", "grasp_only"),
-    ("reactive", "grasp_only"),
-    ("vpg", "grasp_only"),
-    ("csac_per", "csac"),
-    ("csac_beta", "csac"),
-    ("csac_beta", "vpg"),
-)
-"""Methods that are compared: pushes against none, samplers against uniform replay."""
+
+
+class Part(NamedTuple):
+    """What the tables of an archive show."""
+
+    title: str
+    methods: tuple[str, ...]  # in order; names of algorithms, or the settings that are changed
+    pairs: tuple[tuple[str, str], ...]  # of methods that are compared
+    episodes: int  # of an evaluation in scenes like the training's
+    name: Callable[[Variant], str] = lambda variant: NAMES[variant.algo]
+
+    def suites(self) -> dict[str, str]:
+        """Suite -> what it is called."""
+        own = f"scenes like the training's, {self.episodes} episodes"
+        return {IN_DISTRIBUTION: own, "target": "suite `target`"}
+
+
+def _algorithms(title: str) -> Part:
+    """Methods of part 1: pushes against none, samplers against uniform replay."""
+    methods = ("grasp_only", "reactive", "vpg", "csac", "csac_per", "csac_beta")
+    grasp_only, reactive, vpg, csac, per, beta = names = tuple(NAMES[name] for name in methods)
+    pairs = [(name, grasp_only) for name in (csac, per, beta, reactive, vpg)]
+    return Part(title, names, (*pairs, (per, csac), (beta, csac), (beta, vpg)), 500)
+
+
+def _changes(variant: Variant) -> str:
+    """The settings of a variant that the preset has otherwise."""
+    return ", ".join(" ".join(change) for change in variant.changed) or PRESET
+
+
+PRESET = "preset"
+CELL, MAXIMUM, OFFSET = "policy.place argmax", "target.value max", "net.kind offset"
+OFFSET_CELL, OFFSET_ACTOR = f"{OFFSET}, {CELL}", f"{OFFSET}, cem.start actor"
+MAXIMUM_CELL = f"{CELL}, {MAXIMUM}"
+PARTS = {
+    "1-target": _algorithms("Part 1, the target task"),
+    "1-clear": _algorithms("Part 1, the table cleared"),
+    "1-packed": _algorithms("Part 1, packed scenes cleared"),
+    "3-continuous": Part(
+        "Part 3, continuous actions",
+        (PRESET, CELL, MAXIMUM, MAXIMUM_CELL, OFFSET, OFFSET_ACTOR, OFFSET_CELL),
+        (
+            (PRESET, CELL),
+            (MAXIMUM, MAXIMUM_CELL),
+            (OFFSET_ACTOR, OFFSET),
+            (OFFSET_ACTOR, OFFSET_CELL),
+            (OFFSET, OFFSET_CELL),
+            (OFFSET, PRESET),
+            (PRESET, MAXIMUM),
+        ),
+        100,
+        _changes,
+    ),
+}
+"""Name of an archive -> what is shown of it."""
 POINT = 0.01  # within which methods are equivalent
 
 
@@ -52,51 +90,53 @@ def page() -> str:
 
 
 def _part(name: str, path: Path) -> str:
-    report = comparison.build(results.read([path]))
-    suites = [suite for suite in SUITES if _scores(report, suite)]
-    titled = {"Training": _training(report)}
-    titled |= {f"Greedy: {SUITES[suite]}": _greedy(report, suite) for suite in suites}
-    titled["Differences"] = list(_differences(report, suites))
+    part, report = PARTS[name], comparison.build(results.read([path]))
+    curves = _methods(part, report.curves)
+    scores = {
+        suite: _methods(part, [score for score in report.scores if score.suite == suite])
+        for suite in part.suites()
+    }
+    scores = {suite: found for suite, found in scores.items() if found}
+    titled = {"Training": _training(curves)}
+    titled |= {f"Greedy: {part.suites()[suite]}": _greedy(found) for suite, found in scores.items()}
+    titled["Differences"] = list(_differences(part, curves, scores))
     text = "".join(f"\n**{title}**\n\n{tables.table_text(one)}\n" for title, one in titled.items())
-    return f"\n### {PARTS[name]}\n{text}"
+    return f"\n### {part.title}\n{text}"
 
 
-def _training(report: Report) -> Table:
+def _methods(part: Part, found: Sequence[Any]) -> dict[str, Any]:
+    """What was found by method, in their order."""
+    by_name = {part.name(one.variant): one for one in found}
+    assert by_name.keys() <= set(part.methods), by_name.keys() - set(part.methods)
+    return {name: by_name[name] for name in part.methods if name in by_name}
+
+
+def _training(curves: dict[str, Curve]) -> Table:
     return [
         {
-            "method": NAMES[curve.variant.algo],
+            "method": name,
             "seeds": str(len(curve.final)),
             "last 200 grasps": tables.shown(statistics.band([curve.final])),
             "area under the curve": tables.shown(statistics.band([curve.area])),
         }
-        for curve in _methods(report.curves).values()
+        for name, curve in curves.items()
     ]
 
 
-def _greedy(report: Report, suite: str) -> Table:
+def _greedy(scores: dict[str, Score]) -> Table:
     return [
-        {"method": NAMES[score.variant.algo], "seeds": str(score.seeds)}
-        | {results.METRICS[name]: tables.shown(score.band(name), metric=name) for name in METRICS}
-        for score in _methods(_scores(report, suite)).values()
+        {"method": name, "seeds": str(score.seeds)}
+        | {results.METRICS[key]: tables.shown(score.band(key), metric=key) for key in METRICS}
+        for name, score in scores.items()
     ]
 
 
-def _scores(report: Report, suite: str) -> list[Score]:
-    return [score for score in report.scores if score.suite == suite]
-
-
-def _methods(found: Sequence[Any]) -> dict[str, Any]:
-    """What was found by algorithm, in the order of NAMES."""
-    by_algo = {one.variant.algo: one for one in found}
-    return {algo: by_algo[algo] for algo in NAMES if algo in by_algo}
-
-
-def _differences(report: Report, suites: Sequence[str]) -> Iterator[dict[str, str]]:
-    curves = _methods(report.curves)
-    scores = {suite: _methods(_scores(report, suite)) for suite in suites}
-    for a, b in PAIRS:
+def _differences(
+    part: Part, curves: dict[str, Curve], scores: dict[str, dict[str, Score]]
+) -> Iterator[dict[str, str]]:
+    for a, b in part.pairs:
         if all({a, b} <= known.keys() for known in (curves, *scores.values())):
-            row = {"method": NAMES[a], "less": NAMES[b]}
+            row = {"method": a, "less": b}
             row["area"] = _verdict([curves[a].area], [curves[b].area])
             for suite, known in scores.items():
                 where = "" if suite == IN_DISTRIBUTION else f", suite `{suite}`"
