@@ -48,14 +48,15 @@ def quick() -> Config:
     law are not the literature's; neither is shown to be needed. Two cores can afford few passes: a
     large step of the critic follows each step of all scenes, and exploration ends after some 500
     actions. The actor learns on a part of the batch, and the net's features lie 28 mm apart, not
-    14; its maps' cells still 14, and its layers see as far. What it costs:
-    docs/benchmarks/speed-cpu.md.
+    14; its maps' cells still 14, and its layers see as far. It has eight yaws, not sixteen; greedy
+    decisions are means over mirror images. What it costs: docs/benchmarks/speed-cpu.md.
     """
     return Config().change(
         preset="quick",
         scene={"size_jitter": (0.0, 0.0), "density": (600.0, 600.0), "friction": (0.8, 0.8)},
         sim={"physics": "auto"},
-        net=SMALL_NET | {"subcells": 2, "growth": 24},
+        net=SMALL_NET | {"subcells": 2, "growth": 24, "rotations": 8},
+        policy={"augment": True},
         target={"gamma": 0.2},
         explore={"decay": 0.995},
         learn={"actor_batch": 8, "updates": 1, "learning_rate": 4e-3},
