@@ -639,7 +639,7 @@ class Config(Section):
             fits = is_off or self.heightmap.view == "oblique"
             _require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
         plain = not (self.policy.augment and isinstance(self.net, OffsetNet))
-        _require(plain, "policy.augment: not where net.kind is offset, whose slopes have a side")
+        _require(plain, "policy.augment: must be off where net.kind is offset")
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         _require(rotations % 2 == 0, "net.rotations: must be even")

@@ -12,6 +12,7 @@ COPIES = "the same on another host"
 
 RUNS = {
     "quick/csac_beta": "what `quick` learns on two CPU cores",
+    "quick/yaws16": "the same in sixteen yaws and without mirror images",
     "quick/random": "the floor: random places above blocks",
     "quick/oracle": "the ceiling: a planner that reads the blocks' poses",
     "paper_small/csac_beta": "CSAC-beta by the paper's protocol with the small net",
@@ -113,7 +114,10 @@ _WIDE = f"--train.scenes 2048 --learn.updates 64 {_NET}"
 _FORMER = f"train fast {_WIDE} --train.actions 163840 --explore.decay 0.9999"
 """What `fast` was when these were recorded."""
 
-_QUICK = "quick --net.growth 32 --learn.updates 2 --learn.learning_rate 1e-3 --explore.decay 0.998"
+_QUICK = (
+    "quick --net.rotations 16 --net.growth 32 --learn.updates 2 --learn.learning_rate 1e-3 "
+    "--explore.decay 0.998"
+)
 """What `quick` was when these were recorded."""
 
 BENCHES = {
@@ -177,12 +181,12 @@ BENCHES = {
         for gpu in range(4)
     },
     "doctor/h100": ("Warp's kernels of `fast`, built from nothing", "doctor --build"),
-    "start/epyc-quick-first": (
-        "the first action of `quick`, and in commit 71c8723, one run after another",
-        "bench start quick --train.actions 80 --other CHECKOUT",
-    ),
     "start/epyc-quick": (
         "how soon `quick` learns, and did in commit 71c8723, one run after another",
+        "bench start quick --other CHECKOUT",
+    ),
+    "start/epyc-quick-yaws16": (
+        "the same in sixteen yaws, which `quick` had then",
         "bench start quick --other CHECKOUT",
     ),
     "warp_action/h100-2048": (
@@ -353,8 +357,8 @@ BENCHES = {
         "bench closed_loop --policy shipped_camera",
     ),
     "between_cells/cpu": (
-        "what search between cells lifts; RUN by `train quick --net.kind offset --cem.start actor "
-        "--sim.physics c --seed 20`",
+        "what search between cells lifts; RUN by `train quick --net.kind offset --net.rotations 16 "
+        "--policy.no-augment --cem.start actor --sim.physics c --seed 20`",
         "bench between_cells RUN",
     ),
     "objects/h100": (
