@@ -15,7 +15,10 @@ from csac_jax.io import configs, renames
 
 FORMATS = Path(__file__).parent / "formats"
 SAVED = presets.quick().change(  # as it was when the files there were written
-    net={"growth": 32}, explore={"decay": 0.998}, learn={"updates": 2, "learning_rate": 1e-3}
+    net={"growth": 32, "rotations": 16},
+    policy={"augment": False},
+    explore={"decay": 0.998},
+    learn={"updates": 2, "learning_rate": 1e-3},
 )
 
 
