@@ -638,6 +638,7 @@ class Config(Section):
             is_off = getattr(self.sensor, name) == getattr(SensorConfig, name)
             fits = is_off or self.heightmap.view == "oblique"
             _require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
+        # Slopes and curvatures of Q change sides in a mirror image.
         plain = not (self.policy.augment and isinstance(self.net, OffsetNet))
         _require(plain, "policy.augment: must be off where net.kind is offset")
         size, rotations = self.heightmap.size, self.net.rotations
