@@ -82,6 +82,11 @@ class CSAC(Learner):
     def in_chunks(self, networks_at_once: int | None) -> "CSAC":
         return dataclasses.replace(self, networks_at_once=networks_at_once)
 
+    def side_by_side(self) -> "CSAC":
+        frames = self.parts.frames
+        frames = dataclasses.replace(frames, networks=frames.networks.side_by_side())
+        return dataclasses.replace(self, parts=dataclasses.replace(self.parts, frames=frames))
+
     def _chunked(self, part: Callable[..., Any], at_once: int | None = None) -> Callable[..., Any]:
         """A function of `parts` and others as one of the others, vmapped in chunks."""
         bound = functools.partial(part, self.parts)

@@ -88,5 +88,9 @@ class Learner(abc.ABC):
         return self
 
     def in_chunks(self, networks_at_once: int | None) -> "Learner":
-        """The learner where several runs are vmapped, for so many networks at a time."""
+        """The learner where runs are vmapped, for so many networks at a time."""
+        return self
+
+    def side_by_side(self) -> "Learner":
+        """The learner where several runs are vmapped; by default itself."""
         return self

@@ -7,9 +7,13 @@ transpose and every convolution is plain.
 GPU: the gradient of a dilated kernel is computed tap by tap; as one convolution it takes several
 times as long (jaxlib 0.11, H200). The first convolution, of few channels and many taps, is a matrix
 product: a forward pass takes a fifth less. On a CPU that would be slower.
+
+GPU, several runs under `vmap`: XLA makes their convolutions grouped ones, which are slow. By taps a
+convolution is one product of matrices, whose parts are shifted and added (`experiments/bench`).
 """
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -112,4 +116,48 @@ def _kernel_gradient_by_taps(stride, dilation, padding, saved, gradient) -> jax.
 _conv2d.defvjp(
     lambda maps, kernel, *window: (_conv2d(maps, kernel, *window), (maps, kernel)),
     lambda *args: (_maps_gradient(*args), _kernel_gradient(*args)),
+)
+
+
+def convolve_by_taps(maps: jax.Array, kernel: jax.Array, dilation: int) -> jax.Array:
+    """`conv2d` of stride 1, zeros around, by a kernel of an odd size: [B, H, W, O].
+
+    The products of the taps are shifted and added, as fewer channels go out than come in.
+    """
+    size, _, ins, outs = kernel.shape
+    matrix = jnp.transpose(kernel, (2, 0, 1, 3)).reshape(ins, -1)
+    products = (maps.reshape(-1, ins) @ matrix).reshape(*maps.shape[:-1], size**2 * outs)
+    return products if size == 1 else shift_and_add(products, size, dilation)
+
+
+def windows(maps: jax.Array, size: int, stride: int = 1, dilation: int = 1) -> list[jax.Array]:
+    """Windows [B, H / stride, W / stride, F] of a kernel's taps, row by row, zeros around maps."""
+    rows, cols = maps.shape[1:3]
+    around = (size // 2 * dilation, (size - 1) // 2 * dilation)
+    padded = jnp.pad(maps, ((0, 0), around, around, (0, 0)))
+    taps = itertools.product(range(0, size * dilation, dilation), repeat=2)
+    return [padded[:, i : i + rows : stride, j : j + cols : stride] for i, j in taps]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
+def shift_and_add(products: jax.Array, size: int, dilation: int = 1) -> jax.Array:
+    """Sum over a kernel's taps of their shifted products: [B, H, W, size^2 F] -> [B, H, W, F].
+
+    Sums are float32. The gradient is written out: autodiff would pad each tap's slice with zeros.
+    """
+    features = products.shape[-1] // size**2
+    shifted = (
+        window[..., k * features : (k + 1) * features].astype(jnp.float32)
+        for k, window in enumerate(windows(products, size, dilation=dilation))
+    )
+    return functools.reduce(jnp.add, shifted).astype(products.dtype)
+
+
+def _gradient_of_taps(size: int, dilation: int, _: None, gradient: jax.Array) -> tuple[jax.Array]:
+    taps = windows(gradient, size, dilation=dilation)
+    return (jnp.concatenate(taps[::-1], axis=-1),)
+
+
+shift_and_add.defvjp(
+    lambda products, *kernel: (shift_and_add(products, *kernel), None), _gradient_of_taps
 )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import NetConfig, OffsetNet, SmallNet
-from csac_jax.nets.convolution import conv2d
+from csac_jax.nets.convolution import conv2d, convolve_by_taps
 
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 OUTPUT_INIT = nn.initializers.variance_scaling(0.01, "fan_in", "normal")  # maps begin near 0
@@ -44,12 +44,15 @@ class Convolution(nn.Module):
     dtype: Any
     stride: int = 1  # s
     dilation: int = 1
+    by_taps: bool = False  # where the stride is 1, see `convolution`
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
         shape = (self.size, self.size, maps.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.he_normal(), shape)
         maps, kernel = maps.astype(self.dtype), kernel.astype(self.dtype)
+        if self.by_taps and self.stride == 1:
+            return convolve_by_taps(maps, kernel, self.dilation)
         padding = self.dilation * (self.size - self.stride) // 2
         return conv2d(maps, kernel, self.stride, self.dilation, padding)
 
@@ -58,6 +61,7 @@ class Trunk(nn.Module):
     """Features of maps: [B, C, C, I] -> [B, h, h, stem + layers * growth], h = C / stride."""
 
     cfg: SmallNet
+    by_taps: bool = False
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
@@ -65,7 +69,8 @@ class Trunk(nn.Module):
         stem = Convolution(cfg.stem, 2 * cfg.stride, dtype, stride=cfg.stride)(maps)
         features = nn.relu(GroupNorm(dtype)(stem))
         for dilation in cfg.dilations:
-            new = Convolution(cfg.growth, 3, dtype, dilation=dilation)(features)
+            convolution = Convolution(cfg.growth, 3, dtype, dilation=dilation, by_taps=self.by_taps)
+            new = convolution(features)
             features = jnp.concatenate([features, nn.relu(GroupNorm(dtype)(new))], axis=-1)
         return features
 
@@ -131,8 +136,9 @@ class Critic(nn.Module):
     """
 
     cfg: SmallNet
+    by_taps: bool = False
 
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
-        features = Trunk(self.cfg, name="trunk")(maps)
+        features = Trunk(self.cfg, self.by_taps, name="trunk")(maps)
         return Head(self.cfg, OUTPUTS * terms(self.cfg), name="head")(features), features

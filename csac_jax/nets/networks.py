@@ -64,6 +64,12 @@ class Networks:
             maps.append(target[..., None].astype(height.dtype))
         return jnp.concatenate(maps, axis=-1)
 
+    def side_by_side(self) -> "Networks":
+        """The same for several runs under `vmap`: the small critic convolves by taps on a GPU."""
+        if not isinstance(self.critic, dense.Critic) or jax.default_backend() == "cpu":
+            return self
+        return dataclasses.replace(self, critic=self.critic.clone(by_taps=True))
+
     def states_at_once(self, canvas: int) -> int | None:
         """States, of passes of canvas x canvas cells, that the critic sees at a time; None for any.
 

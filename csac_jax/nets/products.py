@@ -12,6 +12,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from csac_jax.nets.convolution import convolve_by_taps, windows
 from csac_jax.nets.dense import pixel_shuffle
 
 _STEM = 7  # pixels, side of the first convolution's kernel
@@ -19,10 +20,7 @@ _KAIMING = nn.initializers.variance_scaling(2.0, "fan_in", "normal")  # torchvis
 
 
 class TapConvolution(nn.Module):
-    """Convolution without bias, zero-padded: [B, H, W, I] -> [B, H, W, features].
-
-    The products of the taps are shifted and added, as fewer channels go out than come in.
-    """
+    """Convolution without bias, zero-padded: [B, H, W, I] -> [B, H, W, features]."""
 
     features: int
     size: int  # cells, side of the kernel, odd
@@ -32,8 +30,7 @@ class TapConvolution(nn.Module):
     def __call__(self, maps: jax.Array) -> jax.Array:
         shape = (self.size, self.size, maps.shape[-1], self.features)
         kernel = self.param("kernel", _KAIMING, shape).astype(self.dtype)
-        products = _times(maps, jnp.transpose(kernel, (2, 0, 1, 3)))
-        return products if self.size == 1 else shift_and_add(products, self.size)
+        return convolve_by_taps(maps, kernel, 1)
 
 
 class Stem(nn.Module):
@@ -65,35 +62,6 @@ def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
     """
     rows = maps.shape[-1]
     return (maps.reshape(-1, rows) @ matrix.reshape(rows, -1)).reshape(*maps.shape[:-1], -1)
-
-
-def windows(maps: jax.Array, size: int, stride: int = 1) -> list[jax.Array]:
-    """Windows [B, H / stride, W / stride, F] of a kernel's taps, row by row, zeros around maps."""
-    rows, cols = maps.shape[1:3]
-    around = (size // 2, (size - 1) // 2)
-    padded = jnp.pad(maps, ((0, 0), around, around, (0, 0)))
-    taps = itertools.product(range(size), repeat=2)
-    return [padded[:, i : i + rows : stride, j : j + cols : stride] for i, j in taps]
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def shift_and_add(products: jax.Array, size: int) -> jax.Array:
-    """Sum over a kernel's taps of their shifted products: [B, H, W, size^2 F] -> [B, H, W, F].
-
-    Sums are float32. The gradient is written out: autodiff would pad each tap's slice with zeros.
-    """
-    features = products.shape[-1] // size**2
-    shifted = (
-        window[..., k * features : (k + 1) * features].astype(jnp.float32)
-        for k, window in enumerate(windows(products, size))
-    )
-    return functools.reduce(jnp.add, shifted).astype(products.dtype)
-
-
-shift_and_add.defvjp(
-    lambda products, size: (shift_and_add(products, size), None),
-    lambda size, _, gradient: (jnp.concatenate(windows(gradient, size)[::-1], axis=-1),),
-)
 
 
 @jax.custom_vjp

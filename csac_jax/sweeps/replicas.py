@@ -136,6 +136,8 @@ class SweepProgram:
         elif replicas.hyperparams is None:
             at_once = chunked_vmap.chunk_size(program.cfg, vmapped)
             program = dataclasses.replace(program, learner=program.learner.in_chunks(at_once))
+        if vmapped > 1:
+            program = dataclasses.replace(program, learner=program.learner.side_by_side())
 
         def train_one(replica: Replicas, state: TrainState) -> tuple[TrainState, StepMetrics]:
             return step.train_step(program, state, replica.hyperparams)

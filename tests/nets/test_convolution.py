@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.nets.convolution import conv2d
+from csac_jax.config import DenseNet121, SmallNet
+from csac_jax.nets import networks
+from csac_jax.nets.convolution import conv2d, convolve_by_taps
 
 SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first five are the net's
     (12, 16, 4, 2, 1, 1),
@@ -91,3 +93,47 @@ def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.Monk
     )
     for name, got, want in zip(("maps", "kernel"), scanned, wanted, strict=True):
         np.testing.assert_allclose(got[1], want, atol=close, err_msg=name)
+
+
+@pytest.mark.parametrize("dilation", [1, 2, 4])
+@pytest.mark.parametrize("size", [1, 3, 5])
+def test_taps_are_a_convolution(size: int, dilation: int):
+    """Claim: by taps, each of three runs under `vmap` has the values and the gradients of JAX's own
+    convolution."""
+    rng, padding = np.random.default_rng(0), dilation * (size // 2)
+    shapes = (3, 2, 9, 12, 4), (3, size, size, 4, 5), (3, 2, 9, 12, 5)
+    maps, kernels, gradients = (jnp.asarray(rng.normal(size=one), jnp.float32) for one in shapes)
+
+    @jax.jit
+    @jax.vmap
+    def ours(maps, kernel, gradient):
+        value, back = jax.vjp(lambda m, k: convolve_by_taps(m, k, dilation), maps, kernel)
+        return value, *back(gradient)
+
+    found = ours(maps, kernels, gradients)
+    for run in range(3):
+        plain = lambda m, k: _plain(m, k, 1, dilation, padding)  # noqa: E731
+        value, back = jax.vjp(plain, maps[run], kernels[run])
+        for got, wanted in zip(found, (value, *back(gradients[run])), strict=True):
+            np.testing.assert_allclose(got[run], wanted, atol=1e-4)
+
+
+def test_runs_side_by_side_convolve_by_taps_on_a_gpu(monkeypatch: pytest.MonkeyPatch):
+    """Claim: for several runs under `vmap` the small critic convolves by taps on a GPU, with the
+    same variables and values; on a CPU, and the paper's, as ever."""
+    net = SmallNet(stem=8, growth=8, head=8, dilations=(1, 2))
+    plain, paper = networks.make(net), networks.make(DenseNet121())
+    assert plain.side_by_side() is plain
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    taps = plain.side_by_side()
+    assert paper.side_by_side() is paper
+    assert taps.critic.by_taps
+    maps = jax.random.normal(jax.random.key(0), (2, 24, 24, 4))
+    variables = taps.critic.init(jax.random.key(1), maps)
+    text = str(jax.make_jaxpr(taps.critic.apply)(variables, maps))
+    assert "conv_general_dilated" in str(jax.make_jaxpr(plain.critic.apply)(variables, maps))
+    assert "conv_general_dilated" not in text
+    for got, wanted in zip(
+        taps.critic.apply(variables, maps), plain.critic.apply(variables, maps), strict=True
+    ):
+        np.testing.assert_allclose(got, wanted, atol=2e-2)  # bfloat16's

@@ -1,14 +1,13 @@
 """A training step that is small, compiles fast and yet calls what every number of a config
 enters."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, explore, losses, rewards
+from csac_jax.agent import actor_critic, explore, losses, maps, rewards
 from csac_jax.agent.csac import CSAC
 from csac_jax.config import Config
 from csac_jax.nets import networks
@@ -30,7 +29,7 @@ CFG = presets.smoke().change(train={"scenes": SCENES, "actions": 12 * SCENES})  
 def program(cfg: Config = CFG, env: Any = None) -> Program:
     """In place of `step.make`: without environment and networks."""
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
-    frames: Any = SimpleNamespace(networks=networks.make(cfg.net))
+    frames = maps.frames(cfg, networks.make(cfg.net))
     learner = CSAC(actor_critic.with_optimisers(cfg, frames, bounds))
     return Program(cfg, env, learner, samplers.make(cfg.replay))
 
