@@ -3,7 +3,8 @@
 An archive PART-NAME.tar.xz holds sweeps of a part. `csac-jax report` reads it too.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ARCHIVES = ROOT / "experiments" / "results" / "study"
 PAGE = ROOT / "docs" / "study.md"
 BEGIN = "<!-- The rest is written by `python -m experiments.study`. -->\n"
-METRICS = ("completion", "grasp_success", "action_efficiency", "pushes_per_episode")
+METRICS = ("completion", "grasp_success", "action_efficiency", PUSHES := "pushes_per_episode")
 
 
 class Part(NamedTuple):
@@ -26,9 +27,11 @@ class Part(NamedTuple):
 
     title: str
     methods: tuple[str, ...]  # in order; names of algorithms, or the settings that are changed
-    pairs: tuple[tuple[str, str], ...]  # of methods that are compared
+    pairs: tuple[tuple[str, str], ...]  # of methods or groups that are compared
     episodes: int  # of an evaluation in scenes like the training's
     name: Callable[[Variant], str] = lambda variant: NAMES[variant.algo]
+    groups: Mapping[str, tuple[str, ...]] = {}  # each of methods, which are its strata
+    metrics: tuple[str, ...] = ("completion",)  # whose differences are shown, beside the area's
 
     def suites(self) -> dict[str, str]:
         """Suite -> what it is called."""
@@ -49,17 +52,58 @@ def _changes(variant: Variant) -> str:
     return ", ".join(" ".join(change) for change in variant.changed) or PRESET
 
 
+def _pushing(variant: Variant) -> str:
+    """The settings of a variant that part 4 changes, also where they are the preset's."""
+    changed = dict(variant.changed)
+    return _values([changed.get(name, known[-1]) for name, known in PUSHING.items()])
+
+
+def _values(values: Sequence[str]) -> str:
+    """The values of `PUSHING`, each after the last word of its setting's name."""
+    return ", ".join(
+        f"{name.split('.')[1]} {value}" for name, value in zip(PUSHING, values, strict=True)
+    )
+
+
+PUSHING = {
+    "reward.push_effect": ("value", "renewed"),
+    "reward.success_bonus": ("0.0", "1.0"),
+    "target.gamma": ("0.5", "0.2"),
+}
+"""Setting of part 4 -> its values, the preset's last."""
+
+
+def _pushes(title: str) -> Part:
+    """Methods of part 4: all values of each setting together, one against the other."""
+    every = tuple(itertools.product(*PUSHING.values()))
+    groups = {
+        f"{setting} {value}": tuple(_values(one) for one in every if one[k] == value)
+        for k, (setting, values) in enumerate(PUSHING.items())
+        for value in values
+    }
+    stored, renewed, no_bonus, bonus, far, near = groups
+    pairs = ((renewed, stored), (no_bonus, bonus), (far, near))
+    methods = tuple(map(_values, every))
+    return Part(title, methods, pairs, 100, _pushing, groups, ("completion", PUSHES))
+
+
 PRESET = "preset"
 CELL, MAXIMUM, OFFSET = "policy.place argmax", "target.value max", "net.kind offset"
 OFFSET_CELL, OFFSET_ACTOR = f"{OFFSET}, {CELL}", f"{OFFSET}, cem.start actor"
 MAXIMUM_CELL = f"{CELL}, {MAXIMUM}"
+ACTOR, CELLS = "cem.start actor", "cem.start cells"
+YAWS, COARSE = "net.rotations 8", "net.subcells 1"
+BOTH = f"{YAWS}, {COARSE}"
 PARTS = {
     "1-target": _algorithms("Part 1, the target task"),
     "1-clear": _algorithms("Part 1, the table cleared"),
     "1-packed": _algorithms("Part 1, packed scenes cleared"),
     "3-continuous": Part(
         "Part 3, continuous actions",
-        (PRESET, CELL, MAXIMUM, MAXIMUM_CELL, OFFSET, OFFSET_ACTOR, OFFSET_CELL),
+        (
+            *(PRESET, CELL, MAXIMUM, MAXIMUM_CELL, ACTOR, CELLS, OFFSET, OFFSET_ACTOR, OFFSET_CELL),
+            *(YAWS, f"{YAWS}, {CELL}", COARSE, f"{COARSE}, {CELL}", BOTH, f"{BOTH}, {CELL}"),
+        ),
         (
             (PRESET, CELL),
             (MAXIMUM, MAXIMUM_CELL),
@@ -68,10 +112,16 @@ PARTS = {
             (OFFSET, OFFSET_CELL),
             (OFFSET, PRESET),
             (PRESET, MAXIMUM),
+            (ACTOR, PRESET),
+            (CELLS, PRESET),
+            *((changed, PRESET) for changed in (YAWS, COARSE, BOTH)),
+            *((changed, f"{changed}, {CELL}") for changed in (YAWS, COARSE, BOTH)),
         ),
         100,
         _changes,
     ),
+    "4-target": _pushes("Part 4, pushes in the target task"),
+    "4-packed": _pushes("Part 4, pushes in packed scenes"),
 }
 """Name of an archive -> what is shown of it."""
 POINT = 0.01  # within which methods are equivalent
@@ -135,29 +185,33 @@ def _differences(
     part: Part, curves: dict[str, Curve], scores: dict[str, dict[str, Score]]
 ) -> Iterator[dict[str, str]]:
     for a, b in part.pairs:
-        if all({a, b} <= known.keys() for known in (curves, *scores.values())):
+        ours, theirs = (part.groups.get(name, (name,)) for name in (a, b))
+        if all({*ours, *theirs} <= known.keys() for known in (curves, *scores.values())):
             row = {"method": a, "less": b}
-            row["area"] = _verdict([curves[a].area], [curves[b].area])
-            for suite, known in scores.items():
+            row["area"] = _verdict(*([curves[k].area for k in one] for one in (ours, theirs)))
+            for (suite, known), metric in itertools.product(scores.items(), part.metrics):
                 where = "" if suite == IN_DISTRIBUTION else f", suite `{suite}`"
-                completions = (known[one].strata("completion") for one in (a, b))
-                row[f"completion{where}"] = _verdict(*completions)
+                strata = [[known[k].strata(metric) for k in one] for one in (ours, theirs)]
+                row[f"{results.METRICS[metric]}{where}"] = _verdict(
+                    *(list(itertools.chain.from_iterable(one)) for one in strata), metric
+                )
             yield row
 
 
-def _verdict(ours: Any, theirs: Any) -> str:
+def _verdict(ours: Any, theirs: Any, metric: str = "") -> str:
     """A difference of strata, and what the protocol makes of it; where they differ with the
-    probability of improvement, that a seed of ours is above one of theirs."""
+    probability of improvement, that a seed of ours is above one of theirs. Only shares can be
+    equivalent."""
     gap = statistics.difference(ours, theirs)
     assert gap.low is not None
     assert gap.high is not None
-    small, differ = max(-gap.low, gap.high) <= POINT, not gap.low <= 0.0 <= gap.high
-    if differ:
+    small = metric != PUSHES and max(-gap.low, gap.high) <= POINT
+    if not gap.low <= 0.0 <= gap.high:
         told = "differ, by less than a point" if small else "differ"
         told += f", P {100 * statistics.improvement(ours, theirs).value:.0f} %"
     else:
         told = "equivalent" if small else "not told"
-    return f"{tables.shown(gap, sign='+')}: {told}"
+    return f"{tables.shown(gap, sign='+', metric=metric)}: {told}"
 
 
 if __name__ == "__main__":
