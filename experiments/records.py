@@ -114,6 +114,11 @@ _WIDE = f"--train.scenes 2048 --learn.updates 64 {_NET}"
 _FORMER = f"train fast {_WIDE} --train.actions 163840 --explore.decay 0.9999"
 """What `fast` was when these were recorded."""
 
+_SEEDS_OF_PAPER_SMALL = "paper_small --sim.physics c --seeds 16"
+_SEEDS_OF_FAST = (
+    "fast --sim.physics c --seeds 8 --train.scenes 64 --train.actions 640 "
+    "--train.learning-starts 64 --scene.pool 8"
+)
 _QUICK = (
     "quick --net.rotations 16 --net.growth 32 --learn.updates 2 --learn.learning_rate 1e-3 "
     "--explore.decay 0.998"
@@ -252,7 +257,19 @@ BENCHES = {
     ),
     "step_kernels/h200-paper_small-16": (
         "the same of 16 seeds of `paper_small`",
-        "bench step_kernels paper_small --sim.physics c --seeds 16",
+        f"bench step_kernels {_SEEDS_OF_PAPER_SMALL}",
+    ),
+    "step_kernels/h200-paper_small-16-grouped": (
+        "the same before the small net convolved by taps",
+        f"bench step_kernels {_SEEDS_OF_PAPER_SMALL}",
+    ),
+    "step_kernels/h200-fast-64-seeds8": (
+        "the same of eight seeds of `fast`, 64 scenes",
+        f"bench step_kernels {_SEEDS_OF_FAST}",
+    ),
+    "step_kernels/h200-fast-64-seeds8-grouped": (
+        "the same before the small net convolved by taps",
+        f"bench step_kernels {_SEEDS_OF_FAST}",
     ),
     "step/xeon-quick": ("a step as `quick` was, Intel Xeon", f"bench step {_QUICK}"),
     "step/epyc-quick-scenes": (
