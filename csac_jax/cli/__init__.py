@@ -89,8 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if set(os.environ.get("COLUMNS", "")) == {"0"}:
         del os.environ["COLUMNS"]  # rich would print nothing
     with output.unbroken(), _logged(), warnings.catch_warnings():
-        warnings.simplefilter("default", DataWarning)
-        warnings.showwarning = _warn
+        warnings.simplefilter("always", DataWarning)
+        warnings.showwarning = _warner()
         return _guarded(list(sys.argv[1:] if argv is None else argv))
 
 
@@ -110,9 +110,17 @@ def _logged() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def _warn(message: object, category: type[Warning], *place: Any, **more: Any) -> None:
-    """Prints a warning in one line, as errors are."""
-    print(f"{PROGRAM}: warning: {' '.join(str(message).split())}", file=sys.stderr)
+def _warner() -> Callable[..., None]:
+    """What prints each warning in one line, as errors are, once wherever it comes from."""
+    said = set()
+
+    def warn(message: object, category: type[Warning], *place: Any, **more: Any) -> None:
+        line = f"{PROGRAM}: warning: {' '.join(str(message).split())}"
+        if line not in said:
+            said.add(line)
+            print(line, file=sys.stderr)
+
+    return warn
 
 
 def _guarded(arguments: list[str]) -> int:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 import types
+import warnings
 from pathlib import Path
 from typing import ClassVar
 
@@ -20,6 +21,7 @@ import csac_jax
 from csac_jax import algorithms, api, cli, presets
 from csac_jax.cli import bench, evaluation, failures, play, settings, sweep, train
 from csac_jax.config import BetaReplay, Config, DenseNet121, SceneConfig, Section, UniformReplay
+from csac_jax.errors import DataWarning
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
 from csac_jax.report.progress import Terminal
@@ -224,6 +226,21 @@ def test_long_work_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     cli.main(["doctor"])
     logger.info("2 of 6")
     assert capsys.readouterr() == ("done\n", "1 of 6\n")
+
+
+def test_a_warning_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    """Claim: a warning that comes from several places, or again, is one line of a command."""
+
+    def twice(_: list[str]) -> int:
+        warnings.warn("odd\nfile", DataWarning, stacklevel=1)
+        for level in (1, 2):
+            warnings.warn("odd file", DataWarning, stacklevel=level)
+        return 0
+
+    monkeypatch.setitem(cli.COMMANDS, "doctor", twice)
+    for _ in range(2):
+        assert cli.main(["doctor"]) == 0
+        assert capsys.readouterr() == ("", "csac-jax: warning: odd file\n")
 
 
 READERS = ["train --resume {}", "eval {}", "export {} p.safetensors", "play --policy {}"]
