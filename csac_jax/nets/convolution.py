@@ -9,7 +9,8 @@ times as long (jaxlib 0.11, H200). The first convolution, of few channels and ma
 product: a forward pass takes a fifth less. On a CPU that would be slower.
 
 GPU, several runs under `vmap`: XLA makes their convolutions grouped ones, which are slow. By taps a
-convolution is one product of matrices, whose parts are shifted and added (`experiments/bench`).
+convolution is one product of matrices, whose parts are shifted and added (`experiments/bench`). Its
+product needs memory, so thousands of passes keep the grouped one.
 """
 
 import functools
@@ -22,6 +23,7 @@ import jax.numpy as jnp
 _convolve = functools.partial(
     jax.lax.conv_general_dilated, dimension_numbers=("NHWC", "HWIO", "NHWC")
 )
+_MOST_PRODUCTS = 1 << 26  # numbers of a run by taps, ours: 0.13 GB in bfloat16
 
 
 def conv2d(
@@ -117,6 +119,11 @@ _conv2d.defvjp(
     lambda maps, kernel, *window: (_conv2d(maps, kernel, *window), (maps, kernel)),
     lambda *args: (_maps_gradient(*args), _kernel_gradient(*args)),
 )
+
+
+def taps_fit(maps: jax.Array, kernel: jax.Array) -> bool:
+    """Whether the products of all taps are few enough to lie in memory at once."""
+    return maps.size // maps.shape[-1] * (kernel.size // kernel.shape[2]) <= _MOST_PRODUCTS
 
 
 def convolve_by_taps(maps: jax.Array, kernel: jax.Array, dilation: int) -> jax.Array:

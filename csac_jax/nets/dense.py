@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import NetConfig, OffsetNet, SmallNet
-from csac_jax.nets.convolution import conv2d, convolve_by_taps
+from csac_jax.nets.convolution import conv2d, convolve_by_taps, taps_fit
 
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 OUTPUT_INIT = nn.initializers.variance_scaling(0.01, "fan_in", "normal")  # maps begin near 0
@@ -44,14 +44,14 @@ class Convolution(nn.Module):
     dtype: Any
     stride: int = 1  # s
     dilation: int = 1
-    by_taps: bool = False  # where the stride is 1, see `convolution`
+    by_taps: bool = False  # where the stride is 1 and they fit, see `convolution`
 
     @nn.compact
     def __call__(self, maps: jax.Array) -> jax.Array:
         shape = (self.size, self.size, maps.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.he_normal(), shape)
         maps, kernel = maps.astype(self.dtype), kernel.astype(self.dtype)
-        if self.by_taps and self.stride == 1:
+        if self.by_taps and self.stride == 1 and taps_fit(maps, kernel):
             return convolve_by_taps(maps, kernel, self.dilation)
         padding = self.dilation * (self.size - self.stride) // 2
         return conv2d(maps, kernel, self.stride, self.dilation, padding)
