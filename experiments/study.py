@@ -14,6 +14,7 @@ from csac_jax.report import comparison, results, tables
 from csac_jax.report.comparison import NAMES, Curve, Score
 from csac_jax.report.results import Variant
 from csac_jax.report.tables import Table
+from csac_jax.sweeps.grid import SWITCHES, TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 ARCHIVES = ROOT / "experiments" / "results" / "study"
@@ -87,9 +88,57 @@ def _pushes(title: str) -> Part:
     return Part(title, methods, pairs, 100, _pushing, groups, ("completion", PUSHES))
 
 
+LAWS = (
+    "uniform",
+    "prioritised",
+    "Beta to (1, 12)",
+    "Beta to (1, 4)",
+    "Beta to (1, 1)",
+    "Beta from (1, 12) to (0.5, 0.5)",
+    "Beta to (1, 12) by reward",
+    "Beta (1, 2)",
+)
+"""Laws of part 2, by which replay draws transitions. Beta laws begin at (0.5, 0.5) unless told."""
+
+
+def _law(variant: Variant) -> str:
+    """The law of a variant of part 2, and its task."""
+    changed = dict(variant.changed)
+    places = [changed.get(f"replay.{place}") for place in ("start", "end")]
+    other = {
+        (None, "1.0 4.0"): "Beta to (1, 4)",
+        (None, "1.0 1.0"): "Beta to (1, 1)",
+        ("1.0 12.0", "0.5 0.5"): "Beta from (1, 12) to (0.5, 0.5)",
+        ("1.0 2.0", "1.0 2.0"): "Beta (1, 2)",
+    }
+    if "replay.rank_by" in changed:
+        law = "Beta to (1, 12) by reward"
+    elif any(places):
+        law = other[places[0], places[1]]
+    else:
+        law = {"csac": "uniform", "csac_per": "prioritised", "csac_beta": LAWS[2]}[variant.algo]
+    task = "packed" if "scene.arranged" in changed else changed.get("task.kind", "target")
+    return f"{law}, {task}"
+
+
+def _replay(actions: str) -> Part:
+    """Laws of part 2 in all tasks together, each against uniform replay."""
+    groups = {law: tuple(f"{law}, {task}" for task in TASKS) for law in LAWS}
+    methods = tuple(itertools.chain.from_iterable(groups.values()))
+    pairs = tuple((law, LAWS[0]) for law in LAWS[1:])
+    return Part(f"Part 2, replay, {actions} actions", methods, pairs, 100, _law, groups)
+
+
+def _switch(variant: Variant) -> str:
+    """The switch of a variant of part 5."""
+    changed = {name for name, _ in variant.changed}
+    return next(switch for switch, settings in SWITCHES.items() if settings.keys() == changed)
+
+
 PRESET = "preset"
 CELL, MAXIMUM, OFFSET = "policy.place argmax", "target.value max", "net.kind offset"
 OFFSET_CELL, OFFSET_ACTOR = f"{OFFSET}, {CELL}", f"{OFFSET}, cem.start actor"
+OFFSET_CELLS = f"{OFFSET}, cem.start cells"
 MAXIMUM_CELL = f"{CELL}, {MAXIMUM}"
 ACTOR, CELLS = "cem.start actor", "cem.start cells"
 YAWS, COARSE = "net.rotations 8", "net.subcells 1"
@@ -98,11 +147,31 @@ PARTS = {
     "1-target": _algorithms("Part 1, the target task"),
     "1-clear": _algorithms("Part 1, the table cleared"),
     "1-packed": _algorithms("Part 1, packed scenes cleared"),
+    "2-replay-250": _replay("250"),
+    "2-replay-500": _replay("500"),
     "3-continuous": Part(
         "Part 3, continuous actions",
         (
-            *(PRESET, CELL, MAXIMUM, MAXIMUM_CELL, ACTOR, CELLS, OFFSET, OFFSET_ACTOR, OFFSET_CELL),
-            *(YAWS, f"{YAWS}, {CELL}", COARSE, f"{COARSE}, {CELL}", BOTH, f"{BOTH}, {CELL}"),
+            *(
+                PRESET,
+                CELL,
+                MAXIMUM,
+                MAXIMUM_CELL,
+                ACTOR,
+                CELLS,
+                OFFSET,
+                OFFSET_ACTOR,
+                OFFSET_CELLS,
+            ),
+            *(
+                OFFSET_CELL,
+                YAWS,
+                f"{YAWS}, {CELL}",
+                COARSE,
+                f"{COARSE}, {CELL}",
+                BOTH,
+                f"{BOTH}, {CELL}",
+            ),
         ),
         (
             (PRESET, CELL),
@@ -114,6 +183,7 @@ PARTS = {
             (PRESET, MAXIMUM),
             (ACTOR, PRESET),
             (CELLS, PRESET),
+            (OFFSET_CELLS, OFFSET_ACTOR),
             *((changed, PRESET) for changed in (YAWS, COARSE, BOTH)),
             *((changed, f"{changed}, {CELL}") for changed in (YAWS, COARSE, BOTH)),
         ),
@@ -122,6 +192,13 @@ PARTS = {
     ),
     "4-target": _pushes("Part 4, pushes in the target task"),
     "4-packed": _pushes("Part 4, pushes in packed scenes"),
+    "5-realism": Part(
+        "Part 5, what is nearer to the paper's robot",
+        tuple(SWITCHES),
+        tuple((switch, "none") for switch in SWITCHES if switch != "none"),
+        100,
+        _switch,
+    ),
 }
 """Name of an archive -> what is shown of it."""
 POINT = 0.01  # within which methods are equivalent

@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax import algorithms, presets
-from csac_jax.config import SimConfig, shown
+from csac_jax.config import shown
 from csac_jax.io import configs, files, renames
 
 ARCHIVE = ".tar.xz"  # of folders of runs: hundreds of logs are alike, so it is small
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
 SKIPPED = ("checkpoints", "tensorboard", "wandb", "best")
-NAMED = ("seed", "preset", "algo", "sim.physics", "sim.robot")  # shown by themselves
+NAMED = ("seed", "preset", "algo", "sim.physics")  # shown by themselves
 HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
 # What may be another in an evaluation.
 VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance")
@@ -291,8 +291,11 @@ def _without_evaluation(results: Results) -> Iterator[str]:
 
 def _variant(path: Path, config: Json) -> Variant:
     """The variant of a file of a run's folder: by name the folder, of several seeds the one above,
-    and the file where it is an evaluation."""
+    and the file where it is an evaluation, which may be with another robot than the run's."""
     folder = path.resolve().parent
+    if path.name != files.METRICS:
+        _, robot = world(_read_json(folder / files.CONFIG))
+        config = {**config, "sim": {**config.get("sim", {}), "robot": robot}}
     name = folder.parent.name if folder.name.startswith("seed-") else folder.name
     source = name if path.name == files.METRICS else f"{name}, {path.stem}"
     return dataclasses.replace(variant(config), source=source)
@@ -346,8 +349,6 @@ def command(one: RecordedRun | Evaluation, trained: Json | None = None) -> str:
     variant = one.variant
     flags = _flags(variant.changed)
     seed = f"--seed {one.config.get('seed', 0)} --sim.physics {physics}"
-    if robot != SimConfig().robot:
-        seed += f" --sim.robot {robot}"
     return f"csac-jax train {variant.preset} --algo {variant.algo} {seed}{flags}"
 
 

@@ -17,7 +17,7 @@ RESULTS = ROOT / "experiments" / "results"
 RUN = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/seed-\d+/(config|train|eval[\w-]*)\.json")
 SWEEP = re.compile(r"[a-z_]+/[a-z_0-9]+(-\d)?/(sweep|summary|train)\.json")
 SEARCH = re.compile(r"search/[a-z_]+/[a-z_]+\.json")
-STUDY = re.compile(r"study/\d-[a-z]+\.tar\.xz")
+STUDY = re.compile(r"study/\d-[a-z]+(-\d+)?\.tar\.xz")
 BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h100|h200)[\w-]*\.json")
 
 

@@ -428,6 +428,23 @@ def test_old_names_are_read_as_todays(tmp_path: Path):
     assert set(one.metrics["failures"]) == {"block_lost", "episode_physics_diverged"}
 
 
+def test_robots_of_training_are_told_apart(tmp_path: Path):
+    """Claim: runs with another robot are another variant, and so are their evaluations; what is
+    evaluated with another robot than it was trained with stays of its run's variant."""
+    for robot in ("hand", "ur5"):
+        config = _config("csac_beta", 0, sim__robot=robot)
+        _run(tmp_path / robot, config, [0.5])
+        for other in ("hand", "ur5"):
+            seen = _config("csac_beta", 0, sim__robot=other)
+            _evaluation(tmp_path / robot / f"eval-{other}.json", seen, 5)
+    found = results.read([tmp_path])
+    trained = {run.path.parent.name: run.variant for run in found.runs}
+    assert (trained["hand"].changed, trained["ur5"].changed) == ((), (("sim.robot", "ur5"),))
+    assert all(one.variant == trained[one.path.parent.name] for one in found.evaluations)
+    (run,) = (run for run in found.runs if run.path.parent.name == "ur5")
+    assert results.command(run).count("--sim.robot ur5") == 1
+
+
 def test_command_gives_the_config_back():
     """Claim: the command in the provenance, parsed, is the run's config."""
     changed = {
