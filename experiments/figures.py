@@ -14,6 +14,7 @@ from matplotlib import cycler, ticker
 from matplotlib.figure import Figure
 
 from csac_jax.report import charts, comparison, curves, results
+from csac_jax.report.results import METRICS
 from experiments import study
 
 plt.rcParams["axes.prop_cycle"] = cycler(color=curves.PALETTE)
@@ -52,9 +53,37 @@ def figures() -> Iterator[tuple[str, Figure]]:
     yield "warp-action", warp_action()
     report = comparison.build(results.read([RESULTS]))
     yield from ((chart.name, chart.figure) for chart in charts.draw(report))
+    yield "study", differences()
     for name, path in study.archives().items():
-        part = comparison.build(results.read([path]))
+        part = comparison.build(study.read(path))
         yield from ((f"study-{name}-{chart.name}", chart.figure) for chart in charts.draw(part))
+
+
+def differences() -> Figure:
+    """What tests the study's hypotheses: a panel for each archive, differences with their intervals
+    and, of shares, the band in which methods are equivalent."""
+    tested = study.tested()
+    rows = [len(gaps) for gaps in tested.values()]
+    figure, panels = plt.subplots(
+        len(rows),
+        figsize=(9, 0.26 * sum(rows) + 0.75 * len(rows)),
+        height_ratios=[1 + count for count in rows],
+        layout="constrained",
+    )
+    for panel, (name, gaps) in zip(panels, tested.items(), strict=True):
+        part = study.PARTS[name]
+        scale, unit = (1, "") if part.by == study.PUSHES else (100, ", points")
+        places = range(len(gaps), 0, -1)
+        for place, gap in zip(places, gaps, strict=True):
+            value, low, high = (scale * x for x in gap.band[:3] if x is not None)
+            panel.errorbar(value, place, xerr=[[value - low], [high - value]], fmt="o", color="C0")
+        if unit:
+            panel.axvspan(-scale * study.POINT, scale * study.POINT, color="0.9", zorder=0)
+        panel.axvline(0, color="0.5", linewidth=1)
+        panel.set_yticks(list(places), [f"{gap.method} less {gap.less}" for gap in gaps])
+        panel.set(ylim=(0.3, len(gaps) + 0.7), xlabel=f"{METRICS.get(part.by, part.by)}{unit}")
+        panel.set_title(f"{part.title} (hypothesis {part.hypothesis})", fontsize="medium")
+    return figure
 
 
 def _read(pattern: str) -> list[dict[str, Any]]:

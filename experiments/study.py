@@ -1,14 +1,17 @@
-"""Writes the tables of the study into docs/study.md, from archives in experiments/results/study.
+"""Writes the tables of the study into docs/study.md, from archives in experiments/results/study,
+and those differences that test its hypotheses into docs/results.md.
 
 An archive PART-NAME.tar.xz holds sweeps of a part. `csac-jax report` reads it too.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from csac_jax.evaluation import statistics
+from csac_jax.evaluation.statistics import Band
 from csac_jax.evaluation.suites import IN_DISTRIBUTION
 from csac_jax.report import comparison, results, tables
 from csac_jax.report.comparison import NAMES, Curve, Score
@@ -18,9 +21,11 @@ from csac_jax.sweeps.grid import SWITCHES, TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 ARCHIVES = ROOT / "experiments" / "results" / "study"
-PAGE = ROOT / "docs" / "study.md"
+PAGE, RESULTS_PAGE = ROOT / "docs" / "study.md", ROOT / "docs" / "results.md"
 BEGIN = "<!-- The rest is written by `python -m experiments.study`. -->\n"
 METRICS = ("completion", "grasp_success", "action_efficiency", PUSHES := "pushes_per_episode")
+AREA = "area"  # under the curve of training; all other metrics are of evaluations
+TITLE, NEXT_TITLE = "## The study\n", "## Summary\n"  # of a section of docs/results.md
 
 
 class Part(NamedTuple):
@@ -30,6 +35,9 @@ class Part(NamedTuple):
     methods: tuple[str, ...]  # in order; names of algorithms, or the settings that are changed
     pairs: tuple[tuple[str, str], ...]  # of methods or groups that are compared
     episodes: int  # of an evaluation in scenes like the training's
+    hypothesis: int
+    tested: int  # how many of the pairs, the first ones, test the hypothesis
+    by: str  # the metric that tests it
     name: Callable[[Variant], str] = lambda variant: NAMES[variant.algo]
     groups: Mapping[str, tuple[str, ...]] = {}  # each of methods, which are its strata
     metrics: tuple[str, ...] = ("completion",)  # whose differences are shown, beside the area's
@@ -45,7 +53,8 @@ def _algorithms(title: str) -> Part:
     methods = ("grasp_only", "reactive", "vpg", "csac", "csac_per", "csac_beta")
     grasp_only, reactive, vpg, csac, per, beta = names = tuple(NAMES[name] for name in methods)
     pairs = [(name, grasp_only) for name in (csac, per, beta, reactive, vpg)]
-    return Part(title, names, (*pairs, (per, csac), (beta, csac), (beta, vpg)), 500)
+    others = (per, csac), (beta, csac), (beta, vpg)
+    return Part(title, names, (*pairs, *others), 500, 1, len(pairs), "completion")
 
 
 def _changes(variant: Variant) -> str:
@@ -74,7 +83,7 @@ PUSHING = {
 """Setting of part 4 -> its values, the preset's last."""
 
 
-def _pushes(title: str) -> Part:
+def _pushes(title: str, tested: int = 0) -> Part:
     """Methods of part 4: all values of each setting together, one against the other."""
     every = tuple(itertools.product(*PUSHING.values()))
     groups = {
@@ -85,7 +94,8 @@ def _pushes(title: str) -> Part:
     stored, renewed, no_bonus, bonus, far, near = groups
     pairs = ((renewed, stored), (no_bonus, bonus), (far, near))
     methods = tuple(map(_values, every))
-    return Part(title, methods, pairs, 100, _pushing, groups, ("completion", PUSHES))
+    metrics = ("completion", PUSHES)
+    return Part(title, methods, pairs, 100, 4, tested, PUSHES, _pushing, groups, metrics)
 
 
 LAWS = (
@@ -104,8 +114,8 @@ LAWS = (
 def _law(variant: Variant) -> str:
     """The law of a variant of part 2, and its task."""
     changed = dict(variant.changed)
-    places = [changed.get(f"replay.{place}") for place in ("start", "end")]
-    other = {
+    places = (changed.get("replay.start"), changed.get("replay.end"))
+    other: dict[tuple[str | None, str | None], str] = {
         (None, "1.0 4.0"): "Beta to (1, 4)",
         (None, "1.0 1.0"): "Beta to (1, 1)",
         ("1.0 12.0", "0.5 0.5"): "Beta from (1, 12) to (0.5, 0.5)",
@@ -114,7 +124,7 @@ def _law(variant: Variant) -> str:
     if "replay.rank_by" in changed:
         law = "Beta to (1, 12) by reward"
     elif any(places):
-        law = other[places[0], places[1]]
+        law = other[places]
     else:
         law = {"csac": "uniform", "csac_per": "prioritised", "csac_beta": LAWS[2]}[variant.algo]
     task = "packed" if "scene.arranged" in changed else changed.get("task.kind", "target")
@@ -126,7 +136,8 @@ def _replay(actions: str) -> Part:
     groups = {law: tuple(f"{law}, {task}" for task in TASKS) for law in LAWS}
     methods = tuple(itertools.chain.from_iterable(groups.values()))
     pairs = tuple((law, LAWS[0]) for law in LAWS[1:])
-    return Part(f"Part 2, replay, {actions} actions", methods, pairs, 100, _law, groups)
+    title, tested = f"Part 2, replay, {actions} actions", len(pairs)
+    return Part(title, methods, pairs, 100, 2, tested, AREA, _law, groups)
 
 
 def _switch(variant: Variant) -> str:
@@ -175,33 +186,81 @@ PARTS = {
         ),
         (
             (PRESET, CELL),
-            (MAXIMUM, MAXIMUM_CELL),
             (OFFSET_ACTOR, OFFSET),
+            (OFFSET_ACTOR, OFFSET_CELLS),
             (OFFSET_ACTOR, OFFSET_CELL),
+            (MAXIMUM, MAXIMUM_CELL),
             (OFFSET, OFFSET_CELL),
             (OFFSET, PRESET),
             (PRESET, MAXIMUM),
             (ACTOR, PRESET),
             (CELLS, PRESET),
-            (OFFSET_CELLS, OFFSET_ACTOR),
             *((changed, PRESET) for changed in (YAWS, COARSE, BOTH)),
             *((changed, f"{changed}, {CELL}") for changed in (YAWS, COARSE, BOTH)),
         ),
         100,
-        _changes,
+        hypothesis=3,
+        tested=4,
+        by=AREA,
+        name=_changes,
     ),
     "4-target": _pushes("Part 4, pushes in the target task"),
-    "4-packed": _pushes("Part 4, pushes in packed scenes"),
+    "4-packed": _pushes("Part 4, pushes in packed scenes", 3),
     "5-realism": Part(
-        "Part 5, what is nearer to the paper's robot",
+        "Part 5, nearer to the paper's robot",
         tuple(SWITCHES),
         tuple((switch, "none") for switch in SWITCHES if switch != "none"),
         100,
-        _switch,
+        hypothesis=5,
+        tested=len(SWITCHES) - 1,
+        by="completion",
+        name=_switch,
     ),
 }
 """Name of an archive -> what is shown of it."""
 POINT = 0.01  # within which methods are equivalent
+
+
+class Gap(NamedTuple):
+    """How far a method or group is ahead of another by a metric."""
+
+    method: str
+    less: str
+    metric: str
+    where: str  # the suite, where it is not scenes like the training's
+    band: Band
+    told: str  # what the protocol makes of it
+
+    @property
+    def shown(self) -> str:
+        """The difference with its interval, and what is told."""
+        metric = "" if self.metric == AREA else self.metric
+        return f"{tables.shown(self.band, sign='+', metric=metric)}: {self.told}"
+
+
+class Found(NamedTuple):
+    """What an archive holds of each method of a part."""
+
+    part: Part
+    curves: dict[str, Curve]
+    scores: dict[str, dict[str, Score]]  # by suite
+
+    def gaps(self, a: str, b: str) -> list[Gap]:
+        """Of a pair by all metrics, the area first; none where a method has not run."""
+        ours, theirs = (self.part.groups.get(name, (name,)) for name in (a, b))
+        known = (self.curves, *self.scores.values())
+        if not all({*ours, *theirs} <= one.keys() for one in known):
+            return []
+        areas = [[self.curves[k].area for k in one] for one in (ours, theirs)]
+        found = [_gap(a, b, AREA, "", *areas)]
+        for (suite, scores), metric in itertools.product(self.scores.items(), self.part.metrics):
+            strata = [
+                list(itertools.chain.from_iterable(scores[k].strata(metric) for k in one))
+                for one in (ours, theirs)
+            ]
+            where = "" if suite == IN_DISTRIBUTION else suite
+            found.append(_gap(a, b, metric, where, *strata))
+        return found
 
 
 def archives() -> dict[str, Path]:
@@ -210,23 +269,84 @@ def archives() -> dict[str, Path]:
     return {name: path for name, path in paths.items() if path.exists()}
 
 
+@functools.cache
+def read(path: Path) -> results.Results:
+    """What an archive holds, read once."""
+    return results.read([path])
+
+
 def page() -> str:
     """docs/study.md with the tables of today's archives."""
     protocol, _, _ = PAGE.read_text().partition(BEGIN)
-    return protocol + BEGIN + "".join(_part(*one) for one in archives().items())
+    return protocol + BEGIN + "".join(map(_part, found().values()))
 
 
-def _part(name: str, path: Path) -> str:
-    part, report = PARTS[name], comparison.build(results.read([path]))
-    curves = _methods(part, report.curves)
+@functools.cache
+def found() -> dict[str, Found]:
+    """What each archive holds, by its name."""
+    return {name: _found(PARTS[name], path) for name, path in archives().items()}
+
+
+def tested() -> dict[str, list[Gap]]:
+    """The differences that test hypotheses, by archive."""
+    return {
+        name: [
+            gap
+            for pair in one.part.pairs[: one.part.tested]
+            for gap in one.gaps(*pair)
+            if (gap.metric, gap.where) == (one.part.by, "")
+        ]
+        for name, one in found().items()
+        if one.part.tested
+    }
+
+
+def with_study(page: str) -> str:
+    """The text of docs/results.md with the section of the study."""
+    rows: Table = [
+        {
+            "hypothesis": str(PARTS[name].hypothesis),
+            "part": PARTS[name].title.partition(", ")[2],
+            "method": gap.method,
+            "less": gap.less,
+            "metric": results.METRICS.get(gap.metric, gap.metric),
+            "difference": gap.shown,
+        }
+        for name, gaps in tested().items()
+        for gap in gaps
+    ]
+    section = (
+        f"{TITLE}\nThe differences that test the hypotheses of [the study](study.md), over seeds "
+        "that no search has used. Written by `python -m experiments.study`.\n\n"
+        f"![Differences](figures/study.png)\n\n{tables.table_text(rows)}\n\n"
+    )
+    before, after, rest = without_study(page).partition(NEXT_TITLE)
+    return before + section + after + rest
+
+
+def without_study(page: str) -> str:
+    """The text of docs/results.md without that section."""
+    before, _, rest = page.partition(TITLE)
+    return before + "".join(rest.partition(NEXT_TITLE)[1:])
+
+
+def _found(part: Part, path: Path) -> Found:
+    report = comparison.build(read(path))
     scores = {
         suite: _methods(part, [score for score in report.scores if score.suite == suite])
         for suite in part.suites()
     }
-    scores = {suite: found for suite, found in scores.items() if found}
-    titled = {"Training": _training(curves)}
-    titled |= {f"Greedy: {part.suites()[suite]}": _greedy(found) for suite, found in scores.items()}
-    titled["Differences"] = list(_differences(part, curves, scores))
+    curves = _methods(part, report.curves)
+    return Found(part, curves, {suite: one for suite, one in scores.items() if one})
+
+
+def _part(one: Found) -> str:
+    part = one.part
+    titled = {"Training": _training(one.curves)}
+    titled |= {
+        f"Greedy: {part.suites()[suite]}": _greedy(scores) for suite, scores in one.scores.items()
+    }
+    titled["Differences"] = list(_differences(one))
     text = "".join(f"\n**{title}**\n\n{tables.table_text(one)}\n" for title, one in titled.items())
     return f"\n### {part.title}\n{text}"
 
@@ -258,38 +378,32 @@ def _greedy(scores: dict[str, Score]) -> Table:
     ]
 
 
-def _differences(
-    part: Part, curves: dict[str, Curve], scores: dict[str, dict[str, Score]]
-) -> Iterator[dict[str, str]]:
-    for a, b in part.pairs:
-        ours, theirs = (part.groups.get(name, (name,)) for name in (a, b))
-        if all({*ours, *theirs} <= known.keys() for known in (curves, *scores.values())):
-            row = {"method": a, "less": b}
-            row["area"] = _verdict(*([curves[k].area for k in one] for one in (ours, theirs)))
-            for (suite, known), metric in itertools.product(scores.items(), part.metrics):
-                where = "" if suite == IN_DISTRIBUTION else f", suite `{suite}`"
-                strata = [[known[k].strata(metric) for k in one] for one in (ours, theirs)]
-                row[f"{results.METRICS[metric]}{where}"] = _verdict(
-                    *(list(itertools.chain.from_iterable(one)) for one in strata), metric
-                )
+def _differences(one: Found) -> Iterator[dict[str, str]]:
+    for pair in one.part.pairs:
+        if gaps := one.gaps(*pair):
+            row = dict(zip(("method", "less"), pair, strict=True))
+            for gap in gaps:
+                where = f", suite `{gap.where}`" if gap.where else ""
+                row[f"{results.METRICS.get(gap.metric, gap.metric)}{where}"] = gap.shown
             yield row
 
 
-def _verdict(ours: Any, theirs: Any, metric: str = "") -> str:
+def _gap(a: str, b: str, metric: str, where: str, ours: Any, theirs: Any) -> Gap:
     """A difference of strata, and what the protocol makes of it; where they differ with the
     probability of improvement, that a seed of ours is above one of theirs. Only shares can be
     equivalent."""
-    gap = statistics.difference(ours, theirs)
-    assert gap.low is not None
-    assert gap.high is not None
-    small = metric != PUSHES and max(-gap.low, gap.high) <= POINT
-    if not gap.low <= 0.0 <= gap.high:
+    band = statistics.difference(ours, theirs)
+    assert band.low is not None
+    assert band.high is not None
+    small = metric != PUSHES and max(-band.low, band.high) <= POINT
+    if not band.low <= 0.0 <= band.high:
         told = "differ, by less than a point" if small else "differ"
         told += f", P {100 * statistics.improvement(ours, theirs).value:.0f} %"
     else:
         told = "equivalent" if small else "not told"
-    return f"{tables.shown(gap, sign='+', metric=metric)}: {told}"
+    return Gap(a, b, metric, where, band, told)
 
 
 if __name__ == "__main__":
     PAGE.write_text(page())
+    RESULTS_PAGE.write_text(with_study(RESULTS_PAGE.read_text()))

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from csac_jax import cli
-from csac_jax.report import results
 from experiments import figures, records, study
 
 ROOT = Path(__file__).parents[2]
@@ -22,12 +21,14 @@ BENCH = re.compile(r"bench/[a-z_]+/(cpu|xeon|epyc|h100|h200)[\w-]*\.json")
 
 
 def test_results_page_is_what_report_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: docs/results.md is what `csac-jax report` writes of the recorded results."""
+    """Claim: docs/results.md is what `csac-jax report` writes of the recorded results, and the
+    study's section what `experiments.study` does."""
     monkeypatch.chdir(ROOT)
     page = tmp_path / "results.md"
     assert cli.main(["report", "experiments/results", "--markdown", str(page)]) == 0
     written = page.read_text().replace(str(page), "docs/results.md")
-    assert written == (ROOT / "docs" / "results.md").read_text()
+    assert study.with_study(written) == study.RESULTS_PAGE.read_text()
+    assert study.without_study(study.RESULTS_PAGE.read_text()) == written
 
 
 def test_index_is_what_records_writes():
@@ -41,7 +42,7 @@ def test_study_has_the_tables_of_its_archives():
     assert study.page() == study.PAGE.read_text()
     assert sorted(study.ARCHIVES.iterdir()) == sorted(study.archives().values())
     for path in study.archives().values():
-        found = results.read([path])
+        found = study.read(path)
         assert {run.config["seed"] for run in found.runs} <= set(range(100, 150))
         assert not [note for note in found.notes if "damaged" in note or "not evaluated" in note]
 
