@@ -98,35 +98,30 @@ def _pushes(title: str, tested: int = 0) -> Part:
     return Part(title, methods, pairs, 100, 4, tested, PUSHES, _pushing, groups, metrics)
 
 
-LAWS = (
-    "uniform",
-    "prioritised",
-    "Beta to (1, 12)",
-    "Beta to (1, 4)",
-    "Beta to (1, 1)",
-    "Beta from (1, 12) to (0.5, 0.5)",
-    "Beta to (1, 12) by reward",
-    "Beta (1, 2)",
-)
-"""Laws of part 2, by which replay draws transitions. Beta laws begin at (0.5, 0.5) unless told."""
+UNIFORM = "uniform"
+LAWS: dict[str, tuple[str, dict[str, str]]] = {
+    UNIFORM: ("csac", {}),
+    "prioritised": ("csac_per", {}),
+    "Beta to (1, 12)": ("csac_beta", {}),
+    "Beta to (1, 4)": ("csac_beta", {"end": "1.0 4.0"}),
+    "Beta to (1, 1)": ("csac_beta", {"end": "1.0 1.0"}),
+    "Beta from (1, 12) to (0.5, 0.5)": ("csac_beta", {"start": "1.0 12.0", "end": "0.5 0.5"}),
+    "Beta to (1, 12) by reward": ("csac_beta", {"rank_by": "reward"}),
+    "Beta (1, 2)": ("csac_beta", dict.fromkeys(("start", "middle", "end"), "1.0 2.0")),
+}
+"""Law of part 2, by which replay draws transitions -> algorithm, and what is changed of `replay`.
+Beta laws begin at (0.5, 0.5) unless told."""
 
 
 def _law(variant: Variant) -> str:
     """The law of a variant of part 2, and its task."""
     changed = dict(variant.changed)
-    places = (changed.get("replay.start"), changed.get("replay.end"))
-    other: dict[tuple[str | None, str | None], str] = {
-        (None, "1.0 4.0"): "Beta to (1, 4)",
-        (None, "1.0 1.0"): "Beta to (1, 1)",
-        ("1.0 12.0", "0.5 0.5"): "Beta from (1, 12) to (0.5, 0.5)",
-        ("1.0 2.0", "1.0 2.0"): "Beta (1, 2)",
+    replay = {
+        name.removeprefix("replay."): value
+        for name, value in changed.items()
+        if name.startswith("replay.")
     }
-    if "replay.rank_by" in changed:
-        law = "Beta to (1, 12) by reward"
-    elif any(places):
-        law = other[places]
-    else:
-        law = {"csac": "uniform", "csac_per": "prioritised", "csac_beta": LAWS[2]}[variant.algo]
+    law = next(law for law, known in LAWS.items() if known == (variant.algo, replay))
     task = "packed" if "scene.arranged" in changed else changed.get("task.kind", "target")
     return f"{law}, {task}"
 
@@ -135,7 +130,7 @@ def _replay(actions: str) -> Part:
     """Laws of part 2 in all tasks together, each against uniform replay."""
     groups = {law: tuple(f"{law}, {task}" for task in TASKS) for law in LAWS}
     methods = tuple(itertools.chain.from_iterable(groups.values()))
-    pairs = tuple((law, LAWS[0]) for law in LAWS[1:])
+    pairs = tuple((law, UNIFORM) for law in LAWS if law != UNIFORM)
     title, tested = f"Part 2, replay, {actions} actions", len(pairs)
     return Part(title, methods, pairs, 100, 2, tested, AREA, _law, groups)
 
@@ -163,26 +158,19 @@ PARTS = {
     "3-continuous": Part(
         "Part 3, continuous actions",
         (
-            *(
-                PRESET,
-                CELL,
-                MAXIMUM,
-                MAXIMUM_CELL,
-                ACTOR,
-                CELLS,
-                OFFSET,
-                OFFSET_ACTOR,
-                OFFSET_CELLS,
-            ),
-            *(
-                OFFSET_CELL,
-                YAWS,
-                f"{YAWS}, {CELL}",
-                COARSE,
-                f"{COARSE}, {CELL}",
-                BOTH,
-                f"{BOTH}, {CELL}",
-            ),
+            PRESET,
+            CELL,
+            MAXIMUM,
+            MAXIMUM_CELL,
+            ACTOR,
+            CELLS,
+            OFFSET,
+            OFFSET_ACTOR,
+            OFFSET_CELLS,
+            OFFSET_CELL,
+            *(YAWS, f"{YAWS}, {CELL}"),
+            *(COARSE, f"{COARSE}, {CELL}"),
+            *(BOTH, f"{BOTH}, {CELL}"),
         ),
         (
             (PRESET, CELL),
