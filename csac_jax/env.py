@@ -154,8 +154,9 @@ class Env:
     def step(self, state: State, action: Action) -> State:
         """The state after one action; blocks lifted or pushed out of the workspace are removed.
 
-        Nothing moves for an action that the robot cannot follow. Where physics diverges, the scene
-        stays as it was; a scene that was invalid before becomes empty. `state.done` is not read.
+        Nothing moves for an action that the robot cannot follow. Where physics diverges, as it does
+        at a pose that is no number, the scene stays as it was; a scene that was invalid before
+        becomes empty. `state.done` is not read.
         """
         cfg, task, spec = self.cfg, self.cfg.task, self.observation_spec
         valid = simulation.healthy(state.scene) & spec.height.contains(state.obs.height)
@@ -163,7 +164,8 @@ class Env:
         blank = layout.parked(cfg.scene.slots).replace(fingers=state.scene.fingers)
         before = _select(valid, state.scene, blank)
         after, trace, plan = simulation.execute(self.physics, cfg, before, state.obs.height, action)
-        diverged = ~(valid & simulation.healthy(after))
+        sound = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would go on
+        diverged = ~(valid & sound & simulation.healthy(after))
         after = _select(diverged, before, after)
 
         # Remove the blocks that were lifted or lost.

@@ -489,6 +489,23 @@ def _assert_replaced(diverged: State, before: Scene, where: str) -> None:
     jax.tree.map(np.testing.assert_array_equal, diverged.scene, expected)
 
 
+def test_pose_that_is_no_number_fails_in_c(lab: Lab):
+    """Claim: an action that is no number is failed physics with C MuJoCo, too, which would go on:
+    the scene stays as it was, and the others are stepped."""
+    cfg = CONFIG.change(sim={"physics": "c"})
+    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    env = dataclasses.replace(lab.env, cfg=cfg, physics=physics)
+    scenes = _stack(*[_cube(0.0, 0.0)] * 3)
+    poses = (0.0, 0.0, 0.0), (np.nan, 0.0, 0.0), (0.0, 0.0, np.inf)
+    actions = _actions(*[(Primitive.GRASP, pose) for pose in poses])
+    first_step = jax.vmap(lambda scene, action: env.step(env.reset_to(scene), action))
+    after = jax.jit(first_step)(scenes, actions)
+    assert after.info.physics_diverged.tolist() == [False, True, True]
+    assert after.info.cleared.tolist() == [1, 0, 0]
+    for index in (1, 2):
+        _assert_replaced(_at(after, index), _at(scenes, index), "action.pose")
+
+
 def test_target_that_is_no_slot_counts_as_divergence(lab: Lab):
     """Claim: a scene whose target is beyond the slots has diverged; it does not pass for a table
     cleared of its target."""
