@@ -155,6 +155,8 @@ PARTS = {
     "1-packed": _algorithms("Part 1, packed scenes cleared"),
     "2-replay-250": _replay("250"),
     "2-replay-500": _replay("500"),
+    "2-replay-1000": _replay("1000"),
+    "2-replay-2500": _replay("2500"),
     "3-continuous": Part(
         "Part 3, continuous actions",
         (
@@ -276,8 +278,8 @@ def found() -> dict[str, Found]:
 
 
 def tested() -> dict[str, list[Gap]]:
-    """The differences that test hypotheses, by archive."""
-    return {
+    """The differences that test hypotheses, by archive, of those that have any."""
+    every = {
         name: [
             gap
             for pair in one.part.pairs[: one.part.tested]
@@ -285,8 +287,8 @@ def tested() -> dict[str, list[Gap]]:
             if (gap.metric, gap.where) == (one.part.by, "")
         ]
         for name, one in found().items()
-        if one.part.tested
     }
+    return {name: gaps for name, gaps in every.items() if gaps}
 
 
 def with_study(page: str) -> str:
@@ -335,7 +337,8 @@ def _part(one: Found) -> str:
         f"Greedy: {part.suites()[suite]}": _greedy(scores) for suite, scores in one.scores.items()
     }
     titled["Differences"] = list(_differences(one))
-    text = "".join(f"\n**{title}**\n\n{tables.table_text(one)}\n" for title, one in titled.items())
+    shown = {title: table for title, table in titled.items() if table}
+    text = "".join(f"\n**{title}**\n\n{tables.table_text(one)}\n" for title, one in shown.items())
     return f"\n### {part.title}\n{text}"
 
 
