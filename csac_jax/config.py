@@ -380,8 +380,6 @@ class CEMConfig(Section, section="cem"):
     candidates: int = _bounded(64, 1)  # J, actions sampled in a round.
     elites: int = _bounded(6, 2)  # K, best actions that the next round's distribution is fitted to.
     rounds: int = _bounded(3, 1)  # Rounds of sampling and fitting.
-    std_estimator: Literal["std", "mad"] = "std"
-    """Of the elites: standard deviation, or line 12's mean absolute deviation with 1 / (K - 1)."""
     start: Literal["both", "actor", "cells"] = "both"
     """W of the first round: about the actor's mean, with the map's best cells among the samples; or
     without those; or about the best cell, with no use of the actor."""
@@ -403,6 +401,9 @@ class PolicyConfig(Section, section="policy"):
     retry: float = _bounded(0.0, 0.0, 10.0)
     """Temperature, in units of Q, that each failed grasp in a row adds: the next place is drawn by
     it, about by Boltzmann's law, where the policy does not explore anyway. 0: the best place."""
+    height_bonus: float = _bounded(0.0, 0.0, 100.0)
+    """What each metre of the surface under a cell adds to Q where the policy chooses: what lies on
+    top is taken first, so that fewer objects fall from a pile. V(s) does not have it."""
     augment: bool = False
     """Where the policy does not explore, Q is the mean over mirror images of the view and over the
     critics (test-time augmentation), at four times the networks' work."""

@@ -99,7 +99,6 @@ def test_unknown_algorithm_names_the_known():
         (lambda: CEMConfig(candidates=5, elites=6), "cem.elites"),
         (lambda: CEMConfig(elites=1), "cem.elites"),
         (lambda: CEMConfig(start="somewhere"), "cem.start"),
-        (lambda: CEMConfig(std_estimator="var"), "cem.std_estimator"),
         (lambda: PolicyConfig(place="best"), "policy.place"),
         (lambda: PolicyConfig(primitive="push"), "policy.primitive"),
         (lambda: TargetConfig(value="mean"), "target.value"),

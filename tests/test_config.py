@@ -71,6 +71,7 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("net.subcells", [3]),
         ("cem.rounds", [0]),
         ("policy.retry", [-0.1, 11.0]),
+        ("policy.height_bonus", [-0.1, 101.0]),
         ("target.gamma", [-0.1]),
         ("target.bootstrap", ["always"]),
         ("reward.grasp_levels", [(-0.4, -0.5, -0.25, 0.0, 1.0), (-1.0, -0.5, -0.25, 0.0, -0.1)]),

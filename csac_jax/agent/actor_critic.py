@@ -142,13 +142,31 @@ def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseM
     return _corrected(learner, params, obs, *_critic_maps(learner, params.critic, obs))
 
 
+def exploration_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
+    """What a policy that explores acts on: `dense_maps`, with `policy.height_bonus`."""
+    return _with_height_bonus(learner, obs, dense_maps(learner, params, obs))
+
+
 def decision_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
-    """What a policy that does not explore acts on: `dense_maps`, or with `policy.augment` Q's mean
-    over mirror images and critics."""
+    """What a policy that does not explore acts on: `exploration_maps`, or with `policy.augment` of
+    Q's mean over mirror images and critics."""
     if not learner.cfg.policy.augment:
-        return dense_maps(learner, params, obs)
+        return exploration_maps(learner, params, obs)
     q, features = _of_passes(learner, params.critic, obs, networks.apply_mirrored)
-    return _corrected(learner, params, obs, jnp.mean(q, axis=0), features)
+    state = _corrected(learner, params, obs, jnp.mean(q, axis=0), features)
+    return _with_height_bonus(learner, obs, state)
+
+
+def _with_height_bonus(learner: ActorCritic, obs: Observation, state: DenseMaps) -> DenseMaps:
+    """The maps of a batch, Q raised with the height of what lies under each cell."""
+    if learner.cfg.policy.height_bonus == 0.0:
+        return state
+    heights = jax.vmap(maps.cell_heights, (None, 0))(learner.frames, obs.height)
+    bonus = learner.cfg.policy.height_bonus * heights[:, None]  # [B, 1, K, h, w]
+    terms = state.terms
+    if terms is not None:
+        terms = terms.at[..., 0].add(bonus)  # the value in the cell
+    return state.replace(q=state.q + bonus, terms=terms)
 
 
 def _corrected(

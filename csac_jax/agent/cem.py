@@ -78,23 +78,16 @@ def _update(cfg: CEMConfig, score: Score, search: _Search, actions: jax.Array) -
     )
 
 
-STD_ESTIMATORS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
-    # abs(a_k - mu) [K, 3], number of elites [] -> [3]
-    "std": lambda deviation, count: jnp.sqrt(jnp.sum(deviation**2, axis=0) / count),
-    "mad": lambda deviation, count: jnp.sum(deviation, axis=0) / jnp.maximum(count - 1.0, 1.0),
-}
-
-
 def fit(cfg: CEMConfig, elites: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean [3] and std [3] of the `valid` [K] elites [K, 3], Algorithm 1 line 12.
 
-    std: sqrt(1 / K sum (a_k - mu)^2), or the paper's `mad`: 1 / (K - 1) sum |a_k - mu|. Yaw is
+    std: sqrt(1 / K sum (a_k - mu)^2), where line 12 has 1 / (K - 1) sum |a_k - mu|. Yaw is
     measured from the first elite, the short way round: across the seam the mean is at the seam.
     """
     weight = valid.astype(elites.dtype)[:, None]  # [K, 1]
     count = jnp.maximum(jnp.sum(weight), 1.0)
     offset = box.wrap_yaw(elites - elites[:1])  # [K, 3]
     mean_offset = jnp.sum(weight * offset, axis=0) / count
-    deviation = weight * jnp.abs(offset - mean_offset[None])
-    std = STD_ESTIMATORS[cfg.std_estimator](deviation, count)
+    deviation = weight * (offset - mean_offset[None])
+    std = jnp.sqrt(jnp.sum(deviation**2, axis=0) / count)
     return box.project(elites[0] + mean_offset), jnp.maximum(std, cfg.std_min)

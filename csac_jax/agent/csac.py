@@ -43,7 +43,7 @@ class CSAC(Learner):
             maps = self._chunked(actor_critic.decision_maps)(state.online, obs)
             best = jax.vmap(policy.best_action, (0, None, 0, 0))
             return best(keys, self.parts, maps, steps_without_change)
-        maps = self._chunked(actor_critic.dense_maps)(state.online, obs)
+        maps = self._chunked(actor_critic.exploration_maps)(state.online, obs)
         act = jax.vmap(policy.act, (0, None, 0, 0, None))
         return act(keys, self.parts, maps, steps_without_change, actions_taken)
 

@@ -170,10 +170,15 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
 
 def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:
     """Cells [K, h, w] bool under which the height map [H, W] m is higher than BARE."""
+    return cell_heights(frames, height) > BARE
+
+
+def cell_heights(frames: Frames, height: jax.Array) -> jax.Array:
+    """What is highest of the height map [H, W] m under each cell, [K, h, w] m; 0 outside it."""
     side, stride = frames.side, frames.networks.stride
     rotated = rotate.rotate(frames.tables, height[..., None])
     blocks = rotated.reshape(-1, side, stride, side, stride)
-    cells = blocks.max(axis=(2, 4)) > BARE  # [K / 2, h, w]
+    cells = blocks.max(axis=(2, 4))  # [K / 2, h, w]
     return _all_frames(cells, cells)
 
 

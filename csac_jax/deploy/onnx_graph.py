@@ -149,7 +149,7 @@ def _inputs(graph: Graph, frames: Frames, fingers: Any) -> tuple[str, int]:
 
 
 def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any, cfg: Config) -> str:
-    """Q [P, K, h, w], the lower of the critics; see `actor_critic.decision_maps`."""
+    """Q [P, K, h, w] to decide by, see `actor_critic.decision_maps`."""
     maps, channels = _inputs(graph, frames, program.fingers(cfg))
     rotated = _rotated(graph, frames, maps, channels)
     image = graph.op("Transpose", rotated, perm=[0, 3, 1, 2])
@@ -164,6 +164,10 @@ def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any, cfg: Co
         for output in range(dense.OUTPUTS)
     )
     every = [_all_frames(graph, ahead, back), _all_frames(graph, grasp, grasp)]
+    if cfg.policy.height_bonus:
+        top = graph.op("Squeeze", _cell_heights(graph, frames, "height"), _axes(graph, 1))
+        bonus = graph.op("Mul", top, graph.const(cfg.policy.height_bonus))
+        every = [graph.op("Add", q, bonus) for q in every]
     return graph.op("Concat", *(graph.op("Unsqueeze", q, _axes(graph, 0)) for q in every), axis=0)
 
 
@@ -257,11 +261,16 @@ def _valid(graph: Graph, frames: Frames, has_target: bool) -> str:
 
 def _above_bare(graph: Graph, frames: Frames, height: str) -> str:
     """1 where the map [H, W] m is higher than BARE, else 0: [K, 1, h, w] float32."""
+    top = _cell_heights(graph, frames, height)
+    return graph.to_float(graph.op("Greater", top, graph.const(BARE)))
+
+
+def _cell_heights(graph: Graph, frames: Frames, height: str) -> str:
+    """See `maps.cell_heights`: [K, 1, h, w] m."""
     rotated = graph.op("Transpose", _rotated(graph, frames, height, 1), perm=[0, 3, 1, 2])
     stride = frames.networks.stride
     top = graph.op("MaxPool", rotated, kernel_shape=[stride] * 2, strides=[stride] * 2)
-    above = graph.to_float(graph.op("Greater", top, graph.const(BARE)))
-    halves = graph.op("Squeeze", above, _axes(graph, 1))
+    halves = graph.op("Squeeze", top, _axes(graph, 1))
     return graph.op("Unsqueeze", _all_frames(graph, halves, halves), _axes(graph, 1))
 
 

@@ -28,7 +28,6 @@ ADDED = ("scenes.failed_grasps",)
 """Leaves that older checkpoints lack: they are 0 there."""
 
 SETTINGS = {
-    "cem.spread": "cem.std_estimator",
     "learn.rate_end": "learn.lr_final_fraction",
     "replay.beta_end": "replay.end",
     "replay.beta_middle": "replay.middle",
@@ -74,8 +73,14 @@ GONE = {
 CONSTANTS = ("reward.eta", "reward.distance_weight", "net.block_layers")
 """Settings of format 2 that are constants now: a file must hold their value."""
 
-DROPPED = ("target.samples", "learn.copy_every", "learn.target_update_period")
-"""Settings that are no more, of which files may hold any values: a policy acts without them."""
+DROPPED = (
+    "cem.spread",
+    "cem.std_estimator",
+    "target.samples",
+    "learn.copy_every",
+    "learn.target_update_period",
+)
+"""Settings that are no more, of which files may hold any values: a policy acts alike without."""
 
 ALGORITHMS = {"vpg": ("vpg_episodic", "bootstrap")}
 """Algorithm that has changed -> its former name now, and the setting of `target` that files which

@@ -443,6 +443,37 @@ def test_decisions_see_the_mean_of_the_critics(learner, observations, randomised
     jax.tree.map(np.testing.assert_array_equal, same, plain)
 
 
+@pytest.mark.parametrize("kind", ["small", "offset"])
+def test_height_bonus_adds_to_q(learner, observations, randomised, kind):
+    """Claim: `policy.height_bonus` adds itself to Q for each metre of the surface under a cell, in
+    decisions and in exploration, between cells too, and changes nothing besides."""
+    cfg = learner.cfg.change(policy={"height_bonus": 3.0}, net={"kind": kind})
+    high = actor_critic.make(cfg)
+    with jax.numpy_dtype_promotion("standard"):
+        params = randomised(actor_critic.init(jax.random.key(0), high)).online
+    frames = high.frames
+    size = round(frames.extent / frames.tables.cell)
+    step = np.where(np.arange(size) < size // 2, 0.02, 0.08).astype(np.float32)  # along x
+    obs = observations(1, 4).replace(height=jnp.broadcast_to(step, (1, size, size)))
+    looks = actor_critic.dense_maps, actor_critic.decision_maps, actor_critic.exploration_maps
+    plain, *raised = (jax.jit(lambda p, o, f=f: f(high, p, o))(params, obs) for f in looks)
+    x, outermost = frames.xy[..., 0], np.abs(frames.xy).max(axis=-1)
+    sure = (outermost < 0.5 * frames.extent - frames.cell) & (np.abs(x) > frames.cell)
+    expected = 3.0 * np.where(x > 0.0, 0.08, 0.02)[sure]
+    assert 0.2 < sure.mean() < 0.9
+    pose = jnp.array([0.3 * frames.extent, 0.013, 0.4])
+    for state in raised:
+        got = np.asarray(state.q - plain.q)[0][:, sure]
+        np.testing.assert_allclose(got, np.broadcast_to(expected, got.shape), atol=1e-5)
+        np.testing.assert_array_equal(state.logits, plain.logits)
+        np.testing.assert_array_equal(state.valid, plain.valid)
+        between = [
+            maps.read_q(frames, jax.tree.map(lambda leaf: leaf[0], one), jnp.int32(1), pose)
+            for one in (state, plain)
+        ]
+        np.testing.assert_allclose(between[0] - between[1], 3.0 * 0.08, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_twin_critics(learner, batch, randomised):
     """Claim: of two critics the maps are the lower value in each cell; each is trained on its own

@@ -140,6 +140,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "heights": {"net": {"colour": False, "stride": 4, "subcells": 2, "dilations": (1, 2)}},
     "gripper": {"net": {"gripper": True}, "task": {"kind": "target"}, "sim": {"gripper": "2f85"}},
     "mirrored": {"policy": {"augment": True}, "learn": {"critics": 2}, "net": {"subcells": 2}},
+    "topmost": {"policy": {"height_bonus": 3.0}, "net": {"growth": 4, "stem": 4}},
     "anywhere": {"policy": {"cells": "all"}, "net": {"growth": 4, "stem": 4}},
     "grasp": {
         "policy": {"primitive": "grasp"},

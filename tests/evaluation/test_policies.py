@@ -93,6 +93,37 @@ def test_mirror_images_reach_the_policy(learned, states):
     assert np.abs(plain.batched(states, _keys()).pose - expected).max() > 0.005
 
 
+def test_height_bonus_leads_to_the_top(states):
+    """Claim: with a large `policy.height_bonus` a policy, and a learner that explores or does not,
+    grasp within a cell and a half of a tower, which they do not without."""
+    off = CFG.change(
+        policy={"place": "argmax", "primitive": "grasp"},
+        explore={"push_fraction": 0.0, "noise_std": 0.0, "epsilon_place": (0.0, 0.0)},
+    )
+    cfg, key = off.change(policy={"height_bonus": 100.0}), jax.random.key(0)
+    parts = actor_critic.make(cfg)
+    state = jax.jit(lambda key: actor_critic.init(key, parts))(key)
+    towers = np.array([[4, 26], [12, 20], [18, 4]])  # rows, columns
+    height = np.asarray(states.obs.height).copy()
+    for scene, (row, col) in zip(height, towers, strict=True):
+        scene[row - 1 : row + 2, col - 1 : col + 2] = 0.15
+    states = states.replace(obs=states.obs.replace(height=jnp.asarray(height)))
+    size = cfg.heightmap.extent / cfg.heightmap.size
+    tops = (towers[:, ::-1] + 0.5) * size - 0.5 * cfg.heightmap.extent  # x, y
+
+    def farthest(pose: jax.Array) -> jax.Array:
+        return np.abs(np.asarray(pose)[:, :2] - tops).max(axis=-1)
+
+    plain, high = (LearnedPolicy(one, state.online).batched(states, _keys()) for one in (off, cfg))
+    near = 1.5 * parts.frames.cell
+    assert (farthest(plain.pose) > near).all()
+    assert (farthest(high.pose) < near).all()
+    steps = states.steps_without_change
+    for actions_taken in (None, jnp.int32(9)):
+        acted = csac.CSAC(parts).act(key, state, states.obs, steps, actions_taken)
+        assert (farthest(acted.pose) < near).all()
+
+
 def test_failures_lead_to_other_places(learned, states):
     """Claim: with `policy.retry` an action after failed grasps is drawn, another one for another
     key; without failures, or from an observation, it is the best one whatever the setting."""
