@@ -12,6 +12,7 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+COMPILE_LITTLE := --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 --xla_llvm_disable_expensive_passes=true
 
 .PHONY: help setup train eval test test-slow test-faults lint format bench pictures figures docs dist doctor clean
 
@@ -32,8 +33,8 @@ eval: $(STAMP)  ## evaluate RUN (the newest) with POLICY (learned) over EPISODES
 	@test -n "$(RUN)" || { echo "eval: there is no run under runs/; run 'make train' first or set RUN=DIR" >&2; exit 1; }
 	$(BIN)/csac-jax eval $(RUN) --policy $(POLICY) --episodes $(EPISODES) --json $(RUN:/=)/eval-$(POLICY).json $(ARGS)
 
-test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run little, hence XLA's flag
-	XLA_FLAGS="$(XLA_FLAGS) --xla_backend_optimization_level=0" $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile $(ARGS)
+test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run little
+	XLA_FLAGS="$(XLA_FLAGS) $(COMPILE_LITTLE)" $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile $(ARGS)
 
 test-slow: $(STAMP)  ## slow tests
 	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)

@@ -46,6 +46,9 @@ class EvalOptions:
     augment: Literal["on", "off"] | None = None
     """Whether Q is the mean over mirror images of the view, see `policy.augment` of `csac-jax train
     --help-all`; by default as the policy's."""
+    height_bonus: float | None = None
+    """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
+    train --help-all`; by default as the policy's."""
     episodes: int = 50
     """Episodes of every part of the suite, each with a fresh scene where the part has several."""
     seed: int = 0
@@ -68,8 +71,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax.evaluation import policies, suites
 
     policy = policies.POLICIES[options.policy](options.source, which)
-    if options.augment is not None:
-        view = {**view, "policy": {"augment": options.augment == "on"}}
+    view = {**view, "policy": settings.decision(options)}
     begun = time.time()
     with as_bad_arguments(ValueError):
         seen = suites.with_objects(

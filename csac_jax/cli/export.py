@@ -6,8 +6,9 @@ from typing import Any, Literal
 
 import tyro
 
-from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, check_extra
+from csac_jax.cli import parsing, settings
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.config import Config
 
 NEEDS = {"stablehlo": "flatbuffers", "onnx": "onnx"}  # modules of the extra `export`
 
@@ -25,6 +26,12 @@ class ExportOptions:
     onnx: one that onnxruntime runs alone, of the small net; it takes the best cell."""
     gripper: str | None = None
     """The robot's gripper, by name or folder; by default that of the training."""
+    augment: Literal["on", "off"] | None = None
+    """Whether Q is the mean over mirror images of the view, see `policy.augment` of `csac-jax train
+    --help-all`; by default as the policy's."""
+    height_bonus: float | None = None
+    """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
+    train --help-all`; by default as the policy's."""
     input: Literal["maps", "image"] = "maps"
     """What a program takes: colour and height map, or (stablehlo) a camera's image and pose."""
     size: tuple[int, int] = (640, 480)
@@ -39,10 +46,12 @@ def run(arguments: list[str]) -> int:
     from csac_jax.io import files, policy_file
 
     policy = deploy.Policy.load(options.policy, gripper=options.gripper)
+    with as_bad_arguments(ValueError):
+        cfg = policy.cfg.change(policy=settings.decision(options))
     if options.format == "safetensors":
-        policy_file.save(options.file, policy.params, policy.cfg)
+        policy_file.save(options.file, policy.params, cfg)
     else:
-        files.replace(options.file, _program(options, policy))
+        files.replace(options.file, _program(options, cfg, policy.params))
     print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
     return 0
 
@@ -63,17 +72,17 @@ def _check(options: ExportOptions) -> None:
         check_extra(f"--format {options.format}", NEEDS[options.format], "export")
 
 
-def _program(options: ExportOptions, policy: Any) -> bytes:
+def _program(options: ExportOptions, cfg: Config, params: Any) -> bytes:
     """The content of a file that holds a program."""
     import jax
 
     from csac_jax.deploy import export
 
-    params = jax.device_get(policy.params)
+    params = jax.device_get(params)
     if options.format == "onnx":
         from csac_jax.deploy import onnx_graph
 
-        return onnx_graph.make(policy.cfg, params)
+        return onnx_graph.make(cfg, params)
     if options.input == "image":
-        return export.stablehlo(*export.from_image(policy.cfg, params, options.size))
-    return export.stablehlo(*export.from_maps(policy.cfg, params))
+        return export.stablehlo(*export.from_image(cfg, params, options.size))
+    return export.stablehlo(*export.from_maps(cfg, params))

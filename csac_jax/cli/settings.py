@@ -106,6 +106,13 @@ def parse_view(
     }
 
 
+def decision(options: Any) -> dict[str, Any]:
+    """What `--augment` and `--height-bonus` of a command set in the section `policy`."""
+    mirrored = None if options.augment is None else options.augment == "on"
+    values = {"augment": mirrored, "height_bonus": options.height_bonus}
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def _inherited(section: Any, some: tuple[str, ...]) -> Any:
     """A dataclass of all or some settings of a section, which are the policy's unless given."""
     docs = field_docs(section)

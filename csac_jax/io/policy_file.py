@@ -36,7 +36,7 @@ SHIPPED = {
 _SHA256 = {
     SHIPPED["shipped"]: "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c",
     SHIPPED["shipped_camera"]: "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
-    SHIPPED["shipped_clutter"]: "a8faa30dabab0eb64cf727c4fe1a319206a94c5fa662db7b3c2f5ac70aea2a96",
+    SHIPPED["shipped_clutter"]: "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
     SHIPPED["shipped_grippers"]: "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
     SHIPPED["shipped_objects"]: "054a04ca76a679a489a30099b89547f7a330f2d305f94bf10c76aa2e3f0a9ce8",
     SHIPPED["shipped_target"]: "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",

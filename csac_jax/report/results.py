@@ -344,7 +344,7 @@ def command(one: RecordedRun | Evaluation, trained: Json | None = None) -> str:
         episodes = one.metrics.get("counts", {}).get("episodes")
         asked = f"--policy {one.policy} --suite {one.suite} --episodes {episodes} --seed {one.seed}"
         both = one.config, trained or one.config
-        options = _objects(*both) + _augment(*both) + _flags(_view(*both))
+        options = _objects(*both) + _decision(*both) + _flags(_view(*both))
         return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}{options}"
     variant = one.variant
     flags = _flags(variant.changed)
@@ -361,10 +361,13 @@ def _objects(config: Json, trained: Json) -> str:
     return asked if split == "held_out" else f"{asked} --split {split}"
 
 
-def _augment(config: Json, trained: Json) -> str:
-    """Option of `eval` for a `policy.augment` other than `trained`'s; older files have none."""
-    asked, own = (one.get("policy", {}).get("augment", False) for one in (config, trained))
-    return "" if asked == own else " --augment on" if asked else " --augment off"
+def _decision(config: Json, trained: Json) -> str:
+    """Options of `eval` for settings of `policy` other than `trained`'s; older files have none."""
+    asked, own = (one.get("policy", {}) for one in (config, trained))
+    mirrored, bonus = asked.get("augment", False), asked.get("height_bonus", 0.0)
+    options = "" if mirrored == own.get("augment", False) else " --augment "
+    options += ("on" if mirrored else "off") if options else ""
+    return options + ("" if bonus == own.get("height_bonus", 0.0) else f" --height-bonus {bonus}")
 
 
 def _view(config: Json, trained: Json) -> Iterator[tuple[str, str]]:

@@ -47,14 +47,14 @@ def options(cfg: Config) -> dict[str, Any] | None:
     The second library is slow at kernel gradients, which `conv2d` keeps from it.
     """
     if jax.default_backend() == "cpu":
-        known = {name: value for name, value in SOONER.items() if _knows(name, value)}
+        known = {name: value for name, value in SOONER.items() if knows(name, value)}
         return known | (LIBRARY if isinstance(cfg.net, SmallNet) and has_library() else {})
     vendor = jax.default_backend() == "gpu" and not isinstance(cfg.net, SmallNet)
-    return dict(VENDOR) if vendor and all(map(_knows, VENDOR, VENDOR.values())) else None
+    return dict(VENDOR) if vendor and all(map(knows, VENDOR, VENDOR.values())) else None
 
 
 @functools.cache
-def _knows(name: str, value: Any) -> bool:
+def knows(name: str, value: Any) -> bool:
     """Whether this XLA has such an option."""
     try:
         jax.jit(jnp.negative, compiler_options={name: value}).lower(0.0).compile()

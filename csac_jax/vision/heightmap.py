@@ -13,6 +13,7 @@ from csac_jax.config import HeightmapConfig
 
 VIEW_HEIGHT = 0.5  # m: blocks in play lie below it, parked blocks wholly above
 _HEIGHT_UNIT = 1e-4  # m per count of the packed height
+_AS_HIGH = 1e-6  # m; points that are less below the highest count as it
 
 
 @struct.dataclass
@@ -39,14 +40,15 @@ class Cells(NamedTuple):
     """The highest point in each cell."""
 
     height: jax.Array  # [H, W] m above the table; 0 where not filled
-    source: jax.Array  # [H, W] int32, index of that point, the first of equals; see `filled`
+    source: jax.Array  # [H, W] int32, index of that point, the first if several are; see `filled`
     filled: jax.Array  # [H, W] bool, the cell has a point
 
 
 def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Cells:
     """Height map of points: z(r, c) = max_i {p_i.z : p_i in cell (r, c)}.
 
-    `max`, then the least index among equals: JAX does not define the order of colliding scatters.
+    `max`, then the least index among those as high: JAX does not define the order of colliding
+    scatters. As high, not equal: a compiler may work z out twice and round otherwise.
 
     Args: points [n, 3] m, world frame; valid [n] bool, False where the ray hit nothing.
     """
@@ -55,7 +57,7 @@ def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Ce
     inside = (row >= 0) & (row < cfg.size) & (col >= 0) & (col < cfg.size)
     cell = jnp.where(inside, row * cfg.size + col, cfg.size**2)  # outside: dropped
     top = jnp.full(cfg.size**2, -jnp.inf).at[cell].max(points[:, 2], mode="drop")
-    is_top = points[:, 2] == top.at[cell].get(mode="fill", fill_value=jnp.inf)
+    is_top = points[:, 2] >= top.at[cell].get(mode="fill", fill_value=jnp.inf) - _AS_HIGH
     index = jnp.arange(len(points), dtype=jnp.int32)
     last = jnp.full(cfg.size**2, jnp.int32(len(points) - 1))
     source = last.at[jnp.where(is_top, cell, cfg.size**2)].min(index, mode="drop")

@@ -106,10 +106,7 @@ def test_more_rounds_come_nearer():
 
     def median_miss(rounds):
         found = search(
-            with_constants(CEMConfig(rounds=rounds), std=0.2),
-            score,
-            jnp.zeros(3),
-            num=100,
+            with_constants(CEMConfig(rounds=rounds), std=0.2), score, jnp.zeros(3), num=100
         )
         return np.median(np.linalg.norm(found.action - peak[None], axis=-1))
 

@@ -12,7 +12,7 @@ import tomllib
 import types
 import warnings
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import pytest
@@ -624,12 +624,22 @@ def test_any_policy_sees_through_another_camera(
     )
 
 
-@pytest.mark.parametrize(("flag", "expected"), [([], False), (["--augment", "on"], True)])
-def test_eval_averages_mirror_images(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, flag: list[str], expected: bool
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ([], {}),
+        (["--augment", "on"], {"augment": True}),
+        (["--height-bonus", "2"], {"height_bonus": 2.0}),
+    ],
+)
+def test_eval_changes_how_a_policy_decides(
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    flags: list[str],
+    expected: dict[str, Any],
 ):
-    """Claim: `eval --augment on` makes any policy act on the mean over mirror images; without it,
-    the policy does as it was trained to."""
+    """Claim: `eval --augment on` makes any policy act on the mean over mirror images, and
+    `--height-bonus` prefer what lies high; without them, the policy does as it was trained to."""
     asked = []
 
     def build(cfg, *_):
@@ -637,12 +647,9 @@ def test_eval_averages_mirror_images(
         raise ValueError("enough")
 
     monkeypatch.setitem(suites.SUITES, "random10", suites.Suite(build))
-    code, _ = _fails(capsys, "eval", "shipped", "--suite", "random10", *flag)
+    code, _ = _fails(capsys, "eval", "shipped", "--suite", "random10", *flags)
     assert code == 2
-    assert (
-        asked[0].policy
-        == policies.load_config("shipped").change(policy={"augment": expected}).policy
-    )
+    assert asked[0].policy == policies.load_config("shipped").change(policy=expected).policy
 
 
 def test_settings_of_a_view_are_those_given():

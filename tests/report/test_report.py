@@ -478,10 +478,11 @@ def test_command_of_an_evaluation_gives_its_view_back():
     assert "--camera" not in results.command(one, seen)
 
 
-def test_command_of_an_evaluation_says_whether_it_augments():
-    """Claim: an evaluation's command has `--augment` where the policy's config is
-    another, also one from before that setting."""
+def test_command_of_an_evaluation_says_how_it_decides():
+    """Claim: an evaluation's command has `--augment` and `--height-bonus` where the policy's config
+    is another, also one from before those settings."""
     on, off = (_config("csac_beta", 0, policy__augment=one) for one in (True, False))
+    high = _config("csac_beta", 0, policy__height_bonus=3.0)
     before = {**off, "policy": {"place": "cem"}}
 
     def command(seen: Any, trained: Any) -> list[str]:
@@ -492,8 +493,12 @@ def test_command_of_an_evaluation_says_whether_it_augments():
     for seen, trained, expected in ((on, off, "on"), (on, before, "on"), (off, on, "off")):
         _, _, *flags = command(seen, trained)
         assert settings.parse_view(EvalOptions, "eval", flags)[0].augment == expected
-    for seen, trained in ((on, on), (off, before), (before, off)):
-        assert not any("augment" in flag for flag in command(seen, trained))
+    for seen, trained, expected in ((high, off, 3.0), (high, before, 3.0), (off, high, 0.0)):
+        _, _, *flags = command(seen, trained)
+        asked, _ = settings.parse_view(EvalOptions, "eval", flags)
+        assert (asked.height_bonus, asked.augment) == (expected, None)
+    for seen, trained in ((on, on), (off, before), (before, off), (high, high)):
+        assert not {"--augment", "--height-bonus"} & set(command(seen, trained))
 
 
 def test_command_of_an_evaluation_names_its_objects():
