@@ -4,8 +4,8 @@ On a CPU, XLA has a second library for convolutions, about twice as fast as Eige
 small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
 LLVM's second level of optimisation compiles sooner than the third, to as fast a program. So do
 XLA's former emitters of kernels, where it still has them: its new ones build an MLIR module for
-each of more than a thousand kernels. Functions are as exact with them. At level 0 some searches by
-CEM end elsewhere with them, and nothing here asks for both.
+each of more than a thousand kernels. Functions are as exact with them. At level 0 they work some
+numbers out twice, which then differ by rounding, and some searches by CEM end elsewhere.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).

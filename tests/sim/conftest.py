@@ -69,7 +69,7 @@ CASES: dict[str, tuple[Scene, Action]] = {
     "empty": (place(cube=(-0.0205, 0.0275, 0.0)), grasp(0.0125, -0.0055, np.pi / 4)),
     "touched": (place(cube=(0.05, 0.0, 0.0)), grasp(0.0, 0.0)),  # a finger comes down on the cube
     "dropped": (
-        place(prism=(0.0, 0.014, 0.0)),
+        place(prism=(0.0, 0.0155, 0.0)),
         grasp(0.0, 0.0),
     ),  # across the slopes, off the middle: it slips out
     "lifted": (place(cube=(0.0, 0.0, 0.0), other=(0.15, 0.1, 0.5)), grasp(0.0, 0.0)),
