@@ -281,8 +281,8 @@ def test_sentences_of_pages_are_short(folder: str):
         (
             "shipped_clutter",
             {
-                "cases": "fast/clutter/seed-1/eval-cases.json",
-                "random30": "fast/clutter/seed-1/eval-random30.json",
+                "cases": "fast/clutter/seed-1/eval-cases-high.json",
+                "random30": "fast/clutter/seed-1/eval-random30-high.json",
             },
         ),
         ("shipped_objects", {"pile": "objects/gpu_hollow/seed-0/eval-pile.json"}),
