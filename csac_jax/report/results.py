@@ -364,10 +364,12 @@ def _objects(config: Json, trained: Json) -> str:
 def _decision(config: Json, trained: Json) -> str:
     """Options of `eval` for settings of `policy` other than `trained`'s; older files have none."""
     asked, own = (one.get("policy", {}) for one in (config, trained))
-    mirrored, bonus = asked.get("augment", False), asked.get("height_bonus", 0.0)
-    options = "" if mirrored == own.get("augment", False) else " --augment "
-    options += ("on" if mirrored else "off") if options else ""
-    return options + ("" if bonus == own.get("height_bonus", 0.0) else f" --height-bonus {bonus}")
+    options = ""
+    if (mirrored := asked.get("augment", False)) != own.get("augment", False):
+        options += f" --augment {'on' if mirrored else 'off'}"
+    if (bonus := asked.get("height_bonus", 0.0)) != own.get("height_bonus", 0.0):
+        options += f" --height-bonus {bonus}"
+    return options
 
 
 def _view(config: Json, trained: Json) -> Iterator[tuple[str, str]]:

@@ -111,17 +111,17 @@ def test_height_bonus_leads_to_the_top(states):
     size = cfg.heightmap.extent / cfg.heightmap.size
     tops = (towers[:, ::-1] + 0.5) * size - 0.5 * cfg.heightmap.extent  # x, y
 
-    def farthest(pose: jax.Array) -> jax.Array:
+    def distance(pose: jax.Array) -> jax.Array:
         return np.abs(np.asarray(pose)[:, :2] - tops).max(axis=-1)
 
     plain, high = (LearnedPolicy(one, state.online).batched(states, _keys()) for one in (off, cfg))
     near = 1.5 * parts.frames.cell
-    assert (farthest(plain.pose) > near).all()
-    assert (farthest(high.pose) < near).all()
+    assert (distance(plain.pose) > near).all()
+    assert (distance(high.pose) < near).all()
     steps = states.steps_without_change
     for actions_taken in (None, jnp.int32(9)):
         acted = csac.CSAC(parts).act(key, state, states.obs, steps, actions_taken)
-        assert (farthest(acted.pose) < near).all()
+        assert (distance(acted.pose) < near).all()
 
 
 def test_failures_lead_to_other_places(learned, states):
