@@ -72,7 +72,8 @@ def differences() -> Figure:
     )
     for panel, (name, gaps) in zip(panels, tested.items(), strict=True):
         part = study.PARTS[name]
-        scale, unit = (1, "") if part.by == study.PUSHES else (100, ", points")
+        counted = part.by in (study.PUSHES, study.ACTIONS)
+        scale, unit = (1, "") if counted else (100, ", points")
         places = range(len(gaps), 0, -1)
         for place, gap in zip(places, gaps, strict=True):
             value, low, high = (scale * x for x in gap.band[:3] if x is not None)

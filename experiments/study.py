@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.evaluation.suites import IN_DISTRIBUTION
@@ -24,7 +26,9 @@ ARCHIVES = ROOT / "experiments" / "results" / "study"
 PAGE, RESULTS_PAGE = ROOT / "docs" / "study.md", ROOT / "docs" / "results.md"
 BEGIN = "<!-- The rest is written by `python -m experiments.study`. -->\n"
 METRICS = ("completion", "grasp_success", "action_efficiency", PUSHES := "pushes_per_episode")
-AREA = "area"  # under the curve of training; all other metrics are of evaluations
+AREA = "area"  # under the curve of training
+ACTIONS = "actions to 90 %"  # of training; all other metrics are of evaluations
+SEEDS = range(100, 120)  # of all parts but the first in the target task
 TITLE, NEXT_TITLE = "## The study\n", "## Summary\n"  # of a section of docs/results.md
 
 
@@ -40,7 +44,11 @@ class Part(NamedTuple):
     by: str  # the metric that tests it
     name: Callable[[Variant], str] = lambda variant: NAMES[variant.algo]
     groups: Mapping[str, tuple[str, ...]] = {}  # each of methods, which are its strata
-    metrics: tuple[str, ...] = ("completion",)  # whose differences are shown, beside the area's
+    metrics: tuple[str, ...] = ("completion",)  # of evaluations, whose differences are shown
+    learning: tuple[str, ...] = (AREA,)  # metrics of training, likewise
+    also: tuple[
+        str, ...
+    ] = ()  # archives whose runs of the samplers in `SEEDS` are of this part, too
 
     def suites(self) -> dict[str, str]:
         """Suite -> what it is called."""
@@ -98,7 +106,7 @@ def _pushes(title: str, tested: int = 0) -> Part:
     return Part(title, methods, pairs, 100, 4, tested, PUSHES, _pushing, groups, metrics)
 
 
-UNIFORM = "uniform"
+UNIFORM, LENGTH = "uniform", "2500"  # the sampler and the actions of the preset
 LAWS: dict[str, tuple[str, dict[str, str]]] = {
     UNIFORM: ("csac", {}),
     "prioritised": ("csac_per", {}),
@@ -132,13 +140,32 @@ def _replay(actions: str) -> Part:
     methods = tuple(itertools.chain.from_iterable(groups.values()))
     pairs = tuple((law, UNIFORM) for law in LAWS if law != UNIFORM)
     title, tested = f"Part 2, replay, {actions} actions", len(pairs)
-    return Part(title, methods, pairs, 100, 2, tested, AREA, _law, groups)
+    also = tuple(f"1-{task}" for task in TASKS) if actions == LENGTH else ()
+    return Part(title, methods, pairs, 100, 2, tested, AREA, _law, groups, also=also)
 
 
 def _switch(variant: Variant) -> str:
     """The switch of a variant of part 5."""
     changed = {name for name, _ in variant.changed}
     return next(switch for switch, settings in SWITCHES.items() if settings.keys() == changed)
+
+
+def _clutter() -> Part:
+    """Numbers of blocks of part 7: more against fewer, then dense against loose."""
+    counts, places = (5, 10, 15, 20, 30), ("loose", "dense")
+    groups = {f"{n} blocks": tuple(f"{n} blocks, {place}" for place in places) for n in counts}
+    methods = tuple(itertools.chain.from_iterable(groups.values()))
+    more = [(many, few) for few, many in itertools.pairwise(groups)]
+    pairs = (*more, *((dense, loose) for loose, dense in groups.values()))
+    title, learning = "Part 7, more blocks", (ACTIONS, AREA)
+    return Part(title, methods, pairs, 100, 6, len(pairs), ACTIONS, _blocks, groups, (), learning)
+
+
+def _blocks(variant: Variant) -> str:
+    """How many blocks a variant of part 7 drops, and how densely."""
+    changed = dict(variant.changed)
+    dense = changed.get("scene.drop_extent") == "0.18 0.18"
+    return f"{changed.get('scene.min_blocks', '10')} blocks, {'dense' if dense else 'loose'}"
 
 
 PRESET = "preset"
@@ -206,6 +233,7 @@ PARTS = {
         by="completion",
         name=_switch,
     ),
+    "7-clutter": _clutter(),
 }
 """Name of an archive -> what is shown of it."""
 POINT = 0.01  # within which methods are equivalent
@@ -224,8 +252,7 @@ class Gap(NamedTuple):
     @property
     def shown(self) -> str:
         """The difference with its interval, and what is told."""
-        metric = "" if self.metric == AREA else self.metric
-        return f"{tables.shown(self.band, sign='+', metric=metric)}: {self.told}"
+        return f"{_shown(self.band, self.metric, sign='+')}: {self.told}"
 
 
 class Found(NamedTuple):
@@ -236,14 +263,17 @@ class Found(NamedTuple):
     scores: dict[str, dict[str, Score]]  # by suite
 
     def gaps(self, a: str, b: str) -> list[Gap]:
-        """Of a pair by all metrics, the area first; none where a method has not run."""
+        """Of a pair by all metrics, training's first; none where a method has not run."""
         ours, theirs = (self.part.groups.get(name, (name,)) for name in (a, b))
-        known = (self.curves, *self.scores.values())
+        measured = self.scores if self.part.metrics else {}
+        known = (self.curves, *measured.values())
         if not all({*ours, *theirs} <= one.keys() for one in known):
             return []
-        areas = [[self.curves[k].area for k in one] for one in (ours, theirs)]
-        found = [_gap(a, b, AREA, "", *areas)]
-        for (suite, scores), metric in itertools.product(self.scores.items(), self.part.metrics):
+        found = []
+        for metric in self.part.learning:
+            learned = [[LEARNING[metric](self.curves[k]) for k in one] for one in (ours, theirs)]
+            found.append(_gap(a, b, metric, "", *learned))
+        for (suite, scores), metric in itertools.product(measured.items(), self.part.metrics):
             strata = [
                 list(itertools.chain.from_iterable(scores[k].strata(metric) for k in one))
                 for one in (ours, theirs)
@@ -321,7 +351,7 @@ def without_study(page: str) -> str:
 
 
 def _found(part: Part, path: Path) -> Found:
-    report = comparison.build(read(path))
+    report = comparison.build(_joined(part, path))
     scores = {
         suite: _methods(part, [score for score in report.scores if score.suite == suite])
         for suite in part.suites()
@@ -330,9 +360,26 @@ def _found(part: Part, path: Path) -> Found:
     return Found(part, curves, {suite: one for suite, one in scores.items() if one})
 
 
+def _joined(part: Part, path: Path) -> results.Results:
+    """What the part's archive holds, and what others hold of it."""
+    own = read(path)
+    others = [read(archives()[name]) for name in part.also]
+    runs = [run for other in others for run in other.runs if _shared(run)]
+    evaluations = [one for other in others for one in other.evaluations if _shared(one)]
+    return results.Results([*own.runs, *runs], [*own.evaluations, *evaluations], own.notes)
+
+
+def _shared(one: results.RecordedRun | results.Evaluation) -> bool:
+    """It is of a sampler's run that part 2 asks for, too."""
+    samplers = [algo for algo, changed in LAWS.values() if not changed]
+    suite = IN_DISTRIBUTION if isinstance(one, results.RecordedRun) else one.suite
+    asked = one.variant.algo in samplers and one.config["seed"] in SEEDS
+    return asked and suite == IN_DISTRIBUTION
+
+
 def _part(one: Found) -> str:
     part = one.part
-    titled = {"Training": _training(one.curves)}
+    titled = {"Training": _training(one)}
     titled |= {
         f"Greedy: {part.suites()[suite]}": _greedy(scores) for suite, scores in one.scores.items()
     }
@@ -349,16 +396,37 @@ def _methods(part: Part, found: Sequence[Any]) -> dict[str, Any]:
     return {name: by_name[name] for name in part.methods if name in by_name}
 
 
-def _training(curves: dict[str, Curve]) -> Table:
-    return [
-        {
-            "method": name,
-            "seeds": str(len(curve.final)),
-            "last 200 grasps": tables.shown(statistics.band([curve.final])),
-            "area under the curve": tables.shown(statistics.band([curve.area])),
-        }
-        for name, curve in curves.items()
-    ]
+def _training(one: Found) -> Table:
+    rows = []
+    for name, curve in one.curves.items():
+        row = {"method": name, "seeds": str(len(curve.final))}
+        if ACTIONS in one.part.learning:
+            reached = sum(tables.first_good(run) is not None for run in curve.runs)
+            row[ACTIONS] = _shown(statistics.band([_actions(curve)]), ACTIONS)
+            row["seeds that reach it"] = str(reached)
+        row["last 200 grasps"] = tables.shown(statistics.band([curve.final]))
+        row["area under the curve"] = tables.shown(statistics.band([curve.area]))
+        rows.append(row)
+    return rows
+
+
+def _actions(curve: Curve) -> list[np.ndarray]:
+    """Actions of each run until nine of ten grasps lift; all where that never is, by seed."""
+    there = [tables.first_good(run) for run in curve.runs]
+    each = [run.actions[-1 if k is None else k] for run, k in zip(curve.runs, there, strict=True)]
+    return curve.by_seed(each)
+
+
+LEARNING = {AREA: lambda curve: curve.area, ACTIONS: _actions}
+"""Metric of training -> its values of a curve, by seed."""
+
+
+def _shown(band: Band, metric: str, sign: str = "") -> str:
+    """A band by a metric; with a sign, as a difference."""
+    if metric != ACTIONS:
+        return tables.shown(band, sign, "" if metric == AREA else metric)
+    value, low, high = (f"{x:{sign},.0f}" for x in band[:3] if x is not None)
+    return f"{value} ({low} to {high})"
 
 
 def _greedy(scores: dict[str, Score]) -> Table:
@@ -386,7 +454,7 @@ def _gap(a: str, b: str, metric: str, where: str, ours: Any, theirs: Any) -> Gap
     band = statistics.difference(ours, theirs)
     assert band.low is not None
     assert band.high is not None
-    small = metric != PUSHES and max(-band.low, band.high) <= POINT
+    small = metric not in (PUSHES, ACTIONS) and max(-band.low, band.high) <= POINT
     if not band.low <= 0.0 <= band.high:
         told = "differ, by less than a point" if small else "differ"
         told += f", P {100 * statistics.improvement(ours, theirs).value:.0f} %"

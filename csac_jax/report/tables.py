@@ -48,10 +48,16 @@ IMPROVED = tuple(name for name in recorded.METRICS if name not in PER_EPISODE)  
 Table = list[dict[str, str]]  # rows; column -> cell
 
 
-def _time_to_good(run: RecordedRun) -> float | None:
-    """Training seconds after which the success of a full window first reached GOOD."""
+def first_good(run: RecordedRun) -> int | None:
+    """Line of a log at which the success of a full window first is GOOD."""
     there = np.flatnonzero((run.success >= GOOD) & (run.grasps >= GRASP_WINDOW))
-    return float(run.seconds[there[0]]) if there.size else None
+    return int(there[0]) if there.size else None
+
+
+def _time_to_good(run: RecordedRun) -> float | None:
+    """Training seconds until then."""
+    line = first_good(run)
+    return None if line is None else float(run.seconds[line])
 
 
 def as_json(report: Report) -> dict[str, Any]:

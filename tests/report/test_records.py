@@ -2,6 +2,7 @@
 
 import json
 import re
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,6 +46,39 @@ def test_study_has_the_tables_of_its_archives():
         found = study.read(path)
         assert {run.config["seed"] for run in found.runs} <= set(range(100, 150))
         assert not [note for note in found.notes if "damaged" in note or "not evaluated" in note]
+
+
+@pytest.mark.parametrize(
+    ("row", "extent", "reached"),
+    [("15 blocks, dense", "0.18:0.18", 18), ("30 blocks, loose", "0.248:0.248", 10)],
+)
+def test_study_counts_actions_until_nine_of_ten_grasps_lift(row: str, extent: str, reached: int):
+    """Claim: "actions to 90 %" of part 7 are the interquartile mean over seeds of the actions at
+    which, by a run's log, nine of ten of its last 200 grasps first had lifted; a run that never
+    gets there counts whole."""
+    name = re.compile(rf"7-{row[:2]}/\S+={extent}/seed-\d+/metrics.jsonl")
+    actions = []
+    with tarfile.open(study.ARCHIVES / "7-clutter.tar.xz") as archive:
+        for member in filter(lambda member: name.fullmatch(member.name), archive):
+            log = [json.loads(line) for line in archive.extractfile(member) or ()]
+            full = [line for line in log if line["grasps_counted"] == 200]
+            good = [line["actions"] for line in full if line["grasp_success"] >= 0.9]
+            actions.append((*good, 2500)[0])
+    mean = sum(sorted(actions)[5:15]) / 10
+    _, shown, there = study.PAGE.read_text().split(f"\n| {row} | ")[1].split(" | ")[:3]
+    assert (shown.split(" (")[0], there) == (f"{mean:,.0f}", str(reached))
+
+
+def test_study_takes_the_samplers_of_part_1():
+    """Claim: at 2,500 actions the samplers of part 2 are the runs of part 1 with the study's first
+    20 seeds, and their evaluations in scenes like the training's; its laws are its own."""
+    found = study.found()["2-replay-2500"]
+    for method, curve in found.curves.items():
+        law, _, task = method.rpartition(", ")
+        source = f"1-{task}" if law in study.LAWS and not study.LAWS[law][1] else "2-"
+        assert all(run.path.parts[-4].startswith(source) for run in curve.runs), method
+        assert sorted(curve.seeds) == list(range(100, 120)), method
+    assert found.scores.keys() == {"in_distribution"}
 
 
 def test_every_record_has_a_claim():
