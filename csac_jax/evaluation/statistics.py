@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # of whose parts each is imported when it is first used
 
 RESAMPLES = 10_000
 
@@ -115,15 +114,20 @@ def _check_pair(ours: Sequence[Stratum], theirs: Sequence[Stratum]) -> None:
 
 def _mean_iqm(*strata: np.ndarray) -> np.ndarray:
     """Mean over strata of the IQM over the last axis: without a quarter of the values, rounded
-    down, at either end."""
-    means = [scipy.stats.trim_mean(values, 0.25, axis=-1) for values in strata]
-    return np.mean(means, axis=0)
+    down, at either end. As SciPy's `trim_mean`, which takes five times as long."""
+    cuts = [values.shape[-1] // 4 for values in strata]
+    middles = [
+        np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut]
+        for values, cut in zip(strata, cuts, strict=True)
+    ]
+    return np.mean([middle.mean(axis=-1) for middle in middles], axis=0)
 
 
 def _above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Share [...] of the pairs of x [..., n] and y [..., m] with x above y, ties by half."""
+    pairs, axes = x.shape[-1] * y.shape[-1], (-2, -1)
     x, y = x[..., :, None], y[..., None, :]
-    return np.mean((x > y) + 0.5 * (x == y), axis=(-2, -1))
+    return ((x > y).sum(axes) + 0.5 * (x == y).sum(axes)) / pairs
 
 
 def _seed_means(stratum: Stratum) -> np.ndarray:

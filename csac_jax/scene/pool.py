@@ -12,7 +12,7 @@ import hashlib
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -143,17 +143,30 @@ def _settle(
         drops = [drop() for _ in range(num)]
         fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
-        with ThreadPoolExecutor() as threads:
-            for scene in threads.map(fall, drops, rows):
-                if scene is not None and len(settled) < count:
-                    settled.append(scene)
-                    counter.count()
+        waiting = list(zip(drops, rows, strict=True))
+        for scene in _first_at_rest(fall, waiting, count - len(settled)):
+            settled.append(scene)
+            counter.count()
         dropped += num
         if dropped >= 20 * _ROUND and len(settled) < dropped / 50:
             found = f"only {len(settled)} of {dropped} dropped scenes came to rest in the workspace"
             remedy = "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
             raise SceneError(f"{found}; {remedy}")
     return _stack(settled)
+
+
+def _first_at_rest(
+    fall: Fall, drops: list[tuple[Scene, BlockFields]], count: int
+) -> Iterator[Scene]:
+    """The first `count` of these scenes that come to rest, in their order. Few others fall."""
+    with ThreadPoolExecutor() as threads:
+        while drops and count:
+            some = max(count, len(os.sched_getaffinity(0)))
+            fallen, drops = threads.map(fall, *zip(*drops[:some], strict=True)), drops[some:]
+            for scene in fallen:
+                if scene is not None and count:
+                    count -= 1
+                    yield scene
 
 
 def _stack(scenes: list[Scene]) -> Scene:

@@ -1,5 +1,6 @@
 """Settled scenes in C MuJoCo, and their cache."""
 
+import os
 import stat
 from pathlib import Path
 from typing import ClassVar
@@ -46,6 +47,26 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Config:
 
 def _placed(world: model.World, scenes: Scene, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return placed.in_c(world, jax.tree.map(lambda leaf: leaf[index], scenes))
+
+
+def test_few_scenes_fall_that_are_not_needed(small: Config, monkeypatch: pytest.MonkeyPatch):
+    """Claim: of a round as many scenes fall as are asked for, and at least one on each core; the
+    scenes are the first of those of a larger pool."""
+    fallen: list[Scene] = []
+    rest = pool.rest
+
+    def counted(*args):
+        fallen.append(args)
+        return rest(*args)
+
+    many = pool.settled(small, pool.TRAIN_STREAM, 6)
+    monkeypatch.setattr(pool, "rest", counted)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    few = pool.settled(small, pool.TRAIN_STREAM, 3)
+    assert len(fallen) == 3
+    jax.tree.map(lambda one, all_: np.testing.assert_array_equal(one, all_[:3]), few, many)
+    assert len(pool.settled(small, pool.TRAIN_STREAM, 1).position) == 1
+    assert len(fallen) == 3 + 2
 
 
 def test_settled_blocks_are_at_rest(world: model.World, scenes: Scene):
