@@ -46,9 +46,7 @@ class Part(NamedTuple):
     groups: Mapping[str, tuple[str, ...]] = {}  # each of methods, which are its strata
     metrics: tuple[str, ...] = ("completion",)  # of evaluations, whose differences are shown
     learning: tuple[str, ...] = (AREA,)  # metrics of training, likewise
-    also: tuple[
-        str, ...
-    ] = ()  # archives whose runs of the samplers in `SEEDS` are of this part, too
+    also: tuple[str, ...] = ()  # archives with more of its runs, see `_shared`
 
     def suites(self) -> dict[str, str]:
         """Suite -> what it is called."""
@@ -370,7 +368,7 @@ def _joined(part: Part, path: Path) -> results.Results:
 
 
 def _shared(one: results.RecordedRun | results.Evaluation) -> bool:
-    """It is of a sampler's run that part 2 asks for, too."""
+    """What part 1 has is of a run that part 2 asks for, too."""
     samplers = [algo for algo, changed in LAWS.values() if not changed]
     suite = IN_DISTRIBUTION if isinstance(one, results.RecordedRun) else one.suite
     asked = one.variant.algo in samplers and one.config["seed"] in SEEDS

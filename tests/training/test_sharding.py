@@ -19,7 +19,8 @@ ROOT = Path(csac_jax.__file__).parents[1]
 
 def _eight(module: str, *arguments: str, flags: str = "", timeout: float = 300.0) -> dict[str, Any]:
     """What a module prints that is run with eight virtual devices."""
-    flags = f"--xla_force_host_platform_device_count=8 {flags}"
+    inherited = os.environ.get("XLA_FLAGS", "")
+    flags = f"{inherited} --xla_force_host_platform_device_count=8 {flags}"
     variables = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     variables.pop(_guard.POOL_VARIABLE, None)  # that of this process is for one device
     command = [sys.executable, "-m", module, *arguments]
