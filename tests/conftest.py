@@ -24,7 +24,7 @@ import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 
 import jax  # isort: skip
 
-gc.set_threshold(100_000, 20, 100)  # with Python's 700, a seventh of all time goes into collecting
+gc.set_threshold(100_000, 20, 100)  # to trace makes many objects that live; 700 collects too often
 
 
 @pytest.fixture(autouse=True)
