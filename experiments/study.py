@@ -54,13 +54,13 @@ class Part(NamedTuple):
         return {IN_DISTRIBUTION: own, "target": "suite `target`"}
 
 
-def _algorithms(title: str) -> Part:
-    """Methods of part 1: pushes against none, samplers against uniform replay."""
+def _algorithms(title: str, episodes: int) -> Part:
+    """Methods of parts 1 and 6: pushes against none, samplers against uniform replay."""
     methods = ("grasp_only", "reactive", "vpg", "csac", "csac_per", "csac_beta")
     grasp_only, reactive, vpg, csac, per, beta = names = tuple(NAMES[name] for name in methods)
     pairs = [(name, grasp_only) for name in (csac, per, beta, reactive, vpg)]
     others = (per, csac), (beta, csac), (beta, vpg)
-    return Part(title, names, (*pairs, *others), 500, 1, len(pairs), "completion")
+    return Part(title, names, (*pairs, *others), episodes, 1, len(pairs), "completion")
 
 
 def _changes(variant: Variant) -> str:
@@ -175,9 +175,9 @@ ACTOR, CELLS = "cem.start actor", "cem.start cells"
 YAWS, COARSE = "net.rotations 8", "net.subcells 1"
 BOTH = f"{YAWS}, {COARSE}"
 PARTS = {
-    "1-target": _algorithms("Part 1, the target task"),
-    "1-clear": _algorithms("Part 1, the table cleared"),
-    "1-packed": _algorithms("Part 1, packed scenes cleared"),
+    "1-target": _algorithms("Part 1, the target task", 500),
+    "1-clear": _algorithms("Part 1, the table cleared", 500),
+    "1-packed": _algorithms("Part 1, packed scenes cleared", 500),
     "2-replay-250": _replay("250"),
     "2-replay-500": _replay("500"),
     "2-replay-1000": _replay("1000"),
@@ -231,6 +231,7 @@ PARTS = {
         by="completion",
         name=_switch,
     ),
+    "6-paper": _algorithms("Part 6, the paper's network in the target task", 100),
     "7-clutter": _clutter(),
 }
 """Name of an archive -> what is shown of it."""
