@@ -25,7 +25,7 @@ from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
-from csac_jax.training import callbacks as followers, loop, memory, sharding, step, traced
+from csac_jax.training import callbacks as followers, halves, loop, memory, sharding, step
 from csac_jax.training.callbacks import Callback, Record, Summary
 from csac_jax.training.sharding import Shard
 
@@ -92,7 +92,6 @@ def train(
         terminal.say(_first_line(folder, cfg))
         program = step.make(cfg, learner=learner, sampler=sampler, network=network)
         own = any(part is not None for part in (learner, sampler, network))
-        compile_chunk = step.compile_chunk if own else traced.compile_chunk
         follower = followers.joined(callbacks)
         if plan is not None:
             how = (cfg, plan, follower, terminal.say, network, learner)
@@ -109,7 +108,7 @@ def train(
             cfg,
             folder,
             first_state,
-            lambda num_steps: compile_chunk(program, num_steps),
+            lambda num_steps: halves.compile_chunk(program, num_steps, keep=not own),
             terminal,
             stop or signals.Stop(),
             resume=resume,

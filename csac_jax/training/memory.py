@@ -9,7 +9,7 @@ import jax
 
 from csac_jax.config import Config
 from csac_jax.replay import ring
-from csac_jax.training import step
+from csac_jax.training import halves, step
 
 GIB = 2**30
 
@@ -49,7 +49,11 @@ def check(cfg: Config, runs: int = 1) -> None:
 
 
 def compiled_text(compiled: Any) -> str:
-    """What a compiled program takes, by XLA's own numbers, as text."""
-    stats = compiled.memory_analysis()
+    """What a compiled chunk takes, by XLA's own numbers, as text."""
+    acts = compiled.act if isinstance(compiled, halves.Chunk) else compiled
+    stats = acts.memory_analysis()
     state, temporary = stats.argument_size_in_bytes / GIB, stats.temp_size_in_bytes / GIB
-    return f"the program takes {state:.2f} GiB for states and {temporary:.2f} GiB besides"
+    besides = "; what learns compiles meanwhile"
+    if acts is compiled:
+        besides = f" and {temporary:.2f} GiB besides"
+    return f"the program takes {state:.2f} GiB for states{besides}"

@@ -68,6 +68,9 @@ class StepMetrics(NamedTuple):
     finite: jax.Array  # [] bool, every number of the learner's state is finite
 
 
+_LOSSES = ("critic_loss", "actor_loss", "td_error", "q_mean")  # of updates
+
+
 class Hyperparams(NamedTuple):
     """Settings that enter the program as arguments, in place of constants of its config."""
 
@@ -124,8 +127,13 @@ def train_step(
 ) -> tuple[TrainState, StepMetrics]:
     """One action in each of the E scenes and the updates that belong to it."""
     program = replace_hyperparams(program, hyperparams)
+    return learn_step(program, *act_step(program, state))
+
+
+def act_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+    """A step without its updates, lines 8-15; metrics as of one that learns nothing."""
     cfg, env, learner = program.cfg, program.env, program.learner
-    key_act, key_learn, key_reset = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
+    key_act, _, key_reset = _step_keys(state.key, state.step)
     scenes = state.scenes
 
     # Observe and act (lines 8-13).
@@ -149,13 +157,6 @@ def train_step(
     transition = Transition(before, action, reward, seen, terminated, label)
     replay = ring.add(state.replay, transition, ~info.physics_diverged)
 
-    # Learn (lines 16-26). Before `learning_starts` the result is dropped: a branch costs more.
-    ready = taken + cfg.train.scenes >= cfg.train.learning_starts
-    done = _updates_done(cfg, state.step)
-    learned, priority, losses = learn(program, key_learn, state.learner, replay, done)
-    learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
-    replay = replay.replace(priority=jnp.where(ready, priority, replay.priority))
-
     metrics = StepMetrics(
         primitive=action.primitive,
         outcome=info.outcome,
@@ -171,11 +172,32 @@ def train_step(
         unreachable=~jax.vmap(functools.partial(simulation.reachable, cfg))(
             scenes.obs.height, action
         ),
-        learned=ready,
-        finite=_is_finite(learned),
-        **losses,
+        learned=jnp.bool_(False),
+        finite=jnp.bool_(True),
+        **dict.fromkeys(_LOSSES, jnp.float32(0.0)),
     )
-    return TrainState(state.key, state.step + 1, scenes_next, learned, replay), metrics
+    return TrainState(state.key, state.step + 1, scenes_next, state.learner, replay), metrics
+
+
+def learn_step(
+    program: Program, state: TrainState, metrics: StepMetrics
+) -> tuple[TrainState, StepMetrics]:
+    """The updates of a step, lines 16-26, after `act_step`; metrics with theirs."""
+    cfg, step = program.cfg, state.step - 1
+    _, key_learn, _ = _step_keys(state.key, step)
+    # Before `learning_starts` the result is dropped: a branch costs more.
+    ready = state.step * cfg.train.scenes >= cfg.train.learning_starts
+    done = updates_before(cfg, step)
+    learned, priority, losses = learn(program, key_learn, state.learner, state.replay, done)
+    learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
+    priority = jnp.where(ready, priority, state.replay.priority)
+    after = state.replace(learner=learned, replay=state.replay.replace(priority=priority))
+    return after, metrics._replace(learned=ready, finite=_is_finite(learned), **losses)
+
+
+def _step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, ...]:
+    """Keys of a training step: to act, to learn and to reset."""
+    return tuple(jax.random.split(jax.random.fold_in(key, step), 3))
 
 
 def _episodic(after: environment.State, _: environment.State) -> tuple[Observation, jax.Array]:
@@ -264,10 +286,14 @@ def _is_finite(tree: Any) -> jax.Array:
     return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))
 
 
-def _updates_done(cfg: Config, step: jax.Array) -> jax.Array:
+def updates_before(cfg: Config, step: jax.Array) -> jax.Array:
     """Updates [] int32 before training step `step` [] that were not dropped."""
-    first = -(-cfg.train.learning_starts // cfg.train.scenes) - 1
-    return jnp.maximum(step - first, 0) * cfg.learn.updates
+    return jnp.maximum(step - first_to_learn(cfg), 0) * cfg.learn.updates
+
+
+def first_to_learn(cfg: Config) -> int:
+    """The first training step whose updates are not dropped."""
+    return -(-cfg.train.learning_starts // cfg.train.scenes) - 1
 
 
 def _draw(program: Program, keys: Any, replay: ReplayState, progress: jax.Array) -> tuple[Any, ...]:
@@ -292,7 +318,14 @@ def compile_init(program: Program) -> Callable[[], TrainState]:
     """What makes the first state, jitted: shapes and state are of one trace, and every seed of one
     program."""
     begin = jax.jit(functools.partial(init_state, program))
-    return lambda: begin(jax.random.key(program.cfg.seed))
+
+    def first() -> TrainState:
+        key = jax.random.key(program.cfg.seed)
+        if isinstance(key, jax.core.Tracer):  # for shapes alone; no options within a trace
+            return begin(key)
+        return begin.lower(key).compile(compiler.options(program.cfg))(key)
+
+    return first
 
 
 def prepare(program: Program) -> None:

@@ -31,13 +31,19 @@ _UNTRACED = ("cache", "logging")  # parts of names of JAX's settings that leave 
 _CHECKSUM = 32  # bytes
 
 
-def compile_chunk(program: Program, num_steps: int) -> Any:
-    """As `step.compile_chunk`, for a program without parts of your own; what it gives has `lower`
-    alone, and traces only where no program of that name is kept."""
-    jitted, folder = step.compile_chunk(program, num_steps), _folder()
+def keep(program: Program, part: str, jitted: Any) -> Any:
+    """A jitted part of a program's step, by its name, or what has `lower` alone and traces it only
+    where no program of that name is kept. Both take a state, and maybe metrics, and give both. The
+    program has no parts of your own."""
+    folder = _folder()
     if folder is None or not (isinstance(program, Program) and _is_named(program)):
         return jitted
-    return _Chunk(jitted, program, num_steps, folder)
+    return _Kept(jitted, program, part, folder)
+
+
+def keep_none(_: Program, __: str, jitted: Any) -> Any:
+    """The jitted part as it is."""
+    return jitted
 
 
 def _folder() -> Path | None:
@@ -62,38 +68,38 @@ def _is_named(program: Program) -> bool:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Chunk:
-    """What lowers a chunk of a program."""
+class _Kept:
+    """What lowers a part of a program's step."""
 
     jitted: Any
     program: Program
-    num_steps: int
+    part: str
     folder: Path
 
-    def lower(self, state: Any) -> Any:
-        """The chunk lowered for such a state, as that of `step.compile_chunk` does it."""
-        leaves, tree = jax.tree.flatten(state)
-        path = self.folder / name(self.program, self.num_steps, leaves, tree)
+    def lower(self, *given: Any) -> Any:
+        """The part lowered for a state, and maybe metrics, such as these."""
+        leaves, tree = jax.tree.flatten(given)
+        path = self.folder / name(self.program, self.part, leaves, tree)
         kept = _read(path)
         if kept is None:
             kept = self._export(leaves, tree)
             _write(path, kept)
         else:
-            _register_calls(self.program, state)
+            _register_calls(self.program, given[0])
         exported = export.deserialize(bytearray(kept))
-        result = jax.tree.structure((tree.unflatten(leaves), _BLANK))
+        result = jax.tree.structure((given[0], _BLANK))
 
-        def chunk(state: Any) -> Any:
-            return jax.tree.unflatten(result, exported.call(*jax.tree.leaves(state)))
+        def part(*given: Any) -> Any:
+            return jax.tree.unflatten(result, exported.call(*jax.tree.leaves(given)))
 
         options = compiler.options(self.program.cfg)
-        return jax.jit(chunk, donate_argnums=0, compiler_options=options).lower(state)
+        return jax.jit(part, donate_argnums=0, compiler_options=options).lower(*given)
 
     def _export(self, leaves: list[Any], tree: Any) -> bytes:
-        """The traced chunk, from leaves to leaves: JAX does not export the classes of trees."""
+        """The traced part, from leaves to leaves: JAX does not export the classes of trees."""
 
         def flat(*given: Any) -> list[Any]:
-            return jax.tree.leaves(self.jitted.__wrapped__(jax.tree.unflatten(tree, given)))
+            return jax.tree.leaves(self.jitted.__wrapped__(*jax.tree.unflatten(tree, given)))
 
         unchecked = [export.DisabledSafetyCheck.custom_call(host_call.TARGET)]
         return bytes(export.export(jax.jit(flat), disabled_checks=unchecked)(*leaves).serialize())
@@ -110,8 +116,8 @@ def _register_calls(program: Program, state: Any) -> None:
     jax.eval_shape(env.step, scene, action)
 
 
-def name(program: Program, num_steps: int, leaves: list[Any], tree: Any) -> str:
-    """A digest of all that decides the trace of a chunk, for a state of these leaves and tree."""
+def name(program: Program, part: str, leaves: list[Any], tree: Any) -> str:
+    """A digest of all that decides the trace of a part, for arguments of these leaves and tree."""
     cfg, env = program.cfg, program.env
     settings = {
         key: value
@@ -120,7 +126,7 @@ def name(program: Program, num_steps: int, leaves: list[Any], tree: Any) -> str:
     }
     told = (
         dataclasses.replace(cfg, seed=0, preset=""),
-        num_steps,
+        part,
         env.physics.world.digest,
         env.gripper,
         (env.any_yaw, env.max_failures),

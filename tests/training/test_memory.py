@@ -1,6 +1,7 @@
 """Memory of a run: exact bytes of its state, and what is refused."""
 
 import re
+from concurrent.futures import Future
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.replay import ring
-from csac_jax.training import memory, step
+from csac_jax.training import halves, memory, step
 
 SMOKE = presets.smoke()
 
@@ -72,3 +73,7 @@ def test_compiled_program_states_its_memory():
     said = memory.compiled_text(compiled)
     assert temporary > 0.1
     assert said == f"the program takes 0.75 GiB for states and {temporary:.2f} GiB besides"
+    chunk = halves.Chunk(SMOKE, 1, compiled, Future())
+    assert memory.compiled_text(chunk) == (
+        "the program takes 0.75 GiB for states; what learns compiles meanwhile"
+    )

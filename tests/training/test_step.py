@@ -2,7 +2,10 @@
 
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -22,7 +25,7 @@ from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step
+from csac_jax.training import halves, step
 from csac_jax.training.step import Program, StepMetrics, TrainState
 from csac_jax.vision.heightmap import Observation
 
@@ -125,6 +128,93 @@ def test_chunks_after_the_first_compile_nothing(run):
     """Claim: one program serves every chunk; nothing is compiled while it runs on."""
     assert run.compilations == 0
     assert [int(state.step) for state in run.states] == [0, T, 2 * T, 3 * T]
+
+
+@pytest.mark.slow
+def test_two_programs_do_what_one_does(run: Run):
+    """Claim: a chunk as two programs, one of which acts and the other learns, ends in the states of
+    the one program, and measures the same."""
+    with mock.patch.object(simulation, "reachable", half_in_reach):
+        chunk = halves.compile_chunk(run.program, T).lower(run.states[0]).compile()
+    state = copy(run.states[0])
+    for number in range(2):
+        state, metrics = chunk(state)
+        pairs = ((run.states[number + 1], state), (run.metrics[number], metrics))
+        for name, wanted, got in (
+            (name, a, b)
+            for one, other in pairs
+            for (name, a), (_, b) in zip(leaves(one), leaves(other), strict=True)
+        ):
+            if name.removeprefix(".") in step._LOSSES:
+                wanted, got = (np.where(metrics.learned, loss, 0.0) for loss in (wanted, got))
+            np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-5, err_msg=name)
+    assert metrics.learned.all()
+    assert not run.metrics[0].learned.all()
+
+
+def test_acting_does_not_wait_for_what_learns():
+    """Claim: each step acts, then learns once updates begin. Until then a chunk needs the program
+    that acts alone; from there on it waits for the other one, and fails as that does."""
+    cfg = CFG.change(train={"scenes": 4, "learning_starts": 12})  # the third step learns
+
+    def act(state: Any) -> tuple[Any, dict[str, Any]]:
+        step, told = state.step + 1, state.told
+        return SimpleNamespace(step=step, told=[*told, "act"]), {"step": step, "learned": False}
+
+    def learn(state: Any, metrics: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        told = [*state.told, "learn"]
+        return SimpleNamespace(step=state.step, told=told), metrics | {"learned": True}
+
+    failed: Future[Any] = Future()
+    failed.set_exception(MemoryError("no room"))
+    chunk = halves.Chunk(cfg, 2, act, failed)
+    state, metrics = chunk(SimpleNamespace(step=0, told=[]))
+    assert state.told == ["act", "act"]
+    np.testing.assert_array_equal(metrics["learned"], [False, False])
+    with pytest.raises(MemoryError, match="no room"):
+        chunk(state)
+    later: Future[Any] = Future()
+    later.set_result(learn)
+    state, metrics = chunk._replace(learn=later)(state)
+    assert state.told == ["act", "act", "act", "learn", "act", "learn"]
+    np.testing.assert_array_equal(metrics["learned"], [True, True])
+    np.testing.assert_array_equal(metrics["step"], [3, 4])
+
+
+def test_what_acts_is_there_first():
+    """Claim: a chunk is compiled as soon as it can act; what learns compiles after that."""
+    go_on, order = threading.Event(), []
+
+    class Part:
+        out_info = ()
+
+        def lower(self) -> "Part":
+            return self
+
+        def compile(self) -> str:
+            assert go_on.wait(60.0)
+            order.append("learns")
+            return "learns"
+
+    class Acting(Part):
+        def compile(self) -> str:
+            order.append("acts")
+            return "acts"
+
+    traceable = mock.Mock(part=lambda _: Part())
+    chunk = halves._Lowered(traceable, Acting()).compile()
+    assert (chunk.act, chunk.learn.done(), order) == ("acts", False, ["acts"])
+    go_on.set()
+    assert chunk.learn.result(60.0) == "learns"
+
+
+def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch, run: Run):
+    """Claim: only on a CPU, and on one device, is a chunk two programs."""
+    halved = lambda program: isinstance(halves.compile_chunk(program, T), halves._Traceable)  # noqa: E731
+    assert halved(run.program)
+    assert not halved(dataclasses.replace(run.program, mesh=mock.Mock()))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert not halved(run.program)
 
 
 def primitives(jaxpr: Any) -> Iterator[str]:
@@ -277,7 +367,7 @@ def test_nothing_is_learned_before_the_warm_up(run):
         CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)
     ]
     for counted in run.states:
-        assert step._updates_done(CFG, counted.step) == counted.learner.updates
+        assert step.updates_before(CFG, counted.step) == counted.learner.updates
     assert all(np.all(np.isfinite(m.critic_loss)) for m in run.metrics)
 
 

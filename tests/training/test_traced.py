@@ -16,7 +16,7 @@ from csac_jax.config import Config
 from csac_jax.errors import FailedError
 from csac_jax.replay import samplers
 from csac_jax.sim import host_call
-from csac_jax.training import loop, step, traced
+from csac_jax.training import halves, loop, step, traced
 from csac_jax.training.step import Program
 
 pytestmark = pytest.mark.mjx
@@ -55,7 +55,17 @@ def _shapes(program: Program) -> Any:
 
 
 def _untraceable() -> Any:
-    return mock.patch.object(step, "train_step", side_effect=TracedError)
+    untraceable = {"side_effect": TracedError}
+    return mock.patch.multiple(
+        step,
+        act_step=mock.create_autospec(step.act_step, **untraceable),
+        learn_step=mock.create_autospec(step.learn_step, **untraceable),
+    )
+
+
+def _lower(program: Program, shapes: Any) -> None:
+    """Lowers the part that acts."""
+    halves.compile_chunk(program, T, keep=True).part(step.act_step).lower(shapes)
 
 
 def _numbers(tree: Any) -> list[np.ndarray]:
@@ -68,12 +78,12 @@ def test_kept_program_is_the_same(folder: Path, program: Program):
     """Claim: a program of another seed, in a process that has not traced it, is lowered without a
     trace, calls the physics of its own world, and computes the same bits as one that is traced."""
     shapes = _shapes(program)
-    plain = step.compile_chunk(program, T).lower(shapes).compile()
-    traced.compile_chunk(program, T).lower(shapes)
-    assert len(list(folder.iterdir())) == 1
+    plain = halves.compile_chunk(program, T).lower(shapes).compile()
+    halves.compile_chunk(program, T, keep=True).lower(shapes).compile()
+    assert len(list(folder.iterdir())) == 2
     other = step.make(dataclasses.replace(CFG, seed=3))
     with _untraceable(), mock.patch.dict(host_call._functions, clear=True):
-        kept = traced.compile_chunk(other, T).lower(shapes).compile()
+        kept = halves.compile_chunk(other, T, keep=True).lower(shapes).compile()
         begun = step.init(other)
         wanted = got = None
         for chunk in (plain, kept):
@@ -83,33 +93,33 @@ def test_kept_program_is_the_same(folder: Path, program: Program):
             wanted, got = got, _numbers((state, metrics))
     assert wanted is not None
     jax.tree.map(np.testing.assert_array_equal, wanted, got)
-    assert len(list(folder.iterdir())) == 1
+    assert len(list(folder.iterdir())) == 2
 
 
 def test_damaged_program_is_traced_anew(folder: Path, program: Program):
     """Claim: a file with a flipped bit is not used, and replaced by a sound one."""
-    shapes, chunk = _shapes(program), traced.compile_chunk(program, T)
-    chunk.lower(shapes)
+    shapes = _shapes(program)
+    _lower(program, shapes)
     (path,) = folder.iterdir()
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with _untraceable(), pytest.raises(TracedError):
-        chunk.lower(shapes)
-    chunk.lower(shapes)
+        _lower(program, shapes)
+    _lower(program, shapes)
     with _untraceable():
-        chunk.lower(shapes)
+        _lower(program, shapes)
 
 
-def _name(cfg: Config = CFG, num_steps: int = T, **env: Any) -> str:
+def _name(cfg: Config = CFG, part: str = "act_step", **env: Any) -> str:
     program = step.make(cfg)
     changed = dataclasses.replace(program, env=dataclasses.replace(program.env, **env))
     leaves, tree = jax.tree.flatten({"step": np.int32(0)})
-    return traced.name(changed, num_steps, leaves, tree)
+    return traced.name(changed, part, leaves, tree)
 
 
 def test_names_tell_programs_apart(monkeypatch: pytest.MonkeyPatch, program: Program):
-    """Claim: another setting, length, world, scene, way of JAX or source has another name; another
+    """Claim: another setting, part, world, scene, way of JAX or source has another name; another
     seed and preset have not."""
     scenes = program.env.scenes
     moved = scenes.replace(position=scenes.position + np.float32(1e-6))
@@ -117,7 +127,7 @@ def test_names_tell_programs_apart(monkeypatch: pytest.MonkeyPatch, program: Pro
         _name(),
         _name(CFG.change(learn={"tau": 0.5})),
         _name(CFG.change(sim={"gripper": "2f85"})),
-        _name(num_steps=T + 1),
+        _name(part="learn_step"),
         _name(scenes=moved),
         _name(max_failures=7),
     ]
@@ -133,10 +143,10 @@ def test_names_tell_programs_apart(monkeypatch: pytest.MonkeyPatch, program: Pro
 def test_own_parts_are_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Claim: `train` keeps no program with a part of the user's own, and none where JAX keeps no
     programs; else it does."""
-    found: list[Any] = []
+    found: list[bool] = []
 
     def run(cfg: Config, run_dir: Path, init: Any, compile_chunk: Any, *_: Any, **__: Any):
-        found.append(compile_chunk(T))
+        found.append(isinstance(compile_chunk(T).part(step.act_step), traced._Kept))
         raise FailedError("enough")
 
     monkeypatch.setattr(loop, "run", run)
@@ -147,7 +157,7 @@ def test_own_parts_are_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch, t
     monkeypatch.setattr(traced, "_folder", lambda: None)
     with pytest.raises(FailedError):
         api.train(CFG, tmp_path / "run", verbose=False)
-    assert [isinstance(one, traced._Chunk) for one in found] == [True, False, False]
+    assert found == [True, False, False]
 
 
 def test_folder_is_that_of_the_compiled_programs(monkeypatch: pytest.MonkeyPatch):
