@@ -63,7 +63,7 @@ def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[s
     traced = time.perf_counter()
     compiled = lowered.compile()
     if isinstance(compiled, halves.Chunk):
-        compiled.learn.result()
+        compiled.learn.result()  # waits for it
     return compiled, {"trace": traced - begun, "compile": time.perf_counter() - traced}
 
 
@@ -254,7 +254,9 @@ def _rates(cfg: Config, seconds: float) -> dict[str, float]:
 
 
 def _memory(chunk: Any) -> dict[str, int | None]:
-    stats, device = chunk.memory_analysis(), jax.devices()[0].memory_stats() or {}
+    """Bytes of the program, of two that of the one that learns, which needs more."""
+    program = chunk.learn.result() if isinstance(chunk, halves.Chunk) else chunk
+    stats, device = program.memory_analysis(), jax.devices()[0].memory_stats() or {}
     return {
         "state_bytes": stats.argument_size_in_bytes,
         "temporary_bytes": stats.temp_size_in_bytes,
