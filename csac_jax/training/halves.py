@@ -54,13 +54,11 @@ class _Lowered(NamedTuple):
 
     def compile(self) -> "Chunk":
         """The chunk that can act; a thread goes on with what learns."""
-        given = self.traceable
-        with ThreadPoolExecutor(1) as thread:
-            acting = thread.submit(self.act.compile)
-            lowered = compiler.lower(given.part(step.learn_step), *self.act.out_info)
-            act = acting.result()
-        learning = ThreadPoolExecutor(1)
-        learn = learning.submit(lowered.compile)
+        given, learning = self.traceable, ThreadPoolExecutor(1)
+        part = given.part(step.learn_step)
+        tracing = learning.submit(compiler.lower, part, *self.act.out_info)
+        act = self.act.compile()
+        learn = learning.submit(tracing.result().compile)
         learning.shutdown(wait=False)
         return Chunk(given.program.cfg, given.num_steps, act, learn)
 

@@ -233,8 +233,9 @@ def _labels(parts: ActorCritic, nets: Any, batch: Transition) -> dict[str, Calla
     }
 
 
-def _whole(chunk: Any, state: step.TrainState) -> Callable[[], Any]:
-    """A call of the compiled chunk, going on from where the last one ended."""
+def _whole(chunk: Any, cfg: Config, state: step.TrainState) -> Callable[[], Any]:
+    """A call of the compiled chunk, going on from where the last one ended; all its steps learn."""
+    state = state.replace(step=jnp.int32(step.first_to_learn(cfg)))
 
     def call() -> Any:
         nonlocal state
@@ -294,7 +295,7 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
     seconds = medians(
-        {**calls, "whole": _whole(chunk, jax.tree.map(jnp.copy, state))}, repeats
+        {**calls, "whole": _whole(chunk, cfg, jax.tree.map(jnp.copy, state))}, repeats
     )  # it uses it up
     whole = seconds["whole"] / steps
     stages = {name: seconds[name] for name in _SEPARATE}
@@ -341,7 +342,7 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
     program = step.make(cfg)
     state = step.init(program)
     chunk, compiling = _compile(program, state, steps)
-    seconds = medians({"whole": _whole(chunk, state)}, repeats)["whole"] / steps
+    seconds = medians({"whole": _whole(chunk, cfg, state)}, repeats)["whole"] / steps
     return {
         curve: value,
         "step_seconds": seconds,

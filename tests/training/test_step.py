@@ -182,7 +182,8 @@ def test_acting_does_not_wait_for_what_learns():
 
 
 def test_what_acts_is_there_first():
-    """Claim: a chunk is compiled as soon as it can act; what learns compiles after that."""
+    """Claim: a chunk is compiled as soon as it can act, by the thread that asks, whose programs from
+    the cache are told; what learns compiles after that."""
     go_on, order = threading.Event(), []
 
     class Part:
@@ -198,6 +199,7 @@ def test_what_acts_is_there_first():
 
     class Acting(Part):
         def compile(self) -> str:
+            assert threading.current_thread() is threading.main_thread()
             order.append("acts")
             return "acts"
 
