@@ -182,8 +182,8 @@ def test_acting_does_not_wait_for_what_learns():
 
 
 def test_what_acts_is_there_first():
-    """Claim: a chunk is compiled as soon as it can act, by the thread that asks, whose programs from
-    the cache are told; what learns compiles after that."""
+    """Claim: a chunk is compiled as soon as it can act, by the thread that asks, so that it is told
+    whether the cache had it; what learns compiles after that."""
     go_on, order = threading.Event(), []
 
     class Part:
