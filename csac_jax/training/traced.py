@@ -36,7 +36,7 @@ def keep(program: Program, part: str, jitted: Any) -> Any:
     where no program of that name is kept. Both take a state, and maybe metrics, and give both. The
     program has no parts of your own."""
     folder = _folder()
-    if folder is None or not (isinstance(program, Program) and _is_named(program)):
+    if folder is None or not _is_named(program):
         return jitted
     return _Kept(jitted, program, part, folder)
 

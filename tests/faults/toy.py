@@ -76,7 +76,7 @@ SOUND = Losses()
 
 
 def compile_chunk(num_steps: int, bad: Losses = SOUND) -> Any:
-    """In place of `step.compile_chunk`."""
+    """In place of `halves.compile_chunk`."""
 
     def step(state: State, _: None) -> tuple[State, StepMetrics]:
         outcome = (jnp.arange(E, dtype=jnp.int32) + state.step) % 5

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 from csac_jax import cli
 from csac_jax.config import Config
-from csac_jax.training import memory, step
+from csac_jax.training import halves, memory, step
 from tests.faults import toy
 
 OPTIONS = ("--train.scenes", f"{toy.E}", "--train.chunk", "1", "--train.save-every", "1")
@@ -24,12 +24,13 @@ def _compile_init(cfg: Config) -> Callable[[], toy.State]:
     return functools.partial(toy.first_state, cfg.seed)
 
 
-def _compile_chunk(cfg: Config, num_steps: int) -> object:
+def _compile_chunk(cfg: Config, num_steps: int, **_: object) -> object:
     return toy.compile_chunk(num_steps)
 
 
 if __name__ == "__main__":
-    step.make, step.compile_init, step.compile_chunk = _make, _compile_init, _compile_chunk  # type: ignore
+    step.make, step.compile_init = _make, _compile_init  # type: ignore
+    halves.compile_chunk = _compile_chunk  # type: ignore
     step.prepare = lambda _: None
     memory.check = lambda *_: None  # type: ignore
     sys.exit(cli.main(sys.argv[1:]))
