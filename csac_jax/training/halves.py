@@ -24,7 +24,7 @@ def compile_chunk(program: Program, num_steps: int, keep: bool = False) -> Any:
     kept on disk where they can be, see `traced`: for a program without parts of your own."""
     if jax.default_backend() != "cpu" or program.mesh is not None:
         return step.compile_chunk(program, num_steps)
-    return _Traceable(program, num_steps, traced.keep if keep else traced.keep_none)
+    return _Traceable(program, num_steps, keep)
 
 
 class _Traceable(NamedTuple):
@@ -32,7 +32,7 @@ class _Traceable(NamedTuple):
 
     program: Program
     num_steps: int
-    kept: Callable[[Program, str, Any], Any]  # a jitted part -> what lowers it
+    keep: bool
 
     def lower(self, state: Any) -> "_Lowered":
         """Traces what acts; the other part is traced while that compiles."""
@@ -43,7 +43,7 @@ class _Traceable(NamedTuple):
         bound = functools.partial(function, self.program)
         options = compiler.options(self.program.cfg)
         jitted = jax.jit(bound, donate_argnums=0, compiler_options=options)
-        return self.kept(self.program, function.__name__, jitted)
+        return traced.keep(self.program, function.__name__, jitted) if self.keep else jitted
 
 
 class _Lowered(NamedTuple):

@@ -187,7 +187,7 @@ def learn_step(
     _, key_learn, _ = _step_keys(state.key, step)
     # Before `learning_starts` the result is dropped: a branch costs more.
     ready = state.step * cfg.train.scenes >= cfg.train.learning_starts
-    done = updates_before(cfg, step)
+    done = _updates_done(cfg, step)
     learned, priority, losses = learn(program, key_learn, state.learner, state.replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, state.replay.priority)
@@ -286,7 +286,7 @@ def _is_finite(tree: Any) -> jax.Array:
     return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))
 
 
-def updates_before(cfg: Config, step: jax.Array) -> jax.Array:
+def _updates_done(cfg: Config, step: jax.Array) -> jax.Array:
     """Updates [] int32 before training step `step` [] that were not dropped."""
     return jnp.maximum(step - first_to_learn(cfg), 0) * cfg.learn.updates
 

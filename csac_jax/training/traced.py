@@ -41,11 +41,6 @@ def keep(program: Program, part: str, jitted: Any) -> Any:
     return _Kept(jitted, program, part, folder)
 
 
-def keep_none(_: Program, __: str, jitted: Any) -> Any:
-    """The jitted part as it is."""
-    return jitted
-
-
 def _folder() -> Path | None:
     """Where programs are kept; None where JAX keeps none on a disk."""
     chosen = jax.config.jax_compilation_cache_dir

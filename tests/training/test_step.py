@@ -369,7 +369,7 @@ def test_nothing_is_learned_before_the_warm_up(run):
         CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)
     ]
     for counted in run.states:
-        assert step.updates_before(CFG, counted.step) == counted.learner.updates
+        assert step._updates_done(CFG, counted.step) == counted.learner.updates
     assert all(np.all(np.isfinite(m.critic_loss)) for m in run.metrics)
 
 
