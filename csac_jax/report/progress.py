@@ -11,8 +11,8 @@ from csac_jax.training.callbacks import Record
 PLAIN_INTERVAL = 10.0  # s between lines where there is no terminal
 
 
-def _describe(record: Record, eta: float) -> str:
-    """Speed, success, losses and remaining time `eta`, s, in one line."""
+def _describe(record: Record, eta: float | None) -> str:
+    """Speed, success, losses and remaining time `eta`, s, if known, in one line."""
     parts = [f"{record.actions_per_second:.1f}/s"]
     if record.grasp_success is not None:
         parts.append(f"grasp success {record.grasp_success:.0%} of last {record.grasps_counted}")
@@ -20,7 +20,9 @@ def _describe(record: Record, eta: float) -> str:
         parts.append(f"loss critic {record.critic_loss:.3f} actor {record.actor_loss:.3f}")
     else:
         parts.append("warming up")
-    return ", ".join([*parts, f"{datetime.timedelta(seconds=round(eta))} left"])
+    if eta is not None:
+        parts.append(f"{datetime.timedelta(seconds=round(eta))} left")
+    return ", ".join(parts)
 
 
 class Terminal:
@@ -42,7 +44,7 @@ class Terminal:
         """Prints a line above the bar."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+    def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
         """Moves the bar; without a terminal, prints a line if one is due."""
         text, now, done = _describe(record, eta), time.monotonic(), record.actions
         if self._console.is_terminal:

@@ -41,8 +41,8 @@ class Reporter(Protocol):
     def say(self, text: str) -> None:
         """One line about something that happened."""
 
-    def progress(self, record: Record, total_actions: int, eta: float) -> None:
-        """After each chunk; `eta` is the time the rest will take, s."""
+    def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
+        """After each chunk; `eta` is the time the rest will take, s, None where unknown."""
 
 
 class Progress(NamedTuple):
@@ -127,9 +127,11 @@ def _go_on(
         step += cfg.train.chunk
         if lost := not_finite(metrics):
             raise TrainingError(_lost_loss(run_dir, lost, step))
+        # The first chunk waits for what still compiles, or for Warp to build its kernels.
+        eta = None if progress is start.progress else seconds * (total - step) / cfg.train.chunk
         progress, record = record_chunk(cfg, step, metrics, progress, seconds)
         append(run_dir, record)
-        reporter.progress(record, total * scenes, seconds * (total - step) / cfg.train.chunk)
+        reporter.progress(record, total * scenes, eta)
         if not doubted and (doubt := _doubt(cfg, record)):
             doubted = True
             reporter.say(doubt)

@@ -65,7 +65,7 @@ class Notes(Callback):
     def say(self, text: str) -> None:
         self.lines.append(text)
 
-    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+    def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
         """Reporter."""
 
 

@@ -108,7 +108,7 @@ class Quiet:
         """Reporter."""
         self.said.append(text)
 
-    def progress(self, record: Record, total_actions: int, eta: float) -> None:
+    def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
         """Reporter."""
         self.chunks += 1
         if self.chunks == self._stop_after:

@@ -25,7 +25,7 @@ class Reporter:
     def say(self, text: str) -> None:
         """Reporter."""
 
-    def progress(self, record: object, total_actions: int, eta: float) -> None:
+    def progress(self, record: object, total_actions: int, eta: float | None) -> None:
         """Reporter."""
         self._after -= 1
         if self._after == 0:
