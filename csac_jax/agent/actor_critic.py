@@ -323,7 +323,7 @@ def _value(
     """
     frames, num = learner.frames, learner.frames.yaws.shape[0]
     index = maps.yaw_index(frames, action.pose[:, 2])
-    lower = jnp.floor(index)
+    lower = rotate.floor(index)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
     inputs = maps.input_maps(frames, obs)

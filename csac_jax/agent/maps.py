@@ -191,7 +191,7 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
     """Trilinear value [] of `maps` [P, K, h, w] at a pose [3] m, m, rad; differentiable in both."""
     num, side = frames.yaws.shape[0], frames.side
     index = yaw_index(frames, pose[2])
-    lower = jnp.floor(index)
+    lower = rotate.floor(index)
     upper_weight = index - lower
 
     def at(k: jax.Array) -> jax.Array:

@@ -30,7 +30,7 @@ def blend(terms: jax.Array, row_col: jax.Array, turn: jax.Array) -> jax.Array:
     own; differentiable in all. Outside, the nearest edge counts."""
     side = jnp.array(terms.shape[:2], jnp.float32)
     position = jnp.clip(row_col, 0.0, side - 1.0)
-    first = jnp.clip(jnp.floor(position), 0.0, side - 2.0)
+    first = jnp.clip(rotate.floor(position), 0.0, side - 2.0)
 
     def at(corner: jax.Array) -> jax.Array:
         row, col = (first + corner).astype(jnp.int32)
@@ -57,7 +57,7 @@ def read(
     """Q [] of terms [P, K, h, w, T] at a pose [3] m, m, rad; differentiable in both."""
     num, side = terms.shape[1], terms.shape[2]
     index = pose[2] * (num / (2.0 * np.pi))
-    below = jnp.floor(index)
+    below = rotate.floor(index)
 
     def at(k: jax.Array, turn: jax.Array) -> jax.Array:
         k = jnp.mod(k, num)

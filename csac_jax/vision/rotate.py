@@ -15,6 +15,8 @@ from flax import struct
 from csac_jax import geometry
 from csac_jax.config import canvas_size
 
+CLOSE = 3e-5  # cells or yaws; rounding moves a position among 80 cells by half of it
+
 
 @struct.dataclass
 class RotationTables:
@@ -56,6 +58,16 @@ def to_cell(canvas: int, cell_size: float, yaw: jax.Array, xy: jax.Array) -> jax
     return geometry.rotate2d(-yaw, xy)[..., ::-1] / cell_size + 0.5 * (canvas - 1)
 
 
+def floor(position: jax.Array) -> jax.Array:
+    """Cells or frames at or below positions [...] among them, float32. What is CLOSE below a whole
+    number counts as that number, and interpolation goes on past its end by as little.
+
+    XLA may work a position out twice, for the values that are read and for their weights, and round
+    it differently. In a cell's centre both must find the same cell.
+    """
+    return jnp.floor(position + CLOSE)
+
+
 def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
     """Value [] of the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells.
 
@@ -65,8 +77,8 @@ def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
     row = jnp.clip(row_col[0], 0.0, height - 1.0)
     col = jnp.clip(row_col[1], 0.0, width - 1.0)
     # Clipped after the cast, because NaN too must stay inside.
-    top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, height - 2)
-    left = jnp.clip(jnp.floor(col).astype(jnp.int32), 0, width - 2)
+    top = jnp.clip(floor(row).astype(jnp.int32), 0, height - 2)
+    left = jnp.clip(floor(col).astype(jnp.int32), 0, width - 2)
     down, right = row - top.astype(row.dtype), col - left.astype(col.dtype)
 
     rows, cols = (first + np.arange(2, dtype=np.int32) for first in (top, left))

@@ -13,6 +13,7 @@ from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
 from csac_jax.sim import primitives
 from csac_jax.sim.outcome import BARE
+from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation
 
 GRASP, PUSH = int(Primitive.GRASP), int(Primitive.PUSH)
@@ -49,6 +50,18 @@ def test_reading_at_a_cells_pose_gives_the_cell(frames, primitive):
     np.testing.assert_allclose(
         _read(frames, values, primitive, poses), values[primitive].reshape(-1), atol=1e-4
     )
+
+
+def test_cell_below_a_cells_pose_is_the_cell(frames):
+    """Claim: rounding puts no cell's own pose into the cell or frame before it."""
+    count, side = len(frames.yaws), frames.side
+    to_cell = jax.vmap(rotate.to_cell, (None, None, 0, 0))
+    position = to_cell(side, frames.cell, jnp.asarray(frames.yaws), jnp.asarray(frames.xy))
+    cells = np.broadcast_to(np.mgrid[:side, :side].transpose(1, 2, 0), position.shape)
+    np.testing.assert_array_equal(rotate.floor(position), cells)
+    index = maps.yaw_index(frames, jnp.asarray(frames.yaws))
+    np.testing.assert_array_equal(rotate.floor(index), np.arange(count))
+    np.testing.assert_array_equal(rotate.floor(position + 0.99), cells)
 
 
 def test_is_valid_at_a_cells_pose_is_the_cell(frames):

@@ -194,7 +194,7 @@ def test_trained_policy_acts_between_cells(kind):
     """Claim: where a block can be lifted only where cells meet, CEM on the trained net with slopes
     leaves the best cell by more than half a cell in most states, in most of all for a higher Q, and
     lifts in many; on the trilinear one it never leaves for a higher Q, and lifts nothing."""
-    cfg = toys.config("csac", actions=2400, max_actions=1)
+    cfg = toys.config("csac", actions=4800, max_actions=1)
     cfg = cfg.change(net={"kind": kind}, cem={"candidates": 32, "elites": 6, "rounds": 4})
     toy = toys.precise(cfg)
     program = step.make(cfg, env=toy)
