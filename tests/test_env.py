@@ -64,24 +64,17 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     def plan_from_state(state: State) -> Action:
         return oracle.grasp(CONFIG, state.scene, state.obs.height)
 
-    reset = jax.jit(jax.vmap(env.reset)).trace(keys)
-    state = reset.lower().compile()(keys)
+    traced_reset = jax.jit(jax.vmap(env.reset)).trace(keys)
+    reset = traced_reset.lower().compile()
+    state = reset(keys)
     plan = jax.jit(jax.vmap(plan_from_state)).lower(state).compile()
     reset_to = jax.jit(jax.vmap(env.reset_to)).lower(state.scene).compile()
     step = jax.jit(jax.vmap(env.step)).trace(state, plan(state))
     into, out = (
         jax.tree.unflatten(jax.tree.structure(state), traced.jaxpr.out_avals)
-        for traced in (reset, step)
+        for traced in (traced_reset, step)
     )
-    return Lab(
-        env,
-        reset.lower().compile(),
-        reset_to,
-        step.lower().compile(),
-        plan,
-        _types(into),
-        _types(out),
-    )
+    return Lab(env, reset, reset_to, step.lower().compile(), plan, _types(into), _types(out))
 
 
 def _cube(x: float, y: float, target: int = layout.ANY) -> Scene:

@@ -4,8 +4,8 @@ On a CPU, XLA has a second library for convolutions, about twice as fast as Eige
 small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
 LLVM's second level of optimisation compiles sooner than the third, to as fast a program. So do
 XLA's former emitters of kernels, where it still has them: its new ones build an MLIR module for
-each of more than a thousand kernels. Functions are as exact with them. At level 0 they work some
-numbers out twice, which then differ by rounding, and some searches by CEM end elsewhere.
+each of more than a thousand kernels. Functions are as exact with them. What `XLA_FLAGS` says of
+either stays.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
@@ -13,6 +13,7 @@ That takes half of the compilation, and the vendor's library is as fast (`experi
 
 import functools
 import gc
+import os
 from typing import Any
 
 import jax
@@ -47,7 +48,9 @@ def options(cfg: Config) -> dict[str, Any] | None:
     The second library is slow at kernel gradients, which `conv2d` keeps from it.
     """
     if jax.default_backend() == "cpu":
-        known = {name: value for name, value in SOONER.items() if knows(name, value)}
+        chosen = os.environ.get("XLA_FLAGS", "")
+        sooner = {name: SOONER[name] for name in SOONER if f"--{name}=" not in chosen}
+        known = {name: value for name, value in sooner.items() if knows(name, value)}
         return known | (LIBRARY if isinstance(cfg.net, SmallNet) and has_library() else {})
     vendor = jax.default_backend() == "gpu" and not isinstance(cfg.net, SmallNet)
     return dict(VENDOR) if vendor and all(map(knows, VENDOR, VENDOR.values())) else None

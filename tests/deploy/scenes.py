@@ -15,6 +15,7 @@ from csac_jax.vision.raycast import Polytopes
 
 CAMERA = CameraConfig()
 HALF = np.array([0.05, 0.025, 0.025])  # of the blocks, m
+MOST = 4  # blocks of most images
 
 
 class Image(NamedTuple):
@@ -30,12 +31,17 @@ def blocks_at(poses: Any, half_size: Any = HALF, colours: Any = None) -> Polytop
     """Boxes on the table at poses [N, 3] m, m, rad; half_size [3] or [N, 3] m; colours [N]."""
     poses = np.array(poses, np.float32).reshape(-1, 3)
     half = np.broadcast_to(half_size, (len(poses), 3)).astype(np.float32)
-    normal, offset = blocks.half_spaces(("box",) * len(poses), jnp.asarray(half))
-    position = np.column_stack([poses[:, :2], half[:, 2]])
-    turn = jax.vmap(lambda yaw: geometry.quat_to_matrix(geometry.quat_from_yaw(yaw)))
     chosen = np.arange(len(poses)) if colours is None else np.array(colours)
     palette = jnp.asarray(blocks.COLOURS)[chosen % len(blocks.COLOURS)]
-    return Polytopes(normal, offset, jnp.asarray(position), turn(jnp.asarray(poses[:, 2])), palette)
+    return _placed(poses, half, palette)
+
+
+@jax.jit
+def _placed(poses: jax.Array, half: jax.Array, palette: jax.Array) -> Polytopes:
+    normal, offset = blocks.half_spaces(("box",) * len(poses), half)
+    position = jnp.column_stack([poses[:, :2], half[:, 2]])
+    turn = jax.vmap(lambda yaw: geometry.quat_to_matrix(geometry.quat_from_yaw(yaw)))
+    return Polytopes(normal, offset, position, turn(poses[:, 2]), palette)
 
 
 def pose_of(cfg: CameraConfig = CAMERA) -> np.ndarray:
@@ -55,7 +61,9 @@ def _rendered(shapes: Polytopes, cfg: CameraConfig) -> Any:
 
 def take(shapes: Polytopes, cfg: CameraConfig = CAMERA) -> Image:
     """The image of blocks on the table; depth is NaN where the camera sees the horizon."""
-    distance, surface, valid, lit = jax.device_get(_rendered(shapes, cfg))
+    most = max(MOST, len(shapes.offset))  # the last block several times: one program for all
+    padded = jax.tree.map(lambda leaf: leaf[np.arange(most).clip(max=len(leaf) - 1)], shapes)
+    distance, surface, valid, lit = jax.device_get(_rendered(padded, cfg))
     rgb = np.round(255 * np.where(valid[..., None], lit[surface], 0.0)).astype(np.uint8)
     depth = np.where(valid, distance, np.nan).astype(np.float32)
     names = ("width", "height", "fx", "fy", "cx", "cy")

@@ -17,8 +17,9 @@ TAKEN = "__ynn_fusion"  # what the library computes is called in a compiled prog
 
 
 @pytest.fixture
-def forgotten():
-    """No memory of what was found before, nor after."""
+def forgotten(monkeypatch: pytest.MonkeyPatch):
+    """No memory of what was found before, nor after, and no options of the user's."""
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     compiler.has_library.cache_clear()
     yield
     compiler.has_library.cache_clear()
@@ -127,6 +128,15 @@ def test_an_option_that_xla_lacks_is_left_out(monkeypatch: pytest.MonkeyPatch):
     asked = compiler.options(presets.paper())
     monkeypatch.setattr(compiler, "SOONER", {**compiler.SOONER, "xla_no_such_option": 1})
     assert compiler.options(presets.paper()) == asked
+
+
+@pytest.mark.usefixtures("forgotten")
+@pytest.mark.parametrize("chosen", compiler.SOONER)
+def test_an_option_that_the_user_gives_stays(monkeypatch: pytest.MonkeyPatch, chosen: str):
+    """Claim: no program overrides what `XLA_FLAGS` says, whose other options change nothing."""
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to= --{chosen}=0")
+    others = {name: value for name, value in compiler.SOONER.items() if name != chosen}
+    assert compiler.options(presets.paper()) == others
 
 
 @pytest.mark.parametrize(
