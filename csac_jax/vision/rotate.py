@@ -15,7 +15,7 @@ from flax import struct
 from csac_jax import geometry
 from csac_jax.config import canvas_size
 
-CLOSE = 3e-5  # cells or yaws; rounding moves a position among 80 cells by half of it
+CLOSE = 3e-5  # cells or yaws, ours: rounding moves a position among 80 cells by half of it
 
 
 @struct.dataclass
