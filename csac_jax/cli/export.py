@@ -29,6 +29,9 @@ class ExportOptions:
     augment: Literal["on", "off"] | None = None
     """Whether Q is the mean over mirror images of the view, see `policy.augment` of `csac-jax train
     --help-all`; by default as the policy's."""
+    average: str | None = None
+    """Another policy, with the same networks and trained from the same start, such as the start
+    itself. Each number of the networks is the mean of both policies' (Wortsman et al. 2022)."""
     height_bonus: float | None = None
     """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
     train --help-all`; by default as the policy's."""
@@ -48,10 +51,11 @@ def run(arguments: list[str]) -> int:
     policy = deploy.Policy.load(options.policy, gripper=options.gripper)
     with as_bad_arguments(ValueError):
         cfg = policy.cfg.change(policy=settings.decision(options))
+    params = policy.params if options.average is None else _mean(policy.params, options.average)
     if options.format == "safetensors":
-        policy_file.save(options.file, policy.params, cfg)
+        policy_file.save(options.file, params, cfg)
     else:
-        files.replace(options.file, _program(options, cfg, policy.params))
+        files.replace(options.file, _program(options, cfg, params))
     print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
     return 0
 
@@ -70,6 +74,23 @@ def _check(options: ExportOptions) -> None:
         raise BadArgumentsError("--size: both numbers must lie in 16 .. 4096 px")
     if options.format in NEEDS:
         check_extra(f"--format {options.format}", NEEDS[options.format], "export")
+
+
+def _mean(params: Any, source: str) -> Any:
+    """The mean of these networks and another policy's."""
+    import jax
+
+    from csac_jax import deploy
+    from csac_jax.io import leaves
+
+    other = deploy.Policy.load(source).params
+    if found := leaves.difference(leaves.layout(other), leaves.layout(params)):
+        name, has, asked = found
+        raise BadArgumentsError(
+            f"--average {source}: has {name} as {has}, the first policy as {asked}; "
+            "give policies with the same networks"
+        )
+    return jax.tree.map(lambda one, two: 0.5 * (one + two), params, other)
 
 
 def _program(options: ExportOptions, cfg: Config, params: Any) -> bytes:

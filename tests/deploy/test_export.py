@@ -202,9 +202,23 @@ def test_policy_file_that_decides_otherwise(policy: Policy, tmp_path: Path):
     jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(policy.params))
 
 
+def test_average_of_policies(policy: Policy, tmp_path: Path):
+    """Claim: `--average` writes the mean of each number of two policies, with the first's config."""
+    other, file = tmp_path / "other.safetensors", tmp_path / "mean.safetensors"
+    tripled = jax.tree.map(lambda leaf: 3.0 * leaf, policy.params)
+    policy_file.save(other, tripled, policy.cfg.change(seed=7))
+    assert cli.main(["export", "shipped", str(file), "--average", str(other)]) == 0
+    cfg, params = policy_file.load(file)
+    assert cfg == policy.cfg
+    jax.tree.map(
+        lambda mean, one: np.testing.assert_array_equal(mean, 2.0 * one), params, policy.params
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ("p.safetensors --average shipped_target", "--average shipped_target: has critic.params."),
         ("p.safetensors --height-bonus 200", "policy.height_bonus: must lie in 0 .. 100"),
         ("p.onnx", "p.onnx: the name of a policy file ends in .safetensors, see --format"),
         ("p.bin --format onnx", "p.bin: the name of a program ends in .onnx, see --format"),
