@@ -203,7 +203,7 @@ def test_policy_file_that_decides_otherwise(policy: Policy, tmp_path: Path):
 
 
 def test_average_of_policies(policy: Policy, tmp_path: Path):
-    """Claim: `--average` writes the mean of each number of two policies, with the first's config."""
+    """Claim: `--average` writes the mean of each number of two policies, and the config of one."""
     other, file = tmp_path / "other.safetensors", tmp_path / "mean.safetensors"
     tripled = jax.tree.map(lambda leaf: 3.0 * leaf, policy.params)
     policy_file.save(other, tripled, policy.cfg.change(seed=7))
