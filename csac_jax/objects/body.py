@@ -73,7 +73,7 @@ def centred(name: str, parts: Sequence[Part], whole: solid.Moments, **more: Any)
     """The object of these parts whose integrals are `whole`."""
     com = whole.first / whole.volume
     shifted = [solid.moved(part, -com) for part in parts]
-    shifted.sort(key=lambda part: -np.linalg.norm(np.ptp(part.vertices, axis=0)))
+    shifted.sort(key=lambda part: -np.square(np.ptp(part.vertices, axis=0)).sum())
     return Object(name, tuple(shifted), whole.volume, solid.inertia(whole), **more)
 
 

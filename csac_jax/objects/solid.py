@@ -2,6 +2,9 @@
 
 Integrals over a polyhedron are sums over its triangles: each spans a tetrahedron with the origin,
 whose integrals of 1, x and x y are closed forms (Tonon 2005, J. Math. Stat. 1, 8-11).
+
+Products go by `einsum`: those of BLAS, which `@` calls, round as the processor has it. Bodies that
+fall into a pile make much of a last bit, so that machines would not agree which piles there are.
 """
 
 import dataclasses
@@ -61,10 +64,11 @@ def simplified(points: np.ndarray) -> Part:
         return part
     corners = part.vertices.astype(np.float64)
     chosen = {*corners.argmin(axis=0).tolist(), *corners.argmax(axis=0).tolist()}
-    chosen |= {int(np.argmax(corners @ way)) for way in _DIAGONALS}
+    chosen |= {*np.einsum("ni,mi->mn", corners, _DIAGONALS).argmax(axis=1).tolist()}
     best = convex(corners[[*chosen]])
     while True:
-        outside = (corners @ best.planes[:, :3].T - best.planes[:, 3]).max(axis=1)
+        above = np.einsum("ni,fi->nf", corners, best.planes[:, :3]) - best.planes[:, 3]
+        outside = above.max(axis=1)
         chosen.add(int(outside.argmax()))
         part = convex(corners[[*chosen]])
         if len(part.planes) > MOST_FACES:
@@ -85,11 +89,12 @@ def _merged(planes: np.ndarray, size: float) -> np.ndarray:
 def moments(part: Part) -> Moments:
     """Integrals over a part."""
     corners = part.vertices.astype(np.float64)[part.triangles]  # [T, 3, 3]
-    sixth = np.linalg.det(corners) / 6.0  # volumes of the tetrahedra
+    normals = np.cross(corners[:, 1], corners[:, 2])
+    sixth = np.einsum("ti,ti->t", corners[:, 0], normals) / 6.0  # volumes of the tetrahedra
     total = corners.sum(axis=1)
     squares = np.einsum("tki,tkj->tij", corners, corners) + np.einsum("ti,tj->tij", total, total)
     second = np.einsum("t,tij->ij", sixth, squares) / 20.0
-    return Moments(float(sixth.sum()), sixth @ total / 4.0, second)
+    return Moments(float(sixth.sum()), np.einsum("t,ti->i", sixth, total) / 4.0, second)
 
 
 def joined(every: Iterable[Moments]) -> Moments:
@@ -105,10 +110,32 @@ def inertia(solid: Moments) -> np.ndarray:
     return np.trace(about) * np.eye(3) - about
 
 
+def principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Principal moments [n, 3] of matrices [n, 3, 3] and their right-handed axes [n, 3, 3], as
+    columns.
+
+    Cyclic Jacobi rotations (Golub and Van Loan, sec. 8.5), each a turn about one axis.
+    """
+    left, axes = np.array(inertia, np.float64), np.tile(np.eye(3), (len(inertia), 1, 1))
+    for i, j in 5 * ((0, 1), (0, 2), (1, 2)):
+        twice, gap = 2.0 * left[:, i, j], left[:, j, j] - left[:, i, i]
+        sign = np.where(gap < 0.0, -1.0, 1.0)
+        length = np.abs(gap) + np.sqrt(gap**2 + twice**2)
+        tangent = sign * twice / np.where(length > 0.0, length, 1.0)
+        cosine = 1.0 / np.sqrt(1.0 + tangent**2)
+        turn = np.tile(np.eye(3), (len(left), 1, 1))
+        turn[:, i, i] = turn[:, j, j] = cosine
+        turn[:, i, j], turn[:, j, i] = tangent * cosine, -tangent * cosine
+        left = np.einsum("nki,nkl,nlj->nij", turn, left, turn)
+        axes = np.einsum("nik,nkj->nij", axes, turn)
+    return np.einsum("nii->ni", left), axes
+
+
 def moved(part: Part, shift: np.ndarray) -> Part:
     """The part shifted by `shift` [3] m."""
     vertices = (part.vertices + shift).astype(np.float32)
-    offsets = part.planes[:, 3] + part.planes[:, :3] @ np.asarray(shift, np.float32)
+    along = np.einsum("fi,i->f", part.planes[:, :3], np.asarray(shift, np.float32))
+    offsets = part.planes[:, 3] + along
     return Part(vertices, part.triangles, np.column_stack([part.planes[:, :3], offsets]))
 
 
@@ -116,5 +143,5 @@ def narrowest(parts: Iterable[Part]) -> float:
     """Least distance, m, of a face of the parts' common hull from the corner opposite it."""
     points = np.concatenate([part.vertices for part in parts])
     hull = ConvexHull(points)
-    along = hull.equations[:, :3] @ points[hull.vertices].T
+    along = np.einsum("fi,ni->fn", hull.equations[:, :3], points[hull.vertices])
     return float(np.ptp(along, axis=1).min())

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from csac_jax.objects import families, library
+from csac_jax.objects import families, library, solid
 from csac_jax.objects.body import DENSITY, Object
 from csac_jax.objects.library import Library, LibraryError, Split
 
@@ -82,8 +82,7 @@ def of(source: Library) -> Tables:
         of, planes[number, : len(row)] = zip(*row, strict=True)
         part[number, : len(row)], first[number, 1 : len(row)] = of, np.diff(of) > 0
     bounds = np.stack([one.bounds for one in objects]).astype(np.float32)
-    moments, axes = np.linalg.eigh([one.inertia for one in objects])
-    axes[:, :, 2] *= np.linalg.det(axes)[:, None]  # right-handed
+    moments, axes = solid.principal(np.stack([one.inertia for one in objects]))
     return Tables(
         normal=planes[..., :3],
         offset=planes[..., 3],

@@ -60,7 +60,8 @@ def packed(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
         for _ in range(_TRIES):
             yaw, xy = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-half, half, 2)
             cos, sin = np.cos(yaw), np.sin(yaw)
-            outline = corners[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + xy
+            turn = np.array([[cos, sin], [-sin, cos]])
+            outline = np.einsum("ni,ij->nj", corners[:, :2], turn) + xy
             outline = outline[ConvexHull(outline).vertices]
             if np.abs(outline).max() <= half and all(_apart(outline, each) for each in outlines):
                 break
@@ -81,7 +82,8 @@ def _apart(one: np.ndarray, two: np.ndarray) -> bool:
         side = np.roll(first, -1, axis=0) - first
         normal = np.column_stack([side[:, 1], -side[:, 0]])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        gap = (second @ normal.T).min(axis=0) - (first @ normal.T).max(axis=0)
+        near, far = (np.einsum("ni,mi->nm", each, normal) for each in (second, first))
+        gap = near.min(axis=0) - far.max(axis=0)
         if gap.max() >= GAP:
             return True
     return False

@@ -1,7 +1,10 @@
 """Libraries as files."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -119,3 +122,28 @@ def test_an_object_is_found_by_name(made: Path):
     assert known.objects[known.number("cup-0-2")].family == "cup"
     with pytest.raises(ValueError, match="no object 'cub' in the library; it has: bottle-0-0"):
         known.number("cub")
+
+
+_TABLES = """
+import hashlib
+from csac_jax.objects import tables
+content = hashlib.sha256()
+for leaf in tables.of(tables.find("mixed:5:80", "all")):
+    content.update(repr(leaf.tobytes() if hasattr(leaf, "tobytes") else leaf).encode())
+print(content.hexdigest())
+"""
+
+
+def test_objects_are_the_same_on_every_processor():
+    """Claim: all numbers of objects are the same, bit by bit, whatever the kernels of BLAS."""
+    found = {
+        kernel: subprocess.run(
+            [sys.executable, "-c", _TABLES],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "OPENBLAS_CORETYPE": kernel},
+        ).stdout
+        for kernel in ("Prescott", "Haswell")
+    }
+    assert found["Prescott"] == found["Haswell"]

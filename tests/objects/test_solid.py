@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from csac_jax.objects import solid
 
@@ -30,6 +32,25 @@ def test_joined_boxes_are_one_box():
     expected = 6.0 * np.diag([4.0 + 9.0, 1.0 + 9.0, 1.0 + 4.0]) / 12.0
     assert whole.volume == pytest.approx(6.0)
     np.testing.assert_allclose(solid.inertia(whole), expected, atol=1e-9)
+
+
+def test_principal_axes_are_scipys():
+    """Claim: principal moments are those of SciPy; the axes are right-handed and turn the moments
+    into the matrix, also of a ball, a cylinder and what is aligned with its axes but for rounding.
+    """
+    turns = Rotation.random(40, rng=0).as_matrix()
+    sides = np.random.default_rng(0).uniform(0.1, 1.0, (40, 3))
+    sides[:10, 1] = sides[:10, 0]
+    sides[5:10] = 1.0
+    turns[10:15] = np.eye(3)
+    inertia = np.einsum("nij,nj,nkj->nik", turns, sides, turns)
+    inertia[15:20] = np.diag([1.0, 2.0, 3.0]) + 1e-17
+    moments, axes = solid.principal(inertia)
+    for found, one in zip(moments, inertia, strict=True):
+        np.testing.assert_allclose(np.sort(found), scipy.linalg.eigvalsh(one), rtol=1e-12)
+    again = np.einsum("nij,nj,nkj->nik", axes, moments, axes)
+    np.testing.assert_allclose(again, inertia, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(axes), 1.0, rtol=1e-12)
 
 
 def test_planes_hold_the_corners_and_no_more():
