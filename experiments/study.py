@@ -262,11 +262,13 @@ class Found(NamedTuple):
     scores: dict[str, dict[str, Score]]  # by suite
 
     def gaps(self, a: str, b: str) -> list[Gap]:
-        """Of a pair by all metrics, training's first; none where a method has not run."""
+        """Of a pair by all metrics, training's first; none where a method has no two seeds."""
         ours, theirs = (self.part.groups.get(name, (name,)) for name in (a, b))
         measured = self.scores if self.part.metrics else {}
         known = (self.curves, *measured.values())
         if not all({*ours, *theirs} <= one.keys() for one in known):
+            return []
+        if any(len(self.curves[name].final) < 2 for name in (*ours, *theirs)):
             return []
         found = []
         for metric in self.part.learning:
