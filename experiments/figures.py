@@ -83,7 +83,9 @@ def differences() -> Figure:
         panel.axvline(0, color="0.5", linewidth=1)
         panel.set_yticks(list(places), [f"{gap.method} less {gap.less}" for gap in gaps])
         panel.set(ylim=(0.3, len(gaps) + 0.7), xlabel=f"{METRICS.get(part.by, part.by)}{unit}")
-        panel.set_title(f"{part.title} (hypothesis {part.hypothesis})", fontsize="medium")
+        panel.set_title(
+            f"{part.title} (hypothesis {part.hypothesis})", fontsize="medium", loc="right"
+        )
     return figure
 
 
