@@ -262,7 +262,7 @@ class Found(NamedTuple):
     scores: dict[str, dict[str, Score]]  # by suite
 
     def gaps(self, a: str, b: str) -> list[Gap]:
-        """Of a pair by all metrics, training's first; none where a method has no two seeds."""
+        """Of a pair by all metrics, training's first; none where a method has not run twice."""
         ours, theirs = (self.part.groups.get(name, (name,)) for name in (a, b))
         measured = self.scores if self.part.metrics else {}
         known = (self.curves, *measured.values())

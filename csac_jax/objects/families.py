@@ -246,10 +246,8 @@ def assembly(rng: Generator) -> list[Part]:
             ends = below[[below[:, axis].argmin(), below[:, axis].argmax()]]
             middles, room = 0.2 * ends[::-1] + 0.8 * ends, 0.28 * float(np.ptp(ends[:, axis]))
         else:
-            middles, room = (
-                np.einsum("mn,ni->mi", rng.dirichlet(np.ones(len(below)), 1), below),
-                _REACH,
-            )
+            weights = rng.dirichlet(np.ones(len(below)), 1)
+            middles, room = np.einsum("mn,ni->mi", weights, below), _REACH
         feet = [middle + _footprint(rng, room) for middle in middles]
         for foot in feet:
             middle, half = foot.mean(axis=0), 0.5 * np.ptp(foot, axis=0)

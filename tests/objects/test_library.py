@@ -134,7 +134,7 @@ print(content.hexdigest())
 """
 
 
-def test_objects_are_the_same_on_every_processor():
+def test_objects_are_the_same_by_all_kernels_of_blas():
     """Claim: all numbers of objects are the same, bit by bit, whatever the kernels of BLAS."""
     found = {
         kernel: subprocess.run(
