@@ -147,6 +147,19 @@ def test_same_arguments_same_scenes(scenes: Scene, monkeypatch, tmp_path: Path):
         )
 
 
+def test_a_gpu_has_no_part_in_settling(small: Config, monkeypatch, tmp_path: Path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    fields, devices = model.scene_fields, set()
+
+    def noted(*given):
+        devices.add(jax.config.jax_default_device)
+        return fields(*given)
+
+    monkeypatch.setattr(model, "scene_fields", noted)
+    pool.settled(small, 5, 2)
+    assert devices == {jax.devices("cpu")[0]}
+
+
 def test_streams_share_no_scene(small: Config):
     """Claim: training and evaluation draw from pools that have no scene in common, nor has one pool
     a scene twice."""
