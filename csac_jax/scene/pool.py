@@ -110,10 +110,20 @@ def _stored(digest: str, make: Callable[[], Scene]) -> Scene:
     for stored in (shipped() / name, path):
         if stored and (known := _read(stored)) is not None:
             return known
-    scenes = make()
+    with _on_host():
+        scenes = make()
     if path:
         _write(path, scenes)
     return scenes
+
+
+def _on_host() -> contextlib.AbstractContextManager[Any]:
+    """Has JAX compute on the CPU where it may: a GPU adds a block's parts in any order, so that the
+    scenes would differ from one process to the next."""
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:  # JAX_PLATFORMS names no CPU
+        return contextlib.nullcontext()
 
 
 class _Counter:
@@ -141,8 +151,7 @@ def _settle(
         # A round of piles takes minutes, so it is no larger than needed.
         num = min(_ROUND, count - len(settled)) if costly else _ROUND
         drops = [drop() for _ in range(num)]
-        with _on_host():
-            fields = jax.device_get(fields_of(_stack(drops)))
+        fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
         waiting = list(zip(drops, rows, strict=True))
         for scene in _first_at_rest(fall, waiting, count - len(settled)):
@@ -154,15 +163,6 @@ def _settle(
             remedy = "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
             raise SceneError(f"{found}; {remedy}")
     return _stack(settled)
-
-
-def _on_host() -> contextlib.AbstractContextManager[Any]:
-    """Has JAX compute on the CPU where it may: a GPU adds a block's parts in any order, so that the
-    scenes would differ from one process to the next."""
-    try:
-        return jax.default_device(jax.local_devices(backend="cpu")[0])
-    except RuntimeError:  # JAX_PLATFORMS names no CPU
-        return contextlib.nullcontext()
 
 
 def _first_at_rest(

@@ -14,7 +14,7 @@ from scipy import stats
 from csac_jax import presets
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import blocks, layout, model, pool
+from csac_jax.scene import arrange, blocks, layout, model, pool
 from csac_jax.scene.layout import Scene, parking
 from tests.scene import placed
 
@@ -147,17 +147,26 @@ def test_same_arguments_same_scenes(scenes: Scene, monkeypatch, tmp_path: Path):
         )
 
 
-def test_a_gpu_has_no_part_in_settling(small: Config, monkeypatch, tmp_path: Path):
+def test_scenes_are_made_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: what is stored was computed on the CPU, also where JAX's own device is a GPU: dropped
+    scenes and arranged ones."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    fields, devices = model.scene_fields, set()
+    monkeypatch.setattr(pool, "_ROUND", 8)
+    devices = {}
 
-    def noted(*given):
-        devices.add(jax.config.jax_default_device)
-        return fields(*given)
+    def note(module, name):
+        of_module = getattr(module, name)
 
-    monkeypatch.setattr(model, "scene_fields", noted)
-    pool.settled(small, 5, 2)
-    assert devices == {jax.devices("cpu")[0]}
+        def noted(*given):
+            devices[name] = jax.config.jax_default_device
+            return of_module(*given)
+
+        monkeypatch.setattr(module, name, noted)
+
+    note(model, "scene_fields")
+    note(arrange, "arrangements")
+    pool.scenes(Config(scene=SceneConfig(slots=("box",) * 3, min_blocks=3, arranged=0.5)), 5, 4)
+    assert devices == dict.fromkeys(["scene_fields", "arrangements"], jax.devices("cpu")[0])
 
 
 def test_streams_share_no_scene(small: Config):
