@@ -49,6 +49,9 @@ class EvalOptions:
     height_bonus: float | None = None
     """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
     train --help-all`; by default as the policy's."""
+    retry: float | None = None
+    """How boldly the policy draws another place after failed grasps, see `policy.retry` of
+    `csac-jax train --help-all`; by default as the policy's."""
     episodes: int = 50
     """Episodes of every part of the suite, each with a fresh scene where the part has several."""
     seed: int = 0

@@ -35,6 +35,9 @@ class ExportOptions:
     height_bonus: float | None = None
     """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
     train --help-all`; by default as the policy's."""
+    retry: float | None = None
+    """How boldly the policy draws another place after failed grasps, see `policy.retry` of
+    `csac-jax train --help-all`; by default as the policy's."""
     input: Literal["maps", "image"] = "maps"
     """What a program takes: colour and height map, or (stablehlo) a camera's image and pose."""
     size: tuple[int, int] = (640, 480)

@@ -107,9 +107,9 @@ def parse_view(
 
 
 def decision(options: Any) -> dict[str, Any]:
-    """What `--augment` and `--height-bonus` of a command set in the section `policy`."""
+    """What a command's `--augment`, `--height-bonus` and `--retry` set in the section `policy`."""
     mirrored = None if options.augment is None else options.augment == "on"
-    values = {"augment": mirrored, "height_bonus": options.height_bonus}
+    values = {"augment": mirrored, "height_bonus": options.height_bonus, "retry": options.retry}
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -367,8 +367,9 @@ def _decision(config: Json, trained: Json) -> str:
     options = ""
     if (mirrored := asked.get("augment", False)) != own.get("augment", False):
         options += f" --augment {'on' if mirrored else 'off'}"
-    if (bonus := asked.get("height_bonus", 0.0)) != own.get("height_bonus", 0.0):
-        options += f" --height-bonus {bonus}"
+    for name in ("height_bonus", "retry"):
+        if (value := asked.get(name, 0.0)) != own.get(name, 0.0):
+            options += f" --{name.replace('_', '-')} {value}"
     return options
 
 

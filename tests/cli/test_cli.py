@@ -630,6 +630,7 @@ def test_any_policy_sees_through_another_camera(
         ([], {}),
         (["--augment", "on"], {"augment": True}),
         (["--height-bonus", "2"], {"height_bonus": 2.0}),
+        (["--retry", "0.1"], {"retry": 0.1}),
     ],
 )
 def test_eval_changes_how_a_policy_decides(
@@ -638,8 +639,9 @@ def test_eval_changes_how_a_policy_decides(
     flags: list[str],
     expected: dict[str, Any],
 ):
-    """Claim: `eval --augment on` makes any policy act on the mean over mirror images, and
-    `--height-bonus` prefer what lies high; without them, the policy does as it was trained to."""
+    """Claim: `eval --augment on` makes any policy act on the mean over mirror images,
+    `--height-bonus` prefer what lies high and `--retry` draw another place after failures; without
+    them, the policy does as it was trained to."""
     asked = []
 
     def build(cfg, *_):

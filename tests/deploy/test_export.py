@@ -194,11 +194,12 @@ def test_policy_file_of_a_policy_file(policy: Policy, tmp_path: Path):
 
 
 def test_policy_file_that_decides_otherwise(policy: Policy, tmp_path: Path):
-    """Claim: a policy file is written with what --augment and --height-bonus ask for."""
+    """Claim: a policy file is written with what --augment, --height-bonus and --retry ask for."""
     file = tmp_path / "high.safetensors"
-    assert cli.main(["export", "shipped", str(file), "--augment=on", "--height-bonus=3"]) == 0
+    asked = ["--augment=on", "--height-bonus=3", "--retry=0.1"]
+    assert cli.main(["export", "shipped", str(file), *asked]) == 0
     cfg, params = policy_file.load(file)
-    assert cfg == policy.cfg.change(policy={"augment": True, "height_bonus": 3.0})
+    assert cfg == policy.cfg.change(policy={"augment": True, "height_bonus": 3.0, "retry": 0.1})
     jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(policy.params))
 
 
@@ -220,6 +221,7 @@ def test_average_of_policies(policy: Policy, tmp_path: Path):
     [
         ("p.safetensors --average shipped_target", "--average shipped_target: has critic.params."),
         ("p.safetensors --height-bonus 200", "policy.height_bonus: must lie in 0 .. 100"),
+        ("p.safetensors --retry 20", "policy.retry: must lie in 0 .. 10"),
         ("p.onnx", "p.onnx: the name of a policy file ends in .safetensors, see --format"),
         ("p.bin --format onnx", "p.bin: the name of a program ends in .onnx, see --format"),
         ("p.onnx --format onnx --input image", "--input image: needs --format stablehlo"),

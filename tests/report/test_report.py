@@ -479,10 +479,11 @@ def test_command_of_an_evaluation_gives_its_view_back():
 
 
 def test_command_of_an_evaluation_says_how_it_decides():
-    """Claim: an evaluation's command has `--augment` and `--height-bonus` where the policy's config
-    is another, also one from before those settings."""
+    """Claim: an evaluation's command has `--augment`, `--height-bonus` and `--retry` where the
+    policy's config is another, also one from before those settings."""
     on, off = (_config("csac_beta", 0, policy__augment=one) for one in (True, False))
     high = _config("csac_beta", 0, policy__height_bonus=3.0)
+    bold = _config("csac_beta", 0, policy__retry=0.1)
     before = {**off, "policy": {"place": "cem"}}
 
     def command(seen: Any, trained: Any) -> list[str]:
@@ -496,9 +497,13 @@ def test_command_of_an_evaluation_says_how_it_decides():
     for seen, trained, expected in ((high, off, 3.0), (high, before, 3.0), (off, high, 0.0)):
         _, _, *flags = command(seen, trained)
         asked, _ = settings.parse_view(EvalOptions, "eval", flags)
-        assert (asked.height_bonus, asked.augment) == (expected, None)
-    for seen, trained in ((on, on), (off, before), (before, off), (high, high)):
-        assert not {"--augment", "--height-bonus"} & set(command(seen, trained))
+        assert (asked.height_bonus, asked.augment, asked.retry) == (expected, None, None)
+    for seen, trained, expected in ((bold, off, 0.1), (bold, before, 0.1), (off, bold, 0.0)):
+        _, _, *flags = command(seen, trained)
+        asked, _ = settings.parse_view(EvalOptions, "eval", flags)
+        assert (asked.height_bonus, asked.augment, asked.retry) == (None, None, expected)
+    for seen, trained in ((on, on), (off, before), (before, off), (high, high), (bold, bold)):
+        assert not {"--augment", "--height-bonus", "--retry"} & set(command(seen, trained))
 
 
 def test_command_of_an_evaluation_names_its_objects():
