@@ -25,6 +25,8 @@ from csac_jax.scene.layout import Scene
 
 LARGEST = 1.25  # compiled over nominal block size: C culls pairs by the bounds it was compiled with
 HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above the highest drop
+_CONE_IMPEDANCE = 10.0  # of friction over that of the normal force, with objects (ours)
+_CONE_EFFORT = 20  # iterations of the solver and of a line search; eight explode (ours)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,6 +79,9 @@ def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec
         # Faster, measured: objects have few parts, and most of them sleep.
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        # With friction pyramids as blocks have them, what is held creeps out of the hand.
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = _CONE_IMPEDANCE
     for slot, place in enumerate(layout.parking(len(scene.slots))):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
@@ -87,8 +92,8 @@ def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec
     if sim.physics == "c":  # the others read their contacts instead
         _add_touch_sensors(spec, gripper, len(scene.slots))
     spec.option.timestep = sim.timestep
-    spec.option.iterations = sim.iterations
-    spec.option.ls_iterations = sim.line_search
+    effort = (sim.iterations, sim.line_search) if library is None else (_CONE_EFFORT,) * 2
+    spec.option.iterations, spec.option.ls_iterations = effort
     spec.add_numeric(name="max_geom_pairs", data=[sim.geom_pairs])
     spec.add_numeric(name="max_contact_points", data=[sim.contacts])
     return spec
@@ -306,6 +311,11 @@ def _with_meshes(world: World, scene: Scene, boxes: BlockFields) -> BlockFields:
         dof_invweight=choose(boxes.dof_invweight, model.dof_invweight0[world.block_dofs], by_dof),
         mesh_scale=jnp.append(scale, 1.0)[user[:-1]],
     )
+
+
+def use_pyramids(model: mujoco.MjModel) -> None:
+    """Gives the model, in place, the friction of a world without objects."""
+    model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_PYRAMIDAL, 1.0
 
 
 def with_blocks(

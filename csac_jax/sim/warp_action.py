@@ -21,7 +21,7 @@ from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from csac_jax.config import SimConfig
 from csac_jax.scene import layout
-from csac_jax.scene.model import World
+from csac_jax.scene.model import World, use_pyramids
 from csac_jax.sim import warp_graph
 
 STEP = 0.0051  # s, longest physics step; compared with C's in docs/benchmarks/physics-parity.md
@@ -278,6 +278,9 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str])
     # Warp refuses both, which C has with objects: the flag, and dense Jacobians of many blocks.
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    # Elliptic cones need five times as many iterations.
+    use_pyramids(model)
+    model.opt.iterations, model.opt.ls_iterations = cfg.iterations, cfg.line_search
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(own, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
