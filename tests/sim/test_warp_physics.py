@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -309,8 +310,9 @@ def test_objects_go_as_in_c():
     start = np.float32([0.0, 0.0, 0.4, 0.0, 0.05, 0.05])
     control = np.tile(start[:5], (cfg.sim.substeps, 1))
     joints = _stack(*[JointTrajectory(start, control, np.ones((), bool))] * SCENES)
-    runs = [jax.jit(jax.vmap(_physics(kind, cfg).run))(scene, joints) for kind in ("warp", "c")]
-    (after, trace), (after_c, _) = runs
+    warp, c = _physics("warp", cfg), _physics("c", cfg)
+    model.use_pyramids(c.world.model)  # as Warp has them
+    (after, trace), (after_c, _) = (jax.jit(jax.vmap(one.run))(scene, joints) for one in (warp, c))
     assert not trace.contact_overflow.any()
     changed = np.abs(np.asarray(after_c.velocity[:, :, 3:]) - scene.velocity[:, :, 3:])
     assert (changed.max(axis=(1, 2)) > 1.0).all()  # rad/s: each met something
@@ -331,6 +333,8 @@ def test_many_objects_fit_on_warp():
 
     placed, _ = warp_action._put(world.model, cfg.sim, 1, warp_action.fields(world))
     assert placed.nv == 66
+    assert placed.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    assert placed.opt.iterations == cfg.sim.iterations
 
 
 def _thrown_objects(cfg: Config) -> Scene:
