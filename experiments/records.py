@@ -73,8 +73,7 @@ RUNS = {
     "objects/gpu_hollow": "from `objects/gpu_mixed`, assemblies with walls",
     "objects/gpu_hollow_large_steps": "the same, steps 2.5 times as large",
     "objects/gpu_longer": "from `gpu_hollow`, twice the shapes",
-    "objects/gpu_averaged": "from `gpu_longer`; evaluated is `shipped_objects`, their mean; "
-    "those named `-cones` are by elliptic cones",
+    "objects/gpu_averaged": "from `gpu_longer`; evaluations are of `shipped_objects`, their mean",
     "objects/gpu_mixed_uniform": "the same, replay uniform and of 131,072",
     "objects/gpu_fine": "from nothing, on maps of 96 cells",
     "objects/gpu_grippers": "a gripper that varies, from `objects/gpu`",
