@@ -222,7 +222,7 @@ def _falling(world: World, scene: Scene, fields: BlockFields) -> mujoco.MjData:
     """The scene's blocks where they are, the hand high above, in a model of their own."""
     exact = model.with_blocks(world, fields)
     exact.opt.iterations, exact.opt.ls_iterations = 20, 20  # quality over speed: this runs once
-    model.use_pyramids(exact)  # with or without objects
+    model.use_pyramids(exact)  # so pools of objects stay what they are in caches and hashes
     exact.opt.timestep = 0.5 * world.model.opt.timestep
     data = mujoco.MjData(exact)
     data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT

@@ -151,7 +151,7 @@ def _slip(cfg: Config) -> float:
 def test_held_objects_do_not_slip(tmp_path: Path):
     """Claim: what the hand holds hangs still, as by Coulomb's law: the fingers press with 40 N at a
     friction of 1.2, and the weight is 1.4 N. A block of the same shape and weight slips, by
-    pyramids, see docs/benchmarks/objects.md."""
+    pyramids, see docs/benchmarks/physics-parity.md."""
     corners = np.array([*itertools.product((-0.02, 0.02), (-0.04, 0.04), (-0.025, 0.025))])
     library.save(tmp_path / "bar", [body.make("bar", [solid.convex(corners)], density=900.0)])
     a_second = CONFIG.change(sim={"grasp_phases": (60, 50, 250)})
