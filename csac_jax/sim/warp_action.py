@@ -21,10 +21,11 @@ from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from csac_jax.config import SimConfig
 from csac_jax.scene import layout
-from csac_jax.scene.model import World, use_pyramids
+from csac_jax.scene.model import World
 from csac_jax.sim import warp_graph
 
 STEP = 0.0051  # s, longest physics step; compared with C's in docs/benchmarks/physics-parity.md
+CONE_EFFORT = 8  # iterations of the solver and of a line search by elliptic cones; C needs 20
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
 FIELDS = {
@@ -278,9 +279,8 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str])
     # Warp refuses both, which C has with objects: the flag, and dense Jacobians of many blocks.
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
-    # Elliptic cones need five times as many iterations.
-    use_pyramids(model)
-    model.opt.iterations, model.opt.ls_iterations = cfg.iterations, cfg.line_search
+    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        model.opt.iterations = model.opt.ls_iterations = CONE_EFFORT
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(own, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
@@ -289,7 +289,7 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str])
         nworld=scenes,
         nconmax=cfg.contacts,
         naconmax=(scenes + SPARE_SCENES) * cfg.contacts,
-        njmax=4 * cfg.contacts + 32,  # the edges of friction pyramids; joints and limits
+        njmax=4 * cfg.contacts + 32,  # a pyramid's edges, more than of a cone; joints and limits
     )
     return put, data
 

@@ -3,19 +3,24 @@ plan."""
 
 import dataclasses
 import functools
-from typing import NamedTuple
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
 
+from csac_jax import presets
 from csac_jax.config import Config, SceneConfig
 from csac_jax.constants import Primitive
-from csac_jax.scene import blocks, layout, model, pool
+from csac_jax.objects import body, library, solid
+from csac_jax.scene import blocks, layout, model, pool, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, primitives
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import Action, Plan
+from csac_jax.sim.primitives import Action, JointTrajectory, Plan
 from csac_jax.vision import observe
 
 CONFIG = Config(scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, settle_time=1.5))
@@ -41,6 +46,70 @@ def act(primitive: Primitive, x: float, y: float, yaw: float = 0.0) -> Action:
 
 push = functools.partial(act, Primitive.PUSH)
 grasp = functools.partial(act, Primitive.GRASP)
+
+
+BAR = np.float32([0.02, 0.04, 0.025])
+"""Half sizes of a bar, m."""
+
+
+def bar(folder: Path) -> dict[str, Any]:
+    """Settings of a scene of one bar of 140 g, from a library that is put in `folder`."""
+    corners = BAR * list(itertools.product((-1, 1), repeat=3))
+    library.save(folder / "bar", [body.make("bar", [solid.convex(corners)], density=900.0)])
+    return {"slots": ("object",), "min_blocks": 1, "objects": str(folder / "bar"), "split": "all"}
+
+
+def grasped_bar(cfg: Config) -> tuple[Scene, JointTrajectory]:
+    """The bar on the table, as a block or an object, and the motion of a hand that grasps it."""
+    scene = layout.parked(cfg.scene.slots)
+    scene = scene.replace(
+        position=np.float32([[0.0, 0.0, BAR[2]]]),
+        half_size=BAR[None],
+        density=np.float32([900.0]),
+        friction=np.float32([0.5]),
+        in_play=np.array([True]),
+    )
+    if cfg.scene.has_objects:
+        scene = scene.replace(object_id=np.int32([0]))
+    height = np.full((cfg.heightmap.size,) * 2, 2 * BAR[2])
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, grasp(0.0, 0.0))
+    return scene, jax.device_get(primitives.joint_trajectory(cfg.sim, plan))
+
+
+TWO_OBJECTS = presets.get("quick").change(
+    scene={"slots": ("object",) * 2, "min_blocks": 2, "objects": "made:0:12"},
+    sim={"grasp_phases": (23, 1, 1), "contacts": 96},
+)
+
+
+def thrown_objects(cfg: Config) -> tuple[Scene, JointTrajectory]:
+    """Four scenes of two objects, others in each, of few parts and of many, and a hand at rest: at
+    first one falls on the other in the air, in the last two both turn and land."""
+    rng, known = np.random.default_rng(0), stock.table(cfg.scene)
+    order = np.argsort(known.present.sum(axis=1))
+    scenes = []
+    for row, pair in enumerate(zip(order[:4], order[-4:], strict=True)):
+        scene = stock.hold(layout.parked(cfg.scene.slots), np.arange(2), np.array(pair), known)
+        turns = rng.normal(size=(2, 4))
+        above, aside = [[0.0, 0.0, 0.3], [0.005, 0.0, 0.4]], [[-0.15, 0.0, 0.08], [0.15, 0.0, 0.08]]
+        falling, thrown = [[0.0] * 6, [0.0, 0.0, -1.5, 0.0, 0.0, 0.0]], rng.normal(0.0, 3.0, (2, 6))
+        thrown[:, :3] = [0.0, 0.0, -0.5]
+        scenes.append(
+            scene.replace(
+                position=np.float32(above if row < 2 else aside),
+                quaternion=np.float32(turns / np.linalg.norm(turns, axis=1, keepdims=True)),
+                velocity=np.float32(falling if row < 2 else thrown),
+                density=np.float32([500.0, 800.0]),
+                in_play=np.ones(2, bool),
+            )
+        )
+    start = np.float32([0.0, 0.0, 0.4, 0.0, 0.05, 0.05])
+    still = JointTrajectory(start, np.tile(start[:5], (cfg.sim.substeps, 1)), np.ones((), bool))
+    return stack(scenes), stack([still] * len(scenes))
+
+
+def stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def _kicked(scene: Scene, speed: float) -> Scene:

@@ -1,7 +1,6 @@
 """Actions among objects of a library: what moves them, and the planner that reads their poses."""
 
 import dataclasses
-import itertools
 from pathlib import Path
 
 import jax
@@ -10,10 +9,11 @@ import pytest
 
 from csac_jax.config import Config
 from csac_jax.env import Env
-from csac_jax.objects import body, families, library, solid
-from csac_jax.scene import layout, model, pool
+from csac_jax.objects import families, library
+from csac_jax.scene import model, pool
 from csac_jax.sim import backend, c_physics, oracle, physics, primitives
 from csac_jax.sim.c_physics import CPhysics
+from tests.sim.conftest import TWO_OBJECTS, bar, grasped_bar, thrown_objects
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
 CONFIG = Config().change(
@@ -126,20 +126,7 @@ def test_a_scene_moves_the_same_after_any_other(env: Env):
 def _slip(cfg: Config) -> float:
     """How far a bar of 140 g slips down in the hand, m, while it hangs there for a second."""
     world = model.build(cfg.scene, cfg.sim)
-    half = np.float32([0.02, 0.04, 0.025])
-    scene = layout.parked(cfg.scene.slots)
-    scene = scene.replace(
-        position=np.float32([[0.0, 0.0, half[2]]]),
-        half_size=half[None],
-        density=np.float32([900.0]),
-        friction=np.float32([0.5]),
-        in_play=np.array([True]),
-    )
-    if cfg.scene.has_objects:
-        scene = scene.replace(object_id=np.int32([0]))
-    height = np.zeros((cfg.heightmap.size,) * 2, np.float32) + 2 * half[2]
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, primitives.Action.grasp(0.0, 0.0, 0.0))
-    joints = jax.device_get(primitives.joint_trajectory(cfg.sim, plan))
+    scene, joints = grasped_bar(cfg)
     fields = jax.device_get(model.scene_fields(world, scene))
     qpos = c_physics.trajectory(world, fields, scene, joints).qpos
     hangs = qpos[:, world.block_qpos[0, 2]] - qpos[:, world.robot_qpos[2]]
@@ -152,13 +139,24 @@ def test_held_objects_do_not_slip(tmp_path: Path):
     """Claim: what the hand holds hangs still, as by Coulomb's law: the fingers press with 40 N at a
     friction of 1.2, and the weight is 1.4 N. A block of the same shape and weight slips, by
     pyramids, see docs/benchmarks/physics-parity.md."""
-    corners = np.array([*itertools.product((-0.02, 0.02), (-0.04, 0.04), (-0.025, 0.025))])
-    library.save(tmp_path / "bar", [body.make("bar", [solid.convex(corners)], density=900.0)])
     a_second = CONFIG.change(sim={"grasp_phases": (60, 50, 250)})
-    one = {"slots": ("object",), "min_blocks": 1, "objects": str(tmp_path / "bar"), "split": "all"}
-    assert _slip(a_second.change(scene=one)) < 1e-4
+    assert _slip(a_second.change(scene=bar(tmp_path))) < 1e-4
     block = {"slots": ("box",), "min_blocks": 1, "objects": ""}
     assert _slip(a_second.change(scene=block)) > 1e-3
+
+
+def test_more_iterations_change_nothing():
+    """Claim: objects that meet in the air, or land, end where a solver with all the iterations that
+    it asks for leaves them."""
+    cfg = TWO_OBJECTS.change(sim={"physics": "c"})
+    ends = []
+    for most in (None, 200):
+        world = model.build(cfg.scene, cfg.sim)
+        if most is not None:
+            world.model.opt.iterations = world.model.opt.ls_iterations = most
+        run = jax.jit(jax.vmap(physics.make(world, cfg.sim).run))
+        ends.append(run(*thrown_objects(cfg))[0].position)
+    np.testing.assert_allclose(*ends, atol=1e-6)
 
 
 def test_heavier_objects_are_another_physics(tmp_path: Path):

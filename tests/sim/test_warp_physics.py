@@ -6,6 +6,7 @@ import importlib.util
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -18,13 +19,13 @@ from csac_jax import presets
 from csac_jax.config import Config, PhysicsKind, SlotKind
 from csac_jax.constants import Outcome
 from csac_jax.errors import SceneError
-from csac_jax.scene import layout, model, pool, stock
+from csac_jax.scene import layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, physics as simulation, primitives, warp_physics
 from csac_jax.sim.outcome import Trace, grasp_outcome
 from csac_jax.sim.primitives import JointTrajectory
 from csac_jax.vision import observe
-from tests.sim.conftest import CASES, CONFIG
+from tests.sim.conftest import CASES, CONFIG, TWO_OBJECTS, bar, grasped_bar, stack, thrown_objects
 
 SCENES = 4
 SLOTS: tuple[SlotKind, ...] = ("box", "arch", "prism", "cylinder")
@@ -100,7 +101,7 @@ def run_on_warp() -> Any:
 def ran(run_on_warp: Any) -> Ran:
     """The scripted cases of this folder, in a world of a mesh and of boxes."""
     cfg = _config()
-    scenes, actions = (_stack(*part) for part in zip(*CASES.values(), strict=True))
+    scenes, actions = map(stack, zip(*CASES.values(), strict=True))
     scenes = jax.tree.map(np.asarray, jax.vmap(lambda scene: layout.park(scene, True))(scenes))
     height = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))(scenes)
     plan = jax.vmap(functools.partial(primitives.plan, cfg.sim, cfg.heightmap))(height, actions)
@@ -269,10 +270,6 @@ def _at(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def _stack(*trees: Any) -> Any:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
-
-
 def _spinning() -> Scene:
     """Blocks that spin in the air, lighter than the model has them."""
     scene = layout.parked(SLOTS)
@@ -302,16 +299,9 @@ def _end(cfg: Config) -> tuple[np.ndarray, np.ndarray, Trace]:
 def test_objects_go_as_in_c():
     """Claim: every scene has its own objects, which turn, land and meet as in C MuJoCo, within a
     millimetre; parts that an object lacks are not there."""
-    cfg = presets.get("quick").change(
-        scene={"slots": ("object",) * 2, "min_blocks": 2, "objects": "made:0:12"},
-        sim={"physics": "warp", "grasp_phases": (23, 1, 1), "contacts": 96},
-    )
-    scene = _thrown_objects(cfg)
-    start = np.float32([0.0, 0.0, 0.4, 0.0, 0.05, 0.05])
-    control = np.tile(start[:5], (cfg.sim.substeps, 1))
-    joints = _stack(*[JointTrajectory(start, control, np.ones((), bool))] * SCENES)
+    cfg = TWO_OBJECTS.change(sim={"physics": "warp"})
+    scene, joints = thrown_objects(cfg)
     warp, c = _physics("warp", cfg), _physics("c", cfg)
-    model.use_pyramids(c.world.model)  # as Warp has them
     (after, trace), (after_c, _) = (jax.jit(jax.vmap(one.run))(scene, joints) for one in (warp, c))
     assert not trace.contact_overflow.any()
     changed = np.abs(np.asarray(after_c.velocity[:, :, 3:]) - scene.velocity[:, :, 3:])
@@ -319,6 +309,20 @@ def test_objects_go_as_in_c():
     np.testing.assert_allclose(after.position, after_c.position, atol=1e-3)
     turned = np.abs(np.sum(np.asarray(after.quaternion) * np.asarray(after_c.quaternion), axis=2))
     np.testing.assert_allclose(turned, 1.0, atol=1e-3)
+
+
+@needs_warp
+def test_held_objects_hang_as_in_c(tmp_path: Path):
+    """Claim: a bar hangs for a second where it hangs in C, within 0.1 mm: by pyramids it slips more
+    than a millimetre."""
+    sim = {"physics": "warp", "grasp_phases": (60, 50, 250)}
+    cfg = presets.get("quick").change(scene=bar(tmp_path), sim=sim)
+    scene, joints = grasped_bar(cfg)
+    (after, trace), (after_c, _) = (
+        jax.jit(_physics(kind, cfg).run)(scene, joints) for kind in ("warp", "c")
+    )
+    assert trace.held.all()
+    np.testing.assert_allclose(after.position, after_c.position, atol=1e-4)
 
 
 @needs_warp
@@ -333,29 +337,5 @@ def test_many_objects_fit_on_warp():
 
     placed, _ = warp_action._put(world.model, cfg.sim, 1, warp_action.fields(world))
     assert placed.nv == 66
-    assert placed.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    assert placed.opt.iterations == cfg.sim.iterations
-
-
-def _thrown_objects(cfg: Config) -> Scene:
-    """Scenes of two objects, others in each, of few parts and of many: at first one falls on the
-    other in the air, in the last two both turn and land."""
-    rng, known = np.random.default_rng(0), stock.table(cfg.scene)
-    order = np.argsort(known.present.sum(axis=1))
-    scenes = []
-    for row, pair in enumerate(zip(order[:SCENES], order[-SCENES:], strict=True)):
-        scene = stock.hold(layout.parked(cfg.scene.slots), np.arange(2), np.array(pair), known)
-        turns = rng.normal(size=(2, 4))
-        above, aside = [[0.0, 0.0, 0.3], [0.005, 0.0, 0.4]], [[-0.15, 0.0, 0.08], [0.15, 0.0, 0.08]]
-        falling, thrown = [[0.0] * 6, [0.0, 0.0, -1.5, 0.0, 0.0, 0.0]], rng.normal(0.0, 3.0, (2, 6))
-        thrown[:, :3] = [0.0, 0.0, -0.5]
-        scenes.append(
-            scene.replace(
-                position=np.float32(above if row < 2 else aside),
-                quaternion=np.float32(turns / np.linalg.norm(turns, axis=1, keepdims=True)),
-                velocity=np.float32(falling if row < 2 else thrown),
-                density=np.float32([500.0, 800.0]),
-                in_play=np.ones(2, bool),
-            )
-        )
-    return _stack(*scenes)
+    assert placed.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert placed.opt.iterations == warp_action.CONE_EFFORT
