@@ -38,7 +38,7 @@ _SHA256 = {
     SHIPPED["shipped_camera"]: "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
     SHIPPED["shipped_clutter"]: "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
     SHIPPED["shipped_grippers"]: "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
-    SHIPPED["shipped_objects"]: "61176fab0c50b7561cba81ff5425d0bc9206909a83e8094c211a0b57523493ba",
+    SHIPPED["shipped_objects"]: "12bf20a8a5597f313de22580922bfa6b0ac89f614ae06d4afe401f81f1ad425e",
     SHIPPED["shipped_target"]: "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",
 }
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
