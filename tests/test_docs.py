@@ -285,7 +285,7 @@ def test_sentences_of_pages_are_short(folder: str):
                 "random30": "fast/clutter/seed-1/eval-random30-high.json",
             },
         ),
-        ("shipped_objects", {"pile": "objects/gpu_averaged/seed-2/eval-pile.json"}),
+        ("shipped_objects", {"pile": "objects/gpu_cones/seed-7/eval-pile.json"}),
     ],
 )
 def test_readme_has_the_recorded_numbers(policy: str, record: dict[str, str]):
