@@ -5,7 +5,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -14,6 +14,9 @@ from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_see
 from csac_jax.config import Config
 from csac_jax.io import files
 from csac_jax.runtime import signals
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,15 +136,20 @@ def _evaluate(options: EvalOptions, policy: Any, seen: Config) -> tuple[Config, 
         return cfg, rollout.measure(policy, parts, count, seed, show)
 
 
-@contextlib.contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A line on the terminal with the part and its finished episodes; nothing elsewhere."""
+def progress() -> "Progress":
+    """Lines on the terminal, of episodes; nothing elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
     console = Console(stderr=True)
     columns = ("{task.description}", BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+@contextlib.contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A line on the terminal with the part and its finished episodes; nothing elsewhere."""
+    bar = progress()
     task = bar.add_task("preparing scenes", total=None)
 
     def show(part: str, finished: int, episodes: int) -> None:

@@ -108,7 +108,7 @@ def test_the_command_goes_on_where_it_was(
     monkeypatch.setattr(benchmark, "measure", measure)
     monkeypatch.setattr("csac_jax.runtime.cache.enable", lambda: None)
     asked = ["benchmark", "--out", str(tmp_path / "b"), "--suites", "pile", "--policies"]
-    both = [*asked, "random", "oracle", "--share", "0.01"]
+    both = [*asked, "random", "oracle", "--share", "0.01", "--jobs", "1"]
     assert cli.main(both) == 130
     first = json.loads((tmp_path / "b/pile/random.json").read_text())
     assert (first["episodes"], first["physics"], first["objects"]) == (10, "c", benchmark.OBJECTS)
@@ -133,14 +133,30 @@ def test_the_command_goes_on_where_it_was(
     assert len(measured) == 6
 
 
+@pytest.mark.mjx
+@pytest.mark.slow
+def test_side_by_side_as_one_by_one(tmp_path):
+    """Claim: cells that are measured at the same time get the numbers of one after the other."""
+
+    def found(jobs: str) -> list[dict[str, typing.Any]]:
+        asked = ["--suites", "pile", "objects_packed", "--policies", "random", "oracle"]
+        asked += ["--share", "0.002", "--jobs", jobs, "--out", str(tmp_path / jobs)]
+        assert cli.main(["benchmark", *asked]) == 0
+        results = json.loads((tmp_path / jobs / "benchmark.json").read_text())["results"]
+        return [{name: one[name] for name in ("policy", "counts", "outcomes")} for one in results]
+
+    apart = found("2")
+    assert len(apart) == 4
+    assert apart == found("1")
+
+
+@pytest.mark.mjx
 @pytest.mark.slow
 def test_a_cell_is_the_evaluation():
-    """Claim: a cell's result is that of `evaluate` with its policy, suite and library."""
+    """Claim: a cell's result is that of `evaluate` with what acts, its suite and library."""
     from csac_jax.evaluation import rollout
 
     cell = next(benchmark.cells(0.001, ("pile",), ("random",)))
     result = benchmark.measure(cell)
-    other = rollout.evaluate(
-        benchmark.POLICIES["random"](), "pile", 1, 0, "c", objects=benchmark.OBJECTS
-    )
+    other = rollout.evaluate(cell.acting(), "pile", 1, 0, "c", objects=benchmark.OBJECTS)
     assert result == {**cell.asked(), **other}

@@ -1,0 +1,33 @@
+"""Work for processes of a pool."""
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+
+def where(say: Callable[..., None], name: str) -> tuple[str, set[int], int, str]:
+    """Says its name twice; returns it, the cores, the process and where JAX computes."""
+    say(name, 1)
+    say(name, 2)
+    time.sleep(0.3)  # so that no process does all
+    return name, os.sched_getaffinity(0), os.getpid(), jax.default_backend()
+
+
+def fails(say: Callable[..., None], name: str) -> None:
+    """Raises."""
+    raise ValueError(name)
+
+
+def is_killed(say: Callable[..., None], name: str) -> None:
+    """Ends as a process does for which no memory is left."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def waits(say: Callable[..., None], folder: Path) -> None:
+    """Leaves its number in the folder, then works for longer than any test."""
+    (folder / str(os.getpid())).touch()
+    time.sleep(600)
