@@ -19,6 +19,7 @@ from csac_jax.cli.failures import (
     check_seed,
 )
 from csac_jax.errors import FailedError
+from csac_jax.runtime import processes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +116,7 @@ def _import(arguments: list[str]) -> int:
         paths = importing.files(list(options.paths), descriptions.SUFFIXES)
     if len(paths) > library.MOST_OBJECTS:
         raise BadArgumentsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
-    jobs, kept = options.jobs or importing.cores(), Path(f"{options.out}.partial")
+    jobs, kept = options.jobs or processes.cores(), Path(f"{options.out}.partial")
     with _progress_bar() as show:
         readers = tuple((suffix, descriptions.read) for suffix in descriptions.SUFFIXES)
         how = conversion.How(options.scale, options.density, readers)

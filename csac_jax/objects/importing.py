@@ -5,7 +5,6 @@ What is finished is kept, so that a run that was stopped goes on.
 
 import contextlib
 import hashlib
-import os
 import resource
 import shutil
 from collections.abc import Callable, Iterator
@@ -161,8 +160,3 @@ def _keep(kept: Path, path: Path, how: How, one: Object, share: float) -> None:
 def forget(kept: Path) -> None:
     """Removes what was kept."""
     shutil.rmtree(kept, ignore_errors=True)
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))

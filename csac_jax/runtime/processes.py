@@ -8,16 +8,23 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any
 
 from csac_jax.errors import FailedError
 
+_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # microseconds of all cores in each period, or "max"
 _PAUSE = 0.2  # s, after which what the processes say is heard
 
 
 def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    """Cores that this process may use: in a container no more than it has time for."""
+    allowed = len(os.sched_getaffinity(0))
+    try:
+        quota, period = _QUOTA.read_text().split()
+        return max(1, min(allowed, int(quota) // int(period)))
+    except (OSError, ValueError):  # no container, or "max"
+        return allowed
 
 
 def each(
@@ -53,7 +60,8 @@ def each(
 def _pool(jobs: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     """Processes, and the queue of what they say."""
     context = multiprocessing.get_context("spawn")
-    free, said, mine = context.Queue(), context.Queue(), sorted(os.sched_getaffinity(0))
+    free, said = context.SimpleQueue(), context.SimpleQueue()
+    mine = sorted(os.sched_getaffinity(0))
     for number in range(jobs):
         free.put(mine[number % len(mine)])
     executor = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(free, said))

@@ -14,21 +14,23 @@ from csac_jax.errors import FailedError
 from csac_jax.runtime import processes
 from tests.runtime import workers
 
-_NAMES = [("a",), ("b",), ("c",), ("d",)]
+_NAMES = "abcd"
 
 
-def _each(work: Any, jobs: int) -> tuple[dict[int, Any], list[tuple]]:
+def _each(work: Any, jobs: int, folder: Path) -> tuple[dict[int, Any], list[tuple]]:
+    """What tasks of these names gave, by number, and what they said."""
     found: dict[int, Any] = {}
     heard: list[tuple] = []
-    processes.each(work, _NAMES, jobs, lambda *said: heard.append(said), found.__setitem__)
+    tasks = [(name, folder, jobs) for name in _NAMES]
+    processes.each(work, tasks, jobs, lambda *said: heard.append(said), found.__setitem__)
     return found, heard
 
 
-def test_each_process_has_a_core():
+def test_each_process_has_a_core(tmp_path: Path):
     """Claim: results come with their tasks' numbers, from processes with a core each, that compute
     on the CPU; what they say is heard in order."""
-    found, heard = _each(workers.where, 2)
-    assert [found[number][0] for number in range(4)] == ["a", "b", "c", "d"]
+    found, heard = _each(workers.where, 2, tmp_path)
+    assert "".join(found[number][0] for number in range(4)) == _NAMES
     by_process = {process: cores for _, cores, process, _ in found.values()}
     assert len(by_process) == 2
     assert os.getpid() not in by_process
@@ -37,23 +39,34 @@ def test_each_process_has_a_core():
     assert len(every) == min(2, processes.cores())
     assert every <= os.sched_getaffinity(0)
     assert {backend for *_, backend in found.values()} == {"cpu"}
-    for (name,) in _NAMES:
+    for name in _NAMES:
         assert [number for said, number in heard if said == name] == [1, 2]
 
 
-def test_one_at_a_time_runs_here():
+def test_one_at_a_time_runs_here(tmp_path: Path):
     """Claim: one job needs no process, and keeps all cores."""
-    found, heard = _each(workers.where, 1)
+    found, heard = _each(workers.where, 1, tmp_path)
     assert {process for _, _, process, _ in found.values()} == {os.getpid()}
     assert found[0][1] == os.sched_getaffinity(0)
     assert heard[:2] == [("a", 1), ("a", 2)]
 
 
+def test_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: as many as the scheduler allows, fewer where a container has less time."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    quota = tmp_path / "cpu.max"
+    monkeypatch.setattr(processes, "_QUOTA", quota)
+    assert processes.cores() == 8
+    for text, cores in {"max 100000": 8, "250000 100000": 2, "50000 100000": 1, "-": 8}.items():
+        quota.write_text(text)
+        assert processes.cores() == cores
+
+
 @pytest.mark.parametrize(("work", "kind"), [("fails", ValueError), ("is_killed", FailedError)])
-def test_errors(work: str, kind: type[Exception]):
+def test_errors(work: str, kind: type[Exception], tmp_path: Path):
     """Claim: an error of the work is raised here, the end of a process is one line."""
     with pytest.raises(kind) as raised:
-        _each(getattr(workers, work), 2)
+        _each(getattr(workers, work), 2, tmp_path)
     assert "\n" not in str(raised.value)
 
 
@@ -90,7 +103,7 @@ def _runs(process: int) -> bool:
     return True
 
 
-def _wait_until(holds: Any, seconds: float = 60) -> None:
+def _wait_until(holds: Any, seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end

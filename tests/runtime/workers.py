@@ -9,20 +9,25 @@ from pathlib import Path
 import jax
 
 
-def where(say: Callable[..., None], name: str) -> tuple[str, set[int], int, str]:
-    """Says its name twice; returns it, the cores, the process and where JAX computes."""
+def where(
+    say: Callable[..., None], name: str, folder: Path, others: int
+) -> tuple[str, set[int], int, str]:
+    """Says its name twice; returns it, the cores, the process and where JAX computes. It waits
+    until so many processes have begun, which leave their numbers in the folder."""
+    (folder / str(os.getpid())).touch()
     say(name, 1)
     say(name, 2)
-    time.sleep(0.3)  # so that no process does all
+    while len(list(folder.iterdir())) < others:
+        time.sleep(0.02)
     return name, os.sched_getaffinity(0), os.getpid(), jax.default_backend()
 
 
-def fails(say: Callable[..., None], name: str) -> None:
+def fails(say: Callable[..., None], name: str, *more: object) -> None:
     """Raises."""
     raise ValueError(name)
 
 
-def is_killed(say: Callable[..., None], name: str) -> None:
+def is_killed(say: Callable[..., None], name: str, *more: object) -> None:
     """Ends as a process does for which no memory is left."""
     os.kill(os.getpid(), signal.SIGKILL)
 
