@@ -4,7 +4,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
-import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -37,9 +37,10 @@ def each(
     """Calls `work(say, *task)` for every task, so many at a time.
 
     One at a time runs in this process. More run in processes of their own, whose JAX computes on
-    the CPU. Args: work, a function of a module; hear, gets what work gives to `say`; finish, gets
-    the number of a task and its result, as they come. An error, SIGINT and SIGTERM end all at
-    once. Raises FailedError where a process was ended from outside, for want of memory for example.
+    the CPU. They end at once with an error of any, and with this process. Args: work, a function
+    of a module; hear, gets what work gives to `say`; finish, gets the number of a task and its
+    result, as they come. Raises FailedError where a process was ended from outside, for want of
+    memory for example.
     """
     if min(jobs, len(tasks)) <= 1:
         for number, task in enumerate(tasks):
@@ -65,7 +66,6 @@ def _pool(jobs: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     for number in range(jobs):
         free.put(mine[number % len(mine)])
     executor = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(free, said))
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         yield executor, said
     except BrokenProcessPool:
@@ -76,7 +76,6 @@ def _pool(jobs: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
         raise
     finally:
         executor.shutdown(cancel_futures=True)
-        signal.signal(signal.SIGTERM, before)
 
 
 _said: Any = None  # the queue, in a process of a pool
@@ -87,10 +86,19 @@ def _begin(free: Any, said: Any) -> None:
     global _said
     _said = said
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; one ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     os.sched_setaffinity(0, {free.get()})  # before JAX starts its threads
     from csac_jax.runtime import devices
 
     devices.select("cpu")
+
+
+def _end_with_parent() -> None:
+    """Ends this process when the one that has the pool is no more, however it ended."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _run(work: Callable[..., Any], task: tuple) -> Any:
