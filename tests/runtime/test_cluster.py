@@ -89,6 +89,7 @@ def test_two_processes_are_one(shard: str, tmp_path: Path):
     assert _sweep(tmp_path / "again", 2, shard) == [0, 0]
     assert _logs(tmp_path / "again") == _logs(tmp_path / "two")
     assert sorted(path.name for path in (tmp_path / "two").iterdir()) == [
+        ".lock",
         "a",
         "groups",
         SUMMARY,

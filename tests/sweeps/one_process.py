@@ -1,6 +1,6 @@
 """One process of a sweep, with a small step in place of the learner's.
 
-python -m tests.runner.one_process FOLDER STOP_AFTER SHARD [COORDINATOR PROCESSES PROCESS_ID]
+python -m tests.sweeps.one_process FOLDER STOP_AFTER SHARD [COORDINATOR PROCESSES PROCESS_ID]
 """
 
 import sys

@@ -26,8 +26,8 @@ SCENES = 8
 CFG = presets.smoke().change(train={"scenes": SCENES, "actions": 12 * SCENES})  # 3 chunks of 4
 
 
-def program(cfg: Config = CFG, env: Any = None) -> Program:
-    """In place of `step.make`: without environment and networks."""
+def program(cfg: Config = CFG, env: Any = None, *_: Any, **__: Any) -> Program:
+    """In place of `step.make`: without environment and networks, whatever parts it is given."""
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
     frames = maps.frames(cfg, networks.make(cfg.net))
     learner = CSAC(actor_critic.with_optimisers(cfg, frames, bounds))
