@@ -1,4 +1,7 @@
-"""Work for several processes of this program, each on a core of its own."""
+"""Work for several processes of this program, each on a core of its own.
+
+Few scenes give JAX and physics little to share out: such work hardly gains by a second core.
+"""
 
 import contextlib
 import multiprocessing
