@@ -60,7 +60,7 @@ def test_extras_are_sorted_and_pinned():
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with wheel and sdist."""
     folder = tmp_path_factory.mktemp("dist")
-    pytest.importorskip("build")
+    pytest.importorskip("build.__main__")  # a folder "build" would pass for the package
     command = [sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT)]
     subprocess.run(command, check=True, capture_output=True, cwd=folder)
     return folder
