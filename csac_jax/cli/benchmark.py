@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from csac_jax.cli import evaluation, output, parsing
+from csac_jax.cli import output, parsing
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.runtime import processes
 
@@ -111,7 +111,7 @@ def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
     """A line on the terminal for each cell in work; nothing elsewhere."""
     from rich.progress import TaskID
 
-    with evaluation.progress() as progress:
+    with output.progress() as progress:
         lines: dict[str, TaskID] = {}
 
         def show(title: str, part: str, finished: int, episodes: int) -> None:

@@ -5,7 +5,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -14,9 +14,6 @@ from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_see
 from csac_jax.config import Config
 from csac_jax.io import files
 from csac_jax.runtime import signals
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,20 +133,10 @@ def _evaluate(options: EvalOptions, policy: Any, seen: Config) -> tuple[Config, 
         return cfg, rollout.measure(policy, parts, count, seed, show)
 
 
-def progress() -> "Progress":
-    """Lines on the terminal, of episodes; nothing elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = ("{task.description}", BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-
-
 @contextlib.contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A line on the terminal with the part and its finished episodes; nothing elsewhere."""
-    bar = progress()
+    bar = output.progress()
     task = bar.add_task("preparing scenes", total=None)
 
     def show(part: str, finished: int, episodes: int) -> None:

@@ -139,12 +139,7 @@ def _import(arguments: list[str]) -> int:
 @contextlib.contextmanager
 def _progress_bar() -> Iterator[Callable[[int, int, str], None]]:
     """A line on the terminal with the file just finished; nothing elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = ("{task.description}", BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    bar = output.progress()
     task = bar.add_task("splitting into convex parts", total=None)
     with bar:
         yield lambda finished, total, name: bar.update(

@@ -5,10 +5,13 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from csac_jax.config import Config
 from csac_jax.io import files
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 class _Unbroken:
@@ -52,6 +55,16 @@ def unbroken() -> Iterator[None]:
         sys.stdout.flush()
         sys.stderr.flush()
         sys.stdout, sys.stderr = before
+
+
+def progress() -> "Progress":
+    """Lines on the terminal of what is in work and how far it is; nothing elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = ("{task.description}", BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def write_result(path: Path | None, result: dict[str, Any], cfg: Config | None = None) -> None:
