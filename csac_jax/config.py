@@ -12,6 +12,8 @@ import math
 import typing
 from typing import Any, ClassVar, Literal
 
+from csac_jax.grippers import Gripper
+
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder", "object"]
 RobotKind = Literal["hand", "ur5", "ur5e"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
@@ -68,7 +70,7 @@ def _is_plain(value: Any) -> bool:
     """Whether a value can be checked: a sweep's numbers may be traced."""
     if isinstance(value, Section | tuple):
         return all(map(_is_plain, value if isinstance(value, tuple) else vars(value).values()))
-    return isinstance(value, int | float | str)
+    return isinstance(value, int | float | str | Gripper)
 
 
 def _fault(field: Any, value: Any) -> str | None:
@@ -170,7 +172,7 @@ class SimConfig(Section, section="sim"):
     `warp` on one CUDA device where it is known to be faster, else `mjx`, or `c` for objects."""
     robot: RobotKind = "hand"
     """`hand`: the gripper alone, floating, for training. `ur5`, `ur5e`: on that arm."""
-    gripper: str = "rg2"
+    gripper: str | Gripper = "rg2"
     """`rg2`, `2f85`, `franka_hand`, or a folder with gripper.json and gripper.xml of your own.
     `varied` has another opening and other fingers in every episode."""
     base: tuple[float, float, float, float] = _bounded((0.6, 0.0, 0.35, 0.0), -math.pi, math.pi)

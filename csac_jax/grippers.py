@@ -87,6 +87,9 @@ class Gripper:
     ]  # m, about palm and fingers: back from the tips, radius
     varies: tuple[Fingers, Fingers] | None = None  # least and most of an episode's; None: the same
 
+    def __str__(self) -> str:
+        return str(self.folder)
+
     @property
     def fingers(self) -> Fingers:
         """Its own, the largest where they vary."""
@@ -161,43 +164,74 @@ def shipped() -> list[str]:
     return sorted(path.parent.name for path in assets().glob(f"grippers/*/{NUMBERS}"))
 
 
-_TOLD: dict[str, Gripper] = {}  # of folders that are not here, by their paths
+def load(source: "str | Gripper") -> Gripper:
+    """Returns the gripper of a name or a folder; a gripper is returned as it is.
+
+    A folder is read at each call: nothing of it is kept. Raises SettingsError for a source that is
+    no gripper, and for numbers that are missing, unknown or out of range.
+    """
+    if isinstance(source, Gripper):
+        return source
+    return _shipped(source) if source in shipped() else _of_folder(Path(source))
 
 
-def numbers(source: str) -> dict[str, Any] | None:
-    """What a gripper.json of one's own says; None for a gripper that comes with the package."""
-    path = Path(source) / NUMBERS
-    return _read(path) if source not in shipped() and path.is_file() else None
-
-
-def remember(source: str, given: dict[str, Any]) -> None:
-    """What a gripper.json says stands in for the folder `source` where there is none: all but
-    physics and pictures need no more. Raises ValueError for numbers that are none."""
-    gripper = _gripper(Path(source), given)
-    _check(gripper)
-    _TOLD[source] = gripper
+def resolve(source: "str | Gripper") -> "str | Gripper":
+    """Replaces the folder of a gripper by the gripper, so that it is read once and travels with its
+    config; the name of a shipped one stays. Raises SettingsError as `load`."""
+    return source if source in shipped() else load(source)
 
 
 @functools.lru_cache
-def load(source: str) -> Gripper:
-    """The gripper of this name or in this folder.
+def _shipped(name: str) -> Gripper:
+    return _of_folder(assets() / "grippers" / name)
 
-    Raises SettingsError for none, and for numbers that are missing, unknown or out of range.
-    """
-    folder = assets() / "grippers" / source if source in shipped() else Path(source)
+
+def _of_folder(folder: Path) -> Gripper:
     path = folder / NUMBERS
-    if not path.is_file() and source in _TOLD:
-        return _TOLD[source]
     if not path.is_file():
         known = ", ".join(shipped())
-        fault = f"'{source}' is neither one of {known} nor a folder with a {NUMBERS}"
+        fault = f"'{folder}' is neither one of {known} nor a folder with a {NUMBERS}"
         raise SettingsError(f"sim.gripper: {fault}")
     try:
-        gripper = _gripper(folder, _read(path))
-        _check(gripper)
+        return from_numbers(folder, _read(path))
     except ValueError as error:
         raise SettingsError(f"{path}: {error}") from None
+
+
+def from_numbers(folder: Path, numbers: dict[str, Any]) -> Gripper:
+    """Builds a gripper from the content of a gripper.json; physics and pictures alone need the
+    folder. Raises ValueError for numbers that are missing, unknown or out of range."""
+    gripper = _gripper(folder, numbers)
+    _check(gripper)
     return gripper
+
+
+def to_numbers(gripper: Gripper) -> dict[str, Any]:
+    """Writes a gripper as the content of its gripper.json, without sources."""
+
+    def ends(pair: Ends) -> dict[str, float]:
+        return dict(zip(_ENDS, pair, strict=True))
+
+    lengths: dict[str, Any] = {}
+    for name, parts in _LENGTHS.items():
+        value = getattr(gripper, name)
+        lengths[name] = dict(zip(parts, value, strict=True)) if parts else value
+    positions = zip(gripper.joints, gripper.positions, strict=True)
+    numbers = {
+        "format": FORMAT,
+        **{name: getattr(gripper, name) for name in _WORDS},
+        "pads": list(gripper.pads),
+        "actuator": {"name": gripper.actuator, **ends(gripper.set_points)},
+        "joints": {joint: ends(pair) for joint, pair in positions},
+        "arc_radius": gripper.arc_radius,
+        **lengths,
+    }
+    if gripper.varies is not None:
+        pairs = zip(*gripper.varies, strict=True)
+        numbers[_VARIES] = {
+            name: list(pair) for name, pair in zip(Fingers._fields, pairs, strict=True)
+        }
+    return numbers
 
 
 def _read(path: Path) -> dict[str, Any]:

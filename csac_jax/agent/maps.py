@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from csac_jax import geometry
+from csac_jax import geometry, grippers
 from csac_jax.agent import box, offsets
 from csac_jax.config import Config, HeightmapConfig, PolicyConfig, SimConfig
 from csac_jax.constants import Primitive
@@ -55,6 +55,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
     tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
     side, cell = tables.canvas // networks.stride, tables.cell * networks.stride
+    resolved = cfg.change(sim={"gripper": grippers.resolve(cfg.sim.gripper)})
     xy, yaws = _cells(rotations, side, cell)
     inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
     return Frames(
@@ -69,7 +70,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         all_cells=cfg.policy.cells == "all",
         xy=xy,
         inside=inside,
-        reachable=_reachable(cfg.sim, cfg.heightmap, rotations, side, cell),
+        reachable=_reachable(resolved.sim, cfg.heightmap, rotations, side, cell),
     )
 
 

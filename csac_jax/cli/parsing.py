@@ -11,6 +11,8 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from csac_jax.cli.failures import PROGRAM, BadArgumentsError
+from csac_jax.config import SimConfig
+from csac_jax.grippers import Gripper
 
 Kind = TypeVar("Kind")
 SHORT_HELP = {"-h", "--help"}
@@ -23,10 +25,11 @@ def parse(
     if it is asked for. Raises BadArgumentsError for bad ones."""
     prog = f"{PROGRAM} {command}"
     if asks_help(arguments):
-        tyro.cli(kind, prog=prog, args=["--help"], default=default)
+        with _registry():
+            tyro.cli(kind, prog=prog, args=["--help"], default=default)
     complaint = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint), _wide_terminal():
+        with contextlib.redirect_stderr(complaint), _wide_terminal(), _registry():
             return tyro.cli(kind, prog=prog, args=arguments, default=default)
     except SystemExit:
         help_flag = "--help" if default is tyro.MISSING_NONPROP else "--help-all"
@@ -36,6 +39,25 @@ def parse(
 def inherited(kind: Any, text: str) -> Any:
     """The type of a setting that is the policy's unless it is given, with its help."""
     return Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint="(default: the policy's)")]
+
+
+def _registry() -> tyro.constructors.ConstructorRegistry:
+    """Adds to tyro that a gripper is given by its name or folder."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def gripper(info: Any) -> Any:
+        if info.type != SimConfig.__annotations__["gripper"]:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="NAME|DIR",
+            instance_from_str=lambda given: given[0],
+            is_instance=lambda value: isinstance(value, str | Gripper),
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return registry
 
 
 def asks_help(arguments: Sequence[str]) -> bool:

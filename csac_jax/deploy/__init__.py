@@ -67,9 +67,8 @@ class Policy:
         path = policy_file.find(source)
         pose = np.eye(4) if workspace_pose is None else images.rigid(workspace_pose, "workspace")
         cfg, params = policy_file.load(path) if path.is_file() else _of_run(path)
-        if gripper is not None:
-            grippers.load(gripper)  # refuses what is none
-            cfg = cfg.change(sim={"gripper": gripper})
+        known = grippers.resolve(cfg.sim.gripper if gripper is None else gripper)
+        cfg = cfg.change(sim={"gripper": known})
         return cls(cfg, jax.device_put(params), pose)
 
     def decide(

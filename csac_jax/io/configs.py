@@ -7,16 +7,25 @@ import dataclasses
 import functools
 import json
 import math
+from pathlib import Path
 from typing import Any
 
-from csac_jax import config
+from csac_jax import config, grippers
 from csac_jax.config import CameraConfig, Config, SimConfig
+from csac_jax.grippers import Gripper
 from csac_jax.io import renames
 
 
 def to_dict(cfg: Config) -> dict[str, Any]:
     """A config as plain JSON values, with the number of its format."""
-    return {"format": renames.FORMAT, **json.loads(json.dumps(dataclasses.asdict(cfg)))}
+    gripper = cfg.sim.gripper
+    if isinstance(gripper, Gripper):
+        cfg = cfg.change(sim={"gripper": ""})
+    values = {"format": renames.FORMAT, **json.loads(json.dumps(dataclasses.asdict(cfg)))}
+    if isinstance(gripper, Gripper):
+        numbers = grippers.to_numbers(gripper)
+        values["sim"]["gripper"] = {"folder": str(gripper.folder), **numbers}
+    return values
 
 
 def from_dict(values: Any) -> Config:
@@ -72,6 +81,9 @@ def _kind(name: str, stored: Any) -> Any:
 
 
 def _validated(name: str, stored: Any) -> Any:
+    if name == "sim" and isinstance(stored, dict) and isinstance(stored.get("gripper"), dict):
+        sim = _validated(name, stored | {"gripper": SimConfig.gripper})
+        return dataclasses.replace(sim, gripper=_own_gripper(stored["gripper"]))
     adapter = _adapter(_kind(name, stored))
     try:
         text = json.dumps(stored)
@@ -87,6 +99,15 @@ def _validated(name: str, stored: Any) -> Any:
     if first["type"] == "unexpected_keyword_argument":
         raise ValueError(f"{place}: unknown setting")
     raise ValueError(f"{place}: {what[0].lower()}{what[1:]}, not {config.shown(first['input'])}")
+
+
+def _own_gripper(stored: dict[str, Any]) -> Gripper:
+    """Builds the gripper that `to_dict` wrote. Raises ValueError for numbers that are none."""
+    numbers = {name: value for name, value in stored.items() if name != "folder"}
+    try:
+        return grippers.from_numbers(Path(str(stored.get("folder"))), numbers)
+    except ValueError as error:
+        raise ValueError(f"sim.gripper: {error}") from None
 
 
 @functools.cache

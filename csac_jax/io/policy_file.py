@@ -42,7 +42,7 @@ _SHA256 = {
     SHIPPED["shipped_target"]: "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",
 }
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
-_GRIPPER = "gripper"  # remark of a policy whose gripper is the user's own
+_GRIPPER = "gripper"  # remark of older files: the numbers of a gripper of one's own
 
 
 class PolicyFileError(FailedError):
@@ -55,9 +55,9 @@ def save(path: Path, params: Params, cfg: Config) -> None:
     tensors = {name: np.asarray(leaf) for name, leaf in leaves.named(params).items()}
     check_finite(path, tensors)
     versions = json.dumps(provenance.versions())
-    remarks = {_CONFIG: json.dumps(configs.to_dict(cfg)), _VERSIONS: versions}
-    if (gripper := grippers.numbers(cfg.sim.gripper)) is not None:
-        remarks[_GRIPPER] = json.dumps(gripper)  # its folder is not where the policy goes
+    gripper = grippers.resolve(cfg.sim.gripper)  # its folder is not where the policy goes
+    stored = configs.to_dict(cfg.change(sim={"gripper": gripper}))
+    remarks = {_CONFIG: json.dumps(stored), _VERSIONS: versions}
     remarks[_DIGEST] = _digest(remarks, tensors)
     files.replace(path, safetensors.numpy.save(tensors, remarks))
 
@@ -126,7 +126,9 @@ def load(path: Path) -> tuple[Config, Params]:
     try:
         cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG))
         if _GRIPPER in remarks:
-            grippers.remember(cfg.sim.gripper, files.parse(remarks[_GRIPPER], _GRIPPER))
+            numbers = files.parse(remarks[_GRIPPER], _GRIPPER)
+            gripper = grippers.from_numbers(Path(str(cfg.sim.gripper)), numbers)
+            cfg = cfg.change(sim={"gripper": gripper})
         made = files.parse(remarks.get(_VERSIONS, "{}"), _VERSIONS)
         if not ours:
             provenance.warn_if_other(made, str(path))

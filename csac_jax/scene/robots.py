@@ -4,7 +4,6 @@ A gripper of gripper.json alone has no drives but its fingers'. The robot `hand`
 the air on four more; any other robot is an arm that has it at its flange.
 """
 
-import functools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -179,7 +178,6 @@ def _require_same(path: Path, what: str, found: float, wanted: float) -> None:
         raise SceneError(f"{path}: {what} is {1e3 * found:.1f} mm, {by_numbers}")
 
 
-@functools.lru_cache
 def _measured(gripper: Gripper, end: int) -> tuple[float, float]:
     """Opening and height of the tips, m, in the MJCF with its joints at one end."""
     model = _compiled(gripper.folder / grippers.MJCF)

@@ -1,10 +1,11 @@
-"""The physics that `sim.physics auto` stands for on this machine, chosen before a run."""
+"""What a config's `sim` stands for on this machine, found out before a run."""
 
 import contextlib
 import importlib.util
 
 import jax
 
+from csac_jax import grippers
 from csac_jax.config import Config, PhysicsKind
 
 WARP_SCENES = 1024
@@ -12,12 +13,15 @@ WARP_SCENES = 1024
 
 
 def resolve(cfg: Config, devices: int = 1, runs: int = 1) -> Config:
-    """The config with `c`, `warp` or `mjx` in place of `auto`; any other choice stays.
+    """Replaces physics `auto` by `c`, `warp` or `mjx`, and the folder of a gripper by its numbers.
 
     `runs` configs of this kind share one program. C MuJoCo serves a single CPU device, where it
     is several times as fast as MJX. Warp serves a single CUDA device where it was measured to be
     faster, is installed and can do the scene. The rest goes to MJX, with objects to C.
+    Raises SettingsError for a folder without a gripper.
     """
+    if (gripper := grippers.resolve(cfg.sim.gripper)) != cfg.sim.gripper:
+        cfg = cfg.change(sim={"gripper": gripper})
     if cfg.sim.physics != "auto":
         return cfg
     others: PhysicsKind = "c" if cfg.scene.has_objects else "mjx"

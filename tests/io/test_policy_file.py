@@ -9,17 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
 
-from csac_jax import grippers, presets
+from csac_jax import deploy, grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import DenseNet121
+from csac_jax.deploy import decision, program
 from csac_jax.errors import DataWarning
 from csac_jax.io import configs, policy_file, weights
 from csac_jax.io.policy_file import PolicyFileError
+from csac_jax.sim.primitives import Action
 
 CFG = presets.get("smoke")
 PAGE = Path(__file__).parents[2] / "docs" / "policies.md"
@@ -64,15 +67,53 @@ def test_a_policy_brings_its_own_gripper(tmp_path: Path, params: Params):
     policy_file.save(path, params, CFG.change(sim={"gripper": str(folder)}))
     shutil.rmtree(folder)
     cfg, _ = policy_file.load(path)
-    here, there = grippers.load(cfg.sim.gripper), grippers.load("2f85")
-    assert here == dataclasses.replace(there, folder=folder)
+    assert cfg.sim.gripper == dataclasses.replace(grippers.load("2f85"), folder=folder)
 
     def spoil(_: dict[str, Any], remarks: dict[str, str]) -> None:
-        remarks["gripper"] = json.dumps({"format": 1})
+        stored = json.loads(remarks["config"])
+        stored["sim"]["gripper"] = {"folder": "mine", "format": 1}
+        remarks["config"] = json.dumps(stored)
 
     _rewrite(path, spoil)
     with pytest.raises(PolicyFileError, match="'actuator' is missing"):
         policy_file.load(path)
+
+
+@pytest.mark.mjx
+@pytest.mark.filterwarnings("ignore")
+def test_grippers_of_one_folder_name_are_two(tmp_path: Path, params: Params):
+    """Claim: of two policies whose grippers have one folder name each decides with its own fingers,
+    whatever lies in the folder now; so do files that hold the numbers as a remark."""
+    folder, openings = tmp_path / "my_gripper", {"wide": 0.11, "narrow": 0.066}
+    for name, opening in openings.items():
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(grippers.load("rg2").folder, folder)
+        numbers = json.loads((folder / grippers.NUMBERS).read_text())
+        numbers["opening"]["open"] = opening
+        (folder / grippers.NUMBERS).write_text(json.dumps(numbers))
+        own = CFG.change(sim={"gripper": str(folder)})
+        policy_file.save(tmp_path / f"{name}.safetensors", params, own)
+        assert grippers.load(str(folder)).opening[1] == opening
+
+        def as_remark(tensors: dict[str, Any], remarks: dict[str, str], numbers=numbers) -> None:
+            stored = json.loads(remarks["config"])
+            stored["sim"]["gripper"] = str(folder)
+            remarks |= {"config": json.dumps(stored), "gripper": json.dumps(numbers)}
+
+        older = tmp_path / f"{name}_older.safetensors"
+        shutil.copy(tmp_path / f"{name}.safetensors", older)
+        _rewrite(older, as_remark)
+    loaded = {
+        name: deploy.Policy.load(tmp_path / f"{name}.safetensors")
+        for name in (*openings, *(f"{name}_older" for name in openings))
+    }
+    for name, policy in loaded.items():
+        height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
+        action = Action.grasp(0.0, 0.0, 0.0)
+        stations = program.stations(policy.cfg, height, action)
+        choice = program.Choice(action, jnp.zeros(()), jnp.bool(True), stations)
+        width = decision.of(jax.device_get(choice), np.eye(4)).width
+        assert width == pytest.approx(openings[name.split("_")[0]])
 
 
 @pytest.mark.parametrize(
