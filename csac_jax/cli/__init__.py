@@ -18,10 +18,9 @@ from csac_jax import algorithms, presets
 from csac_jax.cli import (
     act,
     bench,
-    benchmark,
     calibrate,
     doctor,
-    evaluation,
+    evaluate,
     export,
     finetune,
     objects,
@@ -43,8 +42,7 @@ _LESS = "lower --replay.capacity, --train.scenes, --learn.batch or --seeds, or r
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.run,
     "sweep": sweep.run,
-    "eval": evaluation.run,
-    "benchmark": benchmark.run,
+    "eval": evaluate.run,
     "play": play.run,
     "calibrate": calibrate.run,
     "act": act.run,
@@ -66,7 +64,6 @@ A robot learns to push and grasp in clutter.
   sweep PRESET       train several seeds and settings side by side, in one program
                      --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or one that is shipped
-  benchmark          measure what ships and its baselines in every suite
   play               run one episode, as text, picture and video
   calibrate          find the camera's pose by a printed board
   act POLICY         decide where to grasp or push in a camera's image

@@ -116,9 +116,17 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     cache.enable()
     with as_bad_arguments(ValueError):
         suite = _suite(options.scene)
-        seen = suites.with_objects(policy.cfg.change(**view), suite, options.objects, "all")
-        cfg = rollout.configured(seen, options.physics, options.robot)
-        (env,) = suites.environments(cfg, suite, 1, options.seed).values()
+        prepared = suites.prepare(
+            policy.cfg.change(**view),
+            suite,
+            1,
+            options.seed,
+            options.physics,
+            options.robot,
+            options.objects,
+            "all",
+        )
+    (env,) = prepared.parts.values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")
     steps: list[Any] = []

@@ -1,4 +1,4 @@
-"""What an evaluation reports, from arrays of episodes; no JAX.
+"""Metrics of an evaluation, from arrays of episodes; no JAX.
 
 Every metric is `{"value", "low", "high", "n"}`: value, 95 % interval, number of cases. Without
 cases `n` is 0 and the others are None. Shares have Wilson intervals over the cases named. Actions
@@ -61,12 +61,12 @@ class Episodes(NamedTuple):
 
 
 def wilson(successes: int, n: int) -> dict[str, Any]:
-    """A share with Wilson's 95 % interval, which holds for few cases and near 0 and 1."""
+    """Returns a share with Wilson's 95 % interval, which holds for few cases and near 0 and 1."""
     return _wilson(successes / n, n, n) if n else dict(NO_CASES)
 
 
 def clustered(hits: np.ndarray, cases: np.ndarray) -> dict[str, Any]:
-    """The share of hits among cases, counts of each episode [M], with a 95 % interval.
+    """Returns the share of hits among cases, counts of each episode [M], with a 95 % interval.
 
     It is Wilson's for as many independent cases as these are worth: their number over the design
     effect (Kish, Survey Sampling, 1965), the variance of the ratio between episodes over that of
@@ -82,7 +82,7 @@ def clustered(hits: np.ndarray, cases: np.ndarray) -> dict[str, Any]:
 
 
 def _wilson(share: float, n: int, worth: float) -> dict[str, Any]:
-    """The share of n cases with Wilson's interval for `worth` independent ones (Wilson 1927)."""
+    """Returns a share of n cases with the interval for `worth` independent ones (Wilson 1927)."""
     shrink = 1.0 + _Z**2 / worth
     middle = (share + 0.5 * _Z**2 / worth) / shrink
     half = _Z * np.sqrt(share * (1.0 - share) / worth + (0.5 * _Z / worth) ** 2) / shrink
@@ -91,7 +91,7 @@ def _wilson(share: float, n: int, worth: float) -> dict[str, Any]:
 
 
 def bootstrap_ratio(above: np.ndarray, below: np.ndarray, n: int, seed: int = 0) -> dict[str, Any]:
-    """sum(above) / sum(below) over cases [M], with a 95 % percentile bootstrap interval.
+    """Returns sum(above) / sum(below) over cases [M], with a 95 % percentile bootstrap interval.
 
     `n` is reported as the number of cases. `scipy.stats.bootstrap` refuses a single case.
     """
@@ -105,7 +105,7 @@ def bootstrap_ratio(above: np.ndarray, below: np.ndarray, n: int, seed: int = 0)
 
 
 def summarise(episodes: Episodes) -> dict[str, Any]:
-    """Every metric of the module's docstring, ready for JSON."""
+    """Computes every metric of the module's docstring, ready for JSON."""
     valid, completed, blocks = episodes.valid, episodes.completed, episodes.blocks
     grasps = valid & (episodes.primitive == Primitive.GRASP)
     actions = valid.sum(axis=1)
@@ -139,20 +139,20 @@ def summarise(episodes: Episodes) -> dict[str, Any]:
 
 
 def _mean(values: np.ndarray) -> dict[str, Any]:
-    """The mean of a value per episode [M]."""
+    """Averages a value per episode [M]."""
     return bootstrap_ratio(values, np.ones(values.shape), values.size)
 
 
 def _share(true: np.ndarray, of: np.ndarray | None = None) -> dict[str, Any]:
-    """The share of episodes [M], or of the actions `of` [M, T], in which `true` holds."""
+    """Returns the share of episodes [M], or of the actions `of` [M, T], in which `true` holds."""
     if of is None:
         return wilson(int(true.sum()), true.size)
     return clustered((true & of).sum(axis=1), of.sum(axis=1))
 
 
 def _failures(episodes: Episodes, grasps: np.ndarray) -> dict[str, dict[str, Any]]:
-    """What went wrong, by cause; `grasps` [M, T] bool. No action has two causes, but what is out of
-    reach also has the outcome of an action that moves nothing."""
+    """Counts failures by cause; `grasps` [M, T] bool. An action has one cause; one out of reach
+    also has the outcome of an action that moves nothing."""
     grasped = [_share(~episodes.wrong & (episodes.outcome == kind), grasps) for kind in Outcome]
     ended = {name: _share(episodes.ending == number) for number, name in enumerate(ENDINGS)}
     return {  # of all grasps:

@@ -1,9 +1,9 @@
-"""Evaluations on the way: the policy of now, in scenes that training never saw.
+"""Evaluations during training: the current policy, in scenes that training never saw.
 
 RUN/evaluations.jsonl   a line per evaluation, its whole table in it
 RUN/best/checkpoints/   the state that did best so far; RUN/best is a run's folder like any other
 
-They draw from keys of their own and call programs of their own: what is trained stays the same.
+Evaluations have their own keys and programs: they do not change what is trained.
 """
 
 import json
@@ -23,14 +23,14 @@ from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.training import loop
 from csac_jax.training.callbacks import Callback, Record, RunInfo
 
-PLAN = "evaluation.json"  # in a run's folder: what a resumed run goes on with
+PLAN = "evaluation.json"  # in a run's folder, for a resumed run
 SEED = 1_000_000  # of the evaluations: all meet the same scenes, `eval` others by default
 JUDGED = ("completion", "grasp_success")  # what makes a policy best: the first, then the next
 Score = tuple[float, ...]  # of JUDGED
 
 
 class EvalPlan(NamedTuple):
-    """When and where the policy of a run is evaluated."""
+    """A plan of evaluations during a run."""
 
     every: int  # actions between evaluations; the last chunk has one in any case
     suite: str = EVAL_SUITE
@@ -51,23 +51,25 @@ class Monitor(Callback):
         self,
         cfg: Config,
         plan: EvalPlan,
-        told: Callback,
-        say: Callable[[str], None],
+        callback: Callback,
+        log: Callable[[str], None],
         network: Any = None,
         learner: Learner | None = None,
     ) -> None:
-        """Settles the scenes. Args: told, whose `evaluated` is called; say, takes a line about each
-        evaluation; network and learner of one's own. Raises ValueError for a suite that does not
-        fit the policy."""
-        world = rollout.configured(cfg, "auto", cfg.sim.robot)
-        self._parts = suites.environments(world, plan.suite, plan.episodes, SEED)
-        self._cfg, self._plan, self._told, self._say = cfg, plan, told, say
+        """Settles the scenes.
+
+        Args: callback, whose `evaluated` is called; log, takes a line about each evaluation;
+        network and learner, of a run with custom parts. Raises ValueError for a suite that does not
+        fit the policy.
+        """
+        self._suite = suites.prepare(cfg, plan.suite, plan.episodes, SEED, robot=cfg.sim.robot)
+        self._cfg, self._plan, self._callback, self._log_line = cfg, plan, callback, log
         self._network, self._learner = network, learner
         self._best: Score = ()
         self._done = 0  # actions before the chunk that comes next
 
     def begin(self, run: RunInfo) -> None:
-        """Goes on with the log and the best state of a run that is resumed."""
+        """Continues the log and the best state of a run that is resumed."""
         self._run_dir, self._done = run.run_dir, run.step * self._cfg.train.scenes
         files.write_json(run.run_dir / PLAN, self._plan._asdict())
         files.truncate_log(run.run_dir / files.EVALUATIONS, run.step)
@@ -83,22 +85,22 @@ class Monitor(Callback):
     def _evaluate(self, record: Record, state: Any) -> None:
         begun, plan = time.time(), self._plan
         policy = policies.of_state(self._cfg, state.learner, self._network, self._learner)
-        table = rollout.measure(policy, self._parts, plan.episodes, SEED, None)
+        table = rollout.evaluate(policy, self._suite)
         score = score_of(table)
         if best := score > self._best:
             self._best, place = score, self._run_dir / files.BEST
-            kept = {"seconds": record.seconds, "grasps": [], "score": score}
-            checkpoint.save(place, record.step, state, self._cfg, kept)
+            extra = {"seconds": record.seconds, "grasps": [], "score": score}
+            checkpoint.save(place, record.step, state, self._cfg, extra)
         self._log(record, round(time.time() - begun, 3), score, best, table)
         values = [f"{name} {value:.1%}" for name, value in zip(JUDGED, score, strict=True)]
-        said = f"evaluated on {plan.suite} at {record.actions} actions: {', '.join(values)}"
-        self._say(said.replace("_", " ") + ", the best so far" * best)
-        self._told.evaluated(record, table)
+        line = f"evaluated on {plan.suite} at {record.actions} actions: {', '.join(values)}"
+        self._log_line(line.replace("_", " ") + ", the best so far" * best)
+        self._callback.evaluated(record, table)
 
     def _log(
         self, record: Record, seconds: float, score: Score, best: bool, table: dict[str, Any]
     ) -> None:
-        """Adds a line to the log; it has what `files.read_log` asks of every line."""
+        """Adds a line to the log, with all that `files.read_log` requires."""
         line = {
             "step": record.step,
             "actions": record.actions,
@@ -114,7 +116,7 @@ class Monitor(Callback):
 
 
 def _best_score(folder: Path, step: int) -> Score:
-    """The score of the best state up to a step; later ones are set aside, and damaged ones."""
+    """Reads the score of the best state up to a step; sets later and damaged ones aside."""
     checkpoint.set_aside_after(folder, step)
     if checkpoint.latest_step(folder) is None:
         return ()
@@ -127,13 +129,13 @@ def _best_score(folder: Path, step: int) -> Score:
 
 
 def score_of(table: dict[str, Any]) -> Score:
-    """What policies are ranked by: means over the parts of the suite, without cases 0."""
+    """Returns what policies are ranked by: means over the parts of the suite, without cases 0."""
     parts = _parts(table)
     return tuple(sum(part[name]["value"] or 0.0 for part in parts) / len(parts) for name in JUDGED)
 
 
 def read_plan(run_dir: Path) -> EvalPlan | None:
-    """How a run was evaluated on its way; None if it was not. Raises SettingsError."""
+    """Reads the evaluation plan of a run; None if it has none. Raises SettingsError."""
     path = run_dir / PLAN
     if not path.exists():
         return None
@@ -142,9 +144,7 @@ def read_plan(run_dir: Path) -> EvalPlan | None:
         plan.check()
     except (TypeError, ValueError) as error:
         fault = files.first_line(error)
-        raise SettingsError(
-            f"{path} is damaged ({fault}); remove it, or give --eval-every"
-        ) from None
+        raise SettingsError(f"{path} is damaged ({fault}); remove it, or give eval_every") from None
     return plan
 
 

@@ -1,6 +1,8 @@
-"""What acts: a policy is an object that takes one scene and a key, and returns an action."""
+"""Policies: objects that take one scene and a key, and return an action."""
 
 import dataclasses
+import importlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -26,18 +28,18 @@ Which = int | Literal["last", "best"]  # checkpoint of a run, see `load`
 
 
 class Policy(Protocol):
-    """Chooses the action of one scene. Pure: vmap and jit it."""
+    """A pure function of one scene and a key that returns an action: vmap and jit it."""
 
     @property
     def cfg(self) -> Config:
-        """Config of the scenes, views and task that the policy acts in."""
+        """Returns the config of the scenes, views and task that the policy acts in."""
 
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        """The action in a scene, given as its observation or as the environment's state."""
+        """Chooses the action in a scene, given as its observation or as the environment's state."""
 
 
 class PolicyDebug(NamedTuple):
-    """What a learned policy computed in a state. P = primitives, J = CEM candidates."""
+    """Values behind a decision of a network policy. P = primitives, J = CEM candidates."""
 
     q: jax.Array  # [P, H, W] largest value over the yaws; -inf where there is nothing to act on
     candidates: jax.Array  # [P, J, 3] m, m, rad: the poses of the last CEM round
@@ -59,8 +61,8 @@ class LearnedPolicy:
         return jax.tree.map(lambda leaf: leaf[0], actions)
 
     def batched(self, scenes: Observation | State, keys: jax.Array) -> Action:
-        """Actions, leaves [E], of scenes, leaves [E, ...], and keys [E]. The networks see groups of
-        scenes that fit the memory; under vmap they would see all."""
+        """Chooses actions, leaves [E], for scenes, leaves [E, ...], and keys [E]. The networks see
+        groups of scenes that fit the memory; under vmap they would see all."""
         parts, (obs, unchanged) = actor_critic.make(self.cfg, self.network), _seen(scenes)
         dense_maps = actor_critic.decision_maps(parts, self.params, obs)
         each = keys, parts, dense_maps, _failed(scenes)
@@ -69,7 +71,7 @@ class LearnedPolicy:
 
     @jax.jit
     def debug(self, scene: Observation | State, key: jax.Array) -> PolicyDebug:
-        """What the action in this scene with this key follows from."""
+        """Returns the values behind the action in this scene with this key."""
         parts = actor_critic.make(self.cfg, self.network)
         obs = jax.tree.map(lambda leaf: leaf[None], _seen(scene)[0])
         batch = actor_critic.decision_maps(parts, self.params, obs)
@@ -84,7 +86,7 @@ class LearnedPolicy:
 
 @struct.dataclass
 class LearnerPolicy:
-    """What a learner of one's own does without exploration."""
+    """The greedy policy of a custom learner."""
 
     cfg: Config = struct.field(pytree_node=False)
     learner: Learner = struct.field(pytree_node=False)
@@ -111,14 +113,14 @@ class RandomPolicy:
 
 @struct.dataclass
 class OraclePolicy:
-    """A planner that reads the poses of the blocks: what physics allows at best. `cfg` must be that
-    of the environment, whose kinds of blocks it holds."""
+    """A planner that reads the poses of the blocks. `cfg` must be the environment's, whose kinds of
+    blocks it holds."""
 
     cfg: Config = struct.field(pytree_node=False)
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        """Raises TypeError for an observation."""
+        """Chooses a grasp. Raises TypeError for an observation."""
         if not isinstance(scene, State):
             raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
         # The same scene would have the same grasp fail again; a little turn is no change to see.
@@ -146,21 +148,21 @@ class GeometricPolicy:
 
 
 def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:
-    """Observations and actions in a row without change [...], none after a bare observation."""
+    """Returns observations, and actions in a row without change [...], 0 for a bare observation."""
     if isinstance(scenes, State):
         return scenes.obs, scenes.steps_without_change
     return scenes, jnp.zeros(scenes.height.shape[:-2], jnp.int32)
 
 
 def _failed(scenes: Observation | State) -> jax.Array:
-    """Failed grasps in a row [...], none after a bare observation."""
+    """Counts failed grasps in a row [...], 0 for a bare observation."""
     if isinstance(scenes, State):
         return scenes.failed_grasps
     return jnp.zeros(scenes.height.shape[:-2], jnp.int32)
 
 
 def in_world(policy: Policy, cfg: Config) -> Policy:
-    """The policy for an environment of this config; a policy of the user's own as it is."""
+    """Gives a policy the config of an environment; a custom policy stays as it is."""
     if isinstance(
         policy, LearnedPolicy | LearnerPolicy | RandomPolicy | GeometricPolicy | OraclePolicy
     ):
@@ -169,14 +171,14 @@ def in_world(policy: Policy, cfg: Config) -> Policy:
 
 
 def act(policy: Policy, states: State, keys: jax.Array) -> Action:
-    """Actions, leaves [E], of a policy in states, leaves [E, ...], with keys [E]."""
+    """Chooses actions, leaves [E], of a policy in states, leaves [E, ...], with keys [E]."""
     if isinstance(policy, LearnedPolicy):
         return policy.batched(states, keys)
     return jax.vmap(policy)(states, keys)
 
 
 def load_config(source: str | Path, which: Which = "last") -> Config:
-    """The config of a policy, see `load`."""
+    """Reads the config of a policy; see `load`."""
     path = policy_file.find(source)
     if path.is_file():
         return policy_file.load(path)[0]
@@ -186,9 +188,9 @@ def load_config(source: str | Path, which: Which = "last") -> Config:
 def load(
     source: str | Path, network: Any = None, learner: Learner | None = None, which: Which = "last"
 ) -> Policy:
-    """The policy `shipped`, of a policy file, or of a checkpoint in a run's folder.
+    """Loads a shipped policy, a policy file, or a checkpoint in a run's folder.
 
-    Args: network and learner of one's own, where the run was trained with them; which, the
+    Args: network and learner, of a run that was trained with custom ones; which, the
     checkpoint: `last`, the newest sound one; `best` of the evaluations on the way; or a step.
     Raises FileNotFoundError, PolicyFileError or CheckpointError, with the remedy.
     """
@@ -206,25 +208,51 @@ def load(
 def of_state(
     cfg: Config, state: Any, network: Any = None, learner: Learner | None = None
 ) -> Policy:
-    """The policy of a learner's state; see `load`."""
+    """Builds the policy of a learner's state; see `load`."""
     if learner is not None:
         return LearnerPolicy(cfg, learner, state)
     return LearnedPolicy(cfg, state.online, network)
 
 
 def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
-    """The folder and step of a run's checkpoint; no step for the newest sound one."""
+    """Finds the folder and step of a checkpoint; no step for the newest sound one."""
     if which != "best":
         return run_dir, None if which == "last" else int(which)
     if not (best := run_dir / files.BEST).exists():
-        raise FileNotFoundError(f"there is no {best}; a run keeps its best with --eval-every N")
+        raise FileNotFoundError(f"there is no {best}; a run keeps its best with eval_every")
     return best, None
 
 
-POLICIES: dict[str, Callable[..., Policy]] = {
-    "learned": lambda source, which="last": load(source, which=which),
-    "random": lambda source, which="last": RandomPolicy(load_config(source, which)),
-    "geometric": lambda source, which="last": GeometricPolicy(load_config(source, which)),
-    "oracle": lambda source, which="last": OraclePolicy(load_config(source, which)),
+def make(kind: str, source: str | Path, which: Which = "last") -> Policy:
+    """Makes the policy of a kind: `learned`, the networks of `source`; or a name of `BASELINES` or
+    `MODULE:NAME`, a callable that makes a policy from the config of `source`, see `load`.
+
+    Raises ValueError for an unknown kind, and as `load`.
+    """
+    if kind == "learned":
+        return load(source, which=which)
+    if kind not in BASELINES and ":" not in kind:
+        known = ", ".join(("learned", *BASELINES))
+        raise ValueError(f"policy: '{kind}' is neither MODULE:NAME nor one of: {known}")
+    build = BASELINES[kind] if kind in BASELINES else _imported(kind)
+    policy: Policy = build(load_config(source, which))
+    return policy
+
+
+def _imported(path: str) -> Callable[[Config], Policy]:
+    """Imports `MODULE:NAME`, also from the current folder."""
+    module, _, name = path.partition(":")
+    try:
+        if (here := str(Path.cwd())) not in sys.path:
+            sys.path.insert(0, here)
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"policy: '{path}' cannot be imported ({error})") from None
+
+
+BASELINES: dict[str, Callable[[Config], Policy]] = {
+    "random": RandomPolicy,
+    "geometric": GeometricPolicy,
+    "oracle": OraclePolicy,
 }
-"""Kinds of policy by name: each made from a source, whose config it takes, see `load`."""
+"""Policies without networks, each made from the config that it acts in."""

@@ -16,74 +16,66 @@ from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
+from csac_jax.evaluation.suites import PreparedSuite
 from csac_jax.objects.library import Split
 from csac_jax.runtime import compiler
 from csac_jax.scene import layout, stock
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import backend, physics as simulation, primitives
+from csac_jax.sim import physics as simulation, primitives
 from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.training import step as training
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
 PER_CORE = 4  # of them on a CPU: more gain nothing, and the last episodes keep all places busy
 
-Progress = Callable[[str, int, int], None]  # part of the suite, episodes finished, all episodes
-Count = Callable[[int, int], None]  # the same of one part
+OnProgress = Callable[[str, int, int], None]  # part of the suite, episodes finished, all episodes
 
 
 def evaluate(
     policy: Policy,
-    suite: str = suites.IN_DISTRIBUTION,
+    suite: str | PreparedSuite = suites.IN_DISTRIBUTION,
     episodes: int = 50,
     seed: int = 0,
     physics: PhysicsKind = "auto",
     robot: RobotKind = "hand",
-    progress: Progress | None = None,
+    on_progress: OnProgress | None = None,
     objects: str | None = None,
     split: Split = "held_out",
 ) -> dict[str, Any]:
-    """Metrics of a policy in scenes that training never saw, see `metrics`.
+    """Measures a policy in scenes that training never saw; the metrics are `metrics`'.
 
-    Args: suite, a name of `suites.SUITES` or a case file; episodes, of every part of the suite;
-    progress, called after every action; objects and split, what suites of objects draw from, by
-    default the library that the policy was trained with. Returns: the metrics; of a suite with
-    several parts {"parts": {name: metrics}}. Raises ValueError for a suite that is none or does
-    not fit.
+    Args: suite, a name of `suites.SUITES`, a case file, or a suite prepared by `suites.prepare`,
+    which holds the other arguments; on_progress, called after every action; for the rest see
+    `suites.prepare`. Returns: the metrics; of a suite with several parts {"parts": {name:
+    metrics}}. Raises ValueError as `suites.prepare`.
     """
-    seen = suites.with_objects(policy.cfg, suite, objects, split)
-    cfg, learned = configured(seen, physics, robot), isinstance(policy, LearnedPolicy)
-    parts = suites.environments(cfg, suite, episodes, seed, learned)
-    return measure(policy, parts, episodes, seed, progress)
-
-
-def measure(
-    policy: Policy, parts: dict[str, Env], episodes: int, seed: int, progress: Progress | None
-) -> dict[str, Any]:
-    """The result of `evaluate` in the parts of a suite."""
-    found = {}
-    for name, env in parts.items():
+    if not isinstance(suite, PreparedSuite):
+        learned = isinstance(policy, LearnedPolicy)
+        suite = suites.prepare(
+            policy.cfg, suite, episodes, seed, physics, robot, objects, split, learned
+        )
+    tables = {}
+    for name, env in suite.parts.items():
         actor = policies.in_world(policy, env.cfg)
-        report = functools.partial(progress, name) if progress else None
-        found[name] = metrics.summarise(rollout(env, actor, episodes, seed, report))
+        count = functools.partial(on_progress, name) if on_progress else None
+        tables[name] = metrics.summarise(rollout(env, actor, suite.episodes, suite.seed, count))
         if env.cfg.scene.has_objects:
-            found[name]["scenes_sha256"] = stock.fingerprint(env.cfg.scene, env.scenes)
-    return next(iter(found.values())) if len(found) == 1 else {"parts": found}
-
-
-def configured(cfg: Config, physics: PhysicsKind, robot: RobotKind) -> Config:
-    """The config with this robot and physics; `auto` is chosen for a few scenes at a time."""
-    few = cfg.change(sim={"physics": physics, "robot": robot}, train={"scenes": 1})
-    return cfg.change(sim=backend.resolve(few).sim)
+            tables[name]["scenes_sha256"] = stock.fingerprint(env.cfg.scene, env.scenes)
+    return next(iter(tables.values())) if len(tables) == 1 else {"parts": tables}
 
 
 def rollout(
-    env: Env, policy: Policy, episodes: int, seed: int, progress: Count | None = None
+    env: Env,
+    policy: Policy,
+    episodes: int,
+    seed: int,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> Episodes:
     """Runs episodes of a policy, their scenes spread evenly over the environment's pool.
 
     Some run side by side, each in its place; where they end, the next ones begin. What an episode
     draws follows from the seed and its number alone. What a network or MJX computes may still
-    differ in the last bits.
+    differ in the last bits. `on_progress` gets the episodes finished and all.
     """
     most = min(SIDE_BY_SIDE, episodes)
     if jax.default_backend() == "cpu":
@@ -118,8 +110,8 @@ def rollout(
         terminated, ending = np.asarray(states.terminated), endings(env, states)
         history.append(_Step(numbers, actions, record, over, terminated, ending))
         numbers, actions = np.where(over, _NONE, numbers), actions + 1
-        if progress is not None:
-            progress(episodes - waiting.size - int(np.sum(numbers != _NONE)), episodes)
+        if on_progress is not None:
+            on_progress(episodes - waiting.size - int(np.sum(numbers != _NONE)), episodes)
     return _joined(history, blocks, env.cfg)
 
 
@@ -127,7 +119,7 @@ _NONE = -1  # number of the episode in a place that is free
 
 
 class _Step(NamedTuple):
-    """What one action of all places did; leaves [places], of several steps [S, places]."""
+    """One action of all parallel episodes; leaves [places], of several steps [S, places]."""
 
     number: Any  # int, of the episode there
     action: Any  # int, of that episode, from 0
@@ -138,7 +130,7 @@ class _Step(NamedTuple):
 
 
 def _joined(history: list[_Step], blocks: np.ndarray, cfg: Config) -> Episodes:
-    """The episodes by number, from all steps in order; `blocks` [M] were in play at their start."""
+    """Sorts all steps into episodes; `blocks` [M] were in play at their start."""
     steps = jax.tree.map(lambda *leaves: np.stack(leaves), *history)
     held, order = steps.number != _NONE, np.argsort(steps.number[steps.over])
     at = steps.number[held], steps.action[held]
@@ -159,7 +151,7 @@ def _joined(history: list[_Step], blocks: np.ndarray, cfg: Config) -> Episodes:
 
 @jax.jit
 def _put(states: State, places: jax.Array, some: State) -> State:
-    """The states with others in these places; what is put beyond the last place is dropped."""
+    """Replaces the states in these places; places beyond the last are dropped."""
     return jax.tree.map(lambda leaf, new: leaf.at[places].set(new, mode="drop"), states, some)
 
 
@@ -167,8 +159,7 @@ def _put(states: State, places: jax.Array, some: State) -> State:
 def _compiled(
     kind: Any, cfg: Config, physics: Any, any_yaw: bool, max_failures: int
 ) -> tuple[Callable, Callable]:
-    """`_begin` and `_step` of an environment, whatever its scenes are: parts of a suite that share
-    config and physics share them."""
+    """Compiles `_begin` and `_step` once for all environments of one config and physics."""
     env = kind(cfg, physics, None, any_yaw, max_failures)  # without scenes, as it never resets
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     return jit(functools.partial(_begin, env)), jit(functools.partial(_step, env), static_argnums=0)
@@ -186,7 +177,7 @@ class StepRecord(NamedTuple):
 
 
 def episode(env: Env, policy: Policy, seed: int) -> Iterator[StepRecord]:
-    """One episode of a policy in the first scene of the environment's pool, action by action."""
+    """Runs one episode in the first scene of the environment's pool, and yields every action."""
     key, first = jax.random.key(seed), jax.tree.map(lambda leaf: leaf[:1], env.scenes)
     begin, step = (jax.jit(functools.partial(part, env)) for part in (_begin, _recorded_step))
     states = begin(jax.random.fold_in(key, 0), jnp.zeros(1, jnp.int32), first)
@@ -201,7 +192,6 @@ def episode(env: Env, policy: Policy, seed: int) -> Iterator[StepRecord]:
 
 
 def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> StepRecord:
-    """One action in one scene."""
     action = policy(state, key)
     fingers = state.scene.fingers
     plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action, fingers)
@@ -219,12 +209,12 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
 
 
 def _pytree(policy: Policy) -> Any:
-    """The policy as an argument of compiled programs: its arrays, if it is a pytree, may change."""
+    """Wraps a policy that is no pytree as an argument of compiled programs."""
     return jax.tree_util.Partial(policy) if jax.tree_util.all_leaves([policy]) else policy
 
 
 def endings(env: Env, last: State) -> np.ndarray:
-    """Why the episodes of these last states, leaves [...], ended: indices into ENDINGS [...]."""
+    """Returns why episodes ended, by their last states [...]: indices into ENDINGS [...]."""
     reasons = {
         "terminated": last.terminated,
         "physics_diverged": last.info.physics_diverged,
@@ -237,7 +227,7 @@ def endings(env: Env, last: State) -> np.ndarray:
 
 
 def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: Scene) -> State:
-    """The first states of the episodes `numbers` [E] in `scenes` [E, ...]."""
+    """Builds the first states of the episodes `numbers` [E] in `scenes` [E, ...]."""
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
     placed = jax.vmap(env.randomise_pose)(keys, jax.tree.map(jnp.asarray, scenes))
     return jax.vmap(env.reset_to)(placed, keys)
@@ -246,7 +236,7 @@ def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: Scene) -> State
 def _step(
     env: Env, kind: type, policy: Policy, key: jax.Array, numbers: jax.Array, states: State
 ) -> tuple[State, Episodes]:
-    """One action in every scene and what it did, [E], 0 after the end; finished scenes stay, and
+    """Takes one action in every scene; records [E] are 0 after the end. Finished scenes stay, and
     physics has nothing to do there.
 
     `kind`, the policy's type, is static: JAX takes dataclasses of equal fields for equal whatever

@@ -25,13 +25,13 @@ class Band(NamedTuple):
 
 
 def by_seed(seeds: Sequence[int], values: Sequence[Any] | np.ndarray) -> list[np.ndarray]:
-    """The stratum of values [n, ...] that belong to seeds [n]: an array [hosts, ...] per seed."""
+    """Groups values [n, ...] by their seeds [n] into a stratum: an array [hosts, ...] per seed."""
     values, owners = np.asarray(values, float), np.asarray(seeds)
     return [values[owners == seed] for seed in dict.fromkeys(seeds)]
 
 
 def band(strata: Sequence[Stratum], seed: int = 0) -> Band:
-    """Mean over strata (tasks) of the IQM over each one's seeds, drawn within each stratum.
+    """Averages over strata (tasks) the IQM over each one's seeds, drawn within each stratum.
 
     Unlike Agarwal et al. there is no IQM over all strata at once: of four cases it would leave out
     the hardest. Raises ValueError where a stratum is empty.
@@ -45,8 +45,8 @@ def band(strata: Sequence[Stratum], seed: int = 0) -> Band:
 
 
 def difference(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> Band:
-    """`band` of ours less `band` of theirs, seeds drawn independently; strata in the same order.
-    Raises ValueError where one has fewer than two seeds."""
+    """Subtracts the `band` of theirs from that of ours, seeds drawn independently; strata in the
+    same order. Raises ValueError where one has fewer than two seeds."""
     _check_pair(ours, theirs)
 
     def gap(*strata: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ def difference(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0
 
 
 def improvement(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> Band:
-    """Probability that a seed of ours is above one of theirs in a stratum drawn at random.
+    """Estimates the probability that a seed of ours is above one of theirs in a random stratum.
 
     P = mean over strata of mean over pairs of (x > y) + (x = y) / 2, Agarwal et al. sec. 4.3: the
     Mann-Whitney U over the number of pairs. Raises ValueError as `difference`.
@@ -71,8 +71,8 @@ def improvement(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 
 
 
 def profile(strata: Sequence[Stratum], thresholds: np.ndarray, seed: int = 0) -> list[Band]:
-    """Share of the seeds above each threshold [m], mean over strata: the performance profile of
-    Agarwal et al. sec. 4.2. Raises ValueError where a stratum is empty."""
+    """Returns the share of the seeds above each threshold [m], mean over strata: the performance
+    profile of Agarwal et al. sec. 4.2. Raises ValueError where a stratum is empty."""
     if min(map(len, strata), default=0) == 0:
         raise ValueError("no values to take a share of")
 
@@ -91,8 +91,8 @@ def profile(strata: Sequence[Stratum], thresholds: np.ndarray, seed: int = 0) ->
 def curves(
     points: Sequence[tuple[np.ndarray, np.ndarray]], seeds: Sequence[int]
 ) -> tuple[np.ndarray, list[Band]]:
-    """IQM and band of the curves of runs with these seeds, at the first one's places x [m] up to
-    the shortest's end. A curve holds its first value before its points, x [n] rising and y [n], and
+    """Returns IQM and band of runs' curves, at the first one's places x [m] up to the shortest's
+    end. A curve holds its first value before its points, x [n] rising and y [n], and
     is linear between them."""
     end = min(x[-1] for x, _ in points)
     places = points[0][0][points[0][0] <= end]
@@ -101,7 +101,7 @@ def curves(
 
 
 def area(x: np.ndarray, y: np.ndarray, end: float) -> float:
-    """Mean of a curve, see `curves`, from 0 to `end`: the area below it over its length."""
+    """Averages a curve, see `curves`, from 0 to `end`: the area below it over its length."""
     inner = x[(x > 0.0) & (x < end)]
     places = np.concatenate([[0.0], inner, [end]])
     return float(np.trapezoid(np.interp(places, x, y), places) / end)
@@ -113,8 +113,8 @@ def _check_pair(ours: Sequence[Stratum], theirs: Sequence[Stratum]) -> None:
 
 
 def _mean_iqm(*strata: np.ndarray) -> np.ndarray:
-    """Mean over strata of the IQM over the last axis: without a quarter of the values, rounded
-    down, at either end. As SciPy's `trim_mean`, which takes five times as long."""
+    """Averages over strata the IQM over the last axis: a quarter of the values, rounded down, is
+    cut at either end. As SciPy's `trim_mean`, which takes five times as long."""
     cuts = [values.shape[-1] // 4 for values in strata]
     middles = [
         np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut]
@@ -124,26 +124,26 @@ def _mean_iqm(*strata: np.ndarray) -> np.ndarray:
 
 
 def _above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Share [...] of the pairs of x [..., n] and y [..., m] with x above y, ties by half."""
+    """Returns the share [...] of pairs of x [..., n] and y [..., m] with x above y, ties half."""
     pairs, axes = x.shape[-1] * y.shape[-1], (-2, -1)
     x, y = x[..., :, None], y[..., None, :]
     return ((x > y).sum(axes) + 0.5 * (x == y).sum(axes)) / pairs
 
 
 def _seed_means(stratum: Stratum) -> np.ndarray:
-    """The mean of each seed's hosts, [seeds]."""
+    """Averages each seed's hosts, [seeds]."""
     return np.array([np.mean(one) for one in stratum], float)
 
 
 def _bootstrapped(strata: Sequence[Stratum], statistic: Callable, seed: int) -> Band:
-    """The statistic of strata, arrays [..., seeds] -> [...], with its 95 % percentile band."""
+    """Bootstraps a statistic of strata, arrays [..., seeds] -> [...]; band of 95 % percentiles."""
     value = statistic(*map(_seed_means, strata))
     low, high = np.percentile(statistic(*_draws(strata, seed)), [2.5, 97.5])
     return Band(float(value), float(low), float(high), min(map(len, strata)))
 
 
 def _draws(strata: Sequence[Stratum], seed: int) -> list[np.ndarray]:
-    """Of each stratum RESAMPLES draws, [RESAMPLES, seeds]."""
+    """Draws RESAMPLES times from each stratum, [RESAMPLES, seeds]."""
     rng = np.random.default_rng(seed)
     return [_draw(rng, [np.atleast_1d(one) for one in stratum]) for stratum in strata]
 

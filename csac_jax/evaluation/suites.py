@@ -1,4 +1,4 @@
-"""What a policy is measured on: environments whose scenes training never saw.
+"""Suites: scenes that training never saw, in which policies are measured.
 
 `in_distribution`  scenes dropped or arranged like the training's, from other random numbers.
 `random10`         ten blocks of all shapes, dropped.
@@ -6,8 +6,7 @@
 `cases`            the shipped hard arrangements, one part each, turned in every episode.
 `target`           the cases and random10 with one marked block to get within 5 actions (CSAC
                    sec. 4.4); for policies of the target task.
-`packed`           ordered arrangements of all levels of difficulty. Records of `generated` are of
-                   other families.
+`packed`           ordered arrangements of all levels of difficulty.
 `camera`           random10 seen straight down, from the side, with the noise of a depth camera,
                    with a camera that is also 5 mm off, and with the noise and other colours.
 `pile`             five objects of a library, poured into a pile.
@@ -31,19 +30,32 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from csac_jax import env as environment, presets
-from csac_jax.config import Config, SceneConfig, SensorConfig, SensorKind, SimConfig, SlotKind
+from csac_jax import env as environment
+from csac_jax.config import (
+    Config,
+    PhysicsKind,
+    RobotKind,
+    SceneConfig,
+    SensorConfig,
+    SensorKind,
+    SimConfig,
+    SlotKind,
+)
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
 from csac_jax.objects.library import Split
 from csac_jax.scene import arrange, cases, model, pool
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import physics as simulation
+from csac_jax.sim import backend, physics as simulation
 
 IN_DISTRIBUTION = "in_distribution"
-TEN = presets.get("fast")  # its blocks are those of random10, its contacts enough for ten
+TEN: tuple[SlotKind, ...] = (  # blocks of random10, of all kinds
+    *("box", "box", "arch", "prism", "box"),
+    *("cylinder", "half_cylinder", "box", "box", "box"),
+)
+TEN_CONTACTS = SimConfig(geom_pairs=24, contacts=80)
+THIRTY_CONTACTS = SimConfig(geom_pairs=72, contacts=240)
 TARGET_ACTIONS = 5  # CSAC sec. 4.4
-THIRTY = SimConfig(geom_pairs=72, contacts=240)  # three times those for ten
 FEW = 5  # objects of `pile` and `objects_packed` (VGN, arXiv:2101.01132)
 MAX_FAILURES = 2  # failed grasps in a row that end an episode there (VGN)
 PILE_EXTENT, PACKED_EXTENT = 0.10, 0.30  # m, squares that their objects are placed in (VGN)
@@ -55,68 +67,95 @@ Build = Callable[[Config, int, int], dict[str, Env] | Env]
 
 
 class Suite(NamedTuple):
-    """How the parts of a suite are made."""
+    """The builder of a suite's parts, and the policies that it is for."""
 
     build: Build
+    episodes: int  # of every part in a full measurement
     target: bool = False  # it asks for a target: a learned policy must know that task
     objects: bool = False  # it needs a library of objects
+
+
+class PreparedSuite(NamedTuple):
+    """The environments of a suite, built once for any number of policies of one config."""
+
+    name: str
+    cfg: Config
+    parts: dict[str, Env]
+    episodes: int  # of every part
+    seed: int
 
 
 SUITES: dict[str, Suite] = {}
 
 
-def register(name: str, build: Build, target: bool = False, objects: bool = False) -> None:
-    """Adds a suite. Raises ValueError where there is one of that name."""
+def register(
+    name: str, build: Build, episodes: int = 250, target: bool = False, objects: bool = False
+) -> None:
+    """Adds a suite; see `Suite`. Raises ValueError for a name that is taken."""
     if name in SUITES or name in RENAMED_SUITES:
         raise ValueError(f"there is a suite '{name}' already; choose another name")
-    SUITES[name] = Suite(build, target, objects)
+    SUITES[name] = Suite(build, episodes, target, objects)
 
 
-def with_objects(cfg: Config, suite: str, objects: str | None, split: Split) -> Config:
-    """The config for a suite that may need objects: they come from the library `objects`, by
-    default that of the config. Raises ValueError where there is none."""
+def prepare(
+    cfg: Config,
+    suite: str,
+    episodes: int = 50,
+    seed: int = 0,
+    physics: PhysicsKind = "auto",
+    robot: RobotKind = "hand",
+    objects: str | None = None,
+    split: Split = "held_out",
+    learned: bool = True,
+) -> PreparedSuite:
+    """Builds the environments of a suite for policies of a config; settles their scenes.
+
+    Args: suite, a name of `SUITES` or a case file; episodes, of every part; objects and split, the
+    library of suites of objects, by default the config's; learned, False for a policy that needs no
+    training. Raises ValueError for an unknown suite, an unsound case file or one without the target
+    asked for, a library that is missing or not needed, and for a suite with targets where a learned
+    policy was trained without.
+    """
+    check(suite)
+    suite = RENAMED_SUITES.get(suite, suite)
+    cfg = _with_objects(cfg, suite, objects, split)
+    few = cfg.change(sim={"physics": physics, "robot": robot}, train={"scenes": 1})
+    cfg = cfg.change(sim=backend.resolve(few).sim)  # `auto`: what suits a few scenes at a time
+    if suite not in SUITES:
+        return PreparedSuite(
+            suite, cfg, {Path(suite).stem: _case(cfg, Path(suite))}, episodes, seed
+        )
+    if SUITES[suite].target and learned and cfg.task.kind != "target":
+        raise ValueError(
+            f"suite: {suite} needs a policy trained with task.kind target, this one was trained to "
+            "clear the table; choose another suite, or the policy oracle or random"
+        )
+    parts = SUITES[suite].build(cfg, episodes, 1 + seed)
+    parts = parts if isinstance(parts, dict) else {suite: parts}
+    return PreparedSuite(suite, cfg, parts, episodes, seed)
+
+
+def check(suite: str) -> None:
+    """Raises ValueError for a name that is neither a suite's nor a file's."""
+    if RENAMED_SUITES.get(suite, suite) not in SUITES and not Path(suite).is_file():
+        known = ", ".join(SUITES)
+        raise ValueError(f"suite: '{suite}' is neither a case file nor one of: {known}")
+
+
+def _with_objects(cfg: Config, suite: str, objects: str | None, split: Split) -> Config:
     if suite not in SUITES or not SUITES[suite].objects:
         if objects is not None:
-            names = ", ".join(name for name, one in SUITES.items() if one.objects)
-            raise ValueError(f"--objects: '{suite}' has no objects of a library; {names} have")
+            names = ", ".join(name for name, entry in SUITES.items() if entry.objects)
+            raise ValueError(f"objects: '{suite}' has no objects of a library; {names} have")
         return cfg
     source = objects or cfg.scene.objects
     if not source:
         raise ValueError(
-            f"--objects: {suite} needs a library; csac-jax objects make --out LIB makes one, or "
+            f"objects: {suite} needs a library; csac-jax objects make --out LIB makes one, or "
             "give made:0:200"
         )
     scene = SceneConfig(slots=("object",), min_blocks=1, objects=source, split=split)
     return cfg.change(scene=scene, sim={"physics": "auto"})
-
-
-def environments(
-    cfg: Config, suite: str, episodes: int, seed: int, learned: bool = True
-) -> dict[str, Env]:
-    """The suite's parts by name, each for `episodes` episodes of a policy with this config.
-
-    Raises ValueError for an unknown suite, an unsound case file or one without the target asked
-    for, and for a suite with targets where the policy is learned and was trained without.
-    """
-    check(suite)
-    suite = RENAMED_SUITES.get(suite, suite)
-    if suite in SUITES:
-        build, target, _ = SUITES[suite]
-        if target and learned and cfg.task.kind != "target":
-            raise ValueError(
-                f"--suite: {suite} needs a policy trained with --task.kind target, this one was "
-                "trained to clear the table; choose another suite, or --policy oracle or random"
-            )
-        parts = build(cfg, episodes, 1 + seed)
-        return parts if isinstance(parts, dict) else {suite: parts}
-    return {Path(suite).stem: _case(cfg, Path(suite))}
-
-
-def check(suite: str) -> None:
-    """Raises ValueError for the name of no suite and no file."""
-    if RENAMED_SUITES.get(suite, suite) not in SUITES and not Path(suite).is_file():
-        known = ", ".join(SUITES)
-        raise ValueError(f"--suite: '{suite}' is neither a case file nor one of: {known}")
 
 
 def _target(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
@@ -125,25 +164,25 @@ def _target(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
     return {**_cases(cfg), "random10": dataclasses.replace(ten, cfg=ten.cfg.change(task=cfg.task))}
 
 
-def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN.sim) -> Config:
-    """The config with other blocks, and contacts enough for them: at least those of `sim`."""
+def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN_CONTACTS) -> Config:
+    """Replaces the blocks, and allows at least the contacts of `sim`."""
     pairs, contacts = max(cfg.sim.geom_pairs, sim.geom_pairs), max(cfg.sim.contacts, sim.contacts)
     return cfg.change(scene=scene, sim={"geom_pairs": pairs, "contacts": contacts})
 
 
 def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config:
-    """The config with these blocks in play, of default sizes, and 2.5 actions for each or more."""
+    """Puts these blocks in play, of default sizes, with 2.5 actions for each or more."""
     actions = max(cfg.task.max_actions, len(slots) * 5 // 2)
     scene = SceneConfig(slots=slots, min_blocks=len(slots))
     return _wide(cfg, scene, sim).change(task={"max_actions": actions})
 
 
 def _ten(cfg: Config, episodes: int, stream: int) -> Env:
-    return environment.make_env(_dropped(cfg, TEN.scene.slots, TEN.sim), stream, episodes)
+    return environment.make_env(_dropped(cfg, TEN, TEN_CONTACTS), stream, episodes)
 
 
 def _thirty(cfg: Config, episodes: int, stream: int) -> Env:
-    cfg = _dropped(cfg, TEN.scene.slots * 3, THIRTY)
+    cfg = _dropped(cfg, TEN * 3, THIRTY_CONTACTS)
     return Env(cfg, _physics(cfg), pool.settled(cfg, stream, episodes, poured=True))
 
 
@@ -152,7 +191,7 @@ def _physics(cfg: Config) -> simulation.Physics:
 
 
 def _pool(scene: Scene) -> Scene:
-    """The only scene of a pool, leaves [1, N, ...]."""
+    """Makes a pool of one scene, leaves [1, N, ...]."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
 
 
@@ -160,22 +199,24 @@ def _case(cfg: Config, path: Path) -> Env:
     case = cases.load(path, cfg.heightmap.extent)
     if cfg.task.kind == "target":
         cases.require_target(case)
-    held = {"objects": case.objects, "split": "all"} if case.objects else {}
-    placed: Any = {"slots": case.slots, "min_blocks": len(case.slots), "arranged": 0.0, **held}
+    library = {"objects": case.objects, "split": "all"} if case.objects else {}
+    placed: Any = {"slots": case.slots, "min_blocks": len(case.slots), "arranged": 0.0, **library}
     scene = dataclasses.replace(cfg.scene, **placed)
     cfg = _wide(cfg, scene)
     return Env(cfg, _physics(cfg), _pool(case.scene))
 
 
 def _cases(cfg: Config) -> dict[str, Env]:
-    """The shipped cases. All have slots for the most blocks of each kind: one compilation."""
-    every = {name: cases.load(cases.shipped(name), cfg.heightmap.extent) for name in cases.names()}
+    """Builds the shipped cases, with slots for the most blocks of each kind: one compilation."""
+    loaded = {name: cases.load(cases.shipped(name), cfg.heightmap.extent) for name in cases.names()}
     slots: tuple[SlotKind, ...] = ()
     for kind in typing.get_args(SlotKind):
-        slots += (kind,) * max(case.slots.count(kind) for case in every.values())
+        slots += (kind,) * max(case.slots.count(kind) for case in loaded.values())
     cfg = _wide(cfg, dataclasses.replace(cfg.scene, slots=slots, min_blocks=1))
     physics = _physics(cfg)
-    return {name: Env(cfg, physics, _pool(cases.seat(one, slots))) for name, one in every.items()}
+    return {
+        name: Env(cfg, physics, _pool(cases.seat(case, slots))) for name, case in loaded.items()
+    }
 
 
 def _packed(cfg: Config, episodes: int, stream: int) -> Env:
@@ -185,7 +226,7 @@ def _packed(cfg: Config, episodes: int, stream: int) -> Env:
 
 
 def _objects(cfg: Config, count: int, extent: float) -> Config:
-    """The config with `count` objects in play, placed in a square of side `extent` m."""
+    """Puts `count` objects in play, placed in a square of side `extent` m."""
     placed: Any = {
         "slots": ("object",) * count,
         "min_blocks": count,
@@ -218,7 +259,7 @@ def _target_objects(cfg: Config, episodes: int, stream: int) -> Env:
 
 
 def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
-    """`sensor.kind` of the config names the depth camera; `d415` where it is none."""
+    """Builds random10 for five cameras; the depth camera is the config's, or a D415."""
     kind: SensorKind = "d415" if cfg.sensor.kind == "none" else cfg.sensor.kind
     exact, noisy = SensorConfig(), SensorConfig(kind=kind)
     sensors = {
@@ -238,13 +279,13 @@ def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
 
 
 register(IN_DISTRIBUTION, lambda cfg, count, stream: environment.make_env(cfg, stream, count))
-register("random10", _ten)
-register("random30", _thirty)
+register("random10", _ten, 500)
+register("random30", _thirty, 100)
 register("cases", lambda cfg, episodes, stream: _cases(cfg))
 register("target", _target, target=True)
 register("packed", _packed)
 register("camera", _camera)
-register("pile", _pile, objects=True)
-register("objects_packed", _objects_packed, objects=True)
-register("objects10", _objects10, objects=True)
-register("target_objects", _target_objects, target=True, objects=True)
+register("pile", _pile, 1000, objects=True)
+register("objects_packed", _objects_packed, 1000, objects=True)
+register("objects10", _objects10, 500, objects=True)
+register("target_objects", _target_objects, 500, target=True, objects=True)

@@ -29,7 +29,7 @@ def measure(
     """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
 
     A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
-    ValueError as `suites.environments` does, before anything is measured there.
+    ValueError as `suites.prepare` does, before anything is measured there.
     """
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))
@@ -56,15 +56,14 @@ def _measure_point(
     """Evaluates runs of one point, which share their scenes and the compiled episodes; in C MuJoCo
     if they were trained in it, on whatever device."""
     physics: PhysicsKind = "c" if point.cfg.sim.physics == "c" else "auto"
-    seen = suites.with_objects(point.cfg, suite, None, "held_out")
-    cfg = rollout.configured(seen, physics, point.cfg.sim.robot)
-    parts = suites.environments(cfg, suite, episodes, SEED)
+    robot = point.cfg.sim.robot
+    prepared = suites.prepare(point.cfg, suite, episodes, SEED, physics, robot)
     for run in runs:
         if stop.signal is not None:
             return
         begun, path = time.time(), folder / run.folder
-        found = rollout.measure(policies.load(path), parts, episodes, SEED, None)
-        measured = dataclasses.replace(cfg, seed=run.cfg.seed)
+        found = rollout.evaluate(policies.load(path), prepared)
+        measured = dataclasses.replace(prepared.cfg, seed=run.cfg.seed)
         _write(path / _result(suite), suite, measured, found, begun)
 
 

@@ -19,7 +19,7 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, api, cli, presets
-from csac_jax.cli import bench, evaluation, failures, play, settings, sweep, train
+from csac_jax.cli import bench, evaluate, failures, output, play, settings, sweep, train
 from csac_jax.config import BetaReplay, Config, DenseNet121, SceneConfig, Section, UniformReplay
 from csac_jax.errors import DataWarning
 from csac_jax.evaluation import policies, rollout, suites
@@ -72,7 +72,7 @@ def run_dir(tmp_path: Path) -> Path:
     [
         (
             "trian quick",
-            "unknown command 'trian'; did you mean train? choose one of: train, sweep, eval, bench",
+            "unknown command 'trian'; did you mean train? choose one of: train, sweep, eval, play",
         ),
         ("train", "give a preset first, one of: smoke, quick"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
@@ -657,7 +657,7 @@ def test_eval_changes_how_a_policy_decides(
 def test_settings_of_a_view_are_those_given():
     """Claim: a setting that is given counts, also where it is the package's default; no other."""
     flags = ["shipped", "--sensor.dropped=0.0", "--camera.look_at", "0", "0", "0"]
-    _, changes = settings.parse_view(evaluation.EvalOptions, "eval", flags)
+    _, changes = settings.parse_view(evaluate.EvalOptions, "eval", flags)
     wanted = {"sensor": {"dropped": 0.0}, "camera": {"look_at": (0.0, 0.0, 0.0)}}
     assert changes == {"heightmap": {}, "sim": {}, **wanted}
 
@@ -1008,7 +1008,7 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
         "outcomes": {"lifted": 9},
         "counts": {"grasps": 10},
     }
-    evaluation.print_summary("random in 1 episode", summary)
+    evaluate.print_summary("random in 1 episode", summary)
     shown = capsys.readouterr().out
     assert "90.0 %" in shown
     assert "lifted 9" in shown
@@ -1022,8 +1022,8 @@ def test_progress_is_for_terminals(capsys: pytest.CaptureFixture, monkeypatch: p
     monkeypatch.setenv("TERM", "xterm")
     for terminal in ("", "1"):
         monkeypatch.setenv("FORCE_COLOR", terminal)  # Rich takes this for a terminal
-        with evaluation.progress_bar() as show:
-            show("row", 3, 50)
+        with output.progress() as bars:
+            evaluate._shown(bars)("cases", "row", 3, 50)
         shown = capsys.readouterr()
         assert shown.out == ""
         assert ("row" in shown.err and "3/50" in shown.err) == bool(terminal)

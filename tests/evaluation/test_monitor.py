@@ -78,8 +78,8 @@ def _table(completion: float, success: float | None) -> dict[str, Any]:
 def scores(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     """The tables of the evaluations to come, in place of episodes."""
     given: list[Any] = []
-    monkeypatch.setattr(monitor.suites, "environments", lambda *_: {"all": None})
-    monkeypatch.setattr(monitor.rollout, "measure", lambda *_: given.pop(0))
+    monkeypatch.setattr(monitor.suites, "prepare", lambda *_, **__: None)
+    monkeypatch.setattr(monitor.rollout, "evaluate", lambda *_: given.pop(0))
     monkeypatch.setattr(policies, "of_state", lambda cfg, state, *_: state)
     yield given
     assert given == []

@@ -15,14 +15,14 @@ SMOKE = presets.smoke()
 @pytest.mark.parametrize(
     ("suite", "objects", "message"),
     [
-        ("pile", None, "--objects: pile needs a library; csac-jax objects make --out LIB"),
+        ("pile", None, "objects: pile needs a library; csac-jax objects make --out LIB"),
         ("random10", "made:0:20", "'random10' has no objects of a library; pile, objects_packed"),
     ],
 )
 def test_a_library_fits_the_suite(suite: str, objects: str | None, message: str):
     """Claim: a suite of objects without a library, and a library for another suite, are refused."""
     with pytest.raises(ValueError, match=message):
-        suites.with_objects(SMOKE, suite, objects, "held_out")
+        suites.prepare(SMOKE, suite, objects=objects)
 
 
 @pytest.mark.slow
@@ -30,10 +30,8 @@ def test_a_pile_ends_after_two_failures(monkeypatch: pytest.MonkeyPatch, tmp_pat
     """Claim: episodes of a pile end empty or after two failures in a row; the result has the
     fingerprint of its scenes."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    cfg = suites.with_objects(SMOKE.change(sim={"physics": "c"}), "pile", "made:0:42", "all")
-    cfg = rollout.configured(cfg, "c", "hand")
-    parts = suites.environments(cfg, "pile", 3, seed=0)
-    env = parts["pile"]
+    prepared = suites.prepare(SMOKE, "pile", 3, 0, "c", objects="made:0:42", split="all")
+    env = prepared.parts["pile"]
     assert env.scenes.position.shape == (3, 5, 3)
     episodes = rollout.rollout(env, policies.RandomPolicy(env.cfg), 3, seed=0)
     for row in range(3):
@@ -43,7 +41,7 @@ def test_a_pile_ends_after_two_failures(monkeypatch: pytest.MonkeyPatch, tmp_pat
         assert given_up == bool(failed[-2:].all() and len(failed) > 1)
         assert given_up != bool(episodes.completed[row])
         assert not np.any(failed[:-1] & failed[1:]) or given_up
-    found = rollout.measure(policies.RandomPolicy(env.cfg), parts, 3, 0, None)
+    found = rollout.evaluate(policies.RandomPolicy(env.cfg), prepared)
     assert found["scenes_sha256"] == rollout.stock.fingerprint(env.cfg.scene, env.scenes)
     assert found["declutter_rate"]["n"] == 15
     again = pool.settled(env.cfg, 1, 3, poured=True)

@@ -1,6 +1,7 @@
 """Policies as objects: one scene and a key in, an action out."""
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -196,7 +197,23 @@ def test_load_reads_a_file(tmp_path, learned):
     read = policies.load(str(path))
     assert read.cfg == CFG
     jax.tree.map(np.testing.assert_array_equal, read.params, learned.params)
-    assert policies.POLICIES["random"](str(path)) == RandomPolicy(CFG)
-    assert policies.POLICIES["oracle"](str(path)) == OraclePolicy(CFG)
+    assert policies.make("random", str(path)) == RandomPolicy(CFG)
+    assert policies.make("oracle", str(path)) == OraclePolicy(CFG)
     with pytest.raises(FileNotFoundError, match="there is no folder nowhere"):
         policies.load("nowhere")
+
+
+def test_policy_of_a_module(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: `MODULE:NAME` is a callable in the current folder, called with the config of the
+    source; one that is missing is one line."""
+    code = "from csac_jax.evaluation.policies import RandomPolicy\n\ndef mine(cfg):\n"
+    (tmp_path / "my_policies.py").write_text(code + "    return RandomPolicy(cfg)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    made = policies.make("my_policies:mine", "shipped")
+    assert made == RandomPolicy(policies.load_config("shipped"))
+    for path in ("my_policies:yours", "no_module:mine"):
+        with pytest.raises(ValueError, match=rf"^policy: '{path}' cannot be imported"):
+            policies.make(path, "shipped")
+    with pytest.raises(ValueError, match="neither MODULE:NAME nor one of: learned, random"):
+        policies.make("best", "shipped")

@@ -278,10 +278,12 @@ def test_evaluate_gives_metrics(magnet, monkeypatch):
     """Claim: the metrics of one part come as they are, of several by their names; our policies act
     in the world of each part's environment, whatever their own config's is."""
     elsewhere = OraclePolicy(presets.quick())
-    monkeypatch.setitem(suites.SUITES, "one", suites.Suite(lambda *_: {"a": magnet}))
-    monkeypatch.setitem(suites.SUITES, "two", suites.Suite(lambda *_: {"a": magnet, "b": magnet}))
+    monkeypatch.setitem(suites.SUITES, "one", suites.Suite(lambda *_: {"a": magnet}, 1))
+    monkeypatch.setitem(
+        suites.SUITES, "two", suites.Suite(lambda *_: {"a": magnet, "b": magnet}, 1)
+    )
     told = []
-    one = rollout.evaluate(elsewhere, "one", EPISODES, progress=lambda *at: told.append(at))
+    one = rollout.evaluate(elsewhere, "one", EPISODES, on_progress=lambda *at: told.append(at))
     two = rollout.evaluate(elsewhere, "two", EPISODES)
     assert two == {"parts": {"a": one, "b": one}}
     assert one["completion"]["value"] == one["action_efficiency"]["value"] == 1.0
@@ -291,17 +293,19 @@ def test_evaluate_gives_metrics(magnet, monkeypatch):
 
 
 @pytest.mark.parametrize("physics", ["c", "mjx"])
-def test_configured_physics_is_kept(physics: str):
+def test_physics_that_are_named_are_taken(physics: str, monkeypatch):
     """Claim: physics that are named are taken; `auto` is the one of this machine."""
-    got = rollout.configured(CFG, physics, "ur5")
+    monkeypatch.setitem(suites.SUITES, "none", suites.Suite(lambda *_: {}, 1))
+    got = suites.prepare(CFG, "none", physics=physics, robot="ur5").cfg
     assert (got.sim.physics, got.sim.robot) == (physics, "ur5")
     assert dataclasses.replace(got, sim=CFG.sim) == CFG
 
 
-def test_auto_is_c_on_a_cpu():
+def test_auto_is_c_on_a_cpu(monkeypatch):
     """Claim: on a CPU an evaluation computes physics by C MuJoCo, unless another is named."""
     wanted = "c" if jax.default_backend() == "cpu" else "mjx"
-    assert rollout.configured(presets.get("fast"), "auto", "hand").sim.physics == wanted
+    monkeypatch.setitem(suites.SUITES, "none", suites.Suite(lambda *_: {}, 1))
+    assert suites.prepare(presets.get("fast"), "none").cfg.sim.physics == wanted
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ EPISODES = 5
 
 
 def _varied(cfg: Config, name: str, count: int = 40):
-    env = suites.environments(cfg, "cases", EPISODES, 0)[name]
+    env = suites.prepare(cfg, "cases", EPISODES, 0).parts[name]
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
     return scene, jax.device_get(
         jax.vmap(env.randomise_pose, (0, None))(jax.random.split(jax.random.key(0), count), scene)
@@ -33,7 +33,7 @@ def _varied(cfg: Config, name: str, count: int = 40):
 def test_cases_are_the_shipped_files():
     """Claim: the suite `cases` has one part per shipped case, which holds its blocks and nothing
     else."""
-    parts = suites.environments(CFG, "cases", EPISODES, 0)
+    parts = suites.prepare(CFG, "cases", EPISODES, 0).parts
     assert tuple(parts) == cases.names()
     for name, env in parts.items():
         wanted = cases.load(cases.shipped(name), CFG.heightmap.extent)
@@ -59,7 +59,7 @@ def test_suite_is_the_same_for_every_policy(suite: str):
         CFG.scene, size_jitter=(0.0, 0.0), density=(600.0, 600.0), arranged=0.5
     )
     (one,), (other,) = (
-        suites.environments(cfg, suite, 2, 0).values()
+        suites.prepare(cfg, suite, 2, 0).parts.values()
         for cfg in (CFG, dataclasses.replace(CFG, scene=alike))
     )
     jax.tree.map(np.testing.assert_array_equal, one.scenes, other.scenes)
@@ -69,7 +69,7 @@ def test_suite_is_the_same_for_every_policy(suite: str):
 def test_cases_share_their_compilation():
     """Claim: all four cases have one config and one physics, so that what is compiled for one
     serves all."""
-    first, *others = suites.environments(CFG, "cases", EPISODES, 0).values()
+    first, *others = suites.prepare(CFG, "cases", EPISODES, 0).parts.values()
     assert all(env.cfg == first.cfg and env.physics is first.physics for env in others)
     begun = rollout._compiled.cache_info().misses
     for env in (first, *others):
@@ -109,7 +109,7 @@ def test_packed_scenes_follow_the_seed():
     """Claim: the suite `packed` is the same for the same seed, another for another, and harder
     towards its end."""
     first, again, other = (
-        suites.environments(CFG, "packed", 30, seed)["packed"].scenes for seed in (0, 0, 1)
+        suites.prepare(CFG, "packed", 30, seed).parts["packed"].scenes for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(first.position, again.position)
     assert len({scene.tobytes() for scene in (*first.position, *other.position)}) == 60
@@ -127,10 +127,10 @@ def test_users_case_file(tmp_path: Path):
         "quaternion": [1, 0, 0, 0],
     }
     path.write_text(json.dumps({"name": "mine", "blocks": [block]}))
-    (env,) = suites.environments(CFG, str(path), EPISODES, 0).values()
+    (env,) = suites.prepare(CFG, str(path), EPISODES, 0).parts.values()
     assert env.cfg.scene.slots == ("box",)
     with pytest.raises(ValueError, match="target"):
-        suites.environments(TARGET, str(path), EPISODES, 0)
+        suites.prepare(TARGET, str(path), EPISODES, 0)
 
 
 @pytest.mark.parametrize(("suite", "blocks", "most"), [("random10", 10, 25), ("random30", 30, 75)])
@@ -146,7 +146,7 @@ def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int
 
     monkeypatch.setattr(pool, "settled", settled)
     packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))
-    (env,) = suites.environments(packed, suite, EPISODES, 0).values()
+    (env,) = suites.prepare(packed, suite, EPISODES, 0).parts.values()
     ((slots, least, stream, count, poured),) = asked
     assert (len(slots), least, count, poured) == (blocks, blocks, EPISODES, suite == "random30")
     assert set(slots) == {"box", "arch", "prism", "half_cylinder", "cylinder"}
@@ -154,18 +154,18 @@ def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int
     assert env.cfg.task.max_actions == most
     assert env.cfg.sim.contacts >= 8 * blocks
     long = dataclasses.replace(CFG, task=TaskConfig(max_actions=90))
-    assert suites.environments(long, suite, EPISODES, 0)[suite].cfg.task.max_actions == 90
+    assert suites.prepare(long, suite, EPISODES, 0).parts[suite].cfg.task.max_actions == 90
 
 
 def test_target_suite(monkeypatch: pytest.MonkeyPatch):
     """Claim: the suite `target` is the cases and random10, one marked block each, within 5 actions;
     a policy that was trained to clear the table is refused, one that reads the blocks' poses is
     not."""
-    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN.scene.slots))
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN))
     everyone = blank.replace(in_play=np.ones_like(blank.in_play))
     monkeypatch.setattr(pool, "settled", lambda *_, **__: everyone)
     for cfg, learned in ((TARGET, True), (CFG, False)):
-        parts = suites.environments(cfg, "target", EPISODES, 0, learned)
+        parts = suites.prepare(cfg, "target", EPISODES, 0, learned=learned).parts
         assert tuple(parts) == (*cases.names(), "random10")
         for env in parts.values():
             assert (env.cfg.task.kind, env.cfg.task.max_actions) == ("target", 5)
@@ -173,19 +173,19 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
             varied = env.randomise_pose(jax.random.key(0), scene)
             assert scene.in_play[varied.target]
     with pytest.raises(
-        ValueError, match=r"^--suite: target needs a policy trained with --task.kind target"
+        ValueError, match=r"^suite: target needs a policy trained with task.kind target"
     ):
-        suites.environments(CFG, "target", EPISODES, 0)
+        suites.prepare(CFG, "target", EPISODES, 0)
 
 
 def test_camera_suite(monkeypatch: pytest.MonkeyPatch):
     """Claim: the suite `camera` is the scenes of random10 through ever worse cameras: straight
     down, from the side, with noise, 5 mm off, in other colours; a sensor that is named stays."""
-    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN.scene.slots))
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN))
     monkeypatch.setattr(pool, "settled", lambda *_, **__: blank)
     noisy = CFG.change(heightmap={"view": "oblique"}, sensor={"kind": "azure_kinect"})
     for cfg, kind in ((CFG, "d415"), (noisy, "azure_kinect")):
-        parts = suites.environments(cfg, "camera", EPISODES, 0)
+        parts = suites.prepare(cfg, "camera", EPISODES, 0).parts
         seen = [(env.cfg.heightmap.view, env.cfg.sensor) for env in parts.values()]
         noise = SensorConfig(kind=kind)
         assert seen == [
@@ -202,7 +202,7 @@ def test_unknown_suite():
     """Claim: a suite that is none is refused with the names of those that there are."""
     names = "in_distribution, random10, random30, cases, target, packed, camera"
     with pytest.raises(ValueError, match=f"'hard'.*{names}"):
-        suites.environments(CFG, "hard", EPISODES, 0)
+        suites.prepare(CFG, "hard", EPISODES, 0)
 
 
 def test_suite_of_ones_own(monkeypatch: pytest.MonkeyPatch):
@@ -211,7 +211,7 @@ def test_suite_of_ones_own(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(suites, "SUITES", dict(suites.SUITES))
     asked = []
     suites.register("mine", lambda *at: {"part": asked.append(at)})
-    assert suites.environments(CFG, "mine", EPISODES, 3) == {"part": None}
+    assert suites.prepare(CFG, "mine", EPISODES, 3).parts == {"part": None}
     assert asked == [(CFG, EPISODES, 4)]
     for name in ("mine", "cases", "own"):
         with pytest.raises(ValueError, match=f"there is a suite '{name}' already"):
@@ -223,4 +223,4 @@ def test_old_name_of_a_suite(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(suites.environment, "make_env", lambda cfg, stream, count: (stream, count))
     wanted = {"in_distribution": (1, EPISODES)}
     for name in ("own", "in_distribution"):
-        assert suites.environments(CFG, name, EPISODES, 0) == wanted
+        assert suites.prepare(CFG, name, EPISODES, 0).parts == wanted

@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import settings, train
-from csac_jax.cli.evaluation import EvalOptions
+from csac_jax.cli.evaluate import EvalOptions
 from csac_jax.evaluation import metrics, statistics
 from csac_jax.io import configs, files
 from csac_jax.report import charts, comparison, curves, page, results, tables, wording

@@ -1,0 +1,316 @@
+"""`csac-jax eval`: a policy, measured in one suite or in several."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from csac_jax.cli import output, settings
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
+from csac_jax.io import files
+from csac_jax.runtime import processes, signals
+
+EPISODES = 50  # of every part of a suite, where neither --episodes nor --out is given
+TABLE = "table.md"  # in the folder --out
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalOptions:
+    """Measures a policy in scenes that training never saw. It sees as it was trained to, and
+    has the same gripper, unless other settings are given."""
+
+    source: tyro.conf.Positional[str]
+    """A run's folder, a policy file, or one that comes with the package, such as shipped; or a
+    sweep's folder: all its final policies, each result in the folder of its run."""
+    which: str = "last"
+    """Checkpoint of the run: last, the newest sound one; best, of a run trained with --eval-every;
+    or a step."""
+    policy: str = "learned"
+    """What acts: learned, the networks; random, grasps at random places above blocks; geometric,
+    antipodal grasps from the edges of the height map; oracle, a planner that reads the blocks'
+    poses; or MODULE:NAME, your own, made from the config of the source."""
+    suites: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--suite"])] = ("in_distribution",)
+    """Scenes: in_distribution (like the training's), random10, random30, cases, target (needs a
+    policy of that task), packed, camera (random10 through ever worse cameras), pile,
+    objects_packed, objects10, target_objects (objects of a library), or case files; all for every
+    suite that fits the policy."""
+    out: Path | None = None
+    """Folder for a file of each suite and a table of all. Suites that it holds already are not
+    measured again."""
+    jobs: int = 0
+    """With --out, suites at a time, each on a core of its own; 0 for one per core. One at a time
+    has all cores, or the GPU."""
+    objects: str | None = None
+    """Library that suites of objects draw from: a folder, or made:SEED:COUNT for our own shapes; by
+    default the policy's."""
+    split: Literal["held_out", "train", "all"] = "held_out"
+    """Which of its objects."""
+    physics: Literal["auto", "mjx", "c"] = "auto"
+    """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
+    robot: Literal["hand", "ur5", "ur5e"] = "hand"
+    """What moves the gripper: nothing, it floats as in training; or an arm."""
+    augment: Literal["on", "off"] | None = None
+    """Whether Q is the mean over mirror images of the view, see `policy.augment` of `csac-jax train
+    --help-all`; by default as the policy's."""
+    height_bonus: float | None = None
+    """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
+    train --help-all`; by default as the policy's."""
+    retry: float | None = None
+    """How boldly the policy draws another place after failed grasps, see `policy.retry` of
+    `csac-jax train --help-all`; by default as the policy's."""
+    episodes: int | None = None
+    """Episodes of every part of a suite; by default 50, with --out the suite's own number."""
+    share: float = 1.0
+    """With --out, share of the suites' own numbers of episodes, above 0, at most 1."""
+    seed: int = 0
+    """Number that scenes and noise follow from. No seed gives scenes of the training."""
+    json: Path | None = None
+    """File to write the result of a single suite to, as JSON."""
+
+
+def run(arguments: list[str]) -> int:
+    """Measures and prints; returns the exit code."""
+    options, view = settings.parse_view(EvalOptions, "eval", arguments)
+    _check(options)
+    if (Path(options.source) / files.SWEEP_PLAN).exists():
+        return _evaluate_sweep(options, view)
+    changes = {**view, "policy": settings.decision(options)}
+    if options.out is not None:
+        return _measure_all(options, changes)
+    (suite,) = options.suites
+    with output.progress() as bars, as_bad_arguments(ValueError):
+        result = _measure(_shown(bars), options, changes, suite, options.episodes or EPISODES)
+    for part, summary in result.get("parts", {Path(suite).stem: result}).items():
+        title = (
+            f"{options.policy} policy, {part}: {result['episodes']} episodes, seed {options.seed}"
+        )
+        print_summary(title, summary)
+    if options.json is not None:
+        files.write_json(options.json, result)
+    return 0
+
+
+def _check(options: EvalOptions) -> None:
+    if options.episodes is not None and options.episodes < 1:
+        raise BadArgumentsError("--episodes: at least 1")
+    if not 0.0 < options.share <= 1.0:
+        raise BadArgumentsError("--share: above 0, at most 1")
+    if not 0 <= options.jobs <= 1024:
+        raise BadArgumentsError("--jobs: must lie in 0 .. 1024")
+    check_seed(options.seed)
+    _which(options.which)
+    if options.out is None and (len(options.suites) != 1 or "all" in options.suites):
+        raise BadArgumentsError("--suites: several need --out DIR")
+    if options.out is not None and options.json is not None:
+        raise BadArgumentsError("--json: is for a single suite; --out writes a file for each")
+
+
+def _which(text: str) -> Any:
+    """Reads `best`, `last`, or the number of a step."""
+    if text not in ("best", "last") and not text.isdecimal():
+        raise BadArgumentsError(f"--which: '{text}' is neither best, last nor a step")
+    return text if text in ("best", "last") else int(text)
+
+
+def _evaluate_sweep(options: EvalOptions, view: Any) -> int:
+    """Measures the final policies of a sweep that are left; returns the exit code."""
+    fields = dataclasses.fields(EvalOptions)
+    changed = {field.name for field in fields if getattr(options, field.name) != field.default}
+    if changed - {"source", "suites", "episodes"} or any(view.values()):
+        raise BadArgumentsError(
+            "eval SWEEP: takes --suite and --episodes alone; give one of its runs for other options"
+        )
+    from csac_jax import api
+
+    stop, episodes = signals.install(), options.episodes or EPISODES
+    with as_bad_arguments(ValueError):
+        stopped = api.evaluate_sweep(Path(options.source), options.suites[0], episodes, stop)
+    return 0 if stopped is None else 128 + stopped
+
+
+def _policy(options: EvalOptions, changes: dict[str, Any]) -> tuple[Any, Any]:
+    """Makes the policy; returns it and the config that it acts in."""
+    from csac_jax.evaluation import policies
+
+    policy = policies.make(options.policy, options.source, _which(options.which))
+    return policy, policy.cfg.change(**changes)
+
+
+def _measure(
+    on_progress: Callable[..., None],
+    options: EvalOptions,
+    changes: dict[str, Any],
+    suite: str,
+    episodes: int,
+) -> dict[str, Any]:
+    """Measures the policy in a suite; returns the metrics with all that they follow from."""
+    from csac_jax.evaluation import rollout, suites
+    from csac_jax.io import configs
+    from csac_jax.runtime import cache, provenance
+
+    cache.enable()
+    begun = time.time()
+    policy, cfg = _policy(options, changes)
+    has_objects = suite in suites.SUITES and suites.SUITES[suite].objects
+    several = options.out is not None
+    prepared = suites.prepare(
+        cfg,
+        suite,
+        episodes,
+        options.seed,
+        options.physics,
+        options.robot,
+        options.objects if has_objects or not several else None,
+        options.split,
+        learned=options.policy == "learned",
+    )
+    table = rollout.evaluate(policy, prepared, on_progress=functools.partial(on_progress, suite))
+    library = {"objects": prepared.cfg.scene.objects, "split": options.split}
+    return {
+        **_asked(options, suite, episodes),
+        **(library if prepared.cfg.scene.has_objects else {}),
+        "seconds": round(time.time() - begun, 1),
+        **table,
+        "config": configs.to_dict(prepared.cfg),
+        **provenance.record(),
+    }
+
+
+def _asked(options: EvalOptions, suite: str, episodes: int) -> dict[str, Any]:
+    names = ("policy", "which", "seed")
+    return {**{n: getattr(options, n) for n in names}, "suite": suite, "episodes": episodes}
+
+
+def _measure_all(options: EvalOptions, changes: dict[str, Any]) -> int:
+    """Measures what the folder lacks, suite by suite; returns the exit code."""
+    from csac_jax.evaluation import suites
+
+    assert options.out is not None
+    if options.out.exists() and not options.out.is_dir():
+        raise BadArgumentsError(f"--out: {options.out} is a file; give a folder")
+    options.out.mkdir(parents=True, exist_ok=True)  # before hours of work
+    with as_bad_arguments(ValueError):
+        policy, cfg = _policy(options, changes)
+        chosen = _fitting(options, cfg) if "all" in options.suites else options.suites
+        for suite in chosen:
+            suites.check(suite)
+    tag = _digest(options, policy, changes)
+    numbers = {suite: options.episodes or _episodes(options, suite) for suite in chosen}
+    paths = {suite: options.out / f"{Path(suite).stem}.json" for suite in chosen}
+    waiting = [suite for suite in chosen if not _is_kept(paths[suite], numbers[suite], tag)]
+    for suite in sorted(set(chosen) - set(waiting)):
+        print(f"{suite}, kept from before", flush=True)
+
+    def on_done(number: int, result: dict[str, Any]) -> None:
+        suite = waiting[number]
+        files.write_json(paths[suite], {**result, "digest": tag})
+        _write_table(options.out, paths)
+        print(f"{suite}, {result['episodes']} episodes, {result['seconds']} s", flush=True)
+
+    tasks = [(options, changes, suite, numbers[suite]) for suite in waiting]
+    with output.progress() as bars, as_bad_arguments(ValueError):
+        jobs = options.jobs or processes.cores()
+        processes.each(_measure, tasks, jobs, _shown(bars), on_done)
+    print(_write_table(options.out, paths), end="")
+    return 0
+
+
+def _fitting(options: EvalOptions, cfg: Any) -> tuple[str, ...]:
+    """Returns the suites that a policy of this config can act in."""
+    from csac_jax.evaluation import suites
+
+    can_clear = options.policy != "learned" or cfg.task.kind == "clear"
+    can_target = options.policy != "learned" or cfg.task.kind == "target"
+    has_library = bool(options.objects or cfg.scene.objects)
+    return tuple(
+        name
+        for name, suite in suites.SUITES.items()
+        if (can_target if suite.target else can_clear) and (has_library or not suite.objects)
+    )
+
+
+def _episodes(options: EvalOptions, suite: str) -> int:
+    from csac_jax.evaluation import suites
+
+    full = suites.SUITES[suite].episodes if suite in suites.SUITES else EPISODES
+    return max(1, round(options.share * full))
+
+
+def _digest(options: EvalOptions, policy: Any, changes: dict[str, Any]) -> str:
+    """Returns a digest of all that a result follows from: networks, settings and options."""
+    import jax
+    import numpy as np
+
+    from csac_jax.io import configs
+
+    given = dataclasses.replace(options, out=None, jobs=0, suites=(), share=1.0, episodes=None)
+    settings = configs.to_dict(policy.cfg.change(**changes))
+    digest = hashlib.sha256(json.dumps([str(given), settings], sort_keys=True).encode())
+    for leaf in jax.tree.leaves(getattr(policy, "params", ())):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _is_kept(path: Path, episodes: int, tag: str) -> bool:
+    """Tells if a file holds the whole result that is asked for."""
+    try:
+        result = files.read_object(path)
+    except (FileNotFoundError, ValueError):
+        return False
+    return (result.get("episodes"), result.get("digest")) == (episodes, tag)
+
+
+def _write_table(folder: Path | None, paths: dict[str, Path]) -> str:
+    """Writes and returns the table of the suites that are measured."""
+    from csac_jax.report import suite_table
+
+    assert folder is not None
+    results = [files.read_object(path) for path in paths.values() if path.exists()]
+    text = suite_table.markdown(suite_table.rows(results))
+    files.replace(folder / TABLE, text)
+    return text
+
+
+def _shown(bars: Any) -> Callable[[str, str, int, int], None]:
+    """Returns a function that shows a suite's progress on a terminal."""
+    lines: dict[str, Any] = {}
+
+    def show(suite: str, part: str, finished: int, episodes: int) -> None:
+        if suite not in lines:
+            lines[suite] = bars.add_task("")
+        title = part if part == suite else f"{suite}, {part}"
+        bars.update(
+            lines[suite],
+            description=f"{title}, episodes",
+            completed=finished,
+            total=episodes,
+            visible=finished < episodes,
+        )
+
+    return show
+
+
+def print_summary(title: str, summary: dict[str, Any]) -> None:
+    """Prints every metric, and a dash for one without cases."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from csac_jax.evaluation.statistics import Band
+    from csac_jax.report import tables
+
+    caption = "in brackets: 95 % interval; action_efficiency: blocks per action"
+    table = Table("metric", "value", "n", title=title, caption=caption)
+    for name, entry in {**summary, **summary.get("failures", {})}.items():
+        if isinstance(entry, dict) and "value" in entry:
+            band = Band(**entry) if entry["n"] else None
+            table.add_row(name, tables.shown(metric=name, band=band), str(entry["n"]))
+    console = Console(highlight=False)
+    console.print(table)
+    for name in ("outcomes", "counts"):
+        console.print(f"{name}:", ", ".join(f"{key} {n}" for key, n in summary[name].items()))

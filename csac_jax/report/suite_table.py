@@ -1,0 +1,37 @@
+"""A table of evaluations, suite by suite."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from csac_jax.evaluation.statistics import Band
+from csac_jax.report import tables
+
+METRICS = ("grasp_success", "completion", "declutter_rate", "action_efficiency")
+TITLES = ("grasp success", "completion", "objects taken", "objects per action")
+Row = tuple[str, ...]
+
+
+def rows(results: Iterable[dict[str, Any]]) -> list[Row]:
+    """Builds a row for each part of each result of `csac-jax eval`: suite, policy, episodes and
+    METRICS."""
+    table = []
+    for result in results:
+        suite = Path(result["suite"]).stem
+        for part, summary in result.get("parts", {suite: result}).items():
+            bands = [Band(**entry) if entry["n"] else None for entry in map(summary.get, METRICS)]
+            name = part if part == suite else f"{suite}, {part}"
+            table.append((name, result["policy"], str(result["episodes"]), *shown(bands)))
+    return table
+
+
+def shown(bands: Iterable[Band | None]) -> list[str]:
+    """Formats a band of each of METRICS; a dash where there is none."""
+    return [tables.shown(band, metric=name) for band, name in zip(bands, METRICS, strict=True)]
+
+
+def markdown(table: Iterable[Row]) -> str:
+    """Writes rows as a Markdown table."""
+    head = ("suite", "policy", "episodes", *TITLES)
+    lines = [f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *table)]
+    return "\n".join([*lines, "", "In brackets: 95 % intervals.", ""])
