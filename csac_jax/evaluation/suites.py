@@ -70,7 +70,7 @@ class Suite(NamedTuple):
     """The builder of a suite's parts, and the policies that it is for."""
 
     build: Build
-    episodes: int  # of every part in a full measurement
+    episodes: int = 250  # of every part in a full measurement
     target: bool = False  # it asks for a target: a learned policy must know that task
     objects: bool = False  # it needs a library of objects
 
