@@ -96,7 +96,7 @@ def test_tables_are_those_of_the_config():
     """Claim: every physics and arm that the config allows has its entry, and there are no
     others."""
     assert {*physics.PHYSICS, "auto"} == {*typing.get_args(PhysicsKind)}
-    assert {*kinematics.MAKERS, "hand"} == {*typing.get_args(RobotKind)}
+    assert {*kinematics.ARMS, "hand"} == {*typing.get_args(RobotKind)}
 
 
 @pytest.mark.parametrize("gripper", grippers.shipped())

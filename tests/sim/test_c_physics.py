@@ -11,7 +11,7 @@ import pytest
 
 from csac_jax.scene import layout, model
 from csac_jax.sim import c_physics, primitives
-from csac_jax.sim.c_physics import CPhysics, Simulator, Trajectory
+from csac_jax.sim.c_physics import CPhysics, CSimulator, Trajectory
 from csac_jax.sim.primitives import JointTrajectory
 from tests.scene import placed
 from tests.sim import conftest, slow_loop
@@ -202,13 +202,13 @@ def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed
     scenes.append(dataclasses.replace(scenes[2], half_size=1.1 * np.asarray(scenes[2].half_size)))
     rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in scenes]
 
-    def after(simulator: Simulator, row: tuple) -> bytes:
+    def after(simulator: CSimulator, row: tuple) -> bytes:
         c_physics._rollout(c_world, simulator, *row)
         return placed.model_bytes(simulator.model)
 
-    wanted = [after(Simulator(c_world), row) for row in rows]
+    wanted = [after(CSimulator(c_world), row) for row in rows]
     assert len(set(wanted)) == len(rows)
-    used = Simulator(c_world)
+    used = CSimulator(c_world)
     for i in (0, 1, 2, 3, 2, 1, 3, 0, 2, 0):
         assert after(used, rows[i]) == wanted[i]
 

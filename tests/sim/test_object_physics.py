@@ -113,13 +113,13 @@ def test_a_scene_moves_the_same_after_any_other(env: Env):
         height, grasps
     )
     joints = jax.vmap(lambda one: primitives.joint_trajectory(CONFIG.sim, one))(plans)
-    world, used = env.physics.world, c_physics.Simulator(env.physics.world)
+    world, used = env.physics.world, c_physics.CSimulator(env.physics.world)
     fields = jax.vmap(lambda one: model.scene_fields(world, one))(env.scenes)
     batch = jax.device_get((env.scenes, fields, joints))
     for i in range(len(height)):
         row = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
         again = c_physics._rollout(world, used, *row)
-        fresh = c_physics._rollout(world, c_physics.Simulator(world), *row)
+        fresh = c_physics._rollout(world, c_physics.CSimulator(world), *row)
         np.testing.assert_array_equal(again.qpos, fresh.qpos)
 
 
