@@ -261,8 +261,8 @@ def fields(world: World) -> dict[str, Any]:
 
 
 def steps(cfg: SimConfig) -> int:
-    """Returns the physics steps of a primitive: of at most STEP, a multiple of a graph's, but no more
-    than the config's."""
+    """Returns the number of physics steps of a primitive: each at most STEP, a multiple of those in
+    a graph, but no more than the config's."""
     least = math.ceil(cfg.substeps * cfg.timestep / STEP - 1e-6)
     return min(cfg.substeps, -(-least // warp_graph.LONGEST) * warp_graph.LONGEST)
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax.scene import geoms, solids
 from csac_jax.scene.solids import GeomGroup, Kind, Solids
-from csac_jax.vision import raycast, shapes
+from csac_jax.vision import ray_shapes, raycast
 from tests.vision import mujoco_rays
 
 _cast = jax.jit(jax.vmap(raycast.cast_solids, in_axes=(None, None, 0)))
@@ -177,7 +177,7 @@ def test_seen_from_outside_only(kind):
 
 def test_there_is_a_function_for_every_kind():
     """Claim: the table of ray functions is total."""
-    assert set(shapes.RAY) == set(Kind)
+    assert set(ray_shapes.RAY) == set(Kind)
 
 
 def test_unknown_type_is_refused_by_name():
