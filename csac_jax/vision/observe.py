@@ -58,7 +58,7 @@ def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observat
     believed = camera.make(cfg.camera)
     if key is not None:
         return oblique_noisy(key, cfg, shapes, tables, believed)
-    return from_pixels(cfg.heightmap, believed, seen(cfg, believed, shapes), tables)
+    return from_pixels(cfg.heightmap, believed, cast_pixels(cfg, believed, shapes), tables)
 
 
 def scene_shapes(cfg: SceneConfig, scene: Scene) -> Shapes:
@@ -172,7 +172,7 @@ def _objects_below(
     return _windows(objects, hits, corner, (side, side), ray, first)
 
 
-def seen(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
+def cast_pixels(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
     """Casts the pixels [h, w] of a camera that stands at `cfg.camera`, or nearly."""
     hits, objects = camera.cast_rays(eye, raycast.cast_polytopes, shapes.blocks), shapes.objects
     if objects is None:
@@ -234,7 +234,7 @@ def oblique_noisy(
     pixels are left out, as in `deploy`."""
     key_pose, key_depth, key_colour = jax.random.split(key, 3)
     real = sensor.pose(key_pose, cfg.sensor, believed)
-    hits = seen(cfg, real, shapes)
+    hits = cast_pixels(cfg, real, shapes)
     exact = jnp.where(hits.valid, hits.distance, 0.0)
     lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
     depth, valid = sensor.depths(key_depth, cfg.sensor, cfg.camera, exact, hits.valid, lit)

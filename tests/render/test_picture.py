@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax.render import gl, picture
-from csac_jax.render.picture import View
+from csac_jax.render.picture import Viewpoint
 
 BALL = """
 <mujoco>
@@ -23,7 +23,7 @@ BALL = """
   </worldbody>
 </mujoco>
 """
-VIEW = View(position=(-1.0, 0.0, 0.8), look_at=(0.0, 0.0, 0.1), size=(96, 64))
+VIEW = Viewpoint(position=(-1.0, 0.0, 0.8), look_at=(0.0, 0.0, 0.1), size=(96, 64))
 _BOTH = f"""
 import csac_jax, json, sys
 from csac_jax.render import gl
@@ -37,7 +37,7 @@ def pictures(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    view = picture.View({VIEW.position}, {VIEW.look_at}, {VIEW.size})
+    view = picture.Viewpoint({VIEW.position}, {VIEW.look_at}, {VIEW.size})
     return [draw(model, view)(data) for draw in ways]
 skies = pictures("<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>")
 shown = pictures('''{BALL}''')

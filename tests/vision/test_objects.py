@@ -103,7 +103,7 @@ def test_camera_at_the_side_agrees_with_mujoco(world: model.World):
     @jax.jit
     def depths(scene: Scene) -> jax.Array:
         shapes = observe.scene_shapes(CONFIG.scene, scene)
-        return observe.seen(CONFIG, camera.make(CONFIG.camera), shapes).distance
+        return observe.cast_pixels(CONFIG, camera.make(CONFIG.camera), shapes).distance
 
     rays = np.asarray(camera.directions(camera.make(CONFIG.camera)), np.float64).reshape(-1, 3)
     origin = np.tile(CONFIG.camera.position, (len(rays), 1))
