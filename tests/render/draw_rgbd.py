@@ -1,5 +1,4 @@
-"""A script: an image of two blocks by MuJoCo's renderer, in a process of its own since OpenGL is
-chosen before MuJoCo is imported."""
+"""A script: an image of two blocks by MuJoCo's renderer; OpenGL is chosen before the import."""
 
 import sys
 from typing import Any

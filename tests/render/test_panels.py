@@ -95,8 +95,7 @@ def test_push_is_an_arrow_over_its_way():
 
 
 def test_learned_policy_shows_its_maps():
-    """Claim: of a learned policy, Q of pushes and of grasps is shown on one scale, cells with
-    nothing to act on apart, and the candidates of both in the height map."""
+    """Claim: Q maps share one scale, invalid cells stand out, candidates are in the height map."""
     fig = panels.figure(CFG, _step(Primitive.GRASP, (0.0, 0.0, 0.0), learned=True), HEIGHT)
     best = _places(fig, "Push value, best +2.00", HIGHEST)
     np.testing.assert_allclose(best.mean(axis=0), [-0.1, 0.1], atol=0.5 * CFG.heightmap.cell)
@@ -119,8 +118,7 @@ def test_action_is_drawn_in_its_own_q_map(chosen: Primitive):
 @pytest.mark.parametrize("learned", [True, False])
 @pytest.mark.parametrize("size", [(120, 160), (98, 130), (16, 16)])
 def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tuple[int, int]):
-    """Claim: sides are even, as videos need; the scene is untouched, and the text stands below
-    everything."""
+    """Claim: sides are even; the scene is untouched, the text stands below."""
     scene = np.full((*size, 3), 7, np.uint8)
     step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned)
     complete = panels.frame(CFG, step, size[0])
@@ -143,7 +141,7 @@ def test_long_text_stays_in_sight():
 
 
 def _runs(rows: np.ndarray) -> int:
-    """How many separate runs of True there are."""
+    """Number of separate runs of True."""
     return int(np.sum(np.diff(rows.astype(int), prepend=0) == 1))
 
 

@@ -46,8 +46,7 @@ print(json.dumps([[image.tolist() for image in shown], [image[0, 0].tolist() for
 
 
 def test_rays_show_what_stands_where():
-    """Claim: with no OpenGL, what is left of the view's middle is drawn left, what is farther up
-    higher."""
+    """Claim: without OpenGL, left is drawn left, and farther up higher."""
     model = mujoco.MjModel.from_xml_string(BALL)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -67,8 +66,7 @@ def _where(drawn: np.ndarray, channel: int) -> np.ndarray:
 
 
 def test_both_ways_of_drawing_agree():
-    """Claim: MuJoCo's renderer and our rays show the same things in the same places, to the
-    pixel, under a white sky."""
+    """Claim: MuJoCo's renderer and our rays show the same to the pixel, under a white sky."""
     done = subprocess.run(
         [sys.executable, "-c", _BOTH], capture_output=True, text=True, timeout=300
     )

@@ -82,8 +82,7 @@ TWO_OBJECTS = presets.get("quick").change(
 
 
 def thrown_objects(cfg: Config) -> tuple[Scene, JointTrajectory]:
-    """Four scenes of two objects each, all different, and a hand at rest: in two, one falls on the
-    other in the air; in two, both turn and land."""
+    """Four scenes of two objects: in two, one falls on the other; in two, both turn and land."""
     rng, known = np.random.default_rng(0), stock.table(cfg.scene)
     order = np.argsort(known.present.sum(axis=1))
     scenes = []
