@@ -1,4 +1,4 @@
-"""Names and numbers that several stages share; imports nothing, so that reports need no JAX."""
+"""Names and numbers that several stages share; imports no JAX, which reports do without."""
 
 import enum
 
@@ -22,7 +22,7 @@ class Outcome(enum.IntEnum):
 
 OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome)
 CHANGE_AREA = 12.0  # cm^2 of the height map that must move for an action to count as a change (VPG)
-GRASP_WINDOW = 200  # grasps that the running success is taken over (VPG; CSAC gives none)
+GRASP_WINDOW = 200  # grasps of the running success rate (VPG; CSAC gives none)
 RENAMED_SUITES = {"own": "in_distribution"}  # old name, in records, -> the name now
 EVAL_SUITE = "in_distribution"  # of evaluations during training
 EVAL_EPISODES = 20  # of each part of that suite (ours: an interval of some 20 points)

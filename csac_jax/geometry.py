@@ -14,7 +14,7 @@ FULL_TURN = 2.0 * np.pi  # rad
 
 
 def quat_to_matrix(quat: jax.Array) -> jax.Array:
-    """Rotation matrix [3, 3], body to world, of the unit quaternion `quat` [4]."""
+    """Converts the unit quaternion `quat` [4] to a rotation matrix [3, 3], body to world."""
     w, x, y, z = quat
     return jnp.stack([
         jnp.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)]),
@@ -24,7 +24,7 @@ def quat_to_matrix(quat: jax.Array) -> jax.Array:
 
 
 def quat_multiply(left: jax.Array, right: jax.Array) -> jax.Array:
-    """Hamilton product [4] of two quaternions [4]: the rotation `right` first, then `left`."""
+    """Multiplies two quaternions [4] (Hamilton): the rotation `right` first, then `left`."""
     w0, x0, y0, z0 = left
     w1, x1, y1, z1 = right
     return jnp.stack([
@@ -36,20 +36,20 @@ def quat_multiply(left: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def quat_from_yaw(yaw: jax.Array) -> jax.Array:
-    """Quaternion [4] of a rotation by `yaw` [] rad about z, counter-clockwise from above."""
+    """Returns the quaternion [4] of a rotation by `yaw` [] rad about z, counter-clockwise."""
     zero = jnp.zeros_like(yaw)
     return jnp.stack([jnp.cos(0.5 * yaw), zero, zero, jnp.sin(0.5 * yaw)])
 
 
 def rotate2d(yaw: jax.Array, xy: jax.Array) -> jax.Array:
-    """Points `xy` [..., 2] m rotated by `yaw` [] rad about the origin, counter-clockwise."""
+    """Rotates points `xy` [..., 2] m by `yaw` [] rad about the origin, counter-clockwise."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = xy[..., 0], xy[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def wrap_angle(angle: jax.Array) -> jax.Array:
-    """The same direction in [0, 2 pi) rad, any shape.
+    """Wraps angles of any shape to [0, 2 pi) rad.
 
     In float32 the remainder of a tiny negative angle is 2 pi itself, and that of a denormal stays
     negative. Both become 0.
@@ -59,6 +59,6 @@ def wrap_angle(angle: jax.Array) -> jax.Array:
 
 
 def cell_centres(cfg: HeightmapConfig) -> jax.Array:
-    """Centre xy of every cell, [H, W, 2] m: x = (col + 0.5) cell - extent / 2, y by the row."""
+    """Returns the centre xy of every cell, [H, W, 2] m: x = (col + 0.5) cell - extent / 2."""
     places = (jnp.arange(cfg.size, dtype=jnp.float32) - 0.5 * (cfg.size - 1)) * cfg.cell
     return jnp.stack(jnp.meshgrid(places, places), axis=-1)

@@ -1,11 +1,11 @@
-"""Gymnasium's way to the environment; needs `pip install 'csac-jax[gymnasium]'`.
+"""Gymnasium's interface to the environment; needs `pip install 'csac-jax[gymnasium]'`.
 
     import csac_jax.gym
     env = gymnasium.make("csac_jax/Clutter-v0", config="quick", actions="dense")
     envs = gymnasium.make_vec("csac_jax/Clutter-v0", num_envs=64)  # one compiled call a step
 
 Observations are dicts: `colour` [H, W, 3] uint8, `height` [H, W] float32 m, and in the target task
-`target` [H, W] uint8, 1 where the block to get is seen. The reward is 1 for a block to get.
+`target` [H, W] uint8, 1 where the wanted block is seen. The reward is 1 for a wanted block.
 """
 
 import dataclasses
@@ -40,15 +40,15 @@ _INFO = ("cleared", "blocks_lost", "physics_diverged")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interface:
-    """An environment's spaces, and the way into and out of them."""
+    """An environment's spaces, and conversions to and from them."""
 
     env: Env
     actions: ActionKind
 
     @classmethod
     def make(cls, config: str | Config, actions: ActionKind, scenes: int) -> "Interface":
-        """Of a config or a preset's name, for so many scenes. Raises ValueError for unknown names
-        and for no scene, and what `make_env` raises."""
+        """Makes the interface of a config or a preset's name, for so many scenes. Raises ValueError
+        for unknown names and for no scene, and as `make_env` does."""
         if scenes < 1:
             raise ValueError(f"num_envs: must be at least 1, not {scenes}")
         if actions not in ("continuous", "dense"):
@@ -59,7 +59,7 @@ class Interface:
 
     @property
     def observation_space(self) -> spaces.Dict:
-        """The space of one scene's observations."""
+        """Returns the space of one scene's observations."""
         spec = self.env.observation_spec
         parts: dict[str, spaces.Space[Any]] = {
             "colour": spaces.Box(0, 255, spec.colour.shape, np.uint8),
@@ -73,7 +73,7 @@ class Interface:
 
     @property
     def action_space(self) -> spaces.Space[Any]:
-        """The space of one scene's actions, see ActionKind."""
+        """Returns the space of one scene's actions, see ActionKind."""
         if self.actions == "continuous":
             return spaces.Box(-1.0, 1.0, (4,), np.float32)
         return spaces.Discrete(int(np.prod(self._cells)))
@@ -83,19 +83,19 @@ class Interface:
         size = self.env.cfg.heightmap.size
         return len(Primitive), self.env.cfg.net.rotations, size, size
 
-    def action(self, given: jax.Array) -> Action:
-        """The environment's action for one of the action space."""
+    def action(self, action: jax.Array) -> Action:
+        """Converts an action of the action space to the environment's."""
         if self.actions == "continuous":
             half = 0.5 * self.env.cfg.heightmap.extent
-            kind = jnp.where(given[0] < 0.0, Primitive.GRASP, Primitive.PUSH)
-            return Action(kind.astype(jnp.int32), given[1:] * jnp.array([half, half, np.pi]))
-        kind, yaw, row, column = jnp.unravel_index(given.astype(jnp.int32), self._cells)
+            kind = jnp.where(action[0] < 0.0, Primitive.GRASP, Primitive.PUSH)
+            return Action(kind.astype(jnp.int32), action[1:] * jnp.array([half, half, np.pi]))
+        kind, yaw, row, column = jnp.unravel_index(action.astype(jnp.int32), self._cells)
         xy = geometry.cell_centres(self.env.cfg.heightmap)[row, column]
         turn = 2.0 * np.pi / self._cells[1] * yaw.astype(jnp.float32)
         return Action(kind.astype(jnp.int32), jnp.append(xy, turn))
 
-    def seen(self, obs: Observation) -> dict[str, np.ndarray]:
-        """An observation, leaves [...] or [E, ...], in the observation space."""
+    def observation(self, obs: Observation) -> dict[str, np.ndarray]:
+        """Converts an observation, leaves [...] or [E, ...], to the observation space."""
         parts = {
             "colour": np.round(255.0 * np.asarray(obs.colour)).astype(np.uint8),
             "height": np.array(obs.height),
@@ -106,7 +106,7 @@ class Interface:
 
 
 class ClutterEnv(gymnasium.Env[Any, Any]):
-    """One scene. `info` says what the action did: `outcome` of a grasp, `cleared`, `blocks_lost`,
+    """One scene. `info` has the action's effects: `outcome` of a grasp, `cleared`, `blocks_lost`,
     `physics_diverged`."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012  (Gymnasium's way)
@@ -118,51 +118,51 @@ class ClutterEnv(gymnasium.Env[Any, Any]):
         render_mode: str | None = None,
     ) -> None:
         """Settles its scenes once; the first `reset` and `step` compile. See `Interface.make` for
-        the arguments and what is raised."""
+        arguments and errors."""
         self.interface = Interface.make(config, actions, 1)
         self.observation_space = self.interface.observation_space
         self.action_space = self.interface.action_space
         self.render_mode = render_mode
         env = self.interface.env
         self._reset = jax.jit(env.reset)
-        self._step = jax.jit(lambda state, given: env.step(state, self.interface.action(given)))
+        self._step = jax.jit(lambda state, action: env.step(state, self.interface.action(action)))
         self.state: State | None = None
         """The environment's state, ground truth too; None before the first reset."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The first observation of an episode, and nothing more; `options` has no entries."""
+        """Starts an episode; returns its first observation and an empty info."""
         super().reset(seed=seed)
         self.state = self._reset(_key(self.np_random))
-        return self.interface.seen(self.state.obs), {}
+        return self.interface.observation(self.state.obs), {}
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """As `Env.step`. Raises ResetNeeded before the first reset."""
+        """Steps the environment, see `Env.step`. Raises ResetNeeded before the first reset."""
         after = self.state = self._step(_ready(self.state), jnp.asarray(action))
         info = {name: np.asarray(getattr(after.info, name)).item() for name in _INFO}
         info["outcome"] = OUTCOMES[int(after.info.outcome)]
         ends = bool(after.terminated), bool(after.truncated)
-        return self.interface.seen(after.obs), float(after.reward), *ends, info
+        return self.interface.observation(after.obs), float(after.reward), *ends, info
 
     def render(self) -> np.ndarray | None:
-        """The scene from the side, [480, 640, 3] uint8, by our own rays; None without a mode.
-        Raises ResetNeeded before the first reset."""
+        """Renders the scene from the side, [480, 640, 3] uint8, by our own rays; None without a
+        mode. Raises ResetNeeded before the first reset."""
         if self.render_mode is None:
             return None
         return np.asarray(_picture(self.interface.env.cfg, _ready(self.state).scene))
 
 
 class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
-    """A batch of scenes, each replaced in the step in which it ends; `final_obs` has what it ended
-    with."""
+    """A batch of scenes, each replaced in the step in which it ends; `final_obs` has its last
+    observation."""
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  (Gymnasium's way)
 
     def __init__(
         self, num_envs: int = 1, config: str | Config = "quick", actions: ActionKind = "continuous"
     ) -> None:
-        """As of `ClutterEnv`, for `num_envs` scenes."""
+        """Makes `num_envs` scenes, see `ClutterEnv`."""
         self.num_envs = num_envs
         self.interface = Interface.make(config, actions, num_envs)
         self.single_observation_space = self.interface.observation_space
@@ -171,45 +171,45 @@ class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         auto = AutoResetEnv(self.interface.env)
 
-        def step(key: jax.Array, state: State, given: jax.Array) -> tuple[State, State]:
-            return auto.step(key, state, self.interface.action(given))
+        def step(key: jax.Array, state: State, action: jax.Array) -> tuple[State, State]:
+            return auto.step(key, state, self.interface.action(action))
 
         self._reset, self._step = jax.jit(jax.vmap(auto.reset)), jax.jit(jax.vmap(step))
         self.state: State | None = None
-        """The states that are acted in next, leaves [E, ...]; None before the first reset."""
+        """The states to act in next, leaves [E, ...]; None before the first reset."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The first observations of new episodes, and nothing more; `options` has no entries."""
+        """Starts episodes; returns their first observations and an empty info."""
         super().reset(seed=seed)
         self.state = self._reset(self._keys())
-        return self.interface.seen(self.state.obs), {}
+        return self.interface.observation(self.state.obs), {}
 
     def step(
         self, actions: Any
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One action in every scene. `info` is of these actions, also where an episode ended.
-        Raises ResetNeeded before the first reset."""
-        given = _ready(self.state), jnp.asarray(actions)
-        self.state, after = self._step(self._keys(), *given)
+        """Steps every scene. `info` is of these actions, also where an episode ended. Raises
+        ResetNeeded before the first reset."""
+        state = _ready(self.state)
+        self.state, after = self._step(self._keys(), state, jnp.asarray(actions))
         ends = np.array(after.terminated), np.array(after.truncated)
         info = _infos(after.info)
         done = ends[0] | ends[1]
         if done.any():
             info |= {"final_obs": self._final(after.obs, done), "_final_obs": done}
             info |= {"final_info": _infos(after.info), "_final_info": done}
-        seen = self.interface.seen(self.state.obs)
-        return seen, np.array(after.reward), *ends, info
+        obs = self.interface.observation(self.state.obs)
+        return obs, np.array(after.reward), *ends, info
 
     def _keys(self) -> jax.Array:
         return jax.random.split(_key(self.np_random), self.num_envs)
 
     def _final(self, obs: Observation, done: np.ndarray) -> np.ndarray:
-        """The observations that episodes ended with [E], None elsewhere."""
-        seen, final = self.interface.seen(obs), np.full(self.num_envs, None, object)
+        """Returns the last observations of episodes [E], None elsewhere."""
+        parts, final = self.interface.observation(obs), np.full(self.num_envs, None, object)
         for number in np.flatnonzero(done):
-            final[number] = {name: part[number] for name, part in seen.items()}
+            final[number] = {name: part[number] for name, part in parts.items()}
         return final
 
 
@@ -224,18 +224,18 @@ def _key(rng: np.random.Generator) -> jax.Array:
 
 
 def _infos(info: Info) -> dict[str, Any]:
-    """What actions did [E], in Gymnasium's form: `_name` is where `name` holds."""
-    found: dict[str, Any] = {name: np.array(getattr(info, name)) for name in _INFO}
-    found["outcome"] = np.array(OUTCOMES, object)[np.asarray(info.outcome)]
-    return found | {f"_{name}": np.ones(len(part), bool) for name, part in found.items()}
+    """Converts step infos [E] to Gymnasium's vector format: `_name` is True where `name` is set."""
+    infos: dict[str, Any] = {name: np.array(getattr(info, name)) for name in _INFO}
+    infos["outcome"] = np.array(OUTCOMES, object)[np.asarray(info.outcome)]
+    return infos | {f"_{name}": np.ones(len(part), bool) for name, part in infos.items()}
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _picture(cfg: Config, scene: Scene) -> jax.Array:
-    """The scene as PICTURE's camera sees it, [h, w, 3] uint8."""
+    """Draws the scene as PICTURE's camera sees it, [h, w, 3] uint8."""
     shapes = observe.scene_shapes(cfg.scene, scene)
     tables = observe.scene_tables(cfg.scene, scene, shapes)
-    hits = observe.seen(cfg.change(camera=PICTURE), camera.make(PICTURE), shapes)
+    hits = observe.cast_pixels(cfg.change(camera=PICTURE), camera.make(PICTURE), shapes)
     lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
     shown = jnp.where(hits.valid[..., None], lit, camera.SKY[None, None])
     return jnp.round(255.0 * shown).astype(jnp.uint8)

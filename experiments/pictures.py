@@ -17,7 +17,7 @@ from csac_jax.config import SceneConfig, SimConfig  # noqa: E402
 from csac_jax.env import Env  # noqa: E402
 from csac_jax.evaluation import policies, rollout, suites  # noqa: E402
 from csac_jax.render import episode, media, picture  # noqa: E402
-from csac_jax.render.picture import View  # noqa: E402
+from csac_jax.render.picture import Viewpoint  # noqa: E402
 from csac_jax.runtime import cache  # noqa: E402
 from csac_jax.scene import cases, model  # noqa: E402
 
@@ -58,7 +58,7 @@ def still(name: str) -> np.ndarray:
     return _smaller(draw(data))
 
 
-def close_view(positions: np.ndarray) -> View:
+def close_view(positions: np.ndarray) -> Viewpoint:
     """The view of blocks at `positions` [N, 3] m that they fill."""
     middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
     corners = np.stack(np.meshgrid(*(BLOCK,) * 3), axis=-1).reshape(-1, 3)
@@ -69,7 +69,7 @@ def close_view(positions: np.ndarray) -> View:
     sides = {tangent: np.cross(back, right), tangent * SIZE[0] / SIZE[1]: right}
     needed = [np.abs(offsets @ axis) / tangent + offsets @ back for tangent, axis in sides.items()]
     size = (FINER * SIZE[0], FINER * SIZE[1])
-    return View(tuple(middle + np.max(needed) * back), tuple(middle), size)
+    return Viewpoint(tuple(middle + np.max(needed) * back), tuple(middle), size)
 
 
 def _smaller(image: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ def moving(
 
 
 def _pictures(env: Env, steps: list[Any], every: int, hold: int) -> Iterator[Any]:
-    stage = episode.Stage(env.cfg, steps[0].before, MOVING, OPENGL, views=True)
+    stage = episode.EpisodeRenderer(env.cfg, steps[0].before, MOVING, OPENGL, views=True)
     for number, step in enumerate(steps, 1):
         frames = list(stage.motion(step, episode.line(number, step)))
         yield from ((frame, FRAME_MS) for frame in frames[: -episode.HOLD : every])

@@ -88,8 +88,7 @@ def _cube(x: float, y: float, target: int = layout.ANY) -> Scene:
 
 @pytest.mark.slow
 def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: `scene.arranged` of the scenes that resets draw from are packed arrangements, the
-    others are dropped."""
+    """Claim: `scene.arranged` of a pool's scenes are packed arrangements, the rest dropped."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     scene = dataclasses.replace(CONFIG.scene, slots=("box",) * 3, min_blocks=3, pool=8)
     dropped, mixed = (
@@ -105,8 +104,7 @@ def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_arrangement_without_blocks_for_it():
-    """Claim: `scene.arranged` with blocks that allow no arrangement is one line that names the
-    slots."""
+    """Claim: blocks that allow no arrangement are one line that names the slots."""
     two = SceneConfig(slots=("box", "prism"), min_blocks=2)
     with pytest.raises(SceneError, match=r"scene\.slots: too few for an arrangement"):
         arrange.arrangements(two, CONFIG.heightmap.extent, 0, 2)
@@ -114,8 +112,7 @@ def test_arrangement_without_blocks_for_it():
 
 @pytest.mark.slow
 def test_scenes_stay_inside_however_turned(lab: Lab):
-    """Claim: a scene that a turn would take out of the square is turned by quarters, any other by
-    any yaw."""
+    """Claim: a scene that would leave the square turns by quarters, others by any yaw."""
     for seed, (x, quarters) in enumerate(((0.21, True), (0.15, False))):
         scene, keys = _cube(x, x), jax.random.split(jax.random.key(seed), 64)
         places = jax.vmap(lab.env.randomise_pose, (0, None))(keys, scene).position[:, 0, :2]
@@ -176,8 +173,7 @@ def state_of(stepped: State) -> Callable[[str], State]:
 
 
 def test_last_block_terminates(state_of):
-    """Claim: taking the last block terminates the episode, is worth 1, and is no truncation even at
-    the cap."""
+    """Claim: taking the last block terminates, is worth 1, and does not truncate at the cap."""
     state = state_of("last chance")
     assert (state.terminated, state.truncated, state.done) == (True, False, True)
     assert (state.reward, state.info.cleared, state.info.blocks_lost) == (1.0, 1, 0)
@@ -187,16 +183,14 @@ def test_last_block_terminates(state_of):
 
 
 def test_target_ends_the_episode(state_of):
-    """Claim: in the target task the episode ends when the target is got, though another block is
-    left."""
+    """Claim: in the target task the episode ends with the target, though a block is left."""
     state = state_of("got")
     assert (state.terminated, state.reward, state.info.outcome) == (True, 1.0, Outcome.LIFTED)
     np.testing.assert_array_equal(state.scene.in_play, [False, True, False])
 
 
 def test_wrong_block_is_no_success(state_of):
-    """Claim: lifting another block than the target takes it away, counts as `touched` and is worth
-    nothing."""
+    """Claim: lifting another block takes it away, counts as `touched`, is worth nothing."""
     state = state_of("wrong")
     assert (state.done, state.reward, state.info.cleared, state.info.outcome) == (
         False,
@@ -204,13 +198,11 @@ def test_wrong_block_is_no_success(state_of):
         1,
         Outcome.TOUCHED,
     )
-    assert (
-        state.info.outcome_by_gap == Outcome.TOUCHED
-    )  # no disagreement: the camera sees which block is gone
+    # no disagreement: the camera sees which block is gone
+    assert state.info.outcome_by_gap == Outcome.TOUCHED
     assert state.obs.target.any()
-    np.testing.assert_array_equal(
-        state.obs.target, state.obs.height > 0.001
-    )  # the target alone is left
+    # the target alone is left
+    np.testing.assert_array_equal(state.obs.target, state.obs.height > 0.001)
 
 
 def test_auto_reset_replaces_finished_scenes_alone(lab: Lab, stepped: State):
@@ -251,8 +243,7 @@ def _action_of(state: State) -> Action:
 
 
 def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
-    """Claim: after a target was got the scene goes on with another target; after any other end
-    comes a fresh scene."""
+    """Claim: after a target comes another in the same scene, after other ends a fresh scene."""
     env = dataclasses.replace(
         lab.env, cfg=dataclasses.replace(CONFIG, task=TaskConfig(kind="target"))
     )
@@ -267,8 +258,7 @@ def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
 
 
 def test_failed_grasps_are_counted(state_of):
-    """Claim: a grasp that lifts nothing adds one to the failures in a row, one that lifts any block
-    ends the row, and pushes leave it."""
+    """Claim: failed grasps in a row are counted, a lift ends the row, pushes leave it."""
     after = {name: int(state_of(name).failed_grasps) for name in _CASES}
     pushes = dict.fromkeys(("on", "moved", "out"), FAILED)
     failures = dict.fromkeys(("cap", "steps_without_change"), FAILED + 1)
@@ -298,8 +288,7 @@ def test_action_cap_truncates(state_of):
 
 
 def test_no_change_cap_truncates(state_of):
-    """Claim: an episode is cut off after max_steps_without_change actions in a row without visible
-    change."""
+    """Claim: max_steps_without_change actions without visible change truncate."""
     state = state_of("steps_without_change")
     assert (state.terminated, state.truncated, state.actions, state.steps_without_change) == (
         False,
@@ -310,15 +299,13 @@ def test_no_change_cap_truncates(state_of):
 
 
 def test_episode_goes_on(state_of):
-    """Claim: below both caps the episode goes on, and an action without visible change is
-    counted."""
+    """Claim: below both caps the episode continues, and unchanged steps are counted."""
     state = state_of("on")
     assert (state.done, state.actions, state.steps_without_change) == (False, 1, 2)
 
 
 def test_visible_change_ends_the_count_without_change(state_of):
-    """Claim: an action that moves a block more than CHANGE_AREA resets the count of actions
-    without change."""
+    """Claim: an action that moves more than CHANGE_AREA resets the count."""
     state = state_of("moved")
     assert state.info.moved > CHANGE_AREA
     assert (state.done, state.steps_without_change, state.reward) == (False, 0, 0.0)
@@ -326,8 +313,7 @@ def test_visible_change_ends_the_count_without_change(state_of):
 
 
 def test_block_pushed_out_leaves(state_of):
-    """Claim: a block pushed out of the square counts as lost, not as cleared, and is out of
-    play and of sight."""
+    """Claim: a block pushed out counts as lost, not as cleared, and is out of sight."""
     state = state_of("out")
     assert (state.info.blocks_lost, state.info.cleared, state.reward) == (1, 0, 0.0)
     np.testing.assert_array_equal(state.scene.position, layout.parking(3))
@@ -336,8 +322,7 @@ def test_block_pushed_out_leaves(state_of):
 
 
 def test_oracle_clears_scenes(lab: Lab):
-    """Claim: grasp by grasp a settled scene empties, each lift is worth 1, and the last one
-    terminates the episode."""
+    """Claim: grasp by grasp a scene empties, each lift is worth 1, the last one terminates."""
     state = lab.reset(jax.random.split(jax.random.key(3), SCENES))
     blocks, taken = np.asarray(state.scene.in_play.sum(axis=1)), np.zeros(SCENES, int)
     cleared = np.zeros(SCENES, bool)
@@ -483,8 +468,7 @@ def _assert_replaced(diverged: State, before: Scene, where: str) -> None:
 
 
 def test_pose_that_is_no_number_fails_in_c(lab: Lab):
-    """Claim: an action that is no number is failed physics with C MuJoCo, too, which would go on:
-    the scene stays as it was, and the others are stepped."""
+    """Claim: NaN in an action is failed physics in C, too, in its scene alone."""
     cfg = CONFIG.change(sim={"physics": "c"})
     physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
     env = dataclasses.replace(lab.env, cfg=cfg, physics=physics)
@@ -500,8 +484,7 @@ def test_pose_that_is_no_number_fails_in_c(lab: Lab):
 
 
 def test_target_that_is_no_slot_counts_as_divergence(lab: Lab):
-    """Claim: a scene whose target is beyond the slots has diverged; it does not pass for a table
-    cleared of its target."""
+    """Claim: a target beyond the slots is failed physics, not a cleared table."""
     scene = _stack(*[_cube(0.0, 0.0)] * SCENES)
     wild = dataclasses.replace(
         scene, target=jnp.array([-1, 3, 1_000_000, -2, -(2**31), 0, -1, -1], jnp.int32)
@@ -515,8 +498,7 @@ def test_target_that_is_no_slot_counts_as_divergence(lab: Lab):
 
 
 def test_step_is_a_fixed_point_of_types(lab: Lab):
-    """Claim: what comes out of step has the shapes, dtypes and weak types of what went in: it can
-    be scanned."""
+    """Claim: step keeps shapes, dtypes and weak types: it can be scanned."""
     assert lab.into_step == lab.out_of_step
     assert not any(
         weak
@@ -552,9 +534,8 @@ def test_resets_differ(lab: Lab):
         np.arctan2(*(pool.position[i][pool.in_play[i]][0, :2] @ [[0, 1], [1, 0]])) for i in drawn
     ]
     turned = np.mod(np.array(yaws) - raw, 2 * np.pi)
-    assert (
-        np.histogram(turned, bins=4, range=(0, 2 * np.pi))[0].min() >= 4
-    )  # any yaw: 12 expected in each quarter
+    # any yaw: 12 expected in each quarter
+    assert np.histogram(turned, bins=4, range=(0, 2 * np.pi))[0].min() >= 4
 
 
 def test_same_key_same_scene(lab: Lab):

@@ -185,8 +185,7 @@ def test_other_physics_have_the_same_pads(physics: PhysicsKind):
 @pytest.mark.slow
 @pytest.mark.mjx
 def test_oracle_takes_what_fits(env: Env):
-    """Claim: the planner takes the high block of two where it is narrower than the opening by
-    OPENING_ROOM, else the low one, which still is."""
+    """Claim: the planner takes the high block if narrower than the opening, else the low one."""
     half = jnp.array([[0.026, 0.026, 0.06], [0.025, 0.025, 0.02], [0.02, 0.02, 0.02]])
     position = jnp.array([[-0.08, 0.0, 0.06], [0.08, 0.0, 0.02], [3.6, 0.0, 1.0]])
     scene = _scene().replace(

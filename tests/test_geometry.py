@@ -27,8 +27,7 @@ def test_quaternions_agree_with_scipy():
 
 
 def test_yaw_turns_counter_clockwise():
-    """Claim: a yaw is a turn about z, counter-clockwise from above, the same for quaternions and
-    for points."""
+    """Claim: a yaw turns counter-clockwise from above, quaternions and points alike."""
     for yaw in np.linspace(-7.0, 7.0, 15).astype(np.float32):
         reference = Rotation.from_euler("z", yaw).as_matrix()
         matrix = geometry.quat_to_matrix(geometry.quat_from_yaw(jnp.asarray(yaw)))
@@ -49,8 +48,7 @@ def test_wrapped_angle_is_in_range(angle):
 
 
 def test_cells_lie_where_the_convention_says():
-    """Claim: x = (col + 0.5) cell - extent / 2, rows run along y, and row 0, column 0 lie at the
-    lowest y and x."""
+    """Claim: x = (col + 0.5) cell - extent / 2, y by rows, from the lowest."""
     cfg = HeightmapConfig(224)
     centres = np.asarray(geometry.cell_centres(cfg))
     assert centres.shape == (224, 224, 2)

@@ -31,8 +31,7 @@ def _write(folder: Path, numbers: Any) -> str:
 
 
 def test_shipped_grippers_name_their_sources():
-    """Claim: three grippers come with the package, and a hand of many sizes; each says where its
-    lengths are from."""
+    """Claim: each shipped gripper says where its lengths are from."""
     assert grippers.shipped() == ["2f85", "franka_hand", "rg2", "varied"]
     for name in grippers.shipped():
         sources = _numbers(name)["sources"]
@@ -43,8 +42,7 @@ def test_shipped_grippers_name_their_sources():
 @pytest.mark.parametrize("xp", [np, jnp])
 @pytest.mark.parametrize("name", grippers.shipped())
 def test_gap_is_the_inverse_of_the_joints(name: str, xp: Any):
-    """Claim: joints and actuator go from one end to the other with the opening, and the gap is read
-    back from the first joint."""
+    """Claim: joints and actuator follow the opening; the first joint gives the gap back."""
     gripper = grippers.load(name)
     half = xp.linspace(*gripper.half, 50)
     for joint, (closed, opened) in zip(

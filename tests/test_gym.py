@@ -38,16 +38,14 @@ def batch():
 
 
 def test_gymnasiums_checker_is_silent(single):
-    """Claim: Gymnasium's checker finds nothing to say: spaces, types, seeds and resets are right,
-    and the same seed and actions give the same episode."""
+    """Claim: Gymnasium's checker warns of nothing: spaces, types, seeds, repeatability."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(single.unwrapped, skip_render_check=True)
 
 
 def test_dense_action_is_a_cell(single):
-    """Claim: a dense action is a primitive, a yaw and the middle of a cell of the height map, in
-    this order, the column fastest."""
+    """Claim: a dense action is primitive, yaw, row and column, the column fastest."""
     interface = csac_jax.gym.Interface(single.unwrapped.interface.env, "dense")
     size = CFG.heightmap.size
     shape = len(Primitive), CFG.net.rotations, size, size
@@ -74,8 +72,7 @@ def test_picture_shows_the_blocks(single):
 
 
 def test_continuous_action_fills_the_workspace(single):
-    """Claim: the sign of the first number is the primitive, the others are x, y and yaw in shares
-    of half the workspace and of pi."""
+    """Claim: signs are primitives; x, y, yaw are shares of half the workspace and pi."""
     half = 0.5 * CFG.heightmap.extent
     for given, kind in (((-0.1, 1.0, -0.5, 0.5), Primitive.GRASP), ((0, 0, 1, -1), Primitive.PUSH)):
         action = single.unwrapped.interface.action(jnp.asarray(given, jnp.float32))

@@ -69,18 +69,20 @@ def run(arguments: list[str]) -> int:
 
 def _decide(options: ActOptions, policy: Any, image: tuple[Any, Any, Any, Any]) -> int:
     from csac_jax.deploy import files, images, record
-    from csac_jax.render import decision, media
+    from csac_jax.render import decision_picture, media
 
     mask = None if options.mask is None else files.read_mask(options.mask)
     recorder = None if options.record is None else record.Recorder(options.record, options.policy)
     decisions = policy.decide(*image, mask, options.top)
     for number, one in enumerate(decisions, 1):
-        print(f"{number:2d} {decision.line(one)}")
+        print(f"{number:2d} {decision_picture.line(one)}")
     if not decisions:
         print("nothing to act on")
     if options.png is not None:
         view, maps = images.make(*image, target_mask=mask), policy.maps(*image, mask)
-        media.write_picture(options.png, decision.picture(policy.cfg, view, decisions, maps))
+        media.write_picture(
+            options.png, decision_picture.picture(policy.cfg, view, decisions, maps)
+        )
     result: dict[str, Any] = {"decisions": [one.to_dict() for one in decisions]}
     if recorder is not None:
         result["id"] = recorder.add((*image, mask), decisions)

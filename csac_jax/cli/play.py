@@ -60,7 +60,9 @@ def run(arguments: list[str]) -> int:
 
     print(episode.summary(env, steps))
     if drawn or options.viewer:
-        stage = episode.Stage(env.cfg, steps[0].before, options.size, opengl, options.views)
+        stage = episode.EpisodeRenderer(
+            env.cfg, steps[0].before, options.size, opengl, options.views
+        )
         episode.record(stage, steps, options.png, options.video)
     taken, lost = episode.totals(steps)
     result = {

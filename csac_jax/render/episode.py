@@ -1,4 +1,4 @@
-"""One episode to look at: a line per action, a picture, a video."""
+"""One episode as text, picture, video or in a viewer."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,14 +13,14 @@ from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, rollout
 from csac_jax.evaluation.rollout import StepRecord
 from csac_jax.render import media, panels, picture, viewer
-from csac_jax.render.picture import View
+from csac_jax.render.picture import Viewpoint
 from csac_jax.scene import blocks, layout, model
 from csac_jax.sim import c_physics
 
-VIEWS: dict[RobotKind, View] = {
-    "hand": View(position=(-0.22, -0.5, 0.46), look_at=(0.0, -0.01, 0.05)),
-    "ur5": View(position=(-0.85, -1.25, 0.85), look_at=(0.19, 0.0, 0.33)),
-    "ur5e": View(position=(-0.85, -1.25, 0.85), look_at=(0.19, 0.0, 0.33)),
+VIEWS: dict[RobotKind, Viewpoint] = {
+    "hand": Viewpoint(position=(-0.22, -0.5, 0.46), look_at=(0.0, -0.01, 0.05)),
+    "ur5": Viewpoint(position=(-0.85, -1.25, 0.85), look_at=(0.19, 0.0, 0.33)),
+    "ur5e": Viewpoint(position=(-0.85, -1.25, 0.85), look_at=(0.19, 0.0, 0.33)),
 }
 STOPPED = {
     "action_cap": "stopped at the action limit",
@@ -31,8 +31,8 @@ STOPPED = {
 HOLD = 20  # pictures of an action's end
 
 
-class Stage:
-    """The model of an episode's scene, coloured, and what draws it."""
+class EpisodeRenderer:
+    """Renderer of an episode's scene, in colour."""
 
     def __init__(
         self, cfg: Config, first: State, size: tuple[int, int], opengl: str | None, views: bool
@@ -45,12 +45,14 @@ class Stage:
         self._draw = picture.renderer(self._model, VIEWS[cfg.sim.robot]._replace(size=size), opengl)
 
     def still(self, step: StepRecord, text: str) -> np.ndarray:
-        """The scene before an action, the robot where that action starts: [H, W, 3] uint8."""
+        """Draws the scene before an action, the robot at its start: [H, W, 3] uint8."""
         return self._frame(step)(self._start(step), text)
 
     def motion(self, step: StepRecord, text: str) -> Iterator[np.ndarray]:
-        """The action as it runs in C MuJoCo; a still picture where the robot cannot do it. With
-        views, `text` up to its colon is below, and all of it in HOLD more pictures of the end."""
+        """Draws the action as it runs in C MuJoCo; a still picture if the robot cannot do it.
+
+        With views, `text` up to its colon is below, and all of it in HOLD more pictures of the end.
+        """
         image, frame, action = self._start(step), self._frame(step), text.split(":")[0]
         yield frame(image, action)
         for pose in self.poses(step):
@@ -59,18 +61,18 @@ class Stage:
         yield from [frame(image, text)] * (HOLD if self._views else 0)
 
     def poses(self, step: StepRecord) -> np.ndarray:
-        """The model's qpos [T, ...] while an action runs in C MuJoCo, a row per picture."""
+        """Simulates an action in C MuJoCo; returns qpos [T, ...], a row per picture."""
         recorded = c_physics.trajectory(self._world, self._fields, step.before.scene, step.joints)
         every = max(round(1.0 / (media.FRAMES_PER_SECOND * self._cfg.sim.timestep)), 1)
         return recorded.qpos[::every]
 
-    def show(self, steps: list[StepRecord], say: Callable[[str], None], again: bool = True) -> None:
+    def show(self, steps: list[StepRecord], log: Callable[[str], None], again: bool = True) -> None:
         """Shows the steps in a viewer, see `viewer.play`."""
         texts = [line(number, step) for number, step in enumerate(steps, 1)]
         pictured = [
             viewer.Pictured(text, self.poses(step)) for text, step in zip(texts, steps, strict=True)
         ]
-        viewer.play(self._model, pictured, say, again)
+        viewer.play(self._model, pictured, log, again)
 
     def _start(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos.copy()
@@ -91,29 +93,29 @@ class Stage:
 
 
 def line(number: int, step: StepRecord) -> str:
-    """What an action did, in words."""
+    """Describes an action and its effect."""
     scene, after, info = step.before.scene, step.after, step.after.info
     x, y, yaw = step.action.pose
     where = f"at x {1e3 * x:+.0f} y {1e3 * y:+.0f} mm, yaw {np.degrees(yaw):.0f} deg"
     if step.action.primitive == Primitive.PUSH:
-        done = f"push  {where}: moved {info.moved:.0f} cm2"
+        text = f"push  {where}: moved {info.moved:.0f} cm2"
     else:
-        done = f"grasp {where}: {Outcome(int(info.outcome)).name.lower()}"
+        text = f"grasp {where}: {Outcome(int(info.outcome)).name.lower()}"
     if not step.joints.reachable:
-        done += ", out of the robot's reach"
+        text += ", out of the robot's reach"
     if info.cleared:
         gone = scene.colour[scene.in_play & ~after.scene.in_play]
-        done += f" ({', '.join(blocks.COLOUR_NAMES[colour] for colour in gone)})"
+        text += f" ({', '.join(blocks.COLOUR_NAMES[colour] for colour in gone)})"
     if info.blocks_lost:
-        done += f", {_blocks(int(info.blocks_lost))} left the workspace"
+        text += f", {_blocks(int(info.blocks_lost))} left the workspace"
     if info.physics_diverged:
-        done += ", physics diverged"
+        text += ", physics diverged"
     left = _blocks(int(after.scene.in_play.sum()))
-    return f"{number:3d} {done}; reward {float(step.reward):+.2f}; {left} left"
+    return f"{number:3d} {text}; reward {float(step.reward):+.2f}; {left} left"
 
 
 def summary(env: Env, steps: list[StepRecord]) -> str:
-    """How the episode ended, and what became of the blocks."""
+    """Describes how the episode ended, and what became of the blocks."""
     last = steps[-1].after
     if not last.terminated:
         ending = STOPPED[metrics.ENDINGS[rollout.endings(env, last)]]
@@ -128,14 +130,14 @@ def summary(env: Env, steps: list[StepRecord]) -> str:
 
 
 def completed(steps: list[StepRecord]) -> bool:
-    """Whether the hand took what the task asks for."""
+    """Returns True if the hand took all blocks that the task asks for."""
     last, (_, lost) = steps[-1].after, totals(steps)
     got = last.reward > 0 if last.scene.target != layout.ANY else lost == 0
     return bool(last.terminated and got)
 
 
 def totals(steps: list[StepRecord]) -> tuple[int, int]:
-    """Blocks taken from the table, and blocks that left the workspace."""
+    """Counts blocks taken from the table, and blocks that left the workspace."""
     infos = [step.after.info for step in steps]
     return sum(int(info.cleared) for info in infos), sum(int(info.blocks_lost) for info in infos)
 
@@ -144,11 +146,13 @@ def _blocks(count: int) -> str:
     return f"{count} block{'s' if count != 1 else ''}"
 
 
-def record(stage: Stage, steps: list[StepRecord], png: Path | None, video: Path | None) -> None:
-    """Writes the picture of the first step, and the video of them all."""
+def record(
+    renderer: EpisodeRenderer, steps: list[StepRecord], png: Path | None, video: Path | None
+) -> None:
+    """Writes the picture of the first step, and the video of all steps."""
     lines = [line(number, step) for number, step in enumerate(steps, 1)]
     if png is not None:
-        media.write_picture(png, stage.still(steps[0], lines[0]))
+        media.write_picture(png, renderer.still(steps[0], lines[0]))
     if video is not None:
-        motions = map(stage.motion, steps, lines)
+        motions = map(renderer.motion, steps, lines)
         media.write_video(video, (image for motion in motions for image in motion))

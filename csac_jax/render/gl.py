@@ -1,4 +1,4 @@
-"""Finds an OpenGL backend that MuJoCo can draw with here; MuJoCo reads the choice on import."""
+"""An OpenGL backend that MuJoCo can draw with on this machine; MuJoCo reads it on import."""
 
 import contextlib
 import os
@@ -18,14 +18,14 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 
 
 def has_display() -> bool:
-    """Whether a window can open here."""
+    """Returns True if a window can open here."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def choose() -> str | None:
-    """Sets MUJOCO_GL, unless the user has, to a backend that draws; returns it, None if none."""
-    if given := os.environ.get(VARIABLE, "").lower():
-        return None if given in OFF else given
+    """Sets MUJOCO_GL, unless it is set, to a backend that draws; returns it, or None."""
+    if backend := os.environ.get(VARIABLE, "").lower():
+        return None if backend in OFF else backend
     for backend in BACKENDS:
         if _draws(backend):
             os.environ[VARIABLE] = backend

@@ -15,13 +15,13 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".gif")
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
-    """Raises ValueError for a suffix that is none of these."""
+    """Raises ValueError for any other suffix."""
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: its name must end in one of: {', '.join(suffixes)}")
 
 
 def needs_ffmpeg(path: Path) -> bool:
-    """Whether a video of this suffix is written by ffmpeg."""
+    """Returns True for a video that ffmpeg writes."""
     return path.suffix.lower() in FILMS
 
 

@@ -1,4 +1,4 @@
-"""Panels right of a scene's picture: what the policy saw, what its search tried, what it chose."""
+"""Panels right of a scene's picture: observation, candidates of the search, chosen action."""
 
 import functools
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.evaluation.rollout import StepRecord
-from csac_jax.render import maps
+from csac_jax.render import heatmaps
 
 CANDIDATES = {Primitive.PUSH: "#0072B2", Primitive.GRASP: "#CC79A7"}  # palette of Okabe and Ito
 
@@ -24,8 +24,8 @@ Frame = Callable[[np.ndarray, str], np.ndarray]
 
 
 def frame(cfg: Config, step: StepRecord, height: int) -> Frame:
-    """Draws an action's panels once, `height` px; the result adds them to each of its pictures."""
-    panels = maps.pixels(figure(cfg, step, height))
+    """Draws an action's panels once, `height` px high; returns a function that adds them."""
+    panels = heatmaps.pixels(figure(cfg, step, height))
 
     def complete(scene: np.ndarray, text: str) -> np.ndarray:
         above = np.concatenate([scene, panels], axis=1)
@@ -36,41 +36,41 @@ def frame(cfg: Config, step: StepRecord, height: int) -> Frame:
 
 @functools.lru_cache(maxsize=2)
 def text_line(text: str, width: int, scene_height: int) -> np.ndarray:
-    """The text in black on white [h, width, 3] uint8; a long text takes two lines."""
-    fig = maps.figure(width, 0.075 * scene_height, scene_height)
+    """Draws text in black on white [h, width, 3] uint8; a long text takes two lines."""
+    fig = heatmaps.figure(width, 0.075 * scene_height, scene_height)
     fig.text(0.012, 0.5, text.strip(), fontsize=12.0, va="center", wrap=True)
-    return maps.pixels(fig)
+    return heatmaps.pixels(fig)
 
 
 def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
-    """An action's Q maps, height map and legend; of a policy without Q the height map alone."""
+    """Draws Q maps, height map and legend of an action; without Q the height map alone."""
     if step.debug is None:
-        fig = maps.figure(0.875 * height, height, height)
+        fig = heatmaps.figure(0.875 * height, height, height)
         _draw_height_map(cfg, fig.subplots(gridspec_kw=OTHERS), step)
         return fig
-    fig = maps.figure(1.1 * height, height, height)
+    fig = heatmaps.figure(1.1 * height, height, height)
     (push, grasp), (heights, legend) = fig.subplots(
         2, 2, sharex=True, sharey=True, gridspec_kw=LEARNED
     )
     _draw_q_maps(cfg, (push, grasp), step)
     _draw_height_map(cfg, heights, step)
     handles, _ = heights.get_legend_handles_labels()
-    handles.append(Patch(color=maps.INVALID, label="nothing to act on"))
+    handles.append(Patch(color=heatmaps.INVALID, label="nothing to act on"))
     legend.legend(handles=handles, loc="center left", bbox_to_anchor=(0.3, 0.5), frameon=False)
     legend.set_axis_off()
     return fig
 
 
 def _draw_q_maps(cfg: Config, axes: tuple[Axes, Axes], step: StepRecord) -> None:
-    """Q of both primitives, with the action in its own."""
+    """Draws Q of both primitives, with the action in that of its primitive."""
     assert step.debug is not None
-    maps.draw_q_maps(cfg, axes, step.debug.q)
+    heatmaps.draw_q_maps(cfg, axes, step.debug.q)
     _draw_action(cfg, axes[int(step.action.primitive)], step)
 
 
 def _draw_height_map(cfg: Config, axes: Axes, step: StepRecord) -> None:
-    """The height map with the search's candidates and the chosen action."""
-    maps.draw_heights(cfg, axes, step.before.obs.height)
+    """Draws the height map with the search's candidates and the chosen action."""
+    heatmaps.draw_heights(cfg, axes, step.before.obs.height)
     if step.debug is not None:
         style: dict[str, Any] = {"edgecolors": "white", "linewidths": 0.4, "zorder": 3}
         for primitive, colour in CANDIDATES.items():
@@ -80,4 +80,4 @@ def _draw_height_map(cfg: Config, axes: Axes, step: StepRecord) -> None:
 
 
 def _draw_action(cfg: Config, axes: Axes, step: StepRecord) -> None:
-    maps.draw_action(cfg, axes, int(step.action.primitive), step.action.pose)
+    heatmaps.draw_action(cfg, axes, int(step.action.primitive), step.action.pose)

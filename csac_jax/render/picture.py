@@ -1,4 +1,7 @@
-"""Pictures of a MuJoCo model: by MuJoCo's renderer with OpenGL, by our rays without."""
+"""Pictures of a MuJoCo model: by MuJoCo's renderer with OpenGL, by our rays without.
+
+Call `gl.choose` before MuJoCo is imported.
+"""
 
 import contextlib
 from collections.abc import Callable
@@ -11,19 +14,24 @@ import numpy as np
 from csac_jax.config import CameraConfig
 from csac_jax.scene import blocks, geoms, solids
 from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import BlockFields, World, with_blocks
+from csac_jax.scene.model import BlockFields, World, scene_fields, with_blocks
 from csac_jax.vision import camera
+from csac_jax.vision.camera import Camera
 
 FLOOR = (0.85, 0.86, 0.88, 1.0)
 SKY = np.ones(4, np.float32)
 FOVY = 45.0  # vertical field of view, degrees
 LAMP = np.array([-0.7, -0.5, 2.2])  # place of the light, m: shadows fall away from the viewer
 
+SUN = np.array([-0.3, 0.5, -0.8])  # direction of the light of RGBD images, unlike `camera.LIGHT`
+_NEAR, _FAR = 0.05, 20.0  # m
+_SHOWN, _HIDDEN = 0, 5  # geom groups
+
 Draw = Callable[[mujoco.MjData], np.ndarray]  # a state -> its picture [H, W, 3] uint8
 
 
-class View(NamedTuple):
-    """Where a picture is taken from."""
+class Viewpoint(NamedTuple):
+    """Place, direction and size of a picture."""
 
     position: tuple[float, float, float]  # m
     look_at: tuple[float, float, float]  # m
@@ -31,18 +39,18 @@ class View(NamedTuple):
 
 
 def coloured(world: World, fields: BlockFields, scene: Scene) -> mujoco.MjModel:
-    """The world's model with the blocks of a scene, of these fields, in their colours."""
+    """Returns the world's model with the blocks of a scene, of these fields, in their colours."""
     model = with_blocks(world, fields)
     model.geom_rgba[world.block_geoms, :3] = blocks.COLOURS[scene.colour[world.parts.slot]]
     if world.objects is not None:
-        own, number = world.objects, scene.numbers[world.objects.slots]
-        model.geom_rgba[own.geoms, :3] = blocks.COLOURS[scene.colour[own.slots]][:, None]
-        model.geom_rgba[own.geoms, 3] = own.tables.present[number]  # the others are not drawn
+        objects, number = world.objects, scene.numbers[world.objects.slots]
+        model.geom_rgba[objects.geoms, :3] = blocks.COLOURS[scene.colour[objects.slots]][:, None]
+        model.geom_rgba[objects.geoms, 3] = objects.tables.present[number]  # others are not drawn
     return model
 
 
-def renderer(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
-    """Draws by OpenGL, by our rays where that is None or fails. Recolours the model's planes."""
+def renderer(model: mujoco.MjModel, view: Viewpoint, opengl: str | None) -> Draw:
+    """Draws by OpenGL, or by our rays if that is None or fails. Recolours the model's planes."""
     model.geom_rgba[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR
     if opengl is not None:
         with contextlib.suppress(Exception):  # a broken driver raises nearly anything
@@ -50,7 +58,7 @@ def renderer(model: mujoco.MjModel, view: View, opengl: str | None) -> Draw:
     return _ray_renderer(model, view)
 
 
-def _opengl_renderer(model: mujoco.MjModel, view: View) -> Draw:
+def _opengl_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
     model.vis.global_.fovy = FOVY
     model.vis.global_.offwidth, model.vis.global_.offheight = view.size
     _light(model)
@@ -76,7 +84,7 @@ def _opengl_renderer(model: mujoco.MjModel, view: View) -> Draw:
 
 
 def _light(model: mujoco.MjModel) -> None:
-    """One bright lamp over the whole table, its shadows fine near the workspace."""
+    """Sets one bright lamp over the whole table, its shadows fine near the workspace."""
     model.light_pos[:], model.light_dir[:] = LAMP, -LAMP / np.linalg.norm(LAMP)
     model.light_cutoff[:], model.light_exponent[:] = 80.0, 0.0  # degrees; as bright at the edge
     model.light_diffuse[:], model.light_specular[:] = 0.45, 0.1
@@ -85,7 +93,7 @@ def _light(model: mujoco.MjModel) -> None:
     model.vis.quality.shadowsize, model.vis.quality.offsamples = 4096, 8
 
 
-def _ray_renderer(model: mujoco.MjModel, view: View) -> Draw:
+def _ray_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
     width, height = view.size
     focal = 0.5 * height / np.tan(np.radians(0.5 * FOVY))
     centre = 0.5 * (width - 1), 0.5 * (height - 1)
@@ -100,3 +108,65 @@ def _ray_renderer(model: mujoco.MjModel, view: View) -> Draw:
         return np.round(255 * colour).astype(np.uint8)
 
     return draw
+
+
+class RgbdRenderer:
+    """Colour and depth images of the blocks of one episode by OpenGL, without the robot.
+
+    Close it: it holds an OpenGL context.
+    """
+
+    def __init__(self, world: World, scene: Scene, size: tuple[int, int]) -> None:
+        scene = jax.device_get(scene)
+        self._world = world
+        fields = jax.device_get(scene_fields(world, scene))
+        model = self._model = coloured(world, fields, scene)
+        table = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        model.geom_group[:] = np.where(table | (world.slot_of_geom >= 0), _SHOWN, _HIDDEN)
+        model.light_type[:], model.light_dir[:] = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, SUN
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.1
+        model.vis.global_.offwidth, model.vis.global_.offheight = size
+        model.vis.map.znear = _NEAR / model.stat.extent
+        model.vis.map.zfar = _FAR / model.stat.extent
+        self._data, self._options = mujoco.MjData(model), mujoco.MjvOption()
+        self._options.geomgroup[:] = np.arange(6) == _SHOWN
+        self._renderer = mujoco.Renderer(model, size[1], size[0])
+
+    def image(self, scene: Scene, eye: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Draws the episode's blocks at their poses in `scene`: colour [h, w, 3] uint8 and depth
+        [h, w] m, 0 where nothing is hit."""
+        pose = np.concatenate([scene.position, scene.quaternion], axis=1)
+        self._data.qpos[self._world.block_qpos] = pose
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        self._renderer.update_scene(self._data, scene_option=self._options)
+        for gl_camera in self._renderer.scene.camera:
+            _aim(gl_camera, eye)
+        colour = self._renderer.render().copy()
+        self._renderer.enable_depth_rendering()
+        depth = self._renderer.render()
+        self._renderer.disable_depth_rendering()
+        return colour, np.where(depth < 0.99 * _FAR, depth, 0.0).astype(np.float32)
+
+    def close(self) -> None:
+        """Releases the OpenGL context."""
+        self._renderer.close()
+
+
+def _aim(gl_camera: mujoco.MjvGLCamera, eye: Camera) -> None:
+    """Gives OpenGL's camera the pose and the intrinsics of `eye`."""
+    eye = jax.device_get(eye)
+    gl_camera.pos[:], gl_camera.forward[:] = eye.position, eye.rotation[:, 2]
+    gl_camera.up[:] = -eye.rotation[:, 1]
+    size, near = np.array([eye.width, eye.height]), gl_camera.frustum_near
+    first = (-0.5 - eye.centre) / eye.focal * near  # left and top, down; pixel centres are whole
+    last = (size - 0.5 - eye.centre) / eye.focal * near
+    gl_camera.frustum_center = 0.5 * (first[0] + last[0])
+    gl_camera.frustum_width = 0.5 * (last[0] - first[0])
+    gl_camera.frustum_top, gl_camera.frustum_bottom = -first[1], -last[1]
+
+
+def intrinsics(cfg: CameraConfig) -> dict[str, float]:
+    """Returns the intrinsics of a camera as `deploy.Policy.decide` takes them."""
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    return dict(zip(names, (*cfg.size, *cfg.focal, *cfg.centre), strict=True))

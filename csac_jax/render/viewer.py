@@ -1,6 +1,6 @@
-"""An episode to walk around in: MuJoCo's own window, or without a display a page in the browser.
+"""An interactive view of an episode: MuJoCo's window, or without a display a page in the browser.
 
-The page needs the extra `viewer`. It listens on this machine alone: 127.0.0.1.
+The page needs the extra `viewer`. It listens on 127.0.0.1 only.
 """
 
 import contextlib
@@ -15,34 +15,34 @@ import numpy as np
 
 from csac_jax.render import gl, media
 
-PORT = 8080  # of the page; the next free one is taken
+PORT = 8080  # of the page, or the next free one
 CLOSING = 10.0  # s that a window may take to close
-_PLANE = 1.0  # half of the side of a plane that has no end, m
+_PLANE = 1.0  # half side of an endless plane as drawn, m
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
 
 
 class Pictured(NamedTuple):
     """An action to show."""
 
-    text: str  # what it did
+    text: str  # its effect
     poses: np.ndarray  # [T, ...] qpos
 
 
 class Showing(Protocol):
-    """Where poses are shown."""
+    """A window or page that shows poses."""
 
     def show(self, data: mujoco.MjData, text: str) -> bool:
-        """Shows the model's pose; False once nobody looks any more."""
+        """Shows the model's pose; returns False once the view is closed."""
 
 
 def play(
     model: mujoco.MjModel,
     actions: Sequence[Pictured],
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     again: bool = True,
 ) -> None:
     """Shows an episode, again and again until the window is closed or by Ctrl-C."""
-    opened = _window(model) if gl.has_display() else _page(model, say)
+    opened = _window(model) if gl.has_display() else _page(model, log)
     with contextlib.suppress(KeyboardInterrupt), opened as showing:
         for _ in itertools.count() if again else range(1):
             for action in actions:
@@ -51,7 +51,7 @@ def play(
 
 
 def _run(model: mujoco.MjModel, action: Pictured, showing: Showing) -> bool:
-    """Shows an action in the time that it takes; False once nobody looks any more."""
+    """Shows an action in the time that it takes; returns False once the view is closed."""
     data = mujoco.MjData(model)
     for pose in action.poses:
         data.qpos[:] = pose
@@ -102,13 +102,13 @@ class Page:
         self.parts = {}
         for geom in np.flatnonzero(model.geom_rgba[:, 3] > 0.0):
             vertices, faces = mesh(model, int(geom))
-            red, green, blue = (round(255 * float(one)) for one in model.geom_rgba[geom, :3])
+            red, green, blue = (round(255 * float(share)) for share in model.geom_rgba[geom, :3])
             self.parts[int(geom)] = server.scene.add_mesh_simple(
                 f"/geom{geom}", vertices, faces, color=(red, green, blue), flat_shading=True
             )
 
     def show(self, data: mujoco.MjData, text: str) -> bool:
-        """See `Showing`; a page is looked at for ever."""
+        """Shows the model's pose, see `Showing`; a page never closes."""
         if self._text.content != text:
             self._text.content = text
         for geom, part in self.parts.items():
@@ -119,16 +119,16 @@ class Page:
 
 
 def _look(client: Any) -> None:
-    """Where a reader of the page stands at first."""
+    """Sets the first viewpoint of the page."""
     client.camera.position, client.camera.look_at = (-0.7, -0.7, 0.7), (0.0, 0.0, 0.05)
 
 
 @contextlib.contextmanager
-def _page(model: mujoco.MjModel, say: Callable[[str], None]) -> Iterator[Page]:
+def _page(model: mujoco.MjModel, log: Callable[[str], None]) -> Iterator[Page]:
     import viser
 
     server = viser.ViserServer(host="127.0.0.1", port=PORT, verbose=False)
-    say(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends")
+    log(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends")
     try:
         yield Page(server, model)
     finally:
@@ -136,7 +136,7 @@ def _page(model: mujoco.MjModel, say: Callable[[str], None]) -> Iterator[Page]:
 
 
 def mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3], m, in the geom's frame, and triangles [F, 3] of its surface."""
+    """Returns vertices [V, 3], m, in the geom's frame, and triangles [F, 3] of its surface."""
     import trimesh
 
     size, kind = model.geom_size[geom], mujoco.mjtGeom(int(model.geom_type[geom]))
@@ -151,12 +151,12 @@ def mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     }
     if kind not in shapes:
         raise ValueError(f"geom {geom}: {kind.name} has no picture in the page")
-    found = shapes[kind]()
-    return np.asarray(found.vertices), np.asarray(found.faces)
+    surface = shapes[kind]()
+    return np.asarray(surface.vertices), np.asarray(surface.faces)
 
 
 def _plane(trimesh: Any, size: np.ndarray) -> Any:
-    """A thin box whose top is the plane."""
+    """Makes a thin box whose top is the plane."""
     half = np.where(size[:2] > 0.0, size[:2], _PLANE)
     box = trimesh.creation.box((*(2.0 * half), 0.002))
     return box.apply_translation((0.0, 0.0, -0.001))

@@ -1,4 +1,4 @@
-"""What a config's `sim` stands for on this machine, found out before a run."""
+"""Resolves a config's physics and gripper for this machine, before a run."""
 
 import contextlib
 import importlib.util
@@ -9,16 +9,16 @@ from csac_jax import grippers
 from csac_jax.config import Config, PhysicsKind
 
 WARP_SCENES = 1024
-"""Scenes at a time, of all runs, from which Warp was measured to be faster."""
+"""Scenes at a time, over all runs, from which Warp is faster (measured)."""
 
 
 def resolve(cfg: Config, devices: int = 1, runs: int = 1) -> Config:
     """Replaces physics `auto` by `c`, `warp` or `mjx`, and the folder of a gripper by its numbers.
 
-    `runs` configs of this kind share one program. C MuJoCo serves a single CPU device, where it
-    is several times as fast as MJX. Warp serves a single CUDA device where it was measured to be
-    faster, is installed and can do the scene. The rest goes to MJX, with objects to C.
-    Raises SettingsError for a folder without a gripper.
+    `runs` configs of this kind share one program. A single CPU device takes C MuJoCo, several times
+    as fast as MJX. A single CUDA device takes Warp for WARP_SCENES or more, if it is installed and
+    can do the scene. Otherwise MJX, with objects C. Raises SettingsError for a folder without a
+    gripper.
     """
     if (gripper := grippers.resolve(cfg.sim.gripper)) != cfg.sim.gripper:
         cfg = cfg.change(sim={"gripper": gripper})

@@ -1,7 +1,6 @@
-"""Primitives in C MuJoCo, the reference: every core of the host moves a scene.
+"""Primitives in C MuJoCo, the reference engine, on every core of the host.
 
-The compiled step calls it back, so that the same environment can use it. C MuJoCo examines all
-contacts; MJX keeps a fixed number of them.
+The compiled step calls it back. C MuJoCo examines all contacts; MJX keeps a fixed number of them.
 """
 
 import contextlib
@@ -23,7 +22,7 @@ from csac_jax.config import SimConfig
 from csac_jax.scene import layout, model
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World
-from csac_jax.sim import host_call, outcome
+from csac_jax.sim import host_call, model_fields, outcome
 from csac_jax.sim.outcome import Substep, Trace
 from csac_jax.sim.primitives import JointTrajectory
 
@@ -32,14 +31,14 @@ _CALL_SUBSTEPS = 48  # per call of MuJoCo, ours: a longer call repeats more afte
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CPhysics:
-    """A world in C MuJoCo, with the solver's effort of the config.
+    """A world in C MuJoCo.
 
-    Raises ValueError for a world without touch sensors, which one built for MJX is.
+    Raises ValueError for a world without touch sensors, such as one built for MJX.
     """
 
     world: World
     cfg: SimConfig
-    _idle: list["Simulator"] = dataclasses.field(default_factory=list, init=False)
+    _idle: list["CSimulator"] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         if self.world.model.nsensordata != len(self.world.hand_geoms) * len(self.world.slots):
@@ -47,41 +46,41 @@ class CPhysics:
 
     @functools.cached_property
     def _key(self) -> str:
-        """A digest of all that tells this physics from another's; the same in every process."""
-        told = repr((self.world.digest, self.cfg, mujoco.__version__))
-        return hashlib.sha256(told.encode()).hexdigest()
+        """Returns a digest of world, settings and MuJoCo; the same in every process."""
+        identity = repr((self.world.digest, self.cfg, mujoco.__version__))
+        return hashlib.sha256(identity.encode()).hexdigest()
 
     @functools.cached_property
     def _threads(self) -> ThreadPoolExecutor:
-        """One thread per core, which concurrent calls share."""
+        """Returns one thread per core, which concurrent calls share."""
         return ThreadPoolExecutor(len(os.sched_getaffinity(0)))
 
     @contextlib.contextmanager
-    def _simulator(self) -> Iterator["Simulator"]:
-        """A simulator that nobody else uses meanwhile, if possible an idle one."""
+    def _simulator(self) -> Iterator["CSimulator"]:
+        """Provides a simulator that no other thread uses, if possible an idle one."""
         try:
             simulator = self._idle.pop()
         except IndexError:
-            simulator = Simulator(self.world)
+            simulator = CSimulator(self.world)
         yield simulator
         self._idle.append(simulator)
 
     def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
-        """See `physics.Physics`."""
+        """Runs one primitive, see `physics.Physics`."""
         fields = model.scene_fields(self.world, scene)
         result = scene, outcome.nothing_seen(len(joints.control), len(self.world.slots))
+        arguments = (scene, fields, joints)
         if jax.default_backend() == "cpu" and jax.device_count() == 1:
-            arguments = (scene, fields, joints)
-            moved, seen = host_call.call(self._run_batch, self._key, result, *arguments)
+            moved, substeps = host_call.call(self._run_batch, self._key, result, *arguments)
         else:
-            moved, seen = jax.pure_callback(
-                self._run_batch, result, scene, fields, joints, vmap_method="broadcast_all"
+            moved, substeps = jax.pure_callback(
+                self._run_batch, result, *arguments, vmap_method="broadcast_all"
             )
-        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, seen)
+        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
 
     def _run_batch(self, *batch: Any) -> Any:
-        """`_run` of every scene of a batch; the leading axes come back. NumPy only: JAX must not
-        run inside a callback."""
+        """Runs every scene of a batch, whose leading axes are kept. NumPy only: JAX must not run
+        inside a callback."""
         batch = jax.tree.map(np.asarray, batch)
         axes = batch[-1].reachable.shape
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], batch) for i in np.ndindex(axes)]
@@ -93,28 +92,27 @@ class CPhysics:
     def _run(
         self, scene: Scene, fields: BlockFields, joints: JointTrajectory
     ) -> tuple[Scene, Substep]:
-        """One scene after its primitive, and what was seen, leaves [T, ...]."""
+        """Runs one scene. Returns it after the primitive, and its substeps, leaves [T, ...]."""
         world = self.world
-        seen = outcome.nothing_seen(len(joints.control), len(world.slots))
-        given = scene.position, scene.quaternion, scene.velocity, joints.start, joints.control
-        finite = all(np.isfinite(leaf).all() for leaf in given)  # MuJoCo resets one with NaN
+        substeps = outcome.nothing_seen(len(joints.control), len(world.slots))
+        inputs = scene.position, scene.quaternion, scene.velocity, joints.start, joints.control
+        finite = all(np.isfinite(leaf).all() for leaf in inputs)  # MuJoCo resets one with NaN
         if not (finite and joints.reachable and scene.in_play.any()):
-            return scene, seen
+            return scene, substeps
         with self._simulator() as simulator:
             qpos, qvel, sensed = _rollout(world, simulator, scene, fields, joints)
-        pose = qpos[-1, world.block_qpos].astype(np.float32)
-        velocity = qvel[-1, world.block_dofs].astype(np.float32)
-        moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
-        touching = sensed.reshape(seen.touching.shape) > 0.0
+        last = qpos[-1].astype(np.float32), qvel[-1].astype(np.float32)
+        touching = sensed.reshape(substeps.touching.shape) > 0.0
         rise = (qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2]).astype(np.float32)
         gap = world.gripper.gap(qpos[:, world.finger_qpos]).astype(np.float32)
-        return moved, seen.replace(touching=touching, rise=rise, gap=gap)
+        moved = model_fields.moved(world, scene, *last)
+        return moved, substeps.replace(touching=touching, rise=rise, gap=gap)
 
 
-class Simulator:
-    """What moves one scene at a time; made in a sixteenth of the time that ten blocks take.
+class CSimulator:
+    """A MuJoCo model and data that one thread reuses for scene after scene.
 
-    Objects of many parts sleep: what is at rest costs nothing until something that moves meets it.
+    Objects of many parts sleep: at rest they cost nothing until something that moves meets them.
     """
 
     def __init__(self, world: World) -> None:
@@ -138,52 +136,52 @@ class Trajectory(NamedTuple):
 def trajectory(
     world: World, fields: BlockFields, scene: Scene, joints: JointTrajectory
 ) -> Trajectory:
-    """Every state of one scene, of NumPy arrays; no substep where the robot cannot follow."""
+    """Simulates one scene of NumPy arrays; returns no substep where the robot cannot follow."""
     if joints.reachable:
-        return _rollout(world, Simulator(world), scene, fields, joints)
+        return _rollout(world, CSimulator(world), scene, fields, joints)
     sizes = world.model.nq, world.model.nv, world.model.nsensordata
     return Trajectory(*(np.zeros((0, size)) for size in sizes))
 
 
 def _rollout(
-    world: World, simulator: Simulator, scene: Scene, fields: BlockFields, joints: JointTrajectory
+    world: World, simulator: CSimulator, scene: Scene, fields: BlockFields, joints: JointTrajectory
 ) -> Trajectory:
-    """Every state of one scene. Parked blocks touch nothing and stay where they are."""
-    own, parked = simulator.model, ~scene.in_play
+    """Simulates one scene. Parked blocks touch nothing and stay where they are."""
+    mj_model, parked = simulator.model, ~scene.in_play
     is_parked = np.isin(world.slot_of_geom, np.flatnonzero(parked))
-    own.geom_contype[:] = np.where(is_parked, 0, world.model.geom_contype)
-    own.geom_conaffinity[:] = np.where(is_parked, 0, world.model.geom_conaffinity)
+    mj_model.geom_contype[:] = np.where(is_parked, 0, world.model.geom_contype)
+    mj_model.geom_conaffinity[:] = np.where(is_parked, 0, world.model.geom_conaffinity)
     # MuJoCo derives the bodies' contact masks here: the geoms' come first.
-    model.with_blocks(world, fields, into=(own, simulator.data))
-    mujoco.mj_resetData(own, simulator.data)  # what slept in the last scene
-    start = np.concatenate([[0.0], world.model.qpos0, np.zeros(own.nv)])
+    model.with_blocks(world, fields, into=(mj_model, simulator.data))
+    mujoco.mj_resetData(mj_model, simulator.data)  # what slept in the last scene
+    start = np.concatenate([[0.0], world.model.qpos0, np.zeros(mj_model.nv)])
     start[1 + world.robot_qpos] = joints.start
     start[1 + world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    start[1 + own.nq + world.block_dofs] = scene.velocity
-    speeds = 1 + own.nq + world.block_dofs[scene.in_play]
+    start[1 + mj_model.nq + world.block_dofs] = scene.velocity
+    speeds = 1 + mj_model.nq + world.block_dofs[scene.in_play]
     states, sensed = _simulate(simulator, start, np.asarray(joints.control), speeds)
-    qpos, qvel = np.split(states[:, 1:], [own.nq], axis=1)
+    qpos, qvel = np.split(states[:, 1:], [mj_model.nq], axis=1)
     waiting = world.block_qpos[parked]
     qpos[:, waiting], qvel[:, world.block_dofs[parked]] = start[1 + waiting], 0.0  # they fell
     return Trajectory(qpos, qvel, sensed)
 
 
 def _simulate(
-    simulator: Simulator, state: np.ndarray, control: np.ndarray, speeds: np.ndarray
+    simulator: CSimulator, state: np.ndarray, control: np.ndarray, speeds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States [T, 1 + nq + nv], MuJoCo's, and sensors [T, ...] from `state` by `control` [T, ...].
+    """Steps from `state` by `control` [T, ...]; returns MuJoCo's states [T, 1 + nq + nv] and the
+    sensors [T, ...].
 
     `speeds` [..., 6] are the places of block velocities in a state: after every substep they are
     held to SPEED_LIMIT. MuJoCo's own loop cannot do that, so a call ends with the first substep
     after which a block is too fast. The next call starts from the limited velocities and the
-    solver's warm start, which gives the same bits as a loop that never ended; but objects that
-    sleep may wake.
+    solver's warm start. That gives the bits of one loop, except that sleeping objects may wake.
     """
-    own, data = simulator.model, simulator.data
-    parts, done, ahead, warm = [], 0, _CALL_SUBSTEPS, np.zeros(own.nv)
+    mj_model, data = simulator.model, simulator.data
+    parts, done, ahead, warm = [], 0, _CALL_SUBSTEPS, np.zeros(mj_model.nv)
     while done < len(control):
         (states,), (sensed,) = simulator.engine.rollout(
-            own, data, state, control[None, done : done + ahead], initial_warmstart=warm
+            mj_model, data, state, control[None, done : done + ahead], initial_warmstart=warm
         )
         too_fast = (np.abs(states[:, speeds]) > layout.SPEED_LIMIT).any(axis=(1, 2))
         if too_fast[:-1].any():

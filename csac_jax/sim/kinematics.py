@@ -1,4 +1,4 @@
-"""UR5 and UR5e in closed form: the pose of the finger tips, and joint angles for a pose.
+"""UR5 and UR5e in closed form: forward and inverse kinematics of the finger tips.
 
 The arm's base frame is turned by its yaw. The tip frame is the gripper's: between the open finger
 tips, z back to the flange, fingers closing along x. Joint angles [6] rad have the maker's
@@ -19,8 +19,8 @@ from csac_jax.config import SimConfig
 from csac_jax.geometry import FULL_TURN
 
 
-class Geometry(NamedTuple):
-    """An arm by its maker, m: Denavit-Hartenberg parameters, and what surrounds the links."""
+class DHParameters(NamedTuple):
+    """Denavit-Hartenberg parameters of an arm by its maker, m, and capsules about its links."""
 
     d1: float
     a2: float
@@ -34,16 +34,18 @@ class Geometry(NamedTuple):
 
 
 _RADII = (0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045)  # of both (ur_description)
-MAKERS = {  # sources: scenes/README.md
-    "ur5": Geometry(0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165, _RADII),
-    "ur5e": Geometry(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007, _RADII),
+ARMS = {  # sources: scenes/README.md
+    "ur5": DHParameters(
+        0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165, _RADII
+    ),
+    "ur5e": DHParameters(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007, _RADII),
 }
 
 
 class Arm(NamedTuple):
     """An arm where it stands, with its gripper."""
 
-    links: Geometry
+    links: DHParameters
     base: tuple[float, float, float, float]  # x, y, z m and yaw rad
     tool: float  # m, flange to tip frame
     body_radius: float  # m, of the capsule about wrist 3 and the gripper's body
@@ -51,10 +53,10 @@ class Arm(NamedTuple):
 
 
 def arm(cfg: SimConfig) -> Arm:
-    """The arm of a config, with its gripper."""
+    """Returns the arm of a config, with its gripper."""
     gripper = grippers.load(cfg.gripper)
     tool = cfg.adapter + gripper.depth[1]
-    return Arm(MAKERS[cfg.robot], cfg.base, tool, gripper.body_radius, gripper.hand_capsule)
+    return Arm(ARMS[cfg.robot], cfg.base, tool, gripper.body_radius, gripper.hand_capsule)
 
 
 LIMITS = np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0], np.float32)  # rad, either way
@@ -70,8 +72,8 @@ _FAR = 10.0  # m, positions beyond are out of reach whatever the arm does
 BRANCHES = np.array(list(itertools.product((1.0, -1.0), repeat=3)), np.float32)
 
 
-class Pose(NamedTuple):
-    """Where the finger tips are, world frame."""
+class TipPose(NamedTuple):
+    """Pose of the finger tips, world frame."""
 
     position: jax.Array  # [3] m
     rotation: jax.Array  # [3, 3], tip to world
@@ -82,7 +84,7 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def _frames(arm: Arm, q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array, jax.Array]:
-    """The arm at the joint angles `q` [6], by the maker's parameters, world frame.
+    """Computes the arm at the joint angles `q` [6], by the maker's parameters, world frame.
 
     Returns: shoulder, elbow and wrists 1, 2, 3, [3] m each; the axis of joints 2 to 4 [3]; the x
     axis of the tip frame [3]; the axis of joint 6 [3], from the flange to the tips.
@@ -108,25 +110,25 @@ def _frames(arm: Arm, q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Arr
     return [shoulder, elbow, wrist1, wrist2, wrist3], side, closing, down
 
 
-def forward(arm: Arm, q: jax.Array) -> Pose:
-    """Pose of the finger tips at the joint angles `q` [6] rad."""
+def forward(arm: Arm, q: jax.Array) -> TipPose:
+    """Returns the pose of the finger tips at the joint angles `q` [6] rad."""
     (*_, wrist3), _, closing, down = _frames(arm, q)
     columns = (closing, jnp.cross(closing, down), -down)
-    return Pose(wrist3 + (arm.links.d6 + arm.tool) * down, jnp.stack(columns, axis=1))
+    return TipPose(wrist3 + (arm.links.d6 + arm.tool) * down, jnp.stack(columns, axis=1))
 
 
-def top_down(xyz: jax.Array, yaw: jax.Array) -> Pose:
-    """Pose of a hand that points down, tips at `xyz` [3] m, fingers closing along `yaw` [] rad."""
+def top_down(xyz: jax.Array, yaw: jax.Array) -> TipPose:
+    """Returns the pose of a hand pointing down, tips at `xyz` [3] m, closing along `yaw` [] rad."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    return Pose(xyz, jnp.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]))
+    return TipPose(xyz, jnp.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]))
 
 
 def inverse(arm: Arm, position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Joint angles of all eight branches to a pose of the tips, in closed form.
+    """Solves for the joint angles of all eight branches to a pose of the tips, in closed form.
 
     After Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
     Arc cosines take their `atan2` form: near 1, one rounding of a float32 cosine is an angle of
-    3e-4. Every step uses the rounded angles found before, so that later steps correct them.
+    3e-4. Every step uses the rounded angles of the steps before and so corrects them.
 
     Args: position [3] m; rotation [3, 3], tip to world.
     Returns: [8, 6] rad in [-pi, pi], order of BRANCHES; [8] bool, False where the pose is out of
@@ -144,7 +146,7 @@ def inverse(arm: Arm, position: jax.Array, rotation: jax.Array) -> tuple[jax.Arr
 def _branch(
     arm: Arm, position: jax.Array, rotation: jax.Array, signs: jax.Array
 ) -> tuple[jax.Array, ...]:
-    """Joint angles [6] of the branch of these `signs` [3], and whether they count [] bool."""
+    """Solves one branch, of these `signs` [3]: joint angles [6], and [] bool, they are valid."""
     links, (*base, yaw) = arm.links, arm.base
     x6, y6, down = rotation[:, 0], -rotation[:, 1], -rotation[:, 2]
     from_base = position - jnp.array(base) - (links.d6 + arm.tool) * down  # wrist 3
@@ -165,8 +167,8 @@ def _branch(
     return q - FULL_TURN * jnp.round(q / FULL_TURN), shoulder_ok & elbow_ok & wrist_ok
 
 
-def _shoulder(links: Geometry, xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Shoulder pan [] that puts wrist 3 at `xy` [2] m from the base, d4 beside the arm's plane."""
+def _shoulder(links: DHParameters, xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Solves for the shoulder pan [] with wrist 3 at `xy` [2] m, d4 away from the arm's plane."""
     d4, square = links.d4, _dot(xy, xy)
     ok = square - d4**2 > SINGULAR**2 * square
     xy, square = jnp.where(ok, xy, jnp.array([1.0, 0.0])), jnp.where(ok, square, 1.0)
@@ -175,7 +177,7 @@ def _shoulder(links: Geometry, xy: jax.Array, sign: jax.Array) -> tuple[jax.Arra
 
 
 def _wrist(x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array) -> tuple[jax.Array, ...]:
-    """Wrist 2 and 3 [] from the axis of joints 2, 3 and 4, `x` `y` `z` [] in the flange's frame."""
+    """Solves for wrist 2 and 3 [] from the axis `x` `y` `z` [] of joints 2 to 4, flange frame."""
     square = x**2 + y**2
     ok = square > SINGULAR**2
     x, y, square = jnp.where(ok, x, 1.0), jnp.where(ok, y, 0.0), jnp.where(ok, square, 1.0)
@@ -183,9 +185,9 @@ def _wrist(x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array) -> tuple[j
 
 
 def _elbow(
-    links: Geometry, ahead: jax.Array, up: jax.Array, sign: jax.Array
+    links: DHParameters, ahead: jax.Array, up: jax.Array, sign: jax.Array
 ) -> tuple[jax.Array, ...]:
-    """Shoulder lift and elbow [] that put wrist 1 `ahead` and `up` [] m from the shoulder.
+    """Solves for shoulder lift and elbow [] with wrist 1 `ahead` and `up` [] m of the shoulder.
 
     With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3),
     cos^2(q3 / 2) = (r^2 - (a2 - a3)^2) / (4 a2 a3).
@@ -207,7 +209,7 @@ _ABOVE_TABLE = slice(2, 8)  # not the hand, whose height is the planner's choice
 
 
 def _chain(arm: Arm, q: jax.Array) -> jax.Array:
-    """Points [10, 3] m along the arm; the capsules about it run from each to the next.
+    """Returns points [10, 3] m along the arm; capsules run from each to the next.
 
     They are pedestal, shoulder, upper arm, elbow, forearm, wrist 1, wrist 2, wrist 3 with the
     gripper's body, and open fingers. All but the last two are geoms of the arm's MJCF.
@@ -222,7 +224,7 @@ def _chain(arm: Arm, q: jax.Array) -> jax.Array:
 
 
 def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array) -> jax.Array:
-    """Distance [] m between the segments `p0` `p1` and `q0` `q1` [3] m, neither of them a point.
+    """Returns the distance [] m of the segments `p0` `p1` and `q0` `q1` [3] m, neither a point.
 
     The nearest points of the lines are clipped to one segment, to the other, and back (Ericson,
     Real-Time Collision Detection, 5.1.9).
@@ -239,7 +241,7 @@ def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array
 
 
 def clearance(arm: Arm, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Least distance [] m at the joint angles `q` [6] rad from arm to table, and between links.
+    """Returns the least distance [] m at `q` [6] rad from arm to table, and between links.
 
     The links are capsules, the fingers may touch the table. Negative: they overlap.
     """
@@ -254,13 +256,13 @@ def clearance(arm: Arm, q: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def clear(arm: Arm, q: jax.Array) -> jax.Array:
-    """True where the arm at the joint angles `q` [6] rad avoids the table and itself, [] bool."""
+    """Returns [] bool, the arm at the joint angles `q` [6] rad avoids the table and itself."""
     to_table, between_links = clearance(arm, q)
     return (to_table > _TABLE_CLEARANCE) & (between_links > _LINK_CLEARANCE)
 
 
 def joint_targets(arm: Arm, q_start: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Joint targets that lead the tips through set-points, all on one branch.
+    """Follows set-points of the tips with the joints, all on one branch.
 
     It is the branch that reaches the most set-points; of several, the one with the least motion
     from `q_start` on. The only jump is the one from `q_start`. The arm stops for good at the first
@@ -279,8 +281,8 @@ def joint_targets(arm: Arm, q_start: jax.Array, control: jax.Array) -> tuple[jax
 
 
 def reaches(arm: Arm, tips: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Whether one branch leads to all places `tips` [T, 3] m of a hand that points down at `yaw` []
-    rad, and the arm is clear at each of them, [] bool. It says nothing of the way between them."""
+    """Returns [] bool, one branch reaches all places `tips` [T, 3] m of a hand that points down at
+    `yaw` [] rad, with the arm clear at each. The way between them is not checked."""
     poses = jax.vmap(top_down, (0, None))(tips, yaw)
     solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)  # [T, 8, 6], [T, 8]
     clear_at = jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
@@ -288,7 +290,7 @@ def reaches(arm: Arm, tips: jax.Array, yaw: jax.Array) -> jax.Array:
 
 
 def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, ...]:
-    """One branch [T, 6] rad as far as it is valid [T] bool, without jumps, and within LIMITS.
+    """Follows one branch [T, 6] rad while it is valid [T] bool, without jumps, within LIMITS.
 
     Returns: [T, 6] rad, held from the first set-point that fails; [T] bool, good until then; []
     rad, the sum of all motion.
@@ -306,7 +308,7 @@ def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple
 
 
 def _offset(q_start: jax.Array, path: jax.Array, valid: jax.Array) -> jax.Array:
-    """Whole turns [6] that bring a path [T, 6] rad within LIMITS and near to `q_start` [6]."""
+    """Returns whole turns [6] that bring a path [T, 6] rad within LIMITS, near `q_start` [6]."""
     turns = jnp.arange(-2.0, 3.0)[:, None]
     low = jnp.min(jnp.where(valid[:, None], path, jnp.inf), axis=0)[None] + FULL_TURN * turns
     high = jnp.max(jnp.where(valid[:, None], path, -jnp.inf), axis=0)[None] + FULL_TURN * turns

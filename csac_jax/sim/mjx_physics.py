@@ -1,6 +1,7 @@
 """Primitives in MJX: a fixed-length scan of physics steps per scene; callers vmap."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from csac_jax.config import SimConfig
 from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World, scene_fields
-from csac_jax.sim import mjx_step, outcome
+from csac_jax.sim import mjx_step, model_fields, outcome
 from csac_jax.sim.outcome import Substep, Trace
 from csac_jax.sim.primitives import JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
@@ -18,7 +19,7 @@ from csac_jax.sim.quiet_mjx import mjx
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MjxPhysics:
-    """A world on the device: closed over by the compiled step."""
+    """A world on the device, which the compiled step closes over."""
 
     world: World
     cfg: SimConfig
@@ -26,7 +27,10 @@ class MjxPhysics:
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
 
     def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
-        """See `physics.Physics`. Matrix products keep float32: a GPU would cut them to 10 bits."""
+        """Runs one primitive, see `physics.Physics`.
+
+        Matrix products keep float32: a GPU would cut them to 10 bits.
+        """
         world, model = self.world, scene_model(self, scene)
         initial = initial_data(self, scene, joints)
 
@@ -39,60 +43,38 @@ class MjxPhysics:
             return data, Substep(touching, rise, gap, overflow)
 
         with jax.default_matmul_precision("highest"):
-            data, seen = jax.lax.scan(substep, initial, joints.control)
-        pose, velocity = data.qpos[world.block_qpos], data.qvel[world.block_dofs]
-        moved = scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
-        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, seen)
+            data, substeps = jax.lax.scan(substep, initial, joints.control)
+        moved = model_fields.moved(world, scene, data.qpos, data.qvel)
+        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
-    """Physics of a world, MJX with its JAX implementation."""
+    """Makes the physics of a world, in MJX's JAX implementation."""
     mjx_model, data = mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax")
     return MjxPhysics(world, cfg, mjx_model, data)
 
 
 def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
-    """The model with this scene's block sizes, masses and frictions."""
+    """Returns the model with this scene's block sizes, masses and frictions."""
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
-    geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
-    added_mass = jnp.sum(fields.mass - model.body_mass[bodies])
-    subtree = model.body_subtreemass.at[0].add(added_mass)
     meshes = [  # None for a mesh that no slot uses; `face` repeats the corners of the faces
         mesh and mesh.replace(vert=mesh.vert * scale, face=mesh.face * scale)
         for mesh, scale in zip(model._impl.mesh_convex, fields.mesh_scale, strict=True)
     ]
-    model = model.replace(_impl=model._impl.replace(mesh_convex=tuple(meshes)))
-    model = model.replace(
-        geom_size=model.geom_size.at[geoms].set(fields.size),
-        geom_pos=model.geom_pos.at[geoms].set(fields.centre),
-        geom_rbound=model.geom_rbound.at[geoms].set(fields.rbound),
-        geom_friction=model.geom_friction.at[geoms, 0].set(fields.friction),
-        body_mass=model.body_mass.at[bodies].set(fields.mass),
-        body_subtreemass=subtree.at[bodies].set(fields.mass),
-        body_inertia=model.body_inertia.at[bodies].set(fields.inertia),
-        body_ipos=model.body_ipos.at[bodies].set(fields.com),
-        body_invweight0=model.body_invweight0.at[bodies].set(fields.body_invweight),
-        dof_invweight0=model.dof_invweight0.at[dofs].set(fields.dof_invweight),
-    )
-    if fields.pads is None:
-        return model
-    pads, (size, position, radius) = world.hand_geoms[1:], fields.pads
+    base = functools.partial(getattr, model)
     return model.replace(
-        geom_size=model.geom_size.at[pads].set(size),
-        geom_pos=model.geom_pos.at[pads].set(position),
-        geom_rbound=model.geom_rbound.at[pads].set(radius),
+        _impl=model._impl.replace(mesh_convex=tuple(meshes)),
+        body_subtreemass=model_fields.subtree_mass(world, fields.mass, base),
+        **model_fields.of_scene(world, fields, base),
     )
 
 
 def initial_data(physics: MjxPhysics, scene: Scene, joints: JointTrajectory) -> mjx.Data:
-    """Data with the scene's blocks, and the robot at rest at its first set-point."""
-    world = physics.world
-    poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
-    qpos = physics.data.qpos.at[world.robot_qpos].set(joints.start)
-    qpos = qpos.at[world.block_qpos].set(poses)
-    qvel = physics.data.qvel.at[world.block_dofs].set(scene.velocity)
-    return physics.data.replace(qpos=qpos, qvel=qvel, ctrl=joints.control[0])
+    """Returns data with the scene's blocks, and the robot at rest at its first set-point."""
+    blank = physics.data
+    qpos, qvel = model_fields.start(physics.world, scene, joints, blank.qpos, blank.qvel)
+    return blank.replace(qpos=qpos, qvel=qvel, ctrl=joints.control[0])
 
 
 def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data) -> mjx.Data:
@@ -105,8 +87,8 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
 
 
 def _touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """Which of palm and pads touches which block, [3, N] bool, and whether contacts may be missing,
-    [] bool: once all slots are in use."""
+    """Returns which of palm and pads touches which block, [3, N] bool, and [] bool, contacts may be
+    missing because all slots are in use."""
     active, pair = data._impl.contact.dist < 0.0, data._impl.contact.geom  # [C], [C, 2]
     is_pad = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1)
     is_hand = is_pad & active[None]  # [3, C]

@@ -1,4 +1,4 @@
-"""A step of MJX's JAX implementation; two departures from `mjx.step` bring it nearer to C."""
+"""A step of MJX's JAX implementation; it departs from `mjx.step` twice, to be nearer to C."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ SAME_PLACE = 1e-5  # m; copies lie within 1e-7 m, other points of a pair seldom 
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """The state of one scene a timestep later, by `implicitfast`, without sensors and tendons."""
+    """Advances one scene by a timestep, by `implicitfast`, without sensors and tendons."""
     data = mjx.fwd_position(model, data)
     contact = data._impl.contact
     # A contact beyond its margin is inactive. The distance stays, since others read it.
@@ -24,7 +24,7 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def repeated(contact: mjx.Contact) -> jax.Array:
-    """Which contacts [C] repeat the place of an earlier one of the same two geoms, [C] bool.
+    """Returns [C] bool, a contact repeats the place of an earlier one of the same two geoms.
 
     MJX always gives four points for two boxes or meshes and fills up with copies. Each copy would
     be one more soft constraint: a touch at one point would be four times as stiff.
@@ -36,8 +36,7 @@ def repeated(contact: mjx.Contact) -> jax.Array:
 
 
 def _undamped_at_limits(model: mjx.Model, data: mjx.Data) -> mjx.Model:
-    """The model without the damping of actuators at their force limit, where speed changes no
-    force."""
+    """Removes the damping of actuators at their force limit, where speed changes no force."""
     force, (low, high) = data.actuator_force, model.actuator_forcerange.T
     limited = model.actuator_forcelimited & ((force <= low) | (force >= high))
     damping = jnp.where(limited, 0.0, model.actuator_biasprm[:, 2])

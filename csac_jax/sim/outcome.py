@@ -1,4 +1,4 @@
-"""What a primitive did: by ground truth, and as the robot's finger gap alone suggests."""
+"""The outcome of a primitive: by ground truth, and as the robot's finger gap suggests."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ CLOSED_GAP = 0.005  # m, a smaller finger gap is a closed hand
 
 @struct.dataclass
 class Substep:
-    """What is seen after one physics step. N = block slots."""
+    """Sensor readings after one physics step. N = block slots."""
 
     touching: jax.Array  # [3, N] bool, palm, low pad and high pad against each block
     rise: jax.Array  # [N] m, height gained since the primitive began
@@ -28,7 +28,7 @@ class Substep:
 
 @struct.dataclass
 class Trace:
-    """What was seen while a primitive ran. N = block slots."""
+    """Sensor readings of a whole primitive. N = block slots."""
 
     touched: jax.Array  # [] bool, the hand met a block
     held_rise: jax.Array  # [N] m, largest rise of a block between both pads
@@ -40,33 +40,33 @@ class Trace:
 
 
 def nothing_seen(substeps: int, num: int) -> Substep:
-    """The substeps of a primitive in which nothing moved, NumPy leaves [T, ...], all 0."""
+    """Returns the substeps of a primitive without motion, NumPy leaves [T, ...], all 0."""
     zeros: Any = np.zeros
     touching, rise = zeros((substeps, 3, num), bool), zeros((substeps, num), np.float32)
     return Substep(touching, rise, zeros(substeps, np.float32), zeros(substeps, bool))
 
 
-def trace_of(cfg: SimConfig, seen: Substep) -> Trace:
-    """The trace of all substeps of a primitive, leaves [T, ...]."""
-    held = seen.touching[:, 1] & seen.touching[:, 2]
+def trace_of(cfg: SimConfig, substeps: Substep) -> Trace:
+    """Summarises all substeps of a primitive, leaves [T, ...]."""
+    held = substeps.touching[:, 1] & substeps.touching[:, 2]
     return Trace(
-        touched=jnp.any(seen.touching),
-        held_rise=jnp.max(seen.rise, axis=0, initial=0.0, where=held),
+        touched=jnp.any(substeps.touching),
+        held_rise=jnp.max(substeps.rise, axis=0, initial=0.0, where=held),
         held=held[-1],
-        rise=seen.rise[-1],
-        gap_closed=seen.gap[sum(cfg.grasp_phases[:2]) - 1],
-        gap_end=seen.gap[-1],
-        contact_overflow=jnp.sum(seen.contact_overflow, dtype=jnp.int32),
+        rise=substeps.rise[-1],
+        gap_closed=substeps.gap[sum(cfg.grasp_phases[:2]) - 1],
+        gap_end=substeps.gap[-1],
+        contact_overflow=jnp.sum(substeps.contact_overflow, dtype=jnp.int32),
     )
 
 
 def lifted_blocks(trace: Trace, hand_rise: jax.Array) -> jax.Array:
-    """True for blocks [N] that hang in the hand after it rose by `hand_rise` [] m."""
+    """Returns [N] bool, a block hangs in the hand after it rose by `hand_rise` [] m."""
     return trace.held & (trace.rise >= LIFT_SHARE * hand_rise)
 
 
 def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax.Array:
-    """Outcome [] int32 by ground truth, CSAC eq. 15.
+    """Judges by ground truth, returns Outcome [] int32, CSAC eq. 15.
 
     `nothing`: the hand met no block on bare table. `empty`: it met none at a `surface` [] m above
     BARE. `touched`: it met a block that never rose between the pads. `dropped`: a block rose and
@@ -78,7 +78,7 @@ def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax
 
 
 def grasp_outcome_by_gap(trace: Trace, surface: jax.Array, changed: jax.Array) -> jax.Array:
-    """Outcome [] int32 that finger gaps and the height map suggest.
+    """Judges by finger gaps and height map, returns Outcome [] int32.
 
     Args: changed [] bool, the height map moved.
     """
@@ -87,6 +87,6 @@ def grasp_outcome_by_gap(trace: Trace, surface: jax.Array, changed: jax.Array) -
 
 
 def _highest(*holds: jax.Array) -> jax.Array:
-    """The highest level of a grasp that holds, [] int32; `holds` are those of EMPTY to LIFTED."""
+    """Returns the highest level that holds, [] int32; `holds` are those of EMPTY to LIFTED."""
     levels = [jnp.int32(level) for level in Outcome]
     return jnp.select(holds[::-1], levels[:0:-1], levels[0])

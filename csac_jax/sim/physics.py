@@ -1,4 +1,4 @@
-"""One primitive of one scene, whatever computes its physics."""
+"""One primitive of one scene, on any physics engine."""
 
 import functools
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class Physics(Protocol):
 
 
 def _make_mjx(world: World, cfg: SimConfig) -> Physics:
-    from csac_jax.sim import mjx_physics  # to import MJX takes longer than all else of the package
+    from csac_jax.sim import mjx_physics  # MJX imports slower than the rest of the package
 
     return mjx_physics.make(world, cfg)
 
@@ -38,11 +38,11 @@ PHYSICS: dict[str, Callable[[World, SimConfig], Physics]] = {
     "warp": warp_physics.make,
     "c": c_physics.CPhysics,
 }
-"""Every physics by its name in the config. Each raises an error for a world that it cannot run."""
+"""Engines by their name in the config. Each raises an error for a world that it cannot run."""
 
 
 def make(world: World, cfg: SimConfig) -> Physics:
-    """The physics that the config names. Raises ValueError for `auto`: see `sim.backend`."""
+    """Makes the engine that the config names. Raises ValueError for `auto`, see `sim.backend`."""
     if cfg.physics not in PHYSICS:
         engines = ", ".join(PHYSICS)
         raise ValueError(f"sim.physics: {cfg.physics!r} is no engine; choose one of: {engines}")
@@ -50,8 +50,10 @@ def make(world: World, cfg: SimConfig) -> Physics:
 
 
 def prepare(physics: Physics, scenes: int) -> None:
-    """Does ahead, maybe in another thread, what else delays the first action of so many scenes:
-    Warp's kernels are loaded, or built for minutes, and its substeps recorded."""
+    """Prepares the first action of so many scenes, maybe in another thread.
+
+    Warp builds its kernels for minutes, or loads them, and records its substeps.
+    """
     if isinstance(physics, warp_physics.WarpPhysics):
         physics.simulator.prepared(scenes)
 
@@ -73,13 +75,13 @@ def execute(
 
 
 def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
-    """Whether the robot can follow the whole of a primitive, as `execute` decides, [] bool."""
+    """Returns [] bool, the robot can follow the whole of a primitive, as `execute` decides."""
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
     return primitives.joint_trajectory(cfg.sim, plan).reachable
 
 
 def healthy(scene: Scene) -> jax.Array:
-    """True where every entry of a scene lies within its bounds, [] bool.
+    """Checks that every entry of a scene lies within its bounds, [] bool.
 
     Bounds, not `isfinite`: physics may explode and stay finite. NaN fails every comparison.
     """

@@ -19,19 +19,19 @@ START_GAP = 0.01  # m, between the open hand's tips and what lies under them at 
 
 @struct.dataclass
 class Action:
-    """What to do: a primitive at a place. `z` follows from the heightmap."""
+    """A primitive at a place. `z` follows from the heightmap."""
 
     primitive: jax.Array  # [] int32, Primitive
     pose: jax.Array  # [3] x m, y m, yaw rad: a push goes along the yaw, fingers close along it
 
     @classmethod
     def grasp(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
-        """A grasp at (x, y) m whose fingers close along `yaw` rad; numbers or arrays [...]."""
+        """Makes a grasp at (x, y) m, closing along `yaw` rad; numbers or arrays [...]."""
         return cls._at(Primitive.GRASP, x, y, yaw)
 
     @classmethod
     def push(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
-        """A push from (x, y) m along `yaw` rad; numbers or arrays [...]."""
+        """Makes a push from (x, y) m along `yaw` rad; numbers or arrays [...]."""
         return cls._at(Primitive.PUSH, x, y, yaw)
 
     @classmethod
@@ -59,7 +59,7 @@ class JointTrajectory:
 
 
 def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: Any) -> jax.Array:
-    """Highest surface [] m of the map [H, W] m in a square window of `side` m about `xy` [2] m."""
+    """Returns the highest surface [] m of a map [H, W] m in a window of `side` m at `xy` [2] m."""
     distance = jnp.max(jnp.abs(geometry.cell_centres(cfg) - xy[None, None]), axis=-1)
     return jnp.max(jnp.where(distance <= 0.5 * jnp.maximum(side, cfg.cell), height, 0.0))
 
@@ -71,11 +71,11 @@ def plan(
     action: Action,
     fingers: Fingers | None = None,
 ) -> Plan:
-    """Set-points of a primitive, one of VPG's two (arXiv:1803.09956).
+    """Plans the set-points of a primitive, one of VPG's two (arXiv:1803.09956).
 
     Grasp: straight down with open fingers to `grasp_depth` below the surface, close, lift. Push:
     down with closed fingers to `push_depth` below the surface, then `push_length` along the yaw,
-    the end clipped to the workspace, then lift. `fingers` are the gripper's own, or others.
+    the end clipped to the workspace, then lift. `fingers` default to the gripper's.
     """
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
@@ -102,9 +102,9 @@ def plan(
 def reachable(
     cfg: SimConfig, heightmap: HeightmapConfig, primitive: jax.Array, xy: jax.Array, yaw: jax.Array
 ) -> jax.Array:
-    """Whether the robot reaches where a primitive [] at `xy` [2] m begins and ends, [] bool.
+    """Returns [] bool, the robot reaches both ends of a primitive [] at `xy` [2] m.
 
-    It is asked before anything is known of the height: at the lowest, and over a block.
+    The height is not known yet: both the lowest and that over a block must be in reach.
     """
     if cfg.robot == "hand":
         return jnp.ones((), bool)
@@ -117,23 +117,23 @@ def reachable(
 def _push_end(
     cfg: SimConfig, heightmap: HeightmapConfig, xy: jax.Array, yaw: jax.Array
 ) -> jax.Array:
-    """Where a push from `xy` [2] m ends, [2] m."""
+    """Returns the end [2] m of a push from `xy` [2] m."""
     direction, limit = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]), 0.5 * heightmap.extent
     return jnp.clip(xy + cfg.push_length * direction, -limit, limit)
 
 
 def grasp_depth(cfg: SimConfig, gripper: Gripper) -> float:
-    """How far the tips go below the surface that they grasp, m; no palm comes down on it."""
+    """Returns how far the tips go below the grasped surface, m; the palm stays above it."""
     return min(cfg.grasp_depth, gripper.deepest)
 
 
 def lowest(cfg: SimConfig, gripper: Gripper) -> float:
-    """Least height of the tips above the table, m."""
+    """Returns the least height of the tips above the table, m."""
     return cfg.clearance or gripper.clearance
 
 
 def _progress(phases: tuple[int, int, int]) -> np.ndarray:
-    """How far each phase has come, 0 to 1, at every substep: [3, T].
+    """Returns the progress of each phase, 0 to 1, at every substep, [3, T].
 
     The last phase, the lift, is smooth: a jerk shakes blocks loose.
     """
@@ -145,10 +145,10 @@ def _progress(phases: tuple[int, int, int]) -> np.ndarray:
 
 
 def joint_trajectory(cfg: SimConfig, plan: Plan) -> JointTrajectory:
-    """How a robot's joints follow a plan: the floating hand as it is, an arm by its inverse.
+    """Converts a plan to joint set-points: as they are for the hand, by an arm's inverse.
 
-    The robot moves the tip frame of the open hand. Where the tips go lower as they close, on an
-    arc, the hand goes up by as much, so that the tips stay where the plan has them.
+    The robot moves the tip frame of the open hand. Tips that close on an arc get lower; the hand
+    rises by as much, so that the tips stay where the plan has them.
     """
     gripper = grippers.load(cfg.gripper)
     control = jnp.concatenate([plan.start[None], plan.control])

@@ -1,4 +1,4 @@
-"""MJX, imported without its two lines about Warp, which is an extra. Other output is kept."""
+"""Imports MJX without its two printed lines about Warp, an extra. Other output is kept."""
 
 import contextlib
 import io

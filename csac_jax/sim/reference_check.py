@@ -1,4 +1,4 @@
-"""Does MJX agree with C MuJoCo on this machine? Balls fall on a table in a few scenes."""
+"""Compares MJX with C MuJoCo on this machine: balls fall on a table in a few scenes."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ MODEL = """
 
 
 def largest_error() -> float:
-    """Largest difference of a coordinate after `STEPS` steps, over all scenes, m or 1."""
+    """Returns the largest difference of a coordinate after STEPS steps, over all scenes, m or 1."""
     model = mujoco.MjModel.from_xml_string(MODEL)
     qpos = np.tile(model.qpos0, (SCENES, 1))
     qpos[:, 2] += 0.01 * np.arange(SCENES)  # another height in each scene

@@ -1,9 +1,9 @@
 """All substeps of a primitive in many scenes, as one call on MuJoCo Warp's own arrays.
 
-Model and data of E scenes stay on the device. A call copies in what an action changes: the fields
-of the blocks, the state and the set-points. After every substep, kernels of our own hold parked
-blocks, limit speeds and extend the trace. On CUDA several substeps are one recorded graph, which is
-launched until the primitive is over.
+Model and data of E scenes stay on the device. A call copies in the inputs of an action: fields of
+the blocks, state and set-points. After every substep, our kernels hold parked blocks, limit speeds
+and extend the trace. On CUDA several substeps are one recorded graph, launched until the primitive
+is over.
 """
 
 import copy
@@ -47,7 +47,7 @@ OBJECT_FIELDS = {
     "geom_quat": wp.array2d[wp.quat],
     "body_iquat": wp.array2d[wp.quat],
 }
-"""Those that differ besides where there are objects."""
+"""Further fields that differ where there are objects."""
 _STATE = {"qpos": wp.array2d[float], "qvel": wp.array2d[float]}
 _COMMAND = {
     "control": wp.array3d[float],  # [E, T, nu]
@@ -73,7 +73,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def _command(done: wp.array[int], control: wp.array3d[float], ctrl: wp.array2d[float]):
-    """The set-points of the next substep, which from here on counts as done."""
+    """Sets the set-points of the next substep and counts it as done."""
     scene = wp.tid()
     for actuator in range(ctrl.shape[1]):
         ctrl[scene, actuator] = control[scene, done[scene], actuator]
@@ -92,7 +92,7 @@ def _mark_touch(
     part_of_geom: wp.array[int],  # [G] 0 palm, 1 and 2 pads, -1: not of the hand
     touching: wp.array3d[int],  # [E, 3, N]
 ):
-    """Which part of the hand touches which block, from the contacts of the last step."""
+    """Marks which part of the hand touches which block, from the contacts of the last step."""
     contact = wp.tid()
     if contact >= wp.min(contacts[0], room) or distance[contact] >= margin[contact]:
         return
@@ -106,7 +106,7 @@ def _mark_touch(
 
 @wp.func
 def _limited(value: float, limit: float):
-    """NaN stays NaN, which `wp.clamp` would hide."""
+    """Clips a value; NaN stays NaN, which `wp.clamp` would hide."""
     if value > limit:
         return limit
     if value < -limit:
@@ -178,13 +178,13 @@ class Batch:
 
     def __init__(self, world: World, cfg: SimConfig, scenes: int) -> None:
         self.substeps = substeps = steps(cfg)
-        own = fields(world)
-        self.model, self.data = _put(world.model, cfg, scenes, own)
+        names = fields(world)
+        self.model, self.data = _put(world.model, cfg, scenes, names)
         slots, parts = len(world.slots), len(world.hand_geoms)
         part_of_geom = np.full(world.model.ngeom, -1)
         part_of_geom[world.hand_geoms] = np.arange(parts)
         self._hand_and_blocks = [
-            wp.array(each, dtype=int) for each in (world.slot_of_geom, part_of_geom)
+            wp.array(index, dtype=int) for index in (world.slot_of_geom, part_of_geom)
         ]
         self._constants = [
             round(sum(cfg.grasp_phases[:2]) * substeps / cfg.substeps),
@@ -199,8 +199,8 @@ class Batch:
         self._control = wp.zeros((scenes, substeps, world.model.nu), dtype=float)
         self._in_play = wp.zeros((scenes, slots), dtype=wp.bool)
         state = [self._qpos, self._qvel, self._control, self._in_play]
-        self.given = [*(getattr(self.model, name) for name in own), *state]
-        """Where the arrays that a simulator is given go, in the order of its arguments."""
+        self.given = [*(getattr(self.model, name) for name in names), *state]
+        """Arrays that a simulator's arguments are copied to, in their order."""
         self._touching = wp.zeros((scenes, parts, slots), dtype=int)
         self._done = wp.zeros(scenes, dtype=int)
         self._trace = [
@@ -209,9 +209,9 @@ class Batch:
         self._advance = self.recorded(self.substep)
 
     def run(self, inputs: Sequence[wp.array], outputs: Sequence[wp.array]) -> None:
-        """One primitive; arrays in the order of a simulator's arguments and results."""
-        for target, given in zip(self.given, inputs, strict=True):
-            wp.copy(target, given)
+        """Runs one primitive; arrays in the order of a simulator's arguments and results."""
+        for target, source in zip(self.given, inputs, strict=True):
+            wp.copy(target, source)
         self.restart()
         self._advance()
         results = [self.data.qpos, self.data.qvel, *self._trace]
@@ -219,7 +219,7 @@ class Batch:
             wp.copy(target, result)
 
     def restart(self) -> None:
-        """Goes back to where the last primitive began."""
+        """Resets to the start of the last primitive."""
         data = self.data
         wp.copy(data.qpos, self._qpos)
         wp.copy(data.qvel, self._qvel)
@@ -228,18 +228,17 @@ class Batch:
         self._touching.zero_()
 
     def recorded(self, substep: Callable[[], None]) -> Callable[[], None]:
-        """A function that runs `substep` as often as a primitive does."""
+        """Returns a function that runs `substep` as often as a primitive does."""
         self.restart()
         return warp_graph.repeated(substep, self.substeps)
 
     def step(self) -> None:
-        """One physics step with the set-points of the substep."""
-        given = [self._done, self._control, self.data.ctrl]
-        wp.launch(_command, self.data.nworld, given)
+        """Advances physics by one step with the set-points of the substep."""
+        wp.launch(_command, self.data.nworld, [self._done, self._control, self.data.ctrl])
         mjw.step(self.model, self.data)
 
     def substep(self) -> None:
-        """One physics step, and what follows it."""
+        """Advances physics by one step, limits speeds and extends the trace."""
         self.step()
         data, contact = self.data, self.data.contact
         contacts = [data.nacon, contact.worldid, contact.geom, contact.dist, contact.includemargin]
@@ -257,21 +256,23 @@ class Batch:
 
 
 def fields(world: World) -> dict[str, Any]:
-    """Fields of MuJoCo's model that differ per scene, and their types."""
+    """Returns the fields of MuJoCo's model that differ per scene, and their types."""
     return FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
 
 
 def steps(cfg: SimConfig) -> int:
-    """Physics steps of a primitive: of at most STEP, as many as graphs hold, but no shorter than
-    those of the config."""
+    """Returns the number of physics steps of a primitive: each at most STEP, a multiple of those in
+    a graph, but no more than the config's."""
     least = math.ceil(cfg.substeps * cfg.timestep / STEP - 1e-6)
     return min(cfg.substeps, -(-least // warp_graph.LONGEST) * warp_graph.LONGEST)
 
 
-def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str]) -> tuple[Any, Any]:
-    """Warp's model, whose fields `own` every scene has its own of, and its data.
+def _put(
+    model: mujoco.MjModel, cfg: SimConfig, scenes: int, names: Iterable[str]
+) -> tuple[Any, Any]:
+    """Makes Warp's model, whose fields `names` differ per scene, and its data.
 
-    By this flag Warp takes C's function for two boxes, not the general one for convex shapes.
+    NATIVECCD off: Warp takes C's function for two boxes, not the general one for convex shapes.
     """
     model = copy.copy(model)
     model.opt.timestep = cfg.substeps * cfg.timestep / steps(cfg)
@@ -281,7 +282,7 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str])
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         model.opt.iterations = model.opt.ls_iterations = CONE_EFFORT
-    put = mjw.put_model(model, batch_sizes=dict.fromkeys(own, scenes))
+    put = mjw.put_model(model, batch_sizes=dict.fromkeys(names, scenes))
     put.opt.warn_overflow = 0  # the trace counts
     put.opt.graph_conditional = False  # some scene needs all iterations: a loop saves none
     data = mjw.make_data(
@@ -294,7 +295,7 @@ def _put(model: mujoco.MjModel, cfg: SimConfig, scenes: int, own: Iterable[str])
     return put, data
 
 
-class Simulator:
+class WarpSimulator:
     """A function of the arrays of E scenes, for JAX to call.
 
     It takes FIELDS, with objects OBJECT_FIELDS too, qpos [E, nq], qvel [E, nv], control [E, T, nu]
@@ -304,7 +305,7 @@ class Simulator:
     def __init__(self, world: World, cfg: SimConfig) -> None:
         self.substeps = steps(cfg)
         self.batches: dict[tuple[Any, int], Batch] = {}
-        """By device and scenes; made by the first action of so many scenes, or ahead of it."""
+        """By device and scenes; made by the first action of so many scenes, or by `prepared`."""
         self._world, self._cfg = world, cfg
         self.arguments = {**fields(world), **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
@@ -315,7 +316,7 @@ class Simulator:
         )
 
     def __call__(self, **arrays: jax.Array) -> dict[str, jax.Array]:
-        """The results by name."""
+        """Runs one primitive and returns the results by name."""
         model, (scenes, slots) = self._world.model, arrays["in_play"].shape
         shapes = {name: (scenes, slots)[: kind.ndim] for name, kind in _TRACE.items()}
         shapes |= {"qpos": (scenes, model.nq), "qvel": (scenes, model.nv)}
@@ -324,8 +325,8 @@ class Simulator:
         return dict(zip(self._results, results, strict=True))
 
     def prepared(self, scenes: int) -> Batch:
-        """What computes so many scenes on the current device; minutes pass where kernels are to be
-        built."""
+        """Returns the batch of so many scenes on the current device; kernels are built for minutes
+        the first time."""
         key = (wp.get_device().alias, scenes)
         with _ONE_AT_A_TIME:
             if key not in self.batches:
@@ -342,7 +343,7 @@ class Simulator:
 def _annotated(
     run: Callable[..., None], arguments: list[tuple[str, Any]], results: list[tuple[str, Any]]
 ) -> Callable[..., None]:
-    """`run` with a signature, from which Warp reads the types of arguments and results."""
+    """Gives `run` the signature from which Warp reads the types of arguments and results."""
     kinds = dict(arguments) | {f"{name}_out": kind for name, kind in results}
 
     def function(*arrays: wp.array) -> None:

@@ -15,28 +15,28 @@ LONGEST = 10  # most steps in one recorded graph
 
 
 def repeated(step: Callable[[], None], times: int) -> Callable[[], None]:
-    """A function that runs `step` so many times, on CUDA as graphs. It is tried once here.
+    """Returns a function that runs `step` so many times, on CUDA as graphs; runs it once here.
 
     The step must launch and allocate the same whenever it is run.
     """
-    _load_kernels(step)  # which a recording must not
-    kept: list[wp.array] = []
+    _load_kernels(step)  # a recording must not load any
+    arrays: list[wp.array] = []
 
-    def one() -> None:
-        with _allocated_once(kept):
+    def step_in_place() -> None:
+        with _allocated_once(arrays):
             step()
 
-    one()
+    step_in_place()
     if not wp.get_device().is_cuda:
-        return functools.partial(_repeat, one, times)
-    each = max(n for n in range(1, LONGEST + 1) if times % n == 0)
+        return functools.partial(_repeat, step_in_place, times)
+    recorded = max(n for n in range(1, LONGEST + 1) if times % n == 0)
     with _no_garbage_collection(), wp.ScopedCapture() as capture:
-        _repeat(one, each)
-    return functools.partial(_launch, capture.graph, times // each, kept)
+        _repeat(step_in_place, recorded)
+    return functools.partial(_launch, capture.graph, times // recorded, arrays)
 
 
 def _launch(graph: wp.Graph, times: int, _: list[wp.array]) -> None:
-    """Runs a graph so many times; the arrays are those that it works in and must outlive it."""
+    """Runs a graph so many times; the arrays are those it works in, which must outlive it."""
     _repeat(functools.partial(wp.capture_launch, graph), times)
 
 
@@ -46,10 +46,10 @@ def _repeat(call: Callable[[], None], times: int) -> None:
 
 
 def _load_kernels(step: Callable[[], None]) -> None:
-    """Builds and loads what `step` launches, on all cores.
+    """Builds and loads the kernels that `step` launches, on all cores.
 
-    Launches load kernels one by one; the first time, when they are built, that takes minutes. So
-    does the question for the best size of a launch, which is not asked here.
+    A launch would load its own kernel alone; built one by one they take minutes. So does a query
+    for the best block size, which is replaced here.
     """
     modules: dict[int, dict[Any, None]] = {}
 
@@ -66,8 +66,8 @@ def _load_kernels(step: Callable[[], None]) -> None:
 
 
 @contextlib.contextmanager
-def _allocated_once(kept: list[wp.array]) -> Iterator[None]:
-    """In the block, Warp hands out the arrays of the last such block again, one after the other.
+def _allocated_once(arrays: list[wp.array]) -> Iterator[None]:
+    """Makes Warp hand out the arrays of the last such block again, one after the other.
 
     A recorded graph would allocate and free each of them in every step.
     """
@@ -75,9 +75,9 @@ def _allocated_once(kept: list[wp.array]) -> Iterator[None]:
 
     def hand_out(name: str, *args: Any, **kwargs: Any) -> wp.array:
         place = next(places)
-        if place == len(kept):
-            kept.append(make[name](*args, **kwargs))
-        return kept[place]
+        if place == len(arrays):
+            arrays.append(make[name](*args, **kwargs))
+        return arrays[place]
 
     empty = functools.partial(hand_out, "empty")
 
@@ -98,7 +98,7 @@ def _allocated_once(kept: list[wp.array]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """CUDA ends the process where a program is freed while a graph is recorded."""
+    """Prevents a crash: CUDA ends the process if a program is freed while a graph is recorded."""
     was_on = gc.isenabled()
     gc.disable()
     try:

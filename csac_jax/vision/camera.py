@@ -1,7 +1,7 @@
-"""A pinhole camera: the depth and colour that it sees, and its pixels as points in space.
+"""A pinhole camera: depth and colour images, and pixels as points in space.
 
 The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depth is
-along z. A pixel's ray has no unit length: it advances by 1 m in depth per unit of distance.
+along z. A pixel's ray is not of unit length: it advances by 1 m in depth per unit of distance.
 
     eye = camera.make(CameraConfig().scaled(0.5))
     picture = camera.render(eye, solids.place(geoms.read(model), data.geom_xpos, data.geom_xmat))
@@ -40,7 +40,7 @@ class Camera:
 
 @struct.dataclass
 class Picture:
-    """What a camera sees. H, W = rows and columns of the image."""
+    """An image of a camera. H, W = rows and columns."""
 
     colour: jax.Array  # [H, W, 3] float32, 0 .. 1
     depth: jax.Array  # [H, W] float32 m, along the optical axis; 0 where not valid
@@ -49,7 +49,7 @@ class Picture:
 
 
 def make(cfg: CameraConfig) -> Camera:
-    """The camera of a config, its x horizontal."""
+    """Makes the camera of a config, its x horizontal."""
     offset = np.array(cfg.look_at) - np.array(cfg.position)
     x, y, _ = forward = offset / np.linalg.norm(offset)
     right = np.array([y, -x, 0.0]) / np.hypot(x, y)
@@ -59,13 +59,13 @@ def make(cfg: CameraConfig) -> Camera:
 
 
 def directions(camera: Camera) -> jax.Array:
-    """Rays [H, W, 3] of all pixels in the world frame, each 1 m long in depth."""
+    """Returns rays [H, W, 3] of all pixels in the world frame, each 1 m long in depth."""
     rows, columns = jnp.arange(camera.height), jnp.arange(camera.width)
     return direction(camera, rows[:, None], columns[None])
 
 
 def direction(camera: Camera, row: jax.Array, column: jax.Array) -> jax.Array:
-    """Rays [..., 3] of the pixels at these rows and columns, as in `directions`."""
+    """Returns rays [..., 3] of the pixels at these rows and columns, as in `directions`."""
     x = (column.astype(jnp.float32) - camera.centre[0]) / camera.focal[0]
     y = (row.astype(jnp.float32) - camera.centre[1]) / camera.focal[1]
     right, down, forward = (jnp.expand_dims(axis, range(x.ndim)) for axis in camera.rotation.T)
@@ -73,30 +73,31 @@ def direction(camera: Camera, row: jax.Array, column: jax.Array) -> jax.Array:
 
 
 def points(camera: Camera, depth: jax.Array) -> jax.Array:
-    """Points [H, W, 3] m in the world frame of the depths [H, W] m of all pixels."""
+    """Converts depths [H, W] m of all pixels to points [H, W, 3] m, world frame."""
     return depth[..., None] * directions(camera) + camera.position[None, None]
 
 
 def cast_rays(camera: Camera, cast: Callable[..., Any], shapes: Any) -> Any:
-    """`cast` of shapes and one ray (origin [3] m, direction [3]), for every pixel: [H, W, ...]."""
+    """Calls `cast` on shapes and every pixel's ray (origin [3] m, direction [3]): [H, W, ...]."""
     rays, shape = directions(camera).reshape(-1, 3), (camera.height, camera.width)
     hits = jax.vmap(cast, in_axes=(None, None, 0))(shapes, camera.position, rays)
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), hits)
 
 
 def project(camera: Camera, point: jax.Array) -> jax.Array:
-    """Column and row [2] px, not whole, of the pixel that sees a point [3] m before the camera."""
+    """Projects a point [3] m before the camera to column and row [2] px, not whole."""
     x, y, depth = (point - camera.position) @ camera.rotation
     return camera.focal * jnp.stack([x, y]) / depth + camera.centre
 
 
 @functools.lru_cache(maxsize=64)
 def window(cfg: CameraConfig, extent: float, highest: float, radius: float) -> tuple[int, int]:
-    """Rows and columns of a window that holds what the camera sees of any ball of `radius` m whose
-    centre lies over the square of side `extent` m, at most `highest` m high; at most the image.
+    """Returns rows and columns of a window that holds any ball of `radius` m in the image.
 
-    In the plane of an image axis and the optical axis, a ball at angle a and distance d lies
-    between a - s and a + s with sin s = radius / d. The window is centred on what `project` gives.
+    The ball's centre lies over the square of side `extent` m, at most `highest` m high, and
+    projects to the window's centre. In the plane of an image axis and the optical axis, a ball at
+    angle a and distance d lies between a - s and a + s with sin s = radius / d. The window is at
+    most the image.
     """
     with jax.ensure_compile_time_eval():
         eye = jax.device_get(make(cfg))
@@ -109,22 +110,22 @@ def window(cfg: CameraConfig, extent: float, highest: float, radius: float) -> t
         half = np.arcsin(np.minimum(radius / np.hypot(local[:, axis], local[:, 2]), 1.0))
         ends = np.tan(np.clip(np.stack([angle - half, angle + half]), -1.5, 1.5)) - np.tan(angle)
         reach.append(float(eye.focal[axis]) * float(np.abs(ends).max()))
-    columns, rows = (2 * math.ceil(each) + 3 for each in reach)
+    columns, rows = (2 * math.ceil(pixels) + 3 for pixels in reach)
     return min(rows, cfg.size[1]), min(columns, cfg.size[0])
 
 
 def shade(colour: jax.Array, normal: jax.Array, light: Any = LIGHT) -> jax.Array:
-    """Flat shading: colours [S, 3], 0 .. 1, of surfaces with unit normals [S, 3]; `light` [3] is
-    the unit vector towards the light."""
+    """Shades colours [S, 3], 0 .. 1, of surfaces with unit normals [S, 3]; `light` [3] is the unit
+    vector towards the light."""
     x, y, z = light
     cosine = normal[:, 0] * x + normal[:, 1] * y + normal[:, 2] * z  # [S]
     return (AMBIENT + (1.0 - AMBIENT) * jnp.maximum(cosine, 0.0))[:, None] * colour
 
 
 def render(camera: Camera, solids: Solids) -> Picture:
-    """The picture of a scene of any geoms, flat shaded."""
+    """Renders a scene of any geoms, flat shaded."""
     hit = cast_rays(camera, raycast.cast_solids, solids)
-    own = jnp.asarray(solids.colour).at[jnp.maximum(hit.geom, 0)].get(mode="promise_in_bounds")
-    lit = shade(own.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(own.shape)
+    flat = jnp.asarray(solids.colour).at[jnp.maximum(hit.geom, 0)].get(mode="promise_in_bounds")
+    lit = shade(flat.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(flat.shape)
     colour = jnp.where(hit.valid[..., None], lit, SKY[None, None])
     return Picture(colour, jnp.where(hit.valid, hit.distance, 0.0), hit.geom, hit.valid)

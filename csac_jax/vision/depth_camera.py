@@ -1,4 +1,4 @@
-"""What a depth camera makes of an exact depth image: noise, steps, holes, mixed pixels.
+"""Errors of a depth camera on an exact depth image: noise, steps, holes, mixed pixels.
 
 It works in inverse depth, w = 1 / z: a stereo camera's disparity is f b w, and a plane is linear in
 the image. Errors of w that do not depend on w are errors of z that grow with z^2.
@@ -35,7 +35,7 @@ STEEP = math.cos(math.radians(80.0))  # of the largest angle between ray and nor
 
 
 class DepthCamera(NamedTuple):
-    """How a camera measures depth."""
+    """Error model of a depth camera."""
 
     noise: float  # 1/m, standard deviation of inverse depth
     step: float  # 1/m, between inverse depths; 0: none
@@ -46,8 +46,8 @@ class DepthCamera(NamedTuple):
 
 
 def _stereo(width: int, view_deg: float, baseline: float) -> DepthCamera:
-    """A stereo camera of the D400 series with images of `width` px and a horizontal field of view;
-    `baseline` in m. Its window has 7 px a side (ours)."""
+    """Makes a stereo camera of the D400 series with images of `width` px and a horizontal field of
+    view; `baseline` in m. Its window has 7 px a side (ours)."""
     focal = 0.5 * width / math.tan(math.radians(0.5 * view_deg))
     disparity = focal * baseline  # px, at a depth of 1 m
     return DepthCamera(
@@ -65,7 +65,7 @@ CAMERAS: dict[SensorKind, DepthCamera] = {
     "d435": _stereo(848, 90.0, 0.050),  # [1], [2], [3]
     "azure_kinect": DepthCamera(0.017 / 3.86**2, 0.0, 0.5, 3.86, 0.0, 0.0),  # [6]
 }
-"""Every kind but `none`. The Kinect's random error of 17 mm is taken as that at its range's end."""
+"""Every kind but `none`. The Kinect's random error of 17 mm is taken at the end of its range."""
 
 
 def measure(
@@ -76,12 +76,12 @@ def measure(
     valid: jax.Array,
     lightness: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Measured depths [h, w] m, and which pixels have one [h, w] bool.
+    """Measures depths [h, w] m; returns them and [h, w] bool, a pixel has one.
 
-    Half of the pixels at edges have no depth. Neither have surfaces that are dark or seen at a flat
-    angle, what the second viewpoint does not see, and what is too near or too far. The light that
-    comes back is lightness cos(angle). Edges are at least 1 px wide to both sides. Multiple
-    reflections, sunlight and errors that stay from image to image are left out.
+    Half of the pixels at edges have no depth. Nor have surfaces that are dark, at a flat angle,
+    hidden from the second viewpoint, too near or too far. The returned light is
+    lightness cos(angle). Edges are at least 1 px wide to both sides. Multiple reflections, sunlight
+    and errors that stay from image to image are left out.
 
     Args: exact [h, w] m along the optical axis; valid [h, w] bool, the ray hit anything; lightness
     [h, w], share of the light that the surface scatters; eye, whose intrinsics count.
@@ -105,8 +105,8 @@ def measure(
 
 
 def supported(depth: jax.Array, focal: Any) -> jax.Array:
-    """Pixels [h, w] bool whose depth is that of SUPPORT of their eight neighbours or more: those
-    that have a depth and do not fly.
+    """Returns [h, w] bool, SUPPORT or more of a pixel's eight neighbours have its depth: a pixel
+    with a depth that does not fly.
 
     Args: depth [h, w] m, 0 where there is none; focal, px.
     """
@@ -117,26 +117,26 @@ def supported(depth: jax.Array, focal: Any) -> jax.Array:
         for row, col in itertools.product(range(3), repeat=2)
         if (row, col) != (1, 1)
     ]
-    alike = [(jnp.abs(one - depth) < reach).astype(jnp.int32) for one in neighbours]
+    alike = [(jnp.abs(other - depth) < reach).astype(jnp.int32) for other in neighbours]
     return functools.reduce(jnp.add, alike) >= SUPPORT
 
 
 def _shifted(inverse: jax.Array, radius: int) -> jax.Array:
-    """The pixels `radius` to the right, left, below and above [4, h, w]; edges repeat."""
+    """Returns the pixels `radius` to the right, left, below and above [4, h, w]; edges repeat."""
     padded, size = jnp.pad(inverse, radius, mode="edge"), inverse.shape
     starts = ((radius, 2 * radius), (radius, 0), (2 * radius, radius), (0, radius))
     return jnp.stack([jax.lax.dynamic_slice(padded, start, size) for start in starts])
 
 
 def _bend(inverse: jax.Array, around: jax.Array) -> jax.Array:
-    """How far the inverse depths [h, w] 1/m are from those of a plane; 0 on one."""
+    """Returns the distance of inverse depths [h, w] 1/m from a plane's; 0 on one."""
     right, left, below, above = around
     along, across = jnp.abs(right + left - 2.0 * inverse), jnp.abs(below + above - 2.0 * inverse)
     return jnp.maximum(along, across)
 
 
 def _cosine(eye: CameraConfig, inverse: jax.Array, around: jax.Array, radius: int) -> jax.Array:
-    """Cosine [h, w] of the angle between a surface's normal and the pixel's ray.
+    """Returns the cosine [h, w] of the angle between a surface's normal and the pixel's ray.
 
     On the plane n . p = 1 the pixel (x, y, 1) has the inverse depth n . (x, y, 1).
     """
@@ -151,10 +151,9 @@ def _cosine(eye: CameraConfig, inverse: jax.Array, around: jax.Array, radius: in
 
 
 def hidden(camera: DepthCamera, eye: CameraConfig, inverse: jax.Array) -> jax.Array:
-    """Pixels [h, w] bool that the second viewpoint does not see: the shadows at the left of what is
-    near.
+    """Returns [h, w] bool, hidden from the second viewpoint: shadows at the left of near things.
 
-    A pixel of column u lies in column u - f b w there. It is hidden by one further right that lies
+    A pixel of column u lies in column u - f b w there. A pixel further right hides it that lies
     half a pixel or more further left there. Things narrower than their shadow hide too much.
     """
     columns = jnp.arange(inverse.shape[1], dtype=jnp.float32)[None]
@@ -163,7 +162,7 @@ def hidden(camera: DepthCamera, eye: CameraConfig, inverse: jax.Array) -> jax.Ar
 
 
 def _alike_within(noise: jax.Array, window: float) -> jax.Array:
-    """Noise [h, w] of the same variance, each pixel a mean over `window` px to all sides."""
+    """Averages noise [h, w] over `window` px to all sides and keeps its variance."""
     reach = round(window)
     for axis in range(2):
         moved = [jnp.roll(noise, shift, axis) for shift in range(-reach, reach + 1)]
@@ -172,7 +171,7 @@ def _alike_within(noise: jax.Array, window: float) -> jax.Array:
 
 
 def _depth(camera: DepthCamera, inverse: jax.Array) -> jax.Array:
-    """Depths [h, w] m in steps; 0 where the inverse depth is not above 0."""
+    """Converts to depths [h, w] m in steps; 0 where the inverse depth is not above 0."""
     if camera.step > 0.0:
         inverse = camera.step * jnp.round(inverse / camera.step)
     ahead = inverse > 0.0

@@ -22,7 +22,7 @@ class Observation:
 
     colour: jax.Array  # [H, W, 3] float32, 0 .. 1
     height: jax.Array  # [H, W] float32, m above the table
-    target: jax.Array  # [H, W] bool, the block to get is seen; all True if any block will do
+    target: jax.Array  # [H, W] bool, a wanted block is seen; all True if any block is wanted
     fingers: jax.Array | None = None  # [3] float32 m, `grippers.Fingers`; None where unseen
 
 
@@ -45,10 +45,10 @@ class Cells(NamedTuple):
 
 
 def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Cells:
-    """Height map of points: z(r, c) = max_i {p_i.z : p_i in cell (r, c)}.
+    """Projects points to a height map: z(r, c) = max_i {p_i.z : p_i in cell (r, c)}.
 
     `max`, then the least index among those as high: JAX does not define the order of colliding
-    scatters. As high, not equal: a compiler may work z out twice and round otherwise.
+    scatters. As high, not equal: a compiler may compute z twice and round differently.
 
     Args: points [n, 3] m, world frame; valid [n] bool, False where the ray hit nothing.
     """
@@ -68,7 +68,7 @@ def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Ce
 def observation(
     cells: Cells, colour: jax.Array, target: jax.Array, elsewhere: jax.Array
 ) -> Observation:
-    """The observation of the points that are highest; cells without one have height, colour 0.
+    """Makes the observation of the highest points; cells without one have height and colour 0.
 
     Args: colour [H, W, 3] and target [H, W] bool of each cell's point, see `Cells.source`;
     elsewhere [] bool, the target flag of cells without one.
@@ -89,13 +89,13 @@ def pack(obs: Observation) -> PackedObservation:
 
 
 def unpack(packed: PackedObservation) -> Observation:
-    """The packed observation, to half a colour level and 0.05 mm."""
+    """Restores a packed observation, to half a colour level and 0.05 mm."""
     colour, height = (leaf.astype(jnp.float32) for leaf in (packed.colour, packed.height))
     return Observation(colour / 255.0, height * _HEIGHT_UNIT, packed.target, packed.fingers)
 
 
 def moved_area(cfg: HeightmapConfig, before: jax.Array, after: jax.Array) -> jax.Array:
-    """Area [] cm^2 whose height [H, W] m changed by 1 cm to 30 cm (VPG's bounds)."""
+    """Returns the area [] cm^2 whose height [H, W] m changed by 1 cm to 30 cm (VPG's bounds)."""
     change = jnp.abs(after - before)
     cells = jnp.sum((change >= 0.01) & (change <= 0.3), dtype=jnp.int32)
     return cells.astype(jnp.float32) * (cfg.cell**2 * 1e4)

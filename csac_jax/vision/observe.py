@@ -1,8 +1,8 @@
-"""From the state of one scene to the observation of it.
+"""From the state of one scene to its observation.
 
-Two views (`HeightmapConfig.view`). `ortho` is complete: one ray straight down per cell. `oblique`
-is the depth image of a camera at the side, as points projected along gravity, as in VPG
-(arXiv:1803.09956); what the camera does not see is empty. With a key, either has sensor noise.
+There are two views (`HeightmapConfig.view`). `ortho` is complete: one ray straight down per cell.
+`oblique` is the depth image of a camera at the side, its points projected along gravity as in VPG
+(arXiv:1803.09956); hidden cells are empty. With a key, either has sensor noise.
 
 A surface is a face of a geom or the table, numbered as in `raycast.SurfaceHit`. S = surfaces, G =
 geoms, [h, w] = camera pixels.
@@ -22,34 +22,34 @@ from csac_jax.scene.layout import Scene
 from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
 from csac_jax.vision.camera import Camera
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
-from csac_jax.vision.raycast import Bodies, Polytopes, SurfaceHit
+from csac_jax.vision.raycast import ObjectShapes, Polytopes, SurfaceHit
 
 HIGHEST = 0.25  # m, of the middle of an object that the camera at the side sees whole
 _LIGHT = np.uint32(2**31)  # distinct from a view key's children by `split`
 
 
 class SurfaceTables(NamedTuple):
-    """What is seen of each surface; row 0 is the table."""
+    """Appearance of each surface; row 0 is the table."""
 
     colour: jax.Array  # [S, 3] as lit, 0 .. 1
     is_target: jax.Array  # [S] bool
 
 
 class Shapes(NamedTuple):
-    """What rays meet in a scene; surfaces of blocks are numbered before those of objects."""
+    """Shapes in a scene for rays; surfaces of blocks are numbered before those of objects."""
 
     blocks: Polytopes
-    objects: Bodies | None = None
+    objects: ObjectShapes | None = None
 
     @property
     def first(self) -> int:
-        """Number of the first surface of an object."""
+        """Returns the number of the first surface of an object."""
         return 1 + self.blocks.offset.size
 
 
 def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observation:
-    """The observation of one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor`
-    drawn from `key`."""
+    """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` drawn from
+    `key`."""
     shapes = scene_shapes(cfg.scene, scene)
     tables = scene_tables(cfg.scene, scene, shapes, _light(cfg.sensor, key))
     if cfg.heightmap.view == "ortho":
@@ -58,17 +58,17 @@ def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observat
     believed = camera.make(cfg.camera)
     if key is not None:
         return oblique_noisy(key, cfg, shapes, tables, believed)
-    return from_pixels(cfg.heightmap, believed, seen(cfg, believed, shapes), tables)
+    return from_pixels(cfg.heightmap, believed, cast_pixels(cfg, believed, shapes), tables)
 
 
 def scene_shapes(cfg: SceneConfig, scene: Scene) -> Shapes:
-    """The convex parts of a scene's blocks and objects, for the raycaster."""
-    own = polytopes(cfg.slots, scene)
-    return Shapes(own, _objects(cfg, scene) if cfg.has_objects else None)
+    """Returns the convex parts of a scene's blocks and objects."""
+    objects = _objects(cfg, scene) if cfg.has_objects else None
+    return Shapes(polytopes(cfg.slots, scene), objects)
 
 
 def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
-    """The convex parts of a scene's blocks."""
+    """Returns the convex parts of a scene's blocks."""
     slot = blocks.parts(slots).slot  # [G], of each convex part
     return Polytopes(
         *blocks.half_spaces(slots, scene.half_size),
@@ -78,7 +78,7 @@ def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
     )
 
 
-def _objects(cfg: SceneConfig, scene: Scene) -> Bodies:
+def _objects(cfg: SceneConfig, scene: Scene) -> ObjectShapes:
     known, slot = stock.table(cfg), np.flatnonzero(blocks.is_object(cfg.slots))  # [M]
     number = scene.numbers[slot]
     normal, offset, first, centre = (
@@ -89,7 +89,7 @@ def _objects(cfg: SceneConfig, scene: Scene) -> Bodies:
     rotation = jax.vmap(geometry.quat_to_matrix)(scene.quaternion[slot])  # [M, 3, 3]
     # Products and sums, as in `raycast.world_half_spaces`.
     normal = (rotation[:, None, None] * normal[:, :, :, None]).sum(-1)
-    return Bodies(
+    return ObjectShapes(
         normal,
         offset + (normal * position[:, None, None]).sum(-1),
         first,
@@ -100,7 +100,7 @@ def _objects(cfg: SceneConfig, scene: Scene) -> Bodies:
 
 
 def _light(noise: SensorConfig, key: jax.Array | None) -> Any:
-    """Unit vector [3] towards the light."""
+    """Returns the unit vector [3] towards the light."""
     if key is None or noise.light == 0.0:
         return camera.LIGHT
     return sensor.light(jax.random.fold_in(key, _LIGHT), noise)
@@ -109,7 +109,7 @@ def _light(noise: SensorConfig, key: jax.Array | None) -> Any:
 def scene_tables(
     cfg: SceneConfig, scene: Scene, shapes: Shapes, light: Any = camera.LIGHT
 ) -> SurfaceTables:
-    """Lit colour and target flag of every surface of a scene; see `surface_tables`."""
+    """Returns lit colour and target flag of every surface of a scene, see `surface_tables`."""
     is_target = layout.is_target(scene)
     of_blocks = is_target[blocks.parts(cfg.slots).slot]
     tables = surface_tables(shapes.blocks, of_blocks, light)
@@ -127,10 +127,9 @@ def scene_tables(
 def surface_tables(
     shapes: Polytopes, is_target: jax.Array, light: Any = camera.LIGHT
 ) -> SurfaceTables:
-    """Lit colour and target flag of every surface; the table counts as target if all geoms do.
+    """Returns lit colour and target flag of every surface; the table is target if all geoms are.
 
-    Args: is_target [G] bool, geoms of the block to get; all True if any block will do; light, see
-    `camera.shade`.
+    Args: is_target [G] bool, geoms of wanted blocks; light, see `camera.shade`.
     """
 
     def per_surface(table: jax.Array, geom: jax.Array) -> jax.Array:
@@ -142,7 +141,7 @@ def surface_tables(
 
 
 def ortho(cfg: HeightmapConfig, shapes: Shapes, tables: SurfaceTables) -> Observation:
-    """The view from above: one ray from VIEW_HEIGHT through every cell centre.
+    """Observes from above: one ray from VIEW_HEIGHT through every cell centre.
 
     The direction has no ray axis under vmap, so a plane costs one scalar product per ray.
     """
@@ -158,9 +157,9 @@ def ortho(cfg: HeightmapConfig, shapes: Shapes, tables: SurfaceTables) -> Observ
 
 
 def _objects_below(
-    cfg: HeightmapConfig, objects: Bodies, hits: SurfaceHit, first: int
+    cfg: HeightmapConfig, objects: ObjectShapes, hits: SurfaceHit, first: int
 ) -> SurfaceHit:
-    """The hits of the rays straight down, with the objects, whose surfaces count from `first`."""
+    """Adds objects to the hits of rays straight down; their surfaces count from `first`."""
     down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
     side = min(math.ceil(2.0 * objects.radius / cfg.cell) + 1, cfg.size)
     low = objects.centre[:, 1::-1] - objects.radius  # y, x
@@ -173,8 +172,8 @@ def _objects_below(
     return _windows(objects, hits, corner, (side, side), ray, first)
 
 
-def seen(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
-    """What the pixels [h, w] of a camera hit that stands where `cfg.camera` does, or nearly."""
+def cast_pixels(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
+    """Casts the pixels [h, w] of a camera that stands at `cfg.camera`, or nearly."""
     hits, objects = camera.cast_rays(eye, raycast.cast_polytopes, shapes.blocks), shapes.objects
     if objects is None:
         return hits
@@ -190,14 +189,14 @@ def seen(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
 
 
 def _windows(
-    objects: Bodies,
+    objects: ObjectShapes,
     hits: SurfaceHit,
     corner: jax.Array,
     side: tuple[int, int],
     ray: raycast.Ray,
     first: int,
 ) -> SurfaceHit:
-    """`raycast.cast_windows` with corners [M, 2], whole numbers, moved into the grid."""
+    """Casts objects' windows, with corners [M, 2], whole numbers, moved into the grid."""
     most = np.array(hits.distance.shape) - side
     inside = jnp.clip(corner, 0.0, jnp.asarray(most, jnp.float32)[None]).astype(jnp.int32)
     return raycast.cast_windows(objects, hits, inside, side, ray, first)
@@ -206,7 +205,7 @@ def _windows(
 def ortho_noisy(
     key: jax.Array, noise: SensorConfig, exact: Observation, tables: SurfaceTables
 ) -> Observation:
-    """`exact` as a depth sensor at VIEW_HEIGHT measures it; cells without a depth are empty."""
+    """Adds the noise of a depth sensor at VIEW_HEIGHT; cells without a depth are empty."""
     key_depth, key_colour = jax.random.split(key)
     depth, valid = sensor.depth(key_depth, noise, VIEW_HEIGHT - exact.height)
     colour = jnp.where(valid[..., None], exact.colour, 0.0)
@@ -220,7 +219,7 @@ def ortho_noisy(
 def from_pixels(
     cfg: HeightmapConfig, eye: Camera, hits: SurfaceHit, tables: SurfaceTables
 ) -> Observation:
-    """The view from above of what pixels [h, w] hit; cells that they miss have height, colour 0."""
+    """Projects the hits of pixels [h, w] to the view from above; missed cells have height 0."""
     points = camera.points(eye, hits.distance).reshape(-1, 3)
     cells = heightmap.from_points(cfg, points, hits.valid.reshape(-1))
     row = hits.surface.reshape(-1).at[cells.source].get(mode="promise_in_bounds")
@@ -231,11 +230,11 @@ def from_pixels(
 def oblique_noisy(
     key: jax.Array, cfg: Config, shapes: Shapes, tables: SurfaceTables, believed: Camera
 ) -> Observation:
-    """`from_pixels` with sensor noise; the real camera stands a little off the `believed` one.
-    Flying pixels are left out, as `deploy` does."""
+    """Observes with sensor noise; the real camera stands a little off the `believed` one. Flying
+    pixels are left out, as in `deploy`."""
     key_pose, key_depth, key_colour = jax.random.split(key, 3)
     real = sensor.pose(key_pose, cfg.sensor, believed)
-    hits = seen(cfg, real, shapes)
+    hits = cast_pixels(cfg, real, shapes)
     exact = jnp.where(hits.valid, hits.distance, 0.0)
     lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
     depth, valid = sensor.depths(key_depth, cfg.sensor, cfg.camera, exact, hits.valid, lit)

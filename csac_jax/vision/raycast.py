@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from csac_jax.scene.solids import GeomGroup, Solids
-from csac_jax.vision import shapes
+from csac_jax.vision import ray_shapes
 
 # Rows and columns [h, w] of a grid of rays -> their origin and direction, [h, w, 3] or one for all.
 Ray = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
@@ -36,7 +36,7 @@ class Polytopes:
 
 
 @struct.dataclass
-class Bodies:
+class ObjectShapes:
     """Objects of many convex parts in one scene, world frame. M objects, C chunks of faces of the
     one with the most, F faces of a chunk; see `objects.tables`."""
 
@@ -50,7 +50,7 @@ class Bodies:
 
 @struct.dataclass
 class Hit:
-    """Where one ray first hits; normal and geom are meaningless where not valid."""
+    """First hit of one ray; normal and geom are meaningless where not valid."""
 
     distance: jax.Array  # [] in lengths of the ray's direction; infinite where not valid
     normal: jax.Array  # [3] outward unit normal of the surface, world frame
@@ -59,7 +59,7 @@ class Hit:
 
 
 class SurfaceHit(NamedTuple):
-    """Where one ray first hits: surface 0 is the table, 1 + g F + f is face f of geom g; those of
+    """First hit of one ray: surface 0 is the table, 1 + g F + f is face f of geom g; those of
     objects follow, object by object."""
 
     distance: jax.Array  # [] in lengths of the ray's direction; infinite where not valid
@@ -68,31 +68,31 @@ class SurfaceHit(NamedTuple):
 
 
 def world_half_spaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
-    """Half-spaces of every geom in the world frame: normals [G, F, 3] and offsets [G, F] m."""
+    """Returns the half-spaces of geoms in the world frame: normals [G, F, 3], offsets [G, F] m."""
     # Products and sums: some accelerators run a matrix product at reduced precision.
     normal = (polytopes.rotation[:, None, :, :] * polytopes.normal[:, :, None, :]).sum(-1)
     return normal, polytopes.offset + (normal * polytopes.position[:, None, :]).sum(-1)
 
 
 def surface_normals(polytopes: Polytopes) -> jax.Array:
-    """World normal [1 + G F, 3] of every surface, see `SurfaceHit`."""
+    """Returns the world normal [1 + G F, 3] of every surface, see `SurfaceHit`."""
     normal, _ = world_half_spaces(polytopes)
     return jnp.concatenate([jnp.array([[0.0, 0.0, 1.0]]), normal.reshape(-1, 3)])
 
 
 def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
-    """First surface on the ray from `origin` [3] m along `direction` [3] of any length.
+    """Finds the first surface on the ray from `origin` [3] m along `direction` [3], any length.
 
-    Read properties of a surface, such as its colour, from a table of surfaces: to compute the
-    normal alone for every ray takes longer than to find the surface.
+    Read colours and normals of a hit from a table of surfaces: computing the normal alone for every
+    ray takes longer than finding the surface.
     """
     normal, offset = world_half_spaces(polytopes)
     geoms, faces = offset.shape
-    table = shapes.ray_plane(jnp.zeros(3), origin, direction)
+    table = ray_shapes.ray_plane(jnp.zeros(3), origin, direction)
 
     def fold_geom(nearest, geom):
         distance, surface = nearest
-        enter, face, valid = shapes.enter_half_spaces(geom[0], geom[1], origin, direction)
+        enter, face, valid = ray_shapes.enter_half_spaces(geom[0], geom[1], origin, direction)
         closer = valid & (enter < distance)
         surface = jnp.where(closer, geom[2] * faces + face + 1, surface)
         return (jnp.where(closer, enter, distance), surface), None
@@ -103,13 +103,13 @@ def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array
     return SurfaceHit(distance, surface, table.valid | (surface > 0))
 
 
-def cast_body(bodies: Bodies, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
-    """First face of one object, leaves without the axis M, on one ray; faces count from 0.
+def cast_body(objects: ObjectShapes, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
+    """Finds the first face of one object, leaves without the axis M; faces count from 0.
 
-    As `shapes.enter_half_spaces`, but a part may go on in the next chunk: the parts are what lies
-    between two chunks with `first`.
+    As `ray_shapes.enter_half_spaces`, but a part may span several chunks: a chunk with `first`
+    begins the next part.
     """
-    chunks, faces = bodies.offset.shape
+    chunks, faces = objects.offset.shape
 
     def ended(nearest: Any, part: Any, ends: Any) -> Any:
         enter, leave, _ = part
@@ -122,50 +122,54 @@ def cast_body(bodies: Bodies, origin: jax.Array, direction: jax.Array) -> Surfac
         nearest = ended(nearest, part, first)
         enter, leave, face = jax.tree.map(functools.partial(jnp.where, first), outside, part)
         ray = origin, direction
-        part = shapes.clip(normal, offset, *ray, enter, leave, face, number * faces)
+        part = ray_shapes.clip(normal, offset, *ray, enter, leave, face, number * faces)
         return (nearest, part), None
 
     no_face = jnp.array(0, jnp.int32)
     outside: Any = (jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32), no_face)
     start: Any = ((jnp.array(jnp.inf, jnp.float32), no_face), outside)
-    rows = (bodies.normal, bodies.offset, bodies.first, jnp.arange(chunks, dtype=jnp.int32))
+    rows = (objects.normal, objects.offset, objects.first, jnp.arange(chunks, dtype=jnp.int32))
     (nearest, last), _ = jax.lax.scan(fold_chunk, start, rows)
     distance, face = ended(nearest, last, jnp.array(True))
     return SurfaceHit(distance, face, distance < jnp.inf)
 
 
 def cast_windows(
-    bodies: Bodies, hits: SurfaceHit, corner: jax.Array, side: tuple[int, int], ray: Ray, first: int
+    objects: ObjectShapes,
+    hits: SurfaceHit,
+    corner: jax.Array,
+    side: tuple[int, int],
+    ray: Ray,
+    first: int,
 ) -> SurfaceHit:
-    """The hits [h, w] of a grid of rays, with objects in the way: each meets a window of rays only.
+    """Adds objects to the hits [h, w] of a grid of rays; each is tested on a window of rays only.
 
-    The windows must hold all rays that meet the objects, so that nothing is missed: bounding
-    volumes are culled with shapes known at compile time.
+    A window must hold all rays that meet its object. Its shape is known at compile time.
 
     Args: corner [M, 2] int32, first row and column of each object's window, which lies in the grid;
     side, its rows and columns; ray, see `Ray`; first, number of the objects' first surface.
     """
     rows, columns = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in side), indexing="ij")
-    size = bodies.offset.shape[1] * bodies.offset.shape[2]
+    size = objects.offset.shape[1] * objects.offset.shape[2]
 
-    def fold_object(found: SurfaceHit, one: Any) -> tuple[SurfaceHit, None]:
-        body, at, number = one
-        before = jax.tree.map(lambda leaf: jax.lax.dynamic_slice(leaf, at, side), found)
+    def fold_object(nearest: SurfaceHit, row: Any) -> tuple[SurfaceHit, None]:
+        shapes, at, number = row
+        before = jax.tree.map(lambda leaf: jax.lax.dynamic_slice(leaf, at, side), nearest)
         rays = ray(at[0] + rows, at[1] + columns)
         axes = (None, *(0 if leaf.ndim == 3 else None for leaf in rays))
-        inside = jax.vmap(jax.vmap(cast_body, axes), axes)(body, *rays)
+        inside = jax.vmap(jax.vmap(cast_body, axes), axes)(shapes, *rays)
         after = inside._replace(surface=inside.surface + (first + number * size))
         closer = after.valid & (after.distance < before.distance)
         merged = jax.tree.map(functools.partial(jnp.where, closer), after, before)
         paste = functools.partial(jax.lax.dynamic_update_slice, start_indices=at)
-        return jax.tree.map(paste, found, merged), None
+        return jax.tree.map(paste, nearest, merged), None
 
     numbers = jnp.arange(len(corner), dtype=jnp.int32)
-    return jax.lax.scan(fold_object, hits, (bodies, corner, numbers))[0]
+    return jax.lax.scan(fold_object, hits, (objects, corner, numbers))[0]
 
 
 def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:
-    """First geom of `solids` on the ray from `origin` [3] m along `direction` [3] of any length.
+    """Finds the first geom on the ray from `origin` [3] m along `direction` [3] of any length.
 
     There is no table unless `solids` has one. Each kind of geom is one loop.
     """
@@ -173,9 +177,9 @@ def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:
     def fold(nearest: Any, geom: GeomGroup) -> tuple[Any, None]:
         offset = [origin[axis] - geom.position[axis] for axis in range(3)]
         axes = geom.rotation.T
-        local = ([shapes.dot(axis, part) for axis in axes] for part in (offset, direction))
-        entry = shapes.RAY[geom.kind](geom.shape, *local)
-        normal = tuple(shapes.dot(row, entry.normal) for row in geom.rotation)
+        local = ([ray_shapes.dot(axis, part) for axis in axes] for part in (offset, direction))
+        entry = ray_shapes.RAY[geom.kind](geom.shape, *local)
+        normal = tuple(ray_shapes.dot(row, entry.normal) for row in geom.rotation)
         closer = entry.valid & (entry.distance < nearest[0])
         entered = (entry.distance, normal, geom.geom)
         return jax.tree.map(functools.partial(jnp.where, closer), entered, nearest), None

@@ -29,7 +29,7 @@ class RotationTables:
 
 
 def tables(size: int, extent: float, rotations: int, count: int, margin: float) -> RotationTables:
-    """Tables to rotate maps [size, size, ch] of `extent` m by the first `count` of K rotations."""
+    """Makes tables to rotate maps [size, size, ch] of `extent` m by the first `count` of K yaws."""
     canvas = canvas_size(size, margin)
     along = np.arange(canvas) + 0.5 - 0.5 * canvas  # cells from the centre
     y, x = np.meshgrid(along, along, indexing="ij")
@@ -53,23 +53,23 @@ def rotate(tables: RotationTables, maps: jax.Array, k: Any = slice(None)) -> jax
 
 
 def to_cell(canvas: int, cell_size: float, yaw: jax.Array, xy: jax.Array) -> jax.Array:
-    """Position (row, col) [..., 2], in cells of `cell_size` m, of workspace points `xy` [..., 2] m
+    """Converts workspace points `xy` [..., 2] m to (row, col) [..., 2], in cells of `cell_size` m,
     in the frame rotated by `yaw` [] rad."""
     return geometry.rotate2d(-yaw, xy)[..., ::-1] / cell_size + 0.5 * (canvas - 1)
 
 
 def floor(position: jax.Array) -> jax.Array:
-    """Cells or frames at or below positions [...] among them, float32. What is CLOSE below a whole
-    number counts as that number, and interpolation goes on past its end by as little.
+    """Rounds positions [...] down to cells or frames, float32; CLOSE below a whole number counts as
+    that number.
 
-    XLA may work a position out twice, for the values that are read and for their weights, and round
+    XLA may compute a position twice, for the values that are read and for their weights, and round
     it differently. In a cell's centre both must find the same cell.
     """
     return jnp.floor(position + CLOSE)
 
 
 def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
-    """Value [] of the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells.
+    """Interpolates the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells; returns [].
 
     Cell centres are whole numbers; outside, the nearest edge counts. Differentiable in both.
     """

@@ -1,6 +1,6 @@
-"""Errors of a real depth camera; those that are switched off are left out of the program.
+"""Errors of a real depth camera; those that are off are left out of the program.
 
-An image of another renderer gets them so; `believed` is a CameraConfig:
+For images of another renderer, with a CameraConfig `believed`:
 
     real = sensor.pose(key_pose, cfg, camera.make(believed))  # draw rgb and depth from here
     rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)
@@ -22,8 +22,8 @@ _SRGB = 2.2  # exponent from a colour level to light, about that of sRGB
 
 
 def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
-    """Root key of the noise of an episode reset with `key`, None without noise; ValueError if there
-    is noise but no key."""
+    """Returns the root key of the noise of an episode reset with `key`, None without noise. Raises
+    ValueError for noise without a key."""
     if not cfg.active:
         return None
     if key is None:
@@ -32,7 +32,7 @@ def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
 
 
 def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Measured depths m of the exact ones, any shape, and which pixels have one, bool.
+    """Measures exact depths m of any shape; returns them and bool, a pixel has one.
 
     Normal with standard deviation floor + square d^2; source: SensorConfig.
     """
@@ -50,17 +50,17 @@ def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Arra
 def image(
     key: jax.Array, cfg: SensorConfig, eye: CameraConfig, rgb: Any, depth: Any
 ) -> tuple[jax.Array, jax.Array]:
-    """An image of any renderer as the sensor gives it; the pose's and the lens's errors are `pose`.
+    """Adds sensor errors to an image of any renderer; errors of pose and lens are in `pose`.
 
     Args: rgb [h, w, 3] uint8; depth [h, w] m along the optical axis, 0 or NaN where there is none.
     Returns: the same; depth 0 where there is none.
     """
     key_depth, key_colour = jax.random.split(key)
     exact, valid = depth.astype(jnp.float32), depth > 0.0
-    seen = rgb.astype(jnp.float32) / 255.0
-    found, kept = depths(key_depth, cfg, eye, jnp.where(valid, exact, 0.0), valid, seen)
-    levels = jnp.round(255.0 * colour(key_colour, cfg, seen)).astype(jnp.uint8)
-    return levels, jnp.where(kept, jnp.maximum(found, 0.0), 0.0)
+    lit = rgb.astype(jnp.float32) / 255.0
+    measured, known = depths(key_depth, cfg, eye, jnp.where(valid, exact, 0.0), valid, lit)
+    levels = jnp.round(255.0 * colour(key_colour, cfg, lit)).astype(jnp.uint8)
+    return levels, jnp.where(known, jnp.maximum(measured, 0.0), 0.0)
 
 
 def depths(
@@ -71,20 +71,20 @@ def depths(
     valid: jax.Array,
     colour: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Depth image [h, w] m and which pixels have a depth, bool: of `depth_camera`, then `depth`.
+    """Measures a depth image [h, w] m by `depth_camera`, then `depth`; see `depth`.
 
     Args: exact [h, w] m; valid [h, w] bool; colour [h, w, 3], 0 .. 1, as lit.
     """
     if cfg.kind != "none":
         lightness = jnp.mean(colour, axis=-1) ** _SRGB
-        camera, own = depth_camera.CAMERAS[cfg.kind], jax.random.fold_in(key, _OWN)
-        exact, valid = depth_camera.measure(own, camera, eye, exact, valid, lightness)
-    measured, kept = depth(key, cfg, exact)
-    return measured, valid & kept
+        model, key_model = depth_camera.CAMERAS[cfg.kind], jax.random.fold_in(key, _OWN)
+        exact, valid = depth_camera.measure(key_model, model, eye, exact, valid, lightness)
+    measured, known = depth(key, cfg, exact)
+    return measured, valid & known
 
 
 def pose(key: jax.Array, cfg: SensorConfig, believed: Camera) -> Camera:
-    """The real camera: the believed one, moved and rotated a little, with another lens."""
+    """Draws the real camera: the believed one, moved and rotated a little, with another lens."""
     key_position, key_rotation = jax.random.split(key)
     position, rotation = believed.position, believed.rotation
     std_position, std_rotation = cfg.pose_noise
@@ -104,13 +104,13 @@ def pose(key: jax.Array, cfg: SensorConfig, believed: Camera) -> Camera:
 
 
 def light(key: jax.Array, cfg: SensorConfig) -> jax.Array:
-    """Unit vector [3] towards the light: that of `camera.shade`, turned a little."""
+    """Draws the unit vector [3] towards the light: that of `camera.shade`, turned a little."""
     towards = jnp.asarray(camera.LIGHT, jnp.float32) + cfg.light * jax.random.normal(key, (3,))
     return towards / jnp.sqrt(jnp.sum(towards**2))
 
 
 def colour(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> jax.Array:
-    """Colours [H, W, 3] in 0 .. 1 under another white balance and brightness: one random gain per
+    """Changes white balance and brightness of colours [H, W, 3] in 0 .. 1: one random gain per
     channel, and one of all."""
     if cfg.colour == 0.0 and cfg.light == 0.0:
         return exact

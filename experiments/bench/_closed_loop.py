@@ -21,7 +21,7 @@ from csac_jax.env import Env
 from csac_jax.errors import DataWarning, ViewError
 from csac_jax.evaluation import suites
 from csac_jax.evaluation.metrics import wilson
-from csac_jax.render import rgbd
+from csac_jax.render import picture
 from csac_jax.scene import layout, model
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import outcome, physics as simulation, primitives
@@ -145,7 +145,9 @@ def _episode(
     scene = _first_scene(loop, number)
     blocks, taken_before = int(scene.in_play.sum()), counts["blocks_taken"]
     counts["blocks"] += blocks
-    studio = rgbd.Studio(model.build(env.cfg.scene, env.cfg.sim), scene, env.cfg.camera.size)
+    studio = picture.RgbdRenderer(
+        model.build(env.cfg.scene, env.cfg.sim), scene, env.cfg.camera.size
+    )
     unchanged = 0
     for action in range(task.max_actions):
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(loop.seed), number), action)
@@ -176,7 +178,7 @@ def _record(
     came: record.Outcome,
 ) -> None:
     """Adds an image, its decision and what came of it."""
-    given = (*image, rgbd.intrinsics(cfg.camera), _pose(cfg), None)
+    given = (*image, picture.intrinsics(cfg.camera), _pose(cfg), None)
     recorder.post(recorder.add(given, [decision]), came)
 
 
@@ -196,7 +198,7 @@ def _first_scene(loop: Loop, number: int) -> Scene:
 
 
 def _photograph(
-    cfg: Config, errors: SensorConfig, key: jax.Array, studio: rgbd.Studio, scene: Scene
+    cfg: Config, errors: SensorConfig, key: jax.Array, studio: picture.RgbdRenderer, scene: Scene
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colour and depth of a scene as the sensor gives them."""
     key_pose, key_image = jax.random.split(key)
@@ -220,7 +222,7 @@ def _decide(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DataWarning)
         try:
-            decisions = policy.decide(*image, rgbd.intrinsics(cfg.camera), _pose(cfg))
+            decisions = policy.decide(*image, picture.intrinsics(cfg.camera), _pose(cfg))
         except ViewError:
             counts["refused"] += 1
             return None

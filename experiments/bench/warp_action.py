@@ -92,14 +92,14 @@ def _differing(one: Any, other: Any) -> int:
 
 def _calls(env: environment.Env, states: environment.State, actions: Action) -> int:
     """Calls of Warp in a scan of two steps that keeps what training keeps."""
-    from csac_jax.sim.warp_action import Simulator
+    from csac_jax.sim.warp_action import WarpSimulator
 
     def step(states: environment.State, _: None) -> tuple[environment.State, Any]:
         after = jax.vmap(env.step)(states, actions)
         return after, after.info
 
     with mock.patch.object(
-        Simulator, "prepared", autospec=True, side_effect=Simulator.prepared
+        WarpSimulator, "prepared", autospec=True, side_effect=WarpSimulator.prepared
     ) as counted:
         scan = jax.jit(lambda states: jax.lax.scan(step, states, length=2))
         jax.block_until_ready(scan(states))

@@ -1,5 +1,4 @@
-"""A script: an image of two blocks by MuJoCo's renderer, in a process of its own since OpenGL is
-chosen before MuJoCo is imported."""
+"""A script: an image of two blocks by MuJoCo's renderer; OpenGL is chosen before the import."""
 
 import sys
 from typing import Any
@@ -39,10 +38,10 @@ def main(out_path: str) -> None:
     """Writes colour and depth; exits with 3 where there is no OpenGL."""
     if gl.choose() is None:
         sys.exit(3)
-    from csac_jax.render import rgbd
+    from csac_jax.render import picture
     from csac_jax.scene import model
 
-    studio = rgbd.Studio(model.build(CFG.scene, CFG.sim), scene(), EYE.size)
+    studio = picture.RgbdRenderer(model.build(CFG.scene, CFG.sim), scene(), EYE.size)
     colour, depth = studio.image(scene(), eye())
     studio.close()
     np.savez(out_path, colour=colour, depth=depth)

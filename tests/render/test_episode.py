@@ -35,8 +35,7 @@ def here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
-    """Claim: with no OpenGL, the planner takes a cube: a line per action, picture, video of the
-    whole motion, JSON."""
+    """Claim: without OpenGL, the planner takes a cube: lines, picture, whole video, JSON."""
     files = ["--png", "a/b.png", "--video", "a/b.mp4", "--json", "a/b.json"]
     assert cli.main(["play", "--scene", "cube.json", "--size", "96", "64", *files]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -52,9 +51,8 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
         "rays",
     )
     assert result["blocks_lost"] == 0
-    assert (
-        imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + episode.HOLD
-    )  # 4 ms a substep, 25 a second
+    # 4 ms a substep, 25 a second
+    assert imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + episode.HOLD
     frames = imageio_ffmpeg.read_frames("a/b.mp4")
     width, height = next(frames)["size"]
     assert (width, height) == (96 + 56, 64 + 4)  # the height map to the right, text below
@@ -76,7 +74,7 @@ def _step(
     diverged: bool = False,
     failed: int = 0,
 ) -> Any:
-    """What an episode's summary reads of a step."""
+    """The parts of a step that an episode's summary reads."""
     info = SimpleNamespace(
         cleared=cleared, blocks_lost=blocks_lost, physics_diverged=np.bool_(diverged)
     )
@@ -161,8 +159,7 @@ def test_bad_arguments_are_one_line(
 def test_video_without_the_extra_names_it(
     here, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
-    """Claim: without ffmpeg's wheel, --video says in one line how to get it, before anything is
-    simulated."""
+    """Claim: without ffmpeg's wheel, --video says how to get it, before simulating."""
     import importlib.util
 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)

@@ -17,8 +17,7 @@ SHADES = range(40, 240, 8)
 
 @pytest.mark.parametrize("suffix", media.PICTURES)
 def test_picture_has_the_format_of_its_suffix(tmp_path: Path, suffix: str):
-    """Claim: every suffix that is offered gives a file of that format, in folders that need not
-    exist."""
+    """Claim: every suffix offered gives its format, in folders that need not exist."""
     path = tmp_path / "new" / f"a{suffix.upper()}"
     media.write_picture(path, np.full((30, 46, 3), 90, np.uint8))
     with Image.open(path) as image:
@@ -35,8 +34,7 @@ def test_png_is_what_was_drawn(tmp_path: Path):
 
 @pytest.mark.parametrize("suffix", media.VIDEOS)
 def test_video_has_every_picture(tmp_path: Path, suffix: str):
-    """Claim: a video has as many pictures as were given, of their size and about their colour; its
-    writing warns of nothing."""
+    """Claim: a video has every picture, its size and about its colour, without warnings."""
     path = tmp_path / "new" / f"a{suffix}"
     jax.devices()  # warns of forks from now on
     with warnings.catch_warnings(record=True) as complaints:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from csac_jax import grippers, presets
 from csac_jax.constants import Primitive
-from csac_jax.render import maps, panels
+from csac_jax.render import heatmaps, panels
 
 CFG = presets.smoke()
 RG2 = grippers.load("rg2")
@@ -76,7 +76,7 @@ def test_height_map_and_grasp_lie_where_they_are():
     np.testing.assert_allclose(
         places[dark].mean(axis=0), [0.1, -0.15], atol=0.5 * CFG.heightmap.cell
     )
-    hand = _places(fig, "Height map", maps.CHOSEN)
+    hand = _places(fig, "Height map", heatmaps.CHOSEN)
     np.testing.assert_allclose(hand.mean(axis=0), [-0.1, 0.05], atol=0.003)
     width, height = np.ptp(hand, axis=0)
     assert width == pytest.approx(RG2.opening[1], abs=0.01)
@@ -87,7 +87,7 @@ def test_push_is_an_arrow_over_its_way():
     """Claim: a push begins at its place, is as long as it goes, and is widest near its end."""
     yaw = 0.5 * np.pi
     fig = panels.figure(CFG, _step(Primitive.PUSH, (-0.1, 0.0, yaw), learned=False), HEIGHT)
-    arrow = _places(fig, "Height map", maps.CHOSEN)
+    arrow = _places(fig, "Height map", heatmaps.CHOSEN)
     ends = arrow[:, 1].min(), arrow[:, 1].max()
     assert ends == pytest.approx((0.0, CFG.sim.push_length), abs=0.005)
     begin, end = (np.ptp(arrow[part, 0]) for part in (arrow[:, 1] < 0.04, arrow[:, 1] > 0.06))
@@ -95,13 +95,12 @@ def test_push_is_an_arrow_over_its_way():
 
 
 def test_learned_policy_shows_its_maps():
-    """Claim: of a learned policy, Q of pushes and of grasps is shown on one scale, cells with
-    nothing to act on apart, and the candidates of both in the height map."""
+    """Claim: Q maps share one scale, invalid cells stand out, candidates are in the height map."""
     fig = panels.figure(CFG, _step(Primitive.GRASP, (0.0, 0.0, 0.0), learned=True), HEIGHT)
     best = _places(fig, "Push value, best +2.00", HIGHEST)
     np.testing.assert_allclose(best.mean(axis=0), [-0.1, 0.1], atol=0.5 * CFG.heightmap.cell)
     assert not len(_places(fig, "Grasp value, best +0.00", HIGHEST))
-    invalid = np.abs(_places(fig, "Push value", maps.INVALID)).max(axis=1)
+    invalid = np.abs(_places(fig, "Push value", heatmaps.INVALID)).max(axis=1)
     assert invalid.min() == pytest.approx((0.5 * SIZE - 4) * CFG.heightmap.cell, abs=0.003)
     for primitive, x in ((Primitive.PUSH, 0.15), (Primitive.GRASP, -0.15)):
         places = _places(fig, "Height map", panels.CANDIDATES[primitive])
@@ -112,15 +111,14 @@ def test_learned_policy_shows_its_maps():
 def test_action_is_drawn_in_its_own_q_map(chosen: Primitive):
     """Claim: the Q map of the chosen primitive shows the action, the other does not."""
     fig = panels.figure(CFG, _step(chosen, (0.0, 0.0, 0.0), learned=True), HEIGHT)
-    shown = [len(_places(fig, f"{kind.name.title()} value", maps.CHOSEN)) for kind in Primitive]
+    shown = [len(_places(fig, f"{kind.name.title()} value", heatmaps.CHOSEN)) for kind in Primitive]
     assert [count > 0 for count in shown] == [kind == chosen for kind in Primitive]
 
 
 @pytest.mark.parametrize("learned", [True, False])
 @pytest.mark.parametrize("size", [(120, 160), (98, 130), (16, 16)])
 def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tuple[int, int]):
-    """Claim: sides are even, as videos need; the scene is untouched, and the text stands below
-    everything."""
+    """Claim: sides are even; the scene is untouched, the text stands below."""
     scene = np.full((*size, 3), 7, np.uint8)
     step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned)
     complete = panels.frame(CFG, step, size[0])
@@ -143,7 +141,7 @@ def test_long_text_stays_in_sight():
 
 
 def _runs(rows: np.ndarray) -> int:
-    """How many separate runs of True there are."""
+    """Number of separate runs of True."""
     return int(np.sum(np.diff(rows.astype(int), prepend=0) == 1))
 
 
@@ -164,4 +162,4 @@ def test_nothing_to_act_on():
     step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True)
     step.debug.q[:] = -np.inf
     fig = panels.figure(CFG, step, HEIGHT)
-    assert len(_places(fig, "Push value, nowhere", maps.INVALID)) > 20000
+    assert len(_places(fig, "Push value, nowhere", heatmaps.INVALID)) > 20000

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax.render import gl, picture
-from csac_jax.render.picture import View
+from csac_jax.render.picture import Viewpoint
 
 BALL = """
 <mujoco>
@@ -23,7 +23,7 @@ BALL = """
   </worldbody>
 </mujoco>
 """
-VIEW = View(position=(-1.0, 0.0, 0.8), look_at=(0.0, 0.0, 0.1), size=(96, 64))
+VIEW = Viewpoint(position=(-1.0, 0.0, 0.8), look_at=(0.0, 0.0, 0.1), size=(96, 64))
 _BOTH = f"""
 import csac_jax, json, sys
 from csac_jax.render import gl
@@ -37,7 +37,7 @@ def pictures(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    view = picture.View({VIEW.position}, {VIEW.look_at}, {VIEW.size})
+    view = picture.Viewpoint({VIEW.position}, {VIEW.look_at}, {VIEW.size})
     return [draw(model, view)(data) for draw in ways]
 skies = pictures("<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>")
 shown = pictures('''{BALL}''')
@@ -46,8 +46,7 @@ print(json.dumps([[image.tolist() for image in shown], [image[0, 0].tolist() for
 
 
 def test_rays_show_what_stands_where():
-    """Claim: with no OpenGL, what is left of the view's middle is drawn left, what is farther up
-    higher."""
+    """Claim: without OpenGL, left is drawn left, and farther up higher."""
     model = mujoco.MjModel.from_xml_string(BALL)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -67,8 +66,7 @@ def _where(drawn: np.ndarray, channel: int) -> np.ndarray:
 
 
 def test_both_ways_of_drawing_agree():
-    """Claim: MuJoCo's renderer and our rays show the same things in the same places, to the
-    pixel, under a white sky."""
+    """Claim: MuJoCo's renderer and our rays show the same to the pixel, under a white sky."""
     done = subprocess.run(
         [sys.executable, "-c", _BOTH], capture_output=True, text=True, timeout=300
     )

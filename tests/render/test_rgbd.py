@@ -70,8 +70,7 @@ def test_image_agrees_with_rays(tmp_path: Path):
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_waypoints_are_followed_as_planned(primitive: Primitive):
-    """Claim: straight ways between the waypoints of a decision are the set-points of the simulated
-    primitive, to 0.1 mm and, of the fingers, to the same."""
+    """Claim: straight ways between waypoints are the simulated set-points, to 0.1 mm."""
     height = jnp.zeros((64, 64)).at[20:40, 20:40].set(0.05)
     action = Action(jnp.int32(primitive), jnp.array([-0.03, 0.02, 0.7]))
     plan = primitives.plan(CFG.sim, CFG.heightmap, height, action)

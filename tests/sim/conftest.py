@@ -1,8 +1,8 @@
-"""Scripted and settled scenes, run once in MJX as one batch, and once in C MuJoCo by the same
-plan."""
+"""Scripted scenes on every engine; settled scenes in MJX, and in C MuJoCo by the same plans."""
 
 import dataclasses
 import functools
+import importlib.util
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,18 +18,20 @@ from csac_jax.constants import Primitive
 from csac_jax.objects import body, library, solid
 from csac_jax.scene import blocks, layout, model, pool, stock
 from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, mjx_physics, oracle, physics as simulation, primitives
+from csac_jax.sim import c_physics, oracle, physics as simulation, primitives
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.primitives import Action, JointTrajectory, Plan
 from csac_jax.vision import observe
 
 CONFIG = Config(scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, settle_time=1.5))
 SETTLED = 40
+HAS_WARP = importlib.util.find_spec("warp") is not None
+_NO_WARP = pytest.mark.skipif(not HAS_WARP, reason="Warp is an extra: pip install 'csac-jax[warp]'")
+WARP = pytest.param("warp", marks=[pytest.mark.slow, _NO_WARP])
 
 
 def place(**shapes: tuple[float, float, float]) -> Scene:
-    """A scene of blocks on the table at (x, y, yaw): up to two cubes, one prism; the other slots
-    are parked."""
+    """A scene of up to two cubes and a prism on the table at (x, y, yaw); other slots are parked."""
     scene = layout.parked(CONFIG.scene.slots)
     position, quaternion = scene.position.copy(), scene.quaternion.copy()
     slots = {"cube": 0, "other": 1, "prism": 2}
@@ -46,14 +48,11 @@ def act(primitive: Primitive, x: float, y: float, yaw: float = 0.0) -> Action:
 
 push = functools.partial(act, Primitive.PUSH)
 grasp = functools.partial(act, Primitive.GRASP)
-
-
-BAR = np.float32([0.02, 0.04, 0.025])
-"""Half sizes of a bar, m."""
+BAR = np.float32([0.02, 0.04, 0.025])  # m, half sizes of a bar
 
 
 def bar(folder: Path) -> dict[str, Any]:
-    """Settings of a scene of one bar of 140 g, from a library that is put in `folder`."""
+    """Settings of a scene of one bar of 140 g, from a library in `folder`."""
     corners = BAR * list(itertools.product((-1, 1), repeat=3))
     library.save(folder / "bar", [body.make("bar", [solid.convex(corners)], density=900.0)])
     return {"slots": ("object",), "min_blocks": 1, "objects": str(folder / "bar"), "split": "all"}
@@ -83,8 +82,7 @@ TWO_OBJECTS = presets.get("quick").change(
 
 
 def thrown_objects(cfg: Config) -> tuple[Scene, JointTrajectory]:
-    """Four scenes of two objects, others in each, of few parts and of many, and a hand at rest: at
-    first one falls on the other in the air, in the last two both turn and land."""
+    """Four scenes of two objects: in two, one falls on the other; in two, both turn and land."""
     rng, known = np.random.default_rng(0), stock.table(cfg.scene)
     order = np.argsort(known.present.sum(axis=1))
     scenes = []
@@ -112,53 +110,40 @@ def stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-def _kicked(scene: Scene, speed: float) -> Scene:
-    return dataclasses.replace(
-        scene, velocity=scene.velocity + np.float32([[speed, 0, 0, 0, 0, 0], [0] * 6, [0] * 6])
-    )
+def _kicked(speed: float) -> Scene:
+    scene = place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0))
+    kick = np.zeros((3, 6), np.float32)
+    kick[0, 0] = speed
+    return scene.replace(velocity=scene.velocity + kick)
 
 
 def _spinning() -> Scene:
-    """A plank in the air, spinning about all axes as one squeezed from under the hand was seen
-    to."""
+    """A plank in the air, spinning about all axes like one squeezed from under the hand."""
     scene = place(cube=(0.1, 0.1, 0.0))
     half, position, velocity = scene.half_size.copy(), scene.position.copy(), scene.velocity.copy()
-    half[0], position[0, 2], velocity[0, 3:] = (
-        blocks.SHAPES["plank"].half_size,
-        0.4,
-        [148.0, 137.0, -148.0],
-    )
+    half[0], position[0, 2] = blocks.SHAPES["plank"].half_size, 0.4
+    velocity[0, 3:] = [148.0, 137.0, -148.0]
     return scene.replace(half_size=half, position=position, velocity=velocity)
 
 
 CASES: dict[str, tuple[Scene, Action]] = {
     "nothing": (place(cube=(0.1, 0.1, 0.0)), grasp(-0.1, -0.1)),
-    # The window sees the corner of a cube beside the pads: 9 mm left of and above the place, 13 mm
-    # off their path.
+    # The window sees the corner of a cube 13 mm off the pads' path.
     "empty": (place(cube=(-0.0205, 0.0275, 0.0)), grasp(0.0125, -0.0055, np.pi / 4)),
     "touched": (place(cube=(0.05, 0.0, 0.0)), grasp(0.0, 0.0)),  # a finger comes down on the cube
-    "dropped": (
-        place(prism=(0.0, 0.0155, 0.0)),
-        grasp(0.0, 0.0),
-    ),  # across the slopes, off the middle: it slips out
+    # Across the slopes, off the middle: it slips out.
+    "dropped": (place(prism=(0.0, 0.0155, 0.0)), grasp(0.0, 0.0)),
     "lifted": (place(cube=(0.0, 0.0, 0.0), other=(0.15, 0.1, 0.5)), grasp(0.0, 0.0)),
     "push": (place(cube=(0.06, 0.0, 0.0), prism=(-0.1, 0.1, 0.0)), push(0.0, 0.0)),
     "miss": (place(cube=(0.06, 0.06, 0.0)), push(0.0, 0.0)),
     "spinning": (_spinning(), push(-0.1, -0.1)),
-    "nan": (
-        _kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), np.nan),
-        grasp(0.15, -0.15),
-    ),
-    "exploded": (
-        _kicked(place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0)), 1e3),
-        grasp(0.15, -0.15),
-    ),
+    "nan": (_kicked(np.nan), grasp(0.15, -0.15)),
+    "exploded": (_kicked(1e3), grasp(0.15, -0.15)),
 }
 
 
 class Run(NamedTuple):
-    """What a batch of primitives started from and came to, leaves [E, ...]: CASES in order, then
-    settled scenes."""
+    """Inputs and results of a batch of primitives, leaves [E, ...]: CASES in order, then others."""
 
     scene: Scene
     height: np.ndarray
@@ -186,27 +171,28 @@ def _noisy(actions: Action) -> Action:
     return actions.replace(pose=np.asarray(actions.pose) + noise.astype(np.float32))
 
 
-def execute_settled(config: Config, count: int, scripted: dict[str, tuple[Scene, Action]]) -> Run:
-    """Runs the scripted cases and grasps in `count` settled scenes of `config`, as one batch."""
-    world = model.build(config.scene, config.sim)
-    per_number = count // (1 + len(config.scene.slots) - config.scene.min_blocks)
-    settled = pool.settled(config, pool.TRAIN_STREAM, per_number)
-    look = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))
-    plan_grasp = functools.partial(oracle.grasp, config)
-    grasps = _noisy(jax.jit(jax.vmap(plan_grasp))(settled, look(settled)))
-    scenes, actions = settled, grasps
-    if scripted:
-        alone, acts = (
-            jax.tree.map(lambda *leaves: np.stack(leaves), *part)
-            for part in zip(*scripted.values(), strict=True)
-        )
-        scenes, actions = jax.tree.map(
-            lambda *leaves: np.concatenate(leaves), (alone, acts), (settled, grasps)
-        )
-    height = look(scenes)
-    physics = mjx_physics.make(world, config.sim)
+def execute(config: Config, scenes: Scene, actions: Action) -> Run:
+    """Runs actions in scenes, leaves [E, ...], as one batch on the config's engine."""
+    physics = simulation.make(model.build(config.scene, config.sim), config.sim)
+    height = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))(scenes)
     run = jax.jit(jax.vmap(functools.partial(simulation.execute, physics, config)))
     return jax.tree.map(np.asarray, Run(scenes, height, actions, *run(scenes, height, actions)))
+
+
+def execute_settled(config: Config, count: int, scripted: Sequence[tuple[Scene, Action]]) -> Run:
+    """Runs the scripted cases and grasps in `count` settled scenes in MJX, as one batch."""
+    config = config.change(sim={"physics": "mjx"})
+    per_number = count // (1 + len(config.scene.slots) - config.scene.min_blocks)
+    settled = pool.settled(config, pool.TRAIN_STREAM, per_number)
+
+    def plan(scene: Scene) -> Action:
+        return oracle.grasp(config, scene, observe.observe(config, scene).height)
+
+    batches = [(settled, _noisy(jax.jit(jax.vmap(plan))(settled)))]
+    if scripted:
+        batches.insert(0, stack(scripted))
+    scenes, actions = jax.tree.map(lambda *leaves: np.concatenate(leaves), *batches)
+    return execute(config, scenes, actions)
 
 
 @pytest.fixture(scope="session")
@@ -226,21 +212,31 @@ def c_world() -> model.World:
 
 @pytest.fixture(scope="session")
 def executed(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """CASES and SETTLED grasps in MJX: the one compilation that the tests of this folder share."""
+    """CASES and SETTLED grasps in MJX: one compilation for the tests of this folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        return execute_settled(CONFIG, SETTLED, CASES)
+        return execute_settled(CONFIG, SETTLED, list(CASES.values()))
+
+
+@pytest.fixture(scope="session", params=["c", "mjx", WARP])
+def cases(request: pytest.FixtureRequest) -> Run:
+    """CASES on each engine."""
+    if request.param == "mjx":
+        return request.getfixturevalue("executed").at(slice(len(CASES)))
+    jitter = (CONFIG.scene.size_jitter[0], 0.0)  # Warp's meshes have one size
+    cfg = CONFIG.change(scene={"size_jitter": jitter}, sim={"physics": request.param})
+    return execute(cfg, *stack(list(CASES.values())))
 
 
 @pytest.fixture(scope="session")
 def grasped(executed: Run) -> Run:
-    """The grasps in settled scenes among them."""
+    """The grasps in settled scenes."""
     return executed.at(slice(len(CASES), None))
 
 
 @pytest.fixture(scope="session")
 def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]:
-    """The settled scenes' grasps in C MuJoCo, by the same plans: ends [E, N, 3] m and traces."""
+    """The same plans in C MuJoCo: ends [E, N, 3] m and traces."""
     engine = c_physics.CPhysics(c_world, CONFIG.sim)
 
     def one(scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
@@ -253,14 +249,9 @@ def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]
 
 @pytest.fixture(scope="session")
 def doubled_caps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
-    """Grasps in settled scenes of the default configuration, with its contact caps and with twice
-    as many."""
+    """Grasps in settled scenes by default, with its contact caps and with twice as many."""
     config = Config()
-    sim = dataclasses.replace(
-        config.sim, geom_pairs=2 * config.sim.geom_pairs, contacts=2 * config.sim.contacts
-    )
+    caps = {"geom_pairs": 2 * config.sim.geom_pairs, "contacts": 2 * config.sim.contacts}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        return tuple(
-            execute_settled(c, SETTLED, {}) for c in (config, dataclasses.replace(config, sim=sim))
-        )
+        return tuple(execute_settled(cfg, SETTLED, []) for cfg in (config, config.change(sim=caps)))

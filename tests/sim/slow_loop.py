@@ -37,7 +37,7 @@ def substeps(
 def trajectory(
     world: World, fields: BlockFields, scene: Scene, joints: JointTrajectory
 ) -> Trajectory:
-    """What `c_physics.trajectory` should give for a plan that the robot can follow."""
+    """The reference of `c_physics.trajectory` for a plan that the robot can follow."""
     states = [
         (data.qpos.copy(), data.qvel.copy(), data.sensordata.copy())
         for data in substeps(world, fields, scene, joints)

@@ -51,8 +51,7 @@ def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
 def test_choice(
     monkeypatch: pytest.MonkeyPatch, platform, installed, measured, mesh_jitter, scenes, chosen
 ):
-    """Claim: `auto` is `c` on a CPU, `warp` where measured to be faster, on CUDA, installed, able
-    to do the scene; else `mjx`, also on several devices."""
+    """Claim: `auto` is `c` on a CPU; `warp` if faster, on CUDA, installed and able; else `mjx`."""
     monkeypatch.setattr(backend.jax, "default_backend", lambda: platform)
     monkeypatch.setattr(
         backend.importlib.util, "find_spec", lambda name: object() if installed else None
@@ -86,24 +85,21 @@ def test_other_choices_stay():
 
 
 def test_auto_is_no_engine():
-    """Claim: `auto` that nobody resolved is an error that says what to do, not the physics of some
-    engine."""
+    """Claim: `auto` that nobody resolved is an error that says what to do."""
     with pytest.raises(ValueError, match=r"sim\.physics: 'auto' .* one of: mjx, warp, c"):
         physics.make(None, _config("auto").sim)
 
 
 def test_tables_are_those_of_the_config():
-    """Claim: every physics and arm that the config allows has its entry, and there are no
-    others."""
+    """Claim: every physics and arm of the config has its entry, and there are no others."""
     assert {*physics.PHYSICS, "auto"} == {*typing.get_args(PhysicsKind)}
-    assert {*kinematics.MAKERS, "hand"} == {*typing.get_args(RobotKind)}
+    assert {*kinematics.ARMS, "hand"} == {*typing.get_args(RobotKind)}
 
 
 @pytest.mark.parametrize("gripper", grippers.shipped())
 @pytest.mark.parametrize("kind", typing.get_args(RobotKind))
 def test_plans_move_every_robot_of_the_config(kind: RobotKind, gripper: str):
-    """Claim: a plan becomes a start of every joint and a set-point of every actuator, for every
-    robot and gripper that come with the package."""
+    """Claim: every shipped robot and gripper gets a start per joint, a set-point per actuator."""
     cfg = Config().change(sim={"robot": kind, "gripper": gripper, "physics": "c"})
     world = model.build(SceneConfig(slots=("box",), min_blocks=1), cfg.sim)
     height = jnp.zeros((cfg.heightmap.size,) * 2)

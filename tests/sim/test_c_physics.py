@@ -11,7 +11,7 @@ import pytest
 
 from csac_jax.scene import layout, model
 from csac_jax.sim import c_physics, primitives
-from csac_jax.sim.c_physics import CPhysics, Simulator, Trajectory
+from csac_jax.sim.c_physics import CPhysics, CSimulator, Trajectory
 from csac_jax.sim.primitives import JointTrajectory
 from tests.scene import placed
 from tests.sim import conftest, slow_loop
@@ -36,8 +36,7 @@ def _assert_equal(ours: Trajectory, theirs: Trajectory) -> None:
 
 
 def test_trajectory_goes_the_way_of_the_run(c_world: model.World, pushed: tuple):
-    """Claim: a trajectory has every substep, and its last is where a run leaves the blocks, bit
-    for bit."""
+    """Claim: a trajectory has every substep; its last is the end of a run, bit for bit."""
     scene, fields, joints = pushed
     recorded = c_physics.trajectory(c_world, fields, scene, joints)
     after, trace = jax.jit(CPhysics(c_world, conftest.CONFIG.sim).run)(scene, joints)
@@ -69,8 +68,7 @@ def test_trajectory_needs_no_touch_sensors(world: model.World, c_world: model.Wo
 
 
 def test_trajectory_keeps_parked_blocks_where_they_are(c_world: model.World, pushed: tuple):
-    """Claim: blocks out of play neither fall nor meet anything: the slow loop holds them, this
-    one lets them fall alone and puts them back."""
+    """Claim: parked blocks neither fall nor meet anything, as in the slow loop."""
     scene, fields, joints = pushed
     recorded = c_physics.trajectory(c_world, fields, scene, joints)
     parked = c_world.block_qpos[1:, :3]
@@ -81,8 +79,7 @@ def test_trajectory_keeps_parked_blocks_where_they_are(c_world: model.World, pus
 
 
 def test_touches_are_those_of_every_contact(c_world: model.World, pushed: tuple):
-    """Claim: a hand geom touches a block where any contact of the two is deeper than 0, in either
-    order."""
+    """Claim: a hand geom touches a block in any contact deeper than 0, in either order."""
     scene, fields, joints = pushed
     substeps_with_touch = 0
     for data in slow_loop.substeps(c_world, fields, scene, joints):
@@ -99,8 +96,7 @@ def test_touches_are_those_of_every_contact(c_world: model.World, pushed: tuple)
 
 
 def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
-    """Claim: in a batch each scene ends as its own slow loop does, one that spins too fast too; a
-    scene with NaN stays as it is."""
+    """Claim: in a batch each scene ends as its own slow loop does; one with NaN stays as it is."""
     scene, _, joints = pushed
     large = dataclasses.replace(scene, half_size=1.1 * np.asarray(scene.half_size))
     spun = dataclasses.replace(scene, velocity=np.array(scene.velocity))
@@ -139,8 +135,7 @@ def test_set_points_with_nan_move_nothing(
 def test_limit_of_speed_is_held_after_every_substep(
     c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch, metres: float
 ):
-    """Claim: MuJoCo's own loop, stopped and continued, gives the bits of one that limits the
-    speed after every substep."""
+    """Claim: MuJoCo's interrupted loop gives the bits of one that limits speed each substep."""
     scene, fields, joints = pushed
     limit = np.array([metres] * 3 + [10.0 * metres] * 3, np.float32)
     monkeypatch.setattr(layout, "SPEED_LIMIT", limit)
@@ -164,11 +159,7 @@ def _rollouts(physics: CPhysics, rows: list[tuple]) -> list[Trajectory]:
 def test_simulators_are_used_again(
     c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch
 ):
-    """Claim: calls leave nothing behind: small ones after large ones, and two at the same time,
-    give the same bits.
-
-    Nor does a scene in which the cube is out of play, and meets nothing.
-    """
+    """Claim: calls leave nothing behind: other sizes, parked blocks, two at the same time."""
     scene, _, joints = pushed
     larger = [
         dataclasses.replace(scene, half_size=k * np.asarray(scene.half_size))
@@ -202,13 +193,13 @@ def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed
     scenes.append(dataclasses.replace(scenes[2], half_size=1.1 * np.asarray(scenes[2].half_size)))
     rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in scenes]
 
-    def after(simulator: Simulator, row: tuple) -> bytes:
+    def after(simulator: CSimulator, row: tuple) -> bytes:
         c_physics._rollout(c_world, simulator, *row)
         return placed.model_bytes(simulator.model)
 
-    wanted = [after(Simulator(c_world), row) for row in rows]
+    wanted = [after(CSimulator(c_world), row) for row in rows]
     assert len(set(wanted)) == len(rows)
-    used = Simulator(c_world)
+    used = CSimulator(c_world)
     for i in (0, 1, 2, 3, 2, 1, 3, 0, 2, 0):
         assert after(used, rows[i]) == wanted[i]
 
@@ -220,8 +211,7 @@ def test_world_of_mjx_is_refused(world: model.World):
 
 
 def test_nothing_to_move(c_world: model.World, pushed: tuple):
-    """Claim: an empty table and a plan that the robot cannot follow leave the scene as it is, with
-    a blank trace."""
+    """Claim: an empty table and an unreachable plan leave the scene as it is, the trace blank."""
     scene, fields, joints = pushed
     cleared = dataclasses.replace(scene, in_play=np.zeros(len(c_world.slots), bool))
     unreachable = dataclasses.replace(joints, reachable=np.array(False))

@@ -76,8 +76,7 @@ def _arm() -> mujoco.MjModel:
 
 
 def _plans(num: int, seed: int = 0) -> primitives.Plan:
-    """Plans [num, ...] of pushes and grasps over flat surfaces; the first eight stand in the
-    corners."""
+    """Plans [num, ...] of pushes and grasps over flat surfaces; the first eight in the corners."""
     rng = np.random.default_rng(seed)
     pose = rng.uniform([-HALF, -HALF, 0], [HALF, HALF, 2 * np.pi], (num, 3)).astype(np.float32)
     pose[:8, :2] = np.repeat(
@@ -91,8 +90,7 @@ def _plans(num: int, seed: int = 0) -> primitives.Plan:
 
 @functools.cache
 def _moves(num: int = 64) -> tuple[np.ndarray, tuple[jax.Array, jax.Array]]:
-    """Set-points [num, 1 + T, 5] of plans, from their start on, and the joint targets through
-    them."""
+    """Set-points [num, 1 + T, 5] of plans, start included, and the joint targets through them."""
     plan = _plans(num)
     control = jnp.concatenate([plan.start[:, None], plan.control], axis=1)
     return np.asarray(control), targets_of_batch(jnp.asarray(kinematics.HOME), control)
@@ -123,8 +121,7 @@ def _tips_by_c(sim: SimConfig, joints: np.ndarray) -> Pose:
 
 @pytest.mark.parametrize("name", SIMS)
 def test_forward_agrees_with_c(name: str):
-    """Claim: the tips are where C MuJoCo has them in the MJCF of each arm, wherever its base stands
-    and whatever it carries."""
+    """Claim: the tips are where C MuJoCo has them, for each arm, base and gripper."""
     joints, arm = _random_joints(300), kinematics.arm(SIMS[name])
     found = jax.jit(jax.vmap(functools.partial(kinematics.forward, arm)))(joints)
     distance, angle = _errors(found, _tips_by_c(SIMS[name], joints))
@@ -208,14 +205,12 @@ def test_inverse_returns_to_the_pose():
     sines = np.abs(np.stack([np.sin(joints[:, 2]), np.sin(joints[:, 4])]))
     generic = (sines > 0.05).all(axis=0) & valid.all(axis=1)
     assert generic.sum() > 5000
-    assert (
-        apart[generic].max() < 5e-4
-    )  # near where two branches meet, an angle is worth the root of an error
+    # near where two branches meet, an angle is worth the root of an error
+    assert apart[generic].max() < 5e-4
 
 
 def test_eight_branches_are_distinct():
-    """Claim: where all eight branches count, no two are the same posture, and each has the signs
-    that name it."""
+    """Claim: where all eight branches count, all differ, and each has the signs that name it."""
     solutions, valid = map(np.asarray, inverse(*forward(_random_joints(2000, 1))))
     solutions = solutions[valid.all(axis=1)]
     assert len(solutions) > 1000
@@ -237,10 +232,8 @@ NOWHERE = {
         (ARM.base[0] + 0.5 * ARM.links.d4, 0.0, ABOVE_BASE),
         0.0,
     ),
-    "straight beside the axis": (
-        (ARM.base[0], ARM.links.d4, ABOVE_BASE),
-        0.0,
-    ),  # both shoulders meet
+    # both shoulders meet
+    "straight beside the axis": ((ARM.base[0], ARM.links.d4, ABOVE_BASE), 0.0),
     "nan": ((0.0, np.nan, 0.1), 0.0),
     "nan yaw": (CENTRE, np.nan),
     "infinite": ((0.0, 0.0, -np.inf), 0.0),
@@ -249,8 +242,7 @@ NOWHERE = {
 
 @pytest.mark.parametrize("name", NOWHERE)
 def test_poses_without_an_answer(name: str):
-    """Claim: poses out of reach, singular or not finite have no valid branch, and finite angles and
-    gradients."""
+    """Claim: poses out of reach, singular or not finite: no valid branch, all values finite."""
     xyz, yaw = NOWHERE[name]
     pose = kinematics.top_down(jnp.array(xyz), jnp.array(yaw))
     solutions, valid = inverse_of_one(*pose)
@@ -272,8 +264,7 @@ def test_a_matrix_that_turns_nothing():
     ("joint", "angle"), [(2, 0.0), (2, 0.005), (4, 0.0), (4, -0.005), (4, np.pi)]
 )
 def test_singular_branches_are_flagged(joint: int, angle: float):
-    """Claim: of a pose with a straight elbow or wrist, the branches that meet there do not count;
-    all stay finite."""
+    """Claim: with a straight elbow or wrist, the branches that meet there do not count."""
     pose = kinematics.forward(ARM, jnp.array([0.3, -0.5, 1.0, -1.0, 1.0, 0.2]).at[joint].set(angle))
     solutions, valid = map(np.asarray, inverse_of_one(*pose))
     assert np.isfinite(solutions).all()
@@ -284,8 +275,7 @@ def test_singular_branches_are_flagged(joint: int, angle: float):
 
 
 def test_wrist_at_its_very_singularity():
-    """Claim: where the wrist leaves nothing to tell its angles from, they and their gradients are
-    finite."""
+    """Claim: where the wrist's angles are undefined, they and their gradients are finite."""
     zero, one = jnp.zeros(()), jnp.ones(())
     for output in range(2):
         angle, slopes = jax.value_and_grad(
@@ -296,8 +286,7 @@ def test_wrist_at_its_very_singularity():
 
 
 def test_gradient_of_inverse():
-    """Claim: the derivative of a branch is the inverse of that of the tips' position and
-    heading."""
+    """Claim: the derivative of a branch is the inverse of that of the tips' position and yaw."""
     xyz, yaw = jnp.array([0.1, -0.05, 0.1]), jnp.array(0.4)
 
     def there_and_back(xyz, yaw):
@@ -330,8 +319,7 @@ def test_top_down_is_the_floating_hand():
 
 @pytest.mark.slow
 def test_whole_workspace_is_reachable():
-    """Claim: over every cell, with the tips 0.01 to 0.35 m above the table and at 16 yaws, a clear
-    branch counts."""
+    """Claim: over every cell, tips 0.01 to 0.35 m high, at 16 yaws, a clear branch counts."""
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, None, None))
@@ -381,8 +369,7 @@ def _distances(q: np.ndarray) -> np.ndarray:
 
 
 def test_clearance_agrees_with_c():
-    """Claim: the room between links is that between the capsules of `ur5.xml`, above the table that
-    below them."""
+    """Claim: the room between links, and above the table, is that of the capsules of `ur5.xml`."""
     model, joints = _arm(), _random_joints(200, 2)
     above, apart = map(np.asarray, clearance(joints))
     first, second = kinematics._PAIRS.T
@@ -436,8 +423,7 @@ def _line(start: tuple[float, ...], end: tuple[float, ...], num: int = 50) -> ja
 
 
 def test_targets_keeps_to_one_branch():
-    """Claim: the branch is one that reaches every set-point, even if the arm starts in one that
-    does not."""
+    """Claim: the branch reaches every set-point, even if the arm starts in one that does not."""
     control = _line((0.2, 0.0, 0.1, 0.0, 0.0), (-0.2, 0.2, 0.1, 0.0, 0.0))
     solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
     valid = np.asarray(valid & clear(solutions))
@@ -452,8 +438,7 @@ def test_targets_keeps_to_one_branch():
 
 
 def test_targets_takes_the_branch_it_is_in():
-    """Claim: of branches that reach every set-point, the one with the least motion is taken: the
-    one the arm is in."""
+    """Claim: of branches that reach every set-point, the one with the least motion is taken."""
     control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
     solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
     whole = np.flatnonzero(np.asarray(valid & clear(solutions)).all(axis=0))
@@ -464,8 +449,7 @@ def test_targets_takes_the_branch_it_is_in():
 
 
 def test_targets_leaves_a_branch_that_is_not_clear():
-    """Claim: a branch that reaches every set-point, but through the table or the arm itself, is not
-    taken."""
+    """Claim: a branch through the table or the arm itself is not taken."""
     control = _line((0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0))
     solutions, valid = inverse(*top_down(control[:, :3], control[:, 3]))
     blocked = np.flatnonzero(
@@ -480,8 +464,7 @@ def test_targets_leaves_a_branch_that_is_not_clear():
 
 @pytest.mark.parametrize("turn", [1.0, -1.0])
 def test_targets_stays_within_limits_as_the_hand_turns(turn: float):
-    """Claim: a hand that turns a full circle is followed without a jump, and without passing a
-    joint's limit."""
+    """Claim: a full circle of the hand is followed without a jump, within the limits."""
     start = (0.0, 0.0, 0.1, 0.0, 0.0)
     control = _line(start, (0.0, 0.0, 0.1, 2 * np.pi * turn, 0.0), 400)
     for wrist3 in (-5.0, 0.0, 5.0):
@@ -493,8 +476,7 @@ def test_targets_stays_within_limits_as_the_hand_turns(turn: float):
 
 @pytest.mark.parametrize("lost", [(-0.6, 0.0, 0.1, 0.0, 0.0), (np.nan, 0.0, 0.1, 0.0, 0.0)])
 def test_targets_stops_where_reach_ends(lost: tuple[float, ...]):
-    """Claim: from the first set-point out of reach the arm holds the last good target, and this is
-    flagged."""
+    """Claim: from the first unreachable set-point the arm holds the last target, flagged."""
     control = _line((0.0, 0.0, 0.1, 0.0, 0.05), (-0.1, 0.0, 0.1, 0.0, 0.05))
     target, reachable = targets_of(
         jnp.asarray(kinematics.HOME), control.at[30:40].set(jnp.array(lost))
@@ -511,8 +493,7 @@ def test_targets_stops_where_reach_ends(lost: tuple[float, ...]):
 
 
 def test_one_scene_is_not_the_others_matter():
-    """Claim: a trajectory in a batch of 32, one of them out of reach, is the one that it is
-    alone."""
+    """Claim: a trajectory in a batch, with one out of reach, is the one that it is alone."""
     control, (expected, _) = _moves()
     control = jnp.asarray(control[:32]).at[7, :, 0].set(-5.0)
     batch, reachable = targets_of_batch(jnp.asarray(kinematics.HOME), control)
@@ -523,8 +504,7 @@ def test_one_scene_is_not_the_others_matter():
 
 
 def test_reaches_is_what_the_targets_say():
-    """Claim: where one branch leads to the ends of a straight way and is clear there, the arm can
-    mostly follow it; where none does, it never can."""
+    """Claim: a way whose ends are not reached is never followed, any other mostly."""
     far = kinematics.arm(SimConfig(robot="ur5", base=(0.85, 0.0, 0.35, 0.0)))
     places = np.random.default_rng(6).uniform(-HALF, HALF, (200, 2)).astype(np.float32)
     ends = np.stack([np.column_stack([places, np.full(200, z)]) for z in (0.012, 0.16)], axis=1)

@@ -1,5 +1,4 @@
-"""One step of our MJX beside one of C MuJoCo, from states that show what `mjx.step` does
-otherwise."""
+"""One step of our MJX beside one of C MuJoCo, from states where `mjx.step` differs."""
 
 from typing import ClassVar, NamedTuple
 
@@ -34,8 +33,7 @@ FAR = 0.3  # m, out of everything's way
 
 
 class Case(NamedTuple):
-    """A cube in the air, by place (m) and Euler angles (deg), a set-point of the fingers, and C's
-    contacts."""
+    """A cube in the air: place (m), Euler angles (deg), set-point of the fingers, C's contacts."""
 
     cube: tuple[float, float, float]
     turn: tuple[float, float, float]
@@ -57,8 +55,7 @@ TOUCHING = [name for name, case in CASES.items() if case.contacts]
 
 
 class Ends(NamedTuple):
-    """What a step came to. Velocities [cases, nv] m/s and rad/s, depths of contacts that push,
-    deepest first, m."""
+    """Results of a step: speeds [cases, nv] m/s, rad/s; depths of contacts that push, m."""
 
     qvel: np.ndarray
     depths: list[np.ndarray]
@@ -126,23 +123,20 @@ def theirs(world: model.World, scene: layout.Scene) -> Ends:
 
 @pytest.mark.parametrize("name", TOUCHING)
 def test_contacts_are_those_of_c(name: str, ours: Ends, theirs: Ends):
-    """Claim: each point of a touch pushes once: as many contacts as in C MuJoCo, as deep to a
-    micrometre."""
+    """Claim: each point of a touch pushes once: as many contacts as in C, to a micrometre."""
     index = list(CASES).index(name)
     assert len(theirs.depths[index]) == CASES[name].contacts
     np.testing.assert_allclose(ours.depths[index], theirs.depths[index], atol=1e-6)
 
 
 def test_repeated_points_keep_their_depth(ours: Ends):
-    """Claim: a point that MJX repeats pushes once, but keeps its depth: full slots of contacts are
-    told by it."""
+    """Claim: a point that MJX repeats keeps its depth, which tells full contact slots."""
     assert [ours.deep[list(CASES).index(name)] for name in TOUCHING] == [4] * len(TOUCHING)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_speeds_after_a_step_are_those_of_c(name: str, ours: Ends, theirs: Ends):
-    """Claim: a step leaves the speeds that C MuJoCo leaves, at touches and with a finger at its
-    limit of force."""
+    """Claim: a step leaves C MuJoCo's speeds, at touches and at a finger's limit of force."""
     index = list(CASES).index(name)
     assert np.abs(theirs.qvel[index]).max() > 0.01
     np.testing.assert_allclose(ours.qvel[index], theirs.qvel[index], atol=0.01)

@@ -60,8 +60,7 @@ def test_the_planner_lifts_objects(stepped):
 
 
 def test_scenes_of_a_batch_have_their_own_objects(env: Env, stepped):
-    """Claim: a scene of a batch moves as it does in another batch, to the bit, though its
-    neighbours hold other objects."""
+    """Claim: a scene moves the same in another batch, to the bit."""
     (_, after), (_, other), order = stepped
     assert len(np.unique(env.scenes.object_id)) > 6
     for name in ("position", "quaternion"):
@@ -70,8 +69,7 @@ def test_scenes_of_a_batch_have_their_own_objects(env: Env, stepped):
 
 
 def test_objects_choose_c():
-    """Claim: auto stands for C wherever there are objects, and MJX is refused in a line that says
-    what to take."""
+    """Claim: auto stands for C with objects, and MJX is refused in one line with the remedy."""
     unresolved = CONFIG.change(sim={"physics": "auto"})
     assert backend.resolve(unresolved).sim.physics == "c"
     with pytest.raises(ValueError, match=r"sim\.physics: objects .* need c, warp or auto"):
@@ -79,8 +77,7 @@ def test_objects_choose_c():
 
 
 def test_objects_need_a_library():
-    """Claim: slots of kind object without a library, and packed scenes of blocks and objects, are
-    refused in a line with the setting."""
+    """Claim: objects without a library, and packed scenes of both kinds, are refused by setting."""
     with pytest.raises(ValueError, match=r"scene\.objects: slots of kind object need a library"):
         dataclasses.replace(CONFIG.scene, objects="")
     with pytest.raises(ValueError, match=r"scene\.arranged: must be 0"):
@@ -113,18 +110,18 @@ def test_a_scene_moves_the_same_after_any_other(env: Env):
         height, grasps
     )
     joints = jax.vmap(lambda one: primitives.joint_trajectory(CONFIG.sim, one))(plans)
-    world, used = env.physics.world, c_physics.Simulator(env.physics.world)
+    world, used = env.physics.world, c_physics.CSimulator(env.physics.world)
     fields = jax.vmap(lambda one: model.scene_fields(world, one))(env.scenes)
     batch = jax.device_get((env.scenes, fields, joints))
     for i in range(len(height)):
         row = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
         again = c_physics._rollout(world, used, *row)
-        fresh = c_physics._rollout(world, c_physics.Simulator(world), *row)
+        fresh = c_physics._rollout(world, c_physics.CSimulator(world), *row)
         np.testing.assert_array_equal(again.qpos, fresh.qpos)
 
 
 def _slip(cfg: Config) -> float:
-    """How far a bar of 140 g slips down in the hand, m, while it hangs there for a second."""
+    """Distance, m, that a bar of 140 g slips down in the hand while it hangs there for a second."""
     world = model.build(cfg.scene, cfg.sim)
     scene, joints = grasped_bar(cfg)
     fields = jax.device_get(model.scene_fields(world, scene))
@@ -146,8 +143,7 @@ def test_held_objects_do_not_slip(tmp_path: Path):
 
 
 def test_more_iterations_change_nothing():
-    """Claim: objects that meet in the air, or land, end where a solver with all the iterations that
-    it asks for leaves them."""
+    """Claim: objects that meet or land end where a converged solver leaves them."""
     cfg = TWO_OBJECTS.change(sim={"physics": "c"})
     ends = []
     for most in (None, 200):

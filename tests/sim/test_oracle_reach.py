@@ -20,8 +20,7 @@ FAR = Config().change(
 
 @pytest.mark.slow
 def test_the_planner_takes_what_the_arm_reaches():
-    """Claim: of two equal blocks an arm that stands far away takes the near one, after failures
-    too; the hand takes either."""
+    """Claim: of two blocks a far arm takes the near one, also after failures; the hand either."""
     place = np.array([[-0.15, 0.0, 0.025], [0.15, 0.0, 0.025]], np.float32)
     scene = layout.parked(FAR.scene.slots)
     half = np.full_like(scene.half_size, 0.025)

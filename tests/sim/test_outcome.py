@@ -44,8 +44,7 @@ CLOSES_AT_1 = dataclasses.replace(SimConfig(), grasp_phases=(1, 1, 2))
 
 
 def test_trace_by_hand():
-    """Claim: held is what both pads touch, its rise the highest while they do; the gap is read as
-    the hand has closed and in the end; overflows are counted."""
+    """Claim: held, rises, gaps and overflows are those of the substeps."""
     trace = jax.device_get(outcome.trace_of(CLOSES_AT_1, _substeps()))
     assert trace.touched
     assert not trace.held.any()
@@ -82,23 +81,16 @@ def test_trace_is_that_of_substeps_seen_one_by_one():
         (_trace(touched=True, held_rise=0.009), 0.05, Outcome.TOUCHED),
         (_trace(touched=True, held_rise=0.011), 0.05, Outcome.DROPPED),
         (_trace(touched=True, held_rise=0.09), 0.05, Outcome.DROPPED),
-        (
-            _trace(touched=True, held_rise=0.09, rise=0.09),
-            0.05,
-            Outcome.DROPPED,
-        ),  # in free fall, no longer held
-        (
-            _trace(touched=True, held_rise=0.04, held=True, rise=0.04),
-            0.05,
-            Outcome.DROPPED,
-        ),  # held, far too low
+        # in free fall, no longer held
+        (_trace(touched=True, held_rise=0.09, rise=0.09), 0.05, Outcome.DROPPED),
+        # held, far too low
+        (_trace(touched=True, held_rise=0.04, held=True, rise=0.04), 0.05, Outcome.DROPPED),
         (_trace(touched=True, held_rise=0.06, held=True, rise=0.06), 0.05, Outcome.LIFTED),
         (_trace(touched=True, held_rise=0.06, held=True, rise=0.06), 0.0, Outcome.LIFTED),
     ],
 )
 def test_outcome_by_ground_truth(trace: Trace, surface: float, expected: Outcome):
-    """Claim: nothing, empty, touched, dropped and lifted follow from contacts and rises as
-    grasp_outcome says."""
+    """Claim: all five outcomes follow from contacts and rises as grasp_outcome says."""
     assert outcome.grasp_outcome(trace, jnp.array(surface), jnp.array(RISE)) == expected
 
 
@@ -109,13 +101,8 @@ def test_outcome_by_ground_truth(trace: Trace, surface: float, expected: Outcome
         (0.0, 0.0, 0.05, False, Outcome.EMPTY),
         (0.0, 0.0, 0.05, True, Outcome.TOUCHED),
         (0.0, 0.0, 0.0, True, Outcome.TOUCHED),
-        (
-            0.004,
-            0.004,
-            0.05,
-            True,
-            Outcome.TOUCHED,
-        ),  # a closed hand, give or take the control error
+        # a closed hand, give or take the control error
+        (0.004, 0.004, 0.05, True, Outcome.TOUCHED),
         (0.05, 0.0, 0.05, True, Outcome.DROPPED),
         (0.05, 0.0, 0.05, False, Outcome.DROPPED),
         (0.05, 0.05, 0.05, True, Outcome.LIFTED),
@@ -125,8 +112,7 @@ def test_outcome_by_ground_truth(trace: Trace, surface: float, expected: Outcome
 def test_outcome_by_gap(
     gap_closed: float, gap_end: float, surface: float, changed: bool, expected: Outcome
 ):
-    """Claim: the robot's own judgement takes the finger gap and the change of the map, and no
-    ground truth."""
+    """Claim: the robot's own judgement takes finger gap and map, and no ground truth."""
     for truth in (False, True):
         trace = _trace(truth, 0.09 * truth, truth, 0.09 * truth, gap_closed, gap_end)
         assert (
@@ -139,8 +125,7 @@ def test_outcome_by_gap(
     [(True, 0.051, True), (True, 0.049, False), (False, 0.09, False), (False, 0.0, False)],
 )
 def test_lifted_blocks(held: bool, rise: float, lifted: bool):
-    """Claim: a block is lifted when it is between the pads in the end and rose by half of the
-    hand's rise."""
+    """Claim: a lifted block is held in the end and rose by half of the hand's rise."""
     assert outcome.lifted_blocks(_trace(held=held, rise=rise), jnp.array(RISE)).tolist() == [
         False,
         lifted,

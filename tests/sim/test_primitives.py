@@ -35,8 +35,7 @@ def _plan(
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_both_primitives_take_as_many_substeps(primitive: Primitive):
-    """Claim: push and grasp have the same length, that of the config, so that both run in one
-    scan."""
+    """Claim: push and grasp have the config's length, so that both run in one scan."""
     plan = _plan(primitive, _height())
     assert plan.control.shape == (SIM.substeps, 5)
     assert plan.start.shape == (5,)
@@ -55,8 +54,7 @@ def test_both_primitives_take_as_many_substeps(primitive: Primitive):
     ],
 )
 def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
-    """Claim: tips go to grasp_depth or push_depth below the local top, never below the
-    clearance."""
+    """Claim: tips go to grasp_depth or push_depth below the top, never below the clearance."""
     plan = _plan(primitive, _height((0.0, 0.0, 0.05, top)), yaw=0.3)
     z = np.asarray(plan.control[:, Z])
     assert plan.surface == pytest.approx(top)
@@ -67,8 +65,7 @@ def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_descent_and_lift(primitive: Primitive):
-    """Claim: the descent is uniform, the tips stay low while the primitive acts, the lift starts
-    and ends gently."""
+    """Claim: the descent is uniform, the tips stay low meanwhile, the lift is smooth."""
     phases = SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases
     plan = _plan(primitive, _height())
     z, high, low = np.asarray(plan.control[:, Z]), float(plan.start[Z]), RG2.clearance
@@ -84,8 +81,7 @@ def test_descent_and_lift(primitive: Primitive):
 
 
 def test_grasp_closes_in_place():
-    """Claim: a grasp stays over its place at its yaw, goes down open and is closed before the lift
-    begins."""
+    """Claim: a grasp stays over its place at its yaw, and is closed before the lift begins."""
     plan = _plan(Primitive.GRASP, _height((0.05, -0.1, 0.05, 0.05)), 0.05, -0.1, 2.0)
     np.testing.assert_allclose(
         plan.control[:, [X, Y, YAW]], np.tile([0.05, -0.1, 2.0], (SIM.substeps, 1)), atol=1e-6
@@ -122,8 +118,7 @@ def test_push_ends_in_the_workspace(yaw: float, end: tuple[float, float]):
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_starts_above_whatever_is_under_the_hand(primitive: Primitive):
-    """Claim: the hand starts a centimetre above the highest thing within its reach, whatever stands
-    farther off."""
+    """Claim: the hand starts a centimetre above the highest thing within its reach."""
     near, far = (_plan(primitive, _height((x, 0.0, 0.04, 0.2))) for x in (0.09, 0.13))
     assert near.start[Z] == pytest.approx(0.21, abs=1e-6)
     assert far.start[Z] == pytest.approx(0.112, abs=1e-6)
@@ -132,15 +127,13 @@ def test_starts_above_whatever_is_under_the_hand(primitive: Primitive):
 
 @pytest.mark.parametrize(("offset", "top"), [(0.0, 0.04), (0.009, 0.04), (0.013, 0.0)])
 def test_local_top_is_that_of_the_window(offset: float, top: float):
-    """Claim: the highest surface in a window of 2 cm about the place counts, nothing beyond it,
-    corners included."""
+    """Claim: the highest surface in a window of 2 cm counts, corners included."""
     height = _height((offset, -offset, 0.0022, 0.04))
     assert primitives.local_top(MAP, height, jnp.zeros(2), RG2.finger[1]) == pytest.approx(top)
 
 
 def test_local_top_of_coarse_maps():
-    """Claim: on a map whose cells are wider than the window, the cell about the place still
-    counts."""
+    """Claim: where cells are wider than the window, the cell of the place counts."""
     coarse = HeightmapConfig(size=16)  # 28 mm cells
     height = jnp.zeros((16, 16)).at[8, 8].set(0.05)
     centre = cell_centres(coarse)[8, 8]

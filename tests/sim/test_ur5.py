@@ -50,8 +50,7 @@ def _model(with_block: bool = False) -> mujoco.MjModel:
 def _plan(
     primitive: Primitive, x: float, y: float, yaw: float, top: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Set-points [1 + T, 5] of a primitive over a flat surface, from its start on, and joint
-    targets [1 + T, 7]."""
+    """Set-points [1 + T, 5] of a primitive over a flat surface, and joint targets [1 + T, 7]."""
     action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
     plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(
         jnp.full((MAP.size, MAP.size), top), action
@@ -79,8 +78,7 @@ PLACES = [*CORNERS, (0.0, 0.0, 1.0, 0.05), (0.224, 0.0, 3.0, 0.1), (-0.1, 0.1, 4
 
 @pytest.mark.parametrize("primitive", list(Primitive))
 def test_arm_follows_the_plan(primitive: Primitive):
-    """Claim: as each phase of a primitive ends, the tips are within 3 mm of the set-point, whatever
-    the place."""
+    """Claim: as each phase ends, the tips are within 3 mm of the set-point, at any place."""
     model = _model()
     ends = np.cumsum(SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases)
     for place in PLACES:
@@ -111,8 +109,7 @@ def test_arm_lifts_a_cube(x: float):
 
 @pytest.mark.parametrize(("x", "side"), [(-0.2, 1), (0.0, 1), (0.2, -1)])
 def test_arm_presses_within_reason(x: float, side: int):
-    """Claim: a finger that comes down on a cube neither sinks 15 mm into it nor carries it off: the
-    arm gives way."""
+    """Claim: a finger that comes down on a cube neither sinks 15 mm in nor carries it off."""
     model = _model(with_block=True)
     _, target = _plan(Primitive.GRASP, x, 0.0, 0.0, 2 * CUBE)
     data = _start(model, target, (x + side * 0.055, 0.0))

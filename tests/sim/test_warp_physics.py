@@ -69,8 +69,7 @@ def test_missing_warp_is_one_line(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_meshes_of_two_sizes_are_refused():
-    """Claim: Warp's meshes have one size, and a config that asks for several is refused, one of
-    boxes alone is not."""
+    """Claim: a config of meshes of several sizes is refused, one of boxes alone is not."""
     cfg = _config(SLOTS)
     with pytest.raises(ValueError, match=r"scene\.size_jitter: the second must be 0"):
         cfg.change(scene={"size_jitter": (0.1, 0.1)})
@@ -134,8 +133,7 @@ def test_scripted_primitives_go_as_in_c(ran: Ran):
 
 @needs_warp
 def test_what_was_prepared_ahead_is_used(ran: Ran, monkeypatch: pytest.MonkeyPatch):
-    """Claim: an action of as many scenes as a thread has prepared prepares nothing, and goes like
-    one that was not prepared."""
+    """Claim: scenes that a thread has prepared are not prepared again, and go alike."""
     from csac_jax.sim import warp_action
 
     physics = _physics("warp")
@@ -161,8 +159,7 @@ def test_parked_blocks_stay(ran: Ran):
 
 @needs_warp
 def test_nested_vmap_is_a_loop(ran: Ran, run_on_warp: Any):
-    """Claim: seeds of scenes are one batch, whose results are those of scenes one by one; what
-    seeds share may be given once."""
+    """Claim: seeds of scenes are one batch, with the results of scenes one by one."""
     scenes, joints = _at(ran.scene, np.array([[4, 5], [4, 6]])), _at(ran.joints, [4, 5])
     nested = jax.jit(jax.vmap(jax.vmap(run_on_warp), in_axes=(0, None)))(scenes, joints)
     one = jax.jit(run_on_warp)
@@ -249,8 +246,7 @@ def test_set_points_keep_their_times():
 
 @needs_warp
 def test_spinning_block_goes_as_in_c():
-    """Claim: blocks that spin in the air, lighter than the model has them, are after some substeps
-    as fast as in C."""
+    """Claim: blocks that spin in the air, lighter than the model's, are as fast as in C."""
     cfg = _config(SLOTS).change(sim={"grasp_phases": (2, 1, 2)})
     scene = _spinning()
     start = np.float32([0.0, 0.0, 0.3, 0.0, 0.05, 0.05])
@@ -313,8 +309,7 @@ def test_objects_go_as_in_c():
 
 @needs_warp
 def test_held_objects_hang_as_in_c(tmp_path: Path):
-    """Claim: a bar hangs for a second where it hangs in C, within 0.1 mm: by pyramids it slips more
-    than a millimetre."""
+    """Claim: a bar hangs where it hangs in C for a second, within 0.1 mm."""
     sim = {"physics": "warp", "grasp_phases": (60, 50, 250)}
     cfg = presets.get("quick").change(scene=bar(tmp_path), sim=sim)
     scene, joints = grasped_bar(cfg)

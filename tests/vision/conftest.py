@@ -1,5 +1,4 @@
-"""One scene in two forms: a MuJoCo model, which is the reference, and the half-spaces that the
-raycaster takes."""
+"""One scene as a MuJoCo model, the reference, and as half-spaces for the raycaster."""
 
 from typing import NamedTuple
 
@@ -32,8 +31,7 @@ _FACES = 10
 
 
 class Reference(NamedTuple):
-    """The same scene for C MuJoCo (geom 0 is the table) and for the raycaster (geom i is MuJoCo's i
-    + 1)."""
+    """A scene for C MuJoCo (geom 0 is the table) and for the raycaster (geom i is C's i + 1)."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -54,8 +52,7 @@ class Reference(NamedTuple):
         return np.array(distance), np.array(geom), np.array(normal)
 
     def near_edge(self, origins: np.ndarray, directions: np.ndarray, shift: float) -> np.ndarray:
-        """[R] True where a ray that runs `shift` m beside this one meets another face or
-        nothing."""
+        """[R] bool, a ray `shift` m beside this one meets another face or nothing."""
         _, geom, normal = self.rays(origins, directions)
         helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
         side = np.cross(directions, helper)
@@ -63,15 +60,13 @@ class Reference(NamedTuple):
         edge = np.zeros(len(origins), bool)
         for step in (side, -side, np.cross(directions, side), -np.cross(directions, side)):
             _, other_geom, other_normal = self.rays(origins + shift * step, directions)
-            edge |= (other_geom != geom) | (
-                np.abs(other_normal - normal).max(1) > 0.01
-            )  # both 0 for a miss
+            # both 0 for a miss
+            edge |= (other_geom != geom) | (np.abs(other_normal - normal).max(1) > 0.01)
         return edge
 
 
 def _half_spaces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normals [F, 3] and offsets [F] of one geom in its own frame, from the convex hull of its
-    corners."""
+    """Normals [F, 3] and offsets [F] of one geom, own frame, from its corners' convex hull."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
         corners = model.geom_size[geom] * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     else:
@@ -85,8 +80,7 @@ def _half_spaces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarr
 
 @pytest.fixture(scope="session")
 def reference() -> Reference:
-    """Two boxes, two triangular and two octagonal prisms, standing, lying and tilted, on the
-    table."""
+    """Two boxes, two triangular and two octagonal prisms in several poses on the table."""
     meshes = "".join(
         f'<mesh name="{name}" vertex="{" ".join(str(v) for p in points for v in p)}"/>'
         for name, points in _MESHES.items()

@@ -22,7 +22,7 @@ class Placed(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """What R rays meet."""
+    """Hits of R rays."""
 
     distance: np.ndarray  # [R] in lengths of the direction, -1 for a miss
     geom: np.ndarray  # [R] -1 for a miss
@@ -33,9 +33,8 @@ def blocks_and_arm(rng: np.random.Generator) -> Placed:
     """The eight blocks in random poses under and about the UR5 with its hand, on the table."""
     scene = layout.parked(SLOTS)
     half_size = np.array([blocks.SHAPES[name].half_size for name in SHAPES], np.float32)
-    with (
-        pytest.MonkeyPatch.context() as patch
-    ):  # C's search trees follow neither rescaled meshes nor turned inertias
+    # C's search trees follow neither rescaled meshes nor turned inertias
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(models, "LARGEST", 1.0)
         patch.setattr(models, "_align_inertia", lambda model: None)
         world = models.build(SceneConfig(slots=SLOTS, min_blocks=1), SimConfig(robot="ur5"))
@@ -56,8 +55,7 @@ def blocks_and_arm(rng: np.random.Generator) -> Placed:
 
 
 def every_type(rng: np.random.Generator) -> Placed:
-    """Two of each type that the raycaster knows, of random sizes and poses; one plane has an
-    end."""
+    """Two of each type of the raycaster, of random sizes and poses; one plane has an end."""
     geoms = (
         '<geom type="plane" size="0 0 1" pos="0 0 -0.3"/>'
         '<geom type="plane" size="0.3 0.2 1" euler="10 20 30"/>'
@@ -90,8 +88,7 @@ def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
 def cast(
     model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, direction: np.ndarray
 ) -> Rays:
-    """R rays along `direction` [R, 3] from one `origin` [3], by C MuJoCo; `mj_multiRay` loses some
-    at edges."""
+    """R rays along `direction` [R, 3] from `origin` [3] by C; `mj_multiRay` loses some at edges."""
     num = len(direction)
     found, distance, geom, normal = (
         np.zeros((1, 1), np.int32),
@@ -108,8 +105,7 @@ def cast(
 
 
 def bundle(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """An origin [3] on a sphere of 0.7 m about the scene, and unit directions [R, 3] to points in
-    it; float32."""
+    """An origin [3], 0.7 m off the scene, and unit directions [R, 3] to points in it; float32."""
     origin = rng.normal(size=3)
     origin *= 0.7 / np.linalg.norm(origin)
     origin[2] = abs(origin[2])

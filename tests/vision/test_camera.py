@@ -46,8 +46,7 @@ def _opengl_depth(
     [mujoco_rays.every_type, pytest.param(mujoco_rays.blocks_and_arm, marks=pytest.mark.slow)],
 )
 def test_depth_agrees_with_opengl(tmp_path, make):
-    """Claim: depths are those of MuJoCo's own renderer to 2 mm in every pixel two pixels off an
-    edge or more."""
+    """Claim: depths are those of MuJoCo's renderer to 2 mm, two pixels off edges or more."""
     model, data = make(np.random.default_rng(5))
     eye = camera.make(CameraConfig(position=(-0.7, -0.3, 0.6), look_at=(0.1, 0.0, 0.1)).scaled(0.5))
     expected = _opengl_depth(tmp_path, model, data, eye)
@@ -64,8 +63,7 @@ def test_depth_agrees_with_opengl(tmp_path, make):
 
 
 def test_the_default_is_the_papers_camera():
-    """Claim: 640 x 480 px, 618.62 px of focal length, at (-0.5, 0, 0.5) m, pitched 45 degrees down
-    at the centre."""
+    """Claim: the paper's camera: 640 x 480 px, f = 618.62 px, at (-0.5, 0, 0.5) m, 45 deg."""
     eye = camera.make(CameraConfig())
     assert (eye.width, eye.height) == (640, 480)
     np.testing.assert_allclose(eye.focal, 618.62)
@@ -80,8 +78,7 @@ def test_the_default_is_the_papers_camera():
 
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_points_project_to_their_pixels(scale):
-    """Claim: pixel -> point -> pixel is the identity at any depth and any scale, by the pinhole
-    equation."""
+    """Claim: pixel -> point -> pixel is the identity, by the pinhole equation."""
     eye = camera.make(
         CameraConfig(focal=(600.0, 620.0), centre=(330.0, 236.0), position=(0.3, 0.4, 0.5)).scaled(
             scale
@@ -100,8 +97,7 @@ def test_points_project_to_their_pixels(scale):
 
 
 def test_colours_are_flat_shaded():
-    """Claim: a pixel shows its geom's colour times a brightness that follows the normal, and SKY
-    where nothing is."""
+    """Claim: a pixel is its geom's colour times a brightness by the normal, or SKY."""
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1" rgba="0.2 0.4 0.8 1"/>'
         "</worldbody></mujoco>"
@@ -114,10 +110,8 @@ def test_colours_are_flat_shaded():
     np.testing.assert_allclose(colour[~valid], np.broadcast_to(camera.SKY, colour[~valid].shape))
     np.testing.assert_array_equal(np.asarray(picture.depth)[~valid], 0.0)
     levels = np.unique((colour[valid] / [0.2, 0.4, 0.8]).round(3))
-    expected = [
-        0.4,
-        0.4 + 0.6 * 0.8,
-    ]  # the side towards the camera faces away from the light, the top does not
+    # the side towards the camera faces away from the light, the top does not
+    expected = [0.4, 0.4 + 0.6 * 0.8]
     np.testing.assert_allclose(levels, expected, atol=2e-3)
 
 
@@ -133,8 +127,7 @@ def test_colours_are_flat_shaded():
     ],
 )
 def test_wrong_intrinsics_are_refused(change, message):
-    """Claim: intrinsics that belong to another image size, and other nonsense, are refused by name
-    in one line."""
+    """Claim: intrinsics of another image size, and nonsense, are refused in one line."""
     with pytest.raises(ValueError, match=message) as error:
         dataclasses.replace(CameraConfig(), **change)
     assert "\n" not in str(error.value)
@@ -142,8 +135,7 @@ def test_wrong_intrinsics_are_refused(change, message):
 
 @pytest.mark.parametrize(("share", "message"), [(0.3331, "camera: .*whole"), (0.0, "camera.size")])
 def test_scaled_images_have_whole_pixels(share, message):
-    """Claim: a share of the image that is no image, or has parts of pixels, is refused in one
-    line."""
+    """Claim: a share that gives no image or parts of pixels is refused in one line."""
     with pytest.raises(ValueError, match=message) as error:
         CameraConfig().scaled(share)
     assert "\n" not in str(error.value)

@@ -21,7 +21,7 @@ _supported = jax.jit(depth_camera.supported)
 
 
 class Picture(NamedTuple):
-    """What exact rays see; [h, w, ...] NumPy."""
+    """Exact rays' results; [h, w, ...] NumPy."""
 
     depth: np.ndarray  # m, 0 where nothing is hit
     points: np.ndarray  # m
@@ -101,15 +101,13 @@ def test_disparities_have_steps():
     ],
 )
 def test_range_and_darkness(distance: float, lightness: float, kind: str, share: float):
-    """Claim: what is too near, too far or black has no depth, what is half as light as needed has
-    one half of the time."""
+    """Claim: too near, too far or black: no depth; half as light as needed: half of the time."""
     _, valid = _plane(distance, lightness, kind)
     assert abs(valid.mean() - share) < 0.06
 
 
 def test_neighbours_err_alike():
-    """Claim: a stereo camera's errors are alike within its window, a time-of-flight camera's are
-    not."""
+    """Claim: errors are alike within a stereo camera's window, not in time of flight."""
     for kind, wanted in (("d435", 4 / 5), ("azure_kinect", 0.0)):
         depth, _ = _plane(2.0, kind=kind)
         found = np.corrcoef(depth[:, 1:].ravel(), depth[:, :-1].ravel())[0, 1]
@@ -117,8 +115,7 @@ def test_neighbours_err_alike():
 
 
 def test_shadow_is_what_the_second_viewpoint_does_not_see(picture: Picture):
-    """Claim: away from their borders, shadows are where rays to the second viewpoint are
-    blocked."""
+    """Claim: shadows are where rays to the second viewpoint are blocked."""
     inverse = np.divide(1.0, picture.depth, where=picture.depth > 0, out=0 * picture.depth)
     hidden = np.asarray(depth_camera.hidden(WIDE, EYE, jnp.asarray(inverse)))
     assert picture.shadow.sum() > 50
@@ -186,8 +183,7 @@ def test_support_of_exact_images(picture: Picture):
 
 
 def test_image_of_another_renderer(picture: Picture):
-    """Claim: a NumPy image comes back as the same kinds of arrays: unchanged without errors, else
-    with holes, other depths and other colours."""
+    """Claim: a NumPy image keeps its kind: unchanged without errors, else with all of them."""
     rgb = np.round(255 * picture.lit).astype(np.uint8)
     depth = np.where(picture.depth > 0, picture.depth, np.nan)
     take = jax.jit(sensor.image, static_argnums=(1, 2))

@@ -27,8 +27,7 @@ def _look(cfg: HeightmapConfig, polytopes: raycast.Polytopes, is_target: jax.Arr
 
 
 def test_heights_agree_with_mujoco(reference):
-    """Claim: height and block of every cell, but those within 0.1 mm of an edge, are C MuJoCo's to
-    0.1 mm."""
+    """Claim: height and block of cells 0.1 mm off edges are C MuJoCo's to 0.1 mm."""
     cfg = HeightmapConfig(64)
     obs = _look(cfg, reference.polytopes)
     origin = np.asarray(geometry.cell_centres(cfg), np.float64).reshape(-1, 2)
@@ -41,9 +40,8 @@ def test_heights_agree_with_mujoco(reference):
     height = np.asarray(obs.height).reshape(-1)
     np.testing.assert_allclose(height[clear], 0.5 - distance[clear], rtol=0, atol=1e-4)
     assert np.all(height[clear & (geom == -1)] == 0.0)
-    albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[
-        geom
-    ]  # -1 is the last row
+    # -1 is the last row
+    albedo = np.concatenate([np.asarray(reference.polytopes.colour), _TABLE[None]])[geom]
     brightness = 0.4 + 0.6 * np.maximum(normal @ camera.LIGHT, 0.0)
     colour = np.asarray(obs.colour).reshape(-1, 3)
     np.testing.assert_allclose(colour[clear], (albedo * brightness[:, None])[clear], atol=1e-3)
@@ -52,13 +50,11 @@ def test_heights_agree_with_mujoco(reference):
 
 
 def _settled_pile(rng: np.random.Generator) -> tuple[Config, Scene, Placed]:
-    """Ten settled blocks of all eight shapes of nominal size, for both: geom 0 of C is the
-    table."""
+    """Ten settled blocks of all eight shapes, nominal sizes, for both; geom 0 of C is the table."""
     cfg = dataclasses.replace(presets.get("fast"), heightmap=HeightmapConfig(224))
     drops = dataclasses.replace(cfg.scene, size_jitter=(0.0, 0.0))
-    with (
-        pytest.MonkeyPatch.context() as patch
-    ):  # C's search trees follow neither rescaled meshes nor turned inertias
+    # C's search trees follow neither rescaled meshes nor turned inertias
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(model, "LARGEST", 1.0)
         patch.setattr(model, "_align_inertia", lambda model: None)
         world = model.build(drops, cfg.sim)
@@ -78,11 +74,7 @@ def _settled_pile(rng: np.random.Generator) -> tuple[Config, Scene, Placed]:
 @pytest.mark.slow
 @pytest.mark.mjx
 def test_a_settled_pile_agrees_with_mujoco():
-    """Claim: every cell of the 224-cell map of a settled pile of ten, edges apart, is as high as C
-    MuJoCo's to 0.1 mm.
-
-    An edge is a cell that sees another height 0.1 mm beside its centre.
-    """
+    """Claim: a settled pile of ten is as high as C's to 0.1 mm, 0.1 mm off edges."""
     cfg, scene, pile = _settled_pile(np.random.default_rng(0))
     height = np.asarray(
         jax.jit(lambda scene: observe.observe(cfg, scene))(jax.tree.map(jnp.asarray, scene)).height
@@ -99,17 +91,15 @@ def test_a_settled_pile_agrees_with_mujoco():
 
 
 def test_target_mask_shows_the_target(reference):
-    """Claim: the target mask is all ones if every block is wanted, and else True just where a
-    wanted one is seen."""
+    """Claim: the mask is True where a wanted block is seen, all ones if every one is wanted."""
     cfg = HeightmapConfig(64)
     look = jax.jit(lambda wanted: _look(cfg, reference.polytopes, wanted))
     clearing = look(jnp.ones(6, bool))
     assert np.all(clearing.target)
     masks = np.stack([look(jnp.arange(6) == g).target for g in range(6)])
     assert np.all(masks.sum((1, 2)) > 10)
-    np.testing.assert_array_equal(
-        masks.sum(0), np.asarray(clearing.height) > 0.0
-    )  # each raised cell is one block's
+    # each raised cell is one block's
+    np.testing.assert_array_equal(masks.sum(0), np.asarray(clearing.height) > 0.0)
     middle = np.asarray(geometry.cell_centres(cfg))[masks[4]].mean(0)
     np.testing.assert_allclose(middle, [0.11, -0.07], atol=0.003)  # where the octagon stands
 
@@ -126,8 +116,7 @@ def test_blocks_above_the_view_are_not_seen(reference):
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_packing_rounds(seed):
-    """Claim: packing changes a height by at most 0.05 mm, a colour by half a level; packing again,
-    nothing."""
+    """Claim: packing rounds heights to 0.05 mm, colours to half a level, and is idempotent."""
     rng = np.random.default_rng(seed)
     obs = heightmap.Observation(
         colour=jnp.asarray(rng.uniform(size=(8, 8, 3)), jnp.float32),

@@ -1,5 +1,4 @@
-"""Height maps from points and from a camera's depth image, against NumPy and against the view from
-above."""
+"""Height maps of points and of a depth image, against NumPy and the view from above."""
 
 from typing import Any
 
@@ -42,8 +41,7 @@ _from_points = jax.jit(heightmap.from_points, static_argnums=0)
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_points_agree_with_numpy(seed):
-    """Claim: height and source of every cell are those of a loop over the points: the highest, of
-    ties the first."""
+    """Claim: height and source of a cell are those of a loop: the highest, of ties the first."""
     rng = np.random.default_rng(seed)
     cfg = HeightmapConfig(16, extent=0.5)  # a cell of 2^-5 m: dividing by it is exact
     points = rng.uniform(-0.3, 0.3, (400, 3)).astype(np.float32)
@@ -132,8 +130,7 @@ def test_both_views_agree_where_the_camera_sees(reference):
 
 
 def test_a_block_casts_a_shadow():
-    """Claim: of a cube the camera sees the top where it is, and behind it nothing as far as the
-    sight line says."""
+    """Claim: of a cube the top is seen, and nothing behind it as far as the sight line says."""
     cube = raycast.Polytopes(
         normal=jnp.asarray(np.concatenate([np.eye(3), -np.eye(3)])[None], jnp.float32),
         offset=jnp.full((1, 6), 0.025),
@@ -145,9 +142,8 @@ def test_a_block_casts_a_shadow():
     height, filled = np.asarray(obs.height), np.asarray(obs.colour).sum(-1) > 0.0
     x = np.asarray(geometry.cell_centres(CFG))[0, :, 0]
     middle = slice(30, 34)  # rows at y = 0
-    end = 0.025 + (0.025 + 0.5) * 0.05 / (
-        0.5 - 0.05
-    )  # where the line over the far top edge meets the table
+    # where the line over the far top edge meets the table
+    end = 0.025 + (0.025 + 0.5) * 0.05 / (0.5 - 0.05)
     np.testing.assert_allclose(height[middle][:, np.abs(x) < 0.02], 0.05, atol=1e-4)
     assert not filled[middle][:, (x > 0.03) & (x < end - 0.008)].any()
     assert filled[middle][:, x > end + 0.008].mean() > 0.95

@@ -23,8 +23,7 @@ _seeds = st.integers(0, 2**32 - 1)
 
 
 def _random_rays(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rays [R, 3] from a dome around the scene to points in and about it; float32 values in
-    float64."""
+    """Rays [R, 3] from a dome to points in and about the scene; float32 values in float64."""
     origin = rng.normal(size=(count, 3))
     origin[:, 2] = np.abs(origin[:, 2]) + 0.2
     origin *= 0.6 / np.linalg.norm(origin, axis=1, keepdims=True)
@@ -63,8 +62,7 @@ def _cast(polytopes: raycast.Polytopes, origin: np.ndarray, direction: np.ndarra
 
 
 def test_rays_agree_with_mujoco(reference):
-    """Claim: geoms, distances (0.1 mm) and normals are those of C MuJoCo for every ray 0.1 mm off
-    an edge or more."""
+    """Claim: geoms, distances (0.1 mm), normals are C's for rays 0.1 mm off edges or more."""
     origin, direction = _random_rays(np.random.default_rng(1), 4000)
     distance, geom, normal = reference.rays(origin, direction)
     hit = _cast(reference.polytopes, origin, direction)
@@ -107,8 +105,7 @@ def _upright(reference):
 @settings(max_examples=60, deadline=None)
 @given(_seeds)
 def test_hits_lie_on_the_surface(seed):
-    """Claim: a hit lies on a plane of its geom with the hit's normal, inside of all other planes,
-    and faces the ray."""
+    """Claim: a hit lies on its plane, inside of all others of its geom, and faces the ray."""
     rng = np.random.default_rng(seed)
     polytopes = _random_scene(rng)
     origin, direction = _random_rays(rng, 64)
@@ -128,8 +125,7 @@ def test_hits_lie_on_the_surface(seed):
 @settings(max_examples=40, deadline=None)
 @given(_seeds, st.floats(-7.0, 7.0), st.floats(0.1, 10.0))
 def test_turned_and_scaled(seed, yaw, scale):
-    """Claim: turning scene and rays about z changes no distance, and a direction `scale` times as
-    long divides it."""
+    """Claim: turns about z change no distance; a direction `scale` times as long divides it."""
     rng = np.random.default_rng(seed)
     polytopes = _random_scene(rng)
     origin, direction = _random_rays(rng, 64)
@@ -154,8 +150,7 @@ def test_turned_and_scaled(seed, yaw, scale):
 @settings(max_examples=40, deadline=None)
 @given(_seeds)
 def test_more_geoms_come_no_later(seed):
-    """Claim: the nearest wins: a scene's distance is the least of its geoms' distances, each cast
-    by itself."""
+    """Claim: a scene's distance is the least of its geoms' distances."""
     rng = np.random.default_rng(seed)
     polytopes = _random_scene(rng)
     origin, direction = _random_rays(rng, 64)
@@ -168,8 +163,7 @@ def test_more_geoms_come_no_later(seed):
 
 
 def test_unused_geoms_are_never_hit():
-    """Claim: a geom of unused faces alone (zero normal, positive offset) is never hit, nor does it
-    give NaN."""
+    """Claim: a geom of unused faces (zero normal, positive offset) is never hit, without NaN."""
     rng = np.random.default_rng(3)
     polytopes = _random_scene(rng)
     empty = polytopes.replace(normal=jnp.zeros((4, 8, 3)), offset=jnp.full((4, 8), 1e3))
@@ -190,8 +184,7 @@ def test_no_geoms_at_all():
 
 
 def test_seen_from_outside_only(reference):
-    """Claim: a ray that starts inside a block, or under the table, does not meet it; one that
-    points away misses."""
+    """Claim: a ray from inside a block or under the table does not meet it."""
     down, up = jnp.array([0.0, 0.0, -1.0]), jnp.array([0.0, 0.0, 1.0])
     inside = jnp.array([0.02, 0.01, 0.025])
     hit = _cast_one(reference.polytopes, inside, down)

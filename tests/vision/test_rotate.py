@@ -22,8 +22,7 @@ def _yaw(k: int) -> float:
     ("size", "margin", "count"), [(64, 0.25, 16), (48, 0.0, 8), (64, 2**0.5 - 1, 16)]
 )
 def test_frames_agree_with_scipy(size, margin, count):
-    """Claim: every frame is SciPy's nearest-cell rotation: cells read the same place to half a
-    pixel a side."""
+    """Claim: every frame is SciPy's nearest-cell rotation, to half a pixel a side."""
     tables = rotate.tables(size, 0.448, _K, count, margin)
     row, col = np.meshgrid(*[np.arange(size, dtype=np.float32)] * 2, indexing="ij")
     maps = jnp.asarray(np.stack([row, col, np.ones_like(row)], axis=-1))
@@ -32,9 +31,8 @@ def test_frames_agree_with_scipy(size, margin, count):
     assert frames.shape == (count, side, side, 3)
     for k in range(count):
         cos, sin = np.cos(_yaw(k)), np.sin(_yaw(k))
-        matrix = np.array(
-            [[cos, sin], [-sin, cos]]
-        )  # (row, col) of the frame to (row, col) of the workspace
+        # (row, col) of the frame to (row, col) of the workspace
+        matrix = np.array([[cos, sin], [-sin, cos]])
         offset = 0.5 * (size - 1) - matrix @ np.full(2, 0.5 * (side - 1))
 
         def scipy_frame(channel, order, matrix=matrix, offset=offset):
@@ -52,8 +50,7 @@ def test_frames_agree_with_scipy(size, margin, count):
 
 
 def test_outside_of_the_workspace_is_zero():
-    """Claim: canvas cells that see nothing of the workspace are 0, and those that do are the
-    workspace's area."""
+    """Claim: canvas cells are 0 outside of the workspace, and only there."""
     tables = rotate.tables(64, 0.448, _K, _K, 2**0.5 - 1)
     frames = np.asarray(rotate.rotate(tables, jnp.ones((64, 64, 2))))
     along = (np.arange(tables.canvas) + 0.5 - 0.5 * tables.canvas) / 64
@@ -66,8 +63,7 @@ def test_outside_of_the_workspace_is_zero():
 
 
 def test_quarter_turns_are_exact():
-    """Claim: frame 0 is the map itself in a border of zeros, and quarter turns only permute
-    cells."""
+    """Claim: frame 0 is the map in a border of zeros; quarter turns only permute cells."""
     tables = rotate.tables(64, 0.448, _K, _K, 0.25)
     maps = np.random.default_rng(0).normal(size=(64, 64, 3)).astype(np.float32)
     frames = np.asarray(rotate.rotate(tables, jnp.asarray(maps)))
@@ -75,9 +71,8 @@ def test_quarter_turns_are_exact():
     assert np.abs(frames[0]).sum() == pytest.approx(np.abs(maps).sum(), rel=1e-5)
     for quarter in range(4):
         inner = frames[quarter * _K // 4, 8:-8, 8:-8]
-        np.testing.assert_array_equal(
-            inner, np.rot90(maps, quarter)
-        )  # rows upward: the frame's turn undone
+        # rows upward: the frame's turn undone
+        np.testing.assert_array_equal(inner, np.rot90(maps, quarter))
 
 
 def test_one_frame_is_that_of_all():
@@ -100,8 +95,7 @@ def test_integer_maps_keep_their_type():
 @given(st.integers(0, _K - 1), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15))
 @example(2, 0.11138523104556389, 0.11138523104556389)
 def test_a_block_appears_where_to_cell_says(k, x, y):
-    """Claim: a block at (x, y) is seen in the map to half a cell, and from there in frame k where
-    `to_cell` says, to half a cell."""
+    """Claim: a block is seen in the map and in frame k where `to_cell` says, to half a cell."""
     cfg = HeightmapConfig(64)
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     block = raycast.Polytopes(
@@ -130,8 +124,7 @@ def _look(block):
 
 
 def test_an_action_points_along_the_columns():
-    """Claim: in frame k a step along yaw_k is a step along +column, and along yaw_k + 90 degrees
-    along +row."""
+    """Claim: in frame k, yaw_k is along +column, and yaw_k + 90 degrees along +row."""
     for k in range(_K):
         yaw = jnp.asarray(_yaw(k), jnp.float32)
         place = jnp.array([0.05, -0.03])
@@ -156,12 +149,8 @@ def test_bilinear_agrees_with_scipy():
     rng = np.random.default_rng(0)
     values = rng.normal(size=(3, 12, 17)).astype(np.float32)
     row_col = rng.uniform([-3.0, -3.0], [15.0, 20.0], (3, 500, 2)).astype(np.float32)
-    row_col[:, :4] = [
-        [0.0, 0.0],
-        [11.0, 16.0],
-        [4.0, 16.0],
-        [11.0, 3.5],
-    ]  # the last cells themselves
+    # the last cells themselves
+    row_col[:, :4] = [[0.0, 0.0], [11.0, 16.0], [4.0, 16.0], [11.0, 3.5]]
     read = jax.jit(jax.vmap(jax.vmap(rotate.bilinear, in_axes=(None, 0))))(
         jnp.asarray(values), jnp.asarray(row_col)
     )
@@ -171,8 +160,7 @@ def test_bilinear_agrees_with_scipy():
 
 
 def test_bilinear_gradient_is_the_slope():
-    """Claim: the gradient of `bilinear` in its place is the slope of the surface, in its values the
-    four weights."""
+    """Claim: the gradient in the place is the slope, in the values the four weights."""
     row, col = np.meshgrid(np.arange(6.0), np.arange(7.0), indexing="ij")
     plane = jnp.asarray(2.0 * row - 3.0 * col + 1.0, jnp.float32)
     place = jnp.array([2.25, 4.5])
@@ -212,8 +200,7 @@ _ROOMY = rotate.tables(64, 0.448, _K, _K, 2**0.5 - 1)
 
 
 def test_a_small_margin_loses_corners():
-    """Claim: a margin of sqrt(2) - 1 shows the workspace's corners in every frame, one of 1/8 does
-    not in frame 2."""
+    """Claim: a margin of sqrt(2) - 1 shows corners in every frame, 1/8 does not in frame 2."""
     corners = np.zeros((64, 64, 1), np.float32)
     corners[[0, 0, -1, -1], [0, -1, 0, -1]] = 1.0
     corners[[1, 1, -2, -2], [1, -2, 1, -2]] = 1.0

@@ -24,8 +24,7 @@ SMALL = HeightmapConfig(32)
 
 @pytest.mark.parametrize("distance", [0.3, 1.0, 2.0])
 def test_depth_errors_grow_with_the_square(distance):
-    """Claim: depths are normal about the true ones with sigma = floor + square d^2, and
-    the stated share is dropped."""
+    """Claim: depths err with sigma = floor + square d^2; the stated share is dropped."""
     true = jnp.full((200, 200), distance)
     measured, kept = sensor.depth(jax.random.key(0), ERRORS, true)
     sigma = 0.001 + 0.0014 * distance**2
@@ -34,8 +33,7 @@ def test_depth_errors_grow_with_the_square(distance):
 
 
 def test_the_camera_is_jittered():
-    """Claim: place and orientation scatter about the believed ones with the stated standard
-    deviations, as rotations."""
+    """Claim: place and rotation scatter with the stated standard deviations."""
     errors, eye = SensorConfig(pose_noise=(0.01, 0.02)), camera.make(CameraConfig())
     keys = jax.random.split(jax.random.key(1), 3000)
     real = jax.jit(jax.vmap(lambda key: sensor.pose(key, errors, eye)))(keys)
@@ -61,8 +59,7 @@ def test_colours_change_together():
 
 
 def test_the_lens_is_another():
-    """Claim: focal lengths and the axis scatter by the stated shares of the focal length; nothing
-    else changes."""
+    """Claim: focal lengths and the axis scatter by the stated shares; nothing else changes."""
     errors, eye = SensorConfig(intrinsics_noise=(0.01, 0.02)), camera.make(CameraConfig())
     keys = jax.random.split(jax.random.key(4), 3000)
     real = jax.device_get(jax.jit(jax.vmap(lambda key: sensor.pose(key, errors, eye)))(keys))
@@ -73,8 +70,7 @@ def test_the_lens_is_another():
 
 
 def test_light_changes_in_every_view():
-    """Claim: the light's direction scatters about its own, and the logarithm of its brightness by
-    the stated standard deviation."""
+    """Claim: the light's direction, and the log of its brightness, scatter as stated."""
     errors = SensorConfig(light=0.1)
     keys, others = jax.random.split(jax.random.key(5), (2, 3000))
     towards = np.asarray(jax.jit(jax.vmap(lambda key: sensor.light(key, errors)))(keys))
@@ -145,8 +141,7 @@ _PUSH = Action(primitive=jnp.int32(0), pose=jnp.array([0.15, 0.15, 0.0]))
     ],
 )
 def test_views_differ_from_step_to_step(view, errors):
-    """Claim: every view of an episode has errors of its own, that of another episode others; the
-    same key, the same."""
+    """Claim: every view has its own errors, another episode others; the same key, the same."""
     env = _env(heightmap=view, sensor=errors)
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     first, other, again = (reset(jax.random.key(seed)) for seed in (0, 1, 0))
@@ -200,8 +195,7 @@ def test_without_errors_there_is_no_randomness():
 
 
 def test_the_config_chooses_the_view():
-    """Claim: the environment looks from above by default, and through the config's camera if the
-    view is oblique."""
+    """Claim: the view is from above by default, by the config's camera if oblique."""
     env = _env(heightmap=OBLIQUE)
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
     above, beside = (_look(each, scene) for each in (_env(), env))
@@ -211,8 +205,7 @@ def test_the_config_chooses_the_view():
 
 
 def test_an_episode_with_errors_needs_a_key():
-    """Claim: a reset without a key says so, instead of showing every episode the same
-    errors."""
+    """Claim: a reset with noise but without a key says so."""
     env = _env(sensor=ERRORS)
     with pytest.raises(ValueError, match=r"sensor.*key"):
         env.reset_to(jax.tree.map(lambda leaf: leaf[0], env.scenes))
@@ -251,8 +244,7 @@ def test_an_episode_with_errors_needs_a_key():
     ],
 )
 def test_bad_settings_are_refused(build, message):
-    """Claim: what the sensor, the view, the strides or the even spacing of yaws cannot do is
-    refused in one line."""
+    """Claim: impossible settings of sensor, view, strides or yaws are refused in one line."""
     with pytest.raises(ValueError, match=message) as error:
         build()
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Maps of the workspace, and an action in them, in millimetres."""
+"""Q maps and height maps of the workspace with an action drawn in, in millimetres."""
 
 from typing import Any
 
@@ -20,40 +20,40 @@ INVALID = "#EBEBEB"  # cells of a Q map with nothing to act on
 TALLEST = 120.0  # mm, the end of the height map's scale
 OUTLINE = [patheffects.withStroke(linewidth=3.9, foreground="white")]
 
-DPI = 90.0  # beside a scene 480 px high; it grows with the picture
+DPI = 90.0  # of a picture 480 px high; it grows with the picture
 BAR = (1.04, 0.0, 0.05, 1.0)  # colour bar right of a map, in shares of it
 
 
 def figure(width: float, height: float, scene_height: int) -> Figure:
-    """A blank figure of even sides, px; videos want them."""
+    """Makes a blank figure of even sides, px, as videos need."""
     dpi = DPI * max(scene_height / 480.0, 0.1)  # smaller letters cannot be drawn
     sides = [(2 * round(0.5 * side) + 0.1) / dpi for side in (width, height)]  # Agg rounds down
     return Figure((sides[0], sides[1]), dpi)
 
 
 def pixels(fig: Figure) -> np.ndarray:
-    """A figure as a picture [H, W, 3] uint8."""
+    """Renders a figure as a picture [H, W, 3] uint8."""
     canvas = FigureCanvasAgg(fig)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
 def draw_q_maps(cfg: Config, axes: tuple[Axes, Axes], q: Any) -> None:
-    """Q [P, H, W] of pushes and of grasps, -inf where there is none, in the same colours."""
-    every = np.ma.masked_invalid(q)
+    """Draws Q [P, H, W] of pushes and of grasps, -inf if invalid, in the same colours."""
+    valid = np.ma.masked_invalid(q)
     colours = matplotlib.colormaps["viridis"].with_extremes(bad=INVALID)
-    for primitive, its_axes in zip(Primitive, axes, strict=True):
-        values = every[primitive]
+    for primitive, ax in zip(Primitive, axes, strict=True):
+        values = valid[primitive]
         best = f"best {values.max():+.2f}" if values.count() else "nowhere"
         title = f"{primitive.name.title()} value, {best}"
-        image = _draw_map(cfg, its_axes, title, values, colours)
-        image.set_clim(every.min(), every.max())
-    bar = its_axes.inset_axes(BAR)
-    its_axes.figure.colorbar(image, cax=bar, label="Q, best over yaws")
+        image = _draw_map(cfg, ax, title, values, colours)
+        image.set_clim(valid.min(), valid.max())
+    bar = ax.inset_axes(BAR)
+    ax.figure.colorbar(image, cax=bar, label="Q, best over yaws")
 
 
 def draw_heights(cfg: Config, axes: Axes, height: Any) -> None:
-    """A height map [H, W] m."""
+    """Draws a height map [H, W] m."""
     grey = matplotlib.colormaps["Greys"]
     image = _draw_map(cfg, axes, "Height map", 1e3 * np.asarray(height), grey)
     image.set_clim(0.0, TALLEST)
@@ -61,7 +61,7 @@ def draw_heights(cfg: Config, axes: Axes, height: Any) -> None:
 
 
 def _draw_map(cfg: Config, axes: Axes, title: str, values: np.ndarray, cmap: Colormap) -> AxesImage:
-    """A map of the workspace [H, W], axes in mm, y upwards."""
+    """Draws a map of the workspace [H, W], axes in mm, y upwards."""
     half = 500.0 * cfg.heightmap.extent
     image = axes.imshow(values, cmap, origin="lower", extent=(-half, half) * 2)
     axes.set_title(title, fontsize="medium")
@@ -73,7 +73,7 @@ def _draw_map(cfg: Config, axes: Axes, title: str, values: np.ndarray, cmap: Col
 
 
 def draw_action(cfg: Config, axes: Axes, primitive: int, pose: Any) -> None:
-    """A push as an arrow over its way; a grasp as fingers and the line that they close along.
+    """Draws a push as an arrow over its way, a grasp as fingers and the line they close along.
 
     Args: pose (x m, y m, yaw rad).
     """

@@ -6,7 +6,7 @@ from matplotlib.colors import to_rgb
 import csac_jax
 from csac_jax import presets
 from csac_jax.deploy import Maps, decision, images, program
-from csac_jax.render import decision as drawn, maps
+from csac_jax.render import decision_picture as drawn, heatmaps
 from tests.deploy import scenes
 
 CFG = presets.smoke()
@@ -23,7 +23,7 @@ def _decision(action: csac_jax.Action) -> decision.Decision:
 
 def _coloured(picture: np.ndarray) -> np.ndarray:
     """Places (column, row) [n, 2] of the chosen action's colour left of the maps."""
-    off = np.abs(picture[:, :800] - 255 * np.array(to_rgb(maps.CHOSEN))).max(axis=2)
+    off = np.abs(picture[:, :800] - 255 * np.array(to_rgb(heatmaps.CHOSEN))).max(axis=2)
     return np.argwhere(off <= 1.0)[:, ::-1]
 
 

@@ -1,4 +1,4 @@
-"""What a policy decides on, drawn into the camera's image, beside its Q maps."""
+"""Pictures of a policy's decisions: the camera's image with them, and Q maps."""
 
 import itertools
 from typing import Any
@@ -12,28 +12,28 @@ from csac_jax.constants import Primitive
 from csac_jax.deploy import Maps, images
 from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.images import View
-from csac_jax.render import maps
+from csac_jax.render import heatmaps
 
 HEIGHT = 640  # px
 OTHERS = "#56B4E9"  # alternatives
 _LAYOUT = {"left": 0.01, "right": 0.93, "bottom": 0.09, "top": 0.93, "wspace": 0.12}
 
 
-def picture(cfg: Config, view: View, decisions: list[Decision], found: Maps) -> np.ndarray:
-    """The image with the decisions, and Q of both primitives [H, W, 3] uint8."""
-    fig = maps.figure(1.95 * HEIGHT, HEIGHT, HEIGHT)
+def picture(cfg: Config, view: View, decisions: list[Decision], values: Maps) -> np.ndarray:
+    """Draws the image with the decisions, and Q of both primitives, [H, W, 3] uint8."""
+    fig = heatmaps.figure(1.95 * HEIGHT, HEIGHT, HEIGHT)
     image, push, grasp = fig.subplot_mosaic("IIP;IIG", gridspec_kw=_LAYOUT).values()
     _draw_image(cfg, image, view, decisions)
-    maps.draw_q_maps(cfg, (push, grasp), found.q)
+    heatmaps.draw_q_maps(cfg, (push, grasp), values.q)
     for decision in decisions[:1]:
         primitive = Primitive[decision.primitive.upper()]
         pose = (*decision.position[:2], decision.yaw)
-        maps.draw_action(cfg, (push, grasp)[primitive], primitive, pose)
-    return maps.pixels(fig)
+        heatmaps.draw_action(cfg, (push, grasp)[primitive], primitive, pose)
+    return heatmaps.pixels(fig)
 
 
 def _draw_image(cfg: Config, axes: Axes, view: View, decisions: list[Decision]) -> None:
-    """The image with the workspace's border; the best decision on top."""
+    """Draws the image with the workspace's border; the best decision on top."""
     axes.imshow(view.colour)
     axes.set_title(line(decisions[0]) if decisions else "nothing to act on", fontsize="medium")
     axes.set(autoscale_on=False)
@@ -42,14 +42,14 @@ def _draw_image(cfg: Config, axes: Axes, view: View, decisions: list[Decision]) 
     corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0]])
     _draw_path(axes, view, corners, color="white", lw=0.8)
     for number, decision in reversed(list(enumerate(decisions))):
-        colour = OTHERS if number else maps.CHOSEN
+        colour = OTHERS if number else heatmaps.CHOSEN
         for path in paths(decision, grippers.load(cfg.sim.gripper).footprint[1]):
-            _draw_path(axes, view, path, color=colour, lw=2.2, path_effects=maps.OUTLINE)
+            _draw_path(axes, view, path, color=colour, lw=2.2, path_effects=heatmaps.OUTLINE)
 
 
 def paths(decision: Decision, half_finger: float) -> list[np.ndarray]:
-    """Lines [n, 3] m of a decision: of a grasp the way down and the gap between the tips with the
-    fingers at its ends, of half this width, m; of a push its way."""
+    """Returns lines [n, 3] m of a decision: the way of a push; of a grasp the way down, the gap and
+    both fingers, whose half width is `half_finger` m."""
     places = np.array([waypoint.position for waypoint in decision.waypoints])
     if decision.primitive == Primitive.PUSH.name.lower():
         return [places[:3]]
@@ -60,7 +60,7 @@ def paths(decision: Decision, half_finger: float) -> list[np.ndarray]:
 
 
 def _draw_path(axes: Axes, view: View, path: np.ndarray, **style: Any) -> None:
-    """A line through points [n, 3] m of the workspace, as the camera sees it."""
+    """Draws a line through points [n, 3] m of the workspace, as the camera sees it."""
     steps = np.linspace(0.0, 1.0, 16)[:, None]
     dense = [start + steps * (end - start) for start, end in itertools.pairwise(path)]
     pixel, inside = images.project(view.intrinsics, view.pose, np.concatenate(dense))
@@ -68,7 +68,7 @@ def _draw_path(axes: Axes, view: View, path: np.ndarray, **style: Any) -> None:
 
 
 def line(decision: Decision) -> str:
-    """A decision in a line of text."""
+    """Describes a decision in a line of text."""
     x, y, z = decision.position
     width = f", {1e3 * decision.width:.0f} mm open" if decision.width else ""
     return (

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax.scene import geoms, solids
 from csac_jax.scene.solids import GeomGroup, Kind, Solids
-from csac_jax.vision import raycast, shapes
+from csac_jax.vision import ray_shapes, raycast
 from tests.vision import mujoco_rays
 
 _cast = jax.jit(jax.vmap(raycast.cast_solids, in_axes=(None, None, 0)))
@@ -23,8 +23,7 @@ PIXEL = 1.0 / 618.62  # rad, of the default camera
 def _silhouette(
     model, data, origin: np.ndarray, direction: np.ndarray, ours: np.ndarray
 ) -> np.ndarray:
-    """True where a ray one pixel beside this one meets another geom or nothing, or something 5 mm
-    nearer, [R] bool."""
+    """[R] bool, a ray one pixel beside meets another geom, nothing, or something 5 mm nearer."""
     side = np.cross(direction, [0.0, 0.0, 1.0])
     side *= PIXEL / np.linalg.norm(side, axis=1, keepdims=True)
     up = np.cross(side, direction)
@@ -37,16 +36,14 @@ def _silhouette(
 
 
 def _compare(make, rng: np.random.Generator, scenes: int, count: int) -> tuple[int, int]:
-    """Rays cast and rays of which one caster alone says that they meet something; distances are
-    checked on the way."""
+    """Rays cast, and rays that only one caster says hit; distances are checked on the way."""
     total, differ, met = 0, 0, set()
     while total < scenes * count:
         model, data = make(rng)
         origin, direction = mujoco_rays.bundle(rng, count)
         expected = mujoco_rays.cast(model, data, origin, direction)
-        if np.any(
-            np.sum(expected.normal * direction, axis=1) > 1e-6
-        ):  # the origin lies inside a geom
+        # the origin lies inside a geom
+        if np.any(np.sum(expected.normal * direction, axis=1) > 1e-6):
             continue
         hit = jax.device_get(_cast(mujoco_rays.read(model, data), origin, direction))
         total, differ = total + count, differ + int(np.sum(hit.valid != (expected.geom >= 0)))
@@ -57,9 +54,8 @@ def _compare(make, rng: np.random.Generator, scenes: int, count: int) -> tuple[i
         at_edge = _silhouette(model, data, origin, direction[far], hit.distance[far])
         assert np.all(at_edge), (off[far][~at_edge], expected.geom[far][~at_edge])
         close = both & (off < 1e-5)
-        other = close & (
-            hit.geom != expected.geom
-        )  # two geoms share a surface: spheres at the elbow
+        # two geoms share a surface: spheres at the elbow
+        other = close & (hit.geom != expected.geom)
         assert other.mean() < 0.02
         np.testing.assert_allclose(
             hit.normal[close & ~other], expected.normal[close & ~other], rtol=0, atol=2e-3
@@ -69,8 +65,7 @@ def _compare(make, rng: np.random.Generator, scenes: int, count: int) -> tuple[i
 
 
 def test_rays_agree_with_mujoco():
-    """Claim: distances are those of C MuJoCo to 0.1 mm off silhouettes, normals to 0.002, and hit
-    is hit."""
+    """Claim: distances are C MuJoCo's to 0.1 mm off silhouettes, normals to 0.002."""
     total, differ = _compare(mujoco_rays.every_type, np.random.default_rng(0), scenes=2, count=2500)
     assert differ / total <= 1e-3
 
@@ -78,8 +73,7 @@ def test_rays_agree_with_mujoco():
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [mujoco_rays.every_type, mujoco_rays.blocks_and_arm])
 def test_a_million_rays_agree_with_mujoco(make):
-    """Claim: of 500,000 rays each through all types and through blocks and arm, at most 1 in
-    100,000 meets something for one caster alone."""
+    """Claim: of 500,000 rays, at most 1 in 100,000 meets something for one caster alone."""
     total, differ = _compare(make, np.random.default_rng(1), scenes=50, count=10_000)
     assert differ / total <= 1e-5
 
@@ -87,8 +81,7 @@ def test_a_million_rays_agree_with_mujoco(make):
 def _solid(
     kind: Kind, rng: np.random.Generator
 ) -> tuple[Solids, np.ndarray, np.ndarray, np.ndarray]:
-    """One geom of random size and pose: the scene, its size [3], position [3] and rotation [3,
-    3]."""
+    """One random geom: the scene, its size [3], position [3] and rotation [3, 3]."""
     size, position = rng.uniform(0.01, 0.08, 3), rng.uniform(-0.2, 0.2, 3)
     rotation = Rotation.random(random_state=rng).as_matrix()
     group = GeomGroup(
@@ -102,8 +95,7 @@ def _solid(
 
 
 def _depth(kind: Kind, size: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Signed distances to the surface (about it: of the right sign and zeros), negative inside, of
-    points [R, 3]."""
+    """Signed distances (right in sign and zeros) to the surface of points [R, 3]."""
     if kind is Kind.SPHERE:
         return np.linalg.norm(point, axis=1) - size[0]
     if kind is Kind.BOX:
@@ -119,8 +111,7 @@ def _depth(kind: Kind, size: np.ndarray, point: np.ndarray) -> np.ndarray:
 @settings(max_examples=15, deadline=None)
 @given(seed=_seeds, scale=st.floats(0.1, 10.0))
 def test_hits_lie_on_the_surface(kind, seed, scale):
-    """Claim: a hit lies on the surface, its normal points outwards and against the ray, and nothing
-    lies before it."""
+    """Claim: a hit lies on the surface, its normal faces the ray, and nothing lies before it."""
     rng = np.random.default_rng(seed)
     scene, size, position, rotation = _solid(kind, rng)
     origin, direction = mujoco_rays.bundle(rng, 64)
@@ -146,8 +137,7 @@ def test_hits_lie_on_the_surface(kind, seed, scale):
 
 @pytest.mark.parametrize("kind", [Kind.BOX, *_ROUND])
 def test_rays_along_the_axes_agree_with_mujoco(kind):
-    """Claim: rays parallel to a geom's axis or faces, where a slab gives 0 / 0, are told apart
-    rightly too."""
+    """Claim: rays parallel to axis or faces, where a slab gives 0 / 0, are right too."""
     rng = np.random.default_rng(2)
     geom = f'<geom type="{kind.name.lower()}" size="0.05 0.03 0.02"/>'
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geom}</worldbody></mujoco>")
@@ -177,12 +167,11 @@ def test_seen_from_outside_only(kind):
 
 def test_there_is_a_function_for_every_kind():
     """Claim: the table of ray functions is total."""
-    assert set(shapes.RAY) == set(Kind)
+    assert set(ray_shapes.RAY) == set(Kind)
 
 
 def test_unknown_type_is_refused_by_name():
-    """Claim: a geom of a type that rays do not meet is an error when the scene is read, with its
-    name and the type."""
+    """Claim: a geom of an unknown type is an error on reading, with its name and type."""
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><geom name="egg" type="ellipsoid" size="0.1 0.2 0.3"/>'
         "</worldbody></mujoco>"
@@ -192,8 +181,7 @@ def test_unknown_type_is_refused_by_name():
 
 
 def test_invisible_geoms_are_left_out():
-    """Claim: a geom of opacity 0 is not met, as in C, and colours are the geom's own or its
-    material's."""
+    """Claim: a geom of opacity 0 is not met; colours are the geom's or its material's."""
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><asset><material name="red" rgba="1 0 0 1"/></asset><worldbody>
         <geom type="sphere" size="0.1" pos="0 0 1" rgba="1 1 1 0"/>

@@ -22,8 +22,8 @@ _ON_PLANE = np.float32(1e-12)  # m, depth of an origin that lies on a plane
 Vector = jax.Array | Sequence[jax.Array]  # [3], or its three scalars []
 
 
-class Entry(NamedTuple):
-    """Where one ray enters one geom; all but `valid` are meaningless where not valid."""
+class RayHit(NamedTuple):
+    """Entry of one ray into one geom; all but `valid` are meaningless where not valid."""
 
     distance: jax.Array  # [] in lengths of the ray's direction, not negative
     normal: tuple[jax.Array, ...]  # [] x 3, outward, of unit length, in the geom's frame
@@ -31,14 +31,14 @@ class Entry(NamedTuple):
 
 
 def dot(a: Vector, b: Vector) -> jax.Array:
-    """Scalar product [] of two vectors, in scalars."""
+    """Returns the scalar product [] of two vectors, in scalars."""
     return functools.reduce(jnp.add, (a[axis] * b[axis] for axis in range(len(a))))
 
 
 def enter_half_spaces(
     normal: jax.Array, offset: jax.Array, origin: Vector, direction: Vector
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One ray against one intersection of half-spaces (slab method, Kay and Kajiya 1986).
+    """Intersects one ray with one intersection of half-spaces (slab method, Kay and Kajiya 1986).
 
     t = (offset - n . o) / (n . d) at each plane. The ray enters at the largest t with n . d < 0 and
     leaves at the smallest with n . d > 0. A parallel plane is left at t = +-1e30 (offset - n . o):
@@ -46,7 +46,7 @@ def enter_half_spaces(
     that share a direction share the division.
 
     Args: normal [F, 3] and offset [F] m; origin [3] m, direction [3].
-    Returns: the distance, the face int32 and whether it enters, all []; see `Entry`.
+    Returns: distance, face int32 and bool, the ray enters, all []; see `RayHit`.
     """
     enter, leave = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32)
     start = enter, leave, jnp.array(0, jnp.int32)
@@ -64,7 +64,7 @@ def clip(
     face: jax.Array,
     first: jax.Array | int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The part from `enter` to `leave` of a ray, cut by more half-spaces, numbered from `first`;
+    """Cuts the part from `enter` to `leave` of a ray by more half-spaces, numbered from `first`;
     `face` is the one at which it enters. All []; see `enter_half_spaces`."""
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
@@ -78,8 +78,8 @@ def clip(
     return enter, leave, face
 
 
-def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The upper side of the plane z = 0, |x| <= size[0] and |y| <= size[1]; 0 means no end."""
+def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> RayHit:
+    """Intersects the upper side of the plane z = 0, |x| <= size[0], |y| <= size[1]; 0: endless."""
     falling = direction[2] < 0.0
     distance = -origin[2] / jnp.where(falling, direction[2], -1.0)
     inside = falling & (distance >= 0.0)
@@ -87,12 +87,12 @@ def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
         place = jnp.abs(origin[axis] + distance * direction[axis])
         inside &= (size[axis] <= 0.0) | (place <= size[axis])
     zero = jnp.zeros_like(distance)
-    return Entry(distance, (zero, zero, zero + 1.0), inside)
+    return RayHit(distance, (zero, zero, zero + 1.0), inside)
 
 
 def _slab(half: jax.Array, origin: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where a line enters and leaves |x| <= half along one axis, all []; it enters later than it
-    leaves if it misses, and a parallel one inside does so at -+inf."""
+    """Returns where a line enters and leaves |x| <= half along one axis, all []; it enters later
+    than it leaves if it misses, and a parallel one inside does so at -+inf."""
     parallel = ~(jnp.abs(direction) > 0.0)
     inverse = 1.0 / jnp.where(parallel, 1.0, direction)
     middle, reach = -origin * inverse, half * jnp.abs(inverse)
@@ -102,8 +102,8 @@ def _slab(half: jax.Array, origin: jax.Array, direction: jax.Array) -> tuple[jax
 
 
 def _ball(radius: jax.Array, origin: Vector, direction: Vector) -> tuple[jax.Array, jax.Array]:
-    """As `_slab`, of the points within `radius` [] m: a sphere of three axes, or the endless
-    cylinder about z of the first two."""
+    """Returns the same as `_slab` for points within `radius` [] m: a sphere of three axes, or the
+    endless cylinder about z of two."""
     square = dot(direction, direction)
     parallel = ~(square > 0.0)
     safe = jnp.where(parallel, 1.0, square)
@@ -116,8 +116,8 @@ def _ball(radius: jax.Array, origin: Vector, direction: Vector) -> tuple[jax.Arr
     return nearest - half, nearest + half
 
 
-def ray_box(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The box of half sizes `size` [3]: the ray enters through the slab that it enters last."""
+def ray_box(size: jax.Array, origin: Vector, direction: Vector) -> RayHit:
+    """Intersects the box of half sizes `size` [3]: the ray enters through the slab entered last."""
     slabs = [_slab(size[axis], origin[axis], direction[axis]) for axis in range(3)]
     enters, leaves = zip(*slabs, strict=True)
     enter, leave = functools.reduce(jnp.maximum, enters), functools.reduce(jnp.minimum, leaves)
@@ -125,18 +125,18 @@ def ray_box(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     y = ~x & (enters[1] == enter)
     sides = zip((x, y, ~x & ~y), direction, strict=True)
     normal = tuple(jnp.where(side, -jnp.sign(along), 0.0) for side, along in sides)
-    return Entry(enter, normal, (enter >= 0.0) & (enter <= leave))
+    return RayHit(enter, normal, (enter >= 0.0) & (enter <= leave))
 
 
-def ray_sphere(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The sphere of radius size[0]: |o + t d| = r."""
+def ray_sphere(size: jax.Array, origin: Vector, direction: Vector) -> RayHit:
+    """Intersects the sphere of radius size[0]: |o + t d| = r."""
     distance, _ = _ball(size[0], origin, direction)
     normal = tuple((origin[axis] + distance * direction[axis]) / size[0] for axis in range(3))
-    return Entry(distance, normal, (distance >= 0.0) & (distance < jnp.inf))
+    return RayHit(distance, normal, (distance >= 0.0) & (distance < jnp.inf))
 
 
-def ray_cylinder(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The cylinder about z of radius size[0] and half length size[1]: tube and slab."""
+def ray_cylinder(size: jax.Array, origin: Vector, direction: Vector) -> RayHit:
+    """Intersects the cylinder about z of radius size[0], half length size[1]: tube and slab."""
     enter_side, leave_side = _ball(size[0], origin[:2], direction[:2])
     enter_end, leave_end = _slab(size[1], origin[2], direction[2])
     distance = jnp.maximum(enter_side, enter_end)
@@ -144,11 +144,11 @@ def ray_cylinder(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     end = enter_end > enter_side  # through an end, not the side
     x, y = ((origin[axis] + distance * direction[axis]) / size[0] for axis in range(2))
     side, cap = (x, y, jnp.zeros_like(x)), (0.0, 0.0, -jnp.sign(direction[2]))
-    return Entry(distance, jax.tree.map(functools.partial(jnp.where, end), cap, side), valid)
+    return RayHit(distance, jax.tree.map(functools.partial(jnp.where, end), cap, side), valid)
 
 
-def ray_capsule(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The capsule about z of radius size[0], half length size[1] without its caps.
+def ray_capsule(size: jax.Array, origin: Vector, direction: Vector) -> RayHit:
+    """Intersects the capsule about z of radius size[0], half length size[1] without its caps.
 
     A line that enters the endless tube between the caps enters the capsule there. Beyond an end it
     can hit only the sphere there; so can a parallel ray that starts beyond it.
@@ -158,19 +158,19 @@ def ray_capsule(size: jax.Array, origin: Vector, direction: Vector) -> Entry:
     middle = jnp.abs(z) <= size[1]
     cap = ray_sphere(size, (origin[0], origin[1], origin[2] - jnp.sign(z) * size[1]), direction)
     x, y = ((origin[axis] + enter * direction[axis]) / size[0] for axis in range(2))
-    side = Entry(enter, (x, y, jnp.zeros_like(x)), enter >= 0.0)
+    side = RayHit(enter, (x, y, jnp.zeros_like(x)), enter >= 0.0)
     entry = jax.tree.map(functools.partial(jnp.where, middle), side, cap)
     return entry._replace(valid=entry.valid & (enter < jnp.inf))
 
 
-def ray_polytope(faces: jax.Array, origin: Vector, direction: Vector) -> Entry:
-    """The polytope of the half-spaces `faces` [F, 4]: outward unit normal and offset m."""
+def ray_polytope(faces: jax.Array, origin: Vector, direction: Vector) -> RayHit:
+    """Intersects the polytope of half-spaces `faces` [F, 4]: outward unit normal and offset m."""
     distance, face, valid = enter_half_spaces(faces[:, :3], faces[:, 3], origin, direction)
     normal = (faces[:, axis].at[face].get(mode="promise_in_bounds") for axis in range(3))
-    return Entry(distance, tuple(normal), valid)
+    return RayHit(distance, tuple(normal), valid)
 
 
-RAY: dict[Kind, Callable[[jax.Array, Vector, Vector], Entry]] = {
+RAY: dict[Kind, Callable[[jax.Array, Vector, Vector], RayHit]] = {
     Kind.PLANE: ray_plane,
     Kind.BOX: ray_box,
     Kind.SPHERE: ray_sphere,

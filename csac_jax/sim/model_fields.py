@@ -1,0 +1,55 @@
+"""A scene as fields and state of MuJoCo's model, and back: what the engines share."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from csac_jax.scene.layout import Scene
+from csac_jax.scene.model import BlockFields, World
+from csac_jax.sim.primitives import JointTrajectory
+
+Base = Callable[[str], jax.Array]  # name of a model's field -> its values as compiled
+
+
+def of_scene(world: World, fields: BlockFields, base: Base) -> dict[str, jax.Array]:
+    """Returns fields of the model with this scene's blocks and fingers, by name."""
+    geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
+    changed = {
+        "geom_size": base("geom_size").at[geoms].set(fields.size),
+        "geom_pos": base("geom_pos").at[geoms].set(fields.centre),
+        "geom_rbound": base("geom_rbound").at[geoms].set(fields.rbound),
+        "geom_friction": base("geom_friction").at[geoms, 0].set(fields.friction),
+        "body_mass": base("body_mass").at[bodies].set(fields.mass),
+        "body_inertia": base("body_inertia").at[bodies].set(fields.inertia),
+        "body_ipos": base("body_ipos").at[bodies].set(fields.com),
+        "body_invweight0": base("body_invweight0").at[bodies].set(fields.body_invweight),
+        "dof_invweight0": base("dof_invweight0").at[dofs].set(fields.dof_invweight),
+    }
+    if fields.pads is not None:
+        pads, names = world.hand_geoms[1:], ("geom_size", "geom_pos", "geom_rbound")
+        for name, values in zip(names, fields.pads, strict=True):
+            changed[name] = changed[name].at[pads].set(values)
+    return changed
+
+
+def subtree_mass(world: World, mass: jax.Array, base: Base) -> jax.Array:
+    """Returns the field `body_subtreemass`, kg, where the blocks weigh `mass` [N] kg."""
+    bodies = world.block_bodies
+    added = jnp.sum(mass - base("body_mass")[bodies])
+    return base("body_subtreemass").at[0].add(added).at[bodies].set(mass)
+
+
+def start(
+    world: World, scene: Scene, joints: JointTrajectory, qpos: jax.Array, qvel: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Returns qpos and qvel with the scene's blocks, the robot at rest at its first set-point."""
+    poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
+    qpos = qpos.at[world.robot_qpos].set(joints.start).at[world.block_qpos].set(poses)
+    return qpos, qvel.at[world.block_dofs].set(scene.velocity)
+
+
+def moved(world: World, scene: Scene, qpos: jax.Array, qvel: jax.Array) -> Scene:
+    """Returns the scene with its blocks at qpos [nq] and qvel [nv]."""
+    pose, velocity = qpos[world.block_qpos], qvel[world.block_dofs]
+    return scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)
