@@ -47,14 +47,14 @@ RANK = {stage: rank for rank, row in enumerate(ORDER) for stage in row}
 
 # Module -> where it may be imported, as a stage or a file.
 ONLY_IN = {
-    "mujoco": ("scene", "sim", "render"),
+    "mujoco": ("scene", "sim", "render", "objects/descriptions.py"),
     "flax.linen": ("nets",),
     "flax.nnx": (),
     "optax": ("agent",),
     "orbax": ("io/checkpoint.py",),
     "tyro": ("cli",),
     "rich": ("report", "cli", "api"),
-    "pydantic": ("io", "deploy/service.py"),
+    "pydantic": ("io", "deploy/service.py", "scene/case_file.py"),
     "onnx": ("deploy/onnx_graph.py",),
     "cv2": ("deploy/board.py",),
     "fastapi": ("deploy/service.py",),
@@ -70,7 +70,7 @@ ONLY_IN = {
     "wandb": ("report/trackers.py",),
     "mlflow": ("report/trackers.py",),
     "yaml": ("io/config_file.py",),
-    "trimesh": ("objects/conversion.py", "scene/descriptions.py", "render/viewer.py"),
+    "trimesh": ("objects", "render/viewer.py"),
     "coacd": ("objects/conversion.py",),
 }
 JIT_IN = (

@@ -24,14 +24,14 @@ from csac_jax.runtime import processes
 
 @dataclasses.dataclass(frozen=True)
 class MakeOptions:
-    """Makes a library of our own shapes, at random; it needs no file of anybody's."""
+    """Makes a library of random shapes; needs no mesh files."""
 
     out: Path
     """Folder to write, which must not exist."""
     seed: int = 0
-    """Number that the shapes follow from."""
+    """Seed of the random shapes."""
     count: int = 200
-    """Objects, family by family in turn."""
+    """Number of objects, one family after another."""
     mixed: bool = False
     """Make every other object an assembly of random blocks: more shapes to train on."""
     json: Path | None = None
@@ -40,19 +40,19 @@ class MakeOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ImportOptions:
-    """Makes a library of mesh files: .obj, .stl, .ply and .glb, or of URDF and MJCF. Each is split
-    into convex parts, which takes seconds to a minute. Files that cannot be taken are named and
-    left out. In a folder with URDF or MJCF, the meshes are parts of these."""
+    """Makes a library of mesh files (.obj, .stl, .ply, .glb), URDF or MJCF. Each is split into
+    convex parts, which takes seconds to a minute. Unusable files are named and left out. In a
+    folder with URDF or MJCF, the meshes are parts of these."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Files, and folders of them."""
     out: Path
-    """Folder to write, which must not exist. Beside it, until all is done, OUT.partial keeps what
-    is finished: the same command goes on from there."""
+    """Folder to write, which must not exist. Until all is done, OUT.partial keeps finished objects,
+    and the same command resumes from there."""
     scale: float = 1.0
     """Metres per unit of the files: 0.001 for millimetres."""
     density: float = 600.0
-    """Density of the objects, kg/m^3. Scenes draw theirs around it, as around 600."""
+    """Density of the objects, kg/m^3. Scenes vary it by the same factor as the default 600."""
     jobs: int = 0
     """Files at a time; 0 for one per core."""
     json: Path | None = None
@@ -61,7 +61,7 @@ class ImportOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ShowOptions:
-    """Lists the objects of a library; draws them if asked to."""
+    """Lists the objects of a library, and draws them with --png."""
 
     library: tyro.conf.Positional[str]
     """The library: a folder, made:SEED:COUNT or mixed:SEED:COUNT."""
@@ -92,10 +92,10 @@ def _make(arguments: list[str]) -> int:
         raise BadArgumentsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
     _check_new(options.out)
     draw = families.draw_mixed if options.mixed else families.draw
-    made = library.save(options.out, draw(options.seed, options.count))
-    _list(made.objects)
+    made = library.save(options.out, draw(options.seed, options.count)).objects
+    _list(made)
     print(f"wrote {options.out}")
-    output.write_result(options.json, {"objects": [_row(one) for one in made.objects]})
+    output.write_result(options.json, {"objects": [_row(member) for member in made]})
     return 0
 
 
@@ -105,7 +105,6 @@ def _import(arguments: list[str]) -> int:
     if not (0.0 < options.scale < 1e6 and 0 <= options.jobs <= 1024):
         raise BadArgumentsError("--scale must be positive, --jobs lie in 0 .. 1024")
     from csac_jax.objects import body, conversion, importing, library
-    from csac_jax.scene import descriptions
 
     least, most = body.DENSITIES
     if not least <= options.density <= most:
@@ -113,32 +112,33 @@ def _import(arguments: list[str]) -> int:
     for module in importing.MODULES:
         check_extra("objects import", module, "objects")
     with as_bad_arguments(ValueError):
-        paths = importing.files(list(options.paths), descriptions.SUFFIXES)
+        paths = importing.files(list(options.paths))
     if len(paths) > library.MOST_OBJECTS:
         raise BadArgumentsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
-    jobs, kept = options.jobs or processes.cores(), Path(f"{options.out}.partial")
-    with _progress_bar() as show:
-        readers = tuple((suffix, descriptions.read) for suffix in descriptions.SUFFIXES)
-        how = conversion.How(options.scale, options.density, readers)
-        found = importing.run(paths, how, jobs, kept, show)
-    for line in found.refused:
+    jobs, cache = options.jobs or processes.cores(), Path(f"{options.out}.partial")
+    settings = conversion.ImportSettings(options.scale, options.density)
+    with _progress_bar() as on_progress:
+        result = importing.run(paths, settings, jobs, cache, on_progress)
+    for line in result.refused:
         print(f"{PROGRAM}: {line}", file=sys.stderr)
-    if not found.objects:
-        raise FailedError(f"none of {len(paths)} files can be taken; nothing is written")
-    _list(library.save(options.out, found.objects).objects)
-    importing.forget(kept)
-    for name, share in found.volumes.items():
+    if not result.objects:
+        raise FailedError(f"none of {len(paths)} files can be imported; nothing is written")
+    _list(library.save(options.out, result.objects).objects)
+    importing.forget(cache)
+    for name, share in result.volumes.items():
         if not importing.SOUND[0] <= share <= importing.SOUND[1]:
-            print(f"{name}: its parts have {share:.2f} of the mesh's volume; look at it")
-    print(f"wrote {options.out}; {len(found.refused)} of {len(paths)} files left out")
-    rows = [_row(one) | {"parts_volume": found.volumes[one.name]} for one in found.objects]
-    output.write_result(options.json, {"objects": rows, "refused": found.refused})
+            print(f"{name}: its parts have {share:.2f} of the mesh's volume; check it")
+    print(f"wrote {options.out}; {len(result.refused)} of {len(paths)} files left out")
+    rows = [
+        _row(member) | {"parts_volume": result.volumes[member.name]} for member in result.objects
+    ]
+    output.write_result(options.json, {"objects": rows, "refused": result.refused})
     return 0
 
 
 @contextlib.contextmanager
 def _progress_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """A line on the terminal with the file just finished; nothing elsewhere."""
+    """Shows a line on a terminal with the latest finished file."""
     bar = output.progress()
     task = bar.add_task("splitting into convex parts", total=None)
     with bar:
@@ -168,30 +168,30 @@ def _show(arguments: list[str]) -> int:
 
         sheet.write(options.png, objects)
         print(f"wrote {options.png}")
-    output.write_result(options.json, {"objects": [_row(one) for one in objects]})
+    output.write_result(options.json, {"objects": [_row(member) for member in objects]})
     return 0
 
 
-def _row(one: Any) -> dict[str, Any]:
-    """What is said of an object."""
-
-    size = one.bounds[1] - one.bounds[0]
+def _row(member: Any) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "size_mm": [round(1e3 * float(side), 1) for side in size],
-        "narrowest_mm": round(1e3 * one.narrowest, 1),
-        "mass_g": round(1e3 * one.density * one.volume, 1),
-        "parts": len(one.parts),
-        "split": "held_out" if one.held_out else "train",
+        "name": member.name,
+        "size_mm": [round(1e3 * float(side), 1) for side in member.bounds[1] - member.bounds[0]],
+        "narrowest_mm": round(1e3 * member.narrowest, 1),
+        "mass_g": round(1e3 * member.density * member.volume, 1),
+        "parts": len(member.parts),
+        "split": "held_out" if member.held_out else "train",
     }
 
 
 def _list(objects: Any) -> None:
-    """Prints the objects as a table, and which of them are too wide for the hand."""
+    """Prints the objects as a table, then names those too wide for the default gripper."""
     from rich.console import Console
     from rich.table import Table
 
-    rows = [_row(one) for one in objects]
+    from csac_jax import grippers
+    from csac_jax.config import SimConfig
+
+    rows = [_row(member) for member in objects]
     table = Table("object", "size, mm", "narrowest, mm", "mass, g", "parts", "split")
     for row in rows:
         size = " x ".join(f"{side:.0f}" for side in row["size_mm"])
@@ -200,9 +200,6 @@ def _list(objects: Any) -> None:
     Console(highlight=False).print(table)
     held_out = sum(row["split"] == "held_out" for row in rows)
     print(f"{len(rows)} objects, {held_out} of them held out")
-    from csac_jax import grippers
-    from csac_jax.config import SimConfig
-
     opening = 1e3 * grippers.load(SimConfig().gripper).opening[1]
     wide = [row["name"] for row in rows if row["narrowest_mm"] >= opening]
     if wide:

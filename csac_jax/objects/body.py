@@ -1,4 +1,4 @@
-"""An object: a rigid body of convex parts, and what keeps one from being simulated.
+"""An object: a rigid body of convex parts, and the checks it must pass to be simulated.
 
 Its frame has the axes of its file and its origin at the centre of mass.
 """
@@ -15,7 +15,7 @@ from csac_jax.objects.solid import Part
 
 HELD_OUT = 0.2  # share of the names
 MOST_PARTS = 32
-DENSITY = 600.0  # kg/m^3, of objects of which nothing else is said
+DENSITY = 600.0  # kg/m^3, of objects that name no other
 DENSITIES = 50.0, 25_000.0  # kg/m^3, least and most
 LARGEST = 0.4  # m, of a side: more than fits on the table
 
@@ -36,41 +36,34 @@ class Object:
 
     @property
     def bounds(self) -> np.ndarray:
-        """Lowest and highest corner of the bounding box [2, 3] m."""
+        """Returns the lowest and highest corner of the bounding box [2, 3] m."""
         points = np.concatenate([part.vertices for part in self.parts])
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     @property
     def narrowest(self) -> float:
-        """Least width, m, between two parallel planes, one of them along a face of the hull."""
+        """Returns the least width, m, between parallel planes, one along a face of the hull."""
         return solid.narrowest(self.parts)
 
     @property
     def held_out(self) -> bool:
-        """Kept for evaluation: decided by the digest of the family, or of the object's name or
-        file, never by hand."""
-        return any(_drawn(name) for name in (self.source_sha256 or self.name, self.family) if name)
+        """Returns True for an object kept for evaluation: decided by digests, never by hand."""
+        names = (self.source_sha256 or self.name, self.family)
+        return any(_fraction(name) < HELD_OUT for name in names if name)
 
 
-def _drawn(name: str) -> bool:
-    number = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
-    return number < HELD_OUT * 2**64
-
-
-def renamed(one: Object, name: str) -> Object:
-    """The object under another name."""
-    return dataclasses.replace(one, name=name)
+def _fraction(name: str) -> float:
+    """Hashes a name to a number in 0 .. 1."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
 
 
 def make(name: str, parts: Sequence[Part], **more: Any) -> Object:
-    """The object of convex parts that do not overlap, shifted such that its centre of mass is the
-    origin."""
-    whole = solid.joined(map(solid.moments, parts))
-    return centred(name, parts, whole, **more)
+    """Builds an object of convex parts that do not overlap, its centre of mass at the origin."""
+    return centred(name, parts, solid.joined(map(solid.moments, parts)), **more)
 
 
 def centred(name: str, parts: Sequence[Part], whole: solid.Moments, **more: Any) -> Object:
-    """The object of these parts whose integrals are `whole`."""
+    """Builds an object of these parts, whose integrals are `whole`."""
     com = whole.first / whole.volume
     shifted = [solid.moved(part, -com) for part in parts]
     shifted.sort(key=lambda part: -np.square(np.ptp(part.vertices, axis=0)).sum())
@@ -78,17 +71,15 @@ def centred(name: str, parts: Sequence[Part], whole: solid.Moments, **more: Any)
 
 
 def faults(one: Object) -> str | None:
-    """What keeps an object from being simulated; None if nothing does."""
+    """Finds the first reason that an object cannot be simulated; None for a sound one."""
     if not (one.name.isprintable() and 1 <= len(one.name) <= 100):
         return "has no name of 1 to 100 printable characters"
     size = np.ptp(one.bounds, axis=0)
     if not (size.min() >= 1e-3 and size.max() <= LARGEST):
         sides = f"{1e3 * size.min():.3g} to {1e3 * size.max():.3g}"
         return f"has sides of {sides} mm, not 1 to {1e3 * LARGEST:g}"
-    if (
-        len(one.parts) > MOST_PARTS
-        or max(len(part.planes) for part in one.parts) > solid.MOST_FACES
-    ):
+    faces = max(len(part.planes) for part in one.parts)
+    if len(one.parts) > MOST_PARTS or faces > solid.MOST_FACES:
         return f"has more than {MOST_PARTS} parts, or a part of more than {solid.MOST_FACES} faces"
     if not (0.0 < one.volume <= 1.01 * np.prod(size)):
         return "has a volume that is not positive, or larger than its bounding box"

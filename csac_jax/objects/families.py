@@ -1,8 +1,8 @@
 """Our own shapes: families of objects, each drawn from random numbers as convex parts.
 
-The parts of an object touch, and do not overlap. Sizes are such that the hand, which opens to
-110 mm, finds a grasp: what is wider has a thin wall, an arm or a handle. Round things are polygons,
-so that they come to rest. z is up as the object stands.
+The parts of an object touch and do not overlap. The hand, which opens to 110 mm, can grasp each:
+a wider object has a thin wall, an arm or a handle. Round cross-sections are polygons, so that
+objects come to rest. z is up as the object stands.
 """
 
 import itertools
@@ -22,13 +22,13 @@ _THIN = 0.003  # m, the same to its nearest side, at least
 
 
 def _circle(radius: float, sides: int = _ROUND) -> np.ndarray:
-    """Corners [sides, 2] of a regular polygon; the middle of a side lies on the x axis."""
+    """Returns corners [sides, 2] of a regular polygon; the x axis meets the middle of a side."""
     angle = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _frustum(low: np.ndarray, high: np.ndarray, bottom: float, top: float) -> Part:
-    """Between two polygons [n, 2], one at each height."""
+    """Builds the hull of two polygons [n, 2], one at each height."""
     ends = (np.column_stack([xy, np.full(len(xy), z)]) for xy, z in ((low, bottom), (high, top)))
     return solid.convex(np.concatenate([*ends]))
 
@@ -45,10 +45,9 @@ def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> P
 def _wall(
     inner: tuple[float, float], outer: tuple[float, float], bottom: float, top: float, sides: int
 ) -> list[Part]:
-    """The parts of a ring, radii at the bottom and at the top."""
-    rings = [
-        [_circle(radius, sides) for radius in radii] for radii in zip(inner, outer, strict=True)
-    ]
+    """Builds the parts of a ring; radii at the bottom and at the top."""
+    radii = zip(inner, outer, strict=True)
+    rings = [[_circle(inside, sides), _circle(outside, sides)] for inside, outside in radii]
     parts = []
     for i in range(sides):
         edge = np.array([i, (i + 1) % sides])
@@ -58,37 +57,30 @@ def _wall(
 
 
 def bottle(rng: Generator) -> list[Part]:
-    """Body, shoulder and neck, revolved."""
+    """Draws a bottle: body, shoulder and neck, revolved."""
     body, neck = rng.uniform(0.018, 0.034), rng.uniform(0.008, 0.013)
-    heights = np.cumsum(
-        [0.0, rng.uniform(0.05, 0.09), rng.uniform(0.01, 0.03), rng.uniform(0.015, 0.03)]
-    )
+    heights = np.cumsum([0.0, *rng.uniform([0.05, 0.01, 0.015], [0.09, 0.03, 0.03])])
     rings = [_circle(radius) for radius in (body, body, neck, neck)]
     return [_frustum(rings[i], rings[i + 1], heights[i], heights[i + 1]) for i in range(3)]
 
 
 def _vessel(radii: tuple[float, float], wall: float, height: float, floor: float) -> list[Part]:
-    """A floor and a wall around it, radii outside at the bottom and at the top."""
+    """Builds a floor and a wall around it; outer radii at the bottom and at the top."""
     inner = radii[0] - wall, radii[1] - wall
-    base = _prism(_circle(inner[0], SIDES), 0.0, floor)
     slope = (inner[1] - inner[0]) / height
     base = _frustum(_circle(inner[0], SIDES), _circle(inner[0] + slope * floor, SIDES), 0.0, floor)
     return [base, *_wall(inner, radii, 0.0, height, SIDES)]
 
 
 def bowl(rng: Generator) -> list[Part]:
-    """A floor and a wall that opens upwards."""
+    """Draws a bowl: a floor and a wall that opens upwards."""
     top = rng.uniform(0.04, 0.06)
-    return _vessel(
-        (top * rng.uniform(0.55, 0.8), top),
-        rng.uniform(0.004, 0.007),
-        rng.uniform(0.03, 0.05),
-        0.005,
-    )
+    bottom, wall, height = rng.uniform([0.55, 0.004, 0.03], [0.8, 0.007, 0.05])
+    return _vessel((top * bottom, top), wall, height, 0.005)
 
 
 def cup(rng: Generator) -> list[Part]:
-    """A floor, an upright wall and a handle of three bars."""
+    """Draws a cup: a floor, an upright wall and a handle of three bars."""
     radius, height = rng.uniform(0.026, 0.038), rng.uniform(0.05, 0.08)
     side = radius * np.cos(np.pi / SIDES)  # of the wall, from the axis
     reach, thick, half = rng.uniform(0.018, 0.026), 0.006, rng.uniform(0.004, 0.007)
@@ -99,8 +91,10 @@ def cup(rng: Generator) -> list[Part]:
 
 
 def superquadric(rng: Generator) -> list[Part]:
-    """|x/a|^(2/e) + |y/b|^(2/e), to the power e/f, + |z/c|^(2/f) = 1, by 34 of its points (Barr
-    1981); convex, as e and f lie below 2."""
+    """Draws a superquadric as the hull of 34 of its points; convex, as e and f lie below 2.
+
+    (|x/a|^(2/e) + |y/b|^(2/e))^(e/f) + |z/c|^(2/f) = 1, Barr 1981.
+    """
     half, (east, north) = rng.uniform(0.015, 0.04, 3), rng.uniform(0.25, 1.3, 2)
     around = np.pi * (np.arange(8) + 0.5) / 4.0
     up, across = np.meshgrid(np.radians([-54.0, -18.0, 18.0, 54.0]), around)
@@ -115,7 +109,7 @@ def superquadric(rng: Generator) -> list[Part]:
 
 
 def bracket(rng: Generator) -> list[Part]:
-    """A plate with one leg or two: an L or a U."""
+    """Draws a bracket: a plate with one leg or two, an L or a U."""
     thick, width = rng.uniform(0.008, 0.015), rng.uniform(0.02, 0.045)
     length, legs = rng.uniform(0.05, 0.085), rng.uniform(0.025, 0.06, rng.integers(1, 3))
     parts = [_box((0.0, 0.0, 0.0), (length, width, thick))]
@@ -125,26 +119,22 @@ def bracket(rng: Generator) -> list[Part]:
 
 
 def tube(rng: Generator) -> list[Part]:
-    """A pipe or a ring."""
+    """Draws a tube: a pipe or a ring."""
     outer, wall = rng.uniform(0.015, 0.038), rng.uniform(0.004, 0.007)
     return _wall((outer - wall,) * 2, (outer,) * 2, 0.0, rng.uniform(0.015, 0.08), SIDES)
 
 
 def nut(rng: Generator) -> list[Part]:
-    """A hexagon with a hole."""
+    """Draws a nut: a hexagon with a hole."""
     outer = rng.uniform(0.018, 0.034)
-    return _wall(
-        (outer * rng.uniform(0.45, 0.65),) * 2, (outer,) * 2, 0.0, rng.uniform(0.012, 0.025), 6
-    )
+    inner, height = outer * rng.uniform(0.45, 0.65), rng.uniform(0.012, 0.025)
+    return _wall((inner,) * 2, (outer,) * 2, 0.0, height, 6)
 
 
 def star(rng: Generator) -> list[Part]:
-    """A core with three to six pointed arms."""
-    arms, radius, thick = (
-        int(rng.integers(3, 7)),
-        rng.uniform(0.012, 0.02),
-        rng.uniform(0.012, 0.025),
-    )
+    """Draws a star: a core with three to six pointed arms."""
+    arms = int(rng.integers(3, 7))
+    radius, thick = rng.uniform(0.012, [0.02, 0.025])
     core, tip = _circle(radius, arms), rng.uniform(0.03, 0.05)
     parts = [_prism(core, 0.0, thick)]
     for i in range(arms):
@@ -156,7 +146,7 @@ def star(rng: Generator) -> list[Part]:
 
 
 def wedge(rng: Generator) -> list[Part]:
-    """A ramp, its thin end cut off or not."""
+    """Draws a wedge: a ramp, its thin end cut off or not."""
     length, width, height = rng.uniform([0.04, 0.025, 0.02], [0.09, 0.06, 0.05])
     end = rng.choice([0.0, rng.uniform(0.2, 0.5)]) * height
     x, z = np.array([0.0, length, length, 0.0]), np.array([0.0, 0.0, end, height])
@@ -165,7 +155,7 @@ def wedge(rng: Generator) -> list[Part]:
 
 
 def rod(rng: Generator) -> list[Part]:
-    """A hexagonal bar with one to three bends in a plane; joints are mitred."""
+    """Draws a rod: a hexagonal bar with one to three mitred bends in a plane."""
     bends = int(rng.integers(1, 4))
     turns = rng.uniform(0.4, 1.2, bends) * rng.choice([-1.0, 1.0], bends)
     heading = np.concatenate([[0.0], np.cumsum(turns)])
@@ -183,7 +173,7 @@ def rod(rng: Generator) -> list[Part]:
 
 
 def tool(rng: Generator) -> list[Part]:
-    """A hammer, a screwdriver or a spanner."""
+    """Draws a tool: a hammer, a screwdriver or a spanner."""
     length, half = rng.uniform(0.06, 0.1), rng.uniform(0.006, 0.011)
     handle = _box((0.0, -half, -half), (length, half, half))
     kind = rng.integers(3)
@@ -191,39 +181,32 @@ def tool(rng: Generator) -> list[Part]:
         wide, deep, high = rng.uniform([0.02, 0.022, 0.01], [0.03, 0.04, 0.014])
         return [handle, _box((length, -deep, -high), (length + wide, deep, high))]
     if kind == 1:
-        thin = rng.uniform(0.003, 0.005)
-        return [
-            handle,
-            _box((length, -thin, -thin), (length + rng.uniform(0.03, 0.05), thin, thin)),
-        ]
+        thin, blade = rng.uniform([0.003, 0.03], [0.005, 0.05])
+        return [handle, _box((length, -thin, -thin), (length + blade, thin, thin))]
     wide, jaw = rng.uniform(0.018, 0.026), rng.uniform(0.007, 0.01)
     head = length + 0.015
-    jaws = [
-        _box((head, min(y), -half), (head + 0.02, max(y), half))
-        for y in ((wide, wide - jaw), (-wide, jaw - wide))
-    ]
+    ends = (wide - jaw, wide), (-wide, jaw - wide)
+    jaws = [_box((head, low, -half), (head + 0.02, high, half)) for low, high in ends]
     return [handle, _box((length, -wide, -half), (head, wide, half)), *jaws]
 
 
 def stone(rng: Generator) -> list[Part]:
-    """The hull of random points of an ellipsoid's surface."""
+    """Draws a stone: the hull of random points of an ellipsoid's surface."""
     points = rng.normal(size=(int(rng.integers(10, 25)), 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     return [solid.convex(points * rng.uniform(0.015, 0.04, 3))]
 
 
 def dumbbell(rng: Generator) -> list[Part]:
-    """Two discs and a bar between them, or a spool."""
+    """Draws a dumbbell or a spool: two discs and a bar between them."""
     ends, bar = rng.uniform(0.018, 0.036, 2), rng.uniform(0.007, 0.012)
-    heights = np.cumsum(
-        [0.0, *rng.uniform(0.01, 0.025, 1), rng.uniform(0.03, 0.05), rng.uniform(0.01, 0.025)]
-    )
+    heights = np.cumsum([0.0, *rng.uniform([0.01, 0.03, 0.01], [0.025, 0.05, 0.025])])
     rings = [_circle(radius) for radius in (ends[0], bar, ends[1])]
     return [_prism(ring, heights[i], heights[i + 1]) for i, ring in enumerate(rings)]
 
 
 def brick(rng: Generator) -> list[Part]:
-    """A box, or a prism of three to eight sides."""
+    """Draws a brick: a box, or a prism of three to eight sides."""
     if rng.integers(2):
         return [_box((0.0, 0.0, 0.0), tuple(rng.uniform(0.02, 0.085, 3)))]
     sides = int(rng.integers(3, 9))
@@ -231,8 +214,10 @@ def brick(rng: Generator) -> list[Part]:
 
 
 def assembly(rng: Generator) -> list[Part]:
-    """One to three storeys of slanted, tapered or straight blocks, one or two on the one below. The
-    last storey may be a wall along the outline of what it stands on."""
+    """Draws an assembly: one to three storeys of slanted, tapered or straight blocks.
+
+    One or two stand on the one below. The last storey may be a wall along the outline below it.
+    """
     storeys = int(rng.integers(1, 4))
     parts: list[Part] = []
     below = np.zeros((1, 2))
@@ -259,7 +244,7 @@ def assembly(rng: Generator) -> list[Part]:
 
 
 def _fence(rng: Generator, outline: np.ndarray, bottom: float, top: float) -> list[Part]:
-    """A wall inside a convex outline [n, 2], upright or leaning; a block where there is no room."""
+    """Draws a wall inside a convex outline [n, 2], upright or leaning; a block if too narrow."""
     middle = outline.mean(axis=0)
     corners = outline - middle
     sides = np.roll(corners, -1, axis=0) - corners
@@ -276,8 +261,10 @@ def _fence(rng: Generator, outline: np.ndarray, bottom: float, top: float) -> li
 
 
 def _footprint(rng: Generator, reach: float) -> np.ndarray:
-    """A rectangle or a convex polygon of three to seven corners [n, 2] around the origin, which lie
-    at most `reach` away from it along each axis, and at least _THIN."""
+    """Draws a rectangle or a convex polygon of 3 to 7 corners [n, 2] around the origin.
+
+    Its corners lie at most `reach` m from the origin along each axis, and at least _THIN.
+    """
     half = np.maximum(reach * rng.uniform(0.1, 1.0, 2), _THIN)
     if rng.integers(2):
         return half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -297,19 +284,19 @@ FAMILIES: dict[str, Family] = {
 
 
 def draw(seed: int, count: int) -> list[Object]:
-    """`count` objects, family by family in turn; the same for the same seed. A longer list begins
-    with the shorter one."""
+    """Draws `count` objects, one family after another; a longer list begins with the shorter."""
     families = [*FAMILIES.values()]
-    return [_one(families[i % len(families)], seed, i) for i in range(count)]
+    return [_object(families[i % len(families)], seed, i) for i in range(count)]
 
 
 def draw_mixed(seed: int, count: int) -> list[Object]:
-    """`count` objects, those of `draw` and assemblies in turn."""
-    pairs = ((one, _one(assembly, seed, i)) for i, one in enumerate(draw(seed, -(-count // 2))))
+    """Draws `count` objects: those of `draw` and assemblies, alternating."""
+    shapes = draw(seed, -(-count // 2))
+    pairs = ((shape, _object(assembly, seed, i)) for i, shape in enumerate(shapes))
     return [*itertools.chain.from_iterable(pairs)][:count]
 
 
-def _one(family: Family, seed: int, number: int) -> Object:
+def _object(family: Family, seed: int, number: int) -> Object:
     name = family.__name__
     parts = family(np.random.default_rng([seed, number]))
     return body.make(f"{name}-{seed}-{number}", parts, family=name)

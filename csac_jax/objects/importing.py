@@ -1,9 +1,7 @@
-"""Many files to objects, several at a time.
-
-What is finished is kept, so that a run that was stopped goes on.
-"""
+"""Many files to objects, several at a time. A cache of finished ones lets a stopped run resume."""
 
 import contextlib
+import dataclasses
 import hashlib
 import resource
 import shutil
@@ -14,116 +12,121 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
-from csac_jax.objects import body, conversion, library, solid
+from csac_jax.objects import conversion, descriptions, library, solid
 from csac_jax.objects.body import Object
-from csac_jax.objects.conversion import How
+from csac_jax.objects.conversion import ImportSettings
 from csac_jax.objects.library import LibraryError
 
-SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+MESHES = (".obj", ".stl", ".ply", ".glb")
 MODULES = ("trimesh", "coacd")
-SOUND = (0.9, 1.15)  # volume of the parts / volume of the mesh, else it is said
+SOUND = (0.9, 1.15)  # volume of the parts / volume of the mesh; others deserve a look
 _MEMORY = 2**33  # bytes that one worker may ask for
 
-Progress = Callable[[int, int, str], None]  # finished, all, name of the one just finished
+Converted = tuple[Object, float]  # with the volume of its parts / volume of the mesh
 
 
-class Imported(NamedTuple):
-    """What became of the files."""
+class ImportResult(NamedTuple):
+    """Objects made of files, and the files that gave none."""
 
     objects: list[Object]
     volumes: dict[str, float]  # by name: volume of the parts / volume of the mesh
     refused: list[str]  # one line each, with the file
 
 
-def files(paths: list[Path], described: tuple[str, ...] = ()) -> list[Path]:
-    """The mesh files among these files and in these folders, sorted. Raises ValueError.
+def files(paths: list[Path]) -> list[Path]:
+    """Lists the importable files among these files and in these folders, sorted.
 
-    In a folder with descriptions, of the suffixes `described`, they are taken: the meshes are
-    parts of them.
+    Of a folder with URDF or MJCF only these are taken: its meshes are parts of them. Raises
+    ValueError for a path that is missing or has none.
     """
-    found: list[Path] = []
+    chosen: list[Path] = []
     for path in paths:
         if not path.exists():
             raise ValueError(f"{path} does not exist")
-        inside = [*path.rglob("*")] if path.is_dir() else [path]
-        for suffixes in (described, SUFFIXES):
-            chosen = [one for one in inside if one.suffix.lower() in suffixes and one.is_file()]
-            if chosen:
-                break
-        else:
-            known = ", ".join((*SUFFIXES, *described))
+        inside = [file for file in (path.rglob("*") if path.is_dir() else [path]) if file.is_file()]
+        described, meshes = (
+            [file for file in inside if file.suffix.lower() in suffixes]
+            for suffixes in (descriptions.SUFFIXES, MESHES)
+        )
+        if not described and not meshes:
+            known = ", ".join((*MESHES, *descriptions.SUFFIXES))
             raise ValueError(f"{path}: no mesh file; known are: {known}")
-        found += sorted(chosen)
-    return list(dict.fromkeys(found))
+        chosen += sorted(described or meshes)
+    return list(dict.fromkeys(chosen))
 
 
-def run(paths: list[Path], how: How, jobs: int, kept: Path, progress: Progress) -> Imported:
-    """The objects of mesh files, split by `jobs` processes.
-
-    Finished objects are kept in the folder `kept`, so that a run that was stopped goes on.
-    """
+def run(
+    paths: list[Path],
+    settings: ImportSettings,
+    jobs: int,
+    cache: Path,
+    on_progress: Callable[[int, int, str], None],  # finished, all, name of the latest
+) -> ImportResult:
+    """Converts files in `jobs` processes; the folder `cache` keeps finished objects."""
     names = _names(paths)
-    done: dict[Path, tuple[Object, float]] = {}
+    done: dict[Path, Converted] = {}
     refused: dict[Path, str] = {}
     for path in paths:
-        if (entry := _kept(kept, path, names[path], how)) is not None:
+        if (entry := _cached(cache, path, names[path], settings)) is not None:
             done[path] = entry
-    waiting = [path for path in paths if path not in done]
 
     def finish(path: Path, task: Future) -> None:
         try:
             done[path] = task.result()
-            _keep(kept, path, how, *done[path])
+            _store(cache, path, settings, done[path][0])
         except (ValueError, OSError, MemoryError) as error:
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             refused[path] = f"{path}: {reason}"
-        progress(len(done) + len(refused), len(paths), path.name)
+        on_progress(len(done) + len(refused), len(paths), path.name)
 
-    broken = _each(waiting, jobs, names, how, finish)
-    for path in broken:  # a process that ends takes those beside it along: now each by itself
-        for alone in _each([path], 1, names, how, finish):
-            refused[alone] = f"{alone}: CoACD crashed or ran out of memory; mend or reduce its mesh"
+    waiting = [path for path in paths if path not in done]
+    unfinished = _convert(waiting, jobs, names, settings, finish)
+    for path in unfinished:  # a crash ends all processes of a pool: now each file in its own
+        if _convert([path], 1, names, settings, finish):
+            refused[path] = f"{path}: CoACD crashed or ran out of memory; mend or reduce its mesh"
     entries = [done[path] for path in paths if path in done]
-    volumes = {one.name: share for one, share in entries}
+    volumes = {converted.name: share for converted, share in entries}
     lines = [refused[path] for path in paths if path in refused]
-    return Imported([one for one, _ in entries], volumes, lines)
+    return ImportResult([converted for converted, _ in entries], volumes, lines)
 
 
-def _each(
+def _convert(
     paths: list[Path],
     jobs: int,
     names: dict[Path, str],
-    how: How,
-    finish: Callable[[Path, Future], None],
+    settings: ImportSettings,
+    on_done: Callable[[Path, Future], None],
 ) -> list[Path]:
-    """Converts files in `jobs` processes; returns those that a process which ended left."""
-    broken = []
+    """Converts files in `jobs` processes; returns those left unfinished by a process that ended."""
+    unfinished = []
     with _pool(max(min(jobs, len(paths)), 1)) as pool:
-        tasks = {pool.submit(conversion.convert, path, names[path], how): path for path in paths}
+        tasks = {
+            pool.submit(conversion.convert, path, names[path], settings): path for path in paths
+        }
         for task in as_completed(tasks):
             if isinstance(task.exception(), BrokenProcessPool):
-                broken.append(tasks[task])
+                unfinished.append(tasks[task])
             else:
-                finish(tasks[task], task)
-    return broken
+                on_done(tasks[task], task)
+    return unfinished
 
 
 @contextlib.contextmanager
 def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes of bounded memory; what waits is dropped where the block is left by an error."""
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_limit)
+    """Starts processes of bounded memory; an error in the block cancels waiting tasks."""
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_limit_memory)
     try:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _limit() -> None:
+def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
 
 
 def _names(paths: list[Path]) -> dict[Path, str]:
-    """A name for each file: its own, or with a number where others have it too."""
+    """Names each file by its stem, with a number where several have the same."""
     names: dict[Path, str] = {}
     for path in paths:
         stem = "".join(c if c.isprintable() else "_" for c in path.stem)[:90] or "object"
@@ -135,28 +138,28 @@ def _names(paths: list[Path]) -> dict[Path, str]:
     return names
 
 
-def _entry(kept: Path, path: Path, how: How) -> Path:
-    content = path.read_bytes() if how.reader(path) is None else conversion.opened(path, how)[0]
-    text = f"{path.name} {how.scale} {how.density} ".encode() + content
-    return kept / hashlib.sha256(text).hexdigest()[:32]
+def _entry(cache: Path, path: Path, settings: ImportSettings) -> Path:
+    described = path.suffix.lower() in descriptions.SUFFIXES
+    content = conversion.read(path)[0] if described else path.read_bytes()
+    text = f"{path.name} {settings.scale} {settings.density} ".encode() + content
+    return cache / hashlib.sha256(text).hexdigest()[:32]
 
 
-def _kept(kept: Path, path: Path, name: str, how: How) -> tuple[Object, float] | None:
-    """What an earlier run has made of a file."""
+def _cached(cache: Path, path: Path, name: str, settings: ImportSettings) -> Converted | None:
     with contextlib.suppress(LibraryError, OSError, ValueError):
-        if kept.exists() and path.stat().st_size <= conversion.MOST_BYTES:
-            (one,) = library.load(_entry(kept, path, how)).objects
-            share = sum(solid.moments(part).volume for part in one.parts) / one.volume
-            return body.renamed(one, name), share
+        if cache.exists() and path.stat().st_size <= conversion.MOST_BYTES:
+            (entry,) = library.load(_entry(cache, path, settings)).objects
+            share = sum(solid.moments(part).volume for part in entry.parts) / entry.volume
+            return dataclasses.replace(entry, name=name), share
     return None
 
 
-def _keep(kept: Path, path: Path, how: How, one: Object, share: float) -> None:
-    folder = _entry(kept, path, how)
+def _store(cache: Path, path: Path, settings: ImportSettings, converted: Object) -> None:
+    folder = _entry(cache, path, settings)
     if not folder.exists():
-        library.save(folder, [one])
+        library.save(folder, [converted])
 
 
-def forget(kept: Path) -> None:
-    """Removes what was kept."""
-    shutil.rmtree(kept, ignore_errors=True)
+def forget(cache: Path) -> None:
+    """Removes the cache."""
+    shutil.rmtree(cache, ignore_errors=True)

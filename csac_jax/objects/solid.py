@@ -3,8 +3,8 @@
 Integrals over a polyhedron are sums over its triangles: each spans a tetrahedron with the origin,
 whose integrals of 1, x and x y are closed forms (Tonon 2005, J. Math. Stat. 1, 8-11).
 
-Products go by `einsum`: those of BLAS, which `@` calls, round as the processor has it. Bodies that
-fall into a pile make much of a last bit, so that machines would not agree which piles there are.
+Products use `einsum`: BLAS, which `@` calls, rounds differently on each kind of processor. A pile
+of falling bodies amplifies a last bit, so machines would settle different piles.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ class Moments(NamedTuple):
 
 
 def convex(points: np.ndarray) -> Part:
-    """The convex hull of points [n, 3] m. Raises ValueError where it has no volume."""
+    """Builds the convex hull of points [n, 3] m. Raises ValueError for one without volume."""
     points = np.asarray(points, np.float32).astype(np.float64)
     try:
         hull = ConvexHull(points)
@@ -54,10 +54,10 @@ def convex(points: np.ndarray) -> Part:
 
 
 def simplified(points: np.ndarray) -> Part:
-    """The hull of as many of the points [n, 3] as give at most MOST_FACES faces: the outermost ones
-    along the axes, then again and again the one farthest outside.
+    """Builds a hull of some of the points [n, 3] m, with at most MOST_FACES faces.
 
-    Raises ValueError where they have no volume.
+    It begins with the outermost points along axes and diagonals, then adds the one farthest outside
+    while it may. Raises ValueError for points without volume.
     """
     part = convex(points)
     if len(part.planes) <= MOST_FACES:
@@ -80,14 +80,14 @@ _DIAGONALS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
 
 
 def _merged(planes: np.ndarray, size: float) -> np.ndarray:
-    """One of each plane [F, 4] of the hull's triangles."""
+    """Keeps one of each plane of the hull's triangles: [T, 4] -> [F, 4]."""
     rounded = (planes / [1, 1, 1, size]).round(_SAME_PLANE)
     _, kept = np.unique(rounded, axis=0, return_index=True)
     return planes[np.sort(kept)].astype(np.float32)
 
 
 def moments(part: Part) -> Moments:
-    """Integrals over a part."""
+    """Integrates over a part."""
     corners = part.vertices.astype(np.float64)[part.triangles]  # [T, 3, 3]
     normals = np.cross(corners[:, 1], corners[:, 2])
     sixth = np.einsum("ti,ti->t", corners[:, 0], normals) / 6.0  # volumes of the tetrahedra
@@ -98,23 +98,22 @@ def moments(part: Part) -> Moments:
 
 
 def joined(every: Iterable[Moments]) -> Moments:
-    """Integrals over solids that do not overlap."""
+    """Sums integrals over solids that do not overlap."""
     volumes, firsts, seconds = zip(*every, strict=True)
     return Moments(sum(volumes), np.sum(firsts, axis=0), np.sum(seconds, axis=0))
 
 
 def inertia(solid: Moments) -> np.ndarray:
-    """Inertia [3, 3] m^5 about the centre of mass, axes as they are, of density 1."""
+    """Computes the inertia [3, 3] m^5 of density 1 about the centre of mass, axes unchanged."""
     com = solid.first / solid.volume
     about = solid.second - solid.volume * np.outer(com, com)
     return np.trace(about) * np.eye(3) - about
 
 
 def principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal moments [n, 3] of matrices [n, 3, 3] and their right-handed axes [n, 3, 3], as
-    columns.
+    """Computes principal moments [n, 3] of inertias [n, 3, 3] and their axes [n, 3, 3].
 
-    Cyclic Jacobi rotations (Golub and Van Loan, sec. 8.5), each a turn about one axis.
+    Axes are columns, right-handed. Cyclic Jacobi rotations, Golub and Van Loan, sec. 8.5.
     """
     left, axes = np.array(inertia, np.float64), np.tile(np.eye(3), (len(inertia), 1, 1))
     for i, j in 5 * ((0, 1), (0, 2), (1, 2)):
@@ -132,7 +131,7 @@ def principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moved(part: Part, shift: np.ndarray) -> Part:
-    """The part shifted by `shift` [3] m."""
+    """Shifts a part by `shift` [3] m."""
     vertices = (part.vertices + shift).astype(np.float32)
     along = np.einsum("fi,i->f", part.planes[:, :3], np.asarray(shift, np.float32))
     offsets = part.planes[:, 3] + along
@@ -140,7 +139,7 @@ def moved(part: Part, shift: np.ndarray) -> Part:
 
 
 def narrowest(parts: Iterable[Part]) -> float:
-    """Least distance, m, of a face of the parts' common hull from the corner opposite it."""
+    """Computes the least distance, m, of a face of the common hull from the corner opposite."""
     points = np.concatenate([part.vertices for part in parts])
     hull = ConvexHull(points)
     along = np.einsum("fi,ni->fn", hull.equations[:, :3], points[hull.vertices])

@@ -1,4 +1,4 @@
-"""The objects of a library as arrays of one shape each, for compiled programs."""
+"""The objects of a library as one array per field, for compiled programs."""
 
 import functools
 import re
@@ -33,56 +33,52 @@ class Tables(NamedTuple):
     centre: np.ndarray  # [O, 3] float32 m, middle of the bounding box
     half: np.ndarray  # [O, 3] float32 m, half of the bounding box
     volume: np.ndarray  # [O] m^3
-    heaviness: np.ndarray  # [O] density relative to that of objects of which nothing is said
+    heaviness: np.ndarray  # [O] density relative to `body.DENSITY`
     moments: np.ndarray  # [O, 3] m^5, principal moments of inertia of density 1
     axes: np.ndarray  # [O, 4] unit quaternions (w, x, y, z), principal axes to object
     radius: float  # m, largest distance of a corner from its object's `centre`
 
 
 def find(source: str, split: Split) -> Library:
-    """The objects of a split of the library in the folder `source`, or of our own shapes:
-    `made:SEED:COUNT`, or `mixed:SEED:COUNT` with assemblies among them. Raises LibraryError."""
-    if made := _MADE.fullmatch(source):
-        kind, seed, count = made.groups()
-        return _chosen(_made(kind, int(seed), int(count)), split)
-    return _chosen(library.load(Path(source)), split)
+    """Finds the objects of a split: of the library in the folder `source`, or of our own shapes.
+
+    Those are `made:SEED:COUNT`, or `mixed:SEED:COUNT` with assemblies. Raises LibraryError.
+    """
+    made = _MADE.fullmatch(source)
+    return _select(_draw(*made.groups()) if made else library.load(Path(source)), split)
 
 
 @functools.lru_cache(maxsize=8)
-def _made(kind: str, seed: int, count: int) -> Library:
-    if not 1 <= count <= library.MOST_OBJECTS:
+def _draw(kind: str, seed: str, count: str) -> Library:
+    if not 1 <= int(count) <= library.MOST_OBJECTS:
         most = library.MOST_OBJECTS
         raise LibraryError(f"{kind}:{seed}:{count}: 1 to {most} objects can be made")
-    return library.of(DRAWS[kind](seed, count))
+    draw = families.draw if kind == "made" else families.draw_mixed
+    return library.from_objects(draw(int(seed), int(count)))
 
 
-DRAWS = {"made": families.draw, "mixed": families.draw_mixed}
-
-
-_chosen = functools.lru_cache(maxsize=16)(library.chosen)
+_select = functools.lru_cache(maxsize=16)(library.select)
 
 
 @functools.lru_cache(maxsize=16)
-def of(source: Library) -> Tables:
-    """The tables of a library."""
+def from_library(source: Library) -> Tables:
+    """Builds the tables of a library."""
     objects = source.objects
-    parts = max(len(one.parts) for one in objects)
-    middle, present = (
-        np.zeros((len(objects), parts, 3), np.float32),
-        np.zeros((len(objects), parts), bool),
-    )
-    for number, one in enumerate(objects):
-        present[number, : len(one.parts)] = True
-        middle[number, : len(one.parts)] = [_middle(part.vertices) for part in one.parts]
-    rows = [_chunks(one) for one in objects]
+    parts = max(len(member.parts) for member in objects)
+    middle = np.zeros((len(objects), parts, 3), np.float32)
+    present = np.zeros((len(objects), parts), bool)
+    for number, member in enumerate(objects):
+        present[number, : len(member.parts)] = True
+        middle[number, : len(member.parts)] = [_middle(part.vertices) for part in member.parts]
+    rows = [_chunks(member) for member in objects]
     chunks = max(map(len, rows))
     planes = np.full((len(objects), chunks, CHUNK, 4), _NO_PLANE, np.float32)
     first, part = np.ones(planes.shape[:2], bool), np.full(planes.shape[:2], parts, np.int32)
     for number, row in enumerate(rows):
-        of, planes[number, : len(row)] = zip(*row, strict=True)
-        part[number, : len(row)], first[number, 1 : len(row)] = of, np.diff(of) > 0
-    bounds = np.stack([one.bounds for one in objects]).astype(np.float32)
-    moments, axes = solid.principal(np.stack([one.inertia for one in objects]))
+        owners, planes[number, : len(row)] = zip(*row, strict=True)
+        part[number, : len(row)], first[number, 1 : len(row)] = owners, np.diff(owners) > 0
+    bounds = np.stack([member.bounds for member in objects]).astype(np.float32)
+    moments, axes = solid.principal(np.stack([member.inertia for member in objects]))
     return Tables(
         normal=planes[..., :3],
         offset=planes[..., 3],
@@ -92,8 +88,8 @@ def of(source: Library) -> Tables:
         middle=middle,
         centre=bounds.mean(axis=1),
         half=0.5 * np.ptp(bounds, axis=1),
-        volume=np.array([one.volume for one in objects]),
-        heaviness=np.array([one.density / DENSITY for one in objects]),
+        volume=np.array([member.volume for member in objects]),
+        heaviness=np.array([member.density / DENSITY for member in objects]),
         moments=moments,
         axes=Rotation.from_matrix(axes).as_quat(scalar_first=True),
         radius=max(map(_radius, objects)),
@@ -103,20 +99,20 @@ def of(source: Library) -> Tables:
 _NO_PLANE = np.array([0.0, 0.0, 0.0, NO_FACE], np.float32)
 
 
-def _chunks(one: Object) -> list[tuple[int, np.ndarray]]:
-    """The chunks of an object, each with the number of its part."""
-    found = []
-    for number, part in enumerate(one.parts):
+def _chunks(member: Object) -> list[tuple[int, np.ndarray]]:
+    """Splits an object's faces into chunks, each with the number of its part."""
+    chunks = []
+    for number, part in enumerate(member.parts):
         missing = -len(part.planes) % CHUNK
         full = np.concatenate([part.planes, np.tile(_NO_PLANE, (missing, 1))])
-        found += [(number, chunk) for chunk in full.reshape(-1, CHUNK, 4)]
-    return found
+        chunks += [(number, chunk) for chunk in full.reshape(-1, CHUNK, 4)]
+    return chunks
 
 
 def _middle(points: np.ndarray) -> np.ndarray:
     return 0.5 * (points.min(axis=0) + points.max(axis=0))
 
 
-def _radius(one: Object) -> float:
-    points = np.concatenate([part.vertices for part in one.parts])
-    return float(np.linalg.norm(points - one.bounds.mean(axis=0), axis=1).max())
+def _radius(member: Object) -> float:
+    points = np.concatenate([part.vertices for part in member.parts])
+    return float(np.linalg.norm(points - member.bounds.mean(axis=0), axis=1).max())

@@ -20,24 +20,24 @@ _COLUMNS, _INCHES, _DOTS = 8, 1.5, 90
 
 
 def write(path: Path, objects: Sequence[Object]) -> None:
-    """Draws the objects, at most MOST of them, at one scale, and writes the picture."""
+    """Draws at most MOST objects at one scale and writes the picture."""
     shown = objects[:MOST]
     rows = math.ceil(len(shown) / _COLUMNS)
     figure = Figure(figsize=(_INCHES * _COLUMNS, 1.25 * _INCHES * rows), dpi=_DOTS)
     canvas = FigureCanvasAgg(figure)
-    reach = 0.4 * max(float(np.ptp(one.bounds, axis=0).max()) for one in shown)
-    for number, one in enumerate(shown):
+    reach = 0.4 * max(float(np.ptp(member.bounds, axis=0).max()) for member in shown)
+    for number, member in enumerate(shown):
         axes = figure.add_subplot(rows, _COLUMNS, number + 1, projection="3d")
-        _draw(axes, one, reach, blocks.COLOURS[number % len(blocks.COLOURS)])
+        _draw(axes, member, reach, blocks.COLOURS[number % len(blocks.COLOURS)])
     figure.subplots_adjust(0.0, 0.0, 1.0, 0.95, 0.0, 0.3)
     canvas.draw()
     media.write_picture(path, np.asarray(canvas.buffer_rgba())[..., :3])
 
 
-def _draw(axes: Any, one: Object, reach: float, colour: np.ndarray) -> None:
-    """One object, faces as lit as in the height maps' pictures."""
-    middle = one.bounds.mean(axis=0)
-    corners = [part.vertices[part.triangles] - middle for part in one.parts]
+def _draw(axes: Any, member: Object, reach: float, colour: np.ndarray) -> None:
+    """Draws one object, lit as in the pictures of height maps."""
+    middle = member.bounds.mean(axis=0)
+    corners = [part.vertices[part.triangles] - middle for part in member.parts]
     triangles = np.concatenate(corners)  # [T, 3, 3]
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     cosine = normal @ np.array(camera.LIGHT) / np.linalg.norm(normal, axis=1)
@@ -47,5 +47,5 @@ def _draw(axes: Any, one: Object, reach: float, colour: np.ndarray) -> None:
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
     axes.set_box_aspect((1, 1, 1))
     axes.set_axis_off()
-    size = " x ".join(f"{1e3 * side:.0f}" for side in np.ptp(one.bounds, axis=0))
-    axes.set_title(f"{one.name[:24]}\n{size} mm", fontsize=6)
+    size = " x ".join(f"{1e3 * side:.0f}" for side in np.ptp(member.bounds, axis=0))
+    axes.set_title(f"{member.name[:24]}\n{size} mm", fontsize=6)

@@ -1,7 +1,7 @@
 """Packed arrangements, drawn inside the compiled program: some blocks together, a few loose.
 
-`families` says how blocks are packed. Here slots get sizes, are packed, put on the table, and
-joined by loose blocks. N = block slots, R = roles of a family.
+`families` has the ways of packing. This module draws sizes, packs a family, puts it on the table
+and adds loose blocks. N = block slots, R = roles of a family.
 """
 
 import dataclasses
@@ -37,42 +37,41 @@ class Blocks(NamedTuple):
     on_side: jax.Array  # [N] bool, rotated by a quarter turn about x before the yaw
     half_size: jax.Array  # [N, 3] m, in the block's frame
     half_lying: jax.Array  # [N, 3] m, as the block lies, before the yaw
-    placed: jax.Array  # [N] bool, False where the rest is meaningless
+    placed: jax.Array  # [N] bool; where False, the other fields have no meaning
 
 
 def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -> Scene:
-    """A random arrangement at rest inside the square of side `extent` m; vmap for a batch.
+    """Draws an arrangement at rest inside the square of side `extent` m; vmap for a batch.
 
     A higher `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 40 mm
     to 1 mm, and adds loose blocks. Sizes, densities and frictions vary as in the pool. The target
-    is the block that the others enclose. Fewer than `cfg.min_blocks` are in play where the square
-    has no room left.
-
-    Raises SceneError for slots that allow none, ValueError for a square too small, while tracing.
+    is the block that the others enclose. Fewer than `cfg.min_blocks` are in play if the square has
+    no room left. While tracing, raises SceneError for slots that allow none, ValueError for a
+    square too small.
     """
     least = 2.0 * (RADIUS + _MARGIN)
     if extent < least:
         raise ValueError(
-            f"heightmap.extent: arrangements need {least:g} m at least, not {extent:g}"
+            f"heightmap.extent: arrangements need at least {least:g} m, not {extent:g}"
         )
     possible = families.available(cfg.slots).values()
     key_sizes, key_family, key_pack, key_place, key_loose, key_looks = jax.random.split(key, 6)
     sizes = draw_sizes(key_sizes, cfg)
     draws = families.draw(key_pack, len(cfg.slots))
     # All families, then a choice: under vmap lax.switch would compute all of them, too.
-    each = [pack(family, cfg.slots, draws, sizes, level) for family in possible]
-    chosen = jax.random.randint(key_family, (), 0, len(each))
-    packed, target = jax.tree.map(lambda *leaves: jnp.stack(leaves)[chosen], *each)
+    options = [pack(family, cfg.slots, draws, sizes, level) for family in possible]
+    chosen = jax.random.randint(key_family, (), 0, len(options))
+    packed, target = jax.tree.map(lambda *leaves: jnp.stack(leaves)[chosen], *options)
     border = 0.5 * extent - _MARGIN
     placed = _add_loose(key_loose, cfg, border, level, _put_down(key_place, border, packed))
     return _scene(key_looks, cfg, placed, target)
 
 
 def arrangements(cfg: SceneConfig, extent: float, stream: int, count: int) -> Scene:
-    """`count` packed arrangements, NumPy leaves [P, N, ...], easy ones first.
+    """Draws `count` packed arrangements, NumPy leaves [P, N, ...], easy ones first.
 
-    Where there is room, each has at least MIN_ARRANGED blocks, or `cfg.min_blocks` if that is less.
-    Raises SceneError where the slots allow no arrangement.
+    If there is room, each has at least MIN_ARRANGED blocks, or `cfg.min_blocks` if that is less.
+    Raises SceneError for slots that allow no arrangement.
     """
     cfg = dataclasses.replace(cfg, min_blocks=min(cfg.min_blocks, MIN_ARRANGED))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(stream), jnp.arange(count))
@@ -81,7 +80,7 @@ def arrangements(cfg: SceneConfig, extent: float, stream: int, count: int) -> Sc
 
 
 def draw_sizes(key: jax.Array, cfg: SceneConfig) -> jax.Array:
-    """Random half sizes [2, N, 3] m: of any shape of each slot's kind; of one of its longest."""
+    """Samples half sizes [2, N, 3] m: of any shape of each slot's kind; of one of its longest."""
     key_any, key_long, key_scale = jax.random.split(key, 3)
     num, shapes = len(cfg.slots), [blocks.half_size_choices(kind) for kind in cfg.slots]
     longest = [choices[choices[:, 0] == choices[:, 0].max()] for choices in shapes]
@@ -99,7 +98,7 @@ def draw_sizes(key: jax.Array, cfg: SceneConfig) -> jax.Array:
 def pack(
     family: Family, slots: tuple[SlotKind, ...], draws: Draws, sizes: jax.Array, level: jax.Array
 ) -> tuple[Blocks, jax.Array]:
-    """The packed blocks of an arrangement about the origin, and the slot of the target []."""
+    """Packs the blocks of a family about the origin; also returns the slot of the target []."""
     slot, used = _assign(draws.preference, slots, family.roles)
     optional = level * (0.75 + 0.25 * draws.optional) * (ROLES - family.needed)
     num_used = family.needed + jnp.round(optional).astype(jnp.int32)
@@ -132,19 +131,19 @@ def pack(
 def _assign(
     preference: jax.Array, slots: tuple[SlotKind, ...], roles: tuple[Role, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """A slot of its own for each role [R] int32, by `preference` [N], and whether one was left."""
+    """Assigns a slot to each role [R] int32, by `preference` [N], and tells if one was free [R]."""
     free = jnp.ones(len(slots), bool)
-    chosen, found = [], []
+    chosen, is_free = [], []
     for role in roles:
         fits = free & np.array([kind in role.kinds for kind in slots])
         chosen.append(jnp.argmax(jnp.where(fits, preference, -1.0)).astype(jnp.int32))
-        found.append(jnp.any(fits))
+        is_free.append(jnp.any(fits))
         free = free & ~(fits & (np.arange(len(slots)) == chosen[-1]))
-    return jnp.stack(chosen), jnp.stack(found)
+    return jnp.stack(chosen), jnp.stack(is_free)
 
 
 def _put_down(key: jax.Array, border: float, packed: Blocks) -> Blocks:
-    """The packed blocks, as one, at a random yaw and a random place within `border` m of 0."""
+    """Moves the packed blocks as one to a random yaw and place within `border` m of 0."""
     key_yaw, key_shift = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (), jnp.float32, 0.0, 2.0 * np.pi)
     xy = geometry.rotate2d(yaw, packed.centre[:, :2])
@@ -156,7 +155,7 @@ def _put_down(key: jax.Array, border: float, packed: Blocks) -> Blocks:
 
 
 def _half_aligned(yaw: jax.Array, half: jax.Array) -> jax.Array:
-    """Half extents [N, 2] m along the world's x and y of blocks `half` [N, 3] m at yaws [N]."""
+    """Computes half extents [N, 2] m along world x and y of blocks `half` [N, 3] m at yaws [N]."""
     cos, sin = jnp.abs(jnp.cos(yaw)), jnp.abs(jnp.sin(yaw))
     x, y = cos * half[:, 0] + sin * half[:, 1], sin * half[:, 0] + cos * half[:, 1]
     return jnp.stack([x, y], axis=1)
@@ -165,7 +164,7 @@ def _half_aligned(yaw: jax.Array, half: jax.Array) -> jax.Array:
 def _add_loose(
     key: jax.Array, cfg: SceneConfig, border: float, level: jax.Array, packed: Blocks
 ) -> Blocks:
-    """The arrangement with loose blocks in random free places, as far as there are any."""
+    """Adds loose blocks in random free places, as far as there are any."""
     key_order, key_number, key_tries = jax.random.split(key, 3)
     num = len(cfg.slots)
     order = jax.random.permutation(key_order, num)
@@ -176,8 +175,8 @@ def _add_loose(
 
     def add(i: jax.Array, now: Blocks) -> Blocks:
         key = jax.random.fold_in(key_tries, i)
-        found, xy, yaw = _free_place(key, border, now, now.half_size[order[i]])
-        joins = found & ~now.placed[order[i]] & (jnp.sum(now.placed) < total)
+        is_free, xy, yaw = _free_place(key, border, now, now.half_size[order[i]])
+        joins = is_free & ~now.placed[order[i]] & (jnp.sum(now.placed) < total)
         here = joins & (np.arange(num) == order[i])
         place = jnp.concatenate([xy, now.half_size[order[i], 2:]])
         return now._replace(
@@ -192,7 +191,7 @@ def _add_loose(
 def _free_place(
     key: jax.Array, border: float, now: Blocks, half: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A place for a block of half size [3] m: whether there is one [], xy [2] m, yaw [] rad."""
+    """Searches a place for a block of half size [3] m: success [] bool, xy [2] m, yaw [] rad."""
     key_xy, key_yaw = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (_TRIES,), jnp.float32, 0.0, 2.0 * np.pi)
     room = border - _half_aligned(yaw, jnp.broadcast_to(half, (_TRIES, 3)))
@@ -206,7 +205,7 @@ def _free_place(
 
 
 def rectangle_gap(one: Rectangle, two: Rectangle) -> jax.Array:
-    """Gap [] m along the axis that separates two rectangles most; negative where they overlap."""
+    """Computes the gap [] m of two rectangles along their best separating axis; < 0: overlap."""
     (xy, yaw, half), (other_xy, other_yaw, other_half) = one, two
     # Normals of all sides.
     angle = jnp.stack([yaw, yaw + 0.5 * np.pi, other_yaw, other_yaw + 0.5 * np.pi])
@@ -220,7 +219,7 @@ def rectangle_gap(one: Rectangle, two: Rectangle) -> jax.Array:
 
 
 def _scene(key: jax.Array, cfg: SceneConfig, placed: Blocks, target: jax.Array) -> Scene:
-    """The blocks with random colours, densities and frictions; slots without a place are parked."""
+    """Builds the scene with random colours, densities and frictions; unplaced slots are parked."""
     key_colour, key_density, key_friction = jax.random.split(key, 3)
     num, num_colours = len(cfg.slots), len(blocks.COLOURS)
     colours = jax.random.permutation(key_colour, max(num, num_colours))[:num] % num_colours

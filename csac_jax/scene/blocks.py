@@ -32,9 +32,9 @@ SHAPES = {
     "half_cylinder": Shape("half_cylinder", (0.025, 0.025, 0.0125)),
     "cylinder": Shape("cylinder", (0.0224, 0.0224, 0.025)),
 }
-OBJECT_HALF = (0.03, 0.03, 0.03)  # m, in slots of kind object until they hold one
+OBJECT_HALF = (0.03, 0.03, 0.03)  # m, of slots of kind object before they get one
 MAX_FACES = 10
-PADDING_OFFSET = 1e3  # m, offset of a face that is not there: every point lies inside it
+PADDING_OFFSET = 1e3  # m, offset of a padding face: every point lies inside it
 
 _COLOURS = {  # sRGB (Tableau's ten, as in VPG)
     "blue": (78, 121, 167),
@@ -54,7 +54,7 @@ TABLE_COLOUR = np.array([0.35, 0.33, 0.31], np.float32)
 
 
 def half_size_choices(kind: SlotKind) -> np.ndarray:
-    """Nominal half sizes [choices, 3] m of the shapes that a slot of this kind may hold."""
+    """Returns nominal half sizes [choices, 3] m of the shapes that a slot of a kind may hold."""
     if kind == "object":
         return np.array([OBJECT_HALF], np.float32)
     shapes = SHAPES.values()
@@ -62,12 +62,12 @@ def half_size_choices(kind: SlotKind) -> np.ndarray:
 
 
 def is_object(slots: tuple[SlotKind, ...]) -> np.ndarray:
-    """[N] bool, slots that hold objects of a library."""
+    """Returns [N] bool, slots that hold objects of a library."""
     return np.array(slots) == "object"
 
 
 def is_mesh(slots: tuple[SlotKind, ...]) -> np.ndarray:
-    """[N] bool, slots whose blocks are meshes."""
+    """Returns [N] bool, slots whose blocks are meshes."""
     return np.isin(slots, MESH_KINDS)
 
 
@@ -91,15 +91,15 @@ class Parts(NamedTuple):
 
 
 def parts(slots: tuple[SlotKind, ...]) -> Parts:
-    """The parts of the slots, slot by slot; objects of a library have none here."""
+    """Lists the parts of all slots in order; objects of a library have none here."""
     of_slot = [{"arch": _ARCH, "object": ()}.get(kind, _WHOLE) for kind in slots]
-    slot = np.repeat(np.arange(len(slots)), [len(each) for each in of_slot])
-    every = np.array([part for each in of_slot for part in each], np.float32).reshape(-1, 2, 3)
-    return Parts(slot, every[:, 0], every[:, 1])
+    slot = np.repeat(np.arange(len(slots)), [*map(len, of_slot)])
+    boxes = np.array([part for own in of_slot for part in own], np.float32).reshape(-1, 2, 3)
+    return Parts(slot, boxes[:, 0], boxes[:, 1])
 
 
 def _prism_faces() -> Faces:
-    """Triangular prism: base down, two ends across y, two slopes that meet at the apex."""
+    """Returns a triangular prism: base down, two ends across y, two slopes up to the apex."""
     x, y, z = SHAPES["prism"].half_size
     slope = np.array([2 * z, 0.0, x]) / np.hypot(2 * z, x)
     normals = np.array([[0, 0, -1], [0, 1, 0], [0, -1, 0], slope, slope * [-1, 1, 1]])
@@ -107,7 +107,7 @@ def _prism_faces() -> Faces:
 
 
 def _half_cylinder_faces() -> Faces:
-    """Six chords of a half circle about y, its flat face down."""
+    """Returns six chords of a half circle about y, its flat face down."""
     radius, y, z = SHAPES["half_cylinder"].half_size
     angle = (np.arange(6) + 0.5) * np.pi / 6
     round_ = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
@@ -117,7 +117,7 @@ def _half_cylinder_faces() -> Faces:
 
 
 def _cylinder_faces() -> Faces:
-    """Octagonal prism through a circle about z."""
+    """Returns an octagonal prism through a circle about z."""
     radius, _, z = SHAPES["cylinder"].half_size
     angle = (np.arange(8) + 0.5) * np.pi / 4
     sides = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=1)
@@ -137,10 +137,10 @@ FACES = {
 
 
 def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Faces of every part in its block's frame: inside, n . p <= offset for all of them.
+    """Computes the faces of every part in its block's frame: inside, n . p <= offset for all.
 
-    Args: half_size [N, 3] m. Returns: normals [G, F, 3], outward unit vectors, 0 where there is no
-    face; offsets [G, F] m. G as in `parts`.
+    Args: half_size [N, 3] m. Returns: normals [G, F, 3], outward unit vectors, 0 for padding;
+    offsets [G, F] m. G as in `parts`.
     """
     slot, centre, half = parts(slots)
     normals = np.zeros((len(slot), MAX_FACES, 3), np.float32)
@@ -156,9 +156,9 @@ def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.
 
 
 def scales(cfg: SceneConfig, noise: Any) -> Any:
-    """Sizes of the slots' blocks [N] relative to nominal, from noise [N] in -1 .. 1.
+    """Computes sizes of the slots' blocks [N] relative to nominal, from noise [N] in -1 .. 1.
 
-    MJX shares a mesh between all slots of a kind: they take the scale of the first of them.
+    MJX shares a mesh between all slots of a kind: they take the scale of the first.
     """
     shared, jitter = is_mesh(cfg.slots), np.array(cfg.size_jitter, np.float32)
     first = [cfg.slots.index(kind) for kind in cfg.slots]
@@ -167,6 +167,6 @@ def scales(cfg: SceneConfig, noise: Any) -> Any:
 
 
 def mesh_scale(slots: tuple[SlotKind, ...], half_size: jax.Array) -> jax.Array:
-    """Size of every slot's block relative to nominal [N], by its height; for mesh kinds."""
+    """Computes the size of mesh blocks relative to nominal [N], by their height."""
     nominal = np.array([half_size_choices(kind)[0][2] for kind in slots], np.float32)
     return half_size[:, 2] / nominal

@@ -1,9 +1,9 @@
 """Objects of a library in a MuJoCo model.
 
 The model has the meshes of all objects, and bodies with as many geoms as the object of most parts.
-For a scene, the geoms of a body are pointed at the meshes of its object, and what the compiler
-derives from a mesh is written with it. `mj_setConst` must follow: it renews what depends on that,
-such as the search trees over a body's geoms. Without it contacts would be missed silently.
+For a scene, the geoms of a body get the meshes of its object, with all fields that the compiler
+derives from a mesh. `mj_setConst` must follow: it updates dependent fields, such as the search
+trees over a body's geoms. Without it contacts would be missed silently.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from csac_jax.objects.tables import Tables
 
 
 class ObjectFields(NamedTuple):
-    """What slots of kind object hold in a scene. M = such slots."""
+    """Model fields of slots of kind object that differ per scene. M = such slots."""
 
     number: jax.Array  # [M] int32, object of the library
     density: jax.Array  # [M] kg/m^3
@@ -27,7 +27,7 @@ class ObjectFields(NamedTuple):
 
 
 class PartFields(NamedTuple):
-    """What MuJoCo's compiler derives from the meshes of objects, [O, P, ...].
+    """Fields that MuJoCo's compiler derives from the meshes of objects, [O, P, ...].
 
     The frame of a mesh is that of its inertia. Its size reaches from the frame's origin to the
     farthest corner along each axis. Its radius is the norm of that size.
@@ -48,14 +48,14 @@ class Bodies:
     slots: np.ndarray  # [M] slots of kind object
     bodies: np.ndarray  # [M] body ids
     geoms: np.ndarray  # [M, P] geom ids
-    meshes: np.ndarray  # [O, P] mesh ids, that of the first part where there is no such part
+    meshes: np.ndarray  # [O, P] mesh ids; that of the first part where an object has fewer parts
     parts: PartFields
 
 
 def add_meshes(spec: mujoco.MjSpec, objects: Library) -> None:
-    """A mesh for every part of every object."""
-    for number, one in enumerate(objects.objects):
-        for part, solid in enumerate(one.parts):
+    """Adds a mesh for every part of every object."""
+    for number, member in enumerate(objects.objects):
+        for part, solid in enumerate(member.parts):
             mesh = spec.add_mesh(name=_mesh(number, part))
             mesh.uservert = solid.vertices.ravel()
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
@@ -66,11 +66,11 @@ def _mesh(number: int, part: int) -> str:
 
 
 def add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, objects: Library) -> None:
-    """The geoms of one slot, all with the first mesh.
+    """Adds the geoms of one slot, all with the first mesh.
 
     The inertia stands in for those of scenes, whose axes are not the body's.
     """
-    for _ in range(tables.of(objects).present.shape[1]):
+    for _ in range(tables.from_library(objects).present.shape[1]):
         geom = body.add_geom(spec.find_default("blocks/block"))
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, _mesh(0, 0)
     body.mass, body.explicitinertial, body.simple = 0.1, True, False
@@ -79,18 +79,18 @@ def add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, objects: Library) -> No
 
 
 def read(model: mujoco.MjModel, slots: np.ndarray, bodies: np.ndarray, objects: Library) -> Bodies:
-    """Where the objects are in a compiled model; `slots` [M] and `bodies` [M] are theirs.
+    """Finds the objects in a compiled model; `slots` [M] and `bodies` [M] are theirs.
 
     The model's last meshes are those of the objects, in order.
     """
-    found = tables.of(objects)
-    geoms = model.body_geomadr[bodies][:, None] + np.arange(found.present.shape[1])
-    first = model.mesh(_mesh(0, 0)).id + np.cumsum(found.present.sum(axis=1))
-    first -= found.present.sum(axis=1)  # [O]
-    meshes = first[:, None] + np.where(found.present, np.arange(geoms.shape[1]), 0)
+    table = tables.from_library(objects)
+    geoms = model.body_geomadr[bodies][:, None] + np.arange(table.present.shape[1])
+    counts = table.present.sum(axis=1)  # [O]
+    first = model.mesh(_mesh(0, 0)).id + np.cumsum(counts) - counts
+    meshes = first[:, None] + np.where(table.present, np.arange(geoms.shape[1]), 0)
     starts = model.mesh_vertadr[meshes[0, 0] :]
     corners = model.mesh_vert.astype(np.float64)
-    low, high = (each.reduceat(corners, starts) for each in (np.minimum, np.maximum))
+    low, high = (bound.reduceat(corners, starts) for bound in (np.minimum, np.maximum))
     boxes = np.stack([low, high], axis=1)[meshes - meshes[0, 0]]  # [O, P, 2, 3]
     size = np.abs(boxes).max(axis=2)
     parts = PartFields(
@@ -100,21 +100,21 @@ def read(model: mujoco.MjModel, slots: np.ndarray, bodies: np.ndarray, objects: 
         np.linalg.norm(size, axis=2),
         np.stack([boxes.mean(axis=2), 0.5 * np.ptp(boxes, axis=2)], axis=2),
     )
-    return Bodies(found, slots, bodies, geoms, meshes, parts)
+    return Bodies(table, slots, bodies, geoms, meshes, parts)
 
 
-def put(model: mujoco.MjModel, own: Bodies, fields: ObjectFields) -> None:
-    """Writes the objects of a scene into a model, but for what `mj_setConst` derives from them."""
-    number = np.asarray(fields.number)
-    geoms, present = own.geoms, own.tables.present[number]
-    part = PartFields(*(leaf[number] for leaf in own.parts))
-    model.geom_dataid[geoms] = own.meshes[number]
+def put(model: mujoco.MjModel, objects: Bodies, fields: ObjectFields) -> None:
+    """Writes the objects of a scene into a model; `mj_setConst` must follow."""
+    number, table = np.asarray(fields.number), objects.tables
+    geoms, present = objects.geoms, table.present[number]
+    part = PartFields(*(leaf[number] for leaf in objects.parts))
+    model.geom_dataid[geoms] = objects.meshes[number]
     model.geom_pos[geoms], model.geom_quat[geoms] = part.position, part.quaternion
     model.geom_size[geoms], model.geom_rbound[geoms] = part.size, part.radius
     model.geom_aabb[geoms] = part.box.reshape(*geoms.shape, 6)
     model.geom_friction[geoms, 0] = np.asarray(fields.friction)[:, None]
     model.geom_contype[geoms[~present]] = model.geom_conaffinity[geoms[~present]] = 0
-    density = np.asarray(fields.density, np.float64) * own.tables.heaviness[number]
-    model.body_mass[own.bodies] = density * own.tables.volume[number]
-    model.body_inertia[own.bodies] = density[:, None] * own.tables.moments[number]
-    model.body_iquat[own.bodies], model.body_ipos[own.bodies] = own.tables.axes[number], 0.0
+    density = np.asarray(fields.density, np.float64) * table.heaviness[number]
+    model.body_mass[objects.bodies] = density * table.volume[number]
+    model.body_inertia[objects.bodies] = density[:, None] * table.moments[number]
+    model.body_iquat[objects.bodies], model.body_ipos[objects.bodies] = table.axes[number], 0.0

@@ -27,7 +27,7 @@ WEDGE_ANGLE = np.deg2rad(40.0)  # between an arm of a wedge and its middle
 
 
 class Role(NamedTuple):
-    """What a block of a family may be."""
+    """The blocks that may take one place of a family."""
 
     kinds: tuple[SlotKind, ...]
     long: bool = False  # a box is a cuboid or a plank
@@ -35,7 +35,7 @@ class Role(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Where the blocks of a family go, before the arrangement is rotated and shifted as a whole."""
+    """Places of a family's blocks, before the arrangement is rotated and shifted as a whole."""
 
     xy: jax.Array  # [R, 2] m
     crosswise: jax.Array  # [R] bool, rotated by a quarter turn about z
@@ -68,7 +68,7 @@ class Draws(NamedTuple):
 
 
 def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
-    """The families that these slots allow. Raises SceneError where they allow none."""
+    """Selects the families that these slots allow. Raises SceneError if there are none."""
     possible = {name: family for name, family in FAMILIES.items() if _is_possible(family, slots)}
     if not possible:
         raise SceneError("scene.slots: too few for an arrangement; three boxes are enough")
@@ -76,7 +76,7 @@ def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
 
 
 def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
-    """Whether every needed role finds a slot. Roles of fewer kinds are first: greedy is exact."""
+    """Tests if every needed role gets a slot. Roles of fewer kinds are first: greedy is exact."""
     free = list(slots)
     for role in family.roles[: family.needed]:
         fitting = [kind for kind in free if kind in role.kinds]
@@ -87,7 +87,7 @@ def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
 
 
 def draw(key: jax.Array, num_slots: int) -> Draws:
-    """All draws of a packing, by one call of the generator: each call is slow to compile."""
+    """Draws all noise of a packing in one call of the generator: each call is slow to compile."""
     noise = jax.random.uniform(key, (num_slots + 2 + 5 * ROLES,))
     preference, (optional, gap), roles = jnp.split(noise, [num_slots, num_slots + 2])
     roles = roles.reshape(5, ROLES)
@@ -103,19 +103,19 @@ def draw(key: jax.Array, num_slots: int) -> Draws:
 
 
 def _half_xy(half: jax.Array, crosswise: jax.Array) -> jax.Array:
-    """Half extents [R, 2] m along x and y; crosswise [R] bool."""
+    """Returns half extents [R, 2] m along x and y; crosswise [R] bool."""
     return jnp.where(crosswise[:, None], half[:, 1::-1], half[:, :2])
 
 
 def _line(
     noise: jax.Array, width: jax.Array, used: jax.Array, gap: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Centres [R] m about 0 of blocks along a line, and the number of the middle one [].
+    """Computes centres [R] m about 0 of blocks along a line, and the number of the middle one [].
 
     Args: noise [R] orders the blocks; width [R] m, half widths.
     """
     index = np.arange(ROLES)
-    # Equal noise, in one scene of a million, goes by number.
+    # Ties of noise, in one scene of a million, are broken by number.
     is_tie = (noise[None] == noise[:, None]) & (index[None] < index[:, None])
     before = used[None] & ((noise[None] < noise[:, None]) | is_tie)  # [i, j]: j comes before i
     step = jnp.where(used, 2.0 * width + gap, 0.0)
@@ -125,13 +125,13 @@ def _line(
 
 
 def _by_gap(ends: tuple[float, float], gap: jax.Array) -> jax.Array:
-    """Number [] between that of touching blocks and that of blocks WIDE_GAP apart."""
+    """Interpolates [] between the ends for touching blocks and for blocks WIDE_GAP apart."""
     touching, wide = (np.float32(end) for end in ends)
     return touching + (wide - touching) * gap / np.float32(WIDE_GAP)
 
 
 def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Two like bricks end to end, a block across their joint, one along each face."""
+    """Places two like bricks end to end, a block across their joint, one along each face."""
     crosswise = draws.crosswise & _is_role(3, 4)
     half_xy, joint = _half_xy(half, crosswise), jnp.minimum(gap, STACKED_GAP)
     face = jnp.maximum(half[0, 1], half[2, 1] + STACK_OFFSET) + gap
@@ -143,14 +143,14 @@ def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) 
 
 
 def _place_stairs(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Two flights side by side: each block begins farther along than the one nearer the middle."""
+    """Places two flights of stairs: each block begins farther along than its inner neighbour."""
     y, middle = _line(draws.order, half[:, 1], used, gap)
     slant = _by_gap(SLANTS, gap)
     return Placed(jnp.stack([slant * jnp.abs(y), y], axis=1), jnp.zeros_like(used), middle)
 
 
 def _place_fan(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Like the ribs of a fan: each points away from one place, as near as its neighbours allow."""
+    """Places the ribs of a fan: each points away from one place, as near as neighbours allow."""
     between = _by_gap(FAN_ANGLES, gap)
     sin, cos = jnp.sin(0.5 * between), jnp.cos(0.5 * between)
     away = (0.5 * gap + half[:, 1] * cos) / sin + half[:, 0]
@@ -163,7 +163,7 @@ def _place_fan(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -
 
 
 def _place_bridge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Two like piers, a deck from one to the other, a block along each side."""
+    """Places two like piers, a deck from one to the other, a block along each side."""
     crosswise = _is_role(0, 1)
     half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
     pier = half[2, 0] - SUPPORT + half_xy[0, 0]
@@ -174,7 +174,7 @@ def _place_bridge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array
 
 
 def _place_tower(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Three blocks on top of one another, crosswise in turn, and one at either end."""
+    """Places three blocks on one another, crosswise in turn, and one at either end."""
     crosswise = _is_role(1)
     half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
     end = jnp.max(half_xy[:3, 0]) + STACK_OFFSET + gap  # what is on top may reach farther
@@ -184,7 +184,7 @@ def _place_tower(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array)
 
 
 def _place_wedge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Two blocks in a V, one between them, one behind the tip, one along the outside."""
+    """Places two blocks in a V, one between them, one behind the tip, one along the outside."""
     sin, cos = np.float32(np.sin(WEDGE_ANGLE)), np.float32(np.cos(WEDGE_ANGLE))
     along, out = np.array([cos, sin]), np.array([-sin, cos])
     mirror = np.array([1.0, -1.0], np.float32)
@@ -204,7 +204,7 @@ def _place_wedge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array)
 
 
 def _place_corner(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """Two blocks in an L, one in its corner, one beyond that along either leg."""
+    """Places two blocks in an L, one in its corner, one beyond that along either leg."""
     crosswise = _is_role(1)
     leg, high = _half_xy(half, crosswise)[1], jnp.maximum(half[2, 1], half[3, 1])
     x = jnp.stack(
@@ -217,7 +217,7 @@ def _place_corner(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array
 
 
 def _place_bin(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
-    """A back and two sides, open in front, with a block inside, and one behind the back."""
+    """Places a back and two sides, open in front, a block inside, and one behind the back."""
     crosswise = _is_role(1, 2)
     half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
     side = half[3, 0] + gap + half_xy[1:3, 0]
@@ -228,7 +228,7 @@ def _place_bin(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -
 
 
 def _is_role(*numbers: int) -> jax.Array:
-    """[R] bool, True at these roles."""
+    """Returns [R] bool, True at these roles."""
     return jnp.asarray(np.isin(np.arange(ROLES), numbers))
 
 
@@ -240,14 +240,14 @@ def _stacked(
     floors: dict[int, jax.Array],
     target: int,
 ) -> Placed:
-    """Blocks at x, y [R] m, those with a floor [] m above the table a little off their places."""
+    """Places blocks at x, y [R] m; those on a floor [] m above the table get a random offset."""
     floor = jnp.stack([floors.get(role, jnp.zeros_like(x[0])) for role in range(ROLES)])
     offset = jnp.where(_is_role(*floors)[:, None], STACK_OFFSET * draws.jitter, 0.0)
     return Placed(jnp.stack([x, y], axis=1) + offset, crosswise, jnp.int32(target), floor)
 
 
 def _second_like_first(half: jax.Array) -> jax.Array:
-    """The second block like the first, so that what lies across them lies flat."""
+    """Copies the size of the first block to the second, so that a block across both lies flat."""
     return half.at[1].set(half[0])
 
 

@@ -1,4 +1,4 @@
-"""Any MuJoCo model as solids, which rays meet."""
+"""Any MuJoCo model as solids for raycasting."""
 
 from typing import Any
 
@@ -12,14 +12,14 @@ from csac_jax.scene.solids import GeomGroup, Kind, Solids
 
 
 def read(model: mujoco.MjModel) -> Solids:
-    """The visible geoms of a model at rest, NumPy leaves, numbered as there.
+    """Reads the visible geoms of a model at rest, NumPy leaves, with the model's numbers.
 
     Geoms of opacity 0 are left out. A mesh is its convex hull. Raises ValueError with the name of a
     geom of another type.
     """
     materials = np.concatenate([model.mat_rgba, np.zeros((1, 4), np.float32)])
-    own = model.geom_matid[:, None] < 0  # has no material: -1, the last row
-    rgba: Any = np.where(own, model.geom_rgba, materials[model.geom_matid])
+    no_material = model.geom_matid[:, None] < 0  # -1: the last row
+    rgba: Any = np.where(no_material, model.geom_rgba, materials[model.geom_matid])
     geoms_of: dict[Kind, list[int]] = {}
     for geom in map(int, np.flatnonzero(rgba[:, 3] > 0.0)):
         geoms_of.setdefault(_kind(model, geom), []).append(geom)
@@ -34,9 +34,9 @@ def _kind(model: mujoco.MjModel, geom: int) -> Kind:
     try:
         return Kind(model.geom_type[geom])
     except ValueError:
-        name, found = model.geom(geom).name or geom, _type_name(model.geom_type[geom])
+        name, unknown = model.geom(geom).name or geom, _type_name(model.geom_type[geom])
         known = ", ".join(_type_name(kind.value) for kind in Kind)
-        raise ValueError(f"geom {name}: rays do not meet type {found}; use: {known}") from None
+        raise ValueError(f"geom {name}: rays do not meet type {unknown}; use: {known}") from None
 
 
 def _type_name(geom_type: int) -> str:
@@ -51,13 +51,13 @@ def _group(model: mujoco.MjModel, kind: Kind, geoms: Any) -> GeomGroup:
 
 
 def _half_spaces(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
-    """Faces [G, F, 4] of the convex hulls of mesh geoms; padding faces have a zero normal."""
+    """Computes faces [G, F, 4] of the hulls of mesh geoms; padding faces have a zero normal."""
     corners = np.split(model.mesh_vert, model.mesh_vertadr[1:])  # of every mesh
     hulls = []
     for mesh in model.geom_dataid[geoms]:
         equations = ConvexHull(corners[mesh]).equations
-        _, kept = np.unique(equations.round(5), axis=0, return_index=True)  # of the triangles
-        hulls.append(equations[kept] * [1.0, 1.0, 1.0, -1.0])
+        _, distinct = np.unique(equations.round(5), axis=0, return_index=True)  # of the triangles
+        hulls.append(equations[distinct] * [1.0, 1.0, 1.0, -1.0])
     faces = np.zeros((len(hulls), max(map(len, hulls)), 4), np.float32)
     faces[:, :, 3] = blocks.PADDING_OFFSET
     for row, hull in zip(faces, hulls, strict=True):

@@ -16,7 +16,7 @@ NOMINAL_DENSITY = 600.0  # kg/m^3, wood
 NOMINAL_FRICTION = 0.8
 SPEED_LIMIT = np.array([5, 5, 5, 50, 50, 50], np.float32)
 """Fastest block after a substep, m/s and rad/s (ours). A thin block squeezed from under the hand
-spins faster; the explicit gyroscopic torque would then drive it to NaN."""
+spins faster, and the explicit gyroscopic torque would lead to NaN."""
 STILL = 0.008  # m/s, ours: slower counts as at rest
 ANY = -1  # `Scene.target` in the clearing task
 
@@ -34,25 +34,25 @@ class Scene:
     colour: jax.Array  # [N] int32, row of blocks.COLOURS
     in_play: jax.Array  # [N] bool
     target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
-    object_id: jax.Array | None = None  # [N] int32, which of the library's; None without objects
+    object_id: jax.Array | None = None  # [N] int32, number in the library; None without objects
     fingers: Fingers | None = None  # [] float32 m, the episode's; None: the gripper's own
 
     @property
     def numbers(self) -> jax.Array:
-        """`object_id` of a scene with objects."""
+        """Returns `object_id` of a scene with objects. Raises ValueError for one without."""
         if self.object_id is None:
             raise ValueError("the scene has no objects of a library")
         return self.object_id
 
 
 def parking(num_slots: int) -> np.ndarray:
-    """Parking places [N, 3] m, in the air and far apart, so that nothing touches."""
+    """Returns parking places [N, 3] m, in the air and far apart, so that nothing touches."""
     x = 3.0 + 0.3 * np.arange(num_slots)
     return np.stack([x, np.zeros(num_slots), np.ones(num_slots)], 1).astype(np.float32)
 
 
 def parked(slots: tuple[SlotKind, ...]) -> Scene:
-    """A scene of NumPy arrays: every slot parked, every block nominal."""
+    """Creates a scene of NumPy arrays: every slot parked, every block nominal."""
     num = len(slots)
     leaves: dict[str, Any] = {
         "position": parking(num),
@@ -70,7 +70,7 @@ def parked(slots: tuple[SlotKind, ...]) -> Scene:
 
 
 def park(scene: Scene, keep: jax.Array) -> Scene:
-    """The scene with all blocks but those in `keep` [N] bool parked."""
+    """Moves all blocks but those in `keep` [N] bool to their parking places."""
     keep = scene.in_play & keep
     upright = jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32)[None]
     return scene.replace(
@@ -82,7 +82,7 @@ def park(scene: Scene, keep: jax.Array) -> Scene:
 
 
 def rotate(scene: Scene, yaw: jax.Array) -> Scene:
-    """The scene at rest, its blocks in play rotated about the workspace centre by `yaw` [] rad."""
+    """Rotates the blocks in play about the workspace centre by `yaw` [] rad, all at rest."""
     multiply = jax.vmap(geometry.quat_multiply, (None, 0))
     rotated = scene.replace(
         position=scene.position.at[:, :2].set(geometry.rotate2d(yaw, scene.position[:, :2])),
@@ -92,7 +92,7 @@ def rotate(scene: Scene, yaw: jax.Array) -> Scene:
 
 
 def with_fingers(key: jax.Array, scene: Scene, gripper: Gripper) -> Scene:
-    """The scene with fingers drawn for an episode, where the gripper has ranges of them."""
+    """Samples the fingers of an episode, if the gripper has ranges of them."""
     if gripper.varies is None:
         return scene
     low, high = (np.array(ends, np.float32) for ends in gripper.varies)
@@ -100,33 +100,33 @@ def with_fingers(key: jax.Array, scene: Scene, gripper: Gripper) -> Scene:
 
 
 def fingers(scene: Scene, gripper: Gripper) -> Fingers:
-    """Those of the episode, or the gripper's own."""
+    """Returns the fingers of the episode, or the gripper's own."""
     return gripper.fingers if scene.fingers is None else scene.fingers
 
 
 def mark_target(key: jax.Array, scene: Scene) -> Scene:
-    """The scene with a random block in play as its target; ANY if none is in play."""
+    """Marks a random block in play as the target; ANY if none is in play."""
     slot = jax.random.categorical(key, jnp.where(scene.in_play, 0.0, -jnp.inf)).astype(jnp.int32)
     return scene.replace(target=jnp.where(jnp.any(scene.in_play), slot, ANY))
 
 
 def is_target(scene: Scene) -> jax.Array:
-    """[N] bool, slots of the blocks that the task asks for."""
+    """Returns [N] bool, slots of the blocks that the task asks for."""
     return (scene.target == ANY) | (np.arange(len(scene.in_play)) == scene.target)
 
 
 def inside(position: jax.Array, extent: float) -> jax.Array:
-    """[N] bool, the block's centre [N, 3] m lies above the workspace square."""
+    """Tests which centres [N, 3] m lie above the workspace square, [N] bool."""
     return jnp.all(jnp.abs(position[:, :2]) <= 0.5 * extent, axis=1)
 
 
 def randomise_pose(
     key: jax.Array, scene: Scene, extent: float, any_yaw: bool, has_target: bool
 ) -> Scene:
-    """The scene rotated by a random yaw; with `has_target` it keeps its target or gets one.
+    """Rotates a scene by a random yaw; with `has_target` it keeps its target or gets one.
 
-    The yaw is a quarter turn unless `any_yaw` and every block stays within the square of side
-    `extent` m.
+    The yaw is a multiple of 90 degrees unless `any_yaw` and every block stays within the square of
+    side `extent` m.
     """
     key_yaw, key_target = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)

@@ -1,9 +1,10 @@
-"""MJCF files to one MuJoCo model, with the index of what later stages address in it."""
+"""MJCF files to one MuJoCo model, and the addresses in it that later stages need."""
 
 import copy
 import dataclasses
 import functools
 import hashlib
+import operator
 from typing import NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from csac_jax.assets import assets
 from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig, SlotKind
 from csac_jax.errors import SceneError
 from csac_jax.grippers import Fingers, Gripper
-from csac_jax.scene import blocks, bodies as objects, layout, lint, robots, stock
+from csac_jax.scene import blocks, bodies as objects, layout, robots, stock
 from csac_jax.scene.blocks import Parts
 from csac_jax.scene.bodies import Bodies, ObjectFields
 from csac_jax.scene.layout import Scene
@@ -27,6 +28,12 @@ LARGEST = 1.25  # compiled over nominal block size: C culls pairs by the bounds 
 HAND_PARK_HEIGHT = 10.0  # m, where the hand waits while blocks settle: above the highest drop
 _CONE_IMPEDANCE = 10.0  # of friction over that of the normal force, with objects (ours)
 _CONE_EFFORT = 20, 50  # iterations of the solver, of a line search: 20 of these are too few (ours)
+_MJX_IGNORES = (  # fields of a model that MJX never reads; 0 unless MJCF sets them
+    *("opt.noslip_iterations", "jnt_stiffnesspoly", "dof_dampingpoly"),
+    *("tendon_stiffnesspoly", "tendon_dampingpoly", "geom_gap", "geom_fluid", "geom_adhesion"),
+    *("geom_surfacevel", "pair_gap", "pair_adhesion", "actuator_actearly", "actuator_armature"),
+    *("actuator_damping", "actuator_dampingpoly", "actuator_delay"),
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,31 +52,25 @@ class World:
     gripper: Gripper
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
     mesh_scale: float  # size of compiled meshes of blocks relative to nominal
-    objects: Bodies | None = None  # what slots of kind object hold; None where there are none
+    objects: Bodies | None = None  # of slots of kind object; None without such slots
 
     @functools.cached_property
     def digest(self) -> str:
-        """Of the model, the slots and their objects' densities; the same in every process."""
+        """Returns a SHA-256 of model, slots and objects' densities, equal in every process."""
         stored = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, stored)
-        own = () if self.objects is None else self.objects.tables.heaviness.tolist()
-        return hashlib.sha256(stored.tobytes() + repr((self.slots, own)).encode()).hexdigest()
+        heaviness = () if self.objects is None else self.objects.tables.heaviness.tolist()
+        content = stored.tobytes() + repr((self.slots, heaviness)).encode()
+        return hashlib.sha256(content).hexdigest()
 
     @property
     def finger_qpos(self) -> int:
-        """Address in qpos of the joint that the gripper's opening is read from."""
+        """Returns the address in qpos of the joint that the gripper's opening is read from."""
         return int(self.robot_qpos[-len(self.gripper.joints)])
 
 
-def _read(file: str) -> mujoco.MjSpec:
-    try:
-        return mujoco.MjSpec.from_file(str(assets() / file))
-    except ValueError as error:
-        raise robots.one_line(assets() / file, error) from None
-
-
 def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec:
-    spec = _read("table.xml")
+    spec = robots.read(assets() / "table.xml")
     robots.add(spec, sim, gripper)
     # Warp's meshes have one size in all scenes.
     _add_block_assets(spec, 1.0 if sim.physics == "warp" else LARGEST)
@@ -79,7 +80,7 @@ def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec
         # Faster, measured: objects have few parts, and most of them sleep.
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        # With friction pyramids as blocks have them, what is held creeps out of the hand.
+        # With friction pyramids, as blocks have them, a held object creeps out of the hand.
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = _CONE_IMPEDANCE
     for slot, place in enumerate(layout.parking(len(scene.slots))):
@@ -100,18 +101,19 @@ def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec
 
 
 def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
-    """The block material and the meshes, at this scale."""
-    part = _read("blocks.xml")
-    robots.require(assets() / "blocks.xml", "mesh", MESH_KINDS, part.meshes)
+    """Adds the block material and the meshes, at this scale."""
+    path = assets() / "blocks.xml"
+    part = robots.read(path)
+    robots.require(path, "mesh", MESH_KINDS, part.meshes)
     if part.find_default("block") is None:
-        raise SceneError(f"{assets() / 'blocks.xml'}: default class 'block' is missing")
+        raise SceneError(f"{path}: default class 'block' is missing")
     for mesh in part.meshes:
         mesh.scale = [mesh_scale] * 3
     spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
 
 
 def _add_touch_sensors(spec: mujoco.MjSpec, gripper: Gripper, slots: int) -> None:
-    """A sensor [1] of the number of contacts for each of palm and pads x slots, in that order."""
+    """Adds a sensor [1] of the number of contacts for each of palm and pads x slots, in order."""
     for geom in robots.hand_geoms(gripper):
         for slot in range(slots):
             sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
@@ -121,7 +123,7 @@ def _add_touch_sensors(spec: mujoco.MjSpec, gripper: Gripper, slots: int) -> Non
 
 
 def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> None:
-    """The geoms of one slot, at the largest size of its kind."""
+    """Adds the geoms of one slot, at the largest size of its kind."""
     largest = LARGEST * blocks.half_size_choices(kind).max(axis=0)
     for _, centre, half in zip(*blocks.parts((kind,)), strict=True):
         geom = body.add_geom(spec.find_default("blocks/block"))
@@ -133,11 +135,10 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
 
 
 def build(scene: SceneConfig, sim: SimConfig) -> World:
-    """The world of table, robot and block slots; blocks parked, at the largest size of their kind.
+    """Builds the world of table, robot and block slots; blocks parked, at their largest size.
 
-    Raises SceneError where the MJCF files lack an element that is addressed by name, where they do
-    not compile, and where MJX lacks or would ignore something in them that it is to run. Raises
-    SettingsError for a gripper that there is not.
+    Raises SceneError for MJCF files that lack an element addressed by name, do not compile, or set
+    something that MJX, if it is to run them, ignores. Raises SettingsError for an unknown gripper.
     """
     gripper = grippers.load(sim.gripper)
     try:
@@ -145,8 +146,7 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     except ValueError as error:
         raise robots.one_line(assets(), error) from None
     if sim.physics == "mjx":
-        for fault in lint.faults(model):
-            raise SceneError(f"MJX {fault}")
+        _check_mjx(model)
     _align_inertia(model)
     slots = np.arange(len(scene.slots))
     bodies = np.array([model.body(f"block{slot}").id for slot in slots])
@@ -156,6 +156,7 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     slot_of_geom = slot_of_body[model.geom_bodyid]
     joints = robots.joint_names(sim, gripper)
     held = np.flatnonzero(blocks.is_object(scene.slots))
+    library = stock.library(scene) if held.size else None
     return World(
         model=model,
         slots=scene.slots,
@@ -169,14 +170,19 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         gripper=gripper,
         hand_geoms=np.array([model.geom(name).id for name in robots.hand_geoms(gripper)]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
-        objects=objects.read(model, held, bodies[held], stock.library(scene))
-        if held.size
-        else None,
+        objects=None if library is None else objects.read(model, held, bodies[held], library),
     )
 
 
+def _check_mjx(model: mujoco.MjModel) -> None:
+    """Raises SceneError for a setting that MJX ignores; `put_model` raises for what it lacks."""
+    for field in _MJX_IGNORES:
+        if np.any(operator.attrgetter(field)(model)):
+            raise SceneError(f"MJX ignores {field}; leave it at 0, or take sim.physics c")
+
+
 def _align_inertia(model: mujoco.MjModel) -> None:
-    """Undoes the compiler's swap of axes, by size, where inertial frames are body frames."""
+    """Restores the order of axes, which the compiler sorts, for inertial frames along the body."""
     rotation = Rotation.from_quat(model.body_iquat, scalar_first=True).as_matrix()
     is_swap = np.isclose(np.abs(rotation).max(axis=1), 1.0).all(axis=1)
     swapped = np.abs(rotation.round()) @ model.body_inertia[:, :, None]
@@ -207,12 +213,12 @@ class BlockFields:
     body_invweight: jax.Array  # [N, 2] 1/kg, 1/(kg m^2)
     dof_invweight: jax.Array  # [N, 6] the same for the six dofs
     mesh_scale: jax.Array  # [M] relative to the compiled mesh
-    objects: ObjectFields | None = None  # their rows of the other leaves mean nothing
+    objects: ObjectFields | None = None  # rows of such slots in the other leaves have no meaning
     pads: PadFields | None = None  # where the fingers vary
 
 
 def scene_fields(world: World, scene: Scene) -> BlockFields:
-    """Fields that follow from the sizes, densities and frictions of one scene.
+    """Computes the fields that follow from sizes, densities and frictions of one scene.
 
     Closed forms of what MuJoCo's compiler derives. Boxes: m = 8 rho a b c, I_x = m (b^2 + c^2) / 3,
     parts about their common centre of mass by the parallel axis theorem. Meshes by their scale s:
@@ -229,7 +235,7 @@ def scene_fields(world: World, scene: Scene) -> BlockFields:
 
 
 def _pads(world: World, fingers: Fingers) -> PadFields:
-    """Pads of these fingers: thinner and narrower ones than the compiled keep their inner faces."""
+    """Computes the pads of these fingers; whatever the size, their inner faces stay in place."""
     model, pads = world.model, world.hand_geoms[1:]
     length = jnp.full(2, model.geom_size[pads, 2], jnp.float32)
     half = jnp.stack([jnp.full(2, 0.5 * fingers.thickness), jnp.full(2, 0.5 * fingers.width)])
@@ -241,13 +247,13 @@ def _pads(world: World, fingers: Fingers) -> PadFields:
 
 
 def _box_fields(world: World, scene: Scene) -> BlockFields:
-    """As if every slot were made of boxes."""
+    """Computes the fields as if every slot were made of boxes."""
     slot = world.parts.slot
     half_size = scene.half_size[slot]
     half, centre = half_size * world.parts.half, half_size * world.parts.centre
     part_mass = 8.0 * scene.density[slot] * jnp.prod(half, axis=1)
 
-    # An object has no boxes: 1 kg and 1 kg m^2 stand in for nothing, which has no inverse.
+    # An object has no boxes: 1 kg and 1 kg m^2 stand in for 0, which has no inverse.
     held, num = blocks.is_object(world.slots), len(world.slots)
 
     def add(values: jax.Array) -> jax.Array:
@@ -278,7 +284,7 @@ def _box_fields(world: World, scene: Scene) -> BlockFields:
 
 
 def _with_meshes(world: World, scene: Scene, boxes: BlockFields) -> BlockFields:
-    """`boxes`, but where a slot holds a mesh the compiled fields, scaled."""
+    """Replaces the fields of slots that hold a mesh by the compiled ones, scaled."""
     model, slot = world.model, world.parts.slot
     geoms, bodies = world.block_geoms, world.block_bodies
     is_mesh = blocks.is_mesh(world.slots)  # [N]
@@ -313,18 +319,13 @@ def _with_meshes(world: World, scene: Scene, boxes: BlockFields) -> BlockFields:
     )
 
 
-def use_pyramids(model: mujoco.MjModel) -> None:
-    """Gives the model, in place, the friction of a world without objects."""
-    model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_PYRAMIDAL, 1.0
-
-
 def with_blocks(
     world: World, fields: BlockFields, into: tuple[mujoco.MjModel, mujoco.MjData] | None = None
 ) -> mujoco.MjModel:
-    """The world's model with blocks of these fields (NumPy): a copy, or the model of `into`.
+    """Writes blocks of these fields (NumPy) into a copy of the world's model, or into `into`.
 
     `into` is an earlier copy and data of it: to allocate them takes longer than all the rest.
-    MuJoCo derives what follows: C takes a free body's mass matrix from `dof_M0`, not from its mass.
+    `mj_setConst` must follow: C takes a free body's mass matrix from `dof_M0`, not from its mass.
     """
     model, scratch = into or (copy.copy(world.model), mujoco.MjData(world.model))
     geoms, bodies = world.block_geoms, world.block_bodies

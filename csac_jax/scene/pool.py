@@ -1,8 +1,8 @@
 """The scenes that an environment draws from: packed arrangements, and blocks that were dropped.
 
-C MuJoCo settles those on all cores, bit-identical for any number of threads. Both are cached on
-disk; the scenes of the preset `quick` come with the package. `stream` numbers the stream of random
-numbers: training takes 0, evaluation others.
+C MuJoCo settles dropped blocks on all cores, bit-identical for any number of threads. Scenes are
+cached on disk; those of the preset `quick` come with the package. `stream` numbers the stream of
+random numbers: training takes 0, evaluation others.
 """
 
 import contextlib
@@ -37,65 +37,66 @@ _MOST_DROPPED = 12  # blocks that drop all at once: of 20, hardly a scene stays 
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
 _DRAWS = 20  # of objects, for which there must be room side by side
-_LOGGED_EVERY = 10.0  # s between lines about scenes that settle
+_LOGGED_EVERY = 10.0  # s between log lines while scenes settle
 _MAX_PAUSES = 3  # per block, until pouring a scene is given up; for a few, 2 and the settling
 
 _LOG = logging.getLogger(__name__)
 
-Drop = Callable[[], Scene]
 Fall = Callable[[Scene, BlockFields], Scene | None]
 
 
 def scenes(cfg: Config, stream: int, count: int | None = None) -> Scene:
-    """At least `count` scenes at rest, NumPy leaves [P, N, ...], as many of each number of blocks.
+    """Returns at least `count` scenes at rest, as many of each number of blocks.
 
-    The last `scene.arranged` of them are arrangements, or objects of a library side by side in the
-    largest square of `scene.drop_extent`. Without a count, `scene.pool` of each number of blocks.
-    Raises SceneError where blocks do not come to rest or allow no arrangement.
+    NumPy leaves [P, N, ...]. The last `scene.arranged` of them are arrangements, or objects of a
+    library side by side in the largest square of `scene.drop_extent`. Without a count,
+    `scene.pool` of each number of blocks. Raises SceneError where blocks do not come to rest or
+    allow no arrangement.
     """
     block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
-    each = cfg.scene.pool if count is None else -(-count // block_counts)
-    arranged = round(cfg.scene.arranged * each)
-    parts = [settled(cfg, stream, each - arranged)] if arranged < each else []
+    number = cfg.scene.pool if count is None else -(-count // block_counts)
+    arranged = round(cfg.scene.arranged * number)
+    parts = [settled(cfg, stream, number - arranged)] if arranged < number else []
     if arranged and cfg.scene.has_objects:
         widest = cfg.change(scene={"drop_extent": (cfg.scene.drop_extent[1],) * 2})
         parts.append(settled(widest, stream, arranged, packed=True))
     elif arranged:
-        how = (cfg.scene, cfg.heightmap.extent, stream, arranged * block_counts)
-        name = _digest(cfg, stream, how[-1], "arranged")
-        parts.append(_stored(name, lambda: arrange.arrangements(*how)))
+        drawn = (cfg.scene, cfg.heightmap.extent, stream, arranged * block_counts)
+        name = _digest(cfg, stream, drawn[-1], "arranged")
+        parts.append(_stored(name, lambda: arrange.arrangements(*drawn)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def settled(
     cfg: Config, stream: int, count: int, poured: bool = False, packed: bool = False
 ) -> Scene:
-    """`count` distinct settled scenes for each number of blocks from `scene.min_blocks` to N.
+    """Returns `count` distinct settled scenes for each number of blocks from `min_blocks` to N.
 
     NumPy leaves [P, N, ...], fewest blocks first; the same for the same arguments on every machine
     of one kind. Every block in play is at rest, its centre within extent / 2 of the workspace
     centre, so a scene can be rotated by any yaw. Up to 12 blocks drop all at once, stacked in the
     air. More, or all if `poured`, drop one after another, from `drop_height` above the pile; one
-    that rolls off drops again.
-    If `packed`, objects of a library stand on the table side by side, see `stock.packed`.
-    Logs every few seconds how far it is. Raises SceneError where hardly any scene comes to rest.
+    that rolls off drops again. If `packed`, objects stand on the table, see `stock.packed`.
+    Logs its progress. Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
 
     def settle() -> Scene:
         world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
         rng = np.random.default_rng([stream, 20221])
-        draw = _stand if packed else _drop
         numbers = range(scene.min_blocks, len(scene.slots) + 1)
-        counter = _Counter(count * len(numbers))
-        parts = []
+        done: list[Scene] = []
+        logged_at = time.monotonic()
         for number in numbers:
-            drop = functools.partial(draw, scene, rng, number)
+            drop = functools.partial(_stand if packed else _drop, scene, rng, number)
             pouring = poured or (number > _MOST_DROPPED and not packed)
-            way = pour if pouring else rest
-            fall = functools.partial(way, world, scene, cfg.heightmap.extent)
-            parts.append(_settle(world, drop, fall, count, pouring or packed, counter))
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+            fall = functools.partial(pour if pouring else rest, world, scene, cfg.heightmap.extent)
+            for fallen in _settle(world, drop, fall, count, costly=pouring or packed):
+                done.append(fallen)
+                if time.monotonic() - logged_at >= _LOGGED_EVERY:
+                    logged_at = time.monotonic()
+                    _LOG.info("settling scenes: %d of %d", len(done), count * len(numbers))
+        return _stack(done)
 
     how = ["poured"] * poured + ["packed"] * packed
     if len(scene.slots) > _MOST_DROPPED and not how:
@@ -104,71 +105,53 @@ def settled(
 
 
 def _stored(digest: str, make: Callable[[], Scene]) -> Scene:
-    """The scenes of that digest: those that come with the package, or of the cache, or new ones."""
+    """Returns the scenes of that digest: shipped, cached, or made now and cached."""
     name, cache = f"{digest}.npz", cache_folder.private("pools")
     path = cache and cache / name
-    for stored in (shipped() / name, path):
-        if stored and (known := _read(stored)) is not None:
-            return known
+    for file in (shipped() / name, path):
+        if file and (stored := _read(file)) is not None:
+            return stored
     with _on_host():
-        scenes = make()
+        made = make()
     if path:
-        _write(path, scenes)
-    return scenes
+        _write(path, made)
+    return made
 
 
 def _on_host() -> contextlib.AbstractContextManager[Any]:
-    """Has JAX compute on the CPU where it may: a GPU adds a block's parts in any order, so that the
-    scenes would differ from one process to the next."""
+    """Makes JAX compute on the CPU if it may: a GPU adds a block's parts in any order, so scenes
+    would differ between processes."""
     try:
         return jax.default_device(jax.local_devices(backend="cpu")[0])
     except RuntimeError:  # JAX_PLATFORMS names no CPU
         return contextlib.nullcontext()
 
 
-class _Counter:
-    """Logs now and then how many of `total` scenes are at rest."""
-
-    def __init__(self, total: int) -> None:
-        self._total, self._done, self._logged_at = total, 0, time.monotonic()
-
-    def count(self) -> None:
-        """One more is."""
-        self._done += 1
-        if time.monotonic() - self._logged_at >= _LOGGED_EVERY:
-            self._logged_at = time.monotonic()
-            _LOG.info("settling scenes: %d of %d", self._done, self._total)
-
-
 def _settle(
-    world: World, drop: Drop, fall: Fall, count: int, costly: bool, counter: _Counter
-) -> Scene:
-    """`count` scenes that are at rest after their fall."""
+    world: World, drop: Callable[[], Scene], fall: Fall, count: int, costly: bool
+) -> Iterator[Scene]:
+    """Yields `count` scenes that are at rest after their fall."""
     fields_of = jax.vmap(functools.partial(model.scene_fields, world))
-    settled: list[Scene] = []
-    dropped = 0
-    while len(settled) < count:
-        # A round of piles takes minutes, so it is no larger than needed.
-        num = min(_ROUND, count - len(settled)) if costly else _ROUND
+    missing, dropped = count, 0
+    while missing:
+        num = min(_ROUND, missing) if costly else _ROUND  # a round of piles takes minutes
         drops = [drop() for _ in range(num)]
         fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
-        waiting = list(zip(drops, rows, strict=True))
-        for scene in _first_at_rest(fall, waiting, count - len(settled)):
-            settled.append(scene)
-            counter.count()
+        for scene in _first_at_rest(fall, list(zip(drops, rows, strict=True)), missing):
+            missing -= 1
+            yield scene
         dropped += num
-        if dropped >= 20 * _ROUND and len(settled) < dropped / 50:
-            found = f"only {len(settled)} of {dropped} dropped scenes came to rest in the workspace"
+        if dropped >= 20 * _ROUND and count - missing < dropped / 50:
+            settled = f"only {count - missing} of {dropped} dropped scenes came to rest"
             remedy = "lower scene.min_blocks or scene.drop_extent, or raise scene.settle_time"
-            raise SceneError(f"{found}; {remedy}")
-    return _stack(settled)
+            raise SceneError(f"{settled} in the workspace; {remedy}")
 
 
 def _first_at_rest(
     fall: Fall, drops: list[tuple[Scene, BlockFields]], count: int
 ) -> Iterator[Scene]:
-    """The first `count` of these scenes that come to rest, in their order. Few others fall."""
+    """Yields the first `count` of these scenes that come to rest, in order; few others fall."""
     with ThreadPoolExecutor() as threads:
         while drops and count:
             some = max(count, len(os.sched_getaffinity(0)))
@@ -184,7 +167,7 @@ def _stack(scenes: list[Scene]) -> Scene:
 
 
 def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
-    """A random scene of `count` blocks before they fall, one above the other as in VPG."""
+    """Draws a scene of `count` blocks before they fall, one above the other as in VPG."""
     num, num_colours = len(cfg.slots), len(blocks.COLOURS)
     in_play = rng.permutation(num) < count
     quaternion = rng.normal(size=(num, 4))
@@ -210,8 +193,7 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 
 
 def _stand(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
-    """A random scene of `count` objects that stand beside one another, of some for which there is
-    room."""
+    """Draws a scene of `count` objects that stand side by side; again where there is no room."""
     for _ in range(_DRAWS - 1):
         with contextlib.suppress(SceneError):
             return stock.packed(rng, cfg, _drop(cfg, rng, count))
@@ -219,10 +201,11 @@ def _stand(cfg: SceneConfig, rng: np.random.Generator, count: int) -> Scene:
 
 
 def _falling(world: World, scene: Scene, fields: BlockFields) -> mujoco.MjData:
-    """The scene's blocks where they are, the hand high above, in a model of their own."""
+    """Builds the model and state of one scene, the hand high above."""
     exact = model.with_blocks(world, fields)
     exact.opt.iterations, exact.opt.ls_iterations = 20, 20  # quality over speed: this runs once
-    model.use_pyramids(exact)  # so pools of objects stay what they are in caches and hashes
+    # Pools of objects, in caches and digests, were settled with friction pyramids.
+    exact.opt.cone, exact.opt.impratio = mujoco.mjtCone.mjCONE_PYRAMIDAL, 1.0
     exact.opt.timestep = 0.5 * world.model.opt.timestep
     data = mujoco.MjData(exact)
     data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
@@ -233,7 +216,7 @@ def _falling(world: World, scene: Scene, fields: BlockFields) -> mujoco.MjData:
 def rest(
     world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields
 ) -> Scene | None:
-    """The scene after its blocks fell; None if one is not at rest or left the workspace."""
+    """Drops all blocks; None if one is not at rest then or left the workspace."""
     data = _falling(world, scene, fields)
     data.model.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
     mujoco.mj_step(data.model, data, nstep=round(cfg.settle_time / data.model.opt.timestep))
@@ -243,7 +226,7 @@ def rest(
 def pour(
     world: World, cfg: SceneConfig, extent: float, scene: Scene, fields: BlockFields
 ) -> Scene | None:
-    """As `rest`, but blocks drop one after another, lowest first; those that roll off, again."""
+    """Drops blocks one after another, lowest first; those that roll off, again. See `rest`."""
     data = _falling(world, scene, fields)
     num, pause = len(scene.in_play), round(_PAUSE / data.model.opt.timestep)
     waiting = [int(slot) for slot in np.argsort(scene.position[:, 2]) if scene.in_play[slot]]
@@ -276,7 +259,7 @@ def pour(
 
 
 def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> Scene | None:
-    """The scene as its blocks lie now; None if one is not at rest or left the workspace."""
+    """Reads the poses of the blocks; None if one is not at rest or left the workspace."""
     pose = data.qpos[world.block_qpos].astype(np.float32)
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
@@ -293,18 +276,19 @@ def _at_rest(world: World, extent: float, scene: Scene, data: mujoco.MjData) -> 
 
 
 def shipped() -> Path:
-    """Folder of the pools that come with the package; `experiments.pools` settles them."""
+    """Returns the folder of pools that come with the package; `experiments.pools` makes them."""
     return assets() / "pools"
 
 
 def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
-    """Hash of everything that decides the content of a pool; `how` its scenes are made."""
+    """Hashes everything that decides the content of a pool; `how` tells ways to make it apart."""
     scene = dataclasses.replace(cfg.scene, arranged=0.0)
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
-    if scene.has_objects:  # what is in a library counts, not where it lies
+    if scene.has_objects:  # the content of a library counts, not its place
         scene = dataclasses.replace(scene, objects=stock.library(scene).sha256)
-    relevant = (_VERSION, mujoco.__version__, repr(scene), *numbers)
-    content = hashlib.sha256(repr((*relevant, *how)).encode())
+    content = hashlib.sha256(
+        repr((_VERSION, mujoco.__version__, repr(scene), *numbers, *how)).encode()
+    )
     code = [arrange.__file__, families.__file__] if "arranged" in how else []
     bodies = ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml")
     for path in (*(assets() / name for name in bodies), *map(Path, code)):
@@ -312,30 +296,23 @@ def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
     return content.hexdigest()[:32]
 
 
-def _checksum(arrays: dict[str, np.ndarray]) -> str:
-    content = hashlib.sha256()
-    for name, array in sorted(arrays.items()):
-        content.update(f"{name}={array.dtype}{list(array.shape)}\n".encode() + array.tobytes())
-    return content.hexdigest()
-
-
 def _read(path: Path) -> Scene | None:
-    """The cached scenes; None if there are none or they are damaged."""
+    """Reads stored scenes; None for a file that is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        return Scene(**arrays) if str(arrays.pop("sha256")) == _checksum(arrays) else None
+            arrays = {name: file[name] for name in file.files if name != "sha256"}
+            return Scene(**arrays) if file.zip.testzip() is None else None
     except Exception:  # a damaged archive raises nearly anything, from BadZipFile to KeyError
         return None
 
 
 def _write(path: Path, scenes: Scene) -> None:
-    """Saves the scenes for the next run; a cache that cannot be written is no error."""
+    """Caches scenes for later runs; a cache that cannot be written is no error."""
     arrays: dict[str, Any] = {k: leaf for k, leaf in vars(scenes).items() if leaf is not None}
     temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
-            np.savez(file, sha256=_checksum(arrays), **arrays)
+            np.savez(file, **arrays)
         temporary.replace(path)
     except OSError:
         with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
-"""Arms and grippers as MJCF: put together, and checked against the gripper's numbers.
+"""Arms and grippers as MJCF: assembled, and checked against the gripper's numbers.
 
-A gripper of gripper.json alone has no drives but its fingers'. The robot `hand` carries it through
-the air on four more; any other robot is an arm that has it at its flange.
+The robot `hand` moves a gripper through the air on four drives. Any other robot is an arm with the
+gripper at its flange.
 """
 
 from collections.abc import Iterable
@@ -44,13 +44,13 @@ FLOAT = (  # ours
 
 
 def hand_geoms(gripper: Gripper) -> tuple[str, str, str]:
-    """Names in the model of palm, low pad and high pad."""
+    """Returns the names in the model of palm, low pad and high pad."""
     low, high = gripper.pads
     return PREFIX + gripper.palm, PREFIX + low, PREFIX + high
 
 
 def joint_names(sim: SimConfig, gripper: Gripper) -> list[str]:
-    """Names in the model of all joints of the robot; the gripper's come last."""
+    """Returns the names in the model of all joints of the robot, the gripper's last."""
     fingers = [PREFIX + name for name in gripper.joints]
     if sim.robot == "hand":
         return [PREFIX + drive.name for drive in FLOAT] + fingers
@@ -69,16 +69,15 @@ def add(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
 
 
 def read(path: Path) -> mujoco.MjSpec:
-    """The MJCF of a file. Raises SceneError for one that cannot be read."""
+    """Reads an MJCF file. Raises SceneError."""
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise one_line(path, error) from None
 
 
-def _compiled(path: Path) -> mujoco.MjModel:
-    """The model of a file alone. `attach` silently drops an element that refers to a missing one,
-    which this refuses."""
+def _compile(path: Path) -> mujoco.MjModel:
+    """Compiles a file alone: `attach` silently drops elements that refer to missing ones."""
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -86,12 +85,12 @@ def _compiled(path: Path) -> mujoco.MjModel:
 
 
 def one_line(path: Path, error: ValueError) -> SceneError:
-    """An error of MuJoCo's about a file."""
+    """Formats an error of MuJoCo about a file."""
     return SceneError(f"{path}: {' '.join(str(error).split())}")
 
 
 def require(path: Path, kind: str, required: Iterable[str], elements: Iterable[Any]) -> None:
-    """Raises SceneError where an element that the package addresses by name is missing."""
+    """Raises SceneError for a missing element that the package addresses by name."""
     present = [element.name for element in elements if element.name]
     for name in required:
         if name not in present:
@@ -100,14 +99,17 @@ def require(path: Path, kind: str, required: Iterable[str], elements: Iterable[A
 
 
 def _require_actuators(path: Path, required: Iterable[str], spec: mujoco.MjSpec) -> None:
-    wanted, present = ", ".join(required), ", ".join(each.name for each in spec.actuators)
+    wanted, present = list(required), [actuator.name for actuator in spec.actuators]
     if present != wanted:
-        raise SceneError(f"{path}: actuators must be {wanted}, not {present}")
+        names = f"{', '.join(wanted)}, not {', '.join(present)}"
+        raise SceneError(f"{path}: actuators must be {names}")
 
 
 def _add_floating(spec: mujoco.MjSpec, tool: mujoco.MjSpec, gripper: Gripper) -> None:
-    """The gripper alone. What only shows its body stays away; all have one weight, which the drives
-    are made for."""
+    """Adds the gripper on four drives, which are made for one weight: all grippers get it.
+
+    Visual geoms of its body are left out.
+    """
     root = tool.body(gripper.body)
     for geom in list(root.geoms):
         if not geom.contype and not geom.conaffinity:
@@ -124,7 +126,7 @@ def _add_floating(spec: mujoco.MjSpec, tool: mujoco.MjSpec, gripper: Gripper) ->
 
 
 def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
-    """The arm on its base, and a site `tip` where the gripper belongs."""
+    """Adds the arm on its base, with a site `tip` for the gripper."""
     path = assets() / f"{sim.robot}.xml"
     arm = read(path)
     require(path, "joint", ARM_JOINTS, arm.joints)
@@ -132,7 +134,7 @@ def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
     require(path, "body", ("base",), arm.bodies)
     require(path, "geom", ("base",), arm.geoms)
     _require_actuators(path, ARM_JOINTS, arm)
-    _compiled(path)
+    _compile(path)
     x, y, z, yaw = sim.base
     base, pedestal, flange = arm.body("base"), arm.geom("base"), arm.site("flange")
     base.pos, base.quat = [x, y, z], [np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)]
@@ -143,7 +145,7 @@ def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
 
 
 def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
-    """Raises SceneError where a gripper's MJCF lacks what its numbers name, or has others."""
+    """Raises SceneError for MJCF that does not match the gripper's numbers."""
     path = gripper.folder / grippers.MJCF
     require(path, "body", (gripper.body,), tool.bodies)
     require(path, "joint", gripper.joints, tool.joints)
@@ -151,18 +153,19 @@ def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
     _require_actuators(path, (gripper.actuator,), tool)
     for name in {joint.name for joint in tool.joints} - {*gripper.joints}:
         raise SceneError(f"{path}: joint '{name}' is not among 'joints' of {grippers.NUMBERS}")
+    model = _compile(path)
     for end, name in enumerate(("closed", "open")):
-        opening, height = _measured(gripper, end)
+        opening, height = _measure(model, gripper, end)
         _require_same(path, f"opening when {name}", opening, gripper.opening[end])
         below = float(gripper.drop(gripper.half[end]))
         _require_same(path, f"height of the tips when {name}", height, -below)
     if gripper.varies is not None:
-        _check_pads(path, gripper)
+        _check_pads(path, model, gripper)
 
 
-def _check_pads(path: Path, gripper: Gripper) -> None:
-    """Raises SceneError where an episode's fingers could not be put in place of the MJCF's."""
-    model, (thickness, width, _) = _compiled(path), gripper.finger
+def _check_pads(path: Path, model: mujoco.MjModel, gripper: Gripper) -> None:
+    """Raises SceneError for pads that an episode's fingers could not replace."""
+    thickness, width, _ = gripper.finger
     for name in gripper.pads:
         pad = model.geom(name)
         _require_same(path, f"thickness of {name}", 2.0 * pad.size[0], thickness)
@@ -171,27 +174,27 @@ def _check_pads(path: Path, gripper: Gripper) -> None:
         _require_same(path, f"inner face of {name} in its finger's frame", inner, 0.0)
 
 
-def _require_same(path: Path, what: str, found: float, wanted: float) -> None:
-    """Raises SceneError where a length in the MJCF, m, is not that of the numbers."""
-    if abs(found - wanted) > _TOLERANCE:
+def _require_same(path: Path, what: str, measured: float, wanted: float) -> None:
+    """Raises SceneError for a length in the MJCF, m, that is not that of the numbers."""
+    if abs(measured - wanted) > _TOLERANCE:
         by_numbers = f"by {grippers.NUMBERS} {1e3 * wanted:.1f} mm"
-        raise SceneError(f"{path}: {what} is {1e3 * found:.1f} mm, {by_numbers}")
+        raise SceneError(f"{path}: {what} is {1e3 * measured:.1f} mm, {by_numbers}")
 
 
-def _measured(gripper: Gripper, end: int) -> tuple[float, float]:
-    """Opening and height of the tips, m, in the MJCF with its joints at one end."""
-    model = _compiled(gripper.folder / grippers.MJCF)
+def _measure(model: mujoco.MjModel, gripper: Gripper, end: int) -> tuple[float, float]:
+    """Measures opening and height of the tips, m, with the joints at one end."""
     data = mujoco.MjData(model)
     for name, ends in zip(gripper.joints, gripper.positions, strict=True):
         data.qpos[model.joint(name).qposadr[0]] = ends[end]
     mujoco.mj_kinematics(model, data)
     root = data.body(gripper.body)
-    turn, low_high, lowest = root.xmat.reshape(3, 3), [], []
+    turn, inner, lowest = root.xmat.reshape(3, 3), [], []
     for name, side in zip(gripper.pads, (1.0, -1.0), strict=True):
-        geom, box = model.geom(name).id, model.geom_aabb[model.geom(name).id]
+        geom = model.geom(name).id
+        box = model.geom_aabb[geom]
         rotation = turn.T @ data.geom_xmat[geom].reshape(3, 3)
         centre = turn.T @ (data.geom_xpos[geom] - root.xpos) + rotation @ box[:3]
         half = np.abs(rotation) @ box[3:]
-        low_high.append(centre[0] + side * half[0])
+        inner.append(centre[0] + side * half[0])
         lowest.append(centre[2] - half[2])
-    return float(low_high[1] - low_high[0]), float(min(lowest))
+    return float(inner[1] - inner[0]), float(min(lowest))

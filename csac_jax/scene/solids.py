@@ -1,4 +1,4 @@
-"""Groups of geoms of one kind, for rays that meet more than blocks. It needs no MuJoCo.
+"""Groups of geoms of one kind, for raycasting more than blocks. Needs no MuJoCo.
 
 scene = geoms.read(model)  # on the host, once
 scene = solids.place(scene, data.geom_xpos, data.geom_xmat)  # also inside compiled functions
@@ -42,7 +42,7 @@ class Solids:
 
 
 def place(solids: Solids, xpos: jax.Array | np.ndarray, xmat: jax.Array | np.ndarray) -> Solids:
-    """The same geoms at other poses: xpos [geoms, 3] m; xmat [geoms, 9 or 3, 3], geom to world."""
+    """Moves the geoms to poses xpos [geoms, 3] m and xmat [geoms, 9 or 3, 3], geom to world."""
     rotation = xmat.reshape(-1, 3, 3)
     return solids.replace(
         groups=tuple(

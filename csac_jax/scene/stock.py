@@ -1,4 +1,4 @@
-"""Which objects the slots of a scene hold. It needs no MuJoCo."""
+"""The objects that the slots of a scene hold. Needs no MuJoCo."""
 
 import hashlib
 import itertools
@@ -17,27 +17,27 @@ from csac_jax.scene.layout import Scene
 
 
 def library(cfg: SceneConfig) -> Library:
-    """The objects that scenes of this config draw from. Raises LibraryError."""
+    """Finds the objects that scenes of this config draw from. Raises LibraryError."""
     return tables.find(cfg.objects, cfg.split)
 
 
 def table(cfg: SceneConfig) -> Tables:
-    """The same as arrays."""
-    return tables.of(library(cfg))
+    """Returns the same objects as arrays."""
+    return tables.from_library(library(cfg))
 
 
 def drawn(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
-    """The scene with random objects in their slots, each at most once where there are enough."""
-    slots, known = np.flatnonzero(blocks.is_object(cfg.slots)), table(cfg)
-    rounds = -(-len(slots) // len(known.half))
-    order = np.concatenate([rng.permutation(len(known.half)) for _ in range(rounds)])
-    return hold(scene, slots, order[: len(slots)], known)
+    """Draws the objects of a scene; none repeats before all have been drawn."""
+    slots, objects = np.flatnonzero(blocks.is_object(cfg.slots)), table(cfg)
+    rounds = -(-len(slots) // len(objects.half))
+    order = np.concatenate([rng.permutation(len(objects.half)) for _ in range(rounds)])
+    return hold(scene, slots, order[: len(slots)], objects)
 
 
-def hold(scene: Scene, slots: np.ndarray, numbers: np.ndarray, known: Tables) -> Scene:
-    """The scene with the objects `numbers` [M] of a library in `slots` [M]."""
+def hold(scene: Scene, slots: np.ndarray, numbers: np.ndarray, objects: Tables) -> Scene:
+    """Puts the objects `numbers` [M] of a library into `slots` [M]."""
     object_id, half_size = np.array(scene.numbers), np.array(scene.half_size)
-    object_id[slots], half_size[slots] = numbers, known.half[numbers]
+    object_id[slots], half_size[slots] = numbers, objects.half[numbers]
     return scene.replace(object_id=object_id, half_size=half_size)
 
 
@@ -46,28 +46,28 @@ _TRIES = 200  # random places tried for each
 
 
 def packed(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
-    """The scene with its objects in play standing on the table, as they do in their files, at
-    random places of the square of side `drop_extent` and random yaws, outlines GAP or more apart.
+    """Places the objects in play on the table, upright as in their files.
 
+    Places in the square of side `drop_extent` and yaws are random, outlines GAP or more apart.
     Raises SceneError where there is no room.
     """
     half = 0.5 * rng.uniform(*cfg.drop_extent)
     position, quaternion = np.array(scene.position), np.array(scene.quaternion)
     outlines: list[np.ndarray] = []
     for slot in np.flatnonzero(scene.in_play):
-        one = library(cfg).objects[int(scene.numbers[slot])]
-        corners = np.concatenate([part.vertices for part in one.parts])
+        member = library(cfg).objects[int(scene.numbers[slot])]
+        corners = np.concatenate([part.vertices for part in member.parts])
         for _ in range(_TRIES):
             yaw, xy = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-half, half, 2)
             cos, sin = np.cos(yaw), np.sin(yaw)
             turn = np.array([[cos, sin], [-sin, cos]])
             outline = np.einsum("ni,ij->nj", corners[:, :2], turn) + xy
             outline = outline[ConvexHull(outline).vertices]
-            if np.abs(outline).max() <= half and all(_apart(outline, each) for each in outlines):
+            if np.abs(outline).max() <= half and all(_apart(outline, other) for other in outlines):
                 break
         else:
             raise SceneError(
-                f"no room for '{one.name}' beside {len(outlines)} objects in a square of "
+                f"no room for '{member.name}' among {len(outlines)} objects in a square of "
                 f"{2.0 * half:g} m; take smaller objects"
             )
         outlines.append(outline)
@@ -77,27 +77,28 @@ def packed(rng: np.random.Generator, cfg: SceneConfig, scene: Scene) -> Scene:
 
 
 def _apart(one: np.ndarray, two: np.ndarray) -> bool:
-    """Whether convex outlines [n, 2] m are GAP or more apart, along the normal of some side."""
+    """Tests for a gap of GAP between convex outlines [n, 2] m, along the normal of some side."""
     for first, second in itertools.permutations((one, two)):
         side = np.roll(first, -1, axis=0) - first
         normal = np.column_stack([side[:, 1], -side[:, 0]])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        near, far = (np.einsum("ni,mi->nm", each, normal) for each in (second, first))
-        gap = near.min(axis=0) - far.max(axis=0)
-        if gap.max() >= GAP:
+        near, far = (np.einsum("ni,mi->nm", outline, normal) for outline in (second, first))
+        if (near.min(axis=0) - far.max(axis=0)).max() >= GAP:
             return True
     return False
 
 
 def fingerprint(cfg: SceneConfig, scenes: Scene) -> str:
-    """SHA-256 of what was drawn for scenes of objects, leaves [P, N, ...]: objects, densities,
-    frictions and colours. Physics touches none of it, so that it is the same on every machine."""
+    """Returns a SHA-256 of objects, densities, frictions and colours of scenes [P, N, ...].
+
+    Physics changes none of these, so it is the same on every machine.
+    """
     objects = library(cfg).objects
     content = hashlib.sha256()
-    for number, held in zip(scenes.numbers.ravel(), scenes.in_play.ravel(), strict=True):
-        one = objects[number]
-        text = f"{one.name} {one.source_sha256} {one.volume * one.density / DENSITY:.4e} {held};"
-        content.update(text.encode())
+    for number, in_play in zip(scenes.numbers.ravel(), scenes.in_play.ravel(), strict=True):
+        member = objects[number]
+        weight = f"{member.volume * member.density / DENSITY:.4e}"
+        content.update(f"{member.name} {member.source_sha256} {weight} {in_play};".encode())
     for leaf in (scenes.density, scenes.friction, scenes.colour):
         content.update(np.ascontiguousarray(leaf).tobytes())
     return content.hexdigest()

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import SimConfig
+from csac_jax.errors import SceneError
 from csac_jax.scene import layout
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import World, scene_fields
@@ -49,9 +50,15 @@ class MjxPhysics:
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
-    """Makes the physics of a world, in MJX's JAX implementation."""
-    mjx_model, data = mjx.put_model(world.model, impl="jax"), mjx.make_data(world.model, impl="jax")
-    return MjxPhysics(world, cfg, mjx_model, data)
+    """Builds the physics of a world: MJX with its JAX implementation.
+
+    Raises SceneError for MJCF that MJX lacks code for.
+    """
+    try:
+        mjx_model = mjx.put_model(world.model, impl="jax")
+    except NotImplementedError as error:
+        raise SceneError(f"MJX cannot run the MJCF: {error}; take sim.physics c") from None
+    return MjxPhysics(world, cfg, mjx_model, mjx.make_data(world.model, impl="jax"))
 
 
 def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:

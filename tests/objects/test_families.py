@@ -128,7 +128,7 @@ def test_tables_hold_every_face():
     """Claim: an object is what lies between two chunks with `first`: a point is inside a part of
     the table just where it is inside one of the object."""
     source = tables.find("made:0:42", "all")
-    known, rng = tables.of(source), np.random.default_rng(0)
+    known, rng = tables.from_library(source), np.random.default_rng(0)
     for number, one in enumerate(source.objects):
         points = rng.uniform(*one.bounds, (500, 3)).astype(np.float32)
         depth = known.offset[number] - np.einsum("cfi,ni->ncf", known.normal[number], points)

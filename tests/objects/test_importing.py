@@ -8,7 +8,7 @@ import trimesh
 
 from csac_jax import cli
 from csac_jax.objects import conversion, importing, library, solid
-from csac_jax.objects.conversion import How
+from csac_jax.objects.conversion import ImportSettings
 
 pytest.importorskip("coacd")
 
@@ -25,7 +25,9 @@ def _box(sides: tuple[float, float, float] = (0.03, 0.04, 0.05)) -> trimesh.Trim
 @pytest.mark.parametrize("kind", ["obj", "stl", "ply", "glb"])
 def test_every_format_gives_the_same_box(tmp_path: Path, kind: str):
     """Claim: a box of any format is one part with the closed form of volume and inertia."""
-    one, share = conversion.convert(_file(tmp_path, _box(), f"mesh.{kind}"), "box", How())
+    one, share = conversion.convert(
+        _file(tmp_path, _box(), f"mesh.{kind}"), "box", ImportSettings()
+    )
     assert len(one.parts) == 1
     assert len(one.parts[0].planes) == 6
     assert share == pytest.approx(1.0, rel=1e-3)
@@ -39,7 +41,7 @@ def test_a_ring_keeps_its_hole(tmp_path: Path):
     of the ring, about its centre of mass."""
     ring = trimesh.creation.annulus(0.02, 0.03, 0.03)
     ring.apply_translation([0.1, 0.2, 0.3])
-    one, share = conversion.convert(_file(tmp_path, ring), "ring", How())
+    one, share = conversion.convert(_file(tmp_path, ring), "ring", ImportSettings())
     assert len(one.parts) >= 4
     assert importing.SOUND[0] <= share <= importing.SOUND[1]
     assert not any((part.planes[:, 3] > 0.0).all() for part in one.parts)  # the middle is outside
@@ -64,7 +66,7 @@ def test_a_small_hole_is_mended(tmp_path: Path):
     """Claim: a mesh that lacks one triangle is closed."""
     box = _box()
     holed = trimesh.Trimesh(box.vertices, box.faces[1:], process=False)
-    one, _ = conversion.convert(_file(tmp_path, holed), "box", How())
+    one, _ = conversion.convert(_file(tmp_path, holed), "box", ImportSettings())
     assert one.volume == pytest.approx(6e-5, rel=1e-4)
 
 
@@ -93,7 +95,7 @@ REFUSED = {
     "open": (_open, "is open or torn at [0-9]+ edges; close its mesh"),
     "millimetres": (
         lambda folder: _file(folder, _box((30, 40, 50))),
-        r"is 50 m large at --scale 1; its unit may be another: try --scale 0\.001",
+        r"is 50 m large at scale 1; .* try scale 0\.001",
     ),
     "tiny": (lambda folder: _file(folder, _box((3e-5, 4e-5, 5e-5))), "its unit may be another"),
     "garbage": (lambda folder: _text(folder, "mesh.glb", "glTF nothing"), "cannot be read as glb"),
@@ -112,7 +114,7 @@ def test_what_cannot_be_taken_is_named(tmp_path: Path, name: str):
     """Claim: a file that is open, damaged, hostile or in another unit is one line with a reason."""
     make, message = REFUSED[name]
     with pytest.raises(ValueError, match=message) as caught:
-        conversion.convert(make(tmp_path), name, How())
+        conversion.convert(make(tmp_path), name, ImportSettings())
     assert "\n" not in str(caught.value)
 
 
@@ -122,7 +124,7 @@ def test_a_file_names_no_other_file(tmp_path: Path):
     mesh = _file(tmp_path, _box(), "mesh.obj")
     mesh.write_text("mtllib secret.mtl\nusemtl a\n" + mesh.read_text())
     (tmp_path / "secret.mtl").chmod(0)
-    assert conversion.convert(mesh, "box", How())[0].volume > 0
+    assert conversion.convert(mesh, "box", ImportSettings())[0].volume > 0
 
 
 @pytest.mark.slow
@@ -136,10 +138,10 @@ def test_the_command_writes_what_it_can(tmp_path: Path, capsys: pytest.CaptureFi
     bad = _text(folder, "c.ply", _PLY)
     out = tmp_path / "lib"
     partial = Path(f"{out}.partial")
-    importing.run([folder / "a.stl"], How(), 1, partial, lambda *_: None)
+    importing.run([folder / "a.stl"], ImportSettings(), 1, partial, lambda *_: None)
     (kept,) = partial.iterdir()
     before = kept.stat().st_mtime_ns
-    found = importing.run(importing.files([folder]), How(), 2, partial, lambda *_: None)
+    found = importing.run(importing.files([folder]), ImportSettings(), 2, partial, lambda *_: None)
     assert [one.name for one in found.objects] == ["a", "b"]
     assert len(found.refused) == 1
     assert kept.stat().st_mtime_ns == before

@@ -62,7 +62,7 @@ def _edit(folder: Path, **changes: object) -> None:
     ("change", "message"),
     [
         ({"format": 2}, "format 2 is unknown"),
-        ({"sha256": "0"}, "the digest in objects.json is another"),
+        ({"sha256": "0"}, "the digest in objects.json"),
         ({"objects": []}, "1 to 4096 objects, not 0"),
         ({"objects": 3}, "damaged"),
         ({"first": {"parts": 10**9}}, "1 to 32 parts"),
@@ -128,7 +128,7 @@ _TABLES = """
 import hashlib
 from csac_jax.objects import tables
 content = hashlib.sha256()
-for leaf in tables.of(tables.find("mixed:5:80", "all")):
+for leaf in tables.from_library(tables.find("mixed:5:80", "all")):
     content.update(repr(leaf.tobytes() if hasattr(leaf, "tobytes") else leaf).encode())
 print(content.hexdigest())
 """

@@ -25,68 +25,65 @@ COUNT = 24  # of 3 blocks, and as many of 4
 
 
 @pytest.fixture(scope="module")
-def world() -> model.World:
-    return model.build(SCENE, SimConfig())
-
-
-@pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """COUNT settled scenes."""
+    """Settles COUNT scenes of each number of blocks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
         return pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT)
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Config:
-    """One block, a cache of its own and small rounds, so that settling takes no time."""
+def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Returns a cache of its own, with small rounds."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(pool, "_ROUND", 8)
+    return tmp_path
+
+
+@pytest.fixture
+def small(cache: Path) -> Config:
+    """Returns one block, so that settling takes no time."""
     return Config(scene=SceneConfig(slots=("box",), min_blocks=1))
 
 
-def _placed(world: model.World, scenes: Scene, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    return placed.in_c(world, jax.tree.map(lambda leaf: leaf[index], scenes))
+def _assert_same(one: Scene, two: Scene) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+    dtypes = [[leaf.dtype for leaf in jax.tree.leaves(each)] for each in (one, two)]
+    assert dtypes[0] == dtypes[1]
+
+
+def _assert_at_rest(world: model.World, scenes: Scene) -> int:
+    """Fails where blocks overlap or move; returns the number of contacts between blocks."""
+    touching = 0
+    for index in range(len(scenes.position)):
+        exact, data = placed.in_c(world, jax.tree.map(lambda leaf, i=index: leaf[i], scenes))
+        assert data.contact.dist.min() > -0.002, f"scene {index}"
+        touching += np.sum(np.isin(data.contact.geom, world.block_geoms).all(axis=1))
+        mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
+        moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
+        assert moved.max() < 0.5 * layout.STILL, f"scene {index}: {moved}"
+    return touching
 
 
 def test_few_scenes_fall_that_are_not_needed(small: Config, monkeypatch: pytest.MonkeyPatch):
     """Claim: of a round as many scenes fall as are asked for, and at least one on each core; the
     scenes are the first of those of a larger pool."""
-    fallen: list[Scene] = []
+    fallen: list[tuple] = []
     rest = pool.rest
-
-    def counted(*args):
-        fallen.append(args)
-        return rest(*args)
-
     many = pool.settled(small, pool.TRAIN_STREAM, 6)
-    monkeypatch.setattr(pool, "rest", counted)
+    monkeypatch.setattr(pool, "rest", lambda *args: [fallen.append(args), rest(*args)][1])
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     few = pool.settled(small, pool.TRAIN_STREAM, 3)
     assert len(fallen) == 3
-    jax.tree.map(lambda one, all_: np.testing.assert_array_equal(one, all_[:3]), few, many)
+    _assert_same(few, jax.tree.map(lambda leaf: leaf[:3], many))
     assert len(pool.settled(small, pool.TRAIN_STREAM, 1).position) == 1
     assert len(fallen) == 3 + 2
 
 
-def test_settled_blocks_are_at_rest(world: model.World, scenes: Scene):
-    """Claim: blocks of a settled scene lie still: half a second later none is farther than its
-    speed allows."""
-    for index in range(2 * COUNT):
-        exact, data = _placed(world, scenes, index)
-        mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
-        moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
-        assert moved.max() < 0.5 * layout.STILL, f"scene {index}: {moved}"
-
-
-def test_settled_blocks_do_not_overlap(world: model.World, scenes: Scene):
-    """Claim: no two blocks of a settled scene, and no block and the table, overlap deeper than 2
-    mm."""
-    touching = 0
-    for index in range(2 * COUNT):
-        _, data = _placed(world, scenes, index)
-        assert data.contact.dist.min() > -0.002, f"scene {index}"
-        touching += np.sum(np.isin(data.contact.geom, world.block_geoms).all(axis=1))
+def test_settled_blocks_are_at_rest(scenes: Scene):
+    """Claim: half a second later no block of a settled scene is farther than its speed allows; none
+    overlaps another or the table by 2 mm."""
+    touching = _assert_at_rest(model.build(SCENE, SimConfig()), scenes)
     assert touching > 0  # some lie on others, else there was nothing to see
 
 
@@ -96,17 +93,14 @@ def test_settled_blocks_lie_within_the_radius(scenes: Scene):
     play = scenes.in_play
     assert np.hypot(*scenes.position[play][:, :2].T).max() <= 0.5 * EXTENT
     assert scenes.position[play][:, 2].min() > 0.0
-    np.testing.assert_array_equal(
-        play.sum(axis=1), np.repeat([3, 4], COUNT)
-    )  # min_blocks .. number of slots
+    np.testing.assert_array_equal(play.sum(axis=1), np.repeat([3, 4], COUNT))
     places = np.broadcast_to(parking(4), scenes.position.shape)
     np.testing.assert_array_equal(scenes.position[~play], places[~play])
 
 
-def test_no_block_lies_on_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_no_block_lies_on_the_hand(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: blocks of ten, dropped from up to 1.3 m, all come down to the table: none rests on the
     waiting hand."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(pool, "_ROUND", 24)
     cfg = SceneConfig(slots=("box",) * 10, min_blocks=10)
     settled = pool.settled(Config(scene=cfg), pool.TRAIN_STREAM, 20)
@@ -116,15 +110,12 @@ def test_no_block_lies_on_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def test_blocks_differ_within_their_ranges(scenes: Scene):
     """Claim: a box slot draws each of its shapes, and sizes, densities and frictions spread over
     their ranges."""
-    nominal = blocks.half_size_choices("box")
-    scale = scenes.half_size[:, 0, None] / nominal[None]  # [P, 4, 3]
+    scale = scenes.half_size[:, 0, None] / blocks.half_size_choices("box")  # [P, 4, 3]
     shape = np.argmin(np.ptp(scale, axis=2), axis=1)  # the one that all three axes agree on
     assert set(shape) == {0, 1, 2, 3}
-    by_slot = scenes.half_size[:, 1:, 2] / [
-        blocks.half_size_choices(kind)[0][2] for kind in SCENE.slots[1:]
-    ]
+    nominal = [blocks.half_size_choices(kind)[0][2] for kind in SCENE.slots[1:]]
     for drawn, (low, high) in (
-        (by_slot, (0.9, 1.1)),
+        (scenes.half_size[:, 1:, 2] / nominal, (0.9, 1.1)),
         (scenes.density, SCENE.density),
         (scenes.friction, SCENE.friction),
     ):
@@ -137,29 +128,22 @@ def test_same_arguments_same_scenes(scenes: Scene, monkeypatch, tmp_path: Path):
     """Claim: the same arguments give the same scenes, bit for bit, settled anew or read from the
     cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    anew = pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT)
+    _assert_same(scenes, pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT))
     monkeypatch.setattr(pool, "_settle", None)  # must not be called
-    cached = pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT)
-    for other in (anew, cached):
-        jax.tree.map(np.testing.assert_array_equal, scenes, other)
-        assert jax.tree.map(lambda leaf: leaf.dtype, scenes) == jax.tree.map(
-            lambda leaf: leaf.dtype, other
-        )
+    _assert_same(scenes, pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT))
 
 
-def test_scenes_are_made_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_scenes_are_made_on_the_cpu(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: what is stored was computed on the CPU, also where JAX's own device is a GPU: dropped
     scenes and arranged ones."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(pool, "_ROUND", 8)
     devices = {}
 
     def note(module, name):
-        of_module = getattr(module, name)
+        original = getattr(module, name)
 
-        def noted(*given):
+        def noted(*args):
             devices[name] = jax.config.jax_default_device
-            return of_module(*given)
+            return original(*args)
 
         monkeypatch.setattr(module, name, noted)
 
@@ -176,17 +160,16 @@ def test_streams_share_no_scene(small: Config):
     assert len({scene.tobytes() for scenes in both for scene in scenes}) == 32
 
 
-def test_arrangements_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_arrangements_are_kept(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: packed scenes, too, are made once; another stream, number or code has its own."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     cfg = presets.get("fast").change(scene={"arranged": 1.0, "pool": 6})
-    anew = pool.scenes(cfg, 0)
+    made = pool.scenes(cfg, 0)
     monkeypatch.setattr(pool.arrange, "arrangements", None)  # whatever calls it fails
-    jax.tree.map(np.testing.assert_array_equal, anew, pool.scenes(cfg, 0))
+    _assert_same(made, pool.scenes(cfg, 0))
     for stream, count in ((1, 6), (0, 5)):
         with pytest.raises(TypeError):
             pool.scenes(cfg, stream, count)
-    changed = tmp_path / "families.py"
+    changed = cache / "families.py"
     changed.write_text("")
     monkeypatch.setattr(pool.families, "__file__", str(changed))
     with pytest.raises(TypeError):
@@ -194,54 +177,34 @@ def test_arrangements_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
-def test_damaged_cache_is_settled_anew(small: Config, tmp_path: Path, damage: str):
-    """Claim: a cache file that was cut short or changed is noticed, and its scenes are settled
-    anew."""
+def test_damaged_cache_is_settled_anew(small: Config, cache: Path, damage: str):
+    """Claim: a cache file that was cut short or changed in any byte is noticed, and its scenes are
+    settled anew."""
     good = pool.settled(small, 0, 4)
-    (path,) = tmp_path.rglob("*.npz")
+    (path,) = cache.rglob("*.npz")
     raw = path.read_bytes()
+    damaged = [raw[: len(raw) // 2] if damage == "cut" else b""]
     if damage == "flipped":
-        damaged = []
-        for place in range(0, len(raw), 29):
-            changed = bytearray(raw)
-            changed[place] ^= 0xFF
-            damaged.append(bytes(changed))
-    else:
-        damaged = [raw[: len(raw) // 2] if damage == "cut" else b""]
+        flips = [bytes(place) + b"\xff" + bytes(len(raw) - place - 1) for place in range(len(raw))]
+        damaged = [bytes(a ^ b for a, b in zip(raw, flip, strict=True)) for flip in flips[::29]]
     for content in damaged:
         path.write_bytes(content)
-        read = pool._read(path)
-        if read is not None:  # a byte that carries nothing
-            jax.tree.map(np.testing.assert_array_equal, good, read)
+        if (read := pool._read(path)) is not None:  # a byte that carries nothing
+            _assert_same(good, read)
     path.write_bytes(damaged[len(damaged) // 2])
-    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, 0, 4))
+    _assert_same(good, pool.settled(small, 0, 4))
     assert pool._read(path) is not None
 
 
-def test_replaced_content_is_noticed(small: Config, tmp_path: Path):
-    """Claim: a well-formed cache file whose arrays do not belong to its checksum is not used."""
-    good = pool.settled(small, 0, 4)
-    (path,) = tmp_path.rglob("*.npz")
-    with np.load(path) as file:
-        arrays = {name: file[name] for name in file.files}
-    np.savez(path, **(arrays | {"position": arrays["position"] + np.float32(0.01)}))
-    jax.tree.map(np.testing.assert_array_equal, good, pool.settled(small, 0, 4))
-
-
-def test_cache_folder_is_private(small: Config, tmp_path: Path):
-    """Claim: the cache folder is its owner's alone."""
+def test_cache_folder_is_private(small: Config, cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the cache folder is its owner's alone; where it cannot be written, scenes are settled
+    all the same."""
     pool.settled(small, 0, 4)
-    (path,) = tmp_path.rglob("*.npz")
+    (path,) = cache.rglob("*.npz")
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
     assert list(path.parent.iterdir()) == [path]  # nothing half-written stays
-
-
-def test_unwritable_cache_is_no_error(
-    small: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Claim: where the cache cannot be written, scenes are settled all the same."""
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    (cache / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache / "file"))
     assert pool.settled(small, 0, 4).position.shape == (4, 1, 3)
 
 
@@ -252,9 +215,8 @@ def test_settling_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch, small: Con
     with caplog.at_level("INFO", "csac_jax"):
         pool.settled(two, 0, 3)
         pool.settled(two, 0, 3)
-    assert [line.rpartition(": ")[2] for line in caplog.messages] == [
-        f"{number} of 6" for number in range(1, 7)
-    ]
+    counts = [line.rpartition(": ")[2] for line in caplog.messages]
+    assert counts == [f"{number} of 6" for number in range(1, 7)]
 
 
 def test_hopeless_configuration_is_one_line(small: Config):
@@ -293,28 +255,21 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Claim: poured blocks are all in play, inside the workspace, at rest, higher than one layer;
     scenes differ, and the same stream gives the same ones."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    world = model.build(PILE, SimConfig())
     scenes = pool.settled(Config(scene=PILE), 1, 3, poured=True)
     assert scenes.in_play.shape == (3, 12)
     assert scenes.in_play.all()
     assert (np.linalg.norm(scenes.position[..., :2], axis=-1) <= 0.5 * EXTENT).all()
     assert (scenes.position[..., 2].max(axis=1) > 0.06).all()
     assert len({scene.tobytes() for scene in scenes.position}) == 3
-    for index in range(3):
-        exact, data = _placed(world, scenes, index)
-        mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
-        moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
-        assert moved.max() < 0.5 * layout.STILL, f"scene {index}: {moved}"
+    _assert_at_rest(model.build(PILE, SimConfig()), scenes)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
     again = pool.settled(Config(scene=PILE), 1, 3, poured=True)
     np.testing.assert_array_equal(again.position, scenes.position)
 
 
-def test_many_blocks_come_to_rest(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_many_blocks_come_to_rest(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: scenes of 24 blocks are found within a few rounds, for they are poured; those of 12
     drop at once, as fewer always did."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(pool, "_ROUND", 8)
     falls: list[tuple[str, int]] = []
 
     def spy(way: str):
@@ -324,10 +279,10 @@ def test_many_blocks_come_to_rest(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
             falls.append((way, int(scene.in_play.sum())))
             return fall(world, cfg, extent, scene, fields)
 
-        return spied
+        monkeypatch.setattr(pool, way, spied)
 
-    for way in ("rest", "pour"):
-        monkeypatch.setattr(pool, way, spy(way))
+    spy("rest")
+    spy("pour")
     slots = ("box",) * 24
     scenes = pool.settled(Config(scene=SceneConfig(slots=slots, min_blocks=24)), 0, 2)
     assert scenes.in_play.shape == (2, 24)
@@ -346,42 +301,35 @@ def test_poured_blocks_that_leave_are_dropped_anew():
     world, rng = model.build(cfg, SimConfig()), np.random.default_rng(0)
     for _ in range(6):
         scene = pool._drop(cfg, rng, 4)
-        poured = pool.pour(
-            world, cfg, EXTENT, scene, jax.device_get(model.scene_fields(world, scene))
-        )
+        fields = jax.device_get(model.scene_fields(world, scene))
+        poured = pool.pour(world, cfg, EXTENT, scene, fields)
         assert poured is not None
         assert (np.linalg.norm(poured.position[:, :2], axis=1) <= 0.5 * EXTENT).all()
 
 
-def test_quick_begins_without_settling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Claim: the scenes that `quick` trains in come with the package. Where this fails, run
-    `python -m experiments.pools`."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(pool, "_settle", None)  # must not be called
-    cfg = presets.quick()
-    assert len(pool.scenes(cfg, pool.TRAIN_STREAM).position) == cfg.scene.pool
-
-
-def test_shipped_scenes_are_what_settling_gives(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Claim: a run has the same scenes with and without the pool that comes with the package; of
-    another processor, whose last bits differ, nearly all are alike to 2 mm."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_shipped_scenes_are_what_settling_gives(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the scenes that `quick` trains in come with the package, and settling gives the same;
+    of another processor, whose last bits differ, nearly all are alike to 2 mm. Where this fails,
+    run `python -m experiments.pools`."""
     monkeypatch.setattr(pool, "_ROUND", 24)
     cfg = presets.quick()
-    given = pool.scenes(cfg, pool.TRAIN_STREAM)
     settled = pool.settled(cfg, pool.TRAIN_STREAM, 20)  # the first of those 1,024
-    fits = np.abs(settled.position - given.position[:20]).max(axis=(1, 2)) < 0.002
+    monkeypatch.setattr(pool, "_settle", None)  # must not be called
+    shipped = pool.scenes(cfg, pool.TRAIN_STREAM)
+    assert len(shipped.position) == cfg.scene.pool
+    fits = np.abs(settled.position - shipped.position[:20]).max(axis=(1, 2)) < 0.002
     assert fits.mean() > 0.8
     for name in ("half_size", "density", "friction", "colour"):
-        np.testing.assert_array_equal(getattr(settled, name)[fits], getattr(given, name)[:20][fits])
+        ours, theirs = (getattr(each, name)[:20][fits] for each in (settled, shipped))
+        np.testing.assert_array_equal(ours, theirs)
 
 
-def test_damaged_shipped_pool_is_settled(small: Config, monkeypatch, tmp_path: Path):
+def test_damaged_shipped_pool_is_settled(small: Config, cache: Path, monkeypatch):
     """Claim: a pool that comes with the package is used if it is whole, else the scenes are
     settled."""
     wanted = pool.settled(small, pool.TRAIN_STREAM, 4)
-    (cached,) = (tmp_path / "csac_jax" / "pools").glob("*.npz")
-    folder = tmp_path / "shipped"
+    (cached,) = cache.rglob("*.npz")
+    folder = cache / "shipped"
     folder.mkdir()
     monkeypatch.setattr(pool, "shipped", lambda: folder)
     content = cached.read_bytes()
@@ -389,7 +337,6 @@ def test_damaged_shipped_pool_is_settled(small: Config, monkeypatch, tmp_path: P
     with monkeypatch.context() as patch:
         (folder / cached.name).write_bytes(content)
         patch.setattr(pool, "_settle", None)  # must not be called
-        found = pool.settled(small, pool.TRAIN_STREAM, 4)
+        _assert_same(wanted, pool.settled(small, pool.TRAIN_STREAM, 4))
     (folder / cached.name).write_bytes(content[:-100])
-    for scenes in (found, pool.settled(small, pool.TRAIN_STREAM, 4)):
-        jax.tree.map(np.testing.assert_array_equal, wanted, scenes)
+    _assert_same(wanted, pool.settled(small, pool.TRAIN_STREAM, 4))

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from csac_jax.objects import conversion, importing
-from csac_jax.objects.conversion import How
-from csac_jax.scene import descriptions
+from csac_jax.objects import conversion, descriptions, importing
+from csac_jax.objects.conversion import ImportSettings
 
 pytest.importorskip("coacd")
-HOW = How(readers=tuple((suffix, descriptions.read) for suffix in descriptions.SUFFIXES))
 _URDF = """<robot name="a"><link name="one">
 <visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>
 <collision><origin xyz="0.01 0 0" rpy="0.3 0 1"/>
@@ -47,7 +45,7 @@ def test_a_urdf_has_the_volume_and_inertia_of_its_mesh(tmp_path: Path):
     """Claim: what collides in a URDF, where its origin puts it, has trimesh's volume, inertia and
     size."""
     path, wanted = _described(tmp_path)
-    one, share = conversion.convert(path, "a", HOW)
+    one, share = conversion.convert(path, "a", ImportSettings())
     assert one.volume == pytest.approx(wanted.volume, rel=1e-4)
     np.testing.assert_allclose(one.inertia, wanted.moment_inertia, rtol=1e-3, atol=1e-12)
     np.testing.assert_allclose(one.bounds[1] - one.bounds[0], wanted.extents, atol=1e-3)
@@ -58,7 +56,7 @@ def test_geoms_of_an_mjcf_count_once_where_they_overlap(tmp_path: Path):
     """Claim: two boxes that share a third have the closed form of the volume of both."""
     boxes = "".join(f'<geom type="box" size=".015 .01 .01" pos="{x} 0 0"/>' for x in (0, 0.02))
     path = _text(tmp_path, "a.xml", _MJCF.format(boxes))
-    one, _ = conversion.convert(path, "a", HOW)
+    one, _ = conversion.convert(path, "a", ImportSettings())
     assert one.volume == pytest.approx(0.05 * 0.02 * 0.02, rel=1e-4)
 
 
@@ -114,5 +112,5 @@ def test_joints_that_move_are_refused(tmp_path: Path):
 def test_meshes_in_a_folder_of_descriptions_are_parts_of_them(tmp_path: Path):
     """Claim: a folder with a URDF gives that, not the mesh it names; without one its meshes."""
     path, _ = _described(tmp_path)
-    assert importing.files([tmp_path], descriptions.SUFFIXES) == [path]
-    assert importing.files([tmp_path / "meshes"], descriptions.SUFFIXES)[0].name == "corner.obj"
+    assert importing.files([tmp_path]) == [path]
+    assert importing.files([tmp_path / "meshes"])[0].name == "corner.obj"

@@ -1,6 +1,6 @@
 """A robot description, URDF or MJCF, as one closed mesh: MuJoCo reads it, trimesh joins its geoms.
 
-Nothing may move in it but the whole: an object of a library is one rigid body.
+It must be one rigid body: no joints but a free one.
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ _Geom = mujoco.mjtGeom
 
 
 def read(path: Path) -> Any:
-    """The mesh, as trimesh has it, of what collides in a description; of all geoms if nothing does.
+    """Reads the geoms that collide, or all if none does, as one mesh of trimesh.
 
     Raises ValueError, one line with what to change.
     """
@@ -32,19 +32,15 @@ def read(path: Path) -> Any:
         raise ValueError(f"has {model.njnt} joints that move; an object is one rigid body")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    collides = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
-    meshes = [_placed(model, data, int(geom)) for geom in _either(collides, model.ngeom)]
-    if not meshes:
+    collides = (model.geom_contype | model.geom_conaffinity) != 0
+    geoms = np.flatnonzero(collides | ~collides.any())
+    if not geoms.size:
         raise ValueError("has no geom")
-    return _joined(meshes)
-
-
-def _either(collides: np.ndarray, geoms: int) -> np.ndarray:
-    return collides if collides.size else np.arange(geoms)
+    return _joined([_placed(model, data, int(geom)) for geom in geoms])
 
 
 def _check_files(spec: mujoco.MjSpec, folder: Path) -> None:
-    """The meshes lie in the description's own folder, wherever its text points."""
+    """Raises ValueError for a mesh file outside of the description's folder."""
     for mesh in spec.meshes:
         file = (folder / spec.meshdir / mesh.file).resolve()
         if mesh.file and not file.is_relative_to(folder):
@@ -54,7 +50,7 @@ def _check_files(spec: mujoco.MjSpec, folder: Path) -> None:
 
 
 def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
-    """One geom where the description has it, m."""
+    """Builds the mesh of one geom, m, at its pose."""
     import trimesh
 
     size, kind = model.geom_size[geom], int(model.geom_type[geom])
@@ -82,7 +78,7 @@ def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
 
 
 def _joined(meshes: list[Any]) -> Any:
-    """One mesh of all; what lies in several counts once, where they are closed."""
+    """Merges meshes to one; where all are closed, overlaps count once."""
     import trimesh
 
     if len(meshes) == 1:
