@@ -14,19 +14,13 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from csac_jax.config import NetConfig, OffsetNet, SmallNet
+from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets.convolution import conv2d, convolve_by_taps, taps_fit
 
 OUTPUTS = 3  # push along the frame's yaw, push against it, grasp
 OUTPUT_INIT = nn.initializers.variance_scaling(0.01, "fan_in", "normal")  # maps begin near 0
-TERMS = 7  # of an `OffsetNet` in each cell: value, three slopes, three curvatures
 _GROUP_SIZE = 8  # channels per group of the norm
 EPSILON = 1e-6  # of the norm, Flax's
-
-
-def terms(cfg: SmallNet) -> int:
-    """Numbers of each output in a cell."""
-    return TERMS if isinstance(cfg, OffsetNet) else 1
 
 
 def compute_dtype(cfg: NetConfig) -> Any:
@@ -132,7 +126,6 @@ class Critic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads; the same with `train`.
 
     [B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s = subcells.
-    Of an `OffsetNet` Q has OUTPUTS TERMS channels, all values first, then term by term.
     """
 
     cfg: SmallNet
@@ -141,4 +134,4 @@ class Critic(nn.Module):
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> tuple[jax.Array, jax.Array]:
         features = Trunk(self.cfg, self.by_taps, name="trunk")(maps)
-        return Head(self.cfg, OUTPUTS * terms(self.cfg), name="head")(features), features
+        return Head(self.cfg, name="head")(features), features

@@ -37,7 +37,6 @@ class Networks:
     height_scale: float = 0.05  # m, becomes 1; a block's height
     colour_scale: Any = (0.5, 1.0)  # mean and standard deviation, of all colours or of each [3]
     zoom: int = 0  # pixels of the input per cell of the map; 0: any number of states at a time
-    terms: int = 1  # numbers of each output in a cell, `dense.TERMS` where Q varies inside cells
     one_vector: bool = False  # the optimiser sees one vector: a GPU is slow with many small arrays
 
     def inputs(
@@ -85,8 +84,7 @@ def make(cfg: NetConfig, critic: Any = None) -> Networks:
         return Networks(critic, dense.Head(SmallNet(head=cfg.head)), critic.stride, cfg.colour)
     if isinstance(cfg, SmallNet):
         stride = cfg.stride // cfg.subcells
-        terms = dense.terms(cfg)
-        return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour, terms=terms)
+        return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour)
     modules = densenet.DenseNetCritic(cfg), densenet.DenseNetHead(cfg)
     scales = densenet.HEIGHT_SCALE, densenet.COLOUR_SCALE
     return Networks(*modules, cfg.output_stride, cfg.colour, *scales, cfg.zoom, one_vector=True)

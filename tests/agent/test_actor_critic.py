@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from csac_jax.agent import actor, actor_critic, maps
+from csac_jax.agent import actor, actor_critic, critic, maps, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
 from csac_jax.agent.learner import Transition
 from csac_jax.agent.maps import DenseMaps
@@ -56,7 +56,7 @@ def update(learner):
 
     @jax.jit
     def one(state, batch, weights):
-        return actor_critic.update_critic(jax.random.key(3), learner, state, batch, weights)
+        return critic.update(jax.random.key(3), learner, state, batch, weights)
 
     return lambda state, batch, weights=None: one(
         state, batch, jnp.ones(B) if weights is None else weights
@@ -85,9 +85,7 @@ def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
     Where everything ends the target is the reward, so that the error tells Q. Both primitives,
     poses all over.
     """
-    look = jax.jit(
-        lambda params, obs: actor_critic.dense_maps(learner, params, heightmap.unpack(obs)).q
-    )
+    look = jax.jit(lambda params, obs: values.dense_maps(learner, params, heightmap.unpack(obs)).q)
     read = jax.jit(jax.vmap(lambda q, p, pose: maps.read(learner.frames, q, p, pose)))
     q = look(state.online, batch.obs)
     rng = np.random.default_rng(0)
@@ -143,9 +141,7 @@ def test_target_carries_no_gradient(learner, state, batch):
     def loss(online, target, reward):
         before = state.replace(online=online, target=target)
         seen = batch.replace(reward=reward)
-        return actor_critic.update_critic(jax.random.key(3), learner, before, seen, jnp.ones(B))[
-            1
-        ].critic_loss
+        return critic.update(jax.random.key(3), learner, before, seen, jnp.ones(B))[1].critic_loss
 
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(state.online, state.target, batch.reward)
     online, target, reward = gradient
@@ -159,9 +155,7 @@ def test_critic_gradient_is_that_of_its_loss(learner, state, batch):
     plain = dataclasses.replace(learner, critic_optimiser=optax.sgd(1.0))
     weights = jnp.linspace(0.2, 1.0, B)
     run = jax.jit(
-        lambda state: actor_critic.update_critic(
-            jax.random.key(3), plain, state, _ended(batch), weights
-        )
+        lambda state: critic.update(jax.random.key(3), plain, state, _ended(batch), weights)
     )
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.critic, after.online.critic)
@@ -191,7 +185,7 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
     pose jumps. The step is so long that float32's rounding of the loss, 1e-8, is 1e-5 of the slope.
     """
     plain = dataclasses.replace(learner, actor_optimiser=optax.sgd(1.0))
-    run = jax.jit(lambda state: actor_critic.update_actor(plain, state, observations(B, 4)))
+    run = jax.jit(lambda state: actor.update(plain, state, observations(B, 4)))
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.actor, after.online.actor)
     _check_slope(
@@ -206,14 +200,12 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
 def test_actor_climbs_the_critic(learner, state, batch):
     """Claim: updates of the actor raise Q(s, mu(s)) and leave the critic and both targets as they
     are."""
-    run = jax.jit(
-        lambda state: actor_critic.update_actor(learner, state, heightmap.unpack(batch.obs))
-    )
+    run = jax.jit(lambda state: actor.update(learner, state, heightmap.unpack(batch.obs)))
 
     @jax.jit
     def value(online: Params) -> jax.Array:
         """Mean of Q(s, mu(s)) over states and primitives."""
-        seen = actor_critic.dense_maps(learner, online, heightmap.unpack(batch.obs))
+        seen = values.dense_maps(learner, online, heightmap.unpack(batch.obs))
         poses = [
             jax.vmap(lambda one, p=p: actor.pose(learner.frames, one, p))(seen) for p in Primitive
         ]
@@ -301,7 +293,7 @@ def test_next_value_lies_within_the_map(learner):
     for beta in (0.0, 1e5):
         target = with_constants(TargetConfig(), samples=256, inverse_temperature=beta)
         own = _changed(learner, target=target)
-        run = jax.jit(jax.vmap(lambda key, own=own: actor_critic.next_value(own, key, state)))
+        run = jax.jit(jax.vmap(lambda key, own=own: critic.next_value(own, key, state)))
         values = np.asarray(run(jax.random.split(jax.random.key(1), 16)))
         assert np.all((values >= low) & (values <= high))
         means.append(values.mean())
@@ -321,7 +313,7 @@ def test_inverse_temperature_follows_the_range_of_q(learner):
         own = _changed(learner, target=with_constants(cfg, inverse_temperature=beta))
         own = dataclasses.replace(own, bounds=bounds)
         scaled = state.replace(q=q_scale * state.q)
-        run = jax.jit(lambda key: actor_critic.next_value(own, key, scaled))
+        run = jax.jit(lambda key: critic.next_value(own, key, scaled))
         return float(run(jax.random.key(1)))
 
     plain = value(1.0, 1.0, (-2.0, 4.0))
@@ -336,7 +328,7 @@ def test_next_value_ignores_what_is_bare(learner):
     q = jnp.stack([jnp.full((8, 18, 18), 3.0), jnp.full((8, 18, 18), 1.0)])
     assert q.shape[1:] == learner.frames.xy.shape[:3]
     value = jax.jit(
-        lambda valid: actor_critic.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
+        lambda valid: critic.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
     )
     grasps = jnp.zeros(q.shape, bool).at[Primitive.GRASP].set(True)
     np.testing.assert_allclose(value(grasps), 1.0, rtol=1e-5)
@@ -352,15 +344,13 @@ def test_best_grasp():
     q[Primitive.PUSH] += 9.0
     best = max(q[Primitive.GRASP][valid[Primitive.GRASP]])
     state = DenseMaps(jnp.asarray(q), jnp.asarray(q), jnp.asarray(valid))
-    assert actor_critic.best_grasp(state) == best < 0.0
-    assert actor_critic.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0
+    assert values.best_grasp(state) == best < 0.0
+    assert values.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0
 
 
 def _run(learner: ActorCritic):
     return jax.jit(
-        lambda state, batch: actor_critic.update_critic(
-            jax.random.key(3), learner, state, batch, jnp.ones(B)
-        )
+        lambda state, batch: critic.update(jax.random.key(3), learner, state, batch, jnp.ones(B))
     )
 
 
@@ -377,10 +367,10 @@ def test_max_target_is_the_best_valid_cell(learner):
     of the softmax over the map; without a valid cell, over all."""
     own, state = _changed(learner, target=TargetConfig(value="max")), _random_maps((2, 4, 6, 6))
     best = np.asarray(state.q)[np.asarray(state.valid)].max()
-    assert actor_critic.next_value(own, jax.random.key(0), state) == best
+    assert critic.next_value(own, jax.random.key(0), state) == best
     np.testing.assert_allclose(exact_softmax(state.q, 1e6, state.valid), best, rtol=1e-6)
     assert (
-        actor_critic.next_value(
+        critic.next_value(
             own, jax.random.key(0), state.replace(valid=jnp.zeros(state.q.shape, bool))
         )
         == 5.0
@@ -398,16 +388,16 @@ def test_a_policy_that_never_pushes_expects_nothing_of_pushes(learner, value):
     )
     state = _smooth(learner.frames)
     high = state.replace(q=state.q.at[Primitive.PUSH].add(3.0))
-    run = jax.jit(lambda s: actor_critic.next_value(own, jax.random.key(0), s))
+    run = jax.jit(lambda s: critic.next_value(own, jax.random.key(0), s))
     assert run(state) == run(high) <= float(state.q[Primitive.GRASP].max())
 
 
 def test_max_target_reaches_the_update(learner, state, batch, update):
     """Claim: y = r + gamma max Q'(s', .), by NumPy from the target critic's maps."""
     own = _changed(learner, target=TargetConfig(value="max", gamma=0.5))
-    seen = jax.jit(
-        lambda params, obs: actor_critic.dense_maps(learner, params, heightmap.unpack(obs))
-    )(state.target, batch.next_obs)
+    seen = jax.jit(lambda params, obs: values.dense_maps(learner, params, heightmap.unpack(obs)))(
+        state.target, batch.next_obs
+    )
     best = np.where(seen.valid, seen.q, -np.inf).reshape(B, -1).max(axis=1)
     going, ended = _run(own)(state, batch)[1].error, update(state, _ended(batch))[1].error
     np.testing.assert_allclose(going - ended, 0.5 * np.clip(best, *learner.bounds), atol=1e-5)
@@ -432,14 +422,14 @@ def test_decisions_see_the_mean_of_the_critics(learner, observations, randomised
     with jax.numpy_dtype_promotion("standard"):
         params = randomised(actor_critic.init(jax.random.key(0), twin)).online
     obs = observations(2, 4)
-    look = jax.jit(lambda params: actor_critic.decision_maps(twin, params, obs))
+    look = jax.jit(lambda params: values.decision_maps(twin, params, obs))
     both, single = look(params), [look(_one(params, m)) for m in (0, 1)]
     np.testing.assert_allclose(both.q, 0.5 * (single[0].q + single[1].q), atol=1e-5)
-    plain = jax.jit(lambda params: actor_critic.dense_maps(twin, params, obs))(params)
+    plain = jax.jit(lambda params: values.dense_maps(twin, params, obs))(params)
     np.testing.assert_array_equal(both.valid, plain.valid)
     assert np.abs(np.asarray(both.q - plain.q)).max() > 0.05
     off = _changed(twin, policy={"augment": False})
-    same = jax.jit(lambda params: actor_critic.decision_maps(off, params, obs))(params)
+    same = jax.jit(lambda params: values.decision_maps(off, params, obs))(params)
     jax.tree.map(np.testing.assert_array_equal, same, plain)
 
 
@@ -455,7 +445,7 @@ def test_height_bonus_adds_to_q(learner, observations, randomised, kind):
     size = round(frames.extent / frames.tables.cell)
     step = np.where(np.arange(size) < size // 2, 0.02, 0.08).astype(np.float32)  # along x
     obs = observations(1, 4).replace(height=jnp.broadcast_to(step, (1, size, size)))
-    looks = actor_critic.dense_maps, actor_critic.decision_maps, actor_critic.exploration_maps
+    looks = values.dense_maps, values.decision_maps, values.exploration_maps
     plain, *raised = (jax.jit(lambda p, o, f=f: f(high, p, o))(params, obs) for f in looks)
     x, outermost = frames.xy[..., 0], np.abs(frames.xy).max(axis=-1)
     sure = (outermost < 0.5 * frames.extent - frames.cell) & (np.abs(x) > frames.cell)
@@ -486,7 +476,7 @@ def test_twin_critics(learner, batch, randomised):
     with jax.numpy_dtype_promotion("standard"):
         state = randomised(begun)
     look = jax.jit(
-        lambda params: actor_critic.dense_maps(learner, params, heightmap.unpack(batch.next_obs))
+        lambda params: values.dense_maps(learner, params, heightmap.unpack(batch.next_obs))
     )
     both, single = look(state.target), [look(_one(state.target, m)) for m in (0, 1)]
     np.testing.assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
@@ -520,8 +510,8 @@ def test_without_an_actor(learner, state, observations):
     """Claim: without an actor the logits are the critic's map, ten to one, and an update of the
     actor is none."""
     own = _changed(learner, learn={"actor": False})
-    seen = jax.jit(lambda obs: actor_critic.dense_maps(own, state.online, obs))(observations(2, 4))
+    seen = jax.jit(lambda obs: values.dense_maps(own, state.online, obs))(observations(2, 4))
     np.testing.assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
-    after, loss = actor_critic.update_actor(own, state, observations(2, 4))
+    after, loss = actor.update(own, state, observations(2, 4))
     jax.tree.map(np.testing.assert_array_equal, after, state)
     assert loss == 0.0

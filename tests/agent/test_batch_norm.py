@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from csac_jax.agent import actor_critic
+from csac_jax.agent import actor, actor_critic, critic, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.learner import Transition
 from csac_jax.config import DenseNet121
@@ -69,9 +69,7 @@ def batch(observations) -> Transition:
 def update(learner):
     """(state, batch) -> state, info of one update of the critic."""
     return jax.jit(
-        lambda state, batch: actor_critic.update_critic(
-            jax.random.key(3), learner, state, batch, jnp.ones(B)
-        )
+        lambda state, batch: critic.update(jax.random.key(3), learner, state, batch, jnp.ones(B))
     )
 
 
@@ -101,7 +99,7 @@ def _same(first: Any, other: Any) -> None:
 def test_acting_uses_running_statistics(learner, state, observations):
     """Claim: a state's maps do not depend on what else is looked at, but on the running statistics
     of both nets."""
-    look = jax.jit(lambda params, obs: actor_critic.dense_maps(learner, params, obs))
+    look = jax.jit(lambda params, obs: values.dense_maps(learner, params, obs))
     obs = observations(2, 4)
     others = jax.tree.map(lambda leaf: leaf.at[1].set(jnp.zeros((), leaf.dtype)), obs)
     both, one = look(state.online, obs), look(state.online, others)
@@ -181,7 +179,7 @@ def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
     """Claim: an update of the actor moves its parameters and statistics, and none of the
     critic's."""
     obs = heightmap.unpack(batch.obs)
-    after, _ = jax.jit(lambda state: actor_critic.update_actor(learner, state, obs))(state)
+    after, _ = jax.jit(lambda state: actor.update(learner, state, obs))(state)
     assert _differ(state.online.actor["batch_stats"], after.online.actor["batch_stats"])
     assert np.any(
         state.online.actor["params"]["conv1"]["kernel"]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.agent import actor_critic, maps
+from csac_jax.agent import actor_critic, maps, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import DenseNet121, HeightmapConfig, SmallNet
@@ -50,7 +50,7 @@ def net(request, cfg) -> Fixed:
         lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), abstract
     )
     return Fixed(
-        learner, params, jax.jit(lambda params, obs: actor_critic.dense_maps(learner, params, obs))
+        learner, params, jax.jit(lambda params, obs: values.dense_maps(learner, params, obs))
     )
 
 

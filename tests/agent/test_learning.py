@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.constants import Primitive
 from csac_jax.env import State
@@ -66,7 +66,7 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
         keys = jax.vmap(jax.random.fold_in, (None, 0))(
             jax.random.fold_in(key, i), jnp.arange(EPISODES)
         )
-        dense_maps = actor_critic.dense_maps(learner, params, state.obs)
+        dense_maps = values.dense_maps(learner, params, state.obs)
         best = jax.vmap(policy.best_action, (0, None, 0, 0))
         action = best(keys, learner, dense_maps, state.steps_without_change)
         after = jax.vmap(toy.step)(state, action)
@@ -76,7 +76,7 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
 
     first = jax.vmap(lambda i: toy.reset(jax.random.fold_in(key, i)))(1000 + jnp.arange(EPISODES))
     last, primitives = jax.lax.scan(act, first, jnp.arange(toy.cfg.task.max_actions))
-    return actor_critic.dense_maps(learner, params, first.obs), last, primitives
+    return values.dense_maps(learner, params, first.obs), last, primitives
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.config import SmallNet
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
@@ -343,7 +343,7 @@ def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
     turned = jax.tree.map(
         lambda field: jnp.rot90(field, -1, axes=(1, 2)), scenes
     )  # rows are y: this is +90 degrees
-    look = jax.jit(lambda obs: actor_critic.dense_maps(four, params, obs))
+    look = jax.jit(lambda obs: values.dense_maps(four, params, obs))
     before, after = look(scenes), look(turned)
     for k in (0, 2):
         np.testing.assert_array_equal(after.valid[:, :, k + 1], before.valid[:, :, k])
