@@ -132,7 +132,7 @@ def rotated_inputs(frames: Frames, obs: Observation) -> jax.Array:
 
 
 def unfold(halves: jax.Array) -> jax.Array:
-    """Unfolds net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] to all K, [P, K, h, w]."""
+    """Returns net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] for all K: [P, K, h, w]."""
     ahead, back, grasp = (halves[..., output] for output in range(dense.OUTPUTS))
     return jnp.stack([_all_frames(ahead, back), _all_frames(grasp, grasp)])
 
