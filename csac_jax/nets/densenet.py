@@ -77,7 +77,7 @@ class BatchNorm(nn.Module):
 
 
 def _norm(cfg: DenseNet121, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
-    """Joins and normalises pieces: [..., F]; with `train` batch norm uses the batch's statistics."""
+    """Joins and normalises pieces: [..., F]; with `train` batch norm takes batch statistics."""
     dtype = compute_dtype(cfg)
     maps, *statistics = (jnp.concatenate(leaves, axis=-1) for leaves in zip(*pieces, strict=True))
     if cfg.norm == "batch":

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.agent import actor, actor_critic, critic, maps, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
@@ -98,7 +99,7 @@ def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
         )
         tried = _ended(batch).replace(action=action)
         got = tried.reward - update(state, tried)[1].error
-        np.testing.assert_allclose(got, read(q, action.primitive, action.pose), atol=2e-5)
+        assert_allclose(got, read(q, action.primitive, action.pose), atol=2e-5)
     assert np.std(q) > 0.05
 
 
@@ -107,11 +108,9 @@ def test_update_reports_its_loss(learner, state, batch, update):
     counted."""
     after, info = update(state, batch)
     width = learner.cfg.learn.huber
-    np.testing.assert_allclose(
-        info.critic_loss, np.mean(optax.huber_loss(info.error, delta=width)), rtol=1e-5
-    )
+    assert_allclose(info.critic_loss, np.mean(optax.huber_loss(info.error, delta=width)), rtol=1e-5)
     ended = update(state, _ended(batch))[1]
-    np.testing.assert_allclose(ended.q, np.mean(batch.reward - ended.error), atol=1e-6)
+    assert_allclose(ended.q, np.mean(batch.reward - ended.error), atol=1e-6)
     assert after.updates == state.updates + 1
 
 
@@ -121,16 +120,14 @@ def test_losses_are_weighted(learner, state, batch, update):
     weights = jnp.array([0.0, 0.25, 1.0, 0.5, 0.0, 1.0])
     after, info = update(state, batch, weights)
     loss = optax.huber_loss(info.error, delta=learner.cfg.learn.huber)
-    np.testing.assert_allclose(
-        info.critic_loss, np.mean(np.asarray(weights) * np.asarray(loss)), rtol=1e-5
-    )
+    assert_allclose(info.critic_loss, np.mean(np.asarray(weights) * np.asarray(loss)), rtol=1e-5)
     _, plain = update(state, batch)
-    np.testing.assert_array_equal(info.error, plain.error)
-    np.testing.assert_array_equal(info.q, plain.q)
+    assert_array_equal(info.error, plain.error)
+    assert_array_equal(info.q, plain.q)
     other, _ = update(
         state, batch.replace(reward=batch.reward.at[jnp.array([0, 4])].add(3.0)), weights
     )
-    jax.tree.map(np.testing.assert_array_equal, after.online, other.online)
+    jax.tree.map(assert_array_equal, after.online, other.online)
 
 
 @pytest.mark.slow
@@ -146,7 +143,7 @@ def test_target_carries_no_gradient(learner, state, batch):
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(state.online, state.target, batch.reward)
     online, target, reward = gradient
     for leaf in jax.tree.leaves((target, reward, online.actor)):
-        np.testing.assert_array_equal(leaf, 0.0)
+        assert_array_equal(leaf, 0.0)
     assert all(np.any(np.asarray(leaf) != 0.0) for leaf in jax.tree.leaves(online.critic))
 
 
@@ -174,7 +171,7 @@ def _check_slope(loss, params, gradient, relative: float = 1e-2, step: float = 2
         loss(jax.tree.map(lambda p, g, s=sign: p + s * step / size * g, params, gradient))
         for sign in (1.0, -1.0)
     )
-    np.testing.assert_allclose((above - below) / (2.0 * step), size, rtol=relative)
+    assert_allclose((above - below) / (2.0 * step), size, rtol=relative)
 
 
 def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
@@ -217,11 +214,11 @@ def test_actor_climbs_the_critic(learner, state, batch):
     current, first = run(state)
     for _ in range(60):
         current, _ = run(current)
-    np.testing.assert_allclose(first, -value(state.online), atol=1e-6)
+    assert_allclose(first, -value(state.online), atol=1e-6)
     assert value(current.online) > value(state.online) + 0.004
     for name in ("critic_optimiser", "target", "updates"):
-        jax.tree.map(np.testing.assert_array_equal, getattr(current, name), getattr(state, name))
-    jax.tree.map(np.testing.assert_array_equal, current.online.critic, state.online.critic)
+        jax.tree.map(assert_array_equal, getattr(current, name), getattr(state, name))
+    jax.tree.map(assert_array_equal, current.online.critic, state.online.critic)
 
 
 def test_updates_lower_the_loss(state, batch, update):
@@ -233,7 +230,7 @@ def test_updates_lower_the_loss(state, batch, update):
         current, info = update(current, _ended(batch))
         losses.append(float(jnp.mean(info.error**2)))
     assert losses[-1] < 0.5 * losses[0]
-    jax.tree.map(np.testing.assert_array_equal, current.online.actor, state.online.actor)
+    jax.tree.map(assert_array_equal, current.online.actor, state.online.actor)
 
 
 def test_target_moves_by_tau(learner, state, batch, update):
@@ -244,9 +241,7 @@ def test_target_moves_by_tau(learner, state, batch, update):
     wanted = jax.tree.map(
         lambda new, old: tau * new + (1.0 - tau) * old, after.online, state.target
     )
-    jax.tree.map(
-        lambda got, want: np.testing.assert_allclose(got, want, atol=1e-7), after.target, wanted
-    )
+    jax.tree.map(lambda got, want: assert_allclose(got, want, atol=1e-7), after.target, wanted)
     moved = jax.tree.map(
         lambda new, old: float(np.abs(new - old).max()), after.online.critic, state.online.critic
     )
@@ -264,8 +259,8 @@ def test_bootstrap(learner, state, batch, update, value):
         for t in (half & False, half | True, half)
     )
     gain = learner.cfg.target.gamma * np.clip(value, *learner.bounds)
-    np.testing.assert_allclose(going - ended, gain, atol=1e-5)
-    np.testing.assert_allclose(mixed - ended, np.where(half, 0.0, gain), atol=1e-5)
+    assert_allclose(going - ended, gain, atol=1e-5)
+    assert_allclose(mixed - ended, np.where(half, 0.0, gain), atol=1e-5)
 
 
 def _smooth(frames) -> DenseMaps:
@@ -318,8 +313,8 @@ def test_inverse_temperature_follows_the_range_of_q(learner):
 
     plain = value(1.0, 1.0, (-2.0, 4.0))
     assert abs(plain) > 0.1
-    np.testing.assert_allclose(value(10.0, 1.0, (-20.0, 40.0)), 10.0 * plain, rtol=1e-5)
-    np.testing.assert_allclose(value(1.0, 2.0, (-4.0, 8.0)), plain, rtol=1e-6)
+    assert_allclose(value(10.0, 1.0, (-20.0, 40.0)), 10.0 * plain, rtol=1e-5)
+    assert_allclose(value(1.0, 2.0, (-4.0, 8.0)), plain, rtol=1e-6)
 
 
 def test_next_value_ignores_what_is_bare(learner):
@@ -331,8 +326,8 @@ def test_next_value_ignores_what_is_bare(learner):
         lambda valid: critic.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
     )
     grasps = jnp.zeros(q.shape, bool).at[Primitive.GRASP].set(True)
-    np.testing.assert_allclose(value(grasps), 1.0, rtol=1e-5)
-    np.testing.assert_allclose(value(~grasps), 3.0, rtol=1e-5)
+    assert_allclose(value(grasps), 1.0, rtol=1e-5)
+    assert_allclose(value(~grasps), 3.0, rtol=1e-5)
     assert 1.0 < value(jnp.zeros(q.shape, bool)) <= 3.0
 
 
@@ -368,7 +363,7 @@ def test_max_target_is_the_best_valid_cell(learner):
     own, state = _changed(learner, target=TargetConfig(value="max")), _random_maps((2, 4, 6, 6))
     best = np.asarray(state.q)[np.asarray(state.valid)].max()
     assert critic.next_value(own, jax.random.key(0), state) == best
-    np.testing.assert_allclose(exact_softmax(state.q, 1e6, state.valid), best, rtol=1e-6)
+    assert_allclose(exact_softmax(state.q, 1e6, state.valid), best, rtol=1e-6)
     assert (
         critic.next_value(
             own, jax.random.key(0), state.replace(valid=jnp.zeros(state.q.shape, bool))
@@ -400,14 +395,14 @@ def test_max_target_reaches_the_update(learner, state, batch, update):
     )
     best = np.where(seen.valid, seen.q, -np.inf).reshape(B, -1).max(axis=1)
     going, ended = _run(own)(state, batch)[1].error, update(state, _ended(batch))[1].error
-    np.testing.assert_allclose(going - ended, 0.5 * np.clip(best, *learner.bounds), atol=1e-5)
+    assert_allclose(going - ended, 0.5 * np.clip(best, *learner.bounds), atol=1e-5)
 
 
 @pytest.mark.slow
 def test_squared_loss_reaches_the_update(learner, state, batch):
     """Claim: with `squared` the loss is the mean of the squared errors, line 21."""
     info = _run(_changed(learner, learn={"loss": "squared"}))(state, batch)[1]
-    np.testing.assert_allclose(info.critic_loss, np.mean(np.asarray(info.error) ** 2), rtol=1e-5)
+    assert_allclose(info.critic_loss, np.mean(np.asarray(info.error) ** 2), rtol=1e-5)
 
 
 def _one(params: Params, m: int) -> Params:
@@ -424,13 +419,13 @@ def test_decisions_see_the_mean_of_the_critics(learner, observations, randomised
     obs = observations(2, 4)
     look = jax.jit(lambda params: values.decision_maps(twin, params, obs))
     both, single = look(params), [look(_one(params, m)) for m in (0, 1)]
-    np.testing.assert_allclose(both.q, 0.5 * (single[0].q + single[1].q), atol=1e-5)
+    assert_allclose(both.q, 0.5 * (single[0].q + single[1].q), atol=1e-5)
     plain = jax.jit(lambda params: values.dense_maps(twin, params, obs))(params)
-    np.testing.assert_array_equal(both.valid, plain.valid)
+    assert_array_equal(both.valid, plain.valid)
     assert np.abs(np.asarray(both.q - plain.q)).max() > 0.05
     off = _changed(twin, policy={"augment": False})
     same = jax.jit(lambda params: values.decision_maps(off, params, obs))(params)
-    jax.tree.map(np.testing.assert_array_equal, same, plain)
+    jax.tree.map(assert_array_equal, same, plain)
 
 
 @pytest.mark.parametrize("kind", ["small", "offset"])
@@ -454,14 +449,14 @@ def test_height_bonus_adds_to_q(learner, observations, randomised, kind):
     pose = jnp.array([0.3 * frames.extent, 0.013, 0.4])
     for state in raised:
         got = np.asarray(state.q - plain.q)[0][:, sure]
-        np.testing.assert_allclose(got, np.broadcast_to(expected, got.shape), atol=1e-5)
-        np.testing.assert_array_equal(state.logits, plain.logits)
-        np.testing.assert_array_equal(state.valid, plain.valid)
+        assert_allclose(got, np.broadcast_to(expected, got.shape), atol=1e-5)
+        assert_array_equal(state.logits, plain.logits)
+        assert_array_equal(state.valid, plain.valid)
         between = [
             maps.read_q(frames, jax.tree.map(lambda leaf: leaf[0], one), jnp.int32(1), pose)
             for one in (state, plain)
         ]
-        np.testing.assert_allclose(between[0] - between[1], 3.0 * 0.08, atol=1e-5)
+        assert_allclose(between[0] - between[1], 3.0 * 0.08, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -479,23 +474,17 @@ def test_twin_critics(learner, batch, randomised):
         lambda params: values.dense_maps(learner, params, heightmap.unpack(batch.next_obs))
     )
     both, single = look(state.target), [look(_one(state.target, m)) for m in (0, 1)]
-    np.testing.assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
+    assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
     assert 0.1 < np.mean(single[0].q < single[1].q) < 0.9
 
     run, alone = _run(twin), _run(learner)
     ended = run(state, _ended(batch))[1]
     infos = [alone(_alone(learner, state, m), _ended(batch))[1] for m in (0, 1)]
-    np.testing.assert_allclose(
-        ended.critic_loss, sum(info.critic_loss for info in infos), rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        ended.error, np.mean([info.error for info in infos], axis=0), atol=1e-5
-    )
+    assert_allclose(ended.critic_loss, sum(info.critic_loss for info in infos), rtol=1e-5)
+    assert_allclose(ended.error, np.mean([info.error for info in infos], axis=0), atol=1e-5)
     best = np.where(both.valid, both.q, -np.inf).reshape(B, -1).max(axis=1)
     going = run(state, batch)[1].error - ended.error
-    np.testing.assert_allclose(
-        going, twin.cfg.target.gamma * np.clip(best, *learner.bounds), atol=1e-5
-    )
+    assert_allclose(going, twin.cfg.target.gamma * np.clip(best, *learner.bounds), atol=1e-5)
 
 
 def _alone(learner: ActorCritic, state: LearnerState, m: int) -> LearnerState:
@@ -511,7 +500,7 @@ def test_without_an_actor(learner, state, observations):
     actor is none."""
     own = _changed(learner, learn={"actor": False})
     seen = jax.jit(lambda obs: values.dense_maps(own, state.online, obs))(observations(2, 4))
-    np.testing.assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
+    assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
     after, loss = actor.update(own, state, observations(2, 4))
-    jax.tree.map(np.testing.assert_array_equal, after, state)
+    jax.tree.map(assert_array_equal, after, state)
     assert loss == 0.0

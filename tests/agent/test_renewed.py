@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.agent import actor_critic, critic, rewards, values
 from csac_jax.agent.actor_critic import ActorCritic
@@ -79,16 +80,14 @@ def test_early_label_is_renewed(renewing, observations):
         batch = _batch(observations, stored, reward)
         for weight, label in ((0.0, -0.5), (1.0, 0.5), (-1.0, -0.5)):
             wanted = np.where(pushed, label, reward)
-            np.testing.assert_allclose(
-                _renewed(renewing, jnp.float32(weight), batch), wanted, atol=1e-6
-            )
+            assert_allclose(_renewed(renewing, jnp.float32(weight), batch), wanted, atol=1e-6)
 
 
 def test_stored_label_stays_as_an_option(cfg, observations):
     """Claim: by `push_effect` value the reward is the stored one, and no label is."""
     learner = actor_critic.make(cfg, Height())
     batch = _batch(observations, False, -0.5).replace(push_better=None)
-    np.testing.assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
+    assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
     assert step.example(learner.cfg).push_better is None
     assert step.example(cfg.change(reward={"push_effect": "renewed"})).push_better.dtype == bool
 
@@ -104,7 +103,7 @@ def test_update_does_not_depend_on_the_stored_label(renewing, observations):
         weights = jnp.ones(B // 2)
         update = critic.update(jax.random.key(1), renewing, state, batch, weights)
         errors.append(update[1].error)
-    np.testing.assert_array_equal(*errors)
+    assert_array_equal(*errors)
 
 
 @pytest.mark.parametrize("num", [1, 5])
@@ -118,7 +117,7 @@ def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
     for seed in range(3):
         wanted = np.random.default_rng(seed).random(num) < 0.5
         found = best_grasps(jnp.asarray(wanted))
-        np.testing.assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+        assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
 
 
 def test_replicas_ask_for_the_neediests_quarters(
@@ -143,7 +142,7 @@ def test_replicas_ask_for_the_neediests_quarters(
     ask = functools.partial(values.best_grasps, learner, state.target, obs)
     found = jax.jit(jax.vmap(ask))(jnp.asarray(wanted))
     jax.effects_barrier()
-    np.testing.assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+    assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
     assert len(passed) == 2
 
 
