@@ -290,8 +290,7 @@ class SmallNet(Section, section="net"):
 
     dtype = "auto"  # bfloat16 on accelerators, float32 on a CPU; parameters are float32
 
-    kind: Literal["small"] = "small"
-    """`small`; `offset`: Q varies inside cells; `densenet121`: the paper's, 100 times the work."""
+    kind: Literal["small"] = "small"  # `densenet121` is the paper's: 100 times the work.
     rotations: int = _bounded(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
     colour: bool = True  # Whether the net sees colours, or heights alone.
     gripper: bool = False  # Whether it sees the gripper's opening and the size of its fingers.
@@ -313,15 +312,6 @@ class SmallNet(Section, section="net"):
         """Raises ValueError if the strides do not divide the rotated maps of `size` cells."""
         side = canvas_size(size, self.margin)
         _require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4")
-
-
-class OffsetNet(SmallNet, section="net"):
-    """The small net with Q continuous in the action: beside a value, each cell has slopes and
-    curvatures along x, y and yaw, by which Q goes on inside it (ours; `agent/offsets.py`)."""
-
-    # mypy has no word for the tag of a union that a subclass takes its own of.
-    kind: Literal["offset"] = "offset"  # type: ignore[assignment]
-    """`small`; `offset`: Q varies inside cells; `densenet121`: the paper's, 100 times the work."""
 
 
 class DenseNet121(Section, section="net"):
@@ -363,7 +353,7 @@ class DenseNet121(Section, section="net"):
             )
 
 
-NetConfig = SmallNet | DenseNet121 | OffsetNet
+NetConfig = SmallNet | DenseNet121
 
 
 def canvas_size(size: int, margin: float) -> int:
@@ -583,7 +573,7 @@ class TrainConfig(Section, section="train"):
 
 
 ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
-    "net": ("kind", (SmallNet, DenseNet121, OffsetNet)),
+    "net": ("kind", (SmallNet, DenseNet121)),
     "replay": ("sampler", (UniformReplay, PrioritisedReplay, BetaReplay, OppositeReplay)),
 }
 """Sections that are unions: the field that names the alternative, and the alternatives."""
@@ -641,9 +631,6 @@ class Config(Section):
             is_off = getattr(self.sensor, name) == getattr(SensorConfig, name)
             fits = is_off or self.heightmap.view == "oblique"
             _require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
-        # Slopes and curvatures of Q change sides in a mirror image.
-        plain = not (self.policy.augment and isinstance(self.net, OffsetNet))
-        _require(plain, "policy.augment: must be off where net.kind is offset")
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         _require(rotations % 2 == 0, "net.rotations: must be even")

@@ -13,7 +13,6 @@ from csac_jax.config import (
     Config,
     ExploreConfig,
     LearnConfig,
-    OffsetNet,
     PolicyConfig,
     RewardConfig,
     TargetConfig,
@@ -111,7 +110,6 @@ def test_unknown_algorithm_names_the_known():
         (lambda: LearnConfig(critics=3), "learn.critics"),
         (lambda: LearnConfig(tau=0.0), "learn.tau"),
         (lambda: Config(policy=PolicyConfig(primitive="grasp")), "explore.push_fraction"),
-        (lambda: Config(policy=PolicyConfig(augment=True), net=OffsetNet()), "policy.augment"),
     ],
 )
 def test_bad_settings_are_refused(build, field):

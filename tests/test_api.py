@@ -13,7 +13,7 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, api, presets
-from csac_jax.agent import actor_critic
+from csac_jax.agent import actor_critic, values
 from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config, DenseNet121
 from csac_jax.errors import SettingsError
@@ -123,8 +123,8 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
     colour, height = rng.uniform(size=(*rows, 3)), 0.1 * rng.uniform(size=rows)
     mask = rng.uniform(size=rows) < np.array([0.0, 0.5, 1.0])[:, None, None]
     obs = Observation(jnp.float32(colour), jnp.float32(height), jnp.array(mask))
-    found = actor_critic.dense_maps(actor_critic.make(target), state.online, obs)
-    wanted = actor_critic.dense_maps(actor_critic.make(SMOKE), params, obs)
+    found = values.dense_maps(actor_critic.make(target), state.online, obs)
+    wanted = values.dense_maps(actor_critic.make(SMOKE), params, obs)
     np.testing.assert_allclose(found.q, wanted.q, rtol=1e-5, atol=1e-5)
     _assert_same(state.target, state.online)
 

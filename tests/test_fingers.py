@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from csac_jax import api, deploy, grippers, presets
-from csac_jax.agent import actor_critic, augment
+from csac_jax.agent import actor_critic, augment, values
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Transition
 from csac_jax.cli import main
@@ -200,7 +200,7 @@ def test_oracle_takes_what_fits(env: Env):
 def test_net_sees_the_fingers(states: State):
     """Claim: Q follows the fingers, which a stored observation keeps."""
     learner, params = actor_critic.make(CONFIG), _networks(CONFIG)
-    look = jax.jit(functools.partial(actor_critic.dense_maps, learner, params))
+    look = jax.jit(functools.partial(values.dense_maps, learner, params))
     obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
     same = obs.replace(fingers=obs.fingers[:1].repeat(2, axis=0))
     other = same.replace(fingers=same.fingers + 0.004)
@@ -222,8 +222,8 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
         learner = actor_critic.make(cfg)
         found = start(actor_critic.init(jax.random.key(3), learner)).online
         obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
-        seen = actor_critic.dense_maps(actor_critic.make(blind), params, obs.replace(fingers=None))
-        both = actor_critic.dense_maps(learner, found, obs)
+        seen = values.dense_maps(actor_critic.make(blind), params, obs.replace(fingers=None))
+        both = values.dense_maps(learner, found, obs)
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
     for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):
         other = blind.change(**changes)

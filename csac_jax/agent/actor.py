@@ -1,31 +1,30 @@
-"""The deterministic policy: one pose per primitive, a soft-argmax around the highest logit.
+"""The actor: one pose per primitive, a soft-argmax around the highest logit, and its update.
 
-Over the whole map it would lie between two peaks. It moves smoothly with the logits.
+A soft-argmax over the whole map would lie between two peaks. Around one cell it moves smoothly with
+the logits.
 """
+
+import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from csac_jax import geometry
-from csac_jax.agent import maps
+from csac_jax.agent import maps, values
+from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.maps import DenseMaps, Frames
+from csac_jax.nets import networks
+from csac_jax.vision.heightmap import Observation
 
-SHARPNESS = 10.0  # logit per unit of Q: how the critic's own map enters the actor's
 WINDOW = 2  # cells on each side of the highest one that the soft-argmax covers
 _INWARD = WINDOW + np.array([-1, -1, 0, 1, 1])  # of each row: the next one towards the middle
 
 
-def logits(q: jax.Array, correction: jax.Array) -> jax.Array:
-    """The actor's logits, any shape: the critic's map, without gradient, plus the head's output.
-
-    The policy gradient only moves a mode; the critic's map says where modes are.
-    """
-    return jax.lax.stop_gradient(q) * SHARPNESS + correction
-
-
 def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
-    """mu(s): pose [3] (x m, y m, yaw rad) of one primitive, differentiable in the logits."""
+    """Returns mu(s), the pose [3] (x m, y m, yaw rad) of one primitive; differentiable."""
     side, num = frames.side, frames.yaws.shape[0]
     best = maps.best_cells(state.logits[primitive], state.valid[primitive], 1)[0]
     k, row, col = jnp.unravel_index(best, (num, side, side))
@@ -50,10 +49,10 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
 def _along_yaw(
     frames: Frames, state: DenseMaps, primitive: int, xy: jax.Array, yaws: jax.Array
 ) -> jax.Array:
-    """Logits [3] at one place [2] m and three yaws [3]; -inf where the place is not valid.
+    """Interpolates logits [3] at a place [2] m and three yaws [3]; -inf where it is not valid.
 
-    Between cells only the valid ones are mixed: sum w_i l_i / sum w_i, w_i the bilinear weight of a
-    valid cell, 0 of any other. If none of the three is valid, the middle one counts.
+    Only valid cells are mixed: sum w_i l_i / sum w_i, where w_i is the bilinear weight of a valid
+    cell and 0 for any other. If none of the three is valid, the middle one counts.
     """
     valid = state.valid[primitive]
     valid |= ~jnp.any(valid)
@@ -64,3 +63,33 @@ def _along_yaw(
     is_valid = jax.vmap(lambda pose: maps.is_valid(frames, valid[None], jnp.int32(0), pose))(poses)
     middle = np.array([False, True, False]) & ~jnp.any(is_valid)
     return jnp.where(is_valid | middle, total / jnp.where(is_valid, weight, 1.0), -jnp.inf)
+
+
+def update(
+    learner: ActorCritic, state: LearnerState, obs: Observation
+) -> tuple[LearnerState, jax.Array]:
+    """Updates theta^mu up the critic, Algorithm 1 lines 22-23; also returns the loss [].
+
+    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for each
+    primitive that the policy takes; the loss is -J. Without an actor nothing changes and it is 0.
+    """
+    if not learner.cfg.learn.actor:
+        return state, jnp.zeros(())
+    frames, chosen = learner.frames, maps.allowed_primitives(learner.cfg.policy)
+    q, features = jax.lax.stop_gradient(values.critic_maps(learner, state.online.critic, obs))
+
+    def value(_: jax.Array, single: DenseMaps) -> jax.Array:
+        return maps.read(frames, single.q, jnp.int32(0), pose(frames, single, 0))
+
+    def loss(learned: Any) -> tuple[jax.Array, Any]:
+        variables = {**state.online.actor, **learned}
+        correction, statistics = networks.train(frames.networks.head, variables, features)
+        batch_maps = values.unfold_maps(learner, obs, q, correction)
+        per_state = functools.partial(maps.map_primitives, value, chosen=chosen)
+        return -jnp.mean(jax.vmap(per_state)(batch_maps)), statistics
+
+    before = networks.learned(state.online.actor)
+    (actor_loss, statistics), gradient = jax.value_and_grad(loss, has_aux=True)(before)
+    step, optimiser = learner.actor_optimiser.update(gradient, state.actor_optimiser)
+    online = state.online.replace(actor={**optax.apply_updates(before, step), **statistics})
+    return state.replace(online=online, actor_optimiser=optimiser), actor_loss

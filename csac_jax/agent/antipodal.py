@@ -29,19 +29,22 @@ CANDIDATES = 1024  # best grasps, of which the best within reach is chosen
 
 @struct.dataclass
 class Weights:
-    """What a grasp's flaws cost (ours, by `csac-jax bench geometric`; but for the noise, which only
-    helps where an episode goes on after two failures)."""
+    """Costs of a grasp's flaws.
+
+    Ours, by `csac-jax bench geometric`; the noise only helps where two failures do not end the
+    episode.
+    """
 
     tilt: float = 2.0  # of an edge against the pad, per rad
     offset: float = 10.0  # of the middle of what is held from the hand's, along the closing, per m
     middle: float = 10.0  # the same across, where the hand would turn what it lifts
     width: float = 2.5  # per m
     grip: float = 20.0  # gain per m that the tips reach below what lies between the pads
-    noise: float = 0.5  # added at random after each failure, so that another grasp's turn comes
+    noise: float = 0.5  # random, per failure: another grasp is tried
 
 
 class Profile(NamedTuple):
-    """What lies on one side of the middle of the hand, [K, S, S] each."""
+    """Surface on one side of the middle of the hand, [K, S, S] each."""
 
     edge: jax.Array  # m, farthest that is above the tips; 0 where nothing is
     filled: jax.Array  # m, of the way there that is above the tips
@@ -57,7 +60,7 @@ def grasp(
     failures: jax.Array,
     weights: Weights,
 ) -> Action:
-    """The best antipodal grasp of a height map, within the robot's reach.
+    """Returns the best antipodal grasp of a height map, within the robot's reach.
 
     Args: height [H, W] m; wanted [H, W] bool, where the middle of the hand may be; failures [],
     actions in a row that lifted nothing.
@@ -81,7 +84,7 @@ def grasp(
 
 
 def _places(cfg: Config, yaws: np.ndarray) -> np.ndarray:
-    """Where the cells of the rotated maps are [K, S, S, 2] m; columns run along the yaw."""
+    """Returns the cells of the rotated maps [K, S, S, 2] m; columns run along the yaw."""
     side = int(np.ceil(np.sqrt(2.0) * cfg.heightmap.size))
     along = (np.arange(side) - 0.5 * (side - 1)) * cfg.heightmap.cell
     across, ahead = np.meshgrid(along, along, indexing="ij")
@@ -90,14 +93,14 @@ def _places(cfg: Config, yaws: np.ndarray) -> np.ndarray:
 
 
 def _sampled(cfg: Config, values: jax.Array, places: np.ndarray) -> jax.Array:
-    """A map [H, W] at places [K, S, S, 2] m, 0 outside of it; [K, S, S]."""
+    """Samples a map [H, W] at places [K, S, S, 2] m, 0 outside of it; [K, S, S]."""
     cells = places / cfg.heightmap.cell + 0.5 * (cfg.heightmap.size - 1)
     row_col = [jnp.asarray(cells[..., axis], jnp.float32) for axis in (1, 0)]
     return jax.scipy.ndimage.map_coordinates(values, row_col, order=1)
 
 
 def _scores(cfg: Config, gripper: Gripper, maps: jax.Array, weights: Weights) -> jax.Array:
-    """How good the grasp above each cell is [K, S, S]; hardly any where a finger is in the way."""
+    """Scores the grasp above each cell, [K, S, S]; very low where a finger collides."""
     cell = cfg.heightmap.cell
     reach = round(0.5 * gripper.finger[1] / cell)  # rows that a finger covers on either side
     top = _window(_window(maps, -1, reach), -2, reach)
@@ -118,7 +121,7 @@ def _scores(cfg: Config, gripper: Gripper, maps: jax.Array, weights: Weights) ->
 
 
 class Hand(NamedTuple):
-    """The hand above every cell."""
+    """Hand above every cell."""
 
     gripper: Gripper
     cell: float  # m
@@ -128,17 +131,17 @@ class Hand(NamedTuple):
 
     @property
     def inner(self) -> int:
-        """Cells from the middle to an open finger."""
+        """Returns the cells from the middle to an open finger."""
         return int(self.gripper.half[1] / self.cell)
 
 
 def _covered(hand: Hand, maps: jax.Array) -> jax.Array:
-    """Share [K, S, S] of the cell that is above the tips: edges lie between cells."""
+    """Returns the share of the cell above the tips [K, S, S]: edges lie between cells."""
     return jnp.clip((maps - hand.tip) / hand.below, 0.0, 1.0)
 
 
 def _profile(hand: Hand, maps: jax.Array, way: int) -> Profile:
-    """What the finger on one side meets, `way` 1 ahead or -1 behind."""
+    """Measures the side that one finger meets, `way` 1 ahead or -1 behind."""
     gripper, cell = hand.gripper, hand.cell
     room = gripper.footprint[0] + 0.5 * cell
     under = gripper.half[1] + 0.5 * gripper.finger[0]  # m, middle of the finger
@@ -162,24 +165,24 @@ def _profile(hand: Hand, maps: jax.Array, way: int) -> Profile:
 
 
 def _aside(hand: Hand, maps: jax.Array) -> jax.Array:
-    """How far the middle of what is held is from the hand's, across the closing [K, S, S] m."""
+    """Measures the offset of the held part's middle across the closing [K, S, S] m."""
     lengths = []
     for way in (1, -1):
-        goes_on = _covered(hand, maps)
-        length = 0.5 * hand.cell * goes_on
+        connected = _covered(hand, maps)
+        length = 0.5 * hand.cell * connected
         for number in range(1, hand.inner + 1):
-            goes_on = goes_on * _covered(hand, _shifted(maps, -2, way * number))
-            length += hand.cell * goes_on
+            connected = connected * _covered(hand, _shifted(maps, -2, way * number))
+            length += hand.cell * connected
         lengths.append(length)
     return 0.5 * jnp.abs(lengths[0] - lengths[1])
 
 
 def _shifted(maps: jax.Array, axis: int, cells: int) -> jax.Array:
-    """Each value is that of the cell `cells` ahead along `axis`. Maps are 0 at their rims."""
+    """Shifts by `cells` along `axis`: each takes the value ahead. Maps are 0 at their rims."""
     return jnp.roll(maps, -cells, axis)
 
 
 def _window(maps: jax.Array, axis: int, reach: int) -> jax.Array:
-    """Highest within `reach` cells along `axis`."""
-    every = [_shifted(maps, axis, cells) for cells in range(-reach, reach + 1)]
-    return jnp.max(jnp.stack(every), axis=0)
+    """Returns the highest value within `reach` cells along `axis`."""
+    shifted = [_shifted(maps, axis, cells) for cells in range(-reach, reach + 1)]
+    return jnp.max(jnp.stack(shifted), axis=0)

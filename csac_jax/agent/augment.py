@@ -19,7 +19,7 @@ from csac_jax.vision.heightmap import PackedObservation
 def apply_symmetry(
     transition: Transition, mirror_x: jax.Array, mirror_y: jax.Array, swap: jax.Array
 ) -> Transition:
-    """The transition with x mirrored, then y mirrored, then x and y swapped; flags [] bool."""
+    """Mirrors x, then y, then swaps x and y in a transition, by flags [] bool."""
 
     def view(field: jax.Array) -> jax.Array:  # rows are y, columns x
         if field.ndim < 2:  # no map
@@ -42,15 +42,15 @@ def apply_symmetry(
 
 
 def random_symmetry(key: jax.Array, transition: Transition) -> Transition:
-    """The transition under one of the eight symmetries, each equally likely."""
+    """Applies one of the eight symmetries, each equally likely."""
     return apply_symmetry(transition, *jax.random.bernoulli(key, shape=(3,)))
 
 
 def shift(cfg: Config, transition: Transition, cells: jax.Array) -> Transition:
-    """The transition shifted by `cells` [2] int32 (row, col); cells that come in are bare table.
+    """Shifts a transition by `cells` [2] int32 (row, col); cells that come in are bare table.
 
-    The transition stays as it is where that would cut something off: a surface higher than BARE in
-    either map, the place of the action or the end of a push; or where a push is already cut off.
+    It stays unchanged where that would cut off a surface higher than BARE in either map, the place
+    of the action or the end of a push; or where a push is already cut off.
     """
     pose = transition.action.pose
     step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
@@ -68,21 +68,21 @@ def shift(cfg: Config, transition: Transition, cells: jax.Array) -> Transition:
 
 
 def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
-    """Whether an action at a pose [3] runs its full length above the workspace, [] bool."""
+    """Checks that an action at a pose [3] runs its full length above the workspace, [] bool."""
     length = jnp.where(primitive == Primitive.PUSH, cfg.sim.push_length, 0.0)
     end = pose[:2] + length * jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
     return jnp.all(jnp.maximum(jnp.abs(pose[:2]), jnp.abs(end)) <= 0.5 * cfg.heightmap.extent)
 
 
 def _stays(cfg: Config, height: jax.Array, step: jax.Array) -> jax.Array:
-    """Whether all blocks of a map [H, W] m, shifted by `step` [2] m, stay in the workspace."""
+    """Checks that all blocks of a map [H, W] m stay inside if shifted by `step` [2] m."""
     place = geometry.cell_centres(cfg.heightmap) + step[None, None]
     stays = jnp.all(jnp.abs(place) <= 0.5 * cfg.heightmap.extent, axis=-1)
     return jnp.all((height <= BARE) | stays)
 
 
 def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
-    """Maps shifted by `cells` [2] int32; cells that come in look like the lowest one."""
+    """Shifts maps by `cells` [2] int32; cells that come in look like the lowest one."""
     size = obs.height.shape[0]
     row, col = (jnp.arange(size, dtype=jnp.int32) - count for count in cells)
     row, col = row[:, None], col[None]
@@ -101,7 +101,7 @@ def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
 
 
 def augment(key: jax.Array, cfg: Config, transition: Transition) -> Transition:
-    """The transition augmented as the config says."""
+    """Applies the augmentation of the config."""
     most = cfg.learn.augment_shift
     if cfg.learn.augment:
         transition = random_symmetry(key, transition)

@@ -11,7 +11,7 @@ POSE_WRAPS = np.array([False, False, True])  # of (x, y, yaw)
 
 
 def wrap(u: jax.Array) -> jax.Array:
-    """The same point of a circle of circumference 2 in [-1, 1), any shape.
+    """Wraps a circle of circumference 2 to [-1, 1), any shape.
 
     Near the seam u + 1 is exact in float32: the remainder cannot round up to a whole turn.
     """
@@ -19,10 +19,10 @@ def wrap(u: jax.Array) -> jax.Array:
 
 
 def wrap_yaw(u: jax.Array) -> jax.Array:
-    """Poses, or offsets between them, [..., 3] with the yaw the short way round."""
+    """Wraps the yaw of poses, or of offsets between them, [..., 3]."""
     return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), wrap(u), u)
 
 
 def project(u: jax.Array) -> jax.Array:
-    """Points `u` [..., 3] in the box: yaw wraps, x and y are clipped."""
+    """Projects points `u` [..., 3] to the box: yaw wraps, x and y are clipped."""
     return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), wrap(u), jnp.clip(u, -1.0, 1.0))

@@ -13,7 +13,7 @@ Score = Callable[[jax.Array], jax.Array]  # of a point of the box [3] -> []
 
 
 class CEMResult(NamedTuple):
-    """The best sample of all rounds, in the box."""
+    """Best sample of all rounds, in the box."""
 
     action: jax.Array  # [3]
     value: jax.Array  # [] its score; -inf if no score was a number
@@ -29,12 +29,12 @@ class _Search(NamedTuple):
 def maximise(
     key: jax.Array, cfg: CEMConfig, score: Score, mean: jax.Array, start: jax.Array
 ) -> CEMResult:
-    """Maximises `score` in the box; for one state, vmap over states.
+    """Maximises `score` in the box for one state; vmap over states.
 
     mu' = mean(elites), sigma' = max(std(elites), std_min), elites = best K of J samples, lines
     8-12; numbers as QT-Opt, arXiv:1806.10293. Deviations from line 13: the result is the best
-    sample of all rounds, not the last mean, and the caller adds noise. NaN ranks last, where
-    `top_k` would rank it first. Samples of value -inf are never elites.
+    sample of all rounds, not the last mean, and the caller adds noise. NaN ranks last; `top_k`
+    would rank it first. Samples of value -inf are never elites.
 
     Args: mean [3] the actor's proposal; start [P0, 3] first samples of the first round, P0 <= J.
     """
@@ -54,14 +54,14 @@ def maximise(
 
 
 def _sample(key: jax.Array, search: _Search, i: jax.Array | int, num: int) -> jax.Array:
-    """Gaussian samples [num, 3] of round i."""
+    """Draws Gaussian samples [num, 3] of round i."""
     shape, dtype = (num, *search.mean.shape), search.mean.dtype
     noise = jax.random.normal(jax.random.fold_in(key, i), shape, dtype)
     return box.project(search.mean[None] + search.std[None] * noise)
 
 
 def _update(cfg: CEMConfig, score: Score, search: _Search, actions: jax.Array) -> _Search:
-    """The search after a round of `actions` [J, 3]; unchanged if none of them has a value."""
+    """Updates the search with `actions` [J, 3]; unchanged if none of them has a value."""
     values = jax.vmap(score)(actions)  # [J]
     elite_values, elite = jax.lax.top_k(jnp.where(jnp.isnan(values), -jnp.inf, values), cfg.elites)
     elites = actions[elite]  # [K, 3], best first
@@ -79,10 +79,10 @@ def _update(cfg: CEMConfig, score: Score, search: _Search, actions: jax.Array) -
 
 
 def fit(cfg: CEMConfig, elites: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean [3] and std [3] of the `valid` [K] elites [K, 3], Algorithm 1 line 12.
+    """Fits mean [3] and std [3] of the `valid` [K] elites [K, 3], Algorithm 1 line 12.
 
-    std: sqrt(1 / K sum (a_k - mu)^2), where line 12 has 1 / (K - 1) sum |a_k - mu|. Yaw is
-    measured from the first elite, the short way round: across the seam the mean is at the seam.
+    std: sqrt(1 / K sum (a_k - mu)^2), where line 12 has 1 / (K - 1) sum |a_k - mu|. Yaw is measured
+    from the first elite, the short way round: across the seam the mean is at the seam.
     """
     weight = valid.astype(elites.dtype)[:, None]  # [K, 1]
     count = jnp.maximum(jnp.sum(weight), 1.0)

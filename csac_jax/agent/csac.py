@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from csac_jax.agent import actor_critic, policy, rewards
+from csac_jax.agent import actor, actor_critic, critic, policy, rewards, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.learner import Learner, Transition, UpdateInfo
 from csac_jax.agent.rewards import ActionResult
@@ -40,10 +40,10 @@ class CSAC(Learner):
         """By default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13)."""
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(steps_without_change)))
         if actions_taken is None:
-            maps = self._chunked(actor_critic.decision_maps)(state.online, obs)
+            maps = self._chunked(values.decision_maps)(state.online, obs)
             best = jax.vmap(policy.best_action, (0, None, 0, 0))
             return best(keys, self.parts, maps, steps_without_change)
-        maps = self._chunked(actor_critic.exploration_maps)(state.online, obs)
+        maps = self._chunked(values.exploration_maps)(state.online, obs)
         act = jax.vmap(policy.act, (0, None, 0, 0, None))
         return act(keys, self.parts, maps, steps_without_change, actions_taken)
 
@@ -59,21 +59,19 @@ class CSAC(Learner):
         pushed = result.primitive == Primitive.PUSH
         views = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), obs, next_obs)  # [2 E, ...]
         # In chunks of one run, each part of the states is still skipped that has no push.
-        best_grasps = self._chunked(actor_critic.best_grasps, at_once=1)
+        best_grasps = self._chunked(values.best_grasps, at_once=1)
         before, after = jnp.split(best_grasps(state.target, views, jnp.tile(pushed, 2)), 2)
         return rewards.rewards_of(cfg, result._replace(phi_before=before, phi_after=after))
 
     def update(
         self, key: jax.Array, state: LearnerState, batch: Transition, weights: jax.Array
     ) -> tuple[LearnerState, UpdateInfo]:
-        update = self._chunked(
-            lambda parts, key, *args: actor_critic.update_critic(key, parts, *args)
-        )
+        update = self._chunked(lambda parts, key, *args: critic.update(key, parts, *args))
         return update(key, state, batch, weights)
 
     def end_step(self, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
         """The actor's update (lines 22-23)."""
-        return self._chunked(actor_critic.update_actor)(state, obs)
+        return self._chunked(actor.update)(state, obs)
 
     def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "CSAC":
         parts = actor_critic.with_optimisers(cfg, self.parts.frames, return_bounds)

@@ -10,7 +10,7 @@ from csac_jax.config import ExploreConfig
 
 
 class Greedy(NamedTuple):
-    """What the policy would do. P = primitives."""
+    """Greedy decision of the policy. P = primitives."""
 
     primitive: jax.Array  # [] int32, Primitive
     poses: jax.Array  # [P, 3] normalised (x, y, yaw), the best pose of each primitive
@@ -18,12 +18,12 @@ class Greedy(NamedTuple):
 
 
 def probability(start: float, end: float, decay: float, actions: jax.Array) -> jax.Array:
-    """max(end, start decay^actions) [], `actions` [] int32 taken so far; VPG: 0.5, 0.1, 0.9998."""
+    """Returns max(end, start decay^actions) [], `actions` [] int32; VPG: 0.5, 0.1, 0.9998."""
     return jnp.maximum(end, start * jnp.power(decay, actions.astype(jnp.float32)))
 
 
 def action_noise(key: jax.Array, cfg: ExploreConfig, action: jax.Array) -> jax.Array:
-    """`action` [3] in the box + clip(N(0, delta), -c, c), line 13; c = 3 delta (ours)."""
+    """Adds clip(N(0, delta), -c, c) to `action` [3] in the box, line 13; c = 3 delta (ours)."""
     bound = 3.0 * cfg.noise_std
     noise = cfg.noise_std * jax.random.normal(key, action.shape, action.dtype)
     return box.project(action + jnp.clip(noise, -bound, bound))
@@ -32,11 +32,11 @@ def action_noise(key: jax.Array, cfg: ExploreConfig, action: jax.Array) -> jax.A
 def choose(
     key: jax.Array, cfg: ExploreConfig, actions_taken: jax.Array, greedy: Greedy, places: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Primitive [] int32 and normalised pose [3] to try, after `actions_taken` [] by the whole run.
+    """Chooses a primitive [] int32 and a normalised pose [3], after `actions_taken` [].
 
     With a decaying probability the primitive is random, a push with `push_fraction` (VPG). With
-    another one the pose is that primitive's of `places` [P, 3], which are random. Else it is that
-    primitive's greedy pose plus noise: a forced primitive still acts where it is best.
+    another one the pose is that primitive's of `places` [P, 3], which are random. Otherwise it is
+    the primitive's greedy pose plus noise: a random primitive still acts where it is best.
     """
     key_explore, key_push, key_place, key_noise = jax.random.split(key, 4)
     epsilon = probability(*cfg.epsilon_primitive, cfg.decay, actions_taken)
@@ -50,7 +50,7 @@ def choose(
 
 
 def random_cell(key: jax.Array, valid: jax.Array) -> jax.Array:
-    """Index [] int32, uniform over the True entries of `valid` [n]; 0 if there is none.
+    """Draws an index [] int32, uniform over True entries of `valid` [n]; 0 without one.
 
     A random rank among the valid ones: ties of n noises would favour low indices.
     """

@@ -19,9 +19,10 @@ from csac_jax.config import LearnConfig, TargetConfig
 
 
 def softmax(q: jax.Array, log_density: jax.Array, inverse_temperature: ArrayLike) -> jax.Array:
-    """Self-normalised importance-sampled softmax_beta [], sum_i w_i q_i / sum_i w_i.
+    """Estimates softmax_beta [] by self-normalised importance sampling, sum w_i q_i / sum w_i.
 
     Only distances below the largest q are weighted: rounding cannot pass that q.
+
     Args: q [N] finite values; log_density [N] log p of the samples; inverse_temperature [] beta.
     """
     weight = jax.nn.softmax(inverse_temperature * q - log_density)  # no overflow
@@ -32,12 +33,12 @@ def softmax(q: jax.Array, log_density: jax.Array, inverse_temperature: ArrayLike
 def noisy_actions(
     key: jax.Array, cfg: TargetConfig, mean: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Poses around `mean` [3] in the box, and the log density of each.
+    """Draws poses around `mean` [3] in the box, and the log density of each.
 
     a = mu + eps, eps ~ N(0, std) truncated to [-clip, clip] (Algorithm 1 line 13, SD3), x and y
     also to the box, yaw to half a turn: no pose can be drawn in two ways. Deviation: line 13 clips
-    the normal, which has no density at its bounds. p = phi(eps / std) / (std Z),
-    Z = Phi(high / std) - Phi(low / std), of which nothing cancels as low <= 0 <= high.
+    the normal, which has no density at its bounds. p = phi(eps / std) / (std Z), Z = Phi(high /
+    std) - Phi(low / std), of which nothing cancels as low <= 0 <= high.
 
     Returns: actions [samples, 3]; log density [samples] per unit of the box.
     """
@@ -61,20 +62,20 @@ TD_LOSSES: dict[str, Callable[[LearnConfig, jax.Array], jax.Array]] = {
 
 
 def td_loss(cfg: LearnConfig, error: jax.Array) -> jax.Array:
-    """Loss of TD errors, any shape."""
+    """Computes the loss of TD errors, any shape."""
     return TD_LOSSES[cfg.loss](cfg, error)
 
 
 def td_target(
     reward: jax.Array, gamma: float, terminated: jax.Array, next_value: jax.Array
 ) -> jax.Array:
-    """y = r + gamma (1 - terminated) V(s'), eq. 9 and Algorithm 1 line 19; no gradient.
+    """Computes y = r + gamma (1 - terminated) V(s'), eq. 9 and line 19; no gradient.
 
-    An episode that is cut off is not `terminated`. V(s') after an end may be NaN: it is left out.
+    An episode that is cut off is not `terminated`. V(s') after an end may be NaN and is ignored.
     """
     return jax.lax.stop_gradient(reward + gamma * jnp.where(terminated, 0.0, next_value))
 
 
 def update_target(cfg: LearnConfig, online: Any, target: Any) -> Any:
-    """Target networks after an update of the critic, Algorithm 1 lines 24-26."""
+    """Moves target networks towards the online ones, Algorithm 1 lines 24-26."""
     return optax.incremental_update(online, target, cfg.tau)

@@ -1,8 +1,7 @@
 """Dense maps of one state: Q and actor logits for every primitive, yaw and cell.
 
 Map k stays in frame k, the workspace turned so that yaw_k points along +column. Q at a continuous
-action is trilinear: bilinear in the two frames next to its yaw, linear between them. With
-`net.kind offset` cells say how Q goes on inside them, see `offsets`.
+action is trilinear: bilinear in the two frames next to its yaw, linear between them.
 """
 
 import dataclasses
@@ -16,7 +15,7 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry, grippers
-from csac_jax.agent import box, offsets
+from csac_jax.agent import box
 from csac_jax.config import Config, HeightmapConfig, PolicyConfig, SimConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
@@ -28,13 +27,13 @@ from csac_jax.vision.heightmap import Observation
 
 
 def allowed_primitives(cfg: PolicyConfig) -> tuple[Primitive, ...]:
-    """Primitives that a policy ever takes; V(s) and the actor's loss range over them."""
+    """Returns the primitives that a policy takes; V(s) and the actor's loss range over them."""
     return (Primitive.GRASP,) if cfg.primitive == "grasp" else tuple(Primitive)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frames:
-    """Where the cells of the dense maps lie. K = yaws, h = w = rows and columns of a map."""
+    """Geometry of the dense maps' cells. K = yaws, h = w = rows and columns of a map."""
 
     tables: rotate.RotationTables  # of the first K / 2 frames; the others are these upside down
     yaws: np.ndarray  # [K] rad
@@ -51,7 +50,7 @@ class Frames:
 
 
 def frames(cfg: Config, networks: Networks) -> Frames:
-    """Frames of a config's heightmap and net."""
+    """Builds the frames of a config's heightmap and net."""
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
     tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
     side, cell = tables.canvas // networks.stride, tables.cell * networks.stride
@@ -75,7 +74,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
 
 
 def _cells(rotations: int, side: int, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Workspace position [K, h, w, 2] m of every cell, and the yaws [K] rad of the frames."""
+    """Returns each cell's workspace position [K, h, w, 2] m, and the frames' yaws [K] rad."""
     yaws = 2.0 * np.pi * np.arange(rotations) / rotations
     along = (np.arange(side) - 0.5 * (side - 1)) * cell
     x, y = along[None, None, :], along[None, :, None]
@@ -88,16 +87,17 @@ def _cells(rotations: int, side: int, cell: float) -> tuple[np.ndarray, np.ndarr
 def _reachable(
     sim: SimConfig, heightmap: HeightmapConfig, rotations: int, side: int, cell: float
 ) -> np.ndarray:
-    """Where the robot can act, [P, K, h, w] bool: a table, computed once."""
+    """Computes the cells where the robot can act, [P, K, h, w] bool."""
     xy, yaws = _cells(rotations, side, cell)
     if sim.robot == "hand":
         return np.ones((len(Primitive), *xy.shape[:3]), bool)
 
-    one = functools.partial(primitives.reachable, sim, heightmap)
-    over_cells = jax.vmap(jax.vmap(one, (None, 0, None)), (None, 0, None))
-    every = jax.jit(jax.vmap(jax.vmap(over_cells, (None, 0, 0)), (0, None, None)))
+    reachable = functools.partial(primitives.reachable, sim, heightmap)
+    over_cells = jax.vmap(jax.vmap(reachable, (None, 0, None)), (None, 0, None))
+    over_yaws = jax.vmap(over_cells, (None, 0, 0))
     with jax.ensure_compile_time_eval():
-        return np.asarray(every(jnp.arange(len(Primitive)), xy, yaws))
+        table = jax.jit(jax.vmap(over_yaws, (0, None, None)))
+        return np.asarray(table(jnp.arange(len(Primitive)), xy, yaws))
 
 
 @struct.dataclass
@@ -107,54 +107,47 @@ class DenseMaps:
     q: jax.Array  # [P, K, h, w] float32, the critic's value
     logits: jax.Array  # [P, K, h, w] float32, the actor's
     valid: jax.Array  # [P, K, h, w] bool, see `actionable_cells`
-    terms: jax.Array | None = None  # [P, K, h, w, T] float32, see `offsets`; None: Q is trilinear
 
 
-def of_each_primitive(
+def map_primitives(
     call: Callable[[jax.Array, DenseMaps], Any], state: DenseMaps, chosen: Sequence[Primitive]
 ) -> Any:
-    """What `call(p, one)` gives for each primitive p of `chosen`, leaves [len(chosen), ...]; `one`
-    holds the maps of p alone, as those of primitive 0. All are one trace and one loop."""
-    ones = jax.tree.map(lambda leaf: jnp.stack([leaf[p][None] for p in chosen]), state)
-    return jax.vmap(call)(jnp.array(chosen, jnp.int32), ones)
+    """Calls `call(p, single)` for each primitive p of `chosen`: leaves [len(chosen), ...].
+
+    `single` holds the maps of p alone, as those of primitive 0. All are one trace and one loop.
+    """
+    singles = jax.tree.map(lambda leaf: jnp.stack([leaf[p][None] for p in chosen]), state)
+    return jax.vmap(call)(jnp.array(chosen, jnp.int32), singles)
 
 
 def input_maps(frames: Frames, obs: Observation) -> jax.Array:
-    """The net's input maps [..., H, W, I] of an observation, in the workspace's own frame."""
+    """Builds the net's input maps [..., H, W, I] of an observation, in the workspace's frame."""
     target = obs.target if frames.shows_target else None
     return frames.networks.inputs(obs.colour, obs.height, target, obs.fingers)
 
 
 def rotated_inputs(frames: Frames, obs: Observation) -> jax.Array:
-    """The net's input in the first K / 2 frames, [K / 2, C, C, I]."""
+    """Rotates the net's input to the first K / 2 frames, [K / 2, C, C, I]."""
     return rotate.rotate(frames.tables, input_maps(frames, obs))
 
 
 def unfold(halves: jax.Array) -> jax.Array:
-    """Net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] as maps of all K, [P, K, h, w]."""
+    """Returns net outputs of K / 2 frames [K / 2, h, w, OUTPUTS] for all K: [P, K, h, w]."""
     ahead, back, grasp = (halves[..., output] for output in range(dense.OUTPUTS))
     return jnp.stack([_all_frames(ahead, back), _all_frames(grasp, grasp)])
 
 
-def unfold_terms(halves: jax.Array) -> jax.Array:
-    """The same of OUTPUTS T channels: polynomials [P, K, h, w, T]."""
-    split = halves.reshape(*halves.shape[:-1], -1, dense.OUTPUTS)
-    num = halves.shape[0]
-    all_frames = jax.vmap(unfold, -2, -1)(split)
-    return all_frames.at[:, num:].set(offsets.turn_around(all_frames[:, num:]))
-
-
 def _all_frames(ahead: jax.Array, back: jax.Array) -> jax.Array:
-    """Maps [K, h, w] of two halves [K / 2, h, w]: frame k + K / 2 is frame k upside down."""
+    """Joins two halves [K / 2, h, w]: frame k + K / 2 is frame k upside down; [K, h, w]."""
     return jnp.concatenate([ahead, back[..., ::-1, ::-1]])
 
 
 def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
-    """Cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
+    """Returns cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
 
     Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
     such a surface, of any block, lies within the push's length ahead. With `policy.cells all`:
-    every cell inside the workspace. Of all these, those that the robot reaches.
+    every cell inside the workspace. The robot must reach the cell in each case.
     """
     allowed = frames.inside[None] & frames.reachable
     if frames.all_cells:
@@ -170,12 +163,11 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
 
 
 def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:
-    """Cells [K, h, w] bool under which the height map [H, W] m is higher than BARE."""
     return cell_heights(frames, height) > BARE
 
 
 def cell_heights(frames: Frames, height: jax.Array) -> jax.Array:
-    """What is highest of the height map [H, W] m under each cell, [K, h, w] m; 0 outside it."""
+    """Returns the highest point of the map [H, W] m under each cell, [K, h, w] m; 0 outside."""
     side, stride = frames.side, frames.networks.stride
     rotated = rotate.rotate(frames.tables, height[..., None])
     blocks = rotated.reshape(-1, side, stride, side, stride)
@@ -184,12 +176,12 @@ def cell_heights(frames: Frames, height: jax.Array) -> jax.Array:
 
 
 def yaw_index(frames: Frames, yaw: jax.Array) -> jax.Array:
-    """Index of yaws [...] rad among the frames', float32, whole at each of theirs."""
+    """Returns the fractional frame index of yaws [...] rad, float32; whole at the frames' yaws."""
     return yaw * (frames.yaws.shape[0] / (2.0 * np.pi))
 
 
 def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
-    """Trilinear value [] of `maps` [P, K, h, w] at a pose [3] m, m, rad; differentiable in both."""
+    """Interpolates `maps` [P, K, h, w] at a pose [3] m, m, rad: []; differentiable in both."""
     num, side = frames.yaws.shape[0], frames.side
     index = yaw_index(frames, pose[2])
     lower = rotate.floor(index)
@@ -207,15 +199,8 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
     return (1.0 - upper_weight) * below + upper_weight * above
 
 
-def read_q(frames: Frames, state: DenseMaps, primitive: jax.Array, pose: jax.Array) -> jax.Array:
-    """Q [] at a pose [3] m, m, rad; differentiable in maps and pose."""
-    if state.terms is None:
-        return read(frames, state.q, primitive, pose)
-    return offsets.read(state.terms, frames.cell, frames.yaws, primitive, pose)
-
-
 def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
-    """Whether the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
+    """Checks that the cell nearest to a pose [3] is valid, [] bool; `valid` [P, K, h, w]."""
     num, side = frames.yaws.shape[0], frames.side
     k = jnp.mod(jnp.round(yaw_index(frames, pose[2])).astype(jnp.int32), num)
     position = rotate.to_cell(side, frames.cell, jnp.asarray(frames.yaws)[k], pose[:2])
@@ -226,13 +211,13 @@ def is_valid(frames: Frames, valid: jax.Array, primitive: jax.Array, pose: jax.A
 def read_valid(
     frames: Frames, state: DenseMaps, primitive: jax.Array | int, pose: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Q [] at a pose [3], and whether there is something to act on, [] bool."""
+    """Reads Q [] at a pose [3], and if its nearest cell is valid, [] bool."""
     which = jnp.int32(primitive)
-    return read_q(frames, state, which, pose), is_valid(frames, state.valid, which, pose)
+    return read(frames, state.q, which, pose), is_valid(frames, state.valid, which, pose)
 
 
 def best_over_yaws(frames: Frames, state: DenseMaps, places: jax.Array) -> jax.Array:
-    """Largest valid Q over the yaws [P, H, W] at `places` [H, W, 2] m, or -inf; for pictures."""
+    """Returns the largest valid Q over yaws [P, H, W] at `places` [H, W, 2] m, else -inf."""
 
     def best(primitive: jax.Array, place: jax.Array) -> jax.Array:
         poses = jax.vmap(jnp.append, (None, 0))(place, jnp.asarray(frames.yaws))
@@ -244,22 +229,22 @@ def best_over_yaws(frames: Frames, state: DenseMaps, places: jax.Array) -> jax.A
 
 
 def best_cells(values: jax.Array, valid: jax.Array, num: int) -> jax.Array:
-    """Flat indices [num] int32 into [K, h, w] of the largest values: of valid cells, if any."""
+    """Returns flat indices [num] int32 into [K, h, w] of the largest (valid) values."""
     masked = jnp.where(valid | ~jnp.any(valid), values, -jnp.inf)
     return jax.lax.top_k(masked.reshape(-1), num)[1].astype(jnp.int32)
 
 
 def cell_pose(frames: Frames, index: jax.Array) -> jax.Array:
-    """Pose [3] (x m, y m, yaw rad) of the cell of flat index [] into [K, h, w]."""
+    """Returns the pose [3] (x m, y m, yaw rad) of the cell of flat index [] into [K, h, w]."""
     xy = jnp.asarray(frames.xy).reshape(-1, 2)[index]
     return jnp.append(xy, jnp.asarray(frames.yaws)[index // frames.side**2])
 
 
 def normalise(frames: Frames, pose: jax.Array) -> jax.Array:
-    """Pose [3] (m, m, rad) to the box [-1, 1]^3."""
+    """Maps a pose [3] (m, m, rad) to the box [-1, 1]^3."""
     return box.project(jnp.append(pose[:2] / (0.5 * frames.extent), pose[2] / np.pi - 1.0))
 
 
 def denormalise(frames: Frames, u: jax.Array) -> jax.Array:
-    """Point of the box [-1, 1]^3 to a pose [3] (m, m, rad in [0, 2 pi))."""
+    """Maps a point of the box [-1, 1]^3 to a pose [3] (m, m, rad in [0, 2 pi))."""
     return jnp.append(u[:2] * (0.5 * frames.extent), geometry.wrap_angle((u[2] + 1.0) * np.pi))

@@ -4,9 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from csac_jax import geometry
 from csac_jax.agent import actor, cem, explore, maps
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.cem import CEMResult
@@ -18,30 +16,32 @@ from csac_jax.sim.primitives import Action
 def greedy(
     key: jax.Array, learner: ActorCritic, state: DenseMaps, steps_without_change: jax.Array
 ) -> explore.Greedy:
-    """The best pose of each primitive by `policy.place`, then a primitive by `policy.primitive`."""
-    found = _best_poses(key, learner, state)
+    """Finds each primitive's best pose by `policy.place`, a primitive by `policy.primitive`."""
+    best = _best_poses(key, learner, state)
     rule = PRIMITIVE_RULES[learner.cfg.policy.primitive]
-    return explore.Greedy(rule(found.value, steps_without_change), found.action, found.value)
+    return explore.Greedy(rule(best.value, steps_without_change), best.action, best.value)
 
 
 def candidates(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> jax.Array:
-    """Poses [P, J, 3] (m, m, rad) that `greedy` tries last; for pictures."""
+    """Returns poses [P, J, 3] (m, m, rad) that `greedy` tries last; for pictures."""
     denormalise = jax.vmap(jax.vmap(maps.denormalise, (None, 0)), (None, 0))
     return denormalise(learner.frames, _best_poses(key, learner, state).candidates)
 
 
 def _best_poses(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
-    """What the search finds for each primitive, leaves [P, ...]."""
     search = POSE_SEARCHES[learner.cfg.policy.place]
-    return maps.of_each_primitive(
-        lambda p, one: search(jax.random.fold_in(key, p), learner, one), state, tuple(Primitive)
+    return maps.map_primitives(
+        lambda p, single: search(jax.random.fold_in(key, p), learner, single),
+        state,
+        tuple(Primitive),
     )
 
 
 def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
-    """Maximises the only Q over the pose by the cross-entropy method, Algorithm 1 lines 8-13.
+    """Maximises Q of primitive 0 over the pose by the cross-entropy method, lines 8-13.
 
-    Poses with nothing to act on cost the range of returns. There are as many best cells as elites.
+    Invalid poses are penalised by the range of returns. As many best cells start as there are
+    elites.
     """
     cfg, frames = learner.cfg.cem, learner.frames
 
@@ -57,7 +57,7 @@ def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
 
 
 def _best_cell(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
-    """The valid cell of the only Q where it is largest, as it is (VPG)."""
+    """Returns the centre of the valid cell where Q of primitive 0 is largest (VPG)."""
     cell = maps.best_cells(state.q[0], state.valid[0], 1)[0]
     u = maps.normalise(learner.frames, maps.cell_pose(learner.frames, cell))
     return CEMResult(u, state.q[0].reshape(-1)[cell], u[None])
@@ -79,25 +79,12 @@ PRIMITIVE_RULES: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 }
 
 
-def _random_offset(key: jax.Array, frames: Frames, pose: jax.Array) -> jax.Array:
-    """From a cell's pose [3] to one inside the cell and its share of yaws, [3] m, m, rad."""
-    along, across, turn = jax.random.uniform(key, (3,), minval=-0.5, maxval=0.5)
-    xy = geometry.rotate2d(pose[2], frames.cell * jnp.stack([along, across]))
-    return jnp.append(xy, turn * (2.0 * np.pi / frames.yaws.shape[0]))
-
-
 def random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array:
-    """One random valid cell per primitive as a point of the box [P, 3]; `valid` [P, K, h, w].
-
-    Where Q varies inside cells, a random pose nearest to that cell: else no offset is ever seen.
-    """
+    """Draws one valid cell per primitive as a point of the box [P, 3]; `valid` [P, K, h, w]."""
 
     def place(p: jax.Array, valid: jax.Array) -> jax.Array:
         cell = explore.random_cell(jax.random.fold_in(key, p), valid.reshape(-1))
-        pose = maps.cell_pose(frames, cell)
-        if frames.networks.terms > 1:
-            pose = pose + _random_offset(jax.random.fold_in(key, len(Primitive) + p), frames, pose)
-        return maps.normalise(frames, pose)
+        return maps.normalise(frames, maps.cell_pose(frames, cell))
 
     return jax.vmap(place)(jnp.arange(len(Primitive)), valid)
 
@@ -109,7 +96,7 @@ def act(
     steps_without_change: jax.Array,
     actions_taken: jax.Array,
 ) -> Action:
-    """The action to try while learning: greedy with exploration, Algorithm 1 lines 8-13."""
+    """Chooses the action to try while learning: greedy with exploration, lines 8-13."""
     key_search, key_places, key_choose = jax.random.split(key, 3)
     best = greedy(key_search, learner, state, steps_without_change)
     places = random_places(key_places, learner.frames, state.valid)
@@ -120,7 +107,7 @@ def act(
 def best_action(
     key: jax.Array, learner: ActorCritic, state: DenseMaps, steps_without_change: jax.Array
 ) -> Action:
-    """The action of the learned policy, without exploration."""
+    """Returns the greedy action, without exploration."""
     best = greedy(key, learner, state, steps_without_change)
     pose = maps.denormalise(learner.frames, best.poses[best.primitive])
     return Action(primitive=best.primitive, pose=pose)
@@ -129,8 +116,10 @@ def best_action(
 def after_failures(
     key: jax.Array, learner: ActorCritic, state: DenseMaps, failed_grasps: jax.Array
 ) -> DenseMaps:
-    """The maps to act by after `failed_grasps` [] in a row: Q plus Gumbel noise, by which the best
-    cell is one drawn by Boltzmann's law."""
+    """Adds Gumbel noise to Q after `failed_grasps` [] in a row.
+
+    So the best cell is a draw from Boltzmann's law, of a temperature that rises with each failure.
+    """
     if learner.cfg.policy.retry == 0.0:
         return state
     temperature = learner.cfg.policy.retry * failed_grasps.astype(jnp.float32)
@@ -139,6 +128,6 @@ def after_failures(
 
 
 def random_grasp(key: jax.Array, frames: Frames, valid: jax.Array) -> Action:
-    """A grasp at a random valid cell, with a random yaw; `valid` [P, K, h, w]."""
+    """Draws a grasp at a random valid cell, whose frame gives the yaw; `valid` [P, K, h, w]."""
     u = random_places(key, frames, valid)[Primitive.GRASP]
     return Action(primitive=jnp.int32(Primitive.GRASP), pose=maps.denormalise(frames, u))

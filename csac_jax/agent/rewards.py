@@ -11,7 +11,7 @@ from csac_jax.constants import Outcome, Primitive
 
 
 class ActionResult(NamedTuple):
-    """What an action did, as far as it is paid for."""
+    """Effects of an action that its reward depends on."""
 
     primitive: jax.Array  # [] int32, Primitive
     outcome: jax.Array  # [] int32, Outcome; read for grasps only
@@ -23,7 +23,7 @@ class ActionResult(NamedTuple):
 
 
 def gains_value(cfg: RewardConfig, before: jax.Array, after: jax.Array) -> jax.Array:
-    """Whether the best grasp's value phi, any shape, has risen by more than the dead band."""
+    """Checks that the best grasp's value phi, any shape, rose by more than the dead band."""
     return after > before + cfg.dead_band
 
 
@@ -39,43 +39,43 @@ GOOD_PUSH: dict[str, Callable[[RewardConfig, ActionResult], jax.Array]] = {
 
 
 def scale(cfg: RewardConfig, level: float) -> float:
-    """Gamma = eta0 + eta1 2^(s - s_max), eq. 13; a grasp's level is s_max."""
+    """Returns Gamma = eta0 + eta1 2^(s - s_max), eq. 13; a grasp's level is s_max."""
     return cfg.eta[0] + cfg.eta[1] * 2.0 ** (level - cfg.grasp_level)
 
 
 def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array:
-    """r = r2 - w r1 [], eqs. 10-11: `lifted` [] bool earns r2, r1 is `distance` [] m.
+    """Computes r = r2 - w r1 [], eqs. 10-11: `lifted` [] bool earns r2, r1 is `distance` [] m.
 
-    Deviation: the paper adds r1, which would pay for staying away from the target.
+    Deviation: the paper adds r1, which would reward staying away from the target.
     """
     loss = cfg.distance_weight * jnp.minimum(distance, cfg.distance_cap)
     return jnp.where(lifted, cfg.success_bonus, 0.0) - loss
 
 
 def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
-    """I_g [] of `outcome` [] int32, eq. 15."""
+    """Returns I_g [] of `outcome` [] int32, eq. 15."""
     return jnp.asarray(cfg.grasp_levels, jnp.float32).at[outcome].get(mode="clip")
 
 
 def push_effect(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """I_c [] of a push, good or not by `push_effect`."""
+    """Returns I_c [] of a push, good or not by `push_effect`."""
     return push_level(cfg, GOOD_PUSH[cfg.push_effect](cfg, result))
 
 
 def push_level(cfg: RewardConfig, good: jax.Array) -> jax.Array:
-    """I_c of pushes that are `good` or not, any shape: the second or the first of `push_levels`."""
+    """Returns I_c of pushes that are `good` or not, any shape, from `push_levels`."""
     worse, better = cfg.push_levels
     return jnp.where(good, better, worse)
 
 
 def relabel(cfg: RewardConfig, reward: jax.Array, was: jax.Array, good: jax.Array) -> jax.Array:
-    """Rewards of pushes, any shape, whose label is `good` where it `was` another."""
+    """Corrects rewards of pushes, any shape, from label `was` to label `good`."""
     change = push_level(cfg, good) - push_level(cfg, was)
     return reward + scale(cfg, cfg.push_level) * change
 
 
 def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """R = r + Gamma(phi) I [], eqs. 12 and 14; a push earns no r2.
+    """Computes R = r + Gamma(phi) I [], eqs. 12 and 14; a push earns no r2.
 
     Ours: an action that loses blocks costs `lost_block_penalty` once.
     """
@@ -88,15 +88,15 @@ def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
 
 
 def rewards_of(cfg: RewardConfig, results: ActionResult) -> tuple[jax.Array, jax.Array]:
-    """Rewards [E] and which pushes were good [E] bool, of results with leaves [E]."""
-    each = jax.vmap(reward, (None, 0))(cfg, results)
-    return each, (results.primitive == Primitive.PUSH) & _eq_16(cfg, results)
+    """Computes rewards [E] and which pushes were good [E] bool, of results with leaves [E]."""
+    all_rewards = jax.vmap(reward, (None, 0))(cfg, results)
+    return all_rewards, (results.primitive == Primitive.PUSH) & _eq_16(cfg, results)
 
 
 def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:
-    """Smallest and largest discounted return of an episode of any length.
+    """Returns the smallest and largest discounted return of an episode of any length.
 
-    The smallest is r_min / (1 - gamma) of a loss, else r_min of one action; the largest likewise.
+    The smallest is r_min / (1 - gamma) if r_min < 0, else r_min; the largest likewise.
     """
     grasp = [scale(cfg, cfg.grasp_level) * level for level in cfg.grasp_levels]
     grasp[Outcome.LIFTED] += cfg.success_bonus

@@ -149,7 +149,7 @@ def _inputs(graph: Graph, frames: Frames, fingers: Any) -> tuple[str, int]:
 
 
 def _q_maps(graph: Graph, net: SmallNet, frames: Frames, variables: Any, cfg: Config) -> str:
-    """Q [P, K, h, w] to decide by, see `actor_critic.decision_maps`."""
+    """Q [P, K, h, w] to decide by, see `values.decision_maps`."""
     maps, channels = _inputs(graph, frames, program.fingers(cfg))
     rotated = _rotated(graph, frames, maps, channels)
     image = graph.op("Transpose", rotated, perm=[0, 3, 1, 2])

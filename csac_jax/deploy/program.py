@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry, grippers
-from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
@@ -60,7 +60,7 @@ def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool)
     """Dense maps of one state. With `only_target` a policy of the task `clear`, whose networks see
     no target, may only grasp, and only the target."""
     learner = actor_critic.make(cfg)
-    batch = actor_critic.decision_maps(learner, params, jax.tree.map(lambda leaf: leaf[None], obs))
+    batch = values.decision_maps(learner, params, jax.tree.map(lambda leaf: leaf[None], obs))
     state = jax.tree.map(lambda leaf: leaf[0], batch)
     if not only_target or learner.frames.shows_target:
         return state

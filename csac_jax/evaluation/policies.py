@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.agent import actor_critic, antipodal, maps, policy
+from csac_jax.agent import actor_critic, antipodal, maps, policy, values
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
@@ -64,7 +64,7 @@ class LearnedPolicy:
         """Chooses actions, leaves [E], for scenes, leaves [E, ...], and keys [E]. The networks see
         groups of scenes that fit the memory; under vmap they would see all."""
         parts, (obs, unchanged) = actor_critic.make(self.cfg, self.network), _seen(scenes)
-        dense_maps = actor_critic.decision_maps(parts, self.params, obs)
+        dense_maps = values.decision_maps(parts, self.params, obs)
         each = keys, parts, dense_maps, _failed(scenes)
         dense_maps = jax.vmap(policy.after_failures, (0, None, 0, 0))(*each)
         return jax.vmap(policy.best_action, (0, None, 0, 0))(keys, parts, dense_maps, unchanged)
@@ -74,14 +74,14 @@ class LearnedPolicy:
         """Returns the values behind the action in this scene with this key."""
         parts = actor_critic.make(self.cfg, self.network)
         obs = jax.tree.map(lambda leaf: leaf[None], _seen(scene)[0])
-        batch = actor_critic.decision_maps(parts, self.params, obs)
+        batch = values.decision_maps(parts, self.params, obs)
         dense_maps = jax.tree.map(lambda leaf: leaf[0], batch)
         places = geometry.cell_centres(self.cfg.heightmap)
         q = maps.best_over_yaws(parts.frames, dense_maps, places)
         candidates = policy.candidates(
             key, parts, policy.after_failures(key, parts, dense_maps, _failed(scene))
         )
-        return PolicyDebug(q, candidates, actor_critic.best_grasp(dense_maps))
+        return PolicyDebug(q, candidates, values.best_grasp(dense_maps))
 
 
 @struct.dataclass

@@ -29,7 +29,7 @@ _MOST_PRODUCTS = 1 << 26  # numbers of a run by taps, ours: 0.13 GB in bfloat16
 def conv2d(
     maps: jax.Array, kernel: jax.Array, stride: int, dilation: int, padding: int
 ) -> jax.Array:
-    """Convolution of maps [B, H, W, I] with a kernel [k, k, I, O], zeros around: [B, H', W', O]."""
+    """Computes a zero-padded convolution: [B, H, W, I], kernel [k, k, I, O] -> [B, H', W', O]."""
     overlapping = kernel.shape[0] == 2 * stride == 4 * padding and dilation == 1  # by half
     whole = all(length % stride == 0 for length in maps.shape[1:3])
     if overlapping and whole and jax.default_backend() != "cpu":
@@ -38,9 +38,10 @@ def conv2d(
 
 
 def _product_of_blocks(maps: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """Convolution with a kernel two strides wide, padded by half a stride, as a matrix product.
+    """Computes a convolution whose kernel is two strides wide as a matrix product.
 
-    Each output cell is a product of 2 x 2 blocks of stride x stride input cells.
+    The padding is half a stride. Each output cell is a product of 2 x 2 blocks of stride x stride
+    input cells.
     """
     batch, rows, cols, ins = maps.shape
     high, wide, half = rows // stride, cols // stride, stride // 2
@@ -61,7 +62,7 @@ def _conv2d(maps, kernel, stride, dilation, padding) -> jax.Array:
 
 
 def _maps_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
-    """d loss / d maps: `gradient` [B, H', W', O], dilated by `stride`, times the flipped kernel."""
+    """Computes d loss / d maps: `gradient` [B, H', W', O], dilated, times the flipped kernel."""
     maps, kernel = saved
     low = dilation * (kernel.shape[0] - 1) - padding
     lengths = zip(maps.shape[1:3], gradient.shape[1:3], strict=True)
@@ -71,7 +72,7 @@ def _maps_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
 
 
 def _kernel_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
-    """d loss / d kernel [k, k, I, O]: the maps, channels as batch, convolved with the gradient.
+    """Computes d loss / d kernel [k, k, I, O]: maps, channels as batch, times the gradient.
 
     If the gradient has fewer channels, a CPU convolves the other way round: fewer channels as batch
     are faster. That gives the flipped kernel. A CPU also takes rows two apart, with zeros between
@@ -101,7 +102,7 @@ def _kernel_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
 
 
 def _kernel_gradient_by_taps(stride, dilation, padding, saved, gradient) -> jax.Array:
-    """`_kernel_gradient` as a matrix product for each of the kernel's taps, summed in float32."""
+    """Computes `_kernel_gradient` tap by tap as matrix products, summed in float32."""
     maps, kernel = saved
     padded = jnp.pad(maps, ((0, 0), (padding, padding), (padding, padding), (0, 0)))
     rows, cols = (stride * (length - 1) + 1 for length in gradient.shape[1:3])
@@ -122,12 +123,12 @@ _conv2d.defvjp(
 
 
 def taps_fit(maps: jax.Array, kernel: jax.Array) -> bool:
-    """Whether the products of all taps are few enough to lie in memory at once."""
+    """Checks that the products of all taps are few enough to lie in memory at once."""
     return maps.size // maps.shape[-1] * (kernel.size // kernel.shape[2]) <= _MOST_PRODUCTS
 
 
 def convolve_by_taps(maps: jax.Array, kernel: jax.Array, dilation: int) -> jax.Array:
-    """`conv2d` of stride 1, zeros around, by a kernel of an odd size: [B, H, W, O].
+    """Computes `conv2d` of stride 1 with a kernel of odd size: [B, H, W, O].
 
     The products of the taps are shifted and added, as fewer channels go out than come in.
     """
@@ -138,7 +139,7 @@ def convolve_by_taps(maps: jax.Array, kernel: jax.Array, dilation: int) -> jax.A
 
 
 def windows(maps: jax.Array, size: int, stride: int = 1, dilation: int = 1) -> list[jax.Array]:
-    """Windows [B, H / stride, W / stride, F] of a kernel's taps, row by row, zeros around maps."""
+    """Returns the windows [B, H / stride, W / stride, F] of a kernel's taps, row by row."""
     rows, cols = maps.shape[1:3]
     around = (size // 2 * dilation, (size - 1) // 2 * dilation)
     padded = jnp.pad(maps, ((0, 0), around, around, (0, 0)))
@@ -148,7 +149,7 @@ def windows(maps: jax.Array, size: int, stride: int = 1, dilation: int = 1) -> l
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
 def shift_and_add(products: jax.Array, size: int, dilation: int = 1) -> jax.Array:
-    """Sum over a kernel's taps of their shifted products: [B, H, W, size^2 F] -> [B, H, W, F].
+    """Sums a kernel's shifted products over its taps: [B, H, W, size^2 F] -> [B, H, W, F].
 
     Sums are float32. The gradient is written out: autodiff would pad each tap's slice with zeros.
     """

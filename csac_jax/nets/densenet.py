@@ -39,7 +39,7 @@ class Piece(NamedTuple):
 
 
 def _piece(maps: jax.Array) -> Piece:
-    """Maps with their statistics; both are saved for the gradient, see `Critic`.
+    """Computes the statistics of maps; both are saved for the gradient, see `Critic`.
 
     The variance is E (x - E x)^2: E x^2 - (E x)^2 would cost a decimal in the last block.
     """
@@ -77,7 +77,7 @@ class BatchNorm(nn.Module):
 
 
 def _norm(cfg: DenseNet121, pieces: Sequence[Piece], train: bool, name: str) -> jax.Array:
-    """Pieces joined and normed [..., F]; with `train` batch norm takes the batch's statistics."""
+    """Joins and normalises pieces: [..., F]; with `train` batch norm takes batch statistics."""
     dtype = compute_dtype(cfg)
     maps, *statistics = (jnp.concatenate(leaves, axis=-1) for leaves in zip(*pieces, strict=True))
     if cfg.norm == "batch":
@@ -104,8 +104,8 @@ class DenseLayer(nn.Module):
 class DenseBlock(nn.Module):
     """Dense layers, each on all pieces before it; returns all.
 
-    A norm joins the pieces that it reads. Joined after every layer, as the paper draws it, all
-    channels would be written once more per layer.
+    A norm joins the pieces that it reads. To join them after every layer, as the paper draws it,
+    would write all channels once more per layer.
     """
 
     cfg: DenseNet121
@@ -170,7 +170,7 @@ class DenseNetHead(nn.Module):
 
 
 def _upsample(maps: jax.Array, factor: int) -> jax.Array:
-    """Maps [..., h, w, F] at `factor` times the resolution, bilinear; cells keep their place."""
+    """Resizes maps [..., h, w, F] to `factor` times the resolution, bilinear."""
     *batch, rows, cols, channels = maps.shape
     return jax.image.resize(maps, (*batch, factor * rows, factor * cols, channels), "bilinear")
 
@@ -199,10 +199,10 @@ class DenseNetCritic(nn.Module):
 
 
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
-    """Inputs [T, B, z C, z C, 3] of maps [B, C, C, I]: colour, and every other map three times.
+    """Splits maps [B, C, C, I] into inputs of the trunks [T, B, z C, z C, 3].
 
-    z = zoom / 2, at least 1: a trunk doubles its cells itself. The barrier keeps XLA from rotating
-    the maps once per window.
+    They are colour and, each repeated three times, the other maps. z = zoom / 2, at least 1: a
+    trunk doubles its cells itself. The barrier keeps XLA from rotating the maps once per window.
     """
     inputs = [maps[..., :3]] if cfg.colour else []
     others = range(3 * len(inputs), maps.shape[-1])

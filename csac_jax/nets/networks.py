@@ -1,8 +1,8 @@
-"""The networks of a run, and their variables: what gradients change, and statistics of batch norm.
+"""The networks of a run, and their variables: parameters and running statistics of batch norm.
 
 A critic turns maps [N, C, C, I] into Q [N, h, w, OUTPUTS] and features; the actor's head turns the
 features into maps of Q's shape. Called with `train`, batch norm takes the statistics of the batch,
-else the running ones. A critic of your own is any Flax module of that signature with an attribute
+else the running ones. A custom critic is any Flax module of that signature with an attribute
 `stride`, C / h; its features have the cells of Q.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 from csac_jax.config import NetConfig, SmallNet
 from csac_jax.nets import dense, densenet
 
-BARE = 0.002  # m: lower cells are bare table, of which no net sees the colour
+BARE = 0.002  # m: lower cells are bare table, whose colour no net sees
 FINGERS_MEAN = np.array([0.1, 0.014, 0.02], np.float32)  # m, `grippers.Fingers`; ours
 FINGERS_STD = np.array([0.025, 0.004, 0.004], np.float32)
 MIRRORS = ((), (2,), (3,), (2, 3))  # axes of passes that are turned; columns lie along the frame
@@ -28,7 +28,7 @@ _FULL = 640  # px, ours: side of passes of which one state is seen at a time
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Networks:
-    """A critic, the actor's head and what they are fed."""
+    """Critic, the actor's head, and how their inputs are scaled."""
 
     critic: nn.Module
     head: nn.Module
@@ -37,7 +37,6 @@ class Networks:
     height_scale: float = 0.05  # m, becomes 1; a block's height
     colour_scale: Any = (0.5, 1.0)  # mean and standard deviation, of all colours or of each [3]
     zoom: int = 0  # pixels of the input per cell of the map; 0: any number of states at a time
-    terms: int = 1  # numbers of each output in a cell, `dense.TERMS` where Q varies inside cells
     one_vector: bool = False  # the optimiser sees one vector: a GPU is slow with many small arrays
 
     def inputs(
@@ -47,11 +46,13 @@ class Networks:
         target: jax.Array | None,
         fingers: jax.Array | None = None,
     ) -> jax.Array:
-        """The critic's input maps [..., H, W, I]: 3 of colour or none, 1 of height, 3 of the
-        fingers or none, 1 of target or none.
+        """Builds the critic's input maps [..., H, W, I].
 
-        Bare table is 0, like cells outside of a rotated map. Args: colour [..., H, W, 3] in 0..1;
-        height [..., H, W] m; target [..., H, W] bool or None; fingers [..., 3] m or None.
+        3 of colour or none, 1 of height, 3 of the fingers or none, 1 of target or none. Bare table
+        is 0, like cells outside of a rotated map.
+
+        Args: colour [..., H, W, 3] in 0..1; height [..., H, W] m; target [..., H, W] bool or None;
+        fingers [..., 3] m or None.
         """
         maps = [jnp.maximum(height, 0.0)[..., None] / self.height_scale]
         if self.colour:
@@ -65,50 +66,49 @@ class Networks:
         return jnp.concatenate(maps, axis=-1)
 
     def side_by_side(self) -> "Networks":
-        """The same for several runs under `vmap`: the small critic convolves by taps on a GPU."""
+        """Returns networks for runs under `vmap`: the small critic convolves by taps on a GPU."""
         if not isinstance(self.critic, dense.Critic) or jax.default_backend() == "cpu":
             return self
         return dataclasses.replace(self, critic=self.critic.clone(by_taps=True))
 
     def states_at_once(self, canvas: int) -> int | None:
-        """States, of passes of canvas x canvas cells, that the critic sees at a time; None for any.
+        """Returns the states, of canvas x canvas cells, in a call of the critic; None for any.
 
-        DenseNet-121 sees groups of the pixels of one state at 640 px (ours). So all its calls are
-        made of the same products, which XLA tunes one by one, and need the memory of one group.
+        DenseNet-121 gets groups of the pixels of one state at 640 px (ours). So all its calls
+        consist of the same products, which XLA tunes one by one, and need the memory of one group.
         """
         return max(1, round((_FULL / (self.zoom * canvas)) ** 2)) if self.zoom else None
 
 
 def make(cfg: NetConfig, critic: Any = None) -> Networks:
-    """The networks of a config, or those of the Flax module `critic` with a head of `cfg.head`."""
+    """Builds the networks of a config, or of the Flax module `critic` with a head of `cfg.head`."""
     if critic is not None:
         return Networks(critic, dense.Head(SmallNet(head=cfg.head)), critic.stride, cfg.colour)
     if isinstance(cfg, SmallNet):
         stride = cfg.stride // cfg.subcells
-        terms = dense.terms(cfg)
-        return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour, terms=terms)
+        return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour)
     modules = densenet.DenseNetCritic(cfg), densenet.DenseNetHead(cfg)
     scales = densenet.HEIGHT_SCALE, densenet.COLOUR_SCALE
     return Networks(*modules, cfg.output_stride, cfg.colour, *scales, cfg.zoom, one_vector=True)
 
 
 def learned(variables: Any) -> Any:
-    """The variables that gradients change; the rest are running statistics."""
+    """Returns the variables that gradients change; the rest are running statistics."""
     return {"params": variables["params"]}
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _traced_once(net: nn.Module, variables: Any, maps: jax.Array) -> Any:
-    """What a net makes of [N, C, C, I], traced once: to trace DenseNet-121 takes seconds."""
+    """Applies a net to [N, C, C, I], traced once: to trace DenseNet-121 takes seconds."""
     return net.apply(variables, maps)
 
 
 def apply(networks: Networks, variables: Any, maps: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Q [B, N, ...] and features [B, N, ...] of states of N passes each [B, N, C, C, I]."""
+    """Computes Q [B, N, ...] and features [B, N, ...] of N passes per state [B, N, C, C, I]."""
     critic, group = networks.critic, networks.states_at_once(maps.shape[2])
     if group is not None:
-        of_state = functools.partial(_traced_once, critic, variables)
-        return jax.lax.map(of_state, maps, batch_size=group if group > 1 else None)
+        per_state = functools.partial(_traced_once, critic, variables)
+        return jax.lax.map(per_state, maps, batch_size=group if group > 1 else None)
     flat: Any = critic.apply(variables, maps.reshape(-1, *maps.shape[2:]))
     return jax.tree.map(lambda leaf: leaf.reshape(*maps.shape[:2], *leaf.shape[1:]), flat)
 
@@ -116,10 +116,12 @@ def apply(networks: Networks, variables: Any, maps: jax.Array) -> tuple[jax.Arra
 def apply_mirrored(
     networks: Networks, variables: Any, maps: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """As `apply`, but Q is the mean over four mirror images of each pass, along and across its
-    frame. A mirror along it swaps pushes ahead and back."""
-    shown = jnp.concatenate([jnp.flip(maps, axes) for axes in MIRRORS], axis=1)
-    q, features = apply(networks, variables, shown)
+    """Computes `apply` with Q averaged over four mirror images of each pass.
+
+    They are mirrored along and across its frame. A mirror along it swaps pushes ahead and back.
+    """
+    mirrored = jnp.concatenate([jnp.flip(maps, axes) for axes in MIRRORS], axis=1)
+    q, features = apply(networks, variables, mirrored)
     turned_back = [
         jnp.flip(part, axes)[..., np.array(AHEAD_AND_BACK) if 3 in axes else slice(None)]
         for part, axes in zip(jnp.split(q, len(MIRRORS), axis=1), MIRRORS, strict=True)
@@ -128,5 +130,5 @@ def apply_mirrored(
 
 
 def train(net: nn.Module, variables: Any, maps: jax.Array) -> tuple[Any, Any]:
-    """Outputs of a net by this batch's statistics, and the running ones after it ({} if none)."""
+    """Returns a net's outputs by batch statistics, and the running ones after it ({} if none)."""
     return net.apply(variables, maps, train=True, mutable=["batch_stats"])

@@ -56,7 +56,7 @@ class Stem(nn.Module):
 
 
 def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
-    """Maps [..., I] times a matrix of I rows, whatever its axes: [..., O].
+    """Multiplies maps [..., I] with a matrix of I rows, of any axes: [..., O].
 
     A plain product: over several axes XLA would transpose all maps for the matrix's gradient.
     """
@@ -66,7 +66,7 @@ def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
 
 @jax.custom_vjp
 def max_pool(maps: jax.Array) -> jax.Array:
-    """Maximum over 3 x 3 cells, stride 2: [B, 2 H, 2 W, F], none below 0 -> [B, H, W, F].
+    """Computes the maximum over 3 x 3 cells, stride 2: [B, 2 H, 2 W, F] >= 0 -> [B, H, W, F].
 
     The gradient goes to the first of the largest. It is written out: that of XLA's own window needs
     an operation that GPUs lack in deterministic mode (flax issue 4233).
@@ -75,7 +75,6 @@ def max_pool(maps: jax.Array) -> jax.Array:
 
 
 def _max_pool_forward(maps: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The largest, and which of the nine it is, uint8."""
     first, *others = windows(maps, 3, 2)
     largest, which = first, jnp.zeros(first.shape, jnp.uint8)
     for k, window in enumerate(others, start=1):
@@ -85,7 +84,7 @@ def _max_pool_forward(maps: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _max_pool_backward(which: jax.Array, gradient: jax.Array) -> tuple[jax.Array]:
-    """Even rows lie in the middle row of one window, odd rows in two windows; columns likewise."""
+    """Returns the gradient: even rows lie in one window, odd rows in two; columns likewise."""
     padded = [jnp.pad(leaf, ((0, 0), (0, 1), (0, 1), (0, 0))) for leaf in (which, gradient)]
     rows, cols = which.shape[1:3]
 
@@ -105,6 +104,6 @@ max_pool.defvjp(_max_pool_forward, _max_pool_backward)
 
 
 def average_pool(maps: jax.Array) -> jax.Array:
-    """Mean of 2 x 2 cells: [B, 2 H, 2 W, F] -> [B, H, W, F]."""
+    """Averages 2 x 2 cells: [B, 2 H, 2 W, F] -> [B, H, W, F]."""
     quarters = (maps[:, i::2, j::2] for i in (0, 1) for j in (0, 1))
     return 0.25 * functools.reduce(jnp.add, quarters)

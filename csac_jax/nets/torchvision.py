@@ -19,10 +19,10 @@ _NAMES = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": 
 
 
 def variables(cfg: DenseNet121, tensors: Mapping[str, np.ndarray]) -> Any:
-    """Variables of one trunk, float32 leaves [...], from `tensors` by name.
+    """Converts `tensors` by name to the variables of one trunk, float32 leaves [...].
 
     The classifier and the counters of batch norm are ignored. Raises ValueError naming the first
-    tensor that is missing, misshapen or not known.
+    tensor that is missing, misshapen or unknown.
     """
     trunk, blank = densenet.DenseNetTrunk(cfg), jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     names = set()
@@ -43,5 +43,5 @@ def variables(cfg: DenseNet121, tensors: Mapping[str, np.ndarray]) -> Any:
     taken = jax.tree_util.tree_map_with_path(take, wanted)
     for name in sorted(tensors.keys() - names):
         if not name.startswith("classifier.") and not name.endswith(".num_batches_tracked"):
-            raise ValueError(f"tensor {name} is none of DenseNet-121")
+            raise ValueError(f"tensor {name} is not part of DenseNet-121")
     return taken

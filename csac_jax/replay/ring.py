@@ -20,22 +20,22 @@ class ReplayState:
 
 
 def init(priority: jax.Array, example_item: Any) -> ReplayState:
-    """An empty ring with a slot for each entry of `priority` [C], for items like `example_item`."""
+    """Creates an empty ring of `priority` [C] slots, for items like `example_item`."""
     rows = priority.shape
     items = jax.tree.map(lambda leaf: jnp.zeros((*rows, *leaf.shape), leaf.dtype), example_item)
     return ReplayState(items, jnp.int32(0), jnp.int32(0), priority)
 
 
 def bytes_needed(capacity: int, example_item: Any) -> int:
-    """Memory of a ring of `capacity` items like `example_item`, of leaves or their shapes."""
+    """Returns the memory of a ring of `capacity` items like `example_item` or its shapes."""
     item = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(example_item))
     return capacity * (item + jnp.dtype(jnp.float32).itemsize)  # and its priority
 
 
 def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
-    """Stores the `valid` [E] bool ones of `items`, leaves [E, ...], in order; the oldest give way.
+    """Stores the `valid` [E] bool ones of `items`, leaves [E, ...], over the oldest.
 
-    New items take the largest priority stored, 1 in an empty ring, so that none is ranked above
+    New items take the largest stored priority, 1 in an empty ring, so that none is ranked above
     them. A scatter to slots that are all different: with the state donated, XLA writes in place.
     """
     capacity, num = state.priority.shape[0], valid.shape[0]
@@ -59,7 +59,7 @@ def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
 
 
 def gather(state: ReplayState, slots: jax.Array) -> Any:
-    """Items in `slots` [B] int32, leaves [B, ...]."""
+    """Returns the items in `slots` [B] int32, leaves [B, ...]."""
     return jax.tree.map(lambda ring: ring.at[slots].get(mode="clip"), state.items)
 
 
@@ -67,8 +67,8 @@ def set_priorities(state: ReplayState, slots: jax.Array, priorities: jax.Array) 
     """Replaces the priorities of `slots` [B] int32, all filled, by `priorities` [B], at least 0.
 
     A slot that occurs twice keeps the larger one: by `min` to 0 and `max`, as the order of
-    conflicting `set`s is undefined. One that is not finite counts as the largest that these slots
-    have or had: the transition is looked at again, and no NaN gets into the ranking.
+    conflicting `set`s is undefined. A non-finite one counts as the largest that these slots have or
+    had: the transition is replayed again, and no NaN gets into the ranking.
     """
     finite = jnp.isfinite(priorities)
     known = jnp.where(finite, jnp.minimum(priorities, LARGEST), 0.0)

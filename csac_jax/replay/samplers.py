@@ -1,7 +1,7 @@
 """Which transitions are replayed: uniform (CSAC), prioritised (CSAC-PER), by rank (CSAC-beta), or
 of opposite outcomes (VPG).
 
-Algorithm 1 lines 15-16. A sampler of your own is any object with the methods of `Sampler`.
+Algorithm 1 lines 15-16. A custom sampler is any object with the methods of `Sampler`.
 """
 
 import abc
@@ -26,40 +26,41 @@ BELOW_ONE = 1.0 - 2.0**-23  # largest uniform draw; times any float32 sum it sta
 
 
 class Sample(NamedTuple):
-    """What to learn from."""
+    """Drawn transitions."""
 
     slots: jax.Array  # [B] int32, with repetition
     weights: jax.Array  # [B] float32, of the losses; at most 1
 
 
 class Sampler(abc.ABC):
-    """Draws transitions from the ring; frozen and pure, its memory is `ReplayState.priority`."""
+    """Sampling rule for the ring. Frozen and pure: its memory is `ReplayState.priority`."""
 
     @abc.abstractmethod
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
-        """`num` transitions, after the share `progress` [] of all updates."""
+        """Draws `num` transitions, after the share `progress` [] of all updates."""
 
     def init(self, capacity: int) -> jax.Array:
-        """Priorities [C] of an empty ring; by default 0."""
+        """Returns priorities [C] of an empty ring; by default 0."""
         return jnp.zeros(capacity, jnp.float32)
 
     def update(self, state: ReplayState, slots: jax.Array, errors: jax.Array) -> ReplayState:
-        """The ring after the TD errors [B] of `slots` [B]; by default abs(error) is kept."""
+        """Updates the ring by TD errors [B] of `slots` [B]; by default stores abs(error)."""
         return ring.set_priorities(state, slots, jnp.abs(errors).astype(jnp.float32))
 
     def replace_hyperparams(self, cfg: Any) -> "Sampler":
-        """The sampler of a replay section whose numbers may be traced; by default itself."""
+        """Returns the sampler of a section of traced numbers; by default itself."""
         return self
 
 
 def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array:
-    """Slots drawn with P(i) = m_i / sum m; Schaul et al. 2016, eq. 1 with m = p^alpha.
+    """Draws slots with P(i) = m_i / sum m; Schaul et al. 2016, eq. 1 with m = p^alpha.
 
-    Each goes down a pyramid of sums, built for every batch: unlike a sum tree it cannot drift. The
-    lower half of the way has a uniform number of its own: one float32 has 2^23 values, too few for
-    2^17 slots. Draws are independent, not stratified as in sec. B.2.1.
+    Each draw descends a pyramid of sums, built for every batch: unlike a sum tree it cannot drift.
+    The lower half has a uniform number of its own: one float32 has 2^23 values, too few for 2^17
+    slots. Draws are independent, not stratified as in sec. B.2.1.
 
     Args: masses [C], at least 0, and 0 where nothing is stored: such slots are never drawn.
+
     Returns: [num] int32 slots, with repetition; slot 0 .. C - 1 if all masses are 0.
     """
     node = jnp.zeros(num, jnp.int32)
@@ -74,7 +75,7 @@ def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array
 
 
 def _pyramid(masses: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-    """The upper and the lower half of levels [RADIX n], each the sums of the next one, top first.
+    """Sums levels [RADIX n] up to a top: their upper and lower half, top first.
 
     The last is `masses` [C] padded with 0. Children of node j < n are j, j + n, j + 2 n ...: sums
     over the first axis vectorise.
@@ -88,10 +89,10 @@ def _pyramid(masses: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
 
 
 def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Rows drawn by the columns of `masses` [RADIX, num], and what is left of `uniform` [num].
+    """Draws rows by the columns of `masses` [RADIX, num]; also returns the rest of `uniform` [num].
 
-    Sums made one after the other never fall, and a mass of 0 leaves them as they were: a row of no
-    mass is never the first to exceed the goal. A parallel `cumsum` promises neither.
+    Sequential sums never fall, and a mass of 0 leaves them unchanged: a row of no mass is never the
+    first to exceed the goal. A parallel `cumsum` promises neither.
     """
     reached = list(itertools.accumulate(masses))  # RADIX of [num]
     goal = uniform * reached[-1]
@@ -107,10 +108,10 @@ def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def weights(masses: jax.Array, exponent: ArrayLike) -> jax.Array:
-    """w_i = (n P(i))^-beta / max_j w_j [B] of draws of `masses` [B]; Schaul et al. 2016, sec. 3.4.
+    """Computes w_i = (n P(i))^-beta / max_j w_j [B] of drawn `masses` [B]; Schaul 2016, sec. 3.4.
 
-    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The maximum is the batch's:
-    by the ring's least likely transition all steps would be small.
+    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The maximum is the batch's: by
+    the ring's least likely transition all steps would be small.
     """
     masses = jnp.maximum(masses, jnp.finfo(jnp.float32).tiny)  # of an empty ring all are 0
     return (jnp.min(masses) / masses) ** exponent
@@ -119,16 +120,17 @@ def weights(masses: jax.Array, exponent: ArrayLike) -> jax.Array:
 def beta_slots(
     key: jax.Array, values: jax.Array, size: jax.Array, a: ArrayLike, b: ArrayLike, num: int
 ) -> jax.Array:
-    """Slots whose rank by value follows Beta(a, b): rank 0 = largest; CSAC sec. 3.5, eq. 17.
+    """Draws slots whose rank by value follows Beta(a, b), rank 0 = largest; sec. 3.5, eq. 17.
 
     rank = floor(n x), x ~ Beta(a, b). Beta(1, 1) is uniform, Beta(1, 2) VPG's power law. Equal
     values share their ranks at random: by slot, the oldest would be preferred. NaN is ranked first.
 
     A ring of more than SORTED slots is not sorted: the ranks are those among CANDIDATES random
-    slots, drawn for each batch. The rank among all then has a standard deviation of n / (2
-    sqrt(CANDIDATES)) at most; of the laws of CSAC sec. 4.3, no decile's share changes by 0.001.
+    slots, drawn for each batch. The rank among all then has a standard deviation of at most n / (2
+    sqrt(CANDIDATES)); of the laws of CSAC sec. 4.3, no decile's share changes by 0.001.
 
     Args: values [C], any beyond `size`; size [] filled slots.
+
     Returns: [num] int32 slots, with repetition, all filled; slot 0 .. C - 1 if nothing is stored.
     """
     key_rank, key_ties = jax.random.split(key)
@@ -139,7 +141,7 @@ def beta_slots(
 
 
 def _all_ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Slots [C] by falling value, those that are filled first, and how many these are, []."""
+    """Sorts slots [C] by falling value, filled ones first; also returns their number []."""
     slots = jnp.arange(values.shape[0], dtype=jnp.int32)
     ties = jax.random.bits(key, values.shape)
     filled_first = jnp.where(slots < size, _descending(values), jnp.inf)
@@ -147,20 +149,24 @@ def _all_ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax
 
 
 def _some_ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """CANDIDATES random filled slots by falling value, and their number, []. They are drawn in
-    random order, so that equal values share their ranks."""
+    """Sorts CANDIDATES random filled slots by falling value; also returns their number [].
+
+    They are drawn in random order, so that equal values share their ranks.
+    """
     some = jax.random.randint(key, (CANDIDATES,), 0, jnp.maximum(size, 1), jnp.int32)
     return jax.lax.sort((_descending(values[some]), some), num_keys=1)[1], jnp.int32(CANDIDATES)
 
 
 def _descending(values: jax.Array) -> jax.Array:
-    """Keys [C] that sort `values` [C] from the largest down, NaN first."""
+    """Returns keys [C] that sort `values` [C] from the largest down, NaN first."""
     return -jnp.where(jnp.isnan(values), jnp.inf, values)
 
 
 def newest_slots(key: jax.Array, state: ReplayState, among: int, num: int) -> jax.Array:
-    """One slot of each of `num` equal parts of the newest `among` >= `num` transitions: [num]
-    int32, the newest part first; where fewer are stored, the oldest one stands in."""
+    """Draws a slot [num] from each of `num` equal parts of the newest `among` >= `num`.
+
+    The newest part comes first. Where fewer are stored, the oldest one stands in.
+    """
     part = jnp.arange(num, dtype=jnp.float32) + jax.random.uniform(key, (num,))
     age = jnp.minimum(jnp.floor(part * (among / num)).astype(jnp.int32), among - 1)
     age = jnp.clip(age, 0, jnp.maximum(state.size - 1, 0))
@@ -170,11 +176,12 @@ def newest_slots(key: jax.Array, state: ReplayState, among: int, num: int) -> ja
 def opposite_slots(
     key: jax.Array, state: ReplayState, slots: jax.Array, a: ArrayLike, b: ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """For each of `slots` [B] one of the same primitive and the opposite outcome, and whether there
-    is one, [B] bool; else the slot itself. Zeng et al., code: `main.py`, "experience replay".
+    """Draws for each of `slots` [B] one of its primitive and the opposite outcome, if any.
 
-    An outcome is good if its reward is positive. The rank by priority follows Beta(a, b) within the
-    transitions that fit, rank 0 = largest.
+    Zeng et al., code: `main.py`, "experience replay". An outcome is good if its reward is positive.
+    The rank by priority follows Beta(a, b) within the transitions that match, rank 0 = largest.
+
+    Returns: slots [B], the slot itself without a match; [B] bool, True with one.
     """
     key_rank, key_ties = jax.random.split(key)
     every = jnp.arange(state.priority.shape[0], dtype=jnp.int32)
@@ -188,9 +195,9 @@ def opposite_slots(
     wanted = jnp.bitwise_xor(group[slots], 1)  # [B]
     first, count = (jnp.cumsum(sizes) - sizes)[wanted], sizes[wanted]
     rank = (_beta(key_rank, a, b, len(slots)) * count.astype(jnp.float32)).astype(jnp.int32)
-    found = count > 0
-    fitting = order[jnp.where(found, first + jnp.clip(rank, 0, count - 1), 0)]
-    return jnp.where(found, fitting, slots), found
+    has_match = count > 0
+    matches = order[jnp.where(has_match, first + jnp.clip(rank, 0, count - 1), 0)]
+    return jnp.where(has_match, matches, slots), has_match
 
 
 def _beta(key: jax.Array, a: ArrayLike, b: ArrayLike, num: int) -> jax.Array:
@@ -204,7 +211,7 @@ def _beta(key: jax.Array, a: ArrayLike, b: ArrayLike, num: int) -> jax.Array:
 
 
 def _log_gamma(key: jax.Array, shape: ArrayLike, num: int) -> jax.Array:
-    """Logarithms [num] of draws from Gamma(shape, 1); Marsaglia and Tsang 2000, ACM TOMS 26, 363.
+    """Draws logarithms [num] from Gamma(shape, 1); Marsaglia and Tsang 2000, ACM TOMS 26, 363.
 
     The first accepted candidate; a shape below 1 takes Gamma(shape + 1, 1) times U^(1 / shape).
     """
@@ -216,13 +223,13 @@ def _log_gamma(key: jax.Array, shape: ArrayLike, num: int) -> jax.Array:
     log_v = jnp.log(jnp.maximum(v, jnp.finfo(jnp.float32).tiny))
     log_uniform = jnp.log1p(-jax.random.uniform(key_uniform, (_TRIES, num)))
     accepted = (v > 0.0) & (log_uniform < 0.5 * normal**2 + d * (1.0 - v + log_v))
-    found = jnp.take_along_axis(log_v, jnp.argmax(accepted, axis=0)[None], axis=0)[0]
+    first = jnp.take_along_axis(log_v, jnp.argmax(accepted, axis=0)[None], axis=0)[0]
     small = jnp.log1p(-jax.random.uniform(key_small, (num,))) / shape
-    return jnp.log(d) + found + jnp.where(shape < 1.0, small, 0.0)
+    return jnp.log(d) + first + jnp.where(shape < 1.0, small, 0.0)
 
 
 def beta_schedule(cfg: BetaReplay, progress: jax.Array) -> list[jax.Array]:
-    """a and b of the Beta law, each [], after the share `progress` of all updates; CSAC sec. 3.5.
+    """Returns a and b of the Beta law, each [], at the share `progress` of all updates; sec. 3.5.
 
     Linear from `start` to `middle` at `middle_at`, and on to `end` at 1; constant outside 0 .. 1.
     """
@@ -233,7 +240,7 @@ def beta_schedule(cfg: BetaReplay, progress: jax.Array) -> list[jax.Array]:
 
 @dataclasses.dataclass(frozen=True)
 class _Configured(Sampler):
-    """A sampler that a replay section describes."""
+    """Sampler that a replay section describes."""
 
     cfg: Any
     scenes: int = 1  # transitions that a step adds
@@ -243,7 +250,7 @@ class _Configured(Sampler):
 
 
 class Uniform(_Configured):
-    """All transitions are equally likely."""
+    """Sampler to which all transitions are equally likely."""
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
         slots = jax.random.randint(key, (num,), 0, jnp.maximum(state.size, 1), jnp.int32)
@@ -279,15 +286,15 @@ class Opposite(_Configured):
 
     VPG trains once on its newest transition and once on one drawn against it. Of larger batches the
     first half is spread over the newest transitions, at least those of one step. A draw without a
-    counterpart has weight 0.
+    match has weight 0.
     """
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
         key_new, key_opposite = jax.random.split(key)
         num_new = num - num // 2
         new = newest_slots(key_new, state, max(self.scenes, num_new), num_new)
-        opposite, found = opposite_slots(key_opposite, state, new[: num // 2], *self.cfg.law)
-        weights = jnp.append(jnp.ones(num_new), found.astype(jnp.float32))
+        opposite, has_match = opposite_slots(key_opposite, state, new[: num // 2], *self.cfg.law)
+        weights = jnp.append(jnp.ones(num_new), has_match.astype(jnp.float32))
         return Sample(jnp.append(new, opposite), weights)
 
 
@@ -300,6 +307,6 @@ BUILDERS = {
 
 
 def make(cfg: Any, scenes: int = 1) -> Sampler:
-    """The sampler of a replay section, where a step adds a transition of each of `scenes`."""
+    """Builds the sampler of a replay section, if a step adds a transition of each of `scenes`."""
     kind: Any = BUILDERS[type(cfg)]
     return kind(cfg, scenes)

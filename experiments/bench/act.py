@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic
+from csac_jax.agent import actor_critic, critic, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
@@ -87,7 +87,7 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     params, obs = _random(abstract.online), _observations(cfg.heightmap.size, states)
     begun = time.perf_counter()
     jitted = jax.jit(
-        lambda params, obs: actor_critic.dense_maps(learner, params, obs).q,
+        lambda params, obs: values.dense_maps(learner, params, obs).q,
         compiler_options=compiler.options(cfg),
     )
     dense_maps = jitted.lower(params, obs).compile()
@@ -114,7 +114,7 @@ def _update_memory(learner: ActorCritic) -> int:
         lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype),
         step.example(learner.cfg),
     )
-    update = jax.jit(lambda *given: actor_critic.update_critic(jax.random.key(0), learner, *given))
+    update = jax.jit(lambda *given: critic.update(jax.random.key(0), learner, *given))
     compiled = update.lower(state, batch, jax.ShapeDtypeStruct((size,), jnp.float32)).compile()
     memory = compiled.memory_analysis()
     assert memory is not None

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from csac_jax.agent import actor_critic, losses, maps
+from csac_jax.agent import actor, actor_critic, critic, losses, maps, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, SmallNet
@@ -50,7 +50,7 @@ def _operations(net: SmallNet, inputs: int, cells: int) -> dict[str, float]:
     """Floating-point operations of one forward pass whose features have cells x cells."""
     convolutions = sum(2.0 * k * k * i * o for i, o, k, _, _ in _layers(net, inputs))
     features = net.stem + len(net.dilations) * net.growth
-    outputs = dense.OUTPUTS * dense.terms(net) * net.subcells**2
+    outputs = dense.OUTPUTS * net.subcells**2
     head = 2.0 * (features * net.head + net.head * outputs)
     return {"convolutions": convolutions * cells**2, "head": head * cells**2}
 
@@ -73,7 +73,7 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
     assert isinstance(net, SmallNet)
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     state = jit(lambda key: actor_critic.init(key, parts))(jax.random.key(0))
-    critic = jax.tree.map(lambda leaf: leaf[0], state.online.critic)
+    first = jax.tree.map(lambda leaf: leaf[0], state.online.critic)
     keys = jax.random.split(jax.random.key(1), cfg.learn.batch)
     packed = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct((cfg.learn.batch, *leaf.shape), leaf.dtype),
@@ -105,8 +105,8 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
     ]
     scales = [{"params": {"scale": jnp.ones(o), "bias": jnp.zeros(o)}} for _, o, *_ in layers]
     features = jnp.concatenate(made, axis=-1)
-    head = dense.Head(net, dense.OUTPUTS * dense.terms(net))
-    head_of = {"params": critic["params"]["head"]}
+    head = dense.Head(net)
+    head_of = {"params": first["params"]["head"]}
     action = Action(
         primitive=jnp.arange(cfg.learn.batch) % 2,
         pose=jnp.asarray(rng.uniform(-0.1, 0.1, (cfg.learn.batch, 3)), jnp.float32),
@@ -114,7 +114,7 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
 
     def loss(learned: Any) -> jax.Array:
         variables = {**state.online.critic, **learned}
-        return jnp.mean(actor_critic._value(parts, variables, obs, action)[0] ** 2)
+        return jnp.mean(critic.q_of_actions(parts, variables, obs, action)[0] ** 2)
 
     def optimise(state: actor_critic.LearnerState, gradient: Any) -> Any:
         before = networks.learned(state.online.critic)
@@ -123,24 +123,24 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
         return losses.update_target(cfg.learn, online, state.target), optimiser
 
     forward_of = jit(nets.critic.apply)
-    dense_maps = jit(lambda params, obs: actor_critic.dense_maps(parts, params, obs))
+    dense_maps = jit(lambda params, obs: values.dense_maps(parts, params, obs))
     seen_maps = dense_maps(state.target, obs)
-    values = jit(jax.vmap(functools.partial(actor_critic.next_value, parts), (0, 0)))
+    next_values = jit(jax.vmap(functools.partial(critic.next_value, parts), (0, 0)))
     convolve, gradients = jit(convolutions), jit(jax.grad(loss))
     normalise = jit(lambda scales, made: list(map(norm.apply, scales, made)))
     head_only, adam = jit(head.apply), jit(optimise)
-    learn_actor = jit(lambda state, obs: actor_critic.update_actor(parts, state, obs))
+    learn_actor = jit(lambda state, obs: actor.update(parts, state, obs))
     some = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], obs)
     gradient = networks.learned(state.online.critic)
     actors, frames = (cfg.learn.actor_batch or cfg.learn.batch), turned.shape[1]
     critics = cfg.learn.critics
     return {
-        "forward": (lambda: forward_of(critic, flat), passes * forward),
+        "forward": (lambda: forward_of(first, flat), passes * forward),
         "convolutions": (lambda: convolve(flat, kernels), passes * each["convolutions"]),
         "norm": (lambda: normalise(scales, made), 0.0),
         "head": (lambda: head_only(head_of, features), passes * each["head"]),
         "turn": (lambda: turn(obs), 0.0),
-        "target_value": (lambda: values(keys, seen_maps), 0.0),
+        "target_value": (lambda: next_values(keys, seen_maps), 0.0),
         "gradients": (lambda: gradients(gradient), critics * 2 * cfg.learn.batch * 3.0 * forward),
         "actor": (
             lambda: learn_actor(state, some),

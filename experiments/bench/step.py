@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, policy
+from csac_jax.agent import actor, critic, policy, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
@@ -136,7 +136,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
-        "dense_maps": jit(lambda params, obs: actor_critic.dense_maps(parts, params, obs)),
+        "dense_maps": jit(lambda params, obs: values.dense_maps(parts, params, obs)),
         "act": jax.jit(act),
         "simulate": jax.jit(jax.vmap(env.step)),
         "reward": jit(reward),
@@ -197,24 +197,22 @@ def _learning(
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
 
     def next_value(nets: Any, batch: Transition) -> jax.Array:
-        maps = actor_critic.dense_maps(parts, nets.target, heightmap.unpack(batch.next_obs))
-        return jax.vmap(actor_critic.next_value, (None, 0, 0))(parts, keys, maps)
+        maps = values.dense_maps(parts, nets.target, heightmap.unpack(batch.next_obs))
+        return jax.vmap(critic.next_value, (None, 0, 0))(parts, keys, maps)
 
     draw = jit(
         lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
     )
     value = jit(next_value)
-    critic = jit(
-        lambda nets, batch, weights: actor_critic.update_critic(key, parts, nets, batch, weights)
-    )
-    actor = jit(lambda nets, obs: actor_critic.update_actor(parts, nets, heightmap.unpack(obs)))
+    learn_critic = jit(lambda nets, batch, weights: critic.update(key, parts, nets, batch, weights))
+    learn_actor = jit(lambda nets, obs: actor.update(parts, nets, heightmap.unpack(obs)))
     _, weights, batch = draw(replay)
     obs = jax.tree.map(lambda leaf: leaf[: cfg.learn.actor_batch or None], batch.obs)
     calls: dict[str, Callable[[], Any]] = {
         "draw": lambda: draw(replay),
         "next_value": lambda: value(nets, batch),
-        "update_critic": lambda: critic(nets, batch, weights),
-        "update_actor": lambda: actor(nets, obs),
+        "update_critic": lambda: learn_critic(nets, batch, weights),
+        "update_actor": lambda: learn_actor(nets, obs),
     }
     return calls | _labels(parts, nets, batch)
 
@@ -226,7 +224,7 @@ def _labels(parts: ActorCritic, nets: Any, batch: Transition) -> dict[str, Calla
     fourth = jnp.arange(parts.cfg.learn.batch) % 4 == 0
     obs = jax.jit(heightmap.unpack)(batch.obs)
     jit = functools.partial(jax.jit, compiler_options=compiler.options(parts.cfg))
-    best = jit(lambda params, asked: actor_critic.best_grasps(parts, params, obs, asked))
+    best = jit(lambda params, asked: values.best_grasps(parts, params, obs, asked))
     return {
         "labels": lambda: best(nets.target, fourth),
         "no_labels": lambda: best(nets.target, jnp.zeros_like(fourth)),

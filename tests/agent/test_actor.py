@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.agent import actor
 from csac_jax.agent.maps import DenseMaps
@@ -43,8 +44,8 @@ def test_two_peaks(frames, pose):
     for peaks in ((high, low), (low, high)):
         logits[peaks[0]], logits[peaks[1]] = 20.0, 19.9
         got = pose(jnp.asarray(logits), _everywhere(frames))
-        np.testing.assert_allclose(got[:2], frames.xy[peaks[0]], atol=0.01 * frames.cell)
-        np.testing.assert_allclose(got[2], frames.yaws[peaks[0][0]], atol=0.01)
+        assert_allclose(got[:2], frames.xy[peaks[0]], atol=0.01 * frames.cell)
+        assert_allclose(got[2], frames.yaws[peaks[0][0]], atol=0.01)
 
 
 @pytest.mark.parametrize("step", [(0, 2), (2, 0), (2, 2), (1, 2), (0, -2)])
@@ -55,7 +56,7 @@ def test_two_peaks_side_by_side(frames, pose, step):
     logits[2, 8, 9] = 20.0
     logits[2, 8 + step[0], 9 + step[1]] = 20.0 - 1e-4
     got = pose(jnp.asarray(logits), _everywhere(frames))
-    np.testing.assert_allclose(got[:2], frames.xy[2, 8, 9], atol=0.01 * frames.cell)
+    assert_allclose(got[:2], frames.xy[2, 8, 9], atol=0.01 * frames.cell)
 
 
 def test_sharp_peaks_are_reproduced(frames, pose):
@@ -73,10 +74,8 @@ def test_sharp_peaks_are_reproduced(frames, pose):
         logits = _flat(frames)
         logits[k, row, col] = 25.0
         got = np.asarray(pose(jnp.asarray(logits), _everywhere(frames)))
-        np.testing.assert_allclose(got[:2], frames.xy[k, row, col], atol=0.01 * frames.cell)
-        np.testing.assert_allclose(
-            (got[2] - frames.yaws[k] + np.pi) % (2 * np.pi) - np.pi, 0.0, atol=0.01
-        )
+        assert_allclose(got[:2], frames.xy[k, row, col], atol=0.01 * frames.cell)
+        assert_allclose((got[2] - frames.yaws[k] + np.pi) % (2 * np.pi) - np.pi, 0.0, atol=0.01)
 
 
 def test_invalid_cells_do_not_attract(frames, pose):
@@ -87,7 +86,7 @@ def test_invalid_cells_do_not_attract(frames, pose):
     logits[4, 10, 10] = 20.0
     logits[4, 10, 11], valid[4, 10, 11] = 40.0, False
     got = pose(jnp.asarray(logits), jnp.asarray(valid))
-    np.testing.assert_allclose(got[:2], frames.xy[4, 10, 10], atol=0.01 * frames.cell)
+    assert_allclose(got[:2], frames.xy[4, 10, 10], atol=0.01 * frames.cell)
 
 
 def test_pose_is_finite_where_nothing_is_valid(frames, pose):
@@ -95,7 +94,7 @@ def test_pose_is_finite_where_nothing_is_valid(frames, pose):
     logits = _flat(frames)
     logits[6, 8, 9] = 30.0
     got = pose(jnp.asarray(logits), ~_everywhere(frames))
-    np.testing.assert_allclose(got[:2], frames.xy[6, 8, 9], atol=0.01 * frames.cell)
+    assert_allclose(got[:2], frames.xy[6, 8, 9], atol=0.01 * frames.cell)
 
 
 @pytest.mark.parametrize(
@@ -127,17 +126,15 @@ def test_mean_moves_towards_a_growing_neighbour(frames, pose, neighbour, axis):
         yaw = frames.yaws[2]
         towards = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])[axis]
         assert rate[:2] @ towards > 0.01 * frames.cell
-        np.testing.assert_allclose((after - before)[:2] / 0.02, rate[:2], rtol=0.05, atol=1e-4)
-    np.testing.assert_allclose((after - before)[2] / 0.02, rate[2], rtol=0.1, atol=0.03)
+        assert_allclose((after - before)[:2] / 0.02, rate[:2], rtol=0.05, atol=1e-4)
+    assert_allclose((after - before)[2] / 0.02, rate[2], rtol=0.1, atol=0.03)
 
 
 def test_critic_gets_no_gradient_through_the_actor():
     """Claim: the critic's map enters the actor's logits, ten to one, without gradient."""
     q, correction = jnp.array([1.0, -2.0]), jnp.array([0.5, 0.0])
-    np.testing.assert_allclose(actor.logits(q, correction), [10.5, -20.0])
-    np.testing.assert_array_equal(
-        jax.grad(lambda q: jnp.sum(actor.logits(q, correction)))(q), [0.0, 0.0]
-    )
+    assert_allclose(actor.logits(q, correction), [10.5, -20.0])
+    assert_array_equal(jax.grad(lambda q: jnp.sum(actor.logits(q, correction)))(q), [0.0, 0.0])
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -157,7 +154,7 @@ def test_yaw_does_not_turn_to_what_is_not_valid(frames, pose, side):
     got = pose(jnp.asarray(logits), jnp.asarray(valid))
     away = valid.copy()
     away[2 + side] = False
-    np.testing.assert_allclose(got, pose(jnp.asarray(logits), jnp.asarray(away)), atol=1e-5)
+    assert_allclose(got, pose(jnp.asarray(logits), jnp.asarray(away)), atol=1e-5)
     assert (got[2] - frames.yaws[2]) * side < 0.0  # the only other yaw is on the other side
 
 
@@ -174,4 +171,4 @@ def test_neighbours_do_not_leak_into_the_yaw(frames, pose):
     before = pose(jnp.asarray(logits), jnp.asarray(valid))
     valid[second] = False
     logits[second] = 19.0
-    np.testing.assert_allclose(pose(jnp.asarray(logits), jnp.asarray(valid)), before, atol=1e-3)
+    assert_allclose(pose(jnp.asarray(logits), jnp.asarray(valid)), before, atol=1e-3)

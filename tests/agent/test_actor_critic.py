@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from csac_jax.agent import actor, actor_critic, maps
+from csac_jax.agent import actor, actor_critic, critic, maps, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
 from csac_jax.agent.learner import Transition
 from csac_jax.agent.maps import DenseMaps
@@ -56,7 +57,7 @@ def update(learner):
 
     @jax.jit
     def one(state, batch, weights):
-        return actor_critic.update_critic(jax.random.key(3), learner, state, batch, weights)
+        return critic.update(jax.random.key(3), learner, state, batch, weights)
 
     return lambda state, batch, weights=None: one(
         state, batch, jnp.ones(B) if weights is None else weights
@@ -85,9 +86,7 @@ def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
     Where everything ends the target is the reward, so that the error tells Q. Both primitives,
     poses all over.
     """
-    look = jax.jit(
-        lambda params, obs: actor_critic.dense_maps(learner, params, heightmap.unpack(obs)).q
-    )
+    look = jax.jit(lambda params, obs: values.dense_maps(learner, params, heightmap.unpack(obs)).q)
     read = jax.jit(jax.vmap(lambda q, p, pose: maps.read(learner.frames, q, p, pose)))
     q = look(state.online, batch.obs)
     rng = np.random.default_rng(0)
@@ -100,7 +99,7 @@ def test_value_in_the_loss_is_that_of_the_maps(learner, state, batch, update):
         )
         tried = _ended(batch).replace(action=action)
         got = tried.reward - update(state, tried)[1].error
-        np.testing.assert_allclose(got, read(q, action.primitive, action.pose), atol=2e-5)
+        assert_allclose(got, read(q, action.primitive, action.pose), atol=2e-5)
     assert np.std(q) > 0.05
 
 
@@ -109,11 +108,9 @@ def test_update_reports_its_loss(learner, state, batch, update):
     counted."""
     after, info = update(state, batch)
     width = learner.cfg.learn.huber
-    np.testing.assert_allclose(
-        info.critic_loss, np.mean(optax.huber_loss(info.error, delta=width)), rtol=1e-5
-    )
+    assert_allclose(info.critic_loss, np.mean(optax.huber_loss(info.error, delta=width)), rtol=1e-5)
     ended = update(state, _ended(batch))[1]
-    np.testing.assert_allclose(ended.q, np.mean(batch.reward - ended.error), atol=1e-6)
+    assert_allclose(ended.q, np.mean(batch.reward - ended.error), atol=1e-6)
     assert after.updates == state.updates + 1
 
 
@@ -123,16 +120,14 @@ def test_losses_are_weighted(learner, state, batch, update):
     weights = jnp.array([0.0, 0.25, 1.0, 0.5, 0.0, 1.0])
     after, info = update(state, batch, weights)
     loss = optax.huber_loss(info.error, delta=learner.cfg.learn.huber)
-    np.testing.assert_allclose(
-        info.critic_loss, np.mean(np.asarray(weights) * np.asarray(loss)), rtol=1e-5
-    )
+    assert_allclose(info.critic_loss, np.mean(np.asarray(weights) * np.asarray(loss)), rtol=1e-5)
     _, plain = update(state, batch)
-    np.testing.assert_array_equal(info.error, plain.error)
-    np.testing.assert_array_equal(info.q, plain.q)
+    assert_array_equal(info.error, plain.error)
+    assert_array_equal(info.q, plain.q)
     other, _ = update(
         state, batch.replace(reward=batch.reward.at[jnp.array([0, 4])].add(3.0)), weights
     )
-    jax.tree.map(np.testing.assert_array_equal, after.online, other.online)
+    jax.tree.map(assert_array_equal, after.online, other.online)
 
 
 @pytest.mark.slow
@@ -143,14 +138,12 @@ def test_target_carries_no_gradient(learner, state, batch):
     def loss(online, target, reward):
         before = state.replace(online=online, target=target)
         seen = batch.replace(reward=reward)
-        return actor_critic.update_critic(jax.random.key(3), learner, before, seen, jnp.ones(B))[
-            1
-        ].critic_loss
+        return critic.update(jax.random.key(3), learner, before, seen, jnp.ones(B))[1].critic_loss
 
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(state.online, state.target, batch.reward)
     online, target, reward = gradient
     for leaf in jax.tree.leaves((target, reward, online.actor)):
-        np.testing.assert_array_equal(leaf, 0.0)
+        assert_array_equal(leaf, 0.0)
     assert all(np.any(np.asarray(leaf) != 0.0) for leaf in jax.tree.leaves(online.critic))
 
 
@@ -159,9 +152,7 @@ def test_critic_gradient_is_that_of_its_loss(learner, state, batch):
     plain = dataclasses.replace(learner, critic_optimiser=optax.sgd(1.0))
     weights = jnp.linspace(0.2, 1.0, B)
     run = jax.jit(
-        lambda state: actor_critic.update_critic(
-            jax.random.key(3), plain, state, _ended(batch), weights
-        )
+        lambda state: critic.update(jax.random.key(3), plain, state, _ended(batch), weights)
     )
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.critic, after.online.critic)
@@ -180,7 +171,7 @@ def _check_slope(loss, params, gradient, relative: float = 1e-2, step: float = 2
         loss(jax.tree.map(lambda p, g, s=sign: p + s * step / size * g, params, gradient))
         for sign in (1.0, -1.0)
     )
-    np.testing.assert_allclose((above - below) / (2.0 * step), size, rtol=relative)
+    assert_allclose((above - below) / (2.0 * step), size, rtol=relative)
 
 
 def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
@@ -191,7 +182,7 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
     pose jumps. The step is so long that float32's rounding of the loss, 1e-8, is 1e-5 of the slope.
     """
     plain = dataclasses.replace(learner, actor_optimiser=optax.sgd(1.0))
-    run = jax.jit(lambda state: actor_critic.update_actor(plain, state, observations(B, 4)))
+    run = jax.jit(lambda state: actor.update(plain, state, observations(B, 4)))
     after, _ = run(state)
     gradient = jax.tree.map(jnp.subtract, state.online.actor, after.online.actor)
     _check_slope(
@@ -206,14 +197,12 @@ def test_actor_gradient_is_that_of_its_loss(learner, state, observations):
 def test_actor_climbs_the_critic(learner, state, batch):
     """Claim: updates of the actor raise Q(s, mu(s)) and leave the critic and both targets as they
     are."""
-    run = jax.jit(
-        lambda state: actor_critic.update_actor(learner, state, heightmap.unpack(batch.obs))
-    )
+    run = jax.jit(lambda state: actor.update(learner, state, heightmap.unpack(batch.obs)))
 
     @jax.jit
     def value(online: Params) -> jax.Array:
         """Mean of Q(s, mu(s)) over states and primitives."""
-        seen = actor_critic.dense_maps(learner, online, heightmap.unpack(batch.obs))
+        seen = values.dense_maps(learner, online, heightmap.unpack(batch.obs))
         poses = [
             jax.vmap(lambda one, p=p: actor.pose(learner.frames, one, p))(seen) for p in Primitive
         ]
@@ -225,11 +214,11 @@ def test_actor_climbs_the_critic(learner, state, batch):
     current, first = run(state)
     for _ in range(60):
         current, _ = run(current)
-    np.testing.assert_allclose(first, -value(state.online), atol=1e-6)
+    assert_allclose(first, -value(state.online), atol=1e-6)
     assert value(current.online) > value(state.online) + 0.004
     for name in ("critic_optimiser", "target", "updates"):
-        jax.tree.map(np.testing.assert_array_equal, getattr(current, name), getattr(state, name))
-    jax.tree.map(np.testing.assert_array_equal, current.online.critic, state.online.critic)
+        jax.tree.map(assert_array_equal, getattr(current, name), getattr(state, name))
+    jax.tree.map(assert_array_equal, current.online.critic, state.online.critic)
 
 
 def test_updates_lower_the_loss(state, batch, update):
@@ -241,7 +230,7 @@ def test_updates_lower_the_loss(state, batch, update):
         current, info = update(current, _ended(batch))
         losses.append(float(jnp.mean(info.error**2)))
     assert losses[-1] < 0.5 * losses[0]
-    jax.tree.map(np.testing.assert_array_equal, current.online.actor, state.online.actor)
+    jax.tree.map(assert_array_equal, current.online.actor, state.online.actor)
 
 
 def test_target_moves_by_tau(learner, state, batch, update):
@@ -252,9 +241,7 @@ def test_target_moves_by_tau(learner, state, batch, update):
     wanted = jax.tree.map(
         lambda new, old: tau * new + (1.0 - tau) * old, after.online, state.target
     )
-    jax.tree.map(
-        lambda got, want: np.testing.assert_allclose(got, want, atol=1e-7), after.target, wanted
-    )
+    jax.tree.map(lambda got, want: assert_allclose(got, want, atol=1e-7), after.target, wanted)
     moved = jax.tree.map(
         lambda new, old: float(np.abs(new - old).max()), after.online.critic, state.online.critic
     )
@@ -272,8 +259,8 @@ def test_bootstrap(learner, state, batch, update, value):
         for t in (half & False, half | True, half)
     )
     gain = learner.cfg.target.gamma * np.clip(value, *learner.bounds)
-    np.testing.assert_allclose(going - ended, gain, atol=1e-5)
-    np.testing.assert_allclose(mixed - ended, np.where(half, 0.0, gain), atol=1e-5)
+    assert_allclose(going - ended, gain, atol=1e-5)
+    assert_allclose(mixed - ended, np.where(half, 0.0, gain), atol=1e-5)
 
 
 def _smooth(frames) -> DenseMaps:
@@ -301,7 +288,7 @@ def test_next_value_lies_within_the_map(learner):
     for beta in (0.0, 1e5):
         target = with_constants(TargetConfig(), samples=256, inverse_temperature=beta)
         own = _changed(learner, target=target)
-        run = jax.jit(jax.vmap(lambda key, own=own: actor_critic.next_value(own, key, state)))
+        run = jax.jit(jax.vmap(lambda key, own=own: critic.next_value(own, key, state)))
         values = np.asarray(run(jax.random.split(jax.random.key(1), 16)))
         assert np.all((values >= low) & (values <= high))
         means.append(values.mean())
@@ -321,13 +308,13 @@ def test_inverse_temperature_follows_the_range_of_q(learner):
         own = _changed(learner, target=with_constants(cfg, inverse_temperature=beta))
         own = dataclasses.replace(own, bounds=bounds)
         scaled = state.replace(q=q_scale * state.q)
-        run = jax.jit(lambda key: actor_critic.next_value(own, key, scaled))
+        run = jax.jit(lambda key: critic.next_value(own, key, scaled))
         return float(run(jax.random.key(1)))
 
     plain = value(1.0, 1.0, (-2.0, 4.0))
     assert abs(plain) > 0.1
-    np.testing.assert_allclose(value(10.0, 1.0, (-20.0, 40.0)), 10.0 * plain, rtol=1e-5)
-    np.testing.assert_allclose(value(1.0, 2.0, (-4.0, 8.0)), plain, rtol=1e-6)
+    assert_allclose(value(10.0, 1.0, (-20.0, 40.0)), 10.0 * plain, rtol=1e-5)
+    assert_allclose(value(1.0, 2.0, (-4.0, 8.0)), plain, rtol=1e-6)
 
 
 def test_next_value_ignores_what_is_bare(learner):
@@ -336,11 +323,11 @@ def test_next_value_ignores_what_is_bare(learner):
     q = jnp.stack([jnp.full((8, 18, 18), 3.0), jnp.full((8, 18, 18), 1.0)])
     assert q.shape[1:] == learner.frames.xy.shape[:3]
     value = jax.jit(
-        lambda valid: actor_critic.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
+        lambda valid: critic.next_value(learner, jax.random.key(0), DenseMaps(q, q, valid))
     )
     grasps = jnp.zeros(q.shape, bool).at[Primitive.GRASP].set(True)
-    np.testing.assert_allclose(value(grasps), 1.0, rtol=1e-5)
-    np.testing.assert_allclose(value(~grasps), 3.0, rtol=1e-5)
+    assert_allclose(value(grasps), 1.0, rtol=1e-5)
+    assert_allclose(value(~grasps), 3.0, rtol=1e-5)
     assert 1.0 < value(jnp.zeros(q.shape, bool)) <= 3.0
 
 
@@ -352,15 +339,13 @@ def test_best_grasp():
     q[Primitive.PUSH] += 9.0
     best = max(q[Primitive.GRASP][valid[Primitive.GRASP]])
     state = DenseMaps(jnp.asarray(q), jnp.asarray(q), jnp.asarray(valid))
-    assert actor_critic.best_grasp(state) == best < 0.0
-    assert actor_critic.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0
+    assert values.best_grasp(state) == best < 0.0
+    assert values.best_grasp(state.replace(valid=jnp.zeros(q.shape, bool))) == 0.0
 
 
 def _run(learner: ActorCritic):
     return jax.jit(
-        lambda state, batch: actor_critic.update_critic(
-            jax.random.key(3), learner, state, batch, jnp.ones(B)
-        )
+        lambda state, batch: critic.update(jax.random.key(3), learner, state, batch, jnp.ones(B))
     )
 
 
@@ -377,10 +362,10 @@ def test_max_target_is_the_best_valid_cell(learner):
     of the softmax over the map; without a valid cell, over all."""
     own, state = _changed(learner, target=TargetConfig(value="max")), _random_maps((2, 4, 6, 6))
     best = np.asarray(state.q)[np.asarray(state.valid)].max()
-    assert actor_critic.next_value(own, jax.random.key(0), state) == best
-    np.testing.assert_allclose(exact_softmax(state.q, 1e6, state.valid), best, rtol=1e-6)
+    assert critic.next_value(own, jax.random.key(0), state) == best
+    assert_allclose(exact_softmax(state.q, 1e6, state.valid), best, rtol=1e-6)
     assert (
-        actor_critic.next_value(
+        critic.next_value(
             own, jax.random.key(0), state.replace(valid=jnp.zeros(state.q.shape, bool))
         )
         == 5.0
@@ -398,26 +383,26 @@ def test_a_policy_that_never_pushes_expects_nothing_of_pushes(learner, value):
     )
     state = _smooth(learner.frames)
     high = state.replace(q=state.q.at[Primitive.PUSH].add(3.0))
-    run = jax.jit(lambda s: actor_critic.next_value(own, jax.random.key(0), s))
+    run = jax.jit(lambda s: critic.next_value(own, jax.random.key(0), s))
     assert run(state) == run(high) <= float(state.q[Primitive.GRASP].max())
 
 
 def test_max_target_reaches_the_update(learner, state, batch, update):
     """Claim: y = r + gamma max Q'(s', .), by NumPy from the target critic's maps."""
     own = _changed(learner, target=TargetConfig(value="max", gamma=0.5))
-    seen = jax.jit(
-        lambda params, obs: actor_critic.dense_maps(learner, params, heightmap.unpack(obs))
-    )(state.target, batch.next_obs)
+    seen = jax.jit(lambda params, obs: values.dense_maps(learner, params, heightmap.unpack(obs)))(
+        state.target, batch.next_obs
+    )
     best = np.where(seen.valid, seen.q, -np.inf).reshape(B, -1).max(axis=1)
     going, ended = _run(own)(state, batch)[1].error, update(state, _ended(batch))[1].error
-    np.testing.assert_allclose(going - ended, 0.5 * np.clip(best, *learner.bounds), atol=1e-5)
+    assert_allclose(going - ended, 0.5 * np.clip(best, *learner.bounds), atol=1e-5)
 
 
 @pytest.mark.slow
 def test_squared_loss_reaches_the_update(learner, state, batch):
     """Claim: with `squared` the loss is the mean of the squared errors, line 21."""
     info = _run(_changed(learner, learn={"loss": "squared"}))(state, batch)[1]
-    np.testing.assert_allclose(info.critic_loss, np.mean(np.asarray(info.error) ** 2), rtol=1e-5)
+    assert_allclose(info.critic_loss, np.mean(np.asarray(info.error) ** 2), rtol=1e-5)
 
 
 def _one(params: Params, m: int) -> Params:
@@ -432,15 +417,15 @@ def test_decisions_see_the_mean_of_the_critics(learner, observations, randomised
     with jax.numpy_dtype_promotion("standard"):
         params = randomised(actor_critic.init(jax.random.key(0), twin)).online
     obs = observations(2, 4)
-    look = jax.jit(lambda params: actor_critic.decision_maps(twin, params, obs))
+    look = jax.jit(lambda params: values.decision_maps(twin, params, obs))
     both, single = look(params), [look(_one(params, m)) for m in (0, 1)]
-    np.testing.assert_allclose(both.q, 0.5 * (single[0].q + single[1].q), atol=1e-5)
-    plain = jax.jit(lambda params: actor_critic.dense_maps(twin, params, obs))(params)
-    np.testing.assert_array_equal(both.valid, plain.valid)
+    assert_allclose(both.q, 0.5 * (single[0].q + single[1].q), atol=1e-5)
+    plain = jax.jit(lambda params: values.dense_maps(twin, params, obs))(params)
+    assert_array_equal(both.valid, plain.valid)
     assert np.abs(np.asarray(both.q - plain.q)).max() > 0.05
     off = _changed(twin, policy={"augment": False})
-    same = jax.jit(lambda params: actor_critic.decision_maps(off, params, obs))(params)
-    jax.tree.map(np.testing.assert_array_equal, same, plain)
+    same = jax.jit(lambda params: values.decision_maps(off, params, obs))(params)
+    jax.tree.map(assert_array_equal, same, plain)
 
 
 @pytest.mark.parametrize("kind", ["small", "offset"])
@@ -455,7 +440,7 @@ def test_height_bonus_adds_to_q(learner, observations, randomised, kind):
     size = round(frames.extent / frames.tables.cell)
     step = np.where(np.arange(size) < size // 2, 0.02, 0.08).astype(np.float32)  # along x
     obs = observations(1, 4).replace(height=jnp.broadcast_to(step, (1, size, size)))
-    looks = actor_critic.dense_maps, actor_critic.decision_maps, actor_critic.exploration_maps
+    looks = values.dense_maps, values.decision_maps, values.exploration_maps
     plain, *raised = (jax.jit(lambda p, o, f=f: f(high, p, o))(params, obs) for f in looks)
     x, outermost = frames.xy[..., 0], np.abs(frames.xy).max(axis=-1)
     sure = (outermost < 0.5 * frames.extent - frames.cell) & (np.abs(x) > frames.cell)
@@ -464,14 +449,14 @@ def test_height_bonus_adds_to_q(learner, observations, randomised, kind):
     pose = jnp.array([0.3 * frames.extent, 0.013, 0.4])
     for state in raised:
         got = np.asarray(state.q - plain.q)[0][:, sure]
-        np.testing.assert_allclose(got, np.broadcast_to(expected, got.shape), atol=1e-5)
-        np.testing.assert_array_equal(state.logits, plain.logits)
-        np.testing.assert_array_equal(state.valid, plain.valid)
+        assert_allclose(got, np.broadcast_to(expected, got.shape), atol=1e-5)
+        assert_array_equal(state.logits, plain.logits)
+        assert_array_equal(state.valid, plain.valid)
         between = [
             maps.read_q(frames, jax.tree.map(lambda leaf: leaf[0], one), jnp.int32(1), pose)
             for one in (state, plain)
         ]
-        np.testing.assert_allclose(between[0] - between[1], 3.0 * 0.08, atol=1e-5)
+        assert_allclose(between[0] - between[1], 3.0 * 0.08, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -486,26 +471,20 @@ def test_twin_critics(learner, batch, randomised):
     with jax.numpy_dtype_promotion("standard"):
         state = randomised(begun)
     look = jax.jit(
-        lambda params: actor_critic.dense_maps(learner, params, heightmap.unpack(batch.next_obs))
+        lambda params: values.dense_maps(learner, params, heightmap.unpack(batch.next_obs))
     )
     both, single = look(state.target), [look(_one(state.target, m)) for m in (0, 1)]
-    np.testing.assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
+    assert_allclose(both.q, np.minimum(single[0].q, single[1].q), atol=1e-5)
     assert 0.1 < np.mean(single[0].q < single[1].q) < 0.9
 
     run, alone = _run(twin), _run(learner)
     ended = run(state, _ended(batch))[1]
     infos = [alone(_alone(learner, state, m), _ended(batch))[1] for m in (0, 1)]
-    np.testing.assert_allclose(
-        ended.critic_loss, sum(info.critic_loss for info in infos), rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        ended.error, np.mean([info.error for info in infos], axis=0), atol=1e-5
-    )
+    assert_allclose(ended.critic_loss, sum(info.critic_loss for info in infos), rtol=1e-5)
+    assert_allclose(ended.error, np.mean([info.error for info in infos], axis=0), atol=1e-5)
     best = np.where(both.valid, both.q, -np.inf).reshape(B, -1).max(axis=1)
     going = run(state, batch)[1].error - ended.error
-    np.testing.assert_allclose(
-        going, twin.cfg.target.gamma * np.clip(best, *learner.bounds), atol=1e-5
-    )
+    assert_allclose(going, twin.cfg.target.gamma * np.clip(best, *learner.bounds), atol=1e-5)
 
 
 def _alone(learner: ActorCritic, state: LearnerState, m: int) -> LearnerState:
@@ -520,8 +499,8 @@ def test_without_an_actor(learner, state, observations):
     """Claim: without an actor the logits are the critic's map, ten to one, and an update of the
     actor is none."""
     own = _changed(learner, learn={"actor": False})
-    seen = jax.jit(lambda obs: actor_critic.dense_maps(own, state.online, obs))(observations(2, 4))
-    np.testing.assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
-    after, loss = actor_critic.update_actor(own, state, observations(2, 4))
-    jax.tree.map(np.testing.assert_array_equal, after, state)
+    seen = jax.jit(lambda obs: values.dense_maps(own, state.online, obs))(observations(2, 4))
+    assert_allclose(seen.logits, 10.0 * seen.q, rtol=1e-6)
+    after, loss = actor.update(own, state, observations(2, 4))
+    jax.tree.map(assert_array_equal, after, state)
     assert loss == 0.0

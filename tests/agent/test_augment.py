@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chisquare
 
@@ -91,8 +92,8 @@ def test_view_is_that_of_the_mirrored_scene(transition, flags):
         off = np.abs(np.asarray(seen.height, int) - np.asarray(obs.height, int))
         assert np.mean(off > 1) < 0.003  # a ray along an edge
         bare = (np.asarray(seen.height) == 0) & (np.asarray(obs.height) == 0)
-        np.testing.assert_array_equal(np.asarray(seen.colour)[bare], np.asarray(obs.colour)[bare])
-        np.testing.assert_array_equal(seen.target, obs.target)
+        assert_array_equal(np.asarray(seen.colour)[bare], np.asarray(obs.colour)[bare])
+        assert_array_equal(seen.target, obs.target)
     assert np.mean(np.asarray(seen.height) > 100) > 0.05
 
 
@@ -122,8 +123,8 @@ def test_action_turns_with_the_scene(transition, flags):
     matrix = _matrix(flags)[:2, :2]
     turned = _turn(flags, transition)
     x, y, yaw = np.asarray(turned.action.pose)
-    np.testing.assert_allclose([x, y], matrix @ POSE[:2], atol=1e-7)
-    np.testing.assert_allclose(
+    assert_allclose([x, y], matrix @ POSE[:2], atol=1e-7)
+    assert_allclose(
         [np.cos(yaw), np.sin(yaw)], matrix @ [np.cos(POSE[2]), np.sin(POSE[2])], atol=1e-6
     )
     assert 0.0 <= yaw < 2.0 * np.pi
@@ -149,7 +150,7 @@ def test_reading_under_the_action_stays(transition, flags):
         return maps.actionable_cells(FRAMES, heightmap.unpack(transition.obs))
 
     turned = _turn(flags, transition)
-    np.testing.assert_allclose(height(turned), height(transition), atol=1e-6)
+    assert_allclose(height(turned), height(transition), atol=1e-6)
     before, after = valid(transition), valid(turned)
     poses = jax.vmap(lambda cell: maps.cell_pose(FRAMES, cell))(jnp.arange(before[0].size))
     move = jax.vmap(
@@ -163,7 +164,7 @@ def test_reading_under_the_action_stays(transition, flags):
     moved = jax.jit(move)(poses)
     for primitive in Primitive:
         check = jax.vmap(lambda pose, p=primitive: maps.is_valid(FRAMES, after, jnp.int32(p), pose))
-        np.testing.assert_array_equal(check(moved), before[primitive].reshape(-1))
+        assert_array_equal(check(moved), before[primitive].reshape(-1))
         assert 0.02 < np.mean(before[primitive]) < 0.9
 
 
@@ -179,11 +180,11 @@ def test_they_form_a_group(transition):
     for single in np.eye(3, dtype=bool):
         twice = _turn(single, _turn(single, transition))
         assert _signature(twice) == _signature(transition)
-        np.testing.assert_allclose(twice.action.pose, transition.action.pose, atol=1e-6)
+        assert_allclose(twice.action.pose, transition.action.pose, atol=1e-6)
     for first, second in itertools.product(FLAGS, FLAGS):
         both = _turn(second, _turn(first, transition))
         same = _turn(images[_signature(both)], transition)
-        np.testing.assert_allclose(both.action.pose, same.action.pose, atol=1e-6)
+        assert_allclose(both.action.pose, same.action.pose, atol=1e-6)
 
 
 def test_random_symmetry_draws_all_eight_alike(transition):
@@ -226,8 +227,8 @@ def test_shift_is_the_view_of_the_shifted_scene(transition, cells):
         assert np.mean(off > 1) < 0.005  # a ray along an edge
         off = np.abs(np.asarray(seen.colour, int) - np.asarray(obs.colour, int)).max(axis=-1)
         assert np.mean(off > 1) < 0.005
-        np.testing.assert_array_equal(seen.target, obs.target)
-    np.testing.assert_allclose(
+        assert_array_equal(seen.target, obs.target)
+    assert_allclose(
         moved.action.pose, np.add(POSE, [cells[1] * CELL, cells[0] * CELL, 0.0]), atol=1e-6
     )
     back = shift(moved, -jnp.array(cells, jnp.int32))
@@ -273,14 +274,12 @@ def test_augment_is_what_the_config_says(transition):
             same(jax.random.key(seed), CFG, transition),
             augment.random_symmetry(jax.random.key(seed), transition),
         )
-        jax.tree.map(np.testing.assert_array_equal, default, drawn)
+        jax.tree.map(assert_array_equal, default, drawn)
     off = CFG.change(learn={"augment": False})
-    jax.tree.map(
-        np.testing.assert_array_equal, same(jax.random.key(0), off, transition), transition
-    )
+    jax.tree.map(assert_array_equal, same(jax.random.key(0), off, transition), transition)
     wide = off.change(learn={"augment_shift": 2})
     keys = jax.random.split(jax.random.key(1), 300)
     poses = jax.jit(jax.vmap(lambda key: augment.augment(key, wide, transition).action.pose))(keys)
     shifts = (np.asarray(poses) - POSE)[:, :2] / CELL
-    np.testing.assert_allclose(shifts, shifts.round(), atol=1e-4)
+    assert_allclose(shifts, shifts.round(), atol=1e-4)
     assert len(np.unique(shifts.round(), axis=0)) == 25

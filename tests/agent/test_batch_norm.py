@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from csac_jax.agent import actor_critic
+from csac_jax.agent import actor, actor_critic, critic, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.learner import Transition
 from csac_jax.config import DenseNet121
@@ -69,9 +70,7 @@ def batch(observations) -> Transition:
 def update(learner):
     """(state, batch) -> state, info of one update of the critic."""
     return jax.jit(
-        lambda state, batch: actor_critic.update_critic(
-            jax.random.key(3), learner, state, batch, jnp.ones(B)
-        )
+        lambda state, batch: critic.update(jax.random.key(3), learner, state, batch, jnp.ones(B))
     )
 
 
@@ -95,18 +94,18 @@ def _kernels(variables: Any) -> list[jax.Array]:
 
 
 def _same(first: Any, other: Any) -> None:
-    jax.tree.map(np.testing.assert_array_equal, first, other)
+    jax.tree.map(assert_array_equal, first, other)
 
 
 def test_acting_uses_running_statistics(learner, state, observations):
     """Claim: a state's maps do not depend on what else is looked at, but on the running statistics
     of both nets."""
-    look = jax.jit(lambda params, obs: actor_critic.dense_maps(learner, params, obs))
+    look = jax.jit(lambda params, obs: values.dense_maps(learner, params, obs))
     obs = observations(2, 4)
     others = jax.tree.map(lambda leaf: leaf.at[1].set(jnp.zeros((), leaf.dtype)), obs)
     both, one = look(state.online, obs), look(state.online, others)
-    np.testing.assert_allclose(both.q[0], one.q[0], atol=1e-5)
-    np.testing.assert_allclose(both.logits[0], one.logits[0], atol=1e-4)
+    assert_allclose(both.q[0], one.q[0], atol=1e-5)
+    assert_allclose(both.logits[0], one.logits[0], atol=1e-4)
     assert np.any(np.abs(both.q[1] - one.q[1]) > 1e-2)
     for net, maps in (("critic", "q"), ("actor", "logits")):
         variables = getattr(state.online, net)
@@ -129,7 +128,7 @@ def test_learning_uses_the_batchs_statistics(state, batch, update, updated):
     critic = state.online.critic
     moved = {**critic, "batch_stats": jax.tree.map(lambda leaf: leaf + 1.0, critic["batch_stats"])}
     other = update(state.replace(online=state.online.replace(critic=moved)), batch)
-    np.testing.assert_allclose(other[1].error, updated[1].error, atol=1e-6)
+    assert_allclose(other[1].error, updated[1].error, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -144,7 +143,7 @@ def test_gradients_change_parameters_only(learner, state, batch, update, updated
         0
     ].online.critic
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a - b, 0.9, atol=1e-4),
+        lambda a, b: assert_allclose(a - b, 0.9, atol=1e-4),
         again["batch_stats"],
         after["batch_stats"],
     )
@@ -170,9 +169,7 @@ def test_targets_follow_statistics_too(learner, state, updated):
     tau = learner.cfg.learn.tau
     online, target = updated[0].online.critic, state.target.critic
     wanted = jax.tree.map(lambda new, old: tau * new + (1.0 - tau) * old, online, target)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), updated[0].target.critic, wanted
-    )
+    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-6), updated[0].target.critic, wanted)
     assert _differ(updated[0].target.critic["batch_stats"], target["batch_stats"])
 
 
@@ -181,7 +178,7 @@ def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
     """Claim: an update of the actor moves its parameters and statistics, and none of the
     critic's."""
     obs = heightmap.unpack(batch.obs)
-    after, _ = jax.jit(lambda state: actor_critic.update_actor(learner, state, obs))(state)
+    after, _ = jax.jit(lambda state: actor.update(learner, state, obs))(state)
     assert _differ(state.online.actor["batch_stats"], after.online.actor["batch_stats"])
     assert np.any(
         state.online.actor["params"]["conv1"]["kernel"]

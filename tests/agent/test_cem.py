@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.agent import box, cem
 from csac_jax.config import CEMConfig
@@ -122,7 +123,7 @@ def test_best_sample_is_kept():
         return jnp.where(jnp.max(jnp.abs(action - needle)) < 1e-6, 1.0, -jnp.sum(action**2))
 
     result = search(CEMConfig(rounds=4), score, jnp.zeros(3), needle[None])
-    np.testing.assert_allclose(result.action[0], needle, atol=1e-6)
+    assert_allclose(result.action[0], needle, atol=1e-6)
     assert result.value[0] == 1.0
 
 
@@ -141,7 +142,7 @@ def test_nan_scores_rank_last():
     """Claim: samples whose score is NaN are neither returned nor fitted to."""
     score = lambda action: jnp.where(action[0] > 0.0, jnp.nan, -jnp.abs(action[0] + 0.5))  # noqa: E731
     result = search(CEMConfig(rounds=4), score, jnp.full(3, 0.2))
-    np.testing.assert_allclose(result.action[0, 0], -0.5, atol=0.02)
+    assert_allclose(result.action[0, 0], -0.5, atol=0.02)
 
 
 def test_no_score_at_all():
@@ -149,7 +150,7 @@ def test_no_score_at_all():
     -inf."""
     score = lambda action: jnp.nan * action[0]  # noqa: E731
     result = search(CEMConfig(), score, jnp.array([0.2, 2.0, 1.25]))
-    np.testing.assert_allclose(result.action[0], [0.2, 1.0, -0.75], atol=1e-6)
+    assert_allclose(result.action[0], [0.2, 1.0, -0.75], atol=1e-6)
     assert result.value[0] == -jnp.inf
 
 
@@ -176,7 +177,7 @@ def test_keys_differ():
     first, again, other = (
         search(CEMConfig(), jnp.sum, jnp.zeros(3), seed=seed).action[0] for seed in (0, 0, 1)
     )
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     assert first[2] != other[2]
 
 
@@ -190,24 +191,24 @@ def test_fit_by_hand():
     elites, valid = _elites(0.1, 0.2, 0.6), jnp.ones(3, bool)
     mean, std = cem.fit(CEMConfig(), elites, valid)
     for got, want in ((mean, 0.3), (std, np.sqrt(0.14 / 3))):
-        np.testing.assert_allclose(got, [want] * 3, rtol=1e-6)
+        assert_allclose(got, [want] * 3, rtol=1e-6)
 
 
 def test_fit_across_the_seam():
     """Claim: yaws 0.9, -0.9, -1.0 have mean 1 = -1 and the deviation of -0.1, 0.1, 0; x and y of
     these values do not."""
     mean, std = cem.fit(CEMConfig(), _elites(0.9, -0.9, -1.0), jnp.ones(3, bool))
-    np.testing.assert_allclose([abs(mean[2]), std[2]], [1.0, np.sqrt(0.02 / 3)], atol=1e-6)
-    np.testing.assert_allclose(mean[:2], [-1.0 / 3.0] * 2, atol=1e-6)
+    assert_allclose([abs(mean[2]), std[2]], [1.0, np.sqrt(0.02 / 3)], atol=1e-6)
+    assert_allclose(mean[:2], [-1.0 / 3.0] * 2, atol=1e-6)
 
 
 def test_fit_leaves_out_invalid_elites():
     """Claim: elites without a value do not count, and a single one has the least std."""
     elites = _elites(0.1, 0.3, 0.9)
     mean, _ = cem.fit(CEMConfig(), elites, jnp.array([True, True, False]))
-    np.testing.assert_allclose(mean, [0.2] * 3, atol=1e-6)
+    assert_allclose(mean, [0.2] * 3, atol=1e-6)
     _, std = cem.fit(CEMConfig(), elites, jnp.arange(3) < 1)
-    np.testing.assert_allclose(std, [CEMConfig.std_min] * 3)
+    assert_allclose(std, [CEMConfig.std_min] * 3)
 
 
 def test_wrap():
@@ -226,9 +227,7 @@ def test_wrap():
             np.nextafter(np.float32(-1.0), np.float32(-2.0)),
         ]
     )
-    np.testing.assert_allclose(
-        box.wrap(u), [0.8, -1.0, -0.5, 0.0, 0.99, -1.0, -0.5, -0.75, 1.0], atol=1e-6
-    )
+    assert_allclose(box.wrap(u), [0.8, -1.0, -0.5, 0.0, 0.99, -1.0, -0.5, -0.75, 1.0], atol=1e-6)
     assert np.all(box.wrap(u) < 1.0)
 
 
@@ -247,8 +246,8 @@ def test_last_rounds_are_what_the_search_tries():
     assert all(actions.shape == (16, 3) for actions in tried)
     every = jnp.concatenate(tried)
     values = jax.vmap(score)(every)
-    np.testing.assert_allclose(found[-1].value[0], values.max(), atol=1e-6)
-    np.testing.assert_allclose(found[-1].action[0], every[values.argmax()], atol=1e-6)
+    assert_allclose(found[-1].value[0], values.max(), atol=1e-6)
+    assert_allclose(found[-1].action[0], every[values.argmax()], atol=1e-6)
     away = [
         float(jnp.mean(jnp.linalg.norm(actions[:, :2] - jnp.array([[0.3, -0.2]]), axis=1)))
         for actions in tried

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from csac_jax.agent import actor_critic, maps
+from csac_jax.agent import actor_critic, maps, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import DenseNet121, HeightmapConfig, SmallNet
@@ -50,7 +51,7 @@ def net(request, cfg) -> Fixed:
         lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), abstract
     )
     return Fixed(
-        learner, params, jax.jit(lambda params, obs: actor_critic.dense_maps(learner, params, obs))
+        learner, params, jax.jit(lambda params, obs: values.dense_maps(learner, params, obs))
     )
 
 
@@ -119,16 +120,12 @@ def test_quarter_turn(net, seed):
     then = [k + QUARTER for k in first]
     obs = _hills(seed, 0.0)
     before, after = net.look(net.params, obs), net.look(net.params, _quarter(obs))
-    np.testing.assert_allclose(
-        after.q[:, :, np.array(then)], before.q[:, :, np.array(first)], atol=1e-5
-    )
-    np.testing.assert_array_equal(
-        after.valid[:, :, np.array(then)], before.valid[:, :, np.array(first)]
-    )
+    assert_allclose(after.q[:, :, np.array(then)], before.q[:, :, np.array(first)], atol=1e-5)
+    assert_array_equal(after.valid[:, :, np.array(then)], before.valid[:, :, np.array(first)])
     assert np.std(before.q) > 0.01
     (primitive, pose), (other, turned) = _best(net, before, first), _best(net, after, then)
     assert primitive == other
-    np.testing.assert_allclose(turned, _turned(pose, 0.5 * np.pi), atol=1e-5)
+    assert_allclose(turned, _turned(pose, 0.5 * np.pi), atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -175,6 +172,4 @@ def test_every_yaw_of_a_symmetric_net(net, quarters):
     after = net.look(params, obs)
     for name in ("q", "valid"):
         maps_before, maps_after = (np.asarray(getattr(seen, name)) for seen in (before, after))
-        np.testing.assert_allclose(
-            np.roll(maps_before, quarters * QUARTER, axis=2), maps_after, atol=1e-5
-        )
+        assert_allclose(np.roll(maps_before, quarters * QUARTER, axis=2), maps_after, atol=1e-5)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 
 from csac_jax.agent import explore
@@ -37,9 +38,7 @@ def assert_share(event: np.ndarray, expected: float) -> None:
 )
 def test_probability(actions, expected):
     """Claim: max(end, start decay^actions), by hand."""
-    np.testing.assert_allclose(
-        explore.probability(0.5, 0.1, 0.998, jnp.int32(actions)), expected, rtol=1e-4
-    )
+    assert_allclose(explore.probability(0.5, 0.1, 0.998, jnp.int32(actions)), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("taken", [0, 300, 10**6])
@@ -75,7 +74,7 @@ def test_no_exploration_is_greedy():
     for primitive in (0, 1):
         primitives, poses = choices(cfg, 0, primitive)
         assert np.all(primitives == primitive)
-        np.testing.assert_allclose(poses, np.tile(GREEDY_POSES[primitive], (NUM, 1)), atol=1e-6)
+        assert_allclose(poses, np.tile(GREEDY_POSES[primitive], (NUM, 1)), atol=1e-6)
 
 
 def test_action_noise_is_a_clipped_normal():

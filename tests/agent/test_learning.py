@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.constants import Primitive
 from csac_jax.env import State
@@ -66,7 +67,7 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
         keys = jax.vmap(jax.random.fold_in, (None, 0))(
             jax.random.fold_in(key, i), jnp.arange(EPISODES)
         )
-        dense_maps = actor_critic.dense_maps(learner, params, state.obs)
+        dense_maps = values.dense_maps(learner, params, state.obs)
         best = jax.vmap(policy.best_action, (0, None, 0, 0))
         action = best(keys, learner, dense_maps, state.steps_without_change)
         after = jax.vmap(toy.step)(state, action)
@@ -76,7 +77,7 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
 
     first = jax.vmap(lambda i: toy.reset(jax.random.fold_in(key, i)))(1000 + jnp.arange(EPISODES))
     last, primitives = jax.lax.scan(act, first, jnp.arange(toy.cfg.task.max_actions))
-    return actor_critic.dense_maps(learner, params, first.obs), last, primitives
+    return values.dense_maps(learner, params, first.obs), last, primitives
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,7 @@ def test_bandit_is_solved(algo, value):
     learned = learn(toys.bandit, algo, actions=640, cap=1)
     assert learned.success >= 0.98
     assert learned.pushes[0] <= 0.02
-    np.testing.assert_allclose(learned.value, value, atol=0.1)
+    assert_allclose(learned.value, value, atol=0.1)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +131,7 @@ def test_grasping_alone_fails():
     learned = learn(toys.two_step, "grasp_only", actions=800, cap=CAP)
     assert learned.success == 0.0
     assert learned.pushes == [0.0] * CAP
-    np.testing.assert_allclose(learned.value, 0.0, atol=0.02)
+    assert_allclose(learned.value, 0.0, atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -147,4 +148,4 @@ def test_without_a_future_a_push_must_pay_by_itself(algo, push, value, solves):
     gamma of 0.5 pays for it: -0.1 + 0.5, or V = -0.1 + 0.5 (1 + 0.5 V)."""
     learned = learn(toys.two_step, algo, actions=1200, cap=CAP, push=push)
     assert learned.success >= 0.98 if solves else learned.success == 0.0
-    np.testing.assert_allclose(learned.value, value, atol=0.1)
+    assert_allclose(learned.value, value, atol=0.1)

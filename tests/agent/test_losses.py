@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.agent import losses
 from csac_jax.config import LearnConfig
@@ -17,7 +17,7 @@ def test_huber_gradient_is_bounded(width):
     gradient = jax.vmap(jax.grad(lambda e: losses.td_loss(cfg, e)))(
         jnp.array([1e30, -3e38, width, 0.0])
     )
-    np.testing.assert_allclose(gradient, [width, -width, width, 0.0])
+    assert_allclose(gradient, [width, -width, width, 0.0])
 
 
 def test_td_target_by_hand():
@@ -26,7 +26,7 @@ def test_td_target_by_hand():
     target = losses.td_target(
         jnp.array([1.0, 1.0, -0.5]), 0.5, jnp.array([False, True, True]), value
     )
-    np.testing.assert_array_equal(target, [3.0, 1.0, -0.5])
+    assert_array_equal(target, [3.0, 1.0, -0.5])
 
 
 def test_td_target_has_no_gradient():
@@ -44,9 +44,9 @@ def test_soft_target_by_hand():
     moved, copied = (
         losses.update_target(LearnConfig(tau=tau), online, target) for tau in (0.25, 1.0)
     )
-    np.testing.assert_allclose(moved["a"], [0.25, 5.5], rtol=1e-6)
-    np.testing.assert_allclose(moved["b"], 4.5)
-    jax.tree.map(np.testing.assert_array_equal, copied, online)
+    assert_allclose(moved["a"], [0.25, 5.5], rtol=1e-6)
+    assert_allclose(moved["b"], 4.5)
+    jax.tree.map(assert_array_equal, copied, online)
 
 
 @pytest.mark.parametrize(("loss", "expected"), [("huber", [0.125, 4.0]), ("squared", [0.25, 9.0])])
@@ -55,4 +55,4 @@ def test_td_loss_by_hand(loss, expected):
     21."""
     cfg = with_constants(LearnConfig(loss=loss), huber=2.0)
     got = losses.td_loss(cfg, jnp.array([0.5, -3.0]))
-    np.testing.assert_array_equal(got, expected)
+    assert_array_equal(got, expected)

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from csac_jax.agent import actor_critic, maps, policy
+from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.config import SmallNet
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
@@ -47,7 +48,7 @@ def test_reading_at_a_cells_pose_gives_the_cell(frames, primitive):
     values = _random_maps(frames)
     cells = jnp.arange(values[0].size)
     poses = jax.jit(jax.vmap(lambda cell: maps.cell_pose(frames, cell)))(cells)
-    np.testing.assert_allclose(
+    assert_allclose(
         _read(frames, values, primitive, poses), values[primitive].reshape(-1), atol=1e-4
     )
 
@@ -58,10 +59,10 @@ def test_cell_below_a_cells_pose_is_the_cell(frames):
     to_cell = jax.vmap(rotate.to_cell, (None, None, 0, 0))
     position = to_cell(side, frames.cell, jnp.asarray(frames.yaws), jnp.asarray(frames.xy))
     cells = np.broadcast_to(np.mgrid[:side, :side].transpose(1, 2, 0), position.shape)
-    np.testing.assert_array_equal(rotate.floor(position), cells)
+    assert_array_equal(rotate.floor(position), cells)
     index = maps.yaw_index(frames, jnp.asarray(frames.yaws))
-    np.testing.assert_array_equal(rotate.floor(index), np.arange(count))
-    np.testing.assert_array_equal(rotate.floor(position + 0.99), cells)
+    assert_array_equal(rotate.floor(index), np.arange(count))
+    assert_array_equal(rotate.floor(position + 0.99), cells)
 
 
 def test_is_valid_at_a_cells_pose_is_the_cell(frames):
@@ -76,9 +77,7 @@ def test_is_valid_at_a_cells_pose_is_the_cell(frames):
     for primitive in Primitive:
         poses = jax.vmap(lambda cell: maps.cell_pose(frames, cell))(cells)
         for near in (poses, poses + shift[None]):
-            np.testing.assert_array_equal(
-                check(jnp.int32(primitive), near), valid[primitive].reshape(-1)
-            )
+            assert_array_equal(check(jnp.int32(primitive), near), valid[primitive].reshape(-1))
 
 
 def test_read_is_linear_between_cells(frames):
@@ -87,7 +86,7 @@ def test_read_is_linear_between_cells(frames):
     plane = 2.0 * frames.xy[..., 0] - 3.0 * frames.xy[..., 1] + 0.5
     poses = _poses(300)
     got = _read(frames, jnp.asarray(np.stack([-plane, plane]), jnp.float32), GRASP, poses)
-    np.testing.assert_allclose(got, 2.0 * poses[:, 0] - 3.0 * poses[:, 1] + 0.5, atol=1e-5)
+    assert_allclose(got, 2.0 * poses[:, 0] - 3.0 * poses[:, 1] + 0.5, atol=1e-5)
 
 
 def test_read_is_linear_in_yaw_and_wraps(frames):
@@ -100,9 +99,7 @@ def test_read_is_linear_in_yaw_and_wraps(frames):
     yaw = np.linspace(-2.0 * np.pi, 4.0 * np.pi, 301)
     poses = np.stack([np.full_like(yaw, 0.05), np.full_like(yaw, -0.1), yaw], axis=1)
     wanted = np.interp(yaw, frames.yaws, per_yaw, period=2.0 * np.pi)
-    np.testing.assert_allclose(
-        _read(frames, jnp.asarray(values, jnp.float32), PUSH, poses), wanted, atol=1e-5
-    )
+    assert_allclose(_read(frames, jnp.asarray(values, jnp.float32), PUSH, poses), wanted, atol=1e-5)
 
 
 def test_read_is_trilinear_by_hand(frames):
@@ -113,11 +110,11 @@ def test_read_is_trilinear_by_hand(frames):
     pose = np.append(frames.xy[k, row, col] + frames.cell * np.array([0.25, 0.5]), 0.0)
     corner = values[GRASP, k, row : row + 2, col : col + 2]
     here = np.array([0.5, 0.5]) @ corner @ np.array([0.75, 0.25])
-    np.testing.assert_allclose(_read(frames, values, GRASP, pose[None]), here, atol=1e-5)
+    assert_allclose(_read(frames, values, GRASP, pose[None]), here, atol=1e-5)
     step = 2.0 * np.pi / frames.yaws.size
     turned = pose + np.array([0.0, 0.0, 0.2 * step])
     following = _read(frames, values, GRASP, (pose + np.array([0.0, 0.0, step]))[None])
-    np.testing.assert_allclose(
+    assert_allclose(
         _read(frames, values, GRASP, turned[None]), 0.8 * here + 0.2 * following, atol=1e-5
     )
 
@@ -140,7 +137,7 @@ def test_gradient_of_read(frames):
             2.0 * step
         )
         scale = np.abs(wanted[same]).mean()
-        np.testing.assert_allclose(got[same, axis], wanted[same], atol=2e-3 * scale, rtol=2e-3)
+        assert_allclose(got[same, axis], wanted[same], atol=2e-3 * scale, rtol=2e-3)
         checked += same.sum()
     assert checked > 600
 
@@ -169,9 +166,9 @@ def test_unfolding(frames):
     halves = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     all_yaws = np.asarray(maps.unfold(jnp.asarray(halves)))
     ahead, back, grasp = np.moveaxis(halves, -1, 0)
-    np.testing.assert_array_equal(all_yaws[PUSH], np.concatenate([ahead, back[:, ::-1, ::-1]]))
-    np.testing.assert_array_equal(all_yaws[GRASP], np.concatenate([grasp, grasp[:, ::-1, ::-1]]))
-    np.testing.assert_allclose(frames.xy[half:], frames.xy[:half, ::-1, ::-1], atol=1e-7)
+    assert_array_equal(all_yaws[PUSH], np.concatenate([ahead, back[:, ::-1, ::-1]]))
+    assert_array_equal(all_yaws[GRASP], np.concatenate([grasp, grasp[:, ::-1, ::-1]]))
+    assert_allclose(frames.xy[half:], frames.xy[:half, ::-1, ::-1], atol=1e-7)
 
 
 def test_gripper_is_symmetric(frames):
@@ -182,7 +179,7 @@ def test_gripper_is_symmetric(frames):
     values = maps.unfold(jnp.asarray(halves, jnp.float32))
     poses = _poses(100, seed=2)
     turned = poses + np.array([0.0, 0.0, np.pi])
-    np.testing.assert_allclose(
+    assert_allclose(
         _read(frames, values, GRASP, poses), _read(frames, values, GRASP, turned), atol=1e-4
     )
     apart = np.abs(_read(frames, values, PUSH, poses) - _read(frames, values, PUSH, turned))
@@ -232,7 +229,7 @@ def test_grasps_are_valid_above_blocks(cfg, frames):
         _distance_to_block(frames.xy[0]) < 0.5 * frames.cell
     )  # exact where nothing is turned
     covered = np.max(np.abs(frames.xy[0] - CENTRE) - HALF - 0.5 * frames.cell, axis=-1) < -1e-6
-    np.testing.assert_array_equal(valid[0], covered)
+    assert_array_equal(valid[0], covered)
     assert covered.sum() >= axis_parallel.sum() / 2 > 0
 
 
@@ -284,7 +281,7 @@ def test_actions_anywhere(cfg, frames):
     obs = _one_block(cfg)
     for height in (obs.height, jnp.zeros_like(obs.height)):
         valid = maps.actionable_cells(free, obs.replace(height=height))
-        np.testing.assert_array_equal(valid, np.stack([frames.inside] * 2))
+        assert_array_equal(valid, np.stack([frames.inside] * 2))
     keys = jax.random.split(jax.random.key(0), 100)
     grasps = jax.jit(jax.vmap(lambda key: policy.random_grasp(key, free, valid)))(keys)
     below = jax.vmap(lambda xy: primitives.local_top(cfg.heightmap, obs.height, xy, 0.02))
@@ -297,8 +294,8 @@ def test_target_task_grasps_the_target_alone(cfg, frames):
     lone = _one_block(cfg)
     amid = lone.replace(target=lone.height > 0.01, height=jnp.maximum(lone.height, 0.02))
     valid = maps.actionable_cells(dataclasses.replace(frames, shows_target=True), amid)
-    np.testing.assert_array_equal(valid[GRASP], maps.actionable_cells(frames, lone)[GRASP])
-    np.testing.assert_array_equal(valid[PUSH], maps.actionable_cells(frames, amid)[PUSH])
+    assert_array_equal(valid[GRASP], maps.actionable_cells(frames, lone)[GRASP])
+    assert_array_equal(valid[PUSH], maps.actionable_cells(frames, amid)[PUSH])
     assert 0 < np.asarray(valid[GRASP]).sum() < frames.inside.sum() // 4
     assert np.all(valid[PUSH] == frames.inside)
 
@@ -309,10 +306,8 @@ def test_best_cells(frames):
     valid = _random_maps(frames, 1)[GRASP] > 0.5
     flat = np.asarray(values).reshape(-1)
     only = np.where(np.asarray(valid).reshape(-1), flat, -np.inf)
-    np.testing.assert_array_equal(maps.best_cells(values, valid, 5), np.argsort(-only)[:5])
-    np.testing.assert_array_equal(
-        maps.best_cells(values, jnp.zeros_like(valid), 5), np.argsort(-flat)[:5]
-    )
+    assert_array_equal(maps.best_cells(values, valid, 5), np.argsort(-only)[:5])
+    assert_array_equal(maps.best_cells(values, jnp.zeros_like(valid), 5), np.argsort(-flat)[:5])
 
 
 def test_normalise_is_inverse(frames):
@@ -320,9 +315,7 @@ def test_normalise_is_inverse(frames):
     poses = jnp.asarray(_poses(100), jnp.float32)
     box = jax.vmap(lambda pose: maps.normalise(frames, pose))(poses)
     assert np.all(np.abs(box) <= 1.0)
-    np.testing.assert_allclose(
-        jax.vmap(lambda u: maps.denormalise(frames, u))(box), poses, atol=2e-6
-    )
+    assert_allclose(jax.vmap(lambda u: maps.denormalise(frames, u))(box), poses, atol=2e-6)
 
 
 @pytest.mark.optax
@@ -343,12 +336,12 @@ def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
     turned = jax.tree.map(
         lambda field: jnp.rot90(field, -1, axes=(1, 2)), scenes
     )  # rows are y: this is +90 degrees
-    look = jax.jit(lambda obs: actor_critic.dense_maps(four, params, obs))
+    look = jax.jit(lambda obs: values.dense_maps(four, params, obs))
     before, after = look(scenes), look(turned)
     for k in (0, 2):
-        np.testing.assert_array_equal(after.valid[:, :, k + 1], before.valid[:, :, k])
-        np.testing.assert_allclose(after.q[:, :, k + 1], before.q[:, :, k], atol=1e-4)
-        np.testing.assert_allclose(after.logits[:, :, k + 1], before.logits[:, :, k], atol=1e-3)
+        assert_array_equal(after.valid[:, :, k + 1], before.valid[:, :, k])
+        assert_allclose(after.q[:, :, k + 1], before.q[:, :, k], atol=1e-4)
+        assert_allclose(after.logits[:, :, k + 1], before.logits[:, :, k], atol=1e-3)
     assert np.std(before.q) > 0.05
     for primitive in Primitive:
         first, second = (
@@ -357,7 +350,7 @@ def test_turned_scene_gives_turned_maps(cfg, observations, randomised):
             ]
             for state, k in ((before, 0), (after, 1))
         )
-        np.testing.assert_allclose(second, [-first[1], first[0]], atol=1e-6)
+        assert_allclose(second, [-first[1], first[0]], atol=1e-6)
 
 
 def test_best_over_yaws(frames):
@@ -370,5 +363,5 @@ def test_best_over_yaws(frames):
     state = maps.DenseMaps(jnp.asarray(q), jnp.asarray(q), jnp.asarray(valid))
     places = jnp.asarray(np.stack([frames.xy[3, 9, 6], frames.xy[1, 9, 9]]).reshape(2, 1, 2))
     best = maps.best_over_yaws(frames, state, places)
-    np.testing.assert_allclose(best[:, 0, 0], [1.0, 0.5], atol=1e-5)
+    assert_allclose(best[:, 0, 0], [1.0, 0.5], atol=1e-5)
     assert np.all(np.isneginf(best[:, 1, 0]))

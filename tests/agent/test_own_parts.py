@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.agent.learner import Learner, UpdateInfo
 from csac_jax.constants import Primitive
@@ -76,12 +77,12 @@ def test_sampler_needs_sample_alone():
     each error; a sampler without it is none."""
     sampler = Newest()
     state = ring.init(sampler.init(4), jnp.int32(0))
-    np.testing.assert_array_equal(state.priority, np.zeros(4, np.float32))
+    assert_array_equal(state.priority, np.zeros(4, np.float32))
     state = ring.add(state, jnp.arange(3), jnp.ones(3, bool))
     slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 2)
-    np.testing.assert_array_equal(slots, [2, 2])
+    assert_array_equal(slots, [2, 2])
     state = sampler.update(state, jnp.array([0, 2]), jnp.array([0.25, -3.0]))
-    np.testing.assert_array_equal(state.priority, [0.25, 1.0, 3.0, 0.0])
+    assert_array_equal(state.priority, [0.25, 1.0, 3.0, 0.0])
     assert sampler.replace_hyperparams(CFG.replay) is sampler
     assert weights.shape == (2,)
     with pytest.raises(TypeError, match="sample"):
@@ -94,7 +95,7 @@ def test_learner_and_sampler_of_ones_own():
     after the warm-up alone, and errors come back as priorities."""
     _, last, metrics = _trained(learner=Mean(), sampler=Newest())
     assert np.all(metrics.primitive == Primitive.GRASP)
-    np.testing.assert_array_equal(metrics.learned, np.arange(1, STEPS + 1) * 8 >= 64)
+    assert_array_equal(metrics.learned, np.arange(1, STEPS + 1) * 8 >= 64)
     value, error = 0.0, 0.0
     newest = np.asarray(metrics.reward)[np.asarray(metrics.learned), -1]
     assert np.unique(newest).size > 1
@@ -102,10 +103,10 @@ def test_learner_and_sampler_of_ones_own():
         for _ in range(CFG.learn.updates):
             error = reward - value
             value += 0.5 * error
-    np.testing.assert_allclose(last.learner, value, rtol=1e-5)
+    assert_allclose(last.learner, value, rtol=1e-5)
     slot = (last.replay.head - 1) % last.replay.priority.shape[0]
-    np.testing.assert_allclose(last.replay.priority[slot], abs(error), rtol=1e-5)
-    np.testing.assert_array_equal(metrics.actor_loss, 0.0)
+    assert_allclose(last.replay.priority[slot], abs(error), rtol=1e-5)
+    assert_array_equal(metrics.actor_loss, 0.0)
 
 
 def test_learner_lacking_a_method_is_none():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax import algorithms
 from csac_jax.agent import box, maps, policy
@@ -133,9 +134,9 @@ def test_best_pixel(cfg, frames, learner):
     for p in Primitive:
         cell = np.unravel_index(np.argmax(masked[p]), masked[p].shape)
         pose = jax.vmap(lambda u: maps.denormalise(frames, u))(choice.poses[:, p])
-        np.testing.assert_allclose(pose[:, :2], np.tile(frames.xy[cell], (3, 1)), atol=1e-6)
-        np.testing.assert_allclose(np.cos(pose[:, 2] - frames.yaws[cell[0]]), 1.0, atol=1e-6)
-        np.testing.assert_array_equal(choice.values[:, p], masked[p].max())
+        assert_allclose(pose[:, :2], np.tile(frames.xy[cell], (3, 1)), atol=1e-6)
+        assert_allclose(np.cos(pose[:, 2] - frames.yaws[cell[0]]), 1.0, atol=1e-6)
+        assert_array_equal(choice.values[:, p], masked[p].max())
 
 
 @pytest.mark.parametrize(
@@ -181,7 +182,7 @@ def test_retries_follow_boltzmann(cfg, frames, learner, failed):
     assert off.min(axis=1).max() < 1e-6
     share = np.bincount(off.argmin(axis=1), minlength=4) / len(off)
     wanted = np.exp(values / 0.5) if failed else np.array([1.0, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(share, wanted / wanted.sum(), atol=0.03 if failed else 0.0)
+    assert_allclose(share, wanted / wanted.sum(), atol=0.03 if failed else 0.0)
 
 
 @pytest.mark.parametrize("steps_without_change", [0, 1])
@@ -282,7 +283,7 @@ def test_search_is_the_same_compiled_sooner(cfg, frames, learner):
         jax.jit(jax.vmap(found), compiler_options=options)(jnp.arange(200))
         for options in (compiler.SOONER, {name: own[name] for name in compiler.SOONER})
     )
-    np.testing.assert_allclose(sooner, by_default, rtol=0.0, atol=1e-5)
+    assert_allclose(sooner, by_default, rtol=0.0, atol=1e-5)
 
 
 def test_random_places_reach_all_that_is_valid(frames):
@@ -320,4 +321,4 @@ def test_without_a_search_there_is_one_candidate(cfg, frames, learner):
     tried = policy.candidates(key, _learner(learner, vpg), state)
     action = policy.best_action(key, _learner(learner, vpg), state, jnp.int32(0))
     assert tried.shape == (2, 1, 3)
-    np.testing.assert_allclose(tried[action.primitive, 0], action.pose, atol=1e-5)
+    assert_allclose(tried[action.primitive, 0], action.pose, atol=1e-5)

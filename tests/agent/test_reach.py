@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from csac_jax import presets
 from csac_jax.agent import maps, policy
@@ -42,6 +43,6 @@ def test_all_cells_leave_out_what_is_out_of_reach(frames: maps.Frames):
     empty = jnp.zeros((FAR.heightmap.size,) * 2)
     obs = Observation(jnp.zeros((*empty.shape, 3)), empty, empty > 0)
     valid = np.asarray(maps.actionable_cells(found, obs))
-    np.testing.assert_array_equal(valid, found.inside[None] & frames.reachable)
+    assert_array_equal(valid, found.inside[None] & frames.reachable)
     hand = maps.frames(presets.smoke(), networks.make(FAR.net))
     assert hand.reachable.all()

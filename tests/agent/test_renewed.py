@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from csac_jax.agent import actor_critic, rewards
+from csac_jax.agent import actor_critic, critic, rewards, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.learner import Transition
 from csac_jax.constants import Primitive
@@ -67,8 +68,8 @@ def _batch(observations, better: bool, reward: float) -> Transition:
 @functools.partial(jax.jit, static_argnums=0)
 def _renewed(learner: ActorCritic, weight: jax.Array, batch: Transition) -> jax.Array:
     target = _weighted(learner, weight).target
-    next_maps = actor_critic.dense_maps(learner, target, heightmap.unpack(batch.next_obs))
-    return actor_critic.renewed_reward(learner, target, batch, next_maps)
+    next_maps = values.dense_maps(learner, target, heightmap.unpack(batch.next_obs))
+    return critic.renewed_reward(learner, target, batch, next_maps)
 
 
 def test_early_label_is_renewed(renewing, observations):
@@ -79,16 +80,14 @@ def test_early_label_is_renewed(renewing, observations):
         batch = _batch(observations, stored, reward)
         for weight, label in ((0.0, -0.5), (1.0, 0.5), (-1.0, -0.5)):
             wanted = np.where(pushed, label, reward)
-            np.testing.assert_allclose(
-                _renewed(renewing, jnp.float32(weight), batch), wanted, atol=1e-6
-            )
+            assert_allclose(_renewed(renewing, jnp.float32(weight), batch), wanted, atol=1e-6)
 
 
 def test_stored_label_stays_as_an_option(cfg, observations):
     """Claim: by `push_effect` value the reward is the stored one, and no label is."""
     learner = actor_critic.make(cfg, Height())
     batch = _batch(observations, False, -0.5).replace(push_better=None)
-    np.testing.assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
+    assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
     assert step.example(learner.cfg).push_better is None
     assert step.example(cfg.change(reward={"push_effect": "renewed"})).push_better.dtype == bool
 
@@ -102,9 +101,9 @@ def test_update_does_not_depend_on_the_stored_label(renewing, observations):
         batch = _batch(observations, stored, reward)
         batch = jax.tree.map(lambda leaf: leaf[::2], batch)  # pushes alone
         weights = jnp.ones(B // 2)
-        update = actor_critic.update_critic(jax.random.key(1), renewing, state, batch, weights)
+        update = critic.update(jax.random.key(1), renewing, state, batch, weights)
         errors.append(update[1].error)
-    np.testing.assert_array_equal(*errors)
+    assert_array_equal(*errors)
 
 
 @pytest.mark.parametrize("num", [1, 5])
@@ -112,13 +111,13 @@ def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
     """Claim: in parts of the batch phi_g is what it is all at once, and 0 where nobody asks."""
     state = randomised(actor_critic.init(jax.random.key(0), learner))
     obs = observations(num, 3)
-    maps = jax.jit(lambda: actor_critic.dense_maps(learner, state.target, obs))()
-    every = jax.vmap(actor_critic.best_grasp)(maps)
-    best_grasps = jax.jit(lambda asked: actor_critic.best_grasps(learner, state.target, obs, asked))
+    maps = jax.jit(lambda: values.dense_maps(learner, state.target, obs))()
+    every = jax.vmap(values.best_grasp)(maps)
+    best_grasps = jax.jit(lambda asked: values.best_grasps(learner, state.target, obs, asked))
     for seed in range(3):
         wanted = np.random.default_rng(seed).random(num) < 0.5
         found = best_grasps(jnp.asarray(wanted))
-        np.testing.assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+        assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
 
 
 def test_replicas_ask_for_the_neediests_quarters(
@@ -129,21 +128,21 @@ def test_replicas_ask_for_the_neediests_quarters(
     obs = observations(8, 3)
     wanted = np.zeros((3, 8), bool)
     wanted[0, [1, 6]] = wanted[1, [0, 3, 7]] = True  # one quarter of two, two quarters, none
-    every = jax.vmap(actor_critic.best_grasp)(
-        jax.jit(lambda: actor_critic.dense_maps(learner, state.target, obs))()
+    every = jax.vmap(values.best_grasp)(
+        jax.jit(lambda: values.dense_maps(learner, state.target, obs))()
     )
     passed: list[int] = []
-    dense_maps = actor_critic.dense_maps
+    dense_maps = values.dense_maps
 
     def counted(*args):
         jax.debug.callback(lambda: passed.append(1))
         return dense_maps(*args)
 
-    monkeypatch.setattr(actor_critic, "dense_maps", counted)
-    ask = functools.partial(actor_critic.best_grasps, learner, state.target, obs)
+    monkeypatch.setattr(values, "dense_maps", counted)
+    ask = functools.partial(values.best_grasps, learner, state.target, obs)
     found = jax.jit(jax.vmap(ask))(jnp.asarray(wanted))
     jax.effects_barrier()
-    np.testing.assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+    assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
     assert len(passed) == 2
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from csac_jax import algorithms
 from csac_jax.agent import rewards
@@ -69,12 +70,10 @@ def test_distance_is_a_loss():
     more than at 1 m."""
     cfg = with_constants(RewardConfig(), distance_weight=2.0)
     near = with_constants(cfg, distance_cap=0.1)
-    np.testing.assert_allclose(reward(cfg, Primitive.GRASP, Outcome.LIFTED, 0.2), 1.6, rtol=1e-6)
-    np.testing.assert_allclose(reward(cfg, Primitive.PUSH, distance=0.2, after=1.0), 0.1, rtol=1e-5)
+    assert_allclose(reward(cfg, Primitive.GRASP, Outcome.LIFTED, 0.2), 1.6, rtol=1e-6)
+    assert_allclose(reward(cfg, Primitive.PUSH, distance=0.2, after=1.0), 0.1, rtol=1e-5)
     assert rewards.base(cfg, jnp.array(False), jnp.float32(7.0)) == -2.0
-    np.testing.assert_allclose(
-        rewards.base(near, jnp.array(False), jnp.float32(7.0)), -0.2, rtol=1e-6
-    )
+    assert_allclose(rewards.base(near, jnp.array(False), jnp.float32(7.0)), -0.2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("primitive", [Primitive.PUSH, Primitive.GRASP])
@@ -136,7 +135,7 @@ def test_bounds_hold_and_are_reached(cfg, gamma):
     low, high = rewards.bounds(cfg, gamma)
     assert low - 1e-5 <= returns.min()
     assert returns.max() <= high + 1e-5
-    np.testing.assert_allclose([returns.min(), returns.max()], [low, high], atol=1e-4)
+    assert_allclose([returns.min(), returns.max()], [low, high], atol=1e-4)
 
 
 def test_default_bounds():

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 
 from csac_jax.agent import box, losses
@@ -59,7 +60,7 @@ def test_log_density_is_that_of_the_samples(cfg, mean):
     laws = [reference(cfg, mean, dim) for dim in range(3)]
     inside = [np.clip(noise[:, dim], low, high) for dim, (_, low, high) in enumerate(laws)]
     expected = sum(law.logpdf(x) for (law, _, _), x in zip(laws, inside, strict=True))
-    np.testing.assert_allclose(log_density, expected, atol=1e-4)
+    assert_allclose(log_density, expected, atol=1e-4)
     inverse, volume = np.exp(-log_density), np.prod([high - low for _, low, high in laws])
     assert abs(inverse.mean() - volume) <= 4 * inverse.std() / np.sqrt(NUM) + 1e-5 * volume
 
@@ -77,8 +78,8 @@ def test_mean_outside_the_box_is_brought_in():
         noisy_actions(jax.random.key(0), CFG, jnp.array(mean))
         for mean in ([1.3, 0.0, 1.5], [1.0, 0.0, -0.5])
     )
-    np.testing.assert_allclose(outside[0], inside[0], atol=1e-6)
-    np.testing.assert_allclose(outside[1], inside[1], atol=1e-5)
+    assert_allclose(outside[0], inside[0], atol=1e-6)
+    assert_allclose(outside[1], inside[1], atol=1e-5)
 
 
 def test_keys_differ():
@@ -91,8 +92,8 @@ def test_expectation_by_hand():
     """Claim: q = 0, 1 at beta = ln 3 gives 3/4; with p = 1/2, 1/4 the weights are 2 and 12:
     12/14."""
     q, beta = jnp.array([0.0, 1.0]), float(np.log(3.0))
-    np.testing.assert_allclose(losses.softmax(q, jnp.zeros(2), beta), 0.75, rtol=1e-6)
-    np.testing.assert_allclose(
+    assert_allclose(losses.softmax(q, jnp.zeros(2), beta), 0.75, rtol=1e-6)
+    assert_allclose(
         losses.softmax(q, jnp.log(jnp.array([0.5, 0.25])), beta), 12.0 / 14.0, rtol=1e-6
     )
 
@@ -105,8 +106,8 @@ def test_expectation_lies_between_mean_and_maximum():
     weight = np.exp(-np.asarray(log_density, np.float64))
     betas = [0.0, 0.05, 1.0, 5.0, 20.0, 100.0, 1e5]
     values = np.array([losses.softmax(q, log_density, beta) for beta in betas])
-    np.testing.assert_allclose(values[0], np.sum(weight * np.asarray(q)) / weight.sum(), atol=1e-5)
-    np.testing.assert_allclose(values[-1], np.max(q), atol=1e-6)
+    assert_allclose(values[0], np.sum(weight * np.asarray(q)) / weight.sum(), atol=1e-5)
+    assert_allclose(values[-1], np.max(q), atol=1e-6)
     assert np.all(np.diff(values) >= 0.0)
     assert np.all(values <= np.max(q))
 
@@ -124,7 +125,7 @@ def test_exact_by_hand():
     value = exact_softmax(
         jnp.array([[0.0, 1.0, 5.0]]), float(np.log(3.0)), jnp.array([[True, True, False]])
     )
-    np.testing.assert_allclose(value, 0.75, rtol=1e-6)
+    assert_allclose(value, 0.75, rtol=1e-6)
 
 
 @pytest.mark.parametrize("beta", [0.0, 2.0, 10.0])
@@ -206,7 +207,7 @@ def test_estimate_is_unbiased_on_random_maps(seed):
         assert got.max() <= float(jnp.max(q))
         means.append(got.mean())
     assert np.all(np.diff(means) > 0.1)
-    np.testing.assert_allclose([means[0], means[-1]], [np.mean(q), np.max(q)], atol=1e-2)
+    assert_allclose([means[0], means[-1]], [np.mean(q), np.max(q)], atol=1e-2)
 
 
 def test_exact_tends_to_mean_and_maximum():
@@ -215,5 +216,5 @@ def test_exact_tends_to_mean_and_maximum():
     q, _ = _random_map(0)
     valid = jnp.arange(400) % 3 == 0
     chosen = np.asarray(q)[::3]
-    np.testing.assert_allclose(exact_softmax(q, 0.0, valid), chosen.mean(), rtol=1e-5)
-    np.testing.assert_allclose(exact_softmax(q, 1e6, valid), chosen.max(), rtol=1e-6)
+    assert_allclose(exact_softmax(q, 0.0, valid), chosen.mean(), rtol=1e-5)
+    assert_allclose(exact_softmax(q, 1e6, valid), chosen.max(), rtol=1e-6)

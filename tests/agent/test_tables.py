@@ -6,7 +6,7 @@ import typing
 import pytest
 
 from csac_jax import config
-from csac_jax.agent import actor_critic, losses, policy, rewards
+from csac_jax.agent import critic, losses, policy, rewards
 from csac_jax.config import CEMConfig, LearnConfig, PolicyConfig, RewardConfig, TargetConfig
 from csac_jax.replay import samplers
 from csac_jax.training import step
@@ -15,7 +15,7 @@ from csac_jax.training import step
 @pytest.mark.parametrize(
     ("table", "section", "name"),
     [
-        (actor_critic.NEXT_VALUES, TargetConfig, "value"),
+        (critic.NEXT_VALUES, TargetConfig, "value"),
         (policy.CEM_STARTS, CEMConfig, "start"),
         (policy.POSE_SEARCHES, PolicyConfig, "place"),
         (policy.PRIMITIVE_RULES, PolicyConfig, "primitive"),

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from csac_jax import cli, presets
-from csac_jax.agent import actor_critic, maps
+from csac_jax.agent import actor_critic, maps, values
 from csac_jax.config import CameraConfig
 from csac_jax.constants import Outcome
 from csac_jax.deploy import Policy, experience, finetune, record
@@ -115,7 +115,7 @@ def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
     found = experience.load(policy, record.read(tmp_path))
     learner = actor_critic.make(CFG)
     obs = heightmap.unpack(jax.tree.map(jax.numpy.asarray, found.obs))
-    batch = actor_critic.dense_maps(learner, policy.params, obs)
+    batch = values.dense_maps(learner, policy.params, obs)
     state = jax.tree.map(lambda leaf: leaf[0], batch)
     action = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), found.action)
     q = maps.read_q(learner.frames, state, action.primitive, action.pose)
@@ -143,7 +143,7 @@ def _q(policy: Policy, image: scenes.Image, place: tuple[float, float]) -> float
     """Q of a grasp at a place."""
     learner = actor_critic.make(policy.cfg)
     obs = policy.observe(*image)
-    batch = actor_critic.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
+    batch = values.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
     state = jax.tree.map(lambda leaf: leaf[0], batch)
     pose = np.array([*place, 0.3], np.float32)
     return float(maps.read_q(learner.frames, state, np.int32(1), pose))

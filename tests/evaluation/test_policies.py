@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.agent import actor_critic, csac, policy
+from csac_jax.agent import actor_critic, csac, policy, values
 from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import policies
@@ -59,7 +59,7 @@ def test_learned_acts_like_the_agent(learned, states):
 
     @jax.jit
     def wanted(params, states, keys):
-        dense_maps = actor_critic.dense_maps(parts, params, states.obs)
+        dense_maps = values.dense_maps(parts, params, states.obs)
         best = jax.vmap(policy.best_action, (0, None, 0, 0))
         return best(keys, parts, dense_maps, states.steps_without_change)
 
@@ -82,14 +82,14 @@ def test_mirror_images_reach_the_policy(learned, states):
     cfg = off.change(policy={"augment": True})
     parts, key = actor_critic.make(cfg), jax.random.key(0)
     state = jax.jit(lambda key: actor_critic.init(key, parts))(key)
-    look = jax.jit(lambda obs: actor_critic.decision_maps(parts, state.online, obs))
+    look = jax.jit(lambda obs: values.decision_maps(parts, state.online, obs))
     best = jax.vmap(policy.best_action, (0, None, 0, 0))
     expected = best(_keys(), parts, look(states.obs), states.steps_without_change).pose
     mirrored, plain = (LearnedPolicy(one, state.online) for one in (cfg, off))
     np.testing.assert_allclose(mirrored.batched(states, _keys()).pose, expected, atol=1e-5)
     agent = csac.CSAC(parts).act(key, state, states.obs, states.steps_without_change)
     np.testing.assert_allclose(agent.pose, expected, atol=1e-5)
-    value = jax.vmap(actor_critic.best_grasp)(look(states.obs))[0]
+    value = jax.vmap(values.best_grasp)(look(states.obs))[0]
     np.testing.assert_allclose(mirrored.debug(_scene(states, 0), key).best_grasp, value, atol=1e-6)
     assert np.abs(plain.batched(states, _keys()).pose - expected).max() > 0.005
 
@@ -182,8 +182,8 @@ def test_debug_is_of_the_action(learned, states):
     state = _scene(states, 0)
     seen, action = (look(state, jax.random.key(2)) for look in (learned.debug, learned))
     parts, obs = actor_critic.make(CFG), jax.tree.map(lambda leaf: leaf[:1], states.obs)
-    dense_maps = jax.jit(lambda obs: actor_critic.dense_maps(parts, learned.params, obs))(obs)
-    (best,) = jax.vmap(actor_critic.best_grasp)(dense_maps)
+    dense_maps = jax.jit(lambda obs: values.dense_maps(parts, learned.params, obs))(obs)
+    (best,) = jax.vmap(values.best_grasp)(dense_maps)
     np.testing.assert_allclose(seen.best_grasp, best, rtol=1e-5)
     assert seen.q.shape == (2, CFG.heightmap.size, CFG.heightmap.size)
     places = seen.candidates[Primitive.GRASP, :, :2]

@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax import presets
 from csac_jax.nets import chunked_vmap
@@ -35,7 +35,7 @@ def test_chunks_do_what_each_does(size: int):
         )
         for i in range(6):
             for name, leaf in part(keys[i], runs[i], shared).items():
-                np.testing.assert_allclose(got[name][i], leaf, rtol=1e-6, err_msg=name)
+                assert_allclose(got[name][i], leaf, rtol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize(("size", "calls"), [(1, 2), (2, 6), (3, 6)])
@@ -54,5 +54,5 @@ def test_branch_stays_one_in_chunks_of_one(size: int, calls: int):
     taken = jnp.array([0, 1, 0, 0, 1, 0], bool)
     got = jax.jit(jax.vmap(chunked_vmap.vmap_in_chunks(part, size)))(taken, jnp.arange(6.0))
     jax.effects_barrier()
-    np.testing.assert_array_equal(got, [0.0, 2.0, 2.0, 3.0, 5.0, 5.0])
+    assert_array_equal(got, [0.0, 2.0, 2.0, 3.0, 5.0, 5.0])
     assert len(ran) == calls

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from csac_jax.config import DenseNet121, SmallNet
 from csac_jax.nets import networks
@@ -63,7 +64,7 @@ def test_forward_is_numpys(setting, backend, monkeypatch: pytest.MonkeyPatch):
     in that for a GPU."""
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     maps, kernel = _drawn(*setting[:3])
-    np.testing.assert_allclose(
+    assert_allclose(
         conv2d(maps, kernel, *setting[3:]), _numpy(maps, kernel, *setting[3:]), atol=2e-5
     )
 
@@ -92,7 +93,7 @@ def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.Monk
         maps, kernel
     )
     for name, got, want in zip(("maps", "kernel"), scanned, wanted, strict=True):
-        np.testing.assert_allclose(got[1], want, atol=close, err_msg=name)
+        assert_allclose(got[1], want, atol=close, err_msg=name)
 
 
 @pytest.mark.parametrize("dilation", [1, 2, 4])
@@ -115,7 +116,7 @@ def test_taps_are_a_convolution(size: int, dilation: int):
         plain = lambda m, k: _plain(m, k, 1, dilation, padding)  # noqa: E731
         value, back = jax.vjp(plain, maps[run], kernels[run])
         for got, wanted in zip(found, (value, *back(gradients[run])), strict=True):
-            np.testing.assert_allclose(got[run], wanted, atol=1e-4)
+            assert_allclose(got[run], wanted, atol=1e-4)
 
 
 def test_runs_side_by_side_convolve_by_taps_on_a_gpu(monkeypatch: pytest.MonkeyPatch):
@@ -141,4 +142,4 @@ def test_runs_side_by_side_convolve_by_taps_on_a_gpu(monkeypatch: pytest.MonkeyP
     for got, wanted in zip(
         taps.critic.apply(variables, maps), plain.critic.apply(variables, maps), strict=True
     ):
-        np.testing.assert_allclose(got, wanted, atol=2e-2)  # bfloat16's
+        assert_allclose(got, wanted, atol=2e-2)  # bfloat16's

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.config import SmallNet
 from csac_jax.nets import dense, networks
@@ -88,7 +89,7 @@ def test_net_is_numpys(cfg: SmallNet):
     maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
     got = _apply(params, maps, cfg)
     assert got.shape == (2, 16 // cfg.stride, 24 // cfg.stride, dense.OUTPUTS)
-    np.testing.assert_allclose(got, _numpy_net(params, maps, cfg), rtol=1e-3, atol=1e-4)
+    assert_allclose(got, _numpy_net(params, maps, cfg), rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -123,7 +124,7 @@ def test_maps_follow_the_picture(params):
     here[0, 28:40, 30:42], there[0, 36:48, 34:46] = picture, picture
     before, after = _apply(params, here)[0], _apply(params, there)[0]
     inner = slice(8, -8)
-    np.testing.assert_allclose(
+    assert_allclose(
         np.roll(before, (4, 2), axis=(0, 1))[inner, inner], after[inner, inner], atol=2e-5
     )
     assert np.abs(before - after)[inner, inner].max() > 0.1  # it is not the same everywhere
@@ -148,7 +149,7 @@ def test_finer_maps_lie_where_their_cells_do(stride: int, finer: int):
                     got[:, i::finer, j::finer, output],
                     (finer * i + j) * dense.OUTPUTS + output,
                 )
-                np.testing.assert_allclose(cells, values[..., channel], rtol=1e-3, atol=1e-4)
+                assert_allclose(cells, values[..., channel], rtol=1e-3, atol=1e-4)
 
 
 def test_bare_table_is_zero():
@@ -156,6 +157,6 @@ def test_bare_table_is_zero():
     comes out near 1."""
     height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
     net_input = np.asarray(networks.make(CFG).inputs(jnp.full((2, 2, 3), 0.9), height, None))
-    np.testing.assert_array_equal(net_input[0, 0], 0.0)
-    np.testing.assert_array_equal(net_input[0, 1, :3], 0.0)
-    np.testing.assert_allclose(net_input[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)
+    assert_array_equal(net_input[0, 0], 0.0)
+    assert_array_equal(net_input[0, 1, :3], 0.0)
+    assert_allclose(net_input[1, 0], [0.4, 0.4, 0.4, 1.0], rtol=1e-6)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 os.environ.setdefault("KERAS_BACKEND", "jax")
 
@@ -117,7 +118,7 @@ def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
         after = dict(_weights((variables["params"], state["batch_stats"])))
         for name, (_, _, *wanted) in statistics.items():
             for mine, other in zip(after[name][2:], wanted, strict=True):
-                np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-4, err_msg=name)
+                assert_allclose(mine, other, rtol=1e-4, atol=1e-4, err_msg=name)
     return len(names)
 
 
@@ -203,13 +204,13 @@ def test_trunks_see_colour_height_and_mask():
     zoomed = DenseNet121(zoom=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
     assert seen.shape == (3, 2, 8, 8, 3)
-    np.testing.assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
+    assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
     for trunk, channel in ((1, 3), (2, 4)):
         for copy in range(3):
-            np.testing.assert_array_equal(seen[trunk, :, ::2, 1::2, copy], maps[..., channel])
+            assert_array_equal(seen[trunk, :, ::2, 1::2, copy], maps[..., channel])
     blind = DenseNet121(colour=False)
     only = densenet._trunk_inputs(blind, maps[..., 3:4])
-    np.testing.assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
+    assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
 
 
 def test_a_zoomed_trunk_doubles_its_cells():
@@ -225,9 +226,7 @@ def test_a_zoomed_trunk_doubles_its_cells():
         jax.jit(whole.apply)(variables, repeated),
     )
     assert got.shape == (2, 2, 3, 8)
-    np.testing.assert_allclose(
-        got, wanted, atol=1e-4
-    )  # rounding, which norms of random scales amplify
+    assert_allclose(got, wanted, atol=1e-4)  # rounding, which norms of random scales amplify
 
 
 def test_inputs():
@@ -236,11 +235,11 @@ def test_inputs():
     height, colour = jnp.array([[0.0, 0.03]]), jnp.full((1, 2, 3), 0.5)
     sees, blind = (networks.make(DenseNet121(colour=colour)) for colour in (True, False))
     net_input = np.asarray(sees.inputs(colour, height, jnp.array([[True, False]])))
-    np.testing.assert_array_equal(net_input[0, 0], [0.0, 0.0, 0.0, 0.0, 1.0])
-    np.testing.assert_allclose(
+    assert_array_equal(net_input[0, 0], [0.0, 0.0, 0.0, 0.0, 1.0])
+    assert_allclose(
         net_input[0, 1], [0.015 / 0.229, 0.044 / 0.224, 0.094 / 0.225, 1.0, 0.0], rtol=1e-4
     )
-    np.testing.assert_allclose(blind.inputs(colour, height, None), [[[0.0], [1.0]]], rtol=1e-6)
+    assert_allclose(blind.inputs(colour, height, None), [[[0.0], [1.0]]], rtol=1e-6)
 
 
 def test_trunks_have_weights_of_their_own():
@@ -255,7 +254,7 @@ def test_trunks_have_weights_of_their_own():
     trunk = jax.tree.map(lambda leaf: leaf.at[0].multiply(1.5), variables["params"]["trunk"])
     heavier = {"params": {**variables["params"], "trunk": trunk}}
     for after in (features(heavier, maps), features(variables, maps.at[..., :3].multiply(-1.0))):
-        np.testing.assert_array_equal(after[..., half:], before[..., half:])
+        assert_array_equal(after[..., half:], before[..., half:])
         assert np.any(after[..., :half] != before[..., :half])
 
 
@@ -271,7 +270,7 @@ def test_head_upsamples(zoom: int, output_stride: int, factor: int):
     assert got.shape == (4 * factor, 5 * factor)
     at = [(np.arange(n * factor) + 0.5) / factor - 0.5 for n in (4, 5)]
     inner = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]
-    np.testing.assert_allclose(
+    assert_allclose(
         got[np.ix_(*inner)], np.add.outer(3.0 * at[0][inner[0]], at[1][inner[1]]), atol=1e-5
     )
 
@@ -285,7 +284,7 @@ def test_group_norm_sees_one_map():
     apply = jax.jit(head.apply)
     together = apply(variables, features)
     assert together.shape == (2, 3, 16, 16, 3)
-    np.testing.assert_allclose(together[1, 2], apply(variables, features[1, 2:])[0], atol=1e-5)
+    assert_allclose(together[1, 2], apply(variables, features[1, 2:])[0], atol=1e-5)
 
 
 HALF = with_constants(TINY, dtype="bfloat16")

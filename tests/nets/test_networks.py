@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from csac_jax import presets
 from csac_jax.agent import maps
@@ -170,7 +171,7 @@ def test_states_of_densenet_are_seen_in_groups():
             got = jax.jit(lambda: networks.apply(nets, variables, net_input))()
         apart = [apply(variables, one) for one in net_input]
         for leaf, *wanted in zip(got, *apart, strict=True):
-            np.testing.assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
+            assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["small", "densenet121"])
@@ -210,7 +211,7 @@ def test_mirrored_maps_are_the_mean_of_four_looks():
     )
     q, features = networks.apply_mirrored(nets, variables, passes)
     plain, expected = networks.apply(nets, variables, passes)
-    np.testing.assert_allclose(features, expected, atol=1e-5)
+    assert_allclose(features, expected, atol=1e-5)
 
     def along(q: Any) -> np.ndarray:
         return np.asarray(q)[:, :, :, ::-1][..., [1, 0, 2]]
@@ -219,14 +220,14 @@ def test_mirrored_maps_are_the_mean_of_four_looks():
         return np.asarray(q)[:, :, ::-1]
 
     turned = networks.apply_mirrored(nets, variables, passes[:, :, :, ::-1])[0]
-    np.testing.assert_allclose(turned, along(q), atol=1e-5)
+    assert_allclose(turned, along(q), atol=1e-5)
     turned = networks.apply_mirrored(nets, variables, passes[:, :, ::-1])[0]
-    np.testing.assert_allclose(turned, across(q), atol=1e-5)
+    assert_allclose(turned, across(q), atol=1e-5)
     looks = [
         plain,
         across(networks.apply(nets, variables, passes[:, :, ::-1])[0]),
         along(networks.apply(nets, variables, passes[:, :, :, ::-1])[0]),
         across(along(networks.apply(nets, variables, passes[:, :, ::-1, ::-1])[0])),
     ]
-    np.testing.assert_allclose(q, np.mean(looks, axis=0), atol=1e-5)
+    assert_allclose(q, np.mean(looks, axis=0), atol=1e-5)
     assert np.abs(np.asarray(q - plain)).max() > 0.1

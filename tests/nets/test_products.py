@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.nets import products
 
@@ -51,7 +52,7 @@ def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
         )
 
     for got, wanted in zip(*_both(ours, plain, (maps, kernel), gradient), strict=True):
-        np.testing.assert_allclose(got, wanted, atol=1e-4)
+        assert_allclose(got, wanted, atol=1e-4)
 
 
 def test_doubled_cells_are_pixels_twice_over():
@@ -72,7 +73,7 @@ def test_doubled_cells_are_pixels_twice_over():
     ours = functools.partial(see, True)
     for got, wanted in zip(*_both(ours, repeated, (maps, kernel), gradient), strict=True):
         # sums of up to 192 products of numbers near 1
-        np.testing.assert_allclose(got, wanted, atol=1e-4)
+        assert_allclose(got, wanted, atol=1e-4)
 
 
 def test_max_pool_is_flaxs():
@@ -81,16 +82,14 @@ def test_max_pool_is_flaxs():
     rng = np.random.default_rng(0)
     maps = jnp.asarray(np.maximum(rng.normal(size=(2, 8, 12, 3)), 0.0), jnp.float32)
     pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
-    np.testing.assert_array_equal(products.max_pool(maps), pool(maps))
+    assert_array_equal(products.max_pool(maps), pool(maps))
     weight = jnp.asarray(rng.normal(size=(2, 4, 6, 3)), jnp.float32)
     losses = [lambda maps, f=f: jnp.sum(weight * f(maps)) for f in (products.max_pool, pool)]
     got, wanted = (jax.jit(jax.grad(loss))(maps) for loss in losses)
     positive = (
         maps > 0.0
     )  # at 0 several cells are the largest; the ReLU before takes the gradient away there
-    np.testing.assert_allclose(
-        jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6
-    )
+    assert_allclose(jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6)
     named = ["select_and_scatter" in str(jax.make_jaxpr(jax.grad(loss))(maps)) for loss in losses]
     assert named == [False, True]
 
@@ -102,4 +101,4 @@ def test_max_pool_chooses_the_first_of_the_largest():
     got, wanted = (
         jax.grad(lambda maps, f=f: jnp.sum(f(maps)))(maps) for f in (products.max_pool, pool)
     )
-    np.testing.assert_array_equal(got, wanted)
+    assert_array_equal(got, wanted)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.config import BetaReplay, PrioritisedReplay
 from csac_jax.replay import ring, samplers
@@ -106,14 +107,14 @@ class RingModel(RuleBasedStateMachine):
         assert set(np.asarray(slots)) <= set(range(self.size))
         probability = self.priority[np.asarray(slots)] / self.priority.sum()
         expected = (self.size * probability) ** -(0.4 + 0.6 * progress)
-        np.testing.assert_allclose(weights, expected / expected.max(), rtol=1e-5)
+        assert_allclose(weights, expected / expected.max(), rtol=1e-5)
 
     @invariant()
     def same(self):
         assert (int(self.state.head), int(self.state.size)) == (self.head, self.size)
-        np.testing.assert_array_equal(self.state.items["id"], self.ids)
-        np.testing.assert_array_equal(self.state.items["map"][:, 1, 0], self.ids)
-        np.testing.assert_allclose(self.state.priority, self.priority, rtol=1e-5)
+        assert_array_equal(self.state.items["id"], self.ids)
+        assert_array_equal(self.state.items["map"][:, 1, 0], self.ids)
+        assert_allclose(self.state.priority, self.priority, rtol=1e-5)
 
 
 class TestRingModel(RingModel.TestCase):
@@ -156,7 +157,7 @@ def test_twice_the_same_slot_keeps_the_larger_error():
     state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([9.0, 9.0]))
     for errors in ([0.1, -0.5, 0.2], [-0.5, 0.1, 0.2]):
         updated = set_errors(state, jnp.array([1, 1, 0]), jnp.array(errors))
-        np.testing.assert_allclose(updated.priority[:2], [0.2, 0.5])
+        assert_allclose(updated.priority[:2], [0.2, 0.5])
 
 
 def test_errors_that_are_not_numbers():
@@ -171,7 +172,7 @@ def test_errors_that_are_not_numbers():
         ([1, 0], [3e38, jnp.nan], [1e28, 1e28, 0.1]),
     ):
         updated = set_errors(state, jnp.array(slots), jnp.array(errors))
-        np.testing.assert_allclose(updated.priority[:3], expected)
+        assert_allclose(updated.priority[:3], expected)
 
 
 def test_gather_returns_the_items_of_its_slots():

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import special, stats
 
 from csac_jax.config import BetaReplay, Config, OppositeReplay, PrioritisedReplay, UniformReplay
@@ -127,7 +128,7 @@ def test_large_rings_follow_the_beta_law(a, b):
     assert slots.max() < size
     decile = (ranks(values[:size], slots) * 10) // size
     exact = np.diff(special.betainc(a, b, np.linspace(0.0, 1.0, 11)))
-    np.testing.assert_allclose(np.bincount(decile, minlength=10) / decile.size, exact, atol=0.01)
+    assert_allclose(np.bincount(decile, minlength=10) / decile.size, exact, atol=0.01)
 
 
 def test_large_rings_of_equal_values():
@@ -216,7 +217,7 @@ def test_large_rings_are_drawn_evenly():
     below = 8 ** len(lower)  # slots that the second uniform number decides between
     assert below <= 8**3
     count = np.bincount(np.arange(2**23) * below >> 23)
-    np.testing.assert_allclose(count / count.mean(), 1.0, atol=1e-3)
+    assert_allclose(count / count.mean(), 1.0, atol=1e-3)
 
 
 @pytest.mark.parametrize("zeros", [0.0, 0.5, 0.95, 1.0])
@@ -248,7 +249,7 @@ def test_top_decile_shares():
     errors = jnp.arange(CAPACITY, 0, -1).astype(jnp.float32)  # slot = rank
     for a, b, share in ((1.0, 12.0, 0.72), (1.0, 2.0, 0.19), (0.5, 0.5, 0.205), (1.0, 1.0, 0.10)):
         slots = beta_slots(jax.random.key(1), errors, jnp.int32(CAPACITY), a, b, NUM)
-        np.testing.assert_allclose(np.mean(np.asarray(slots) < CAPACITY // 10), share, atol=0.012)
+        assert_allclose(np.mean(np.asarray(slots) < CAPACITY // 10), share, atol=0.012)
 
 
 @pytest.mark.parametrize(
@@ -273,7 +274,7 @@ def test_items_with_large_errors_are_drawn_most(sampler):
         if isinstance(sampler, samplers.Beta)
         else 5.001 / (np.abs(errors).sum() + 8e-3)
     )
-    np.testing.assert_allclose(count[7] / NUM, share, atol=0.01)
+    assert_allclose(count[7] / NUM, share, atol=0.01)
 
 
 def test_ranking_by_reward():
@@ -340,7 +341,7 @@ def test_opposites_follow_vpgs_law(kind):
     given = jnp.full(NUM, newest, jnp.int32)
     slots, found = samplers.opposite_slots(jax.random.key(1), state, given, 1.0, 2.0)
     assert np.all(found)
-    np.testing.assert_array_equal(weights, 1.0)
+    assert_array_equal(weights, 1.0)
     fitting = np.flatnonzero(2 * primitive[:700] + good[:700] == (kind ^ 1))
     assert np.isin(slots, fitting).all()
     place = np.searchsorted(fitting, slots)
@@ -372,8 +373,8 @@ def test_without_an_opposite_only_the_new_counts():
     sampler = samplers.make(OppositeReplay())
     state = tried([1, 0, 1, 1, 1], [0.0, 0.5, 0.0, 1.0, 1.0], np.ones(5), 3, head=3)
     slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
-    np.testing.assert_array_equal(slots, [2, 1, 2, 1])
-    np.testing.assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
+    assert_array_equal(slots, [2, 1, 2, 1])
+    assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
 
 
 def test_nan_is_ranked_first():
@@ -434,7 +435,7 @@ def test_weights_by_formula(progress, law):
     expected = (900 * mass / mass.sum())[np.asarray(slots)] ** -(
         0.2 + 0.6 * np.clip(progress, 0.0, 1.0)
     )
-    np.testing.assert_allclose(weights, expected / expected.max(), rtol=2e-5)
+    assert_allclose(weights, expected / expected.max(), rtol=2e-5)
     assert np.unique(weights).size > 1
 
 
@@ -447,7 +448,7 @@ def test_full_weights_take_the_bias_away():
     plain = values[np.asarray(slots)].mean()
     weighted = np.average(values[np.asarray(slots)], weights=weights)
     assert plain > values.mean() + 0.05
-    np.testing.assert_allclose(weighted, values.mean(), atol=0.01)
+    assert_allclose(weighted, values.mean(), atol=0.01)
 
 
 @pytest.mark.parametrize("name", ["uniform", "beta"])
@@ -455,7 +456,7 @@ def test_other_samplers_do_not_weight(name):
     """Claim: weights of uniform and beta draws are ones, whatever the errors."""
     state = stored(SAMPLERS[name], np.random.default_rng(0).normal(size=CAPACITY))
     drawn = sample(jax.random.key(0), SAMPLERS[name], state, jnp.float32(0.3), 64)
-    np.testing.assert_array_equal(drawn.weights, 1.0)
+    assert_array_equal(drawn.weights, 1.0)
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
@@ -475,9 +476,9 @@ def test_batched_seeds_are_each_by_itself(sampler):
     )
     for i, (key, state) in enumerate(zip(keys, states, strict=True)):
         alone = jax.jit(step)(key, state)
-        np.testing.assert_array_equal(together[0][i], alone[0])
-        np.testing.assert_allclose(together[1][i], alone[1], rtol=1e-6)
-        np.testing.assert_allclose(together[2][i], alone[2], rtol=1e-6)
+        assert_array_equal(together[0][i], alone[0])
+        assert_allclose(together[1][i], alone[1], rtol=1e-6)
+        assert_allclose(together[2][i], alone[2], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -488,7 +489,7 @@ def test_batched_seeds_are_each_by_itself(sampler):
 def test_schedule_by_hand(progress, expected):
     """Claim: (a, b) goes from (0.5, 0.5) to (1, 1) at 40 % and on to (1, 12), in straight lines,
     and stays there."""
-    np.testing.assert_allclose(
+    assert_allclose(
         samplers.beta_schedule(BetaReplay(), jnp.float32(progress)), expected, rtol=1e-5
     )
 
@@ -497,9 +498,7 @@ def test_one_law_for_the_whole_run():
     """Claim: with start, middle and end the same, (a, b) never changes: VPG's Beta(1, 2)."""
     cfg = BetaReplay(start=(1.0, 2.0), middle=(1.0, 2.0), end=(1.0, 2.0))
     for progress in np.linspace(-0.5, 1.5, 21):
-        np.testing.assert_array_equal(
-            samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0]
-        )
+        assert_array_equal(samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0])
 
 
 def test_sampler_follows_the_schedule():
@@ -511,7 +510,7 @@ def test_sampler_follows_the_schedule():
         slots = np.asarray(
             sample(jax.random.key(0), sampler, state, jnp.float32(progress), NUM).slots
         )
-        np.testing.assert_allclose(np.mean(slots >= 0.9 * CAPACITY), share, atol=0.012)
+        assert_allclose(np.mean(slots >= 0.9 * CAPACITY), share, atol=0.012)
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
@@ -521,7 +520,7 @@ def test_keys_differ(sampler):
     first, again, other = (
         sample(jax.random.key(i), sampler, state, jnp.float32(0.3), 32).slots for i in (0, 0, 1)
     )
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     assert np.any(first != other)
 
 
@@ -566,7 +565,7 @@ def test_as_a_sum_tree_after_a_million_updates():
     for these, new in zip(slots, priorities, strict=True):
         truth[these] = (new.astype(float) + 1e-9) ** sampler.cfg.alpha
     top, ours = samplers._pyramid(state.priority)[0][0].sum(), np.asarray(state.priority, float)
-    np.testing.assert_allclose(top, truth.sum(), rtol=1e-5)
-    np.testing.assert_allclose(top, tree.nodes[0], rtol=1e-4)
-    np.testing.assert_allclose(ours / float(top), truth / truth.sum(), rtol=1e-5)
+    assert_allclose(top, truth.sum(), rtol=1e-5)
+    assert_allclose(top, tree.nodes[0], rtol=1e-4)
+    assert_allclose(ours / float(top), truth / truth.sum(), rtol=1e-5)
     assert np.abs(ours / float(top) - theirs).sum() < 1e-4

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, rewards
+from csac_jax.agent import actor, actor_critic, rewards, values
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import UpdateInfo
 from csac_jax.config import Config, PrioritisedReplay
@@ -541,8 +541,8 @@ def test_only_pushes_ask_for_the_best_grasps(monkeypatch: pytest.MonkeyPatch):
 
     @jax.jit
     def one(obs: Observation) -> jax.Array:
-        dense_maps = actor_critic.dense_maps(learner, state.target, obs)
-        return jax.vmap(actor_critic.best_grasp)(dense_maps)
+        dense_maps = values.dense_maps(learner, state.target, obs)
+        return jax.vmap(values.best_grasp)(dense_maps)
 
     wanted = np.stack([one(before), one(after)])
     assert np.all(np.abs(wanted) > 1e-3)
@@ -560,7 +560,7 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
         taken.append(obs.height.shape[0])
         return state, jnp.zeros(())
 
-    monkeypatch.setattr(actor_critic, "update_actor", update)
+    monkeypatch.setattr(actor, "update", update)
     for actor_batch in (0, 3):
         cfg = CFG.change(learn={"actor_batch": actor_batch})
         program = step.make(cfg, env=object())
