@@ -1,8 +1,8 @@
-"""The final policies of a sweep, measured without exploration: SWEEP/POINT/seed-K/eval.json, and
-eval-SUITE.json for scenes other than those of a policy's own task.
+"""Evaluates the final policies of a sweep, without exploration.
 
-The file is that of `csac-jax eval --json`. A policy that has one is passed over, so an interrupted
-evaluation goes on where it was.
+The result is SWEEP/POINT/seed-K/eval.json, or eval-SUITE.json for scenes other than those of a
+policy's own task, as of `csac-jax eval --json`. A policy that has one is skipped, so an interrupted
+evaluation continues where it was.
 """
 
 import dataclasses
@@ -28,16 +28,16 @@ def measure(
 ) -> int | None:
     """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
 
-    A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
-    ValueError as `suites.environments` does, before anything is measured there.
+    A failed run has no policy. Returns the number of the signal that stopped it. Raises ValueError
+    as `suites.environments` does.
     """
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))
         left = [run for run in runs if _is_left(folder / run.folder, suite)]
-        if kept := sum((folder / run.folder / _result(suite)).exists() for run in runs):
-            reporter.say(f"{point.name}: {kept} policies have their {_result(suite)} already")
+        if done := sum((folder / run.folder / _result(suite)).exists() for run in runs):
+            reporter.log(f"{point.name}: {done} policies have their {_result(suite)} already")
         if left and stop.signal is None:
-            reporter.say(f"evaluating {point.name}: {len(left)} policies")
+            reporter.log(f"evaluating {point.name}: {len(left)} policies")
             _measure_point(plan.episodes, suite, point, folder, left, stop)
     return stop.signal
 
@@ -53,23 +53,25 @@ def _is_left(path: Path, suite: str) -> bool:
 def _measure_point(
     episodes: int, suite: str, point: SweepPoint, folder: Path, runs: list[SweepRun], stop: Stop
 ) -> None:
-    """Evaluates runs of one point, which share their scenes and the compiled episodes; in C MuJoCo
-    if they were trained in it, on whatever device."""
+    """Evaluates runs of one point, which share scenes and compiled episodes.
+
+    In C MuJoCo if they were trained in it, on whatever device.
+    """
     physics: PhysicsKind = "c" if point.cfg.sim.physics == "c" else "auto"
-    seen = suites.with_objects(point.cfg, suite, None, "held_out")
-    cfg = rollout.configured(seen, physics, point.cfg.sim.robot)
+    with_objects = suites.with_objects(point.cfg, suite, None, "held_out")
+    cfg = rollout.configured(with_objects, physics, point.cfg.sim.robot)
     parts = suites.environments(cfg, suite, episodes, SEED)
     for run in runs:
         if stop.signal is not None:
             return
         begun, path = time.time(), folder / run.folder
-        found = rollout.measure(policies.load(path), parts, episodes, SEED, None)
+        table = rollout.measure(policies.load(path), parts, episodes, SEED, None)
         measured = dataclasses.replace(cfg, seed=run.cfg.seed)
-        _write(path / _result(suite), suite, measured, found, begun)
+        _write(path / _result(suite), suite, measured, table, begun)
 
 
-def _write(path: Path, suite: str, cfg: Config, found: dict[str, Any], begun: float) -> None:
+def _write(path: Path, suite: str, cfg: Config, table: dict[str, Any], begun: float) -> None:
     asked = {"policy": "learned", "suite": suite, "seed": SEED}
     seconds = {"seconds": round(time.time() - begun, 1)}
     config = {"config": configs.to_dict(cfg)}
-    files.write_json(path, {**asked, **seconds, **found, **config, **provenance.record()})
+    files.write_json(path, {**asked, **seconds, **table, **config, **provenance.record()})

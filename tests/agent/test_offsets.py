@@ -15,7 +15,7 @@ from csac_jax.config import OffsetNet
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from experiments.bench import between_cells
 from tests.agent import toys
 
@@ -197,8 +197,8 @@ def test_trained_policy_acts_between_cells(kind):
     cfg = toys.config("csac", actions=4800, max_actions=1)
     cfg = cfg.change(net={"kind": kind}, cem={"candidates": 32, "elites": 6, "rounds": 4})
     toy = toys.precise(cfg)
-    program = step.make(cfg, env=toy)
-    state, _ = step.compile_chunk(program, cfg.train.steps)(step.init(program))
+    program = programs.make(cfg, env=toy)
+    state, _ = programs.compile_chunk(program, cfg.train.steps)(programs.init(program))
     learner, num = actor_critic.make(cfg), 128
     keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(9), jnp.arange(num))
     first = jax.vmap(toy.reset)(keys)

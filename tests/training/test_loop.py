@@ -88,7 +88,7 @@ class Listener:
         if stop_after == 0:
             self.stop.signal = signal
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Reporter."""
         self.said.append(text)
 

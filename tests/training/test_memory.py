@@ -11,7 +11,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.replay import ring
-from csac_jax.training import halves, memory, step
+from csac_jax.training import memory, program as programs, split_step
 
 SMOKE = presets.smoke()
 
@@ -24,7 +24,7 @@ def test_state_is_exact():
     """Claim: ring and networks are known to the byte."""
     quick = presets.quick()
     known = memory.state_bytes(quick)
-    small = ring.init(jnp.zeros(64), step.example(quick))
+    small = ring.init(jnp.zeros(64), programs.example(quick))
     stored = sum(leaf.nbytes for leaf in jax.tree.leaves(small))
     # head and size are no slots
     assert known["replay"] == (stored - 8) * quick.replay.capacity // 64 + 8
@@ -73,7 +73,7 @@ def test_compiled_program_states_its_memory():
     said = memory.compiled_text(compiled)
     assert temporary > 0.1
     assert said == f"the program takes 0.75 GiB for states and {temporary:.2f} GiB besides"
-    chunk = halves.Chunk(SMOKE, 1, compiled, Future())
+    chunk = split_step.Chunk(SMOKE, 1, compiled, Future())
     assert memory.compiled_text(chunk) == (
         "the program takes 0.75 GiB for states; what learns compiles meanwhile"
     )

@@ -25,8 +25,9 @@ from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import halves, step
-from csac_jax.training.step import Program, StepMetrics, TrainState
+from csac_jax.training import program as programs, split_step, step, transitions
+from csac_jax.training.step import Program, TrainState
+from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision.heightmap import Observation
 
 pytestmark = pytest.mark.mjx
@@ -68,9 +69,9 @@ def run() -> Run:
             counted.append(event)
 
     with jax.debug_key_reuse(True), mock.patch.object(simulation, "reachable", half_in_reach):
-        program = step.make(CFG)
-        states = [step.init(program)]
-        traced = step.compile_chunk(program, T).trace(states[0])
+        program = programs.make(CFG)
+        states = [programs.init(program)]
+        traced = programs.compile_chunk(program, T).trace(states[0])
         chunk = traced.lower().compile()
         metrics = []
         compilations = 0
@@ -135,7 +136,7 @@ def test_two_programs_do_what_one_does(run: Run):
     """Claim: a chunk as two programs, one of which acts and the other learns, ends in the states of
     the one program, and measures the same."""
     with mock.patch.object(simulation, "reachable", half_in_reach):
-        chunk = halves.compile_chunk(run.program, T).lower(run.states[0]).compile()
+        chunk = split_step.compile_chunk(run.program, T).lower(run.states[0]).compile()
     for number in range(2):  # each from the same state: physics makes much of what rounding does
         state, metrics = chunk(copy(run.states[number]))
         pairs = ((run.states[number + 1], state), (run.metrics[number], metrics))
@@ -144,7 +145,7 @@ def test_two_programs_do_what_one_does(run: Run):
             for one, other in pairs
             for (name, a), (_, b) in zip(leaves(one), leaves(other), strict=True)
         ):
-            if name.removeprefix(".") in step._LOSSES:
+            if name.removeprefix(".") in transitions.LOSSES:
                 wanted, got = (np.where(metrics.learned, loss, 0.0) for loss in (wanted, got))
             np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-5, err_msg=name)
     assert metrics.learned.all()
@@ -166,7 +167,7 @@ def test_acting_does_not_wait_for_what_learns():
 
     failed: Future[Any] = Future()
     failed.set_exception(MemoryError("no room"))
-    chunk = halves.Chunk(cfg, 2, act, failed)
+    chunk = split_step.Chunk(cfg, 2, act, failed)
     state, metrics = chunk(SimpleNamespace(step=0, told=[]))
     assert state.told == ["act", "act"]
     np.testing.assert_array_equal(metrics["learned"], [False, False])
@@ -203,7 +204,7 @@ def test_what_acts_is_there_first():
             return "acts"
 
     traceable = mock.Mock(part=lambda _: Part())
-    chunk = halves._Lowered(traceable, Acting()).compile()
+    chunk = split_step._Lowered(traceable, Acting()).compile()
     assert (chunk.act, chunk.learn.done(), order) == ("acts", False, ["acts"])
     go_on.set()
     assert chunk.learn.result(60.0) == "learns"
@@ -211,7 +212,7 @@ def test_what_acts_is_there_first():
 
 def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch, run: Run):
     """Claim: only on a CPU, and on one device, is a chunk two programs."""
-    halved = lambda program: isinstance(halves.compile_chunk(program, T), halves._Traceable)  # noqa: E731
+    halved = lambda program: isinstance(split_step.compile_chunk(program, T), split_step._Traceable)  # noqa: E731
     assert halved(run.program)
     assert not halved(dataclasses.replace(run.program, mesh=mock.Mock()))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
@@ -282,7 +283,7 @@ def test_blocks_that_left_reach_the_reward(run):
     cfg = CFG.change(reward={"lost_block_penalty": 0.75})
     reward = cfg.reward
     env = Losing(cfg, run.program.env.physics, run.program.env.scenes)
-    program = step.make(cfg, env=env)
+    program = programs.make(cfg, env=env)
     _, metrics = jax.jit(functools.partial(step.train_step, program))(copy(run.states[0]))
     grasp, push = (
         reward.grasp_levels[Outcome.NOTHING] - 0.75,
@@ -299,12 +300,12 @@ def test_temporary_memory_does_not_grow_with_the_ring():
     at most."""
     temporary, rings = [], []
     for capacity in (512, 2048):
-        program = step.make(CFG.change(replay={"capacity": capacity}))
+        program = programs.make(CFG.change(replay={"capacity": capacity}))
         env = Still(program.env.cfg, program.env.physics, program.env.scenes)
         program = dataclasses.replace(program, env=env)
-        state = step.init(program)
+        state = programs.init(program)
         temporary.append(
-            step.compile_chunk(program, T)
+            programs.compile_chunk(program, T)
             .lower(state)
             .compile()
             .memory_analysis()
@@ -325,7 +326,7 @@ def test_seeds_differ(run):
     """Claim: seeds 0 and 1 begin with other scenes and networks, and choose and see other things in
     every scene."""
     other_cfg = dataclasses.replace(CFG, seed=1)
-    begun = step.init(dataclasses.replace(run.program, cfg=other_cfg))
+    begun = programs.init(dataclasses.replace(run.program, cfg=other_cfg))
     for name in ("scenes", "learner"):
         assert not equal(getattr(begun, name), getattr(run.states[0], name)), name
     state, _ = run.chunk(begun)
@@ -487,7 +488,7 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     monkeypatch.setattr(PrioritisedReplay, "per_epsilon", 0.25)
     monkeypatch.setattr(CSAC, "update", update)
     monkeypatch.setattr(CSAC, "end_step", lambda self, state, obs: (state, jnp.float32(0.0)))
-    replay = ring.init(jnp.full(64, 7.0), step.example(cfg)).replace(size=jnp.int32(64))
+    replay = ring.init(jnp.full(64, 7.0), programs.example(cfg)).replace(size=jnp.int32(64))
     learner_state = actor_critic.LearnerState(None, None, None, None, jnp.int32(0))
     program = Program(cfg, nothing, CSAC(nothing), made)
     key, done = jax.random.key(0), jnp.int32(0)
@@ -563,9 +564,9 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(actor_critic, "update_actor", update)
     for actor_batch in (0, 3):
         cfg = CFG.change(learn={"actor_batch": actor_batch})
-        program = step.make(cfg, env=object())
+        program = programs.make(cfg, env=object())
         state = jax.eval_shape(program.learner.init, jax.random.key(0))
-        replay = jax.eval_shape(lambda: ring.init(jnp.zeros(64), step.example(CFG)))
+        replay = jax.eval_shape(lambda: ring.init(jnp.zeros(64), programs.example(CFG)))
         learn = functools.partial(step.learn, program)
         jax.eval_shape(learn, jax.random.key(0), state, replay, jnp.int32(0))
     assert taken == [CFG.learn.batch, 3]

@@ -13,13 +13,9 @@ from csac_jax.config import Config
 from csac_jax.nets import networks
 from csac_jax.replay import samplers
 from csac_jax.training import sharding
-from csac_jax.training.step import (
-    Hyperparams,
-    Program,
-    StepMetrics,
-    TrainState,
-    replace_hyperparams,
-)
+from csac_jax.training.program import Hyperparams, replace_hyperparams
+from csac_jax.training.step import Program, TrainState
+from csac_jax.training.transitions import StepMetrics
 from tests.metrics import step_metrics
 
 SCENES = 8

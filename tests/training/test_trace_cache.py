@@ -16,7 +16,7 @@ from csac_jax.config import Config
 from csac_jax.errors import FailedError
 from csac_jax.replay import samplers
 from csac_jax.sim import host_call
-from csac_jax.training import halves, loop, step, traced
+from csac_jax.training import loop, program as programs, split_step, step, trace_cache
 from csac_jax.training.step import Program
 
 pytestmark = pytest.mark.mjx
@@ -41,31 +41,31 @@ class TracedError(Exception):
 @pytest.fixture
 def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Where programs are kept, still empty."""
-    monkeypatch.setattr(traced, "_folder", lambda: tmp_path / "traced")
+    monkeypatch.setattr(trace_cache, "_folder", lambda: tmp_path / "traced")
     return tmp_path / "traced"
 
 
 @pytest.fixture(scope="module")
 def program() -> Program:
-    return step.make(CFG)
+    return programs.make(CFG)
 
 
 def _shapes(program: Program) -> Any:
-    return jax.eval_shape(step.compile_init(program))
+    return jax.eval_shape(programs.compile_init(program))
 
 
 def _untraceable() -> Any:
     untraceable = {"side_effect": TracedError}
     return mock.patch.multiple(
         step,
-        act_step=mock.create_autospec(step.act_step, **untraceable),
-        learn_step=mock.create_autospec(step.learn_step, **untraceable),
+        act_step=mock.create_autospec(step.act_half, **untraceable),
+        learn_step=mock.create_autospec(step.learn_half, **untraceable),
     )
 
 
 def _lower(program: Program, shapes: Any) -> None:
     """Lowers the part that acts."""
-    halves.compile_chunk(program, T, keep=True).part(step.act_step).lower(shapes)
+    split_step.compile_chunk(program, T, keep=True).part(step.act_half).lower(shapes)
 
 
 def _numbers(tree: Any) -> list[np.ndarray]:
@@ -78,13 +78,13 @@ def test_kept_program_is_the_same(folder: Path, program: Program):
     """Claim: a program of another seed, in a process that has not traced it, is lowered without a
     trace, calls the physics of its own world, and computes the same bits as one that is traced."""
     shapes = _shapes(program)
-    plain = halves.compile_chunk(program, T).lower(shapes).compile()
-    halves.compile_chunk(program, T, keep=True).lower(shapes).compile()
+    plain = split_step.compile_chunk(program, T).lower(shapes).compile()
+    split_step.compile_chunk(program, T, keep=True).lower(shapes).compile()
     assert len(list(folder.iterdir())) == 2
-    other = step.make(dataclasses.replace(CFG, seed=3))
+    other = programs.make(dataclasses.replace(CFG, seed=3))
     with _untraceable(), mock.patch.dict(host_call._functions, clear=True):
-        kept = halves.compile_chunk(other, T, keep=True).lower(shapes).compile()
-        begun = step.init(other)
+        kept = split_step.compile_chunk(other, T, keep=True).lower(shapes).compile()
+        begun = programs.init(other)
         wanted = got = None
         for chunk in (plain, kept):
             state = jax.tree.map(lambda leaf: leaf.copy(), begun)
@@ -112,10 +112,10 @@ def test_damaged_program_is_traced_anew(folder: Path, program: Program):
 
 
 def _name(cfg: Config = CFG, part: str = "act_step", **env: Any) -> str:
-    program = step.make(cfg)
+    program = programs.make(cfg)
     changed = dataclasses.replace(program, env=dataclasses.replace(program.env, **env))
     leaves, tree = jax.tree.flatten({"step": np.int32(0)})
-    return traced.name(changed, part, leaves, tree)
+    return trace_cache.name(changed, part, leaves, tree)
 
 
 def test_names_tell_programs_apart(monkeypatch: pytest.MonkeyPatch, program: Program):
@@ -133,7 +133,7 @@ def test_names_tell_programs_apart(monkeypatch: pytest.MonkeyPatch, program: Pro
     ]
     with jax.numpy_rank_promotion("warn"):
         given.append(_name())
-    monkeypatch.setattr(traced, "_sources", lambda: "of another commit")
+    monkeypatch.setattr(trace_cache, "_sources", lambda: "of another commit")
     given.append(_name())
     assert len(set(given)) == len(given)
     monkeypatch.undo()
@@ -146,7 +146,7 @@ def test_own_parts_are_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch, t
     found: list[bool] = []
 
     def run(cfg: Config, run_dir: Path, init: Any, compile_chunk: Any, *_: Any, **__: Any):
-        found.append(isinstance(compile_chunk(T).part(step.act_step), traced._Kept))
+        found.append(isinstance(compile_chunk(T).part(step.act_half), trace_cache._Kept))
         raise FailedError("enough")
 
     monkeypatch.setattr(loop, "run", run)
@@ -154,7 +154,7 @@ def test_own_parts_are_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch, t
     for sampler in (None, own):
         with pytest.raises(FailedError):
             api.train(CFG, tmp_path / "run", sampler=sampler, verbose=False)
-    monkeypatch.setattr(traced, "_folder", lambda: None)
+    monkeypatch.setattr(trace_cache, "_folder", lambda: None)
     with pytest.raises(FailedError):
         api.train(CFG, tmp_path / "run", verbose=False)
     assert found == [True, False, False]
@@ -166,17 +166,17 @@ def test_folder_is_that_of_the_compiled_programs(monkeypatch: pytest.MonkeyPatch
     try:
         for chosen, kept in (("/a/b", Path("/a/b/traced")), ("gs://a/b", None), (None, None)):
             jax.config.update("jax_compilation_cache_dir", chosen)
-            assert traced._folder() == kept
+            assert trace_cache._folder() == kept
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_oldest_program_goes_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Claim: no more than so many are kept; one that was just read stays."""
-    monkeypatch.setattr(traced, "MOST", 2)
+    monkeypatch.setattr(trace_cache, "MOST", 2)
     for age, name in enumerate("ab"):
-        traced._write(tmp_path / name, name.encode())
+        trace_cache._write(tmp_path / name, name.encode())
         os.utime(tmp_path / name, (age, age))
-    assert traced._read(tmp_path / "a") == b"a"
-    traced._write(tmp_path / "c", b"c")
+    assert trace_cache._read(tmp_path / "a") == b"a"
+    trace_cache._write(tmp_path / "c", b"c")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c"]
