@@ -91,7 +91,7 @@ def learn_half(
     _, key_learn, _ = _step_keys(state.key, step)
     # Before `learning_starts` the result is dropped: a branch costs more.
     ready = state.step * cfg.train.scenes >= cfg.train.learning_starts
-    done = jnp.maximum(step - first_to_learn(cfg), 0) * cfg.learn.updates
+    done = updates_done(cfg, step)
     learned, priority, losses = learn(program, key_learn, state.learner, state.replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, state.replay.priority)
@@ -146,6 +146,11 @@ def learn(
 def first_to_learn(cfg: Config) -> int:
     """Returns the first training step whose updates are kept."""
     return -(-cfg.train.learning_starts // cfg.train.scenes) - 1
+
+
+def updates_done(cfg: Config, step: jax.Array) -> jax.Array:
+    """Returns how many updates [] int32 were kept before training step `step` []."""
+    return jnp.maximum(step - first_to_learn(cfg), 0) * cfg.learn.updates
 
 
 def numbered_keys(key: jax.Array, num: int) -> jax.Array:

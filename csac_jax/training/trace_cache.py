@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import hashlib
 import os
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,16 +20,13 @@ import jax
 from jax import export
 
 import csac_jax
-from csac_jax.env import Env
 from csac_jax.runtime import compiler, host_call, private_jax, provenance
 from csac_jax.scene import stock
-from csac_jax.sim import c_physics
 from csac_jax.training.step import Program
 from csac_jax.training.transitions import StepMetrics
 
 MOST = 64  # files, of some MB each; those unused for longest are deleted
 _UNTRACED = ("cache", "logging")  # parts of names of JAX's settings that leave a trace as it is
-_CHECKSUM = 32  # bytes
 
 
 def jit(program: Program, half: Callable[..., Any], cached: bool) -> Any:
@@ -54,15 +52,7 @@ def _folder() -> Path | None:
 def _is_named(program: Program) -> bool:
     """Returns True if `name` holds all that the program is made of."""
     one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
-    if not (one_cpu and program.mesh is None and type(program.env) is Env):
-        return False
-    if type(program.env.physics) is c_physics.CPhysics:
-        return True
-    if program.cfg.sim.physics != "mjx":
-        return False
-    from csac_jax.sim import mjx_physics  # slow to import; the program has done it
-
-    return type(program.env.physics) is mjx_physics.MjxPhysics
+    return one_cpu and program.cfg.sim.physics in ("c", "mjx")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -154,12 +144,11 @@ def _sources() -> str:
 def _read(path: Path) -> bytes | None:
     """Reads a file; None if it is missing or damaged."""
     try:
-        content = path.read_bytes()
+        traced = zlib.decompress(path.read_bytes())  # it has a checksum
         os.utime(path)
-    except OSError:
+    except (OSError, zlib.error):
         return None
-    checksum, traced = content[:_CHECKSUM], content[_CHECKSUM:]
-    return traced if hashlib.sha256(traced).digest() == checksum else None
+    return traced
 
 
 def _write(path: Path, traced: bytes) -> None:
@@ -167,7 +156,7 @@ def _write(path: Path, traced: bytes) -> None:
     temporary = path.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(hashlib.sha256(traced).digest() + traced)
+        temporary.write_bytes(zlib.compress(traced, 1))
         temporary.replace(path)
         newest = sorted(path.parent.iterdir(), key=lambda file: -file.stat().st_mtime)
         for old in newest[MOST:]:

@@ -144,8 +144,8 @@ def test_parts_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
         meeting.wait(timeout=20)
         return np.asarray(value)
 
-    def train_step(program: step.Program, state: step.TrainState, hyperparams: Any) -> Any:
-        state, metrics = toys.train_step(program, state, hyperparams)
+    def train_step(program: step.Program, state: step.TrainState) -> Any:
+        state, metrics = toys.train_step(program, state)
         here = jax.ShapeDtypeStruct((), np.float32)
         met = jax.pure_callback(meet, here, state.scenes[0], vmap_method="broadcast_all")
         return state.replace(scenes=state.scenes.at[0].set(met)), metrics
