@@ -13,6 +13,7 @@ Map, in the direction of data; imports point only backwards along it:
 
     constants   numbers that several stages share
     config      every setting, as frozen dataclasses
+    runtime     compile cache, devices, signals, provenance; all of JAX that is private
     presets     named configs; algorithms: the CSAC family and its baselines
     geometry    poses, pixels <-> metres
     objects     shapes of convex parts: libraries, own families, import of meshes
@@ -23,7 +24,6 @@ Map, in the direction of data; imports point only backwards along it:
     agent       learner: cross-entropy method, targets, losses, rewards, exploration, update
     replay      ring of transitions and its samplers
     env         reset and step of one scene
-    runtime     compile cache, devices, signals, provenance
     io          checkpoints, policy files, configs
     training    the training step and its host loop
     evaluation  policies, suites, metrics, statistics
@@ -53,7 +53,7 @@ from csac_jax import _guard
 if TYPE_CHECKING:
     from csac_jax import algorithms, deploy, presets
     from csac_jax.agent.learner import Learner, Transition, UpdateInfo
-    from csac_jax.api import Run, evaluate, load_policy, sweep, train
+    from csac_jax.api import Run, evaluate, load_policy, sweep, train, train_fn
     from csac_jax.config import Config
     from csac_jax.env import AutoResetEnv, Env, State, make_env
     from csac_jax.evaluation.policies import Policy
@@ -68,7 +68,7 @@ __version__ = "0.2.0"
 _HOMES = {
     "csac_jax": ("algorithms", "deploy", "presets"),
     "csac_jax.agent.learner": ("Learner", "Transition", "UpdateInfo"),
-    "csac_jax.api": ("Run", "evaluate", "load_policy", "sweep", "train"),
+    "csac_jax.api": ("Run", "evaluate", "load_policy", "sweep", "train", "train_fn"),
     "csac_jax.config": ("Config",),
     "csac_jax.env": ("AutoResetEnv", "Env", "State", "make_env"),
     "csac_jax.evaluation.policies": ("Policy",),
@@ -104,6 +104,7 @@ __all__ = [
     "presets",
     "sweep",
     "train",
+    "train_fn",
     "unpack",
 ]
 

@@ -1,4 +1,4 @@
-"""Protection against faults of JAX. It imports nothing of JAX, so that it acts before JAX starts.
+"""Protection against faults of JAX, before JAX is imported.
 
 1. jax 0.10.2 computes wrong rows for `vmap(M @ row)` followed by a reduction (jax issue 39103).
 2. So do 0.10.1 and earlier in a plainer case: with M 3 x 3, `vmap(sum(M @ row))` is wrong in every
@@ -42,14 +42,14 @@ def refuse_broken_jax() -> None:
 
 
 def switch_off_broken_fusion() -> None:
-    """Adds the flag to XLA's, unless the user has given it or this jaxlib may not know it."""
+    """Adds the flag to XLA's, unless it is there or this jaxlib may not know it."""
     flags = os.environ.get("XLA_FLAGS", "")
     if importlib.metadata.version("jaxlib").startswith(FUSION_SERIES) and FUSION_FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {FUSION_FLAG}=".lstrip()
 
 
 def switch_off_broken_partitioner() -> None:
-    """Has this jaxlib partition programs without Shardy, unless the user has chosen."""
+    """Selects the partitioner before Shardy, unless the user has chosen."""
     broken = importlib.metadata.version("jaxlib").startswith(PARTITIONER_SERIES)
     if broken and PARTITIONER_VARIABLE not in os.environ:
         os.environ[PARTITIONER_VARIABLE] = "false"
@@ -64,13 +64,13 @@ def widen_thread_pool() -> None:
 
 
 def needed_threads() -> int:
-    """Fewer threads than these may hang batched MJX; it depends on XLA's virtual devices."""
+    """Returns how many threads batched MJX needs, by the number of XLA's virtual devices."""
     counts = re.findall(rf"{DEVICES_FLAG}=(\d+)", os.environ.get("XLA_FLAGS", "")) or ["1"]
     return max(MIN_THREADS, DEVICE_THREADS * int(counts[-1]))
 
 
 def pool_setting() -> tuple[str, int]:
-    """The variable that decides the size of the pool and its value, as JAX will read them."""
+    """Returns the variable that decides the size of the pool, and its value."""
     for name in USER_VARIABLES:
         if os.environ.get(name, "").isdigit():
             return name, int(os.environ[name])

@@ -1,4 +1,4 @@
-"""What the commands do, as functions; the package root exports them."""
+"""The functions of the public API; the package root exports them."""
 
 import dataclasses
 import datetime
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 from rich.console import Console
 
 from csac_jax import algorithms
@@ -19,15 +20,24 @@ from csac_jax.evaluation.monitor import EvalPlan
 from csac_jax.evaluation.policies import LearnedPolicy, Policy
 from csac_jax.io import leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
-from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, cluster, provenance, signals
 from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
-from csac_jax.training import callbacks as followers, halves, loop, memory, sharding, step
+from csac_jax.training import (
+    callbacks as followers,
+    loop,
+    memory,
+    program as programs,
+    sharding,
+    split_step,
+)
 from csac_jax.training.callbacks import Callback, Record, Summary
+from csac_jax.training.progress import Terminal
 from csac_jax.training.sharding import Shard
+from csac_jax.training.step import TrainState
+from csac_jax.training.transitions import StepMetrics
 
 RUNS = Path("runs")
 evaluate = rollout.evaluate
@@ -40,12 +50,12 @@ class Run(NamedTuple):
     run_dir: Path
     cfg: Config
     summary: Summary
-    own: dict[str, Any]  # network and learner of one's own, as `load_policy` takes them
+    parts: dict[str, Any]  # the network and learner given, as `load_policy` takes them
 
     @property
     def policy(self) -> Policy:
-        """The policy of the last checkpoint."""
-        return load_policy(self.run_dir, **self.own)
+        """Returns the policy of the last checkpoint."""
+        return load_policy(self.run_dir, **self.parts)
 
 
 def train(
@@ -67,48 +77,48 @@ def train(
 ) -> Run:
     """Trains until the config's actions are done, or until `stop`; logs and saves in `run_dir`.
 
-    Args: run_dir, a folder that does not exist, by default runs/PRESET-SEED-TIME. resume, goes on
-    with the run in `run_dir`; only `train.actions` may differ, and be larger. at, step of the
+    Args: run_dir, a folder that does not exist, by default runs/PRESET-SEED-TIME. resume, continues
+    the run in `run_dir`; only `train.actions` may differ, and be larger. at, step of the
     checkpoint to resume from, by default the newest sound one. init, networks to start from:
     "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121 as
     .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of your
     own, which a resumed run needs again. callbacks, each a `Callback` or a function of the `Record`
     of each chunk. eval_every, actions between evaluations of the policy of now, in eval_episodes
-    episodes of eval_suite, see `evaluate`; the best state is kept, see `load_policy`. A resumed run
-    goes on with them.
+    episodes of eval_suite, see `evaluate`, with the best state saved, see `load_policy`. A resumed
+    run continues them.
     Raises SettingsError for settings that do not fit, FileExistsError for a folder that exists,
     TrainingError for a loss or parameter that is not finite, CheckpointError for nothing sound to
     resume or a disc that is full, LockedError for a run that another process trains.
     """
     cfg = backend.resolve(cfg)
-    _checked(memory.check, cfg)
+    memory.check(cfg)
     folder = new_folder(f"{cfg.preset}-{cfg.seed}") if run_dir is None else Path(run_dir)
     if resume:
         loop.check_resumable(cfg, folder, at)
-    start = starting(cfg, init)
+    start = initial_networks(cfg, init)
     plan = _eval_plan(folder, resume, EvalPlan(eval_every, eval_suite, eval_episodes))
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
-        terminal.say(_first_line(folder, cfg))
-        program = step.make(cfg, learner=learner, sampler=sampler, network=network)
-        own = any(part is not None for part in (learner, sampler, network))
+        terminal.log(_first_line(folder, cfg))
+        program = programs.make(cfg, learner=learner, sampler=sampler, network=network)
+        cached = learner is None and sampler is None and network is None
         follower = followers.joined(callbacks)
         if plan is not None:
-            how = (cfg, plan, follower, terminal.say, network, learner)
-            follower = followers.joined([follower, _checked(monitor.Monitor, *how)])
+            inputs = (cfg, plan, follower, terminal.log, network, learner)
+            follower = followers.joined([follower, _checked(monitor.Monitor, *inputs)])
 
-        begin = step.compile_init(program)
+        begin = programs.compile_init(program)
 
-        def first_state() -> step.TrainState:
+        def first_state() -> TrainState:
             state = begin()
-            step.prepare(program)
+            programs.prepare(program)
             return state if start is None else state.replace(learner=start(state.learner))
 
         summary = loop.run(
             cfg,
             folder,
             first_state,
-            lambda num_steps: halves.compile_chunk(program, num_steps, keep=not own),
+            lambda num_steps: split_step.compile_chunk(program, num_steps, cached),
             terminal,
             stop or signals.Stop(),
             resume=resume,
@@ -116,6 +126,27 @@ def train(
             callback=follower,
         )
     return Run(folder, cfg, summary, {"network": network, "learner": learner})
+
+
+def train_fn(
+    cfg: Config,
+    *,
+    sampler: Sampler | None = None,
+    network: Any = None,
+    learner: Learner | None = None,
+) -> Callable[[jax.Array], tuple[TrainState, StepMetrics]]:
+    """Returns a pure function from a key to a run's last state and its metrics [T, ...].
+
+    It does all steps of `train` with `jax.random.key(seed)`, without log or checkpoint, in any
+    physics. Jit it, and vmap it over keys: `jax.jit(jax.vmap(train_fn(cfg)))(keys)`. T = steps.
+    """
+    cfg = backend.resolve(cfg)
+    program = programs.make(cfg, learner=learner, sampler=sampler, network=network)
+
+    def run(key: jax.Array) -> tuple[TrainState, StepMetrics]:
+        return programs.run_steps(program, loop.total_steps(cfg), programs.init_state(program, key))
+
+    return run
 
 
 def sweep(
@@ -140,9 +171,11 @@ def sweep(
     with 95 % intervals. Raises as `train`.
     """
     points = _points(cfg, dict(vary or {}))
-    _checked(runner.check_plan, SweepPlan(seeds, points, episodes))
+    runner.check_plan(SweepPlan(seeds, points, episodes))
     runs = seeds * len(points)
-    points = [one._replace(cfg=backend.resolve(one.cfg, devices or 1, runs)) for one in points]
+    points = [
+        point._replace(cfg=backend.resolve(point.cfg, devices or 1, runs)) for point in points
+    ]
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
     plan = SweepPlan(seeds, points, episodes)
     return run_sweep(plan, folder, devices, shard, init, verbose, stop or signals.Stop()).summary
@@ -160,25 +193,26 @@ def run_sweep(
 ) -> SweepResult:
     """Runs what is left of a sweep's plan, see `sweep`."""
     cache.enable()
-    mesh = _checked(sharding.make, devices)
+    mesh = sharding.make(devices)
     for point in plan.points:
         scenes, batch = point.cfg.train.scenes, point.cfg.learn.batch
-        _checked(sharding.check, mesh, shard, plan.seeds, scenes, batch)
-        starting(point.cfg, init)
-    _checked(runner.check_room, plan, 1 if mesh is None or shard == "scenes" else mesh.size)
+        sharding.check(mesh, shard, plan.seeds, scenes, batch)
+        initial_networks(point.cfg, init)
+    runner.check_room(plan, 1 if mesh is None or shard == "scenes" else mesh.size)
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
-        return replicas.sweep_program(group, mesh, shard, starting(group.configs[0], init))
+        start = initial_networks(group.configs[0], init)
+        return replicas.sweep_program(group, mesh, shard, start)
 
     with Terminal(Console(quiet=not (verbose and cluster.is_first()))) as terminal:
-        terminal.say(f"sweep {folder}")
+        terminal.log(f"sweep {folder}")
         result = runner.run(plan, folder, make_program, terminal, stop, resume=resume)
         if result.stopped_by is not None or not plan.episodes or not cluster.is_first():
             return result
         with lock.exclusive(folder):
             stopped = final.measure(plan, folder, terminal, stop)
         if stopped is not None:
-            terminal.say(f"stopped; go on with: csac-jax sweep --resume {folder}")
+            terminal.log(f"stopped; continue with: csac-jax sweep --resume {folder}")
         return result._replace(stopped_by=stopped)
 
 
@@ -188,13 +222,15 @@ def evaluate_sweep(folder: Path, suite: str, episodes: int, stop: signals.Stop) 
     plan = runner.read_plan(folder)._replace(episodes=episodes)
     with Terminal(Console()) as terminal, lock.exclusive(folder):
         stopped = final.measure(plan, folder, terminal, stop, suite)
-        terminal.say("stopped; the same command goes on" if stopped else f"saved in {folder}")
+        terminal.log("stopped; the same command continues" if stopped else f"saved in {folder}")
         return stopped
 
 
-def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
-    """What puts the networks of `source`, see `train`, into a learner's first state. Raises
-    SettingsError where they are not those of the config."""
+def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
+    """Returns a function that puts the networks of `source`, see `train`, into an initial state.
+
+    Raises SettingsError if they are not those of the config.
+    """
     if source is None:
         return None
     if isinstance(cfg.net, DenseNet121) and _is_weights(source):
@@ -208,41 +244,41 @@ def starting(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | N
         params = actor_critic.with_inputs(params, wanted)
     if leaves.layout(params) != leaves.layout(wanted):
         raise SettingsError(
-            f"--init {source}: its networks are not those of these settings; "
-            "leave out --net, --learn.critics and --task.kind"
+            f"init {source}: its networks are not those of these settings; "
+            "take other net, learn.critics or task.kind"
         )
     return lambda state: actor_critic.with_params(state, params)
 
 
-def with_networks_of(cfg: Config, source: str | Path) -> Config:
-    """The config with networks of the sizes of the policy `source`, see `train`'s `init`."""
+def match_networks(cfg: Config, source: str | Path) -> Config:
+    """Gives a config networks of the sizes of the policy `source`, see `train`'s `init`."""
     if _is_weights(source):
         return cfg
-    given = policies.load_config(source)
-    learn = {"critics": given.learn.critics, "actor": given.learn.actor}
-    net = given.net
+    stored = policies.load_config(source)
+    learn = {"critics": stored.learn.critics, "actor": stored.learn.actor}
+    net = stored.net
     if isinstance(net, SmallNet) and isinstance(cfg.net, SmallNet) and cfg.net.gripper:
         net = dataclasses.replace(net, gripper=True)
     return cfg.change(net=net, learn=learn)
 
 
 def new_folder(name: str) -> Path:
-    """A folder under RUNS, with the time in its name, that does not exist yet."""
+    """Returns a folder under RUNS, with the time in its name, that does not exist yet."""
     stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
     return next(path for path in candidates if not path.exists())
 
 
-def _eval_plan(folder: Path, resume: bool, asked: EvalPlan) -> EvalPlan | None:
-    """How a run is evaluated on its way, if it is: as asked for, else as before it was stopped."""
-    if not asked.every:
+def _eval_plan(folder: Path, resume: bool, plan: EvalPlan) -> EvalPlan | None:
+    """Returns the plan if it evaluates at all, else that of the run that is resumed, if any."""
+    if not plan.every:
         return monitor.read_plan(folder) if resume else None
-    _checked(asked.check)
-    return asked
+    _checked(plan.check)
+    return plan
 
 
 def _checked(call: Callable[..., Any], *args: Any) -> Any:
-    """What `call` returns; its ValueErrors are SettingsErrors."""
+    """Returns what `call` returns; turns its ValueErrors into SettingsErrors."""
     try:
         return call(*args)
     except ValueError as error:
@@ -250,29 +286,28 @@ def _checked(call: Callable[..., Any], *args: Any) -> Any:
 
 
 def _is_weights(source: str | Path) -> bool:
-    """Whether `source` is a file of weights and no policy."""
+    """Returns True if `source` is a file of weights and no policy."""
     path = Path(source)
     return source != "shipped" and path.is_file() and not policy_file.is_policy(path)
 
 
 def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
-    """Every combination of the values."""
+    """Returns the points of every combination of the values."""
     for name in vary:
-        _checked(grid.kind_of, name)
+        grid.kind_of(name)
 
     def configure(values: dict[str, Any]) -> Config:
         settings: dict[str, Any] = {}
         for name, value in values.items():
             settings |= {} if name == "algo" else grid.settings_of(name, value)
         base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
-        return step.replace_settings(base, settings)
+        return programs.replace_settings(base, settings)
 
-    found: list[SweepPoint] = _checked(grid.combine, vary, configure)
-    return found
+    return grid.combine(vary, configure)
 
 
 def _first_line(folder: Path, cfg: Config) -> str:
-    """What is run, and on what."""
+    """Describes a run that begins."""
     scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
     return (
         f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "

@@ -1,4 +1,4 @@
-"""Where files are cached that this user's programs make and trust. Needs no JAX."""
+"""The user's folder for cached files. Needs no JAX."""
 
 import os
 import stat
@@ -6,10 +6,10 @@ from pathlib import Path
 
 
 def private(*parts: str) -> Path | None:
-    """The folder CACHE/csac_jax/PARTS of this user, made with mode 0700.
+    """Makes the folder CACHE/csac_jax/PARTS of this user, with mode 0700.
 
-    CACHE is XDG_CACHE_HOME or ~/.cache. None where there is no home, the folder cannot be written,
-    or another user owns it or can write into it.
+    CACHE is XDG_CACHE_HOME or ~/.cache. Returns None if there is no home, the folder cannot be
+    written, or another user owns it or can write into it.
     """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

@@ -30,7 +30,7 @@ from csac_jax.sim import backend
 from csac_jax.sweeps import grid, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult, SweepRun, runs_of
-from csac_jax.training import step
+from csac_jax.training import program as programs
 
 METHODS = ("grasp_only", "reactive", "vpg", "csac", "csac_per", "csac_beta")
 FIRST_SEED = 1_000_000  # of the search: results begin at 0
@@ -70,7 +70,7 @@ def plan(cfg: Config, methods: Sequence[str], count: int, seeds: int) -> SweepPl
 
 def point(name: str, cfg: Config, algo: str, settings: dict[str, Any], seed: int) -> SweepPoint:
     """The point of an algorithm with these settings, by dotted name, from this seed on."""
-    tried = step.replace_settings(algorithms.configure(cfg, algo), settings).change(seed=seed)
+    tried = programs.replace_settings(algorithms.configure(cfg, algo), settings).change(seed=seed)
     told = {key: str(value) for key, value in settings.items()}
     return SweepPoint(name, told, backend.resolve(tried))
 
@@ -85,7 +85,7 @@ def run(
 ) -> None:
     """Tries `trials` settings of every method with `seeds` seeds each; goes on in a folder that
     exists. TASK is clear, target or packed."""
-    cfg = step.replace_settings(presets.get(preset), grid.settings_of("task", task))
+    cfg = programs.replace_settings(presets.get(preset), grid.settings_of("task", task))
     if search(cfg, folder, methods, trials, seeds, signals.install()).stopped_by is None:
         for record in records(folder):
             print(f"{record['algo']}: {record['best'] or 'its defaults'}")
@@ -194,7 +194,7 @@ def result_plan(found: Sequence[dict[str, Any]], seeds: int, seed: int, episodes
     points = []
     for record in found:
         cfg = configs.from_dict(record["config"])
-        tried = step.replace_settings(cfg, record["best"]).change(seed=seed)
+        tried = programs.replace_settings(cfg, record["best"]).change(seed=seed)
         told = {key: str(value) for key, value in record["best"].items()}
         points.append(SweepPoint(record["algo"], told, tried))
     return SweepPlan(seeds, points, episodes)

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from csac_jax.training.step import StepMetrics
+from csac_jax.training.transitions import StepMetrics
 
 
 def step_metrics(scenes: int, loss: Any = 0.0, **given: Any) -> StepMetrics:

@@ -22,7 +22,7 @@ from csac_jax.io import checkpoint, config_file, policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
-from csac_jax.training import step
+from csac_jax.training import program as programs, step
 from csac_jax.training.callbacks import Record
 from csac_jax.vision.heightmap import Observation
 
@@ -90,18 +90,18 @@ def test_first_state_has_the_networks_of_the_policy(tmp_path: Path):
     """Claim: `init` puts a policy's networks into online and target ones; the optimisers are those
     of a fresh run."""
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
-    start = api.starting(SMOKE, tmp_path / "policy.safetensors")
+    start = api.initial_networks(SMOKE, tmp_path / "policy.safetensors")
     assert start is not None
     fresh = _learner_state(SMOKE)
     _assert_starts_from(start(fresh), params, fresh)
-    assert api.starting(SMOKE, None) is None
+    assert api.initial_networks(SMOKE, None) is None
 
 
 @pytest.mark.parametrize("seeds", [2, 3])
 def test_first_states_of_several_runs_have_the_networks_of_the_policy(tmp_path: Path, seeds: int):
     """Claim: so do the runs of a sweep, each of them, whose states have an axis of runs."""
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
-    start = api.starting(SMOKE, tmp_path / "policy.safetensors")
+    start = api.initial_networks(SMOKE, tmp_path / "policy.safetensors")
     assert start is not None
     each = [_learner_state(SMOKE, seed) for seed in range(seeds)]
     found = start(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
@@ -115,7 +115,7 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
     are the same, whatever is the target."""
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
     target = SMOKE.change(task={"kind": "target"})
-    start = api.starting(target, tmp_path / "policy.safetensors")
+    start = api.initial_networks(target, tmp_path / "policy.safetensors")
     assert start is not None
     state = start(_learner_state(target))
     rows = (3, SMOKE.heightmap.size, SMOKE.heightmap.size)
@@ -162,9 +162,9 @@ def test_networks_of_a_policy_can_be_asked_for(tmp_path: Path):
     given = SMOKE.change(net={"growth": 8}, learn={"critics": 2, "tau": 0.5})
     path = tmp_path / "policy.safetensors"
     params = _policy(path, given)
-    cfg = api.with_networks_of(SMOKE, path)
+    cfg = api.match_networks(SMOKE, path)
     assert cfg == SMOKE.change(net={"growth": 8}, learn={"critics": 2})
-    start, fresh = api.starting(cfg, path), _learner_state(cfg)
+    start, fresh = api.initial_networks(cfg, path), _learner_state(cfg)
     assert start is not None
     _assert_starts_from(start(fresh), params, fresh)
 
@@ -176,9 +176,9 @@ def test_weights_that_cannot_be_read_are_refused(tmp_path: Path):
     path.write_bytes(b"no tensors")
     cfg = SMOKE.change(net=DenseNet121(rotations=4, margin=0.0))
     with pytest.raises(SettingsError, match=f"{path} cannot be read") as caught:
-        api.starting(cfg, path)
+        api.initial_networks(cfg, path)
     assert "\n" not in str(caught.value)
-    assert api.with_networks_of(cfg, path) == cfg
+    assert api.match_networks(cfg, path) == cfg
 
 
 def _stopped() -> Stop:
@@ -189,7 +189,7 @@ def _stopped() -> Stop:
 
 
 def _saved(run: api.Run) -> step.TrainState:
-    state, _ = checkpoint.restore(run.run_dir, step.abstract_state(run.cfg))
+    state, _ = checkpoint.restore(run.run_dir, programs.abstract_state(run.cfg))
     return state
 
 

@@ -218,7 +218,7 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
     path = tmp_path / "policy.safetensors"
     policy_file.save(path, params, blind)
     for cfg in (CONFIG, CONFIG.change(task={"kind": "target"})):
-        start: Any = api.starting(cfg, path)
+        start: Any = api.initial_networks(cfg, path)
         learner = actor_critic.make(cfg)
         found = start(actor_critic.init(jax.random.key(3), learner)).online
         obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
@@ -229,13 +229,13 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
         other = blind.change(**changes)
         policy_file.save(path, _networks(other), other)
         with pytest.raises(SettingsError, match="its networks are not those of these settings"):
-            api.starting(CONFIG.change(task={"kind": "target"}), path)
+            api.initial_networks(CONFIG.change(task={"kind": "target"}), path)
 
 
 def test_sizes_of_a_start_keep_the_gripper():
     """Claim: with `init` the nets have the sizes of that policy and still see the gripper."""
-    assert api.with_networks_of(CONFIG, "shipped").net.gripper
-    assert not api.with_networks_of(CONFIG.change(net={"gripper": False}), "shipped").net.gripper
+    assert api.match_networks(CONFIG, "shipped").net.gripper
+    assert not api.match_networks(CONFIG.change(net={"gripper": False}), "shipped").net.gripper
 
 
 def test_augmentation_keeps_the_fingers(states: State):

@@ -99,7 +99,7 @@ def test_user_setting_is_kept(name: str):
 
 def test_rows_are_right():
     """Claim: with the package imported, `vmap(sum(M @ row))` is right in every row."""
-    done = _python("from csac_jax.runtime import selftest; print(selftest.rows_error())")
+    done = _python("from csac_jax.sim import selftest; print(selftest.rows_error())")
     assert float(done.stdout) < 1e-5, done.stderr
 
 

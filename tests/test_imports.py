@@ -26,7 +26,6 @@ ORDER = (
     ("evaluation",),
     ("training",),
     ("io",),
-    ("runtime",),
     ("env",),
     ("replay", "agent"),
     ("nets",),
@@ -37,6 +36,7 @@ ORDER = (
     ("geometry",),
     ("presets",),
     ("algorithms",),
+    ("runtime",),
     ("config",),
     ("grippers",),
     ("constants", "errors", "cache_folder", "assets"),
@@ -53,7 +53,7 @@ ONLY_IN = {
     "optax": ("agent",),
     "orbax": ("io/checkpoint.py",),
     "tyro": ("cli",),
-    "rich": ("report", "cli", "api"),
+    "rich": ("training/progress.py", "report", "cli", "api"),
     "pydantic": ("io", "deploy/service.py", "scene/case_file.py"),
     "onnx": ("deploy/onnx_graph.py",),
     "cv2": ("deploy/board.py",),
@@ -66,19 +66,16 @@ ONLY_IN = {
     "jinja2": ("report/page.py",),
     "plotly": ("report/page.py",),
     "viser": ("render/viewer.py",),
-    "tensorboardX": ("report/trackers.py",),
-    "wandb": ("report/trackers.py",),
-    "mlflow": ("report/trackers.py",),
+    "tensorboardX": ("training/trackers.py",),
+    "wandb": ("training/trackers.py",),
+    "mlflow": ("training/trackers.py",),
     "yaml": ("io/config_file.py",),
     "trimesh": ("objects", "render/viewer.py"),
     "coacd": ("objects/conversion.py",),
 }
 JIT_IN = (
     *("training", "sweeps", "evaluation", "deploy"),
-    *(
-        "runtime/compiler.py",
-        "runtime/selftest.py",
-    ),  # small programs that show what this machine does
+    *("runtime/compiler.py", "sim/selftest.py"),  # small programs that test this machine
     "scene/arrange.py",
     "agent/maps.py",  # where an arm reaches is a table, computed once
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
@@ -249,7 +246,7 @@ def test_checker_reads_the_package():
         ("agent/a.py", "from csac_jax import replay", "replay is imported"),
         ("replay/a.py", "from csac_jax.agent.cem import maximise", "agent is imported"),
         ("config.py", "from csac_jax import geometry", "geometry is imported"),
-        ("training/a.py", "from csac_jax.report import progress", "report is imported"),
+        ("training/a.py", "from csac_jax.report import tables", "report is imported"),
         ("training/a.py", "from csac_jax import cli", "cli is imported"),
         ("sweeps/a.py", "from csac_jax import api", "api is imported"),
         ("report/a.py", "from csac_jax.api import train", "api is imported"),
@@ -316,7 +313,7 @@ def test_checker_sees_a_breach(tmp_path: Path, file: str, source: str, fault: st
             "import tyro, rich\nfrom csac_jax.cli import b\nfrom csac_jax.report import charts",
         ),
         ("scene/a.py", "import mujoco\nfrom pathlib import Path\nprint(Path('x'))"),
-        ("api.py", "from rich.console import Console\nfrom csac_jax.report import progress"),
+        ("api.py", "from rich.console import Console\nfrom csac_jax.report import tables"),
         ("__init__.py", "if TYPE_CHECKING:\n    from csac_jax import api"),
         ("io/configs.py", "def f():\n    import pydantic\nfrom csac_jax import errors"),
     ],

@@ -14,8 +14,9 @@ from csac_jax.io import configs
 from csac_jax.runtime import signals
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.replicas import group_configs
-from csac_jax.training import step
-from csac_jax.training.step import Hyperparams, Program, TrainState
+from csac_jax.training import program as programs, step
+from csac_jax.training.program import Hyperparams
+from csac_jax.training.step import Program, TrainState
 from experiments import search
 from tests.training import toys
 
@@ -63,7 +64,7 @@ def test_values_fill_their_ranges():
 def _train_step(program: Program, state: TrainState, hyperparams: Hyperparams | None = None):
     """The small step, with grasps that succeed more often for a larger discount."""
     state, metrics = toys.train_step(program, state, hyperparams)
-    gamma = step.replace_hyperparams(program, hyperparams).cfg.target.gamma
+    gamma = programs.replace_hyperparams(program, hyperparams).cfg.target.gamma
     outcome = jnp.where(jnp.abs(state.scenes) < 0.2 + gamma, 4, 2).astype(jnp.int32)
     return state, metrics._replace(outcome=outcome)
 
@@ -72,8 +73,8 @@ def _train_step(program: Program, state: TrainState, hyperparams: Hyperparams | 
 def searched(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A search of two methods, three settings and two seeds, stopped once; a small step stands in
     for the learner's."""
-    monkeypatch.setattr(step, "make", lambda cfg, *_, **__: toys.program(cfg))
-    monkeypatch.setattr(step, "init_state", toys.init_state)
+    monkeypatch.setattr(programs, "make", lambda cfg, *_, **__: toys.program(cfg))
+    monkeypatch.setattr(programs, "init_state", toys.init_state)
     monkeypatch.setattr(step, "train_step", _train_step)
     folder, stop = tmp_path / "search", signals.Stop()
     stop.signal = 15

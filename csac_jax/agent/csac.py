@@ -15,16 +15,21 @@ from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config, RewardConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import chunked_vmap
+from csac_jax.nets.chunked_vmap import ALONE, Batching
 from csac_jax.sim.primitives import Action
 from csac_jax.vision.heightmap import Observation
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CSAC(Learner):
-    """The algorithms of `algorithms`, by the config of `parts`."""
+    """The learner of the algorithms in `algorithms`, by the config of `parts`.
+
+    The training step also calls `update_actor`, once after all updates of a step. Sweeps, which
+    vmap runs, ask for `replace_hyperparams` and `batched`.
+    """
 
     parts: ActorCritic
-    networks_at_once: int | None = None  # of runs that are vmapped, see `chunked_vmap`; None: all
+    batching: Batching = ALONE
 
     def init(self, key: jax.Array) -> LearnerState:
         return actor_critic.init(key, self.parts)
@@ -37,7 +42,7 @@ class CSAC(Learner):
         steps_without_change: jax.Array,
         actions_taken: jax.Array | None = None,
     ) -> Action:
-        """By default CEM on the critic's maps from the actor's mean, plus noise (lines 8-13)."""
+        """Chooses by CEM on the critic's maps from the actor's mean, plus noise (lines 8-13)."""
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(steps_without_change)))
         if actions_taken is None:
             maps = self._chunked(values.decision_maps)(state.online, obs)
@@ -55,7 +60,7 @@ class CSAC(Learner):
         next_obs: Observation,
         result: ActionResult,
     ) -> tuple[jax.Array, jax.Array]:
-        """Eqs. 10-16, phi by the target critic."""
+        """Computes eqs. 10-16, phi by the target critic."""
         pushed = result.primitive == Primitive.PUSH
         views = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), obs, next_obs)  # [2 E, ...]
         # In chunks of one run, each part of the states is still skipped that has no push.
@@ -69,25 +74,26 @@ class CSAC(Learner):
         update = self._chunked(lambda parts, key, *args: critic.update(key, parts, *args))
         return update(key, state, batch, weights)
 
-    def end_step(self, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
-        """The actor's update (lines 22-23)."""
+    def update_actor(self, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
+        """Updates the actor on `obs` [B, ...] (lines 22-23); returns also its loss []."""
         return self._chunked(actor.update)(state, obs)
 
     def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "CSAC":
+        """Returns the learner of a config whose hyper-parameters may be traced."""
         parts = actor_critic.with_optimisers(cfg, self.parts.frames, return_bounds)
         return dataclasses.replace(self, parts=parts)
 
-    def in_chunks(self, networks_at_once: int | None) -> "CSAC":
-        return dataclasses.replace(self, networks_at_once=networks_at_once)
-
-    def side_by_side(self) -> "CSAC":
-        frames = self.parts.frames
-        frames = dataclasses.replace(frames, networks=frames.networks.side_by_side())
-        return dataclasses.replace(self, parts=dataclasses.replace(self.parts, frames=frames))
+    def batched(self, batching: Batching) -> "CSAC":
+        """Returns the learner for runs that are vmapped."""
+        parts, frames = self.parts, self.parts.frames
+        if batching.side_by_side:
+            frames = dataclasses.replace(frames, networks=frames.networks.side_by_side())
+            parts = dataclasses.replace(parts, frames=frames)
+        return dataclasses.replace(self, parts=parts, batching=batching)
 
     def _chunked(self, part: Callable[..., Any], at_once: int | None = None) -> Callable[..., Any]:
-        """A function of `parts` and others as one of the others, vmapped in chunks."""
+        """Binds `parts` to a function, which is vmapped in chunks if `batching` says so."""
         bound = functools.partial(part, self.parts)
-        if self.networks_at_once is None:
+        if self.batching.networks_at_once is None:
             return bound
-        return chunked_vmap.vmap_in_chunks(bound, at_once or self.networks_at_once)
+        return chunked_vmap.vmap_in_chunks(bound, at_once or self.batching.networks_at_once)

@@ -1,36 +1,36 @@
-"""What learns from replayed transitions: the interface that a training step knows.
+"""The interface between a training step and what learns from replayed transitions.
 
-A learner of your own derives from `Learner`. `csac.CSAC` is the one that the package comes with.
+A learner of your own derives from `Learner`: `init`, `act`, `update` and, at will, `reward`.
+`csac.CSAC` is the one that the package comes with.
 """
 
 import abc
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from flax import struct
 
 from csac_jax.agent import rewards
 from csac_jax.agent.rewards import ActionResult
-from csac_jax.config import Config, RewardConfig
+from csac_jax.config import RewardConfig
 from csac_jax.sim.primitives import Action
 from csac_jax.vision.heightmap import Observation, PackedObservation
 
 
 @struct.dataclass
 class Transition:
-    """What one action showed; a batch has a leading axis B."""
+    """One action with its states and reward; a batch has a leading axis B."""
 
     obs: PackedObservation
     action: Action
     reward: jax.Array  # [] float32, R of CSAC eq. 12
     next_obs: PackedObservation
     terminated: jax.Array  # [] bool, a true end: nothing follows
-    push_better: jax.Array | None = None  # [] bool, label in `reward`; None if it is not renewed
+    push_better: jax.Array | None = None  # [] bool, label in `reward`; None if it is not stored
 
 
 class UpdateInfo(NamedTuple):
-    """What one update saw."""
+    """Losses and errors of one update."""
 
     critic_loss: jax.Array  # []
     q: jax.Array  # [] mean of Q(s, a)
@@ -42,7 +42,7 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def init(self, key: jax.Array) -> Any:
-        """The state before the first update."""
+        """Creates the state before the first update."""
 
     @abc.abstractmethod
     def act(
@@ -53,7 +53,7 @@ class Learner(abc.ABC):
         steps_without_change: jax.Array,
         actions_taken: jax.Array | None = None,
     ) -> Action:
-        """An action for every observation, leaves [E, ...].
+        """Chooses an action for every observation, leaves [E, ...].
 
         Args: steps_without_change [E] int32; actions_taken [] int32 by the whole run, which
         exploration decays with, or None for the policy without exploration.
@@ -63,11 +63,7 @@ class Learner(abc.ABC):
     def update(
         self, key: jax.Array, state: Any, batch: Transition, weights: jax.Array
     ) -> tuple[Any, UpdateInfo]:
-        """One update on a batch, leaves [B, ...], whose losses count by `weights` [B]."""
-
-    def end_step(self, state: Any, obs: Observation) -> tuple[Any, jax.Array]:
-        """After a step's updates, with `obs` [B, ...] of the last batch: new state and loss."""
-        return state, jnp.zeros(())
+        """Makes one update on a batch, leaves [B, ...], whose losses count by `weights` [B]."""
 
     def reward(
         self,
@@ -77,20 +73,8 @@ class Learner(abc.ABC):
         next_obs: Observation,
         result: ActionResult,
     ) -> tuple[jax.Array, jax.Array]:
-        """Rewards [E] float32 and which pushes were good [E] bool; `result` has no phi yet.
+        """Computes rewards [E] float32 and which pushes were good [E] bool; `result` lacks phi.
 
         By default phi is 0: take `push_effect` "change" with it.
         """
         return rewards.rewards_of(cfg, result)
-
-    def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "Learner":
-        """The learner of a config whose hyper-parameters may be traced; by default itself."""
-        return self
-
-    def in_chunks(self, networks_at_once: int | None) -> "Learner":
-        """The learner where runs are vmapped, for so many networks at a time."""
-        return self
-
-    def side_by_side(self) -> "Learner":
-        """The learner where several runs are vmapped; by default itself."""
-        return self

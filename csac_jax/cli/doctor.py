@@ -34,7 +34,7 @@ def run(arguments: list[str]) -> int:
     options, cfg = _read(arguments)
     needs = {} if cfg is None else _print_memory(cfg)
     with _watchdog(90.0, _HANGS):
-        from csac_jax.runtime import selftest
+        from csac_jax.sim import selftest
 
         guard = _print_machine()
         begun = time.perf_counter()

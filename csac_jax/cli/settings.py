@@ -68,7 +68,7 @@ def base(name: str | None, flags: Sequence[str]) -> Config:
         return cfg
     from csac_jax import api
 
-    return api.with_networks_of(cfg, init)
+    return api.match_networks(cfg, init)
 
 
 @as_bad_arguments(ValueError)

@@ -66,7 +66,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax import api
 
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")
-    from csac_jax.report.trackers import TRACKERS
+    from csac_jax.training.trackers import TRACKERS
 
     try:
         done = api.train(

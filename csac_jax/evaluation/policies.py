@@ -21,7 +21,7 @@ from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step as training
+from csac_jax.training import program as programs
 from csac_jax.vision.heightmap import Observation
 
 Which = int | Literal["last", "best"]  # checkpoint of a run, see `load`
@@ -199,7 +199,7 @@ def load(
         return LearnedPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)
-    state, _ = checkpoint.restore(folder, training.abstract_state(cfg, learner, network), step)
+    state, _ = checkpoint.restore(folder, programs.abstract_state(cfg, learner, network), step)
     if learner is None:
         policy_file.check_finite(folder, state.learner.online)
     return of_state(cfg, state.learner, network, learner)

@@ -23,7 +23,7 @@ from csac_jax.scene import layout, stock
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import physics as simulation, primitives
 from csac_jax.sim.primitives import Action, JointTrajectory
-from csac_jax.training import step as training
+from csac_jax.training import transitions
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
 PER_CORE = 4  # of them on a CPU: more gain nothing, and the last episodes keep all places busy
@@ -202,8 +202,8 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     key = jax.random.clone(key)  # the debug view is of the same draws
     debug, later = policy.debug(state, key), policy.debug(after, jax.random.clone(key))
     phi = {"phi_before": debug.best_grasp, "phi_after": later.best_grasp}  # the acting critic's
-    paid = training.judged(policy.cfg.reward, after)
-    result = training.action_result(action, paid.info)._replace(**phi)
+    paid = transitions.with_reward_outcome(policy.cfg.reward, after)
+    result = transitions.to_action_result(action, paid.info)._replace(**phi)
     reward = rewards.reward(policy.cfg.reward, result)
     return StepRecord(state, action, joints, after, reward, debug)
 

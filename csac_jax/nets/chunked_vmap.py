@@ -1,11 +1,11 @@
-"""`vmap` of runs side by side in chunks, for what their networks do.
+"""Networks of several runs under `vmap`: in which form they work, and how many at a time.
 
 All DenseNet-121s at once need the memory of all and gain little: each fills a device by itself. One
 by one, their many small products leave the device waiting.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +15,25 @@ from csac_jax.config import Config, SmallNet
 _LARGEST = 5  # networks of DenseNet-121 in a chunk, ours: five seeds are one, 16 are four
 
 
+class Batching(NamedTuple):
+    """How the networks of a learner work where its runs are vmapped."""
+
+    side_by_side: bool = False  # in the form for several runs, see `Networks.side_by_side`
+    networks_at_once: int | None = None  # one chunk of `vmap_in_chunks`; None: all
+
+
+ALONE = Batching()  # a run that is not vmapped
+
+
 def chunk_size(cfg: Config, runs: int) -> int | None:
-    """How many networks work at a time, in chunks of one size; None for those of all `runs`."""
+    """Returns how many networks work at a time, in equal chunks; None for those of all `runs`."""
     if isinstance(cfg.net, SmallNet):
         return None
     return max(size for size in range(1, _LARGEST + 1) if runs % size == 0)
 
 
 def vmap_in_chunks(function: Callable[..., Any], size: int) -> Callable[..., Any]:
-    """`function`; under `vmap` it runs in chunks of `size` rows, one after the other.
+    """Wraps `function`: under `vmap` it runs in chunks of `size` rows, one after the other.
 
     A chunk of one row is not vmapped, so that a branch stays one. The size must divide the vmapped
     axis. `function` may close over no tracer of that vmap.

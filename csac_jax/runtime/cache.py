@@ -1,4 +1,4 @@
-"""Compiled programs on disk, so that the second run of a program need not compile it.
+"""A cache of compiled programs on disk.
 
 The folder is the user's cache directory, with a part for each kind of machine: on the CPU an entry
 is machine code for one processor, which JAX's own key does not name. Nothing here can stop a run: a
@@ -14,12 +14,12 @@ import threading
 from pathlib import Path
 
 import jax
-from jax._src import compilation_cache
 
 from csac_jax import _guard, cache_folder
+from csac_jax.runtime import private_jax
 
-LARGEST = 4 * 2**30  # bytes kept per kind of machine; what is unused for longest goes first
-SHORTEST = 0.5  # s: what compiles faster is not kept
+LARGEST = 4 * 2**30  # bytes per kind of machine; entries unused for longest are deleted first
+SHORTEST = 0.5  # s; programs that compile faster are not cached
 _ASKED = "/jax/compilation_cache/compile_requests_use_cache"
 _HIT = "/jax/compilation_cache/cache_hits"
 _PROCESSOR = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU part")
@@ -35,7 +35,7 @@ def enable() -> Path | None:
     if not jax.config.jax_enable_compilation_cache:
         return None
     _listen()
-    _compress_with_checksum()
+    private_jax.compress_with_checksum()
     if chosen := jax.config.jax_compilation_cache_dir:
         return Path(chosen)
     if (folder := _folder()) is None:
@@ -48,26 +48,15 @@ def enable() -> Path | None:
 
 
 def _date_entries(folder: Path) -> None:
-    """Gives entries without a time of last use, which a killed process leaves, the oldest one: JAX
-    fails on them."""
+    """Dates entries that a killed process left without a time of last use; JAX fails on them."""
     for entry in folder.glob("*-cache"):
         last_use = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
         if not last_use.exists():
             last_use.write_bytes(bytes(8))
 
 
-def _compress_with_checksum() -> None:
-    """Has JAX compress by zlib, which notices flipped bits. JAX prefers zstandard, without them.
-
-    JAX has no public choice; `tests/runtime/test_cache.py` shows that this one is heeded.
-    """
-    for name in ("zstd", "zstandard"):
-        if hasattr(compilation_cache, name):
-            setattr(compilation_cache, name, None)
-
-
 def hits() -> int:
-    """Programs found in the cache since `enable`, by this thread."""
+    """Returns how many programs this thread has found in the cache since `enable`."""
     return _hits[threading.get_ident()]
 
 
@@ -77,8 +66,10 @@ def _listen() -> None:
 
 
 def _on_event(event: str, **_: object) -> None:
-    """Counts JAX's events; silences XLA's C++ log when the first program is looked for on a CPU,
-    unless the user has chosen a level: it has a spurious warning for each. Failures still raise."""
+    """Counts JAX's events, and silences XLA's C++ log on a CPU unless the user has chosen a level.
+
+    That log has a spurious warning for each program. Failures still raise.
+    """
     _events[event] += 1
     _hits[threading.get_ident()] += event == _HIT
     first = event == _ASKED and _events[event] == 1
@@ -87,15 +78,14 @@ def _on_event(event: str, **_: object) -> None:
 
 
 def _folder() -> Path | None:
-    """The user's folder for this kind of machine: its processor, and the threads that programs are
-    cut for."""
+    """Returns the user's folder for this processor and number of threads."""
     relevant = (platform.machine(), platform.processor(), _processor(), _guard.pool_setting()[1])
     machine = hashlib.sha256(repr((*relevant, "zlib")).encode()).hexdigest()[:16]
     return cache_folder.private("xla", machine)
 
 
 def _processor() -> tuple[str, ...]:
-    """Model and abilities of the first processor, as Linux states them; none elsewhere."""
+    """Returns model and abilities of the first processor, as Linux states them; else nothing."""
     stated = Path("/proc/cpuinfo")
     first = stated.read_text().split("\n\n")[0] if stated.exists() else ""
     return tuple(line for line in first.splitlines() if line.split("\t")[0] in _PROCESSOR)

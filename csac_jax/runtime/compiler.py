@@ -1,11 +1,10 @@
-"""How a training program is traced, and which options XLA compiles it with.
+"""Tracing of training programs, and the options that XLA compiles them with.
 
 On a CPU, XLA has a second library for convolutions, about twice as fast as Eigen at those of the
 small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
 LLVM's second level of optimisation compiles sooner than the third, to as fast a program. So do
 XLA's former emitters of kernels, where it still has them: its new ones build an MLIR module for
-each of more than a thousand kernels. Functions are as exact with them. What `XLA_FLAGS` says of
-either stays.
+each of more than a thousand kernels. Choices in `XLA_FLAGS` stay.
 
 On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
 That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
@@ -22,7 +21,6 @@ import numpy as np
 
 from csac_jax import _guard
 from csac_jax.config import Config, SmallNet
-from csac_jax.nets.convolution import conv2d
 
 LIBRARY = {_guard.FUSION_FLAG.lstrip("-"): "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"}
 SOONER = {"xla_backend_optimization_level": 2, "xla_cpu_use_fusion_emitters": False}
@@ -30,22 +28,24 @@ VENDOR = {"xla_gpu_enable_triton_gemm": False}
 _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float32 gives some 1e-5
 
 
-def lower(jitted: Any, *given: Any) -> Any:
-    """`jitted.lower(*given)` without Python's garbage collector: a quarter faster, as tracing makes
-    hundreds of thousands of small objects and next to no garbage."""
+def lower(jitted: Any, *inputs: Any) -> Any:
+    """Lowers a jitted function without Python's garbage collector, which is a quarter faster.
+
+    Tracing makes hundreds of thousands of small objects and next to no garbage.
+    """
     was_on = gc.isenabled()
     gc.disable()
     try:
-        return jitted.lower(*given)
+        return jitted.lower(*inputs)
     finally:
         if was_on:
             gc.enable()
 
 
 def options(cfg: Config) -> dict[str, Any] | None:
-    """Options of `jax.jit` for the config's training program, None for the defaults.
+    """Returns the options of `jax.jit` for the config's training program; None for the defaults.
 
-    The second library is slow at kernel gradients, which `conv2d` keeps from it.
+    The second library is slow at kernel gradients, which `nets.convolution` keeps from it.
     """
     if jax.default_backend() == "cpu":
         chosen = os.environ.get("XLA_FLAGS", "")
@@ -58,7 +58,7 @@ def options(cfg: Config) -> dict[str, Any] | None:
 
 @functools.cache
 def knows(name: str, value: Any) -> bool:
-    """Whether this XLA has such an option."""
+    """Returns True if this XLA has such an option."""
     try:
         jax.jit(jnp.negative, compiler_options={name: value}).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
@@ -68,17 +68,23 @@ def knows(name: str, value: Any) -> bool:
 
 @functools.cache
 def has_library() -> bool:
-    """Whether this is a CPU whose XLA knows the library and computes a small convolution right."""
+    """Returns True on a CPU whose XLA has the library and computes a small convolution right."""
     if jax.default_backend() != "cpu":
         return False
     rng = np.random.default_rng(0)
     shapes = ((1, 8, 8, 40), (3, 3, 40, 24))
     maps, kernel = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
     try:
-        program = jax.jit(lambda m, k: conv2d(m, k, 1, 1, 1), compiler_options=LIBRARY)
-        got = np.asarray(program(maps, kernel))
+        got = np.asarray(jax.jit(_convolve, compiler_options=LIBRARY)(maps, kernel))
     except jax.errors.JaxRuntimeError:
         return False
     padded = np.pad(maps.astype(np.float64), ((0, 0), (1, 1), (1, 1), (0, 0)))
     wanted = sum(padded[:, i : i + 8, j : j + 8] @ kernel[i, j] for i in range(3) for j in range(3))
     return bool(np.max(np.abs(got - wanted)) < _BOUND)
+
+
+def _convolve(maps: jax.Array, kernel: jax.Array) -> jax.Array:
+    """Convolves maps [B, H, W, I] with a kernel [3, 3, I, O], zeros around."""
+    layout = ("NHWC", "HWIO", "NHWC")
+    sides = [(1, 1)] * 2
+    return jax.lax.conv_general_dilated(maps, kernel, (1, 1), sides, dimension_numbers=layout)

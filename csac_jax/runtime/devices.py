@@ -1,4 +1,4 @@
-"""Which devices JAX computes on."""
+"""The devices that JAX computes on."""
 
 import os
 from typing import Literal
@@ -26,4 +26,4 @@ def require(name: str | None = None) -> None:
             f"JAX finds no device of JAX_PLATFORMS={asked}; unset it, or set it to cpu"
         ) from None
     if name not in (None, used):
-        raise DeviceError(f"--device {name}: JAX finds none here; leave it out for the {used}")
+        raise DeviceError(f"device {name}: JAX finds none here; leave it out for the {used}")

@@ -1,6 +1,6 @@
 """Work for several processes of this program, each on a core of its own.
 
-Few scenes give JAX and physics little to share out: such work hardly gains by a second core.
+With few scenes, one process hardly gains by a second core.
 """
 
 import contextlib
@@ -17,11 +17,11 @@ from typing import Any
 from csac_jax.errors import FailedError
 
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # microseconds of all cores in each period, or "max"
-_PAUSE = 0.2  # s, after which what the processes say is heard
+_PAUSE = 0.2  # s between looks at the queue
 
 
 def cores() -> int:
-    """Cores that this process may use: in a container no more than it has time for."""
+    """Returns the cores that this process may use, within the quota of a container."""
     allowed = len(os.sched_getaffinity(0))
     try:
         quota, period = _QUOTA.read_text().split()
@@ -34,45 +34,44 @@ def each(
     work: Callable[..., Any],
     tasks: Sequence[tuple],
     jobs: int,
-    hear: Callable[..., None],
-    finish: Callable[[int, Any], None],
+    on_progress: Callable[..., None],
+    on_done: Callable[[int, Any], None],
 ) -> None:
-    """Calls `work(say, *task)` for every task, so many at a time.
+    """Calls `work(report, *task)` for every task, `jobs` at a time.
 
     One at a time runs in this process. More run in processes of their own, whose JAX computes on
-    the CPU. They end at once with an error of any, and with this process. Args: work, a function
-    of a module; hear, gets what work gives to `say`; finish, gets the number of a task and its
-    result, as they come. Raises FailedError where a process was ended from outside, for want of
-    memory for example.
+    the CPU. All end with the first error, and with this process. Args: work, a function of a
+    module; on_progress, gets what work gives to `report`; on_done, gets the number of a task and
+    its result. Raises FailedError if a process was ended from outside, as for lack of memory.
     """
     if min(jobs, len(tasks)) <= 1:
         for number, task in enumerate(tasks):
-            finish(number, work(hear, *task))
+            on_done(number, work(on_progress, *task))
         return
-    with _pool(min(jobs, len(tasks))) as (executor, said):
+    with _pool(min(jobs, len(tasks))) as (executor, reports):
         numbers = {executor.submit(_run, work, task): n for n, task in enumerate(tasks)}
         left = set(numbers)
         while left:
             done, left = wait(left, _PAUSE, FIRST_COMPLETED)
-            while not said.empty():
-                hear(*said.get())
+            while not reports.empty():
+                on_progress(*reports.get())
             for future in done:
-                finish(numbers[future], future.result())
+                on_done(numbers[future], future.result())
 
 
 @contextlib.contextmanager
 def _pool(jobs: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
-    """Processes, and the queue of what they say."""
+    """Starts processes; yields them and the queue of their reports."""
     context = multiprocessing.get_context("spawn")
-    free, said = context.SimpleQueue(), context.SimpleQueue()
-    mine = sorted(os.sched_getaffinity(0))
+    free, reports = context.SimpleQueue(), context.SimpleQueue()
+    allowed = sorted(os.sched_getaffinity(0))
     for number in range(jobs):
-        free.put(mine[number % len(mine)])
-    executor = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(free, said))
+        free.put(allowed[number % len(allowed)])
+    executor = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(free, reports))
     try:
-        yield executor, said
+        yield executor, reports
     except BrokenProcessPool:
-        raise FailedError("a process was ended, perhaps for want of memory") from None
+        raise FailedError("a process was ended, perhaps for lack of memory") from None
     except BaseException:
         for process in multiprocessing.active_children():
             process.terminate()
@@ -81,13 +80,13 @@ def _pool(jobs: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
         executor.shutdown(cancel_futures=True)
 
 
-_said: Any = None  # the queue, in a process of a pool
+_reports: Any = None  # the queue, in a process of a pool
 
 
-def _begin(free: Any, said: Any) -> None:
+def _begin(free: Any, reports: Any) -> None:
     """Begins a process of a pool."""
-    global _said
-    _said = said
+    global _reports
+    _reports = reports
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; one ends the others
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.sched_setaffinity(0, {free.get()})  # before JAX starts its threads
@@ -97,7 +96,7 @@ def _begin(free: Any, said: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """Ends this process when the one that has the pool is no more, however it ended."""
+    """Ends this process when its parent ends, however that was."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -105,5 +104,5 @@ def _end_with_parent() -> None:
 
 
 def _run(work: Callable[..., Any], task: tuple) -> Any:
-    """One task, in a process of a pool."""
-    return work(lambda *what: _said.put(what), *task)
+    """Runs one task in a process of a pool."""
+    return work(lambda *report: _reports.put(report), *task)

@@ -1,4 +1,4 @@
-"""Where a result comes from: versions, device, commit."""
+"""Provenance of a result: versions, device, commit."""
 
 import contextlib
 import importlib.metadata
@@ -18,16 +18,16 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-che
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the installed packages that can change a result."""
-    found = {"python": platform.python_version(), "csac-jax": __version__}
+    """Returns the versions of Python and of the packages that can change a result."""
+    installed = {"python": platform.python_version(), "csac-jax": __version__}
     for name in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)  # policies act without MuJoCo
-    return found
+            installed[name] = importlib.metadata.version(name)  # policies act without MuJoCo
+    return installed
 
 
 def warn_if_other(stored: Any, what: str) -> None:
-    """Warns where `what` was made by versions, see `versions`, that may compute other numbers."""
+    """Warns if `what` was made by versions, see `versions`, that may compute other numbers."""
     now = versions()
     for name in ("csac-jax", "jax", "mujoco"):
         was = stored.get(name) if isinstance(stored, dict) else None
@@ -37,13 +37,13 @@ def warn_if_other(stored: Any, what: str) -> None:
 
 
 def device() -> str:
-    """JAX's devices as text."""
+    """Describes JAX's devices."""
     devices = jax.devices()
     return f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform})"
 
 
 def commit() -> str | None:
-    """Commit of the package's checkout, with "-dirty" if files differ from it; None without one.
+    """Returns the commit of the package's checkout, with "-dirty" if files differ; else None.
 
     CSAC_JAX_COMMIT replaces it: in a container the sources come without their history.
     """
@@ -58,7 +58,7 @@ def commit() -> str | None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """What git says; None if it says nothing or fails."""
+    """Returns git's output; None if it is empty or git fails."""
     command = ["git", "-C", str(folder), *arguments]
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=10)
@@ -67,5 +67,5 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def record() -> dict[str, object]:
-    """All of it, for a result's JSON."""
+    """Returns device, versions and commit, for a result's JSON."""
     return {"device": device(), "versions": versions(), "commit": commit()}

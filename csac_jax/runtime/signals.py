@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: the first asks the loop to save and end, a later one ends it at once.
+"""SIGINT and SIGTERM: the first makes the loop save and end, a later one ends it at once.
 
 Python runs its own signal handlers between bytecodes, so not while XLA compiles or a chunk runs.
 The C handler behind `signal.set_wakeup_fd` does not wait: it writes the signal's number into a
@@ -24,7 +24,7 @@ class Stop:
 
     @property
     def exit_code(self) -> int:
-        """130 for SIGINT, 143 for SIGTERM, 0 if there was none."""
+        """Returns 130 for SIGINT, 143 for SIGTERM, 0 if there was none."""
         return 0 if self.signal is None else 128 + self.signal
 
 
@@ -41,7 +41,7 @@ def install() -> Stop:
 
 
 def _listen(stop: Stop, reader: socket.socket, writer: socket.socket) -> None:
-    """Reads signal numbers for ever. It holds `writer`, which must stay open."""
+    """Reads signal numbers until the process ends. It holds `writer`, which must stay open."""
     seen: dict[int, float] = {}
     while writer.fileno() >= 0:
         for number in reader.recv(64):
@@ -50,5 +50,5 @@ def _listen(stop: Stop, reader: socket.socket, writer: socket.socket) -> None:
             if number in SIGNALS and number not in seen:
                 seen[number] = time.monotonic()
                 stop.signal = stop.signal or number
-                said = f"{signal.Signals(number).name}: saving after this chunk"
-                print(f"{said}; once more to end at once", file=sys.stderr, flush=True)
+                text = f"{signal.Signals(number).name}: saving after this chunk"
+                print(f"{text}; once more to end at once", file=sys.stderr, flush=True)

@@ -19,10 +19,11 @@ import numpy as np
 from mujoco import rollout
 
 from csac_jax.config import SimConfig
+from csac_jax.runtime import host_call
 from csac_jax.scene import layout, model
 from csac_jax.scene.layout import Scene
 from csac_jax.scene.model import BlockFields, World
-from csac_jax.sim import host_call, model_fields, outcome
+from csac_jax.sim import model_fields, outcome
 from csac_jax.sim.outcome import Substep, Trace
 from csac_jax.sim.primitives import JointTrajectory
 

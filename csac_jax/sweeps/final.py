@@ -1,8 +1,8 @@
-"""The final policies of a sweep, measured without exploration: SWEEP/POINT/seed-K/eval.json, and
-eval-SUITE.json for scenes other than those of a policy's own task.
+"""Evaluates the final policies of a sweep, without exploration.
 
-The file is that of `csac-jax eval --json`. A policy that has one is passed over, so an interrupted
-evaluation goes on where it was.
+The result is SWEEP/POINT/seed-K/eval.json, or eval-SUITE.json for scenes other than those of a
+policy's own task, as of `csac-jax eval --json`. A policy that has one is skipped, so an interrupted
+evaluation continues where it was.
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ def measure(
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))
         left = [run for run in runs if _is_left(folder / run.folder, suite)]
-        if kept := sum((folder / run.folder / _result(suite)).exists() for run in runs):
-            reporter.say(f"{point.name}: {kept} policies have their {_result(suite)} already")
+        if done := sum((folder / run.folder / _result(suite)).exists() for run in runs):
+            reporter.log(f"{point.name}: {done} policies have their {_result(suite)} already")
         if left and stop.signal is None:
-            reporter.say(f"evaluating {point.name}: {len(left)} policies")
+            reporter.log(f"evaluating {point.name}: {len(left)} policies")
             _measure_point(plan.episodes, suite, point, folder, left, stop)
     return stop.signal
 
@@ -53,8 +53,10 @@ def _is_left(path: Path, suite: str) -> bool:
 def _measure_point(
     episodes: int, suite: str, point: SweepPoint, folder: Path, runs: list[SweepRun], stop: Stop
 ) -> None:
-    """Evaluates runs of one point, which share their scenes and the compiled episodes; in C MuJoCo
-    if they were trained in it, on whatever device."""
+    """Evaluates runs of one point, which share scenes and compiled episodes.
+
+    In C MuJoCo if they were trained in it, on whatever device.
+    """
     physics: PhysicsKind = "c" if point.cfg.sim.physics == "c" else "auto"
     robot = point.cfg.sim.robot
     prepared = suites.prepare(point.cfg, suite, episodes, SEED, physics, robot)
@@ -67,8 +69,8 @@ def _measure_point(
         _write(path / _result(suite), suite, measured, found, begun)
 
 
-def _write(path: Path, suite: str, cfg: Config, found: dict[str, Any], begun: float) -> None:
+def _write(path: Path, suite: str, cfg: Config, table: dict[str, Any], begun: float) -> None:
     asked = {"policy": "learned", "suite": suite, "seed": SEED}
     seconds = {"seconds": round(time.time() - begun, 1)}
     config = {"config": configs.to_dict(cfg)}
-    files.write_json(path, {**asked, **seconds, **found, **config, **provenance.record()})
+    files.write_json(path, {**asked, **seconds, **table, **config, **provenance.record()})

@@ -1,5 +1,4 @@
-"""The points of a sweep: every combination of the values in `--vary NAME=A,B`. It needs no JAX, so
-that complaints come at once."""
+"""The points of a sweep: every combination of the varied values. Needs no JAX."""
 
 import dataclasses
 import difflib
@@ -12,6 +11,7 @@ from typing import Any, NamedTuple
 
 from csac_jax.algorithms import unknown
 from csac_jax.config import ALTERNATIVES, Config, Section
+from csac_jax.errors import SettingsError
 
 BASE = "base"  # name of the only point where nothing is varied
 LONGEST = 120  # characters of a point's name, which is a folder's
@@ -21,7 +21,7 @@ TASKS: dict[str, dict[str, Any]] = {
     "target": {"task.kind": "target", "scene.arranged": 0.0},
     "packed": {"task.kind": "clear", "scene.arranged": 1.0},
 }
-"""Values of `--vary task=...`: what is to be done, and in which scenes."""
+"""Values of the varied name `task`: a task and its scenes."""
 _OBLIQUE = {"heightmap.view": "oblique"}
 _NOISE = {
     "sensor.depth_noise": (0.001, 0.0014),  # of a structured-light camera, see `SensorConfig`
@@ -40,15 +40,14 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "ur5": _UR5,
     "together": _SENSED | _ANYWHERE | _OBLIQUE | _NOISE | _UR5,
 }
-"""Values of `--vary switch=...`: what is nearer to the paper's robot, one at a time or together;
-errors of the camera are ours."""
+"""Values of the varied name `switch`: settings nearer to a robot; camera errors are ours."""
 BUNDLES = {"task": TASKS, "switch": SWITCHES}
 """Varied names that stand for several settings."""
 _VALUE = re.compile(r"([^./-]|-?\.?\d|-inf)[^/]*")  # a negative number is no flag
 
 
 class SweepPoint(NamedTuple):
-    """One combination of the varied values."""
+    """A combination of the varied values."""
 
     name: str  # as in `learn.tau=0.01,replay.sampler=beta`; of its folder
     values: dict[str, str]  # setting -> value, as given
@@ -56,14 +55,14 @@ class SweepPoint(NamedTuple):
 
 
 def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> list[SweepPoint]:
-    """Every combination of the values of `NAME=A,B,...`; the last name's values change fastest.
+    """Combines the values of `NAME=A,B,...`; the last name's values change fastest.
 
     `configure` makes a config of flags. Colons separate the items of a tuple, as in
-    `replay.end=1:4,1:12`. Raises ValueError for what cannot be varied.
+    `replay.end=1:4,1:12`. Raises SettingsError for what cannot be varied.
     """
     axes = dict(map(_axis, varied))
     if len(axes) < len(varied):
-        raise ValueError("--vary: a setting is given twice; name it once, with all its values")
+        raise SettingsError("vary: a setting is given twice; name it once, with all its values")
 
     def from_flags(values: dict[str, str]) -> Config:
         return configure([flag for name in values for flag in _flags(name, values[name])])
@@ -74,39 +73,43 @@ def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> l
 def combine(
     axes: Mapping[str, Sequence[Any]], configure: Callable[[dict[str, Any]], Config]
 ) -> list[SweepPoint]:
-    """A point for every combination, setting -> value, of which `configure` makes a config. They
-    are numbered where one has a name that is too long for a folder. Raises ValueError for too many.
+    """Makes a point of every combination, setting -> value; `configure` makes its config.
+
+    Points are numbered if one has a name that is too long for a folder. Raises SettingsError for
+    too many.
     """
-    found: list[SweepPoint] = []
+    points: list[SweepPoint] = []
     if math.prod(map(len, axes.values())) > MOST_RUNS:
-        raise ValueError(f"--vary: more than {MOST_RUNS} combinations; leave some values out")
+        raise SettingsError(f"vary: more than {MOST_RUNS} combinations; leave some values out")
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
         name = ",".join(f"{setting}={value}" for setting, value in values.items()) or BASE
-        told = {setting: str(value) for setting, value in values.items()}
-        found.append(SweepPoint(name, told, configure(values)))
-    if all(len(point.name) <= LONGEST for point in found):
-        return found
-    return [point._replace(name=f"setting-{i}") for i, point in enumerate(found)]
+        texts = {setting: str(value) for setting, value in values.items()}
+        points.append(SweepPoint(name, texts, configure(values)))
+    if all(len(point.name) <= LONGEST for point in points):
+        return points
+    return [point._replace(name=f"setting-{i}") for i, point in enumerate(points)]
 
 
 def _axis(text: str) -> tuple[str, list[str]]:
     name, equals, rest = text.partition("=")
     name, values = name.replace("-", "_"), rest.split(",")
     if not equals or not all(values):
-        raise ValueError(f"--vary {text}: give a setting and its values, as in learn.tau=0.01,0.02")
+        raise SettingsError(f"vary {text}: give a setting and its values: learn.tau=0.01,0.02")
     kind_of(name)
     if len(set(values)) < len(values):
-        raise ValueError(f"--vary {text}: a value is given twice")
+        raise SettingsError(f"vary {text}: a value is given twice")
     if not all(map(_VALUE.fullmatch, values)):
-        raise ValueError(f"--vary {text}: a value must hold no slash, nor begin with a dot or dash")
+        raise SettingsError(
+            f"vary {text}: a value must hold no slash, nor begin with a dot or dash"
+        )
     return name, values
 
 
 def kind_of(name: str) -> object:
-    """Type of a setting by its dotted name. Raises ValueError for what cannot be varied."""
+    """Returns the type of a setting by its dotted name; SettingsError if it cannot be varied."""
     if name == "seed":
-        raise ValueError("--vary: seeds are varied by --seeds")
+        raise SettingsError("vary: leave seed out; give the number of seeds")
     kinds: dict[str, object] = {"algo": str, **dict.fromkeys(BUNDLES, str)}
     for section, default in vars(Config()).items():
         if isinstance(default, Section):
@@ -116,30 +119,28 @@ def kind_of(name: str) -> object:
                 kinds |= {f"{section}.{field.name}": hints[field.name] for field in fields}
     if name not in kinds:
         near = difflib.get_close_matches(name, kinds, 1)
-        listed = "csac-jax train quick --help-all lists them"
-        hint = f"perhaps you meant {near[0]}" if near else listed
-        raise ValueError(f"--vary: '{name}' is no setting; {hint}")
+        hint = f"perhaps you meant {near[0]}" if near else "see docs/reference/settings.md"
+        raise SettingsError(f"vary: '{name}' is no setting; {hint}")
     return kinds[name]
 
 
 def settings_of(name: str, value: Any) -> dict[str, Any]:
-    """The settings that a varied name stands for: those of a bundle, or itself. Raises ValueError
-    for a value that the bundle lacks."""
+    """Returns the settings that a varied name stands for: those of a bundle, or itself."""
     if name not in BUNDLES:
         return {name: value}
     if value not in BUNDLES[name]:
-        raise ValueError(unknown(name, value, BUNDLES[name]))
+        raise SettingsError(unknown(name, value, BUNDLES[name]))
     return BUNDLES[name][value]
 
 
 def _flags(name: str, value: str) -> list[str]:
     if name in BUNDLES:
         settings = settings_of(name, value)
-        return [flag for key, given in settings.items() for flag in _flags(key, _text(given))]
+        return [flag for key, item in settings.items() for flag in _flags(key, _text(item))]
     flag = "--" + name.replace("_", "-")
     if kind_of(name) is bool:
         if value not in ("true", "false"):
-            raise ValueError(f"--vary {name}: {value!r} is neither true nor false")
+            raise SettingsError(f"vary {name}: {value!r} is neither true nor false")
         section, _, field = flag.rpartition(".")
         return [flag if value == "true" else f"{section}.no-{field}"]
     items = value.split(":") if typing.get_origin(kind_of(name)) is tuple else [value]
@@ -147,5 +148,5 @@ def _flags(name: str, value: str) -> list[str]:
 
 
 def _text(value: Any) -> str:
-    """A value as `--vary` takes it."""
+    """Formats a value as `points` reads it."""
     return ":".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -1,8 +1,7 @@
 """Many runs in one program: replicas, which differ in seed and hyper-parameters.
 
 S = replicas. `step.train_step` is written for one run and vmapped here, once. All leaves of a state
-have a leading axis S but `step`: replicas share the counter, so that a schedule by it stays a
-branch.
+but `step` have a leading axis S: replicas share the counter, so that a schedule stays a branch.
 """
 
 import dataclasses
@@ -17,12 +16,16 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from csac_jax.agent import rewards
+from csac_jax.agent.csac import CSAC
 from csac_jax.config import Config, SmallNet
 from csac_jax.nets import chunked_vmap
+from csac_jax.nets.chunked_vmap import Batching
 from csac_jax.runtime import compiler
-from csac_jax.training import memory, step
+from csac_jax.training import memory, program as programs, step
+from csac_jax.training.program import Hyperparams
 from csac_jax.training.sharding import AXIS, Shard
-from csac_jax.training.step import Hyperparams, Program, StepMetrics, TrainState
+from csac_jax.training.step import Program, TrainState
+from csac_jax.training.transitions import StepMetrics
 
 _TRACED = {
     "target": "gamma",
@@ -38,7 +41,7 @@ TRACED_HYPERPARAMS = tuple(
 
 
 def _prefix(replicas: Any, step: Any, scenes: Any) -> Any:
-    """A value for each part of a state: its `step`, its scenes and all the rest."""
+    """Builds a tree with a value for each part of a state."""
     return TrainState(key=replicas, step=step, scenes=scenes, learner=replicas, replay=replicas)
 
 
@@ -48,7 +51,7 @@ _SPECS = {"seeds": _prefix(_FIRST, _WHOLE, _FIRST), "scenes": _prefix(_WHOLE, _W
 
 
 class Replicas(NamedTuple):
-    """What tells replicas apart."""
+    """Seeds and settings of replicas."""
 
     seed: Any  # [S] uint32
     hyperparams: Hyperparams | None  # leaves [S, ...] float32; None if only the seeds differ
@@ -62,22 +65,23 @@ class ProgramGroup(NamedTuple):
 
 
 def group_configs(configs: Sequence[Config]) -> list[ProgramGroup]:
-    """The configs in as few groups as can be, in the order of their first ones."""
+    """Groups configs, in as few groups as possible, in the order of their first ones."""
     groups: dict[Config, list[Config]] = {}
     for cfg in configs:
         unnamed = dataclasses.replace(cfg, seed=0, preset="", algo="csac")
-        blank = step.replace_settings(unnamed, dict.fromkeys(_traced(cfg)))
+        blank = programs.replace_settings(unnamed, dict.fromkeys(_traced(cfg)))
         groups.setdefault(blank, []).append(cfg)
     return [ProgramGroup(tuple(alike), _differing(alike)) for alike in groups.values()]
 
 
 def _differing(configs: Sequence[Config]) -> tuple[str, ...]:
+    """Returns the names of the TRACED_HYPERPARAMS in which configs differ."""
     first, *others = map(_traced, configs)
     return tuple(name for name in first if any(other[name] != first[name] for other in others))
 
 
 def _traced(cfg: Config) -> dict[str, Any]:
-    """The values of those TRACED_HYPERPARAMS that this config has: alternatives have their own."""
+    """Returns the TRACED_HYPERPARAMS that this config has: alternatives have their own."""
     settings = {
         f"{section}.{name}": value
         for section in _TRACED
@@ -86,14 +90,14 @@ def _traced(cfg: Config) -> dict[str, Any]:
     return {name: settings[name] for name in TRACED_HYPERPARAMS if name in settings}
 
 
-def of_group(group: ProgramGroup) -> Replicas:
-    """What tells the runs of a group apart, as arrays of NumPy: every process has its own copy."""
+def group_replicas(group: ProgramGroup) -> Replicas:
+    """Returns seeds and settings of a group, as NumPy arrays: every process has a copy."""
     configs, names = group
     seed = np.array([cfg.seed for cfg in configs], np.uint32)
     if not names:
         return Replicas(seed, None)
     traced = [_traced(cfg) for cfg in configs]
-    values = {name: np.array([own[name] for own in traced], np.float32) for name in names}
+    values = {name: np.array([row[name] for row in traced], np.float32) for name in names}
     bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in configs]
     low, high = np.array(bounds, np.float32).T
     return Replicas(seed, Hyperparams(values, (low, high)))
@@ -101,7 +105,7 @@ def of_group(group: ProgramGroup) -> Replicas:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SweepProgram:
-    """Replicas in one program, on one device or laid out over a mesh."""
+    """A program of replicas, on one device or laid out over a mesh."""
 
     program: Program
     replicas: Replicas
@@ -111,7 +115,7 @@ class SweepProgram:
     start: Callable[[Any], Any] | None = None  # changes the learners' first state [S, ...]
 
     def init(self) -> TrainState:
-        """The state of all replicas before the first step."""
+        """Creates the initial state of all replicas."""
         state = self._jitted_init()(self.replicas)
         if self.start is None:
             return state
@@ -119,28 +123,26 @@ class SweepProgram:
         return jax.device_put(started, self._shardings())
 
     def abstract(self) -> TrainState:
-        """Shapes, types and places of `init`'s state; nothing is compiled."""
+        """Returns shapes, dtypes and shardings of `init`'s state; nothing is compiled."""
         return self._jitted_init().eval_shape(self.replicas)
 
     def compile_chunk(self, num_steps: int) -> Any:
-        """A jitted function state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
+        """Jits a function state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
 
         The state is donated. With a mesh over seeds each device scans its own replicas; metrics end
-        up on every device. Networks work in chunks unless hyper-parameters are traced, which
-        `chunked_vmap` cannot close over, or scenes are sharded.
+        up on every device.
         """
         mesh, replicas, program = self.mesh, self.replicas, self.program
         vmapped = len(replicas.seed) // (self.parts if mesh is None else mesh.size)
         if mesh is not None and self.shard == "scenes":
             program = dataclasses.replace(program, mesh=mesh)
-        elif replicas.hyperparams is None:
-            at_once = chunked_vmap.chunk_size(program.cfg, vmapped)
-            program = dataclasses.replace(program, learner=program.learner.in_chunks(at_once))
-        if vmapped > 1:
-            program = dataclasses.replace(program, learner=program.learner.side_by_side())
+        assert isinstance(program.learner, CSAC)
+        learner = program.learner.batched(self._batching(vmapped))
+        program = dataclasses.replace(program, learner=learner)
 
         def train_one(replica: Replicas, state: TrainState) -> tuple[TrainState, StepMetrics]:
-            return step.train_step(program, state, replica.hyperparams)
+            traced = programs.replace_hyperparams(program, replica.hyperparams)
+            return step.train_step(traced, state)
 
         train_all = jax.vmap(train_one, in_axes=(0, AXES), out_axes=(AXES, 0))
 
@@ -161,20 +163,33 @@ class SweepProgram:
         places = (self._shardings(), NamedSharding(mesh, _WHOLE))
         return jit(lambda state: chunk(state, replicas), out_shardings=places)
 
+    def _batching(self, vmapped: int) -> Batching:
+        """Returns how the networks of so many runs work under `vmap`.
+
+        Not in chunks where hyper-parameters are traced, as `vmap_in_chunks` cannot close over them,
+        or where scenes are sharded.
+        """
+        sharded = self.mesh is not None and self.shard == "scenes"
+        chunked = not sharded and self.replicas.hyperparams is None
+        at_once = chunked_vmap.chunk_size(self.program.cfg, vmapped) if chunked else None
+        return Batching(side_by_side=vmapped > 1, networks_at_once=at_once)
+
     def replica(self, state: TrainState, index: int) -> TrainState:
-        """The state of one replica, as `train` has it, on every device."""
+        """Returns the state of one replica, as `train` has it, on every device."""
         if self.mesh is None:
             return replica(state, index)
         return jax.jit(replica, out_shardings=NamedSharding(self.mesh, _WHOLE))(state, index)
 
     def _jitted_init(self) -> Any:
         def init_one(replica: Replicas) -> TrainState:
-            return step.init_state(self.program, jax.random.key(replica.seed), replica.hyperparams)
+            return programs.init_state(
+                self.program, jax.random.key(replica.seed), replica.hyperparams
+            )
 
         return jax.jit(jax.vmap(init_one, out_axes=AXES), out_shardings=self._shardings())
 
     def _shardings(self) -> Any:
-        """Where the leaves of a state lie, as a prefix of it; None without a mesh."""
+        """Returns the shardings of a state, as a prefix of it; None without a mesh."""
         if self.mesh is None:
             return None
         return jax.tree.map(functools.partial(NamedSharding, self.mesh), _SPECS[self.shard])
@@ -183,20 +198,20 @@ class SweepProgram:
 def sweep_program(
     group: ProgramGroup, mesh: Mesh | None = None, shard: Shard = "seeds", start: Any = None
 ) -> SweepProgram:
-    """The program of a group; its environment is made here."""
-    program = step.make(group.configs[0])
+    """Makes the program of a group, with its environment."""
+    program = programs.make(group.configs[0])
     parts = num_parts(program.cfg, len(group.configs), mesh)
-    return SweepProgram(program, of_group(group), mesh, shard, parts, start)
+    return SweepProgram(program, group_replicas(group), mesh, shard, parts, start)
 
 
 def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
-    """How many parts are best for so many replicas, see `Pipelined`: on a GPU at most two, ours.
+    """Returns how many parts are best for so many replicas, see `Pipelined`.
 
-    One on several devices, for DenseNet-121, which keeps a device busy, and where the states do not
-    fit twice: they are taken apart and joined again.
+    On a GPU at most two, ours. One on several devices, for DenseNet-121, which keeps a device busy,
+    and where the states do not fit twice: they are taken apart and joined again.
     """
-    on_cpu, halves = jax.default_backend() == "cpu", cfg.sim.physics == "c" and replicas % 2 == 0
-    parts = replicas if on_cpu else 2 if halves else 1
+    even = cfg.sim.physics == "c" and replicas % 2 == 0
+    parts = replicas if jax.default_backend() == "cpu" else 2 if even else 1
     if parts == 1 or mesh is not None or not isinstance(cfg.net, SmallNet):
         return 1
     fits = 2 * replicas * sum(memory.state_bytes(cfg).values()) <= memory.limit()
@@ -206,6 +221,7 @@ def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pipelined:
     """A chunk of all replicas made of one that serves an equal part of them; the state is donated.
+
     It is lowered and compiled like a jitted function, and callable once compiled.
 
     On a GPU with C physics the device waits for the host. The host moves the scenes of one part
@@ -229,7 +245,7 @@ class Pipelined:
         return self.program.memory_analysis()
 
     def __call__(self, state: TrainState) -> tuple[TrainState, StepMetrics]:
-        """The result of all parts, once the last one is done."""
+        """Runs all parts; returns their joined result."""
         states = jax.block_until_ready(_split(state, self.parts))
         for leaf in jax.tree.leaves(state):
             leaf.delete()
@@ -242,21 +258,21 @@ class Pipelined:
 
 
 def _in_parts(tree: Any, parts: int) -> list[Any]:
-    """Equal parts of leaves [S, ...]."""
+    """Splits leaves [S, ...] into equal parts."""
     split = jax.tree.map(lambda leaf: leaf.reshape(parts, -1, *leaf.shape[1:]), tree)
     return [jax.tree.map(lambda leaf, k=k: leaf[k], split) for k in range(parts)]
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _split(state: TrainState, parts: int) -> list[TrainState]:
-    """The states of equal parts, copied."""
+    """Copies the states of equal parts."""
     split = _in_parts(state.replace(step=()), parts)
     return [jax.tree.map(jnp.copy, part.replace(step=state.step)) for part in split]
 
 
 @jax.jit
 def _join(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, StepMetrics]:
-    """States [S', ...] and metrics [T, S', ...] of the parts as those of all replicas."""
+    """Joins states [S', ...] and metrics [T, S', ...] of parts to those of all replicas."""
     states, metrics = zip(*done, strict=True)
     leading = [state.replace(step=()) for state in states]
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *leading)
@@ -265,6 +281,6 @@ def _join(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, S
 
 
 def replica(state: TrainState, index: int) -> TrainState:
-    """The state of one replica, as `train` has it."""
+    """Returns the state of one replica, as `train` has it."""
     own = jax.tree.map(lambda leaf: leaf[index], state.replace(step=()))
     return own.replace(step=state.step)

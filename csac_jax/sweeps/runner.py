@@ -1,13 +1,13 @@
-"""The host's side of a sweep: its groups in turn, all runs of a group in one program.
+"""The host's loop of a sweep: its groups in turn, all runs of a group in one program.
 
-SWEEP/sweep.json                what was asked for; a sweep is resumed from it
+SWEEP/sweep.json                the plan; a sweep is resumed from it
 SWEEP/summary.json              grasp success of every point over its seeds, and of every run
 SWEEP/POINT/seed-K/             a run, laid out like one of `train`; its checkpoint comes at the end
-SWEEP/POINT/seed-K/eval.json    its final policy, measured, where the plan has `episodes`
+SWEEP/POINT/seed-K/eval.json    evaluation of its final policy, where the plan has `episodes`
 SWEEP/groups/I/checkpoints/     the state of all runs of group I, until they are done
 SWEEP/groups/I/done             their checkpoints are written
 
-A run is one point with one seed. One whose loss is not finite is named and given up, alone.
+A run is one point with one seed. One whose loss is not finite ends; the others continue.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from csac_jax.config import Config, shown
-from csac_jax.errors import FailedError
+from csac_jax.errors import FailedError, SettingsError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import NO_CASES
 from csac_jax.io import checkpoint, configs, files, lock
@@ -46,11 +46,11 @@ _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
 
 
 class SweepError(FailedError):
-    """A sweep that cannot begin or go on; the message is one line with the remedy."""
+    """A sweep that cannot begin or continue; the message is one line with the remedy."""
 
 
 class SweepPlan(NamedTuple):
-    """What a sweep runs: every point with seeds cfg.seed, cfg.seed + 1, ..."""
+    """The runs of a sweep: every point with seeds cfg.seed, cfg.seed + 1, ..."""
 
     seeds: int
     points: list[SweepPoint]
@@ -65,7 +65,7 @@ class SweepRun(NamedTuple):
 
     @property
     def folder(self) -> Path:
-        """Where its log and checkpoint lie, within the sweep's folder."""
+        """Returns the folder of its log and checkpoint, within the sweep's."""
         return Path(self.point) / f"seed-{self.cfg.seed}"
 
 
@@ -106,23 +106,23 @@ def _run(
     reporter: loop.Reporter,
     stop: Stop,
 ) -> SweepResult:
-    """See `run`; nobody else writes in the folder."""
+    """Runs as `run` does; nobody else writes in the folder."""
     sweep = _Sweep(folder, groups_of(plan), reporter, stop)
     for index, (group, _) in enumerate(sweep.groups):
-        own = folder / "groups" / str(index)
-        if not sweep.stopping() and not (own / DONE).exists():
-            sweep.train_group(index, own, make_program(group))
+        group_folder = folder / "groups" / str(index)
+        if not sweep.stopping() and not (group_folder / DONE).exists():
+            sweep.train_group(index, group_folder, make_program(group))
     summary = summarise(plan, folder)
     if cluster.is_first():
         files.write_json(folder / SUMMARY, summary)
     done = f"done; saved in {folder}, results in {folder / SUMMARY}"
-    stopped = f"stopped and saved; go on with: csac-jax sweep --resume {folder}"
-    reporter.say(done if sweep.stopped is None else stopped)
+    stopped = f"stopped and saved; continue with: csac-jax sweep --resume {folder}"
+    reporter.log(done if sweep.stopped is None else stopped)
     return SweepResult(summary, sweep.compiled, sweep.stopped)
 
 
 def read_plan(folder: Path) -> SweepPlan:
-    """The plan of a sweep's folder. Raises SweepError if there is none that can be read."""
+    """Reads the plan of a sweep's folder. Raises SweepError if it cannot be read."""
     try:
         stored = files.read_object(folder / files.SWEEP_PLAN)
         if stored.pop(DIGEST, None) not in (None, _digest(stored)):  # old ones have none
@@ -149,7 +149,7 @@ def read_plan(folder: Path) -> SweepPlan:
 
 
 def plan_text(plan: SweepPlan) -> str:
-    """What `read_plan` reads, as JSON."""
+    """Returns the JSON that `read_plan` reads."""
     points = [
         {"name": point.name, "values": point.values, "config": configs.to_dict(point.cfg)}
         for point in plan.points
@@ -163,23 +163,23 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def check_plan(plan: SweepPlan) -> None:
-    """Raises ValueError for a number of runs, or a name of a folder, that cannot be meant."""
+    """Raises SettingsError for too many runs or episodes, or an unsafe folder name."""
     if type(plan.seeds) is not int or not 1 <= plan.seeds * len(plan.points) <= grid.MOST_RUNS:
-        raise ValueError(f"--seeds: 1 to {grid.MOST_RUNS} runs in all, seeds times settings")
+        raise SettingsError(f"seeds: 1 to {grid.MOST_RUNS} runs in all, seeds times settings")
     if type(plan.episodes) is not int or not 0 <= plan.episodes <= MOST_EPISODES:
-        raise ValueError(f"--evaluate: 0 to {MOST_EPISODES} episodes")
+        raise SettingsError(f"episodes: 0 to {MOST_EPISODES}")
     names = [point.name for point in plan.points]
     for name in names:
         if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.isprintable():
-            raise ValueError(f"{shown(name)} is no name of a folder")
+            raise SettingsError(f"{shown(name)} is no name of a folder")
         if name in RESERVED:
-            raise ValueError(f"the name '{name}' is taken by the sweep's own files")
+            raise SettingsError(f"the name '{name}' is taken by the sweep's own files")
     if len(set(names)) < len(names):
-        raise ValueError("two settings have the same name")
+        raise SettingsError("two settings have the same name")
 
 
 def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
-    """Raises ValueError where a run has begun with another config than the plan's, or elsewhere."""
+    """Raises ValueError if a run has begun with another config than the plan's, or elsewhere."""
     for run in runs_of(plan):
         if not (folder / run.folder).resolve().is_relative_to(folder.resolve()):
             raise ValueError(f"{run.folder} is a link out of the sweep's folder")
@@ -191,7 +191,7 @@ def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
 
 
 def runs_of(plan: SweepPlan) -> list[SweepRun]:
-    """Every point with every seed."""
+    """Returns every point with every seed."""
     return [
         SweepRun(point.name, dataclasses.replace(point.cfg, seed=point.cfg.seed + k))
         for point in plan.points
@@ -200,15 +200,15 @@ def runs_of(plan: SweepPlan) -> list[SweepRun]:
 
 
 def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
-    """What runs together, each with its runs in order. Raises SweepError if points are equal."""
+    """Groups the runs of a plan, in order. Raises SweepError if points are equal."""
     runs = {run.cfg: run for run in runs_of(plan)}
     if len(runs) < plan.seeds * len(plan.points):
-        raise SweepError("--vary: two settings have the same values; leave one of them out")
+        raise SweepError("vary: two settings have the same values; leave one of them out")
     return [(group, [runs[cfg] for cfg in group.configs]) for group in group_configs(list(runs))]
 
 
 def check_room(plan: SweepPlan, devices: int) -> None:
-    """Raises ValueError where a group's runs, divided among `devices`, exceed a device's memory."""
+    """Raises SettingsError if a group's runs, divided among `devices`, exceed their memory."""
     for group, _ in groups_of(plan._replace(seeds=1)):
         cfg, runs = group.configs[0], -(-len(group.configs) * plan.seeds // devices)
         memory.check(cfg, runs)
@@ -216,7 +216,7 @@ def check_room(plan: SweepPlan, devices: int) -> None:
 
 @dataclasses.dataclass
 class _Sweep:
-    """A sweep on its way."""
+    """A sweep that runs."""
 
     folder: Path
     groups: list[tuple[ProgramGroup, list[SweepRun]]]
@@ -226,14 +226,14 @@ class _Sweep:
     compiled: list[float] = dataclasses.field(default_factory=list)  # s, of each group
 
     def stopping(self) -> bool:
-        """Whether a signal has come to any process. All must ask at once."""
+        """Returns True if a signal has come to any process. All must ask at once."""
         self.stopped = cluster.agree(self.stop.signal)
         return self.stopped is not None
 
     def train_group(self, index: int, folder: Path, program: SweepProgram) -> None:
-        """Trains a group, whose own `folder` this is, to its end or to a signal."""
+        """Trains a group, which has `folder` to itself, to its end or to a signal."""
         training = _GroupTraining(self.folder, folder, self.groups[index][1], program)
-        self.reporter.say(f"group {index + 1} of {len(self.groups)}: {training.title()}")
+        self.reporter.log(f"group {index + 1} of {len(self.groups)}: {training.title()}")
         chunk = None
         while not training.over() and not self.stopping():
             if chunk is None:
@@ -249,7 +249,7 @@ class _Sweep:
             training.finish()
 
     def _show(self, index: int, records: list[Record]) -> None:
-        """One line about all runs: their actions and speed together, means of the rest."""
+        """Shows sums of all runs' actions and speed, and means of the rest."""
 
         def mean(name: str) -> float | None:
             values = [getattr(record, name) for record in records]
@@ -272,22 +272,22 @@ class _Sweep:
 
 
 class _GroupTraining:
-    """A group on its way: its state and what the host carries for each run."""
+    """A group that trains: its state and the host's state of each run."""
 
     def __init__(
         self, sweep_folder: Path, folder: Path, runs: list[SweepRun], program: SweepProgram
     ) -> None:
-        """Goes on from the newest checkpoint, if there is one; logs are cut to it."""
+        """Continues from the newest checkpoint, if there is one, and cuts the logs to it."""
         self.folder, self.runs, self.program, self.cfg = folder, runs, program, runs[0].cfg
         self.paths = [sweep_folder / run.folder for run in runs]
-        self.progress = [loop.Progress(0.0, [])] * len(runs)
+        self.loop_states = [loop.LoopState(0.0, [])] * len(runs)
         self.failed: list[int | None] = [None] * len(runs)  # step of a loss that is not finite
         if checkpoint.latest_step(folder) is None:
             self.state = program.init()
         else:
             self.state, extra = checkpoint.restore(folder, program.abstract())
             stored = extra["runs"] if "runs" in extra else extra["members"]  # its older name
-            self.progress = [loop.Progress(*progress) for progress, _ in stored]
+            self.loop_states = [loop.LoopState(*loop_state) for loop_state, _ in stored]
             self.failed = [failed for _, failed in stored]
             if cluster.is_first():
                 checkpoint.set_aside(folder)
@@ -300,30 +300,31 @@ class _GroupTraining:
                 files.truncate_log(path / files.METRICS, self.step)
 
     def title(self) -> str:
-        """Its runs in words, and the step that it goes on from."""
+        """Describes its runs, and the step that it continues from."""
         names = list(dict.fromkeys(run.point for run in self.runs))
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         since = f", resumed at step {self.step}" if self.step else ""
         return f"{len(self.runs)} runs, {', '.join(names[:4])}{more}{since}"
 
     def over(self) -> bool:
-        """Whether all runs are done or given up."""
+        """Returns True if all runs are done or have failed."""
         return None not in self.failed or self.step >= loop.total_steps(self.cfg)
 
     def advance(self, chunk: Callable[[Any], Any], reporter: loop.Reporter) -> list[Record]:
-        """Runs a chunk, saves now and then; logs and returns a line of each run that goes on."""
+        """Runs a chunk and saves if it is time; logs and returns a record of each sound run."""
         self.state, metrics, seconds = loop.timed(chunk, self.state)
         self.step += self.cfg.train.chunk
         records = []
         for i, run in enumerate(self.runs):
-            own = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
-            if self.failed[i] is None and (lost := loop.not_finite(own)):
+            run_metrics = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
+            if self.failed[i] is None and (name := loop.not_finite(run_metrics)):
                 self.failed[i] = self.step
-                reason = f"given up at step {self.step}, {lost} is not finite"
-                reporter.say(f"{run.point}, seed {run.cfg.seed}: {reason}")
+                reason = f"given up at step {self.step}, {name} is not finite"
+                reporter.log(f"{run.point}, seed {run.cfg.seed}: {reason}")
             if self.failed[i] is None:
-                old = self.progress[i]
-                self.progress[i], record = loop.record_chunk(run.cfg, self.step, own, old, seconds)
+                self.loop_states[i], record = loop.record_chunk(
+                    run.cfg, self.step, run_metrics, self.loop_states[i], seconds
+                )
                 records.append(record)
                 if cluster.is_first():
                     loop.append(self.paths[i], record)
@@ -333,7 +334,7 @@ class _GroupTraining:
 
     def save(self) -> None:
         """Writes a checkpoint of the group."""
-        runs = list(zip(self.progress, self.failed, strict=True))
+        runs = list(zip(self.loop_states, self.failed, strict=True))
         checkpoint.save(self.folder, self.step, self.state, self.cfg, {"runs": runs})
         self.saved = self.step
 
@@ -341,7 +342,7 @@ class _GroupTraining:
         """Writes the runs' checkpoints, then removes the group's; a resumed sweep repeats it."""
         for i, path in enumerate(self.paths):
             if self.failed[i] is None:
-                state, extra = self.program.replica(self.state, i), self.progress[i]._asdict()
+                state, extra = self.program.replica(self.state, i), self.loop_states[i]._asdict()
                 checkpoint.save(path, self.step, state, self.runs[i].cfg, extra)
         if cluster.is_first():
             files.replace(self.folder / DONE, "")
@@ -350,8 +351,10 @@ class _GroupTraining:
 
 
 def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:
-    """Grasp success over the last grasps of every run, by its log, and the interquartile mean over
-    the seeds of each point; a run with another number of steps than the plan's does not count."""
+    """Returns grasp success of every run, by its log, and its interquartile mean over the seeds.
+
+    A run with another number of steps than the plan's does not count.
+    """
     points: list[dict[str, Any]] = []
     for point in plan.points:
         rows = [_row(folder, run) for run in runs_of(plan._replace(points=[point]))]

@@ -1,4 +1,4 @@
-"""What follows a run: trackers, evaluations on the way, and functions of your own."""
+"""Callbacks of a run: trackers, evaluations during training, functions of your own."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from csac_jax.config import Config
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One line of metrics.jsonl: how far the run is, and what a chunk did, in sums and means."""
+    """One line of metrics.jsonl: progress of the run, and sums and means of a chunk."""
 
     step: int  # training steps done
     actions: int  # actions done, over all scenes
@@ -20,7 +20,7 @@ class Record:
     grasps_counted: int  # min(grasps so far, GRASP_WINDOW); without any, success is None
     pushes: int
     grasps: int
-    outcomes: dict[str, int]  # grasps by what came of them
+    outcomes: dict[str, int]  # grasps by their outcome
     pushes_better: int  # pushes that made the best grasp worth more
     cleared: int  # blocks taken from the table
     blocks_lost: int  # blocks that left the workspace
@@ -38,7 +38,7 @@ class Record:
 
 
 class Summary(NamedTuple):
-    """How a run ended."""
+    """The end of a run."""
 
     step: int
     actions: int
@@ -50,7 +50,7 @@ class Summary(NamedTuple):
 
 
 class RunInfo(NamedTuple):
-    """What a callback is told of the run that begins."""
+    """A run that begins."""
 
     cfg: Config
     run_dir: Path
@@ -58,24 +58,24 @@ class RunInfo(NamedTuple):
 
 
 class Callback:
-    """Follows a run; a method that you leave out does nothing. Exceptions end the run."""
+    """A base for what follows a run; its methods do nothing. Exceptions end the run."""
 
     def begin(self, run: RunInfo) -> None:
-        """Before the first chunk; the folder is there."""
+        """Runs before the first chunk; the folder exists."""
 
     def chunk(self, record: Record, state: Any) -> None:
-        """After each chunk. The next one uses up `state`, a `TrainState`: copy what you keep."""
+        """Runs after each chunk. The next chunk overwrites `state`: copy what you keep."""
 
     def evaluated(self, record: Record, table: dict[str, Any]) -> None:
-        """After an evaluation on the way; `table` is as of `evaluate`."""
+        """Runs after an evaluation during training; `table` is as of `evaluate`."""
 
     def end(self, summary: Summary | None) -> None:
-        """After the last chunk; no summary if the run has failed."""
+        """Runs after the last chunk; no summary if the run has failed."""
 
 
 def joined(callbacks: Sequence[Callback | Callable[[Record], None]]) -> Callback:
-    """Several as one, called in their order; a function is called with the record of each chunk."""
-    return _Joined([one if isinstance(one, Callback) else _Function(one) for one in callbacks])
+    """Joins callbacks into one, called in order; functions are called with each chunk's record."""
+    return _Joined([call if isinstance(call, Callback) else _Function(call) for call in callbacks])
 
 
 class _Function(Callback):

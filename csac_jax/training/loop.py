@@ -28,41 +28,42 @@ SUMS = (
     "unreachable"
 )
 MEANS = "critic_loss actor_loss td_error q_mean"
-DIVERGED_SHARE = 1e-3  # of a chunk's actions: diverged physics beyond it is told; 1e-5 is common
+DIVERGED_SHARE = 1e-3  # of a chunk's actions: more diverged physics is logged; 1e-5 is common
 
 
 class TrainingError(FailedError):
-    """A run that cannot go on; the message is one line with the remedy."""
+    """A run that cannot continue; the message is one line with the remedy."""
 
 
 class Reporter(Protocol):
-    """Shows a run to somebody."""
+    """A display of a run."""
 
-    def say(self, text: str) -> None:
-        """One line about something that happened."""
+    def log(self, text: str) -> None:
+        """Shows a line about an event."""
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """After each chunk; `eta` is the time the rest will take, s, None where unknown."""
+        """Shows a chunk. `eta` is the time the rest will take, s, None where unknown."""
 
 
-class Progress(NamedTuple):
-    """What the host carries from chunk to chunk, and the checkpoint in its JSON."""
+class LoopState(NamedTuple):
+    """The host's state from chunk to chunk; the checkpoint holds it in its JSON."""
 
     seconds: float  # spent in chunks
     grasps: list[int]  # the last GRASP_WINDOW grasps, oldest first: 1 for a lift, else 0
 
 
 class _Start(NamedTuple):
-    """Where a run begins. XLA compiles what makes the state while Python traces the chunk."""
+    """The beginning of a run. XLA compiles the initial state while Python traces the chunk."""
 
     step: int
-    progress: Progress
+    loop_state: LoopState
+    saved: int | None  # step of the newest checkpoint
     shapes: Any  # of the state
     state: Future[Any]
 
 
 def total_steps(cfg: Config) -> int:
-    """Training steps of a run, rounded up to whole chunks, so that one program serves all."""
+    """Returns the training steps of a run, in whole chunks, so that one program serves all."""
     return math.ceil(cfg.train.steps / cfg.train.chunk) * cfg.train.chunk
 
 
@@ -79,22 +80,24 @@ def run(
 ) -> Summary:
     """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
 
-    Args: run_dir, exists if `resume`, else is made; init, gives the first state in a thread of its
-    own, a pytree with `step` [] int32 that is 0; compile_chunk, takes the number of steps and gives
-    a jitted function state -> (state, StepMetrics [T, ...]) that may use up its argument; at, the
-    step to resume from, by default the newest sound one; callback, which follows the run. Raises
-    TrainingError on a loss or parameter that is not finite, CheckpointError if there is nothing
-    sound to resume from or the disc is full, LockedError if another process trains in `run_dir`.
+    Args: run_dir, exists if `resume`, else is made; init, creates the initial state in a thread of
+    its own, a pytree with `step` [] int32 that is 0; compile_chunk, takes the number of steps and
+    gives a jitted function state -> (state, StepMetrics [T, ...]) that may use up its argument; at,
+    the step to resume from, by default the newest sound one. Raises TrainingError on a loss or
+    parameter that is not finite, CheckpointError if there is nothing sound to resume from or the
+    disc is full, LockedError if another process trains in `run_dir`.
     """
     checkpoint.check_path(run_dir)
     if not resume:
         run_dir.mkdir(parents=True)
     with lock.exclusive(run_dir), ThreadPoolExecutor(1) as thread:
         start = _begin(cfg, run_dir, init, resume, at, thread)
+        if resume:
+            actions = start.step * cfg.train.scenes
+            reporter.log(f"resumed {run_dir} at step {start.step} ({actions} actions)")
         callback.begin(RunInfo(cfg, run_dir, start.step))
-        how = (compile_chunk, reporter, stop, resume, callback)
         try:
-            summary = _go_on(cfg, run_dir, start, *how)
+            summary = _train(cfg, run_dir, start, compile_chunk, reporter, stop, callback)
         except Exception:
             callback.end(None)
             raise
@@ -102,22 +105,19 @@ def run(
         return summary
 
 
-def _go_on(
+def _train(
     cfg: Config,
     run_dir: Path,
     start: _Start,
     compile_chunk: Callable[[int], Any],
     reporter: Reporter,
     stop: Stop,
-    resumed: bool,
     callback: Callback,
 ) -> Summary:
-    """Trains from there on, see `run`; nobody else writes in the folder."""
-    step, progress = start.step, start.progress
+    """Trains from `start` on, see `run`; nobody else writes in the folder."""
+    step, loop_state, saved = start.step, start.loop_state, start.saved
     total, scenes = total_steps(cfg), cfg.train.scenes
-    if resumed:
-        reporter.say(f"resumed {run_dir} at step {step} ({step * scenes} actions)")
-    chunk, compile_seconds, doubted, saved = None, 0.0, False, step if resumed else None
+    chunk, compile_seconds, warned = None, 0.0, False
     while step < total and stop.signal is None:
         if chunk is None:
             chunk, compile_seconds = compile_program(cfg, compile_chunk, start.shapes, reporter)
@@ -125,28 +125,29 @@ def _go_on(
             continue  # a signal may have come meanwhile
         state, metrics, seconds = timed(chunk, state)
         step += cfg.train.chunk
-        if lost := not_finite(metrics):
-            raise TrainingError(_lost_loss(run_dir, lost, step))
+        if name := not_finite(metrics):
+            raise TrainingError(_not_finite_text(run_dir, name, step))
         # The first chunk waits for what still compiles, or for Warp to build its kernels.
-        eta = None if progress is start.progress else seconds * (total - step) / cfg.train.chunk
-        progress, record = record_chunk(cfg, step, metrics, progress, seconds)
+        first = loop_state is start.loop_state
+        eta = None if first else seconds * (total - step) / cfg.train.chunk
+        loop_state, record = record_chunk(cfg, step, metrics, loop_state, seconds)
         append(run_dir, record)
         reporter.progress(record, total * scenes, eta)
-        if not doubted and (doubt := _doubt(cfg, record)):
-            doubted = True
-            reporter.say(doubt)
+        if not warned and (warning := _physics_warning(cfg, record)):
+            warned = True
+            reporter.log(warning)
         if step % (cfg.train.save_every * cfg.train.chunk) == 0:
-            saved = _save(cfg, run_dir, step, state, progress)
+            saved = _save(cfg, run_dir, step, state, loop_state)
         callback.chunk(record, state)
     if saved != step:
         state = start.state.result() if chunk is None else state
-        _save(cfg, run_dir, step, state, progress)
-    stopped = f"stopped and saved at step {step}; go on with: csac-jax train --resume {run_dir}"
+        _save(cfg, run_dir, step, state, loop_state)
+    stopped = f"stopped and saved at step {step}; continue with: csac-jax train --resume {run_dir}"
     done = f"done: {step * scenes} actions; saved in {run_dir}"
-    reporter.say(done if stop.signal is None else stopped)
-    actions, grasps = step * scenes, progress.grasps
+    reporter.log(done if stop.signal is None else stopped)
+    actions, grasps = step * scenes, loop_state.grasps
     return Summary(
-        step, actions, progress.seconds, compile_seconds, mean(grasps), len(grasps), stop.signal
+        step, actions, loop_state.seconds, compile_seconds, mean(grasps), len(grasps), stop.signal
     )
 
 
@@ -158,29 +159,29 @@ def _begin(
     at: int | None,
     thread: ThreadPoolExecutor,
 ) -> _Start:
-    """The first state, on its way, or that of a checkpoint, to which the log is cut."""
+    """Starts to create the initial state, or restores a checkpoint and cuts the log to it."""
     if resume:
         check_resumable(cfg, run_dir, at)
     files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
     shapes = jax.eval_shape(init)
     if not resume:
         files.truncate_log(run_dir / files.METRICS, 0)
-        return _Start(0, Progress(0.0, []), shapes, thread.submit(init))
+        return _Start(0, LoopState(0.0, []), None, shapes, thread.submit(init))
     state, extra = checkpoint.restore(run_dir, shapes, at)
     checkpoint.set_aside(run_dir, at)
     step = int(state.step)
     files.truncate_log(run_dir / files.METRICS, step)
-    progress = Progress(extra["seconds"], extra["grasps"])
-    return _Start(step, progress, shapes, thread.submit(lambda: state))
+    loop_state = LoopState(extra["seconds"], extra["grasps"])
+    return _Start(step, loop_state, step, shapes, thread.submit(lambda: state))
 
 
-def _save(cfg: Config, run_dir: Path, step: int, state: Any, progress: Progress) -> int:
-    checkpoint.save(run_dir, step, state, cfg, progress._asdict())
+def _save(cfg: Config, run_dir: Path, step: int, state: Any, loop_state: LoopState) -> int:
+    checkpoint.save(run_dir, step, state, cfg, loop_state._asdict())
     return step
 
 
 def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
-    """Raises SettingsError where the run has other settings, CheckpointError where it is none."""
+    """Raises SettingsError if the run has other settings, CheckpointError if there is no run."""
     stored = checkpoint.load_config(run_dir, at)
     longer = stored.change(train={"actions": max(stored.train.actions, cfg.train.actions)})
     if names := configs.differences(longer, cfg):
@@ -193,20 +194,20 @@ def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
 def compile_program(
     cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter
 ) -> tuple[Any, float]:
-    """The compiled chunk for such a state, and the seconds that it took."""
-    reporter.say("compiling the training program; this takes a while, once")
+    """Compiles a chunk for states like this; returns it and the seconds that it took."""
+    reporter.log("compiling the training program; this takes a while, once")
     if cfg.sim.physics == "warp":
-        reporter.say("then Warp builds its kernels, on a new machine for minutes")
+        reporter.log("then Warp builds its kernels, on a new machine for minutes")
     begun, hits = time.perf_counter(), cache.hits()
     program = compiler.lower(compile_chunk(cfg.train.chunk), state).compile()
     seconds = time.perf_counter() - begun
     source = " (from the cache)" if cache.hits() > hits else ""
-    reporter.say(f"compiled in {seconds:.1f} s{source}; {memory.compiled_text(program)}")
+    reporter.log(f"compiled in {seconds:.1f} s{source}; {memory.compiled_text(program)}")
     return program, seconds
 
 
 def timed(chunk: Callable[[Any], Any], state: Any) -> tuple[Any, Any, float]:
-    """What a chunk makes of a state: the next one, metrics on the host, and the seconds it took."""
+    """Runs a chunk; returns the next state, metrics on the host, and the seconds it took."""
     begun = time.perf_counter()
     state, metrics = chunk(state)
     metrics = jax.device_get(metrics)
@@ -214,13 +215,14 @@ def timed(chunk: Callable[[Any], Any], state: Any) -> tuple[Any, Any, float]:
 
 
 def not_finite(metrics: Any) -> str | None:
-    """What of a run's chunk is not finite, if anything; losses of the warm-up do not count."""
-    losses = {name: getattr(metrics, name)[metrics.learned] for name in LOSSES}
-    lost = next((name for name, loss in losses.items() if not np.isfinite(loss).all()), None)
-    return lost or (None if metrics.finite.all() else "a parameter")
+    """Returns the name of the first non-finite loss, or None; those of the warm-up do not count."""
+    for name in LOSSES:
+        if not np.isfinite(getattr(metrics, name)[metrics.learned]).all():
+            return name
+    return None if metrics.finite.all() else "a parameter"
 
 
-def _lost_loss(run_dir: Path, name: str, step: int) -> str:
+def _not_finite_text(run_dir: Path, name: str, step: int) -> str:
     last = checkpoint.latest_step(run_dir)
     kept = "no checkpoint was saved" if last is None else f"the checkpoint of step {last} is kept"
     return (
@@ -229,20 +231,21 @@ def _lost_loss(run_dir: Path, name: str, step: int) -> str:
     )
 
 
-def _doubt(cfg: Config, record: Record) -> str | None:
+def _physics_warning(cfg: Config, record: Record) -> str | None:
+    """Returns a warning if physics diverged in too many actions of a chunk."""
     diverged, actions = record.physics_diverged, cfg.train.chunk * cfg.train.scenes
     if diverged <= max(DIVERGED_SHARE * actions, 1.0):
         return None
     return (
         f"physics failed in {diverged} of the last {actions} actions, whose scenes were dropped; "
-        f"before you trust this run, try another --sim.physics than {cfg.sim.physics}"
+        f"before you trust this run, try another sim.physics than {cfg.sim.physics}"
     )
 
 
 def record_chunk(
-    cfg: Config, step: int, metrics: Any, before: Progress, seconds: float
-) -> tuple[Progress, Record]:
-    """The log's line for a chunk with `metrics` [T, E] that took `seconds`."""
+    cfg: Config, step: int, metrics: Any, before: LoopState, seconds: float
+) -> tuple[LoopState, Record]:
+    """Summarises a chunk with `metrics` [T, E] that took `seconds`."""
     grasped = metrics.primitive == Primitive.GRASP
     outcomes = metrics.outcome[grasped]  # in order of time, then of scene
     window = collections.deque(before.grasps, maxlen=GRASP_WINDOW)
@@ -265,11 +268,11 @@ def record_chunk(
         **sums,
         **means,
     )
-    return Progress(before.seconds + seconds, list(window)), record
+    return LoopState(before.seconds + seconds, list(window)), record
 
 
 def mean(values: Sequence[float] | np.ndarray) -> float | None:
-    """The mean; None of no values."""
+    """Returns the mean, or None of no values."""
     return float(np.mean(values)) if len(values) else None
 
 

@@ -1,5 +1,4 @@
-"""Whether a run fits into memory: the bytes of its state are known before anything is compiled,
-what its program needs besides once XLA has compiled it."""
+"""Memory of a run: that of its state is known before anything is compiled."""
 
 import math
 import os
@@ -8,22 +7,25 @@ from typing import Any
 import jax
 
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 from csac_jax.replay import ring
-from csac_jax.training import halves, step
+from csac_jax.training import program, split_step
 
 GIB = 2**30
 
 
 def limit() -> int:
-    """Bytes of the first device: its own limit, or this machine's memory if it states none (CPUs).
-    All, not what is free: the system gives up its caches for a run."""
+    """Returns the bytes of the first device; this machine's memory if it states none (CPUs).
+
+    All, not what is free: the system gives up its caches for a run.
+    """
     stats = jax.devices()[0].memory_stats() or {}
     return stats.get("bytes_limit") or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def state_bytes(cfg: Config) -> dict[str, int]:
-    """Bytes of a run's state by part. Traces the networks, which takes seconds."""
-    state = step.abstract_state(cfg)
+    """Returns the bytes of a run's state by part; tracing the networks takes seconds."""
+    state = program.abstract_state(cfg)
     parts = {"replay": state.replay, "scenes": state.scenes, "networks": state.learner}
 
     def size(part: Any) -> int:
@@ -33,27 +35,25 @@ def state_bytes(cfg: Config) -> dict[str, int]:
 
 
 def check(cfg: Config, runs: int = 1) -> None:
-    """Raises ValueError if a device cannot hold the rings of `runs` runs side by side."""
-    available, slot = limit(), ring.bytes_needed(1, step.example(cfg))
+    """Raises SettingsError if a device cannot hold the rings of `runs` runs side by side."""
+    available, slot = limit(), ring.bytes_needed(1, program.example(cfg))
     needed, capacity = runs * cfg.replay.capacity * slot, available // (runs * slot)
     if needed <= available:
         return
     taken = f"the replay takes {needed / GIB:.1f} GiB, there are {available / GIB:.1f}"
-    remedy = f"lower --replay.capacity from {cfg.replay.capacity} to {capacity} at most"
+    remedy = f"lower replay.capacity from {cfg.replay.capacity} to {capacity} at most"
     if capacity < max(cfg.train.scenes, cfg.learn.batch):
-        remedy = "lower --heightmap.size"
+        remedy = "lower heightmap.size"
     if runs > 1:
         taken = f"{taken}, enough for {available // (needed // runs)} of {runs} runs side by side"
-        remedy = f"{remedy}, lower --seeds or raise --devices"
-    raise ValueError(f"replay.capacity: {taken}; {remedy}")
+        remedy = f"{remedy}, lower seeds or raise devices"
+    raise SettingsError(f"replay.capacity: {taken}; {remedy}")
 
 
 def compiled_text(compiled: Any) -> str:
-    """What a compiled chunk takes, by XLA's own numbers, as text."""
-    acts = compiled.act if isinstance(compiled, halves.Chunk) else compiled
+    """Describes the memory of a compiled chunk, by XLA's own numbers."""
+    acts = compiled.act if isinstance(compiled, split_step.Chunk) else compiled
     stats = acts.memory_analysis()
     state, temporary = stats.argument_size_in_bytes / GIB, stats.temp_size_in_bytes / GIB
-    besides = "; what learns compiles meanwhile"
-    if acts is compiled:
-        besides = f" and {temporary:.2f} GiB besides"
-    return f"the program takes {state:.2f} GiB for states{besides}"
+    rest = f" and {temporary:.2f} GiB besides" if acts is compiled else "; learning still compiles"
+    return f"the program takes {state:.2f} GiB for states{rest}"

@@ -11,12 +11,14 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from csac_jax.errors import SettingsError
+
 Shard = Literal["seeds", "scenes"]
 AXIS = "devices"
 
 
 def map_scenes(mesh: Mesh | None, function: Callable) -> Callable:
-    """`function` of leaves [E, ...] to leaves [E, ...], each device of a mesh on its own scenes."""
+    """Runs `function`, leaves [E, ...] to leaves [E, ...], on each device for its own scenes."""
     if mesh is None:
         return function
     along = PartitionSpec(AXIS)
@@ -24,7 +26,7 @@ def map_scenes(mesh: Mesh | None, function: Callable) -> Callable:
 
 
 def shard_batch(mesh: Mesh | None, tree: Any) -> Any:
-    """Leaves [B, ...], of which each device of a mesh holds its share."""
+    """Lays out leaves [B, ...], of which each device of a mesh holds its share."""
     if mesh is None:
         return tree
     along = NamedSharding(mesh, PartitionSpec(AXIS))
@@ -32,23 +34,26 @@ def shard_batch(mesh: Mesh | None, tree: Any) -> Any:
 
 
 def make(devices: int | None) -> Mesh | None:
-    """A line of the first `devices` devices; no mesh for a single one. None stands for one, or for
-    all of several processes, which use no fewer. Raises ValueError if there are not so many."""
+    """Makes a mesh of the first `devices` devices; None for a single one.
+
+    By default one device, or all of several processes, which use no fewer. Raises SettingsError if
+    there are not so many.
+    """
     present, alone = jax.devices(), jax.process_count() == 1
     wanted = (1 if alone else len(present)) if devices is None else devices
     if not alone and wanted != len(present):
-        raise ValueError(f"--devices: leave it out, several processes use all {len(present)}")
+        raise SettingsError(f"devices: leave it out, several processes use all {len(present)}")
     if not 1 <= wanted <= len(present):
         there = f"there are {len(present)} ({present[0].platform}); give 1 .. {len(present)}"
-        raise ValueError(f"--devices: {wanted} asked for, {there}")
+        raise SettingsError(f"devices: {wanted} asked for, {there}")
     return None if wanted == 1 else Mesh(np.array(present[:wanted]), (AXIS,))
 
 
 def check(mesh: Mesh | None, shard: Shard, runs: int, scenes: int, batch: int) -> None:
-    """Raises ValueError where the devices cannot divide the runs, or scenes and batch, evenly."""
+    """Raises SettingsError if the devices cannot divide the runs, or scenes and batch, evenly."""
     size = 1 if mesh is None else mesh.size
     by_scenes = {"train.scenes": scenes, "learn.batch": batch}
-    for name, number in ({"--seeds": runs} if shard == "seeds" else by_scenes).items():
+    for name, number in ({"seeds": runs} if shard == "seeds" else by_scenes).items():
         if number % size:
-            remedy = f"give a multiple of {size}, or other --devices"
-            raise ValueError(f"{name}: {number} does not divide among {size} devices; {remedy}")
+            remedy = f"give a multiple of {size}, or another number of devices"
+            raise SettingsError(f"{name}: {number} does not divide among {size} devices; {remedy}")

@@ -25,7 +25,7 @@ from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
 from csac_jax.runtime import compiler, provenance
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from csac_jax.vision.heightmap import Observation
 from experiments.bench._options import read
 from experiments.bench._timing import medians
@@ -112,7 +112,7 @@ def _update_memory(learner: ActorCritic) -> int:
     size = learner.cfg.learn.batch
     batch = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape), leaf.dtype),
-        step.example(learner.cfg),
+        programs.example(learner.cfg),
     )
     update = jax.jit(lambda *given: critic.update(jax.random.key(0), learner, *given))
     compiled = update.lower(state, batch, jax.ShapeDtypeStruct((size,), jnp.float32)).compile()

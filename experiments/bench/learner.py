@@ -31,7 +31,7 @@ from csac_jax.nets import dense, networks
 from csac_jax.nets.convolution import conv2d
 from csac_jax.runtime import compiler, provenance
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from csac_jax.vision import heightmap
 from experiments.bench._options import Parser, config, split
 from experiments.bench._timing import medians
@@ -77,7 +77,7 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
     keys = jax.random.split(jax.random.key(1), cfg.learn.batch)
     packed = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct((cfg.learn.batch, *leaf.shape), leaf.dtype),
-        step.example(cfg).obs,
+        programs.example(cfg).obs,
     )
     obs = jit(heightmap.unpack)(_random(packed))
     turn = jit(lambda obs: jax.vmap(maps.rotated_inputs, (None, 0))(parts.frames, obs))

@@ -43,7 +43,7 @@ from csac_jax.replay import ring
 from csac_jax.runtime import cache, compiler, provenance
 from csac_jax.sim import backend
 from csac_jax.sim.primitives import Action
-from csac_jax.training import halves, step
+from csac_jax.training import program as programs, split_step, step, transitions
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
 from experiments.bench._options import Parser, config, split, with_blocks
@@ -59,10 +59,10 @@ def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[s
     """The compiled chunk, seconds to trace it and to compile it. Of two programs the second is
     traced while the first compiles, and counts as compilation."""
     begun = time.perf_counter()
-    lowered = compiler.lower(halves.compile_chunk(program, steps), state)
+    lowered = compiler.lower(split_step.compile_chunk(program, steps), state)
     traced = time.perf_counter()
     compiled = lowered.compile()
-    if isinstance(compiled, halves.Chunk):
+    if isinstance(compiled, split_step.Chunk):
         compiled.learn.result()  # waits for it
     return compiled, {"trace": traced - begun, "compile": time.perf_counter() - traced}
 
@@ -121,7 +121,9 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         return choose(keys, parts, maps, steps_without_change, jnp.int32(0))
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
-        result = step.action_result(action, step.judged(cfg.reward, after).info)
+        result = transitions.to_action_result(
+            action, transitions.with_reward_outcome(cfg.reward, after).info
+        )
         return learner.reward(cfg.reward, nets, before.obs, after.obs, result)[0]
 
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
@@ -254,7 +256,7 @@ def _rates(cfg: Config, seconds: float) -> dict[str, float]:
 
 def _memory(chunk: Any) -> dict[str, int | None]:
     """Bytes of the program, of two that of the one that learns, which needs more."""
-    program = chunk.learn.result() if isinstance(chunk, halves.Chunk) else chunk
+    program = chunk.learn.result() if isinstance(chunk, split_step.Chunk) else chunk
     stats, device = program.memory_analysis(), jax.devices()[0].memory_stats() or {}
     return {
         "state_bytes": stats.argument_size_in_bytes,
@@ -288,8 +290,8 @@ def _autodiff_conv(maps: jax.Array, kernel: jax.Array) -> jax.Array:
 
 def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     """Times of one config's step and of its stages."""
-    program = step.make(cfg)
-    state = step.init(program)
+    program = programs.make(cfg)
+    state = programs.init(program)
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
     seconds = medians(
@@ -337,8 +339,8 @@ def _at(cfg: Config, curve: str, value: int) -> Config:
 
 def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dict[str, Any]:
     """One point of a curve: the whole step alone."""
-    program = step.make(cfg)
-    state = step.init(program)
+    program = programs.make(cfg)
+    state = programs.init(program)
     chunk, compiling = _compile(program, state, steps)
     seconds = medians({"whole": _whole(chunk, cfg, state)}, repeats)["whole"] / steps
     return {

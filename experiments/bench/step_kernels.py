@@ -27,7 +27,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.runtime import cache, provenance
 from csac_jax.sim import backend
 from csac_jax.sweeps import replicas
-from csac_jax.training import sharding, step
+from csac_jax.training import program as programs, sharding, step
 from experiments.bench._options import Parser, config, split
 
 KINDS = {  # the first that a kernel's name holds
@@ -77,10 +77,10 @@ def _traced(folder: Path) -> Iterable[tuple[str, float, float]]:
 def _compiled(program: step.Program, mesh: Mesh | None, seeds: int) -> tuple[Any, Any]:
     """The state of a run, or of several seeds, and its compiled step."""
     if mesh is None and seeds == 1:
-        return step.init(program), step.compile_chunk(program, 1)
+        return programs.init(program), programs.compile_chunk(program, 1)
     configs = [dataclasses.replace(program.cfg, seed=seed) for seed in range(seeds)]
     (group,) = replicas.group_configs(configs)
-    runs = replicas.SweepProgram(program, replicas.of_group(group), mesh, _shard(seeds))
+    runs = replicas.SweepProgram(program, replicas.group_replicas(group), mesh, _shard(seeds))
     return runs.init(), runs.compile_chunk(1)
 
 
@@ -106,7 +106,7 @@ def main(arguments: list[str]) -> None:
     except ValueError as error:
         raise BadArgumentsError(f"bench step_kernels: {error}") from None
     cache.enable()
-    state, chunk = _compiled(step.make(cfg), mesh, seeds)
+    state, chunk = _compiled(programs.make(cfg), mesh, seeds)
     for _ in range(2):
         state, _ = chunk(state)
     jax.block_until_ready(state)

@@ -27,7 +27,7 @@ from csac_jax.config import Config
 from csac_jax.runtime import compiler, provenance
 from csac_jax.sim import backend
 from csac_jax.sweeps import grid, replicas, runner
-from csac_jax.training import sharding, step
+from csac_jax.training import program as programs, sharding, step
 from experiments.bench._options import Parser, config, split
 
 
@@ -59,7 +59,7 @@ def measure(
     sharding.check(mesh, shard, seeds, cfg.train.scenes, cfg.learn.batch)
     (group,) = replicas.group_configs([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
     parts = replicas.num_parts(cfg, seeds, mesh)
-    together = replicas.SweepProgram(program, replicas.of_group(group), mesh, shard, parts)
+    together = replicas.SweepProgram(program, replicas.group_replicas(group), mesh, shard, parts)
     row = _timed(together.compile_chunk(steps), together.init(), repeats)
     rate = seeds * cfg.train.scenes * steps / row["seconds"]
     return {"seeds": seeds, "devices": devices, "parts": parts, **row, "actions_per_second": rate}
@@ -95,10 +95,12 @@ def main(arguments: list[str]) -> None:
             runner.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
         raise BadArgumentsError(f"bench sweep: {error}") from None
-    program = step.make(cfg)
+    program = programs.make(cfg)
     with_train = 1 in options.seeds and 1 in options.devices
     alone = (
-        _timed(step.compile_chunk(program, options.steps), step.init(program), options.repeats)
+        _timed(
+            programs.compile_chunk(program, options.steps), programs.init(program), options.repeats
+        )
         if with_train
         else None
     )

@@ -15,7 +15,7 @@ from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.constants import Primitive
 from csac_jax.env import State
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from tests.agent import toys
 from tests.agent.toys import Toy
 
@@ -42,8 +42,8 @@ def learn(
     episodes."""
     cfg = toys.config(algo, actions, cap, push)
     toy = problem(cfg)
-    program = step.make(cfg, env=toy)
-    state, metrics = step.compile_chunk(program, cfg.train.steps)(step.init(program))
+    program = programs.make(cfg, env=toy)
+    state, metrics = programs.compile_chunk(program, cfg.train.steps)(programs.init(program))
     assert np.all(np.isfinite(metrics.critic_loss))
     begun, ended, primitives = jax.jit(functools.partial(_play, toy, actor_critic.make(cfg)))(
         jax.random.key(99), state.learner.online

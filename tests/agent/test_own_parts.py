@@ -15,7 +15,7 @@ from csac_jax.nets import dense
 from csac_jax.replay import ring
 from csac_jax.replay.samplers import Sample, Sampler
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step
+from csac_jax.training import program as programs, step, transitions
 from tests.agent import toys
 
 pytestmark = pytest.mark.optax
@@ -64,12 +64,12 @@ class Tiny(nn.Module):
         return nn.Dense(dense.OUTPUTS)(features), features
 
 
-def _trained(**parts) -> tuple[Any, step.TrainState, step.StepMetrics]:
+def _trained(**parts) -> tuple[Any, step.TrainState, transitions.StepMetrics]:
     """The learner's first state in a run with these parts, the run's last one, and its metrics."""
-    program = step.make(CFG, env=toys.Toy(CFG, (toys.GOOD, toys.DUD) * 5), **parts)
-    first = step.init(program)
+    program = programs.make(CFG, env=toys.Toy(CFG, (toys.GOOD, toys.DUD) * 5), **parts)
+    first = programs.init(program)
     learner = jax.tree.map(jnp.copy, first.learner)
-    return learner, *step.compile_chunk(program, STEPS)(first)
+    return learner, *programs.compile_chunk(program, STEPS)(first)
 
 
 def test_sampler_needs_sample_alone():

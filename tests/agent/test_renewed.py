@@ -16,7 +16,7 @@ from csac_jax.agent.learner import Transition
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from csac_jax.vision import heightmap
 from tests.agent import toys
 
@@ -88,8 +88,8 @@ def test_stored_label_stays_as_an_option(cfg, observations):
     learner = actor_critic.make(cfg, Height())
     batch = _batch(observations, False, -0.5).replace(push_better=None)
     assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
-    assert step.example(learner.cfg).push_better is None
-    assert step.example(cfg.change(reward={"push_effect": "renewed"})).push_better.dtype == bool
+    assert programs.example(learner.cfg).push_better is None
+    assert programs.example(cfg.change(reward={"push_effect": "renewed"})).push_better.dtype == bool
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from csac_jax import config
 from csac_jax.agent import critic, losses, policy, rewards
 from csac_jax.config import CEMConfig, LearnConfig, PolicyConfig, RewardConfig, TargetConfig
 from csac_jax.replay import samplers
-from csac_jax.training import step
+from csac_jax.training import transitions
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from csac_jax.training import step
         (policy.PRIMITIVE_RULES, PolicyConfig, "primitive"),
         (rewards.GOOD_PUSH, RewardConfig, "push_effect"),
         (losses.TD_LOSSES, LearnConfig, "loss"),
-        (step.BOOTSTRAPS, TargetConfig, "bootstrap"),
+        (transitions.BOOTSTRAPS, TargetConfig, "bootstrap"),
     ],
 )
 def test_tables_are_total(table, section, name):

@@ -24,10 +24,10 @@ from csac_jax.config import BetaReplay, Config, DenseNet121, SceneConfig, Sectio
 from csac_jax.errors import DataWarning
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
-from csac_jax.report.progress import Terminal
 from csac_jax.runtime import signals
 from csac_jax.scene import pool
 from csac_jax.training.callbacks import Summary
+from csac_jax.training.progress import Terminal
 
 ROOT = Path(csac_jax.__file__).parents[1]
 SMOKE = presets.smoke()
@@ -928,7 +928,7 @@ def test_doctor_shows_memory(
 ):
     """Claim: `doctor --preset X`, with any settings, says what the state of such a run takes, part
     by part."""
-    from csac_jax.runtime import selftest
+    from csac_jax.sim import selftest
 
     monkeypatch.setattr(selftest, "CHECKS", ())
     flags = "--preset smoke --scene.slots box box --scene.min-blocks 1"
@@ -949,8 +949,7 @@ def test_doctor_shows_memory(
 
 def test_doctor_builds_kernels(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: `doctor --build` makes what Warp needs for as many scenes as the preset has."""
-    from csac_jax.runtime import selftest
-    from csac_jax.sim import physics, warp_physics
+    from csac_jax.sim import physics, selftest, warp_physics
 
     made: list[int] = []
     fake = types.SimpleNamespace(prepared=made.append)
@@ -973,7 +972,8 @@ def test_doctor_names_the_library(
     said: str,
 ):
     """Claim: `doctor` says by which of XLA's libraries training computes convolutions."""
-    from csac_jax.runtime import compiler, selftest
+    from csac_jax.runtime import compiler
+    from csac_jax.sim import selftest
 
     monkeypatch.setattr(selftest, "CHECKS", ())
     monkeypatch.setattr(compiler, "has_library", lambda: found)
@@ -985,7 +985,7 @@ def test_doctor_names_the_library(
 @pytest.mark.parametrize("error", [1.0, float("nan")])
 def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, error: float):
     """Claim: a check that fails, or gives NaN, is exit code 1 and one line that names it."""
-    from csac_jax.runtime import selftest
+    from csac_jax.sim import selftest
 
     monkeypatch.setattr(
         selftest, "CHECKS", (("sums", lambda: error, 0.5), ("products", lambda: 0.0, 0.5))

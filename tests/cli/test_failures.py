@@ -18,10 +18,10 @@ from csac_jax.cli import doctor, failures
 from csac_jax.errors import FailedError, SceneError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.render import gl
-from csac_jax.report.progress import Terminal
 from csac_jax.runtime import cache, signals
-from csac_jax.training import loop, step
+from csac_jax.training import loop, program as programs
 from csac_jax.training.callbacks import Summary
+from csac_jax.training.progress import Terminal
 
 SMOKE = presets.smoke()
 
@@ -146,7 +146,7 @@ def test_training_that_fails(
     """Claim: a run that fails is one line and an exit code; a folder that someone else has made
     meanwhile as well."""
     monkeypatch.setattr(cache, "enable", lambda: None)
-    monkeypatch.setattr(step, "make", lambda cfg, **_: None)
+    monkeypatch.setattr(programs, "make", lambda cfg, **_: None)
     monkeypatch.setattr(loop, "run", _raises(error))
     assert cli.main(["train", "smoke", "--run-dir", "there"]) == code
     assert capsys.readouterr().err == f"csac-jax: {line}\n"
@@ -247,7 +247,7 @@ def test_lines_are_printed_on_any_terminal(
 
     def say(arguments: list[str]) -> int:
         with Terminal(Console()) as terminal:
-            terminal.say("compiled")
+            terminal.log("compiled")
         return 0
 
     monkeypatch.setitem(cli.COMMANDS, "doctor", say)
@@ -284,7 +284,7 @@ def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):
     """Claim: the folder of `--json` is made; where it cannot be, train.json is there all the same,
     and there is one line."""
     monkeypatch.setattr(cache, "enable", lambda: None)
-    monkeypatch.setattr(step, "make", lambda cfg, **_: None)
+    monkeypatch.setattr(programs, "make", lambda cfg, **_: None)
     summary = Summary(*[0] * len(Summary._fields))
     monkeypatch.setattr(loop, "run", lambda *_, **__: summary)
     assert cli.main(["train", "smoke", "--run-dir", "a", "--json", "new/folder/out.json"]) == 0

@@ -62,7 +62,7 @@ class Notes(Callback):
     def end(self, summary: Summary | None) -> None:
         self.ends.append(summary)
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         self.lines.append(text)
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
@@ -108,7 +108,7 @@ def _run(
     cfg: Config = CFG,
 ) -> Summary:
     """A run of the tiny program, evaluated if `every`."""
-    watched = [Monitor(cfg, EvalPlan(every), notes, notes.say)] if every else []
+    watched = [Monitor(cfg, EvalPlan(every), notes, notes.log)] if every else []
     joined = callbacks.joined([notes, *watched, *others])
     return loop.run(cfg, folder, _first, _chunk, notes, notes.stop, resume, callback=joined)
 

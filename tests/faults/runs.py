@@ -24,7 +24,7 @@ from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint, files
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import loop, step
+from csac_jax.training import loop, program as programs, step, transitions
 from csac_jax.training.loop import TrainingError
 from tests.faults import harness, toy, toy_cli
 from tests.faults.harness import MissingToolError, Tally, fault
@@ -667,10 +667,10 @@ def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally
         replay={"capacity": 128},
         train={"scenes": 64, "learning_starts": 64, "actions": 6400},
     )
-    program = step.make(cfg)
-    compiled = step.compile_chunk(program, 1).lower(start := step.init(program)).compile()
+    program = programs.make(cfg)
+    compiled = programs.compile_chunk(program, 1).lower(start := programs.init(program)).compile()
 
-    def run(state: step.TrainState) -> tuple[step.TrainState, step.StepMetrics]:
+    def run(state: step.TrainState) -> tuple[step.TrainState, transitions.StepMetrics]:
         state, metrics = compiled(jax.tree.map(jnp.copy, state))
         return state, jax.device_get(metrics)
 

@@ -31,7 +31,7 @@ from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
 from csac_jax.training import loop
 from csac_jax.training.callbacks import Record, Summary
-from csac_jax.training.step import StepMetrics
+from csac_jax.training.transitions import StepMetrics
 from tests.metrics import step_metrics
 
 E = 3  # scenes
@@ -104,7 +104,7 @@ class Quiet:
         self.stop, self.said, self.chunks = stop or signals.Stop(), [], 0
         self._stop_after = stop_after
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Reporter."""
         self.said.append(text)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 from csac_jax import cli
 from csac_jax.config import Config
-from csac_jax.training import halves, memory, step
+from csac_jax.training import memory, program as programs, split_step
 from tests.faults import toy
 
 OPTIONS = ("--train.scenes", f"{toy.E}", "--train.chunk", "1", "--train.save-every", "1")
@@ -29,8 +29,8 @@ def _compile_chunk(cfg: Config, num_steps: int, **_: object) -> object:
 
 
 if __name__ == "__main__":
-    step.make, step.compile_init = _make, _compile_init  # type: ignore
-    halves.compile_chunk = _compile_chunk  # type: ignore
-    step.prepare = lambda _: None
+    programs.make, programs.compile_init = _make, _compile_init  # type: ignore
+    split_step.compile_chunk = _compile_chunk  # type: ignore
+    programs.prepare = lambda _: None
     memory.check = lambda *_: None  # type: ignore
     sys.exit(cli.main(sys.argv[1:]))

@@ -20,7 +20,7 @@ from csac_jax import presets
 from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint, leaves, renames
 from csac_jax.io.checkpoint import CheckpointError
-from csac_jax.training import step as training
+from csac_jax.training import program as programs
 
 CFG = presets.smoke()
 
@@ -415,6 +415,6 @@ def test_added_leaves_are_zero_in_older_checkpoints(tmp_path: Path):
 def test_states_leaves_have_the_names_of_today():
     """Claim: `renames.STATE` and `renames.ADDED` name leaves that a run's state has."""
     cfg = CFG.change(sensor={"dropped": 0.1})  # only with noise there is a key of noise
-    names = leaves.named(training.abstract_state(cfg)).keys()
+    names = leaves.named(programs.abstract_state(cfg)).keys()
     assert {*renames.STATE.values(), *renames.ADDED} <= names
     assert not set(renames.STATE) & names

@@ -7,7 +7,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import BetaReplay, OppositeReplay, PrioritisedReplay, UniformReplay
 from csac_jax.replay import ring, samplers
-from csac_jax.training import step
+from csac_jax.training import program as programs
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_bytes_are_those_of_the_ring(preset):
     """Claim: the predicted memory is that of the arrays: two maps of 6 bytes per cell, and 26 bytes
     besides."""
     cfg = presets.get(preset)
-    example = step.example(cfg)
+    example = programs.example(cfg)
     sampler = samplers.make(cfg.replay)
     state = jax.eval_shape(lambda: ring.init(sampler.init(cfg.replay.capacity), example))
     arrays = [*jax.tree.leaves(state.items), state.priority]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from csac_jax.io import checkpoint
-from csac_jax.training import step
+from csac_jax.training import program as programs
 
 pytestmark = [pytest.mark.mjx, pytest.mark.optax, pytest.mark.slow]
 
@@ -41,8 +41,8 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def _state(run_dir: Path) -> list[np.ndarray]:
-    program = step.make(checkpoint.load_config(run_dir))
-    state, _ = checkpoint.restore(run_dir, jax.eval_shape(lambda: step.init(program)))
+    program = programs.make(checkpoint.load_config(run_dir))
+    state, _ = checkpoint.restore(run_dir, jax.eval_shape(lambda: programs.init(program)))
     return [
         np.asarray(leaf)
         for leaf in jax.tree.leaves(state.replace(key=jax.random.key_data(state.key)))

@@ -17,7 +17,7 @@ import numpy as np
 
 from csac_jax.io import checkpoint
 from csac_jax.sweeps import replicas
-from csac_jax.training import sharding, step
+from csac_jax.training import program as programs, sharding, step
 from tests.training import toys
 
 SEEDS = {"seeds": 8, "scenes": 2}
@@ -32,7 +32,7 @@ def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
         [dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])]
     )
     program = replicas.SweepProgram(
-        toys.program(cfg), replicas.of_group(group), sharding.make(devices), shard
+        toys.program(cfg), replicas.group_replicas(group), sharding.make(devices), shard
     )
     state = program.init()
     places = jax.tree.map(lambda leaf: leaf.sharding, state)
@@ -87,6 +87,6 @@ def compare(shard: str, folder: Path) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    step.init_state, step.train_step = toys.init_state, toys.train_step
+    programs.init_state, step.train_step = toys.init_state, toys.train_step
     found = {shard: compare(shard, Path(sys.argv[1])) for shard in SEEDS}
     print(json.dumps({"devices": len(jax.devices()), **found}))

@@ -19,7 +19,7 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.sweeps import replicas
-from csac_jax.training import sharding, step
+from csac_jax.training import program as programs, sharding, step
 from tests.sweeps.eight_devices import _difference
 
 SCENES = 8
@@ -40,7 +40,7 @@ def run(program: step.Program, devices: int) -> tuple[Any, Any]:
     """State and metrics [T, 1, ...] after STEPS steps."""
     (group,) = replicas.group_configs([program.cfg])
     line = sharding.make(devices)
-    together = replicas.SweepProgram(program, replicas.of_group(group), line, "scenes")
+    together = replicas.SweepProgram(program, replicas.group_replicas(group), line, "scenes")
     return jax.device_get(together.compile_chunk(STEPS)(together.init()))
 
 
@@ -62,5 +62,5 @@ def compare(one: tuple[Any, Any], other: tuple[Any, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    made = step.make(config())
+    made = programs.make(config())
     print(json.dumps({"devices": len(jax.devices()), **compare(run(made, 1), run(made, SCENES))}))

@@ -12,7 +12,7 @@ from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import sharding, step
+from csac_jax.training import program as programs, sharding, step
 from tests.training import toys
 
 
@@ -22,7 +22,7 @@ class Reporter:
     def __init__(self, stop: Stop, after: int) -> None:
         self._stop, self._after = stop, after
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Reporter."""
 
     def progress(self, record: object, total_actions: int, eta: float | None) -> None:
@@ -36,7 +36,11 @@ def main(folder: str, after: str, shard: str, *place: str) -> int:
     """Exit code: 0 if the sweep is done, 15 if it was stopped."""
     if place:
         cluster.join(place[0], int(place[1]), int(place[2]))
-    step.init_state, step.train_step, step.make = toys.init_state, toys.train_step, toys.program
+    programs.init_state, step.train_step, programs.make = (
+        toys.init_state,
+        toys.train_step,
+        toys.program,
+    )
     line, stop = sharding.make(None), Stop()
     assert (line is not None) == bool(place)
     plan = runner.SweepPlan(2, [SweepPoint("a", {}, toys.CFG)])

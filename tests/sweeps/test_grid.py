@@ -8,7 +8,7 @@ from csac_jax.cli.sweep import SweepOptions
 from csac_jax.config import Config
 from csac_jax.io import configs
 from csac_jax.sweeps import grid
-from csac_jax.training import step
+from csac_jax.training import program as programs
 
 
 def _points(varied: list[str]) -> list[grid.SweepPoint]:
@@ -69,7 +69,7 @@ def test_switches_are_changes_of_the_preset():
     found = {point.values["switch"]: point.cfg for point in grid.points([varied], configure)}
     changed = {name: dict(grid.settings_of("switch", name)) for name in found}
     for name, cfg in found.items():
-        assert cfg == step.replace_settings(base, changed[name])
+        assert cfg == programs.replace_settings(base, changed[name])
         assert set(configs.differences(base, cfg)) == set(changed[name])
     assert changed["none"] == {}
     assert len({str(sorted(each)) for each in changed.values()}) == len(grid.SWITCHES)

@@ -11,7 +11,7 @@ import pytest
 from csac_jax import algorithms, presets
 from csac_jax.sweeps import replicas
 from csac_jax.sweeps.replicas import Replicas, SweepProgram
-from csac_jax.training import sharding, step
+from csac_jax.training import program as programs, sharding, step
 from tests.training import toys
 
 pytestmark = pytest.mark.optax
@@ -41,7 +41,7 @@ OTHER = {
 @pytest.fixture(autouse=True)
 def toy_step(monkeypatch: pytest.MonkeyPatch):
     """The small step in place of the real one."""
-    monkeypatch.setattr(step, "init_state", toys.init_state)
+    monkeypatch.setattr(programs, "init_state", toys.init_state)
     monkeypatch.setattr(step, "train_step", toys.train_step)
 
 
@@ -51,7 +51,7 @@ def _seeds(num: int, cfg=toys.CFG) -> replicas.ProgramGroup:
 
 
 def _program(group: replicas.ProgramGroup, parts: int = 1) -> SweepProgram:
-    return SweepProgram(toys.program(group.configs[0]), replicas.of_group(group), parts=parts)
+    return SweepProgram(toys.program(group.configs[0]), replicas.group_replicas(group), parts=parts)
 
 
 def _run(group: replicas.ProgramGroup, chunks: int = 2) -> tuple[Any, list[Any]]:
@@ -66,7 +66,7 @@ def _run(group: replicas.ProgramGroup, chunks: int = 2) -> tuple[Any, list[Any]]
 def _alone(cfg, chunks: int = 2) -> tuple[Any, list[Any]]:
     """As `train` runs it: its numbers are constants, its state has no axis of replicas."""
     program = toys.program(cfg)
-    chunk, state, seen = step.compile_chunk(program, 4), step.init(program), []
+    chunk, state, seen = programs.compile_chunk(program, 4), programs.init(program), []
     for _ in range(chunks):
         state, metrics = chunk(state)
         seen.append(jax.device_get(metrics))
@@ -86,7 +86,7 @@ def test_replicas_are_the_runs_of_train():
     """Claim: each replica is the run that `train` makes of its seed and settings, to rounding, also
     where hyper-parameters are traced, every one of them."""
     assert OTHER.keys() == set(replicas.TRACED_HYPERPARAMS)
-    configs = (toys.CFG, step.replace_settings(toys.CFG, OTHER).change(seed=1))
+    configs = (toys.CFG, programs.replace_settings(toys.CFG, OTHER).change(seed=1))
     (group,) = replicas.group_configs(configs)
     assert group == (configs, replicas.TRACED_HYPERPARAMS)
     state, seen = _run(group)
@@ -122,7 +122,7 @@ def test_parts_are_the_same_runs(differ: bool):
     hyper-parameters differ; chunks follow one another, the state is used up."""
     configs = [dataclasses.replace(toys.CFG, seed=k) for k in range(6)]
     if differ:
-        configs[3:] = [step.replace_settings(cfg, {"target.gamma": 0.1}) for cfg in configs[3:]]
+        configs[3:] = [programs.replace_settings(cfg, {"target.gamma": 0.1}) for cfg in configs[3:]]
     (group,) = replicas.group_configs(configs)
     wanted, seen = _run(group)
     program = _program(group, parts=3)
@@ -144,8 +144,8 @@ def test_parts_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
         meeting.wait(timeout=20)
         return np.asarray(value)
 
-    def train_step(program: step.Program, state: step.TrainState, hyperparams: Any) -> Any:
-        state, metrics = toys.train_step(program, state, hyperparams)
+    def train_step(program: step.Program, state: step.TrainState) -> Any:
+        state, metrics = toys.train_step(program, state)
         here = jax.ShapeDtypeStruct((), np.float32)
         met = jax.pure_callback(meet, here, state.scenes[0], vmap_method="broadcast_all")
         return state.replace(scenes=state.scenes.at[0].set(met)), metrics
@@ -190,7 +190,7 @@ def test_settings_that_are_numbers_share_a_program():
 
 def test_seeds_alone_keep_their_constants():
     """Claim: where only seeds differ, nothing is traced: settings stay constants of the program."""
-    each = replicas.of_group(_seeds(2))
+    each = replicas.group_replicas(_seeds(2))
     assert each == Replicas(each.seed, None)
     assert each.seed.tolist() == [0, 1]
 
@@ -199,6 +199,6 @@ def test_bounds_are_those_of_the_settings():
     """Claim: traced bounds of returns are those that each setting has by itself."""
     other = toys.CFG.change(target={"gamma": 0.25})
     (group,) = replicas.group_configs([toys.CFG, other])
-    each = replicas.of_group(group)
+    each = replicas.group_replicas(group)
     wanted = np.array([toys.program(cfg).learner.parts.bounds for cfg in (toys.CFG, other)])
     np.testing.assert_allclose(np.stack(each.hyperparams.return_bounds, axis=1), wanted, 1e-6)

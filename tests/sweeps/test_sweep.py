@@ -18,7 +18,7 @@ from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.replicas import ProgramGroup
 from csac_jax.sweeps.runner import SweepError, SweepPlan
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from tests.training import test_loop
 from tests.training.test_loop import CFG, Fake, State
 
@@ -260,7 +260,7 @@ def test_equal_settings_are_refused():
 def test_runs_must_fit_together(monkeypatch: pytest.MonkeyPatch):
     """Claim: the replays of a group's runs together, those of points that are numbers included,
     must fit into the devices; else it is said how many would."""
-    slot = ring.bytes_needed(1, step.example(CFG))
+    slot = ring.bytes_needed(1, programs.example(CFG))
     monkeypatch.setattr(runner.memory, "limit", lambda: 4 * CFG.replay.capacity * slot)
     for seeds, devices, fits in ((2, 1, True), (3, 1, False), (3, 2, True)):  # of two points
         plan = SweepPlan(seeds, [_point("a"), _point("c", learn={"tau": 0.5})])

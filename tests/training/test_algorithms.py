@@ -9,7 +9,7 @@ import pytest
 from csac_jax import algorithms, presets
 from csac_jax.constants import Primitive
 from csac_jax.io import checkpoint
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from tests.training.test_step import assert_same, copy
 
 pytestmark = [pytest.mark.mjx, pytest.mark.slow]
@@ -27,9 +27,9 @@ def test_algorithm_runs_and_resumes(algo, tmp_path):
         if event == "/jax/core/compile/backend_compile_duration":
             compiled.append(event)
 
-    program = step.make(cfg)
-    begun = step.init(program)
-    chunk = step.compile_chunk(program, cfg.train.chunk).lower(begun).compile()
+    program = programs.make(cfg)
+    begun = programs.init(program)
+    chunk = programs.compile_chunk(program, cfg.train.chunk).lower(begun).compile()
     first, _ = chunk(copy(begun))
     kept = copy(first)
     jax.monitoring.register_event_duration_secs_listener(count)

@@ -9,7 +9,7 @@ from csac_jax import algorithms, presets
 from csac_jax.agent import losses, rewards
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Info, State
-from csac_jax.training import step
+from csac_jax.training import program as programs, step, transitions
 from csac_jax.vision.heightmap import Observation
 from tests.agent import toys
 
@@ -42,8 +42,10 @@ def values(algo: str) -> np.ndarray:
     cfg = algorithms.configure(presets.get("paper_small"), algo)
     after = state(BLOCKS - (EVENT == 2).astype(jnp.int32), EVENT)
     fresh = state(jnp.where(after.terminated, FULL, BLOCKS), EVENT)
-    seen, terminated = step.BOOTSTRAPS[cfg.target.bootstrap](after, fresh)
-    result = step.action_result(step.Action(PRIMITIVE, jnp.zeros((len(EVENT), 3))), after.info)
+    seen, terminated = transitions.BOOTSTRAPS[cfg.target.bootstrap](after, fresh)
+    result = transitions.to_action_result(
+        step.Action(PRIMITIVE, jnp.zeros((len(EVENT), 3))), after.info
+    )
     reward = jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
     following = np.asarray(seen.height, int)
     weight = np.array([1.0, 1.0 - P, P])
@@ -73,12 +75,14 @@ def test_vpgs_rule_grasps_the_last_block():
     assert np.all(q[:, 1] > q[:, 0])
 
 
-@pytest.mark.parametrize("bootstrap", list(step.BOOTSTRAPS))
+@pytest.mark.parametrize("bootstrap", list(transitions.BOOTSTRAPS))
 def test_episode_that_is_cut_off_goes_on(bootstrap):
     """Claim: an action that had an effect bootstraps from its own scene where the episode is cut
     off."""
     after = state(jnp.array([2]), jnp.array([0])).replace(truncated=jnp.array([True]))
-    seen, terminated = step.BOOTSTRAPS[bootstrap](after, state(jnp.array([FULL]), jnp.array([0])))
+    seen, terminated = transitions.BOOTSTRAPS[bootstrap](
+        after, state(jnp.array([FULL]), jnp.array([0]))
+    )
     assert seen.height.tolist() == [2.0]
     assert not terminated.any()
 
@@ -90,8 +94,8 @@ def test_step_stores_what_is_acted_in_next(algo, follows):
     """Claim: by VPG's rule a stored action of an episode that ends is followed by the observation
     that the next action was taken in, by the former rule by the last of its own."""
     cfg = toys.config(algo, actions=96, max_actions=4)
-    program = step.make(cfg, env=toys.bandit(cfg))
-    state, metrics = step.compile_chunk(program, cfg.train.steps)(step.init(program))
+    program = programs.make(cfg, env=toys.bandit(cfg))
+    state, metrics = programs.compile_chunk(program, cfg.train.steps)(programs.init(program))
     num = cfg.train.scenes
     rows = lambda leaf: np.asarray(leaf)[: cfg.train.actions].reshape(-1, num, *leaf.shape[1:])  # noqa: E731
     items = jax.tree.map(rows, state.replay.items)

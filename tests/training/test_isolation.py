@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.training import step
-from csac_jax.training.step import StepMetrics, TrainState
+from csac_jax.training import program as programs
+from csac_jax.training.step import TrainState
+from csac_jax.training.transitions import StepMetrics
 
 pytestmark = [
     pytest.mark.mjx,
@@ -49,9 +50,9 @@ class Run(NamedTuple):
 @pytest.fixture(scope="module")
 def chunk() -> Iterator[Any]:
     with jax.debug_key_reuse(True):
-        program = step.make(CFG)
-        state = step.init(program)
-        compiled = step.compile_chunk(program, 1).lower(state).compile()
+        program = programs.make(CFG)
+        state = programs.init(program)
+        compiled = programs.compile_chunk(program, 1).lower(state).compile()
 
         def run(given: TrainState) -> Run:
             after, metrics = jax.device_get(compiled(jax.tree.map(jnp.copy, given)))

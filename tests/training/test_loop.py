@@ -43,8 +43,7 @@ def _init() -> State:
 
 
 class Fake:
-    """A program that draws its metrics at random, counts compilations, and can lose its loss, its
-    parameters or its physics."""
+    """A program of random metrics that counts compilations and can fail in several ways."""
 
     def __init__(
         self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99, lost_at: int = -1
@@ -53,7 +52,7 @@ class Fake:
         self._nan_at, self._ill, self._lost_at = nan_at, (ill_from, ill_to), lost_at
 
     def compile_chunk(self, num_steps: int):
-        """As `csac_jax.training.step.compile_chunk`, with the program bound."""
+        """Stands in for `program.compile_chunk`, with the program bound."""
         self.compiled.append(num_steps)
         return jax.jit(
             lambda state: jax.lax.scan(self._step, state, length=num_steps), donate_argnums=0
@@ -88,7 +87,7 @@ class Listener:
         if stop_after == 0:
             self.stop.signal = signal
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Reporter."""
         self.said.append(text)
 
@@ -110,10 +109,8 @@ def _run(
 
 def _final(run_dir: Path) -> list[bytes]:
     state, _ = checkpoint.restore(run_dir, jax.eval_shape(_init))
-    return [
-        np.asarray(leaf).tobytes()
-        for leaf in (jax.random.key_data(state.key), state.step, state.total)
-    ]
+    leaves = (jax.random.key_data(state.key), state.step, state.total)
+    return [np.asarray(leaf).tobytes() for leaf in leaves]
 
 
 def _log(run_dir: Path) -> list[dict]:
@@ -130,7 +127,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_dir
 
 
-def test_state_is_made_beside_the_compilation(tmp_path: Path):
+def test_state_is_made_during_the_compilation(tmp_path: Path):
     """Claim: the first state is made while the chunk is compiled, not before."""
     compiling, waited, listener, fake = threading.Event(), [], Listener(), Fake()
 
@@ -162,16 +159,9 @@ def test_run_ends_complete(tmp_path: Path):
     assert None not in listener.etas[1:]
 
 
-def test_steps_are_rounded_up_to_whole_chunks():
-    """Claim: the number of steps is rounded up to whole chunks."""
-    cfg = CFG.change(train={"actions": 73})
-    assert cfg.train.steps == 25
-    assert loop.total_steps(cfg) == 28
-    assert loop.total_steps(CFG) == 24
-
-
 def test_saves_on_the_way(tmp_path: Path):
-    """Claim: every `save_every` chunks a checkpoint is written."""
+    """Claim: steps are rounded up to whole chunks; every `save_every` chunks a run saves."""
+    assert loop.total_steps(CFG.change(train={"actions": 73})) == 28
     saved = []
     listener = Listener()
     listener.progress = lambda *_: saved.append(checkpoint.latest_step(tmp_path / "run"))
@@ -198,23 +188,16 @@ def test_resumed_run_ends_as_the_uninterrupted_one(tmp_path: Path, whole: Path, 
 
 def test_lines_newer_than_the_checkpoint_are_dropped(tmp_path: Path, whole: Path):
     """Claim: after a kill, lines of the log newer than the checkpoint, and a half-written one, are
-    written anew."""
-    _run(tmp_path / "run", Listener(2), Fake())
+    written again; `seconds` counts resumed parts too."""
+    before = _run(tmp_path / "run", Listener(2), Fake()).seconds
     log = tmp_path / "run/metrics.jsonl"
     newer = {**_log(tmp_path / "run")[-1], "step": 12, "actions": -1, "seconds": 9.0}
     log.write_text(log.read_text() + json.dumps(newer) + '\n{"step": 16, "act')
-    _run(tmp_path / "run", Listener(), Fake(), resume=True)
-    assert _log(tmp_path / "run") == _log(whole)
-
-
-def test_seconds_go_on_after_resuming(tmp_path: Path):
-    """Claim: `seconds` counts resumed parts too."""
-    before = _run(tmp_path / "run", Listener(2), Fake()).seconds
     listener = Listener()
     _run(tmp_path / "run", listener, Fake(), resume=True)
+    assert _log(tmp_path / "run") == _log(whole)
     seconds = [record.seconds for record in listener.records]
-    assert seconds[0] >= round(before, 3)
-    assert seconds == sorted(seconds)
+    assert [round(before, 3), *seconds] == sorted([round(before, 3), *seconds])
 
 
 def test_complete_run_resumed_does_nothing(tmp_path: Path):
@@ -226,69 +209,63 @@ def test_complete_run_resumed_does_nothing(tmp_path: Path):
     assert _final(tmp_path / "run") == before
 
 
-@pytest.mark.parametrize("step", [9, 21])
-def test_loss_that_is_not_finite_stops_the_run(tmp_path: Path, step: int):
-    """Claim: a loss that is not finite ends the run with one line; the last good checkpoint stays
-    the newest."""
-    good = (step // 8) * 8
-    with pytest.raises(
-        TrainingError, match=f"critic_loss is not finite.*step {good} is kept.*learning_rate"
-    ) as caught:
-        _run(tmp_path / "run", Listener(), Fake(nan_at=step))
+@pytest.mark.parametrize(
+    ("fault", "step", "message"),
+    [
+        ("nan_at", 9, "critic_loss is not finite.*step 8 is kept.*learning_rate"),
+        ("nan_at", 21, "critic_loss is not finite.*step 16 is kept"),
+        ("lost_at", 2, "a parameter is not finite"),  # in the warm-up
+        ("lost_at", 21, "a parameter is not finite"),
+    ],
+)
+def test_what_is_not_finite_stops_the_run(tmp_path: Path, fault: str, step: int, message: str):
+    """Claim: a loss or parameter that is not finite ends the run with one line; the last good
+    checkpoint stays the newest."""
+    with pytest.raises(TrainingError, match=message) as caught:
+        _run(tmp_path / "run", Listener(), Fake(**{fault: step}))
     assert "\n" not in str(caught.value)
-    assert checkpoint.latest_step(tmp_path / "run") == good
+    assert checkpoint.latest_step(tmp_path / "run") == ((step // 8) * 8 or None)
     assert all(math.isfinite(line["reward"]) for line in _log(tmp_path / "run"))
 
 
-@pytest.mark.parametrize("step", [2, 21])
-def test_parameter_that_is_not_finite_stops_the_run(tmp_path: Path, step: int):
-    """Claim: a parameter that is not finite ends the run, in the warm-up too, though the losses
-    are; no checkpoint holds it."""
-    with pytest.raises(TrainingError, match="a parameter is not finite") as caught:
-        _run(tmp_path / "run", Listener(), Fake(lost_at=step))
-    assert "\n" not in str(caught.value)
-    good = (step // 8) * 8
-    assert checkpoint.latest_step(tmp_path / "run") == (good or None)
-
-
-def test_loss_of_the_warm_up_is_not_looked_at(tmp_path: Path):
-    """Claim: before the first update there is no loss: none is judged, none is logged."""
+def test_loss_of_the_warm_up_does_not_count(tmp_path: Path):
+    """Claim: before the first update there is no loss: it may be NaN, and none is logged."""
     listener = Listener(2)
     _run(tmp_path / "run", listener, Fake(nan_at=2))
     assert listener.records[0].critic_loss is None
     assert listener.records[1].critic_loss is not None
 
 
-def test_physics_that_keeps_failing_is_said_once(tmp_path: Path):
-    """Claim: a run whose physics fails again and again says so, once; a scene that fails alone is
-    no news."""
-    for name, fake, told in (("many", Fake(ill_from=5), 1), ("one", Fake(ill_from=5, ill_to=6), 0)):
+def test_warnings_come_once(tmp_path: Path):
+    """Claim: physics that fails again and again is logged once, a single failure not at all; the
+    build of Warp's kernels is announced."""
+    warp = CFG.change(scene={"size_jitter": (0.1, 0.0)}, sim={"physics": "warp"})
+    cases: Any = (
+        ("many", Fake(ill_from=5), CFG, "physics failed", 1),
+        ("one", Fake(ill_from=5, ill_to=6), CFG, "physics failed", 0),
+        ("warp", Fake(), warp, "Warp builds its kernels", 1),
+        ("mjx", Fake(), CFG, "Warp builds its kernels", 0),
+    )
+    for name, fake, cfg, text, times in cases:
         listener = Listener()
-        _run(tmp_path / name, listener, fake)
-        doubts = [said for said in listener.said if "physics failed" in said]
-        assert len(doubts) == told
-    assert sum(record.physics_diverged for record in listener.records) == 1
+        _run(tmp_path / name, listener, fake, cfg=cfg)
+        assert sum(text in line for line in listener.said) == times, name
+        if name == "one":
+            assert sum(record.physics_diverged for record in listener.records) == 1
 
 
-def test_kernels_of_warp_are_announced(tmp_path: Path):
-    """Claim: before the first step on Warp, during which nothing is shown for minutes, the reason
-    is."""
-    for physics, told in (("mjx", 0), ("warp", 1)):
-        cfg = CFG.change(scene={"size_jitter": (0.1, 0.0)}, sim={"physics": physics})
-        listener = Listener(1)
-        _run(tmp_path / physics, listener, Fake(), cfg=cfg)
-        assert sum("Warp builds its kernels" in said for said in listener.said) == told
-
-
-def test_existing_folder_is_left_alone(tmp_path: Path):
-    """Claim: a new run never writes into a folder that exists."""
+def test_bad_folders(tmp_path: Path):
+    """Claim: a new run never writes into a folder that exists; one without a checkpoint cannot be
+    resumed."""
     with pytest.raises(FileExistsError):
         _run(tmp_path, Listener(), Fake())
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        _run(tmp_path, Listener(), Fake(), resume=True)
 
 
 @pytest.mark.parametrize("stop_after", [1, 3, None])
-def test_resumed_with_more_actions_goes_on_to_the_longer_end(tmp_path: Path, stop_after: int):
+def test_resumed_with_more_actions_ends_as_the_longer_run(tmp_path: Path, stop_after: int):
     """Claim: a stopped or complete run that is resumed with more `train.actions` ends bit for bit
     as one that had them from the start; its folder holds the new number, and can be resumed."""
     _run(tmp_path / "whole", Listener(total=96), Fake(), cfg=LONGER)
@@ -328,12 +305,6 @@ def test_resume_needs_the_same_config(tmp_path: Path, changes: dict[str, Any], n
     assert (_final(run_dir), _log(run_dir), (run_dir / "config.json").read_text()) == before
 
 
-def test_resume_needs_a_checkpoint(tmp_path: Path):
-    """Claim: a folder without a checkpoint cannot be resumed."""
-    with pytest.raises(CheckpointError, match="no checkpoint"):
-        _run(tmp_path, Listener(), Fake(), resume=True)
-
-
 def _metrics(primitive: list[int], outcome: list[int]) -> Any:
     """One scene, T steps."""
     steps = [
@@ -346,7 +317,7 @@ def _metrics(primitive: list[int], outcome: list[int]) -> Any:
 def test_success_is_over_the_last_200_grasps():
     """Claim: grasp success is over the last 200 grasps, pushes not counted, oldest dropped
     first."""
-    before = loop.Progress(0.0, [1] * 150 + [0] * 49)  # 199 grasps
+    before = loop.LoopState(0.0, [1] * 150 + [0] * 49)  # 199 grasps
     metrics = _metrics(primitive=[1, 0, 1, 1], outcome=[4, 4, 3, 4])
     after, record = loop.record_chunk(CFG, 4, metrics, before, 0.5)
     assert after.grasps == [1] * 148 + [0] * 49 + [1, 0, 1]

@@ -2,29 +2,24 @@
 
 import re
 from concurrent.futures import Future
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 from csac_jax.replay import ring
-from csac_jax.training import halves, memory, step
+from csac_jax.training import memory, program as programs, split_step
 
 SMOKE = presets.smoke()
-
-
-def _smoke(**sections: dict[str, Any]) -> Config:
-    return SMOKE.change(**sections)
 
 
 def test_state_is_exact():
     """Claim: ring and networks are known to the byte."""
     quick = presets.quick()
     known = memory.state_bytes(quick)
-    small = ring.init(jnp.zeros(64), step.example(quick))
+    small = ring.init(jnp.zeros(64), programs.example(quick))
     stored = sum(leaf.nbytes for leaf in jax.tree.leaves(small))
     # head and size are no slots
     assert known["replay"] == (stored - 8) * quick.replay.capacity // 64 + 8
@@ -36,26 +31,20 @@ def test_state_is_exact():
 
 @pytest.mark.parametrize("runs", [1, 3])
 def test_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, runs: int):
-    """Claim: rings larger than memory are refused; the capacity named fits, the next one does
-    not."""
+    """Claim: rings larger than memory are refused; the capacity named fits, the next one does not;
+    where none fits, the message says so."""
     monkeypatch.setattr(memory, "limit", lambda: 100 * 2**20)
-    with pytest.raises(
-        ValueError, match=r"^replay\.capacity: the replay takes .* GiB, there are"
-    ) as caught:
-        memory.check(_smoke(replay={"capacity": 100_000}), runs)
-    named = re.search(r"lower --replay.capacity from 100000 to (\d+) at most", str(caught.value))
+    with pytest.raises(SettingsError, match=r"^replay\.capacity: the replay takes") as caught:
+        memory.check(SMOKE.change(replay={"capacity": 100_000}), runs)
+    named = re.search(r"lower replay.capacity from 100000 to (\d+) at most", str(caught.value))
     assert named
-    assert ("lower --seeds" in str(caught.value)) == (runs > 1)
-    memory.check(_smoke(replay={"capacity": int(named[1])}), runs)
-    with pytest.raises(ValueError, match=r"replay\.capacity"):
-        memory.check(_smoke(replay={"capacity": int(named[1]) + 1}), runs)
-
-
-def test_nothing_fits(monkeypatch: pytest.MonkeyPatch):
-    """Claim: where no capacity that holds scenes and batch fits, the message says so."""
+    assert ("lower seeds" in str(caught.value)) == (runs > 1)
+    memory.check(SMOKE.change(replay={"capacity": int(named[1])}), runs)
+    with pytest.raises(SettingsError):
+        memory.check(SMOKE.change(replay={"capacity": int(named[1]) + 1}), runs)
     monkeypatch.setattr(memory, "limit", lambda: 2**16)
-    with pytest.raises(ValueError, match=r"replay\.capacity: .*; lower --heightmap\.size$"):
-        memory.check(SMOKE)
+    with pytest.raises(SettingsError, match=r"lower heightmap\.size"):
+        memory.check(SMOKE, runs)
 
 
 def test_presets_fit(monkeypatch: pytest.MonkeyPatch):
@@ -70,10 +59,8 @@ def test_compiled_program_states_its_memory():
     rows = jax.ShapeDtypeStruct((3 * 2**20, 64), jnp.float32)
     compiled = jax.jit(lambda x: jnp.sort(x, 0)[0]).lower(rows).compile()
     temporary = compiled.memory_analysis().temp_size_in_bytes / memory.GIB
-    said = memory.compiled_text(compiled)
     assert temporary > 0.1
-    assert said == f"the program takes 0.75 GiB for states and {temporary:.2f} GiB besides"
-    chunk = halves.Chunk(SMOKE, 1, compiled, Future())
-    assert memory.compiled_text(chunk) == (
-        "the program takes 0.75 GiB for states; what learns compiles meanwhile"
-    )
+    text = f"0.75 GiB for states and {temporary:.2f} GiB besides"
+    assert text in memory.compiled_text(compiled)
+    chunk = split_step.Chunk(SMOKE, 1, compiled, Future())
+    assert "0.75 GiB for states; learning still compiles" in memory.compiled_text(chunk)

@@ -16,7 +16,7 @@ from csac_jax.env import Env
 from csac_jax.io import checkpoint
 from csac_jax.nets import chunked_vmap
 from csac_jax.sweeps import replicas
-from csac_jax.training import step
+from csac_jax.training import program as programs
 from tests.sweeps.test_replicas import assert_close
 from tests.training.test_step import assert_same, copy, equal
 
@@ -47,7 +47,7 @@ def test_paper_has_densenet_121_three_times():
     """Claim: the state of the preset `paper` can be made: a trunk each for colour, height and
     target mask, online and target, and a ring that holds all 2,500 actions."""
     cfg = presets.paper()
-    state = step.abstract_state(cfg)
+    state = programs.abstract_state(cfg)
     for params in (state.learner.online, state.learner.target):
         trunks = [params.critic[kind]["trunk"] for kind in ("params", "batch_stats")]
         assert sum(leaf.size for leaf in jax.tree.leaves(trunks)) == 3 * TRUNK
@@ -60,9 +60,9 @@ def test_paper_has_densenet_121_three_times():
 def test_paper_can_be_traced():
     """Claim: the whole training step of `paper` can be traced, and gives back a state of the same
     shapes and types."""
-    program = step.make(presets.paper().change(scene={"pool": 1}))
-    state = jax.eval_shape(lambda: step.init(program))
-    after, metrics = jax.eval_shape(step.compile_chunk(program, 1), state)
+    program = programs.make(presets.paper().change(scene={"pool": 1}))
+    state = jax.eval_shape(lambda: programs.init(program))
+    after, metrics = jax.eval_shape(programs.compile_chunk(program, 1), state)
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), state
     )
@@ -74,10 +74,10 @@ def test_run_with_batch_norm_resumes(tmp_path):
     """Claim: a run of DenseNet with batch norm learns, moves its statistics, and goes on after a
     checkpoint as if nothing had happened, in every bit of every leaf."""
     cfg = presets.smoke().change(net=dataclasses.replace(TINY, norm="batch"))
-    program = step.make(cfg)
+    program = programs.make(cfg)
     program = dataclasses.replace(program, env=Still(cfg, program.env.physics, program.env.scenes))
-    begun = step.init(program)
-    chunk = step.compile_chunk(program, 4).lower(begun).compile()
+    begun = programs.init(program)
+    chunk = programs.compile_chunk(program, 4).lower(begun).compile()
     first, _ = chunk(copy(begun))
     second, metrics = chunk(copy(first))
     assert np.all(np.isfinite(metrics.critic_loss))
@@ -107,14 +107,14 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
     """
     monkeypatch.setattr(chunked_vmap, "_LARGEST", size)
     configs = [presets.smoke().change(net=TINY, seed=k) for k in range(4)]
-    program = step.make(configs[0])
+    program = programs.make(configs[0])
     program = dataclasses.replace(
         program, env=Still(configs[0], program.env.physics, program.env.scenes)
     )
 
     def lowered(configs):
         (group,) = replicas.group_configs(configs)
-        together = replicas.SweepProgram(program, replicas.of_group(group))
+        together = replicas.SweepProgram(program, replicas.group_replicas(group))
         begun = together.init()
         return begun, together.compile_chunk(6).lower(begun)
 
@@ -124,7 +124,7 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
     after, metrics = chunk.compile()(begun)
     for k, cfg in enumerate(configs):
         one = dataclasses.replace(program, cfg=cfg)
-        alone, seen = step.compile_chunk(one, 6)(step.init(one))
+        alone, seen = programs.compile_chunk(one, 6)(programs.init(one))
         for mine, want in (
             (replicas.replica(after, k), alone),
             (jax.tree.map(lambda leaf, k=k: leaf[:, k], metrics), seen),

@@ -25,8 +25,9 @@ from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import halves, step
-from csac_jax.training.step import Program, StepMetrics, TrainState
+from csac_jax.training import program as programs, split_step, step, trace_cache, transitions
+from csac_jax.training.step import Program, TrainState
+from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision.heightmap import Observation
 
 pytestmark = pytest.mark.mjx
@@ -68,22 +69,21 @@ def run() -> Run:
             counted.append(event)
 
     with jax.debug_key_reuse(True), mock.patch.object(simulation, "reachable", half_in_reach):
-        program = step.make(CFG)
-        states = [step.init(program)]
-        traced = step.compile_chunk(program, T).trace(states[0])
+        program = programs.make(CFG)
+        states = [programs.init(program)]
+        traced = programs.compile_chunk(program, T).trace(states[0])
         chunk = traced.lower().compile()
         metrics = []
         compilations = 0
         jax.monitoring.register_event_duration_secs_listener(count)
         for number in range(3):
-            given = copy(states[-1])
-            before = len(counted)
-            state, seen = jax.block_until_ready(chunk(given))
+            inputs, before = copy(states[-1]), len(counted)
+            state, seen = jax.block_until_ready(chunk(inputs))
             compilations += len(counted) - before if number else 0
             states.append(state)
             metrics.append(jax.device_get(seen))
         jax.monitoring.unregister_event_duration_listener(count)
-    assert counted  # the listener hears: the first copy is compiled
+    assert counted  # the first copy is compiled
     return Run(program, traced, chunk, states, metrics, compilations)
 
 
@@ -112,16 +112,10 @@ def equal(first: Any, other: Any) -> bool:
 def test_state_is_a_fixed_point_of_types(run):
     """Claim: a step changes no shape, dtype or weak type of the state, so that its output fits its
     program."""
-    shapes = run.traced.jaxpr
+    kind = lambda aval: (aval.shape, aval.dtype, aval.weak_type)  # noqa: E731
     num = len(jax.tree.leaves(run.states[0]))
-    before, after = shapes.in_avals[:num], shapes.out_avals[:num]
-    assert len(shapes.in_avals) == num
-    for (name, _), given, got in zip(leaves(run.states[0]), before, after, strict=True):
-        assert (given.shape, given.dtype, given.weak_type) == (
-            got.shape,
-            got.dtype,
-            got.weak_type,
-        ), name
+    before, after = run.traced.jaxpr.in_avals, run.traced.jaxpr.out_avals[:num]
+    assert [*map(kind, before)] == [*map(kind, after)]
 
 
 def test_chunks_after_the_first_compile_nothing(run):
@@ -135,7 +129,7 @@ def test_two_programs_do_what_one_does(run: Run):
     """Claim: a chunk as two programs, one of which acts and the other learns, ends in the states of
     the one program, and measures the same."""
     with mock.patch.object(simulation, "reachable", half_in_reach):
-        chunk = halves.compile_chunk(run.program, T).lower(run.states[0]).compile()
+        chunk = split_step.compile_chunk(run.program, T).lower(run.states[0]).compile()
     for number in range(2):  # each from the same state: physics makes much of what rounding does
         state, metrics = chunk(copy(run.states[number]))
         pairs = ((run.states[number + 1], state), (run.metrics[number], metrics))
@@ -144,7 +138,7 @@ def test_two_programs_do_what_one_does(run: Run):
             for one, other in pairs
             for (name, a), (_, b) in zip(leaves(one), leaves(other), strict=True)
         ):
-            if name.removeprefix(".") in step._LOSSES:
+            if name.removeprefix(".") in transitions.LOSSES:
                 wanted, got = (np.where(metrics.learned, loss, 0.0) for loss in (wanted, got))
             np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-5, err_msg=name)
     assert metrics.learned.all()
@@ -157,65 +151,57 @@ def test_acting_does_not_wait_for_what_learns():
     cfg = CFG.change(train={"scenes": 4, "learning_starts": 12})  # the third step learns
 
     def act(state: Any) -> tuple[Any, dict[str, Any]]:
-        step, told = state.step + 1, state.told
-        return SimpleNamespace(step=step, told=[*told, "act"]), {"step": step, "learned": False}
+        calls = [*state.calls, "act"]
+        return SimpleNamespace(step=state.step + 1, calls=calls), {"learned": False}
 
     def learn(state: Any, metrics: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        told = [*state.told, "learn"]
-        return SimpleNamespace(step=state.step, told=told), metrics | {"learned": True}
+        return SimpleNamespace(step=state.step, calls=[*state.calls, "learn"]), {"learned": True}
 
-    failed: Future[Any] = Future()
+    failed, later = Future[Any](), Future[Any]()
     failed.set_exception(MemoryError("no room"))
-    chunk = halves.Chunk(cfg, 2, act, failed)
-    state, metrics = chunk(SimpleNamespace(step=0, told=[]))
-    assert state.told == ["act", "act"]
+    later.set_result(learn)
+    chunk = split_step.Chunk(cfg, 2, act, failed)
+    state, metrics = chunk(SimpleNamespace(step=0, calls=[]))
     np.testing.assert_array_equal(metrics["learned"], [False, False])
     with pytest.raises(MemoryError, match="no room"):
         chunk(state)
-    later: Future[Any] = Future()
-    later.set_result(learn)
     state, metrics = chunk._replace(learn=later)(state)
-    assert state.told == ["act", "act", "act", "learn", "act", "learn"]
+    assert state.calls == ["act", "act", "act", "learn", "act", "learn"]
     np.testing.assert_array_equal(metrics["learned"], [True, True])
-    np.testing.assert_array_equal(metrics["step"], [3, 4])
 
 
-def test_what_acts_is_there_first():
-    """Claim: a chunk is compiled as soon as it can act, by the thread that asks, so that it is told
+def test_what_acts_is_there_first(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a chunk is compiled as soon as it can act, by the thread that asks, so that it sees
     whether the cache had it; what learns compiles after that."""
-    go_on, order = threading.Event(), []
+    go_on, threads = threading.Event(), []
 
-    class Part:
-        out_info = ()
+    def learns() -> str:
+        assert go_on.wait(60.0)
+        return "learns"
 
-        def lower(self) -> "Part":
-            return self
+    def acts() -> str:
+        threads.append(threading.current_thread())
+        return "acts"
 
-        def compile(self) -> str:
-            assert go_on.wait(60.0)
-            order.append("learns")
-            return "learns"
-
-    class Acting(Part):
-        def compile(self) -> str:
-            assert threading.current_thread() is threading.main_thread()
-            order.append("acts")
-            return "acts"
-
-    traceable = mock.Mock(part=lambda _: Part())
-    chunk = halves._Lowered(traceable, Acting()).compile()
-    assert (chunk.act, chunk.learn.done(), order) == ("acts", False, ["acts"])
+    half = SimpleNamespace(lower=lambda: SimpleNamespace(compile=learns))
+    monkeypatch.setattr(trace_cache, "jit", lambda *_: half)
+    act = SimpleNamespace(out_info=(), compile=acts)
+    chunk = split_step._Lowered(split_step._Traceable(mock.Mock(), T, False), act).compile()
+    assert (chunk.act, chunk.learn.done(), threads) == ("acts", False, [threading.main_thread()])
     go_on.set()
     assert chunk.learn.result(60.0) == "learns"
 
 
 def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch, run: Run):
     """Claim: only on a CPU, and on one device, is a chunk two programs."""
-    halved = lambda program: isinstance(halves.compile_chunk(program, T), halves._Traceable)  # noqa: E731
-    assert halved(run.program)
-    assert not halved(dataclasses.replace(run.program, mesh=mock.Mock()))
+
+    def is_split(program: Program) -> bool:
+        return isinstance(split_step.compile_chunk(program, T), split_step._Traceable)
+
+    assert is_split(run.program)
+    assert not is_split(dataclasses.replace(run.program, mesh=mock.Mock()))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert not halved(run.program)
+    assert not is_split(run.program)
 
 
 def primitives(jaxpr: Any) -> Iterator[str]:
@@ -230,25 +216,13 @@ def primitives(jaxpr: Any) -> Iterator[str]:
                 yield from primitives(inner)
 
 
-def test_search_for_host_calls_finds_them():
-    """Claim: the search below sees a callback inside of a scan inside of a branch."""
-
-    def body(carry, _):
-        jax.debug.print("{x}", x=carry)
-        return carry, None
-
-    nested = jax.make_jaxpr(
-        lambda x: jax.lax.cond(x > 0, lambda x: jax.lax.scan(body, x, length=2)[0], lambda x: x, x)
-    )
-    assert any(word in name for name in primitives(nested(1.0).jaxpr) for word in HOST)
-
-
 def test_chunk_does_not_speak_to_the_host(run):
     """Claim: no callback, no feed and no transfer in the compiled chunk, at any depth."""
     names = set(primitives(run.traced.jaxpr.jaxpr))
     assert {"scan", "while", "conv_general_dilated", "sort"} <= names  # it was searched in depth
-    found = {name for name in names if any(word in name for word in HOST)}
-    assert not found
+    assert not {name for name in names if any(word in name for word in HOST)}
+    loud = jax.make_jaxpr(lambda x: jax.lax.cond(x > 0, lambda: jax.debug.print("{}", x), int))
+    assert any(word in name for name in primitives(loud(1.0).jaxpr) for word in HOST)
 
 
 def test_replay_is_updated_in_place(run):
@@ -280,17 +254,13 @@ def test_blocks_that_left_reach_the_reward(run):
     """Claim: a step takes `reward.lost_block_penalty` where a block has left, from grasps of
     nothing and worthless pushes alike."""
     cfg = CFG.change(reward={"lost_block_penalty": 0.75})
-    reward = cfg.reward
-    env = Losing(cfg, run.program.env.physics, run.program.env.scenes)
-    program = step.make(cfg, env=env)
+    reward, env = cfg.reward, Losing(cfg, run.program.env.physics, run.program.env.scenes)
+    program = programs.make(cfg, env=env)
     _, metrics = jax.jit(functools.partial(step.train_step, program))(copy(run.states[0]))
-    grasp, push = (
-        reward.grasp_levels[Outcome.NOTHING] - 0.75,
-        rewards.scale(reward, reward.push_level) * reward.push_levels[0] - 0.75,
-    )
-    np.testing.assert_allclose(
-        metrics.reward, np.where(metrics.primitive == Primitive.GRASP, grasp, push), rtol=1e-6
-    )
+    grasp = reward.grasp_levels[Outcome.NOTHING] - 0.75
+    push = rewards.scale(reward, reward.push_level) * reward.push_levels[0] - 0.75
+    wanted = np.where(metrics.primitive == Primitive.GRASP, grasp, push)
+    np.testing.assert_allclose(metrics.reward, wanted, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -299,17 +269,12 @@ def test_temporary_memory_does_not_grow_with_the_ring():
     at most."""
     temporary, rings = [], []
     for capacity in (512, 2048):
-        program = step.make(CFG.change(replay={"capacity": capacity}))
+        program = programs.make(CFG.change(replay={"capacity": capacity}))
         env = Still(program.env.cfg, program.env.physics, program.env.scenes)
         program = dataclasses.replace(program, env=env)
-        state = step.init(program)
-        temporary.append(
-            step.compile_chunk(program, T)
-            .lower(state)
-            .compile()
-            .memory_analysis()
-            .temp_size_in_bytes
-        )
+        state = programs.init(program)
+        compiled = programs.compile_chunk(program, T).lower(state).compile()
+        temporary.append(compiled.memory_analysis().temp_size_in_bytes)
         rings.append(sum(leaf.nbytes for leaf in jax.tree.leaves(state.replay)))
     assert temporary[1] - temporary[0] < (rings[1] - rings[0]) / 50
 
@@ -325,7 +290,7 @@ def test_seeds_differ(run):
     """Claim: seeds 0 and 1 begin with other scenes and networks, and choose and see other things in
     every scene."""
     other_cfg = dataclasses.replace(CFG, seed=1)
-    begun = step.init(dataclasses.replace(run.program, cfg=other_cfg))
+    begun = programs.init(dataclasses.replace(run.program, cfg=other_cfg))
     for name in ("scenes", "learner"):
         assert not equal(getattr(begun, name), getattr(run.states[0], name)), name
     state, _ = run.chunk(begun)
@@ -354,9 +319,7 @@ def test_nothing_is_learned_before_the_warm_up(run):
     """Claim: until `train.learning_starts` actions are done the networks, targets and optimisers
     stay as they are; then each training step has its updates."""
     assert run.metrics[0].learned.tolist() == [False, False, False, True]  # 8 actions, 2 per step
-    late = run.states[0].replace(
-        step=jnp.int32(-T - 1)
-    )  # so far from the warm-up's end that a chunk ends before it
+    late = run.states[0].replace(step=jnp.int32(-T - 1))  # a chunk ends before the warm-up does
     state, metrics = run.chunk(copy(late))
     assert not np.any(metrics.learned)
     assert_same(state.learner, run.states[0].learner)
@@ -368,7 +331,7 @@ def test_nothing_is_learned_before_the_warm_up(run):
         CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)
     ]
     for counted in run.states:
-        assert step._updates_done(CFG, counted.step) == counted.learner.updates
+        assert step.updates_done(CFG, counted.step) == counted.learner.updates
     assert all(np.all(np.isfinite(m.critic_loss)) for m in run.metrics)
 
 
@@ -487,7 +450,7 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     monkeypatch.setattr(PrioritisedReplay, "per_epsilon", 0.25)
     monkeypatch.setattr(CSAC, "update", update)
     monkeypatch.setattr(CSAC, "end_step", lambda self, state, obs: (state, jnp.float32(0.0)))
-    replay = ring.init(jnp.full(64, 7.0), step.example(cfg)).replace(size=jnp.int32(64))
+    replay = ring.init(jnp.full(64, 7.0), programs.example(cfg)).replace(size=jnp.int32(64))
     learner_state = actor_critic.LearnerState(None, None, None, None, jnp.int32(0))
     program = Program(cfg, nothing, CSAC(nothing), made)
     key, done = jax.random.key(0), jnp.int32(0)
@@ -563,9 +526,9 @@ def test_actor_learns_on_a_part_of_the_batch(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(actor, "update", update)
     for actor_batch in (0, 3):
         cfg = CFG.change(learn={"actor_batch": actor_batch})
-        program = step.make(cfg, env=object())
+        program = programs.make(cfg, env=object())
         state = jax.eval_shape(program.learner.init, jax.random.key(0))
-        replay = jax.eval_shape(lambda: ring.init(jnp.zeros(64), step.example(CFG)))
+        replay = jax.eval_shape(lambda: ring.init(jnp.zeros(64), programs.example(CFG)))
         learn = functools.partial(step.learn, program)
         jax.eval_shape(learn, jax.random.key(0), state, replay, jnp.int32(0))
     assert taken == [CFG.learn.batch, 3]

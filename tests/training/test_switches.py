@@ -13,7 +13,7 @@ from csac_jax.env import Env, Info, State
 from csac_jax.scene import layout, model
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import step
+from csac_jax.training import program as programs, step, transitions
 from csac_jax.vision.heightmap import Observation
 
 LEVELS = jnp.arange(len(Outcome), dtype=jnp.int32)
@@ -30,10 +30,12 @@ def _after(outcome: jax.Array, by_gap: jax.Array) -> State:
 
 def _paid(cfg: Config, after: State) -> tuple[np.ndarray, np.ndarray]:
     """Rewards [T] of grasps, and whether nothing follows them, [T] bool."""
-    paid = step.judged(cfg.reward, after)
+    paid = transitions.with_reward_outcome(cfg.reward, after)
     action = Action(jnp.full(TRUE.shape, Primitive.GRASP, jnp.int32), jnp.zeros((len(TRUE), 3)))
-    reward, _ = rewards.rewards_of(cfg.reward, step.action_result(action, paid.info))
-    return np.asarray(reward), np.asarray(step.BOOTSTRAPS[cfg.target.bootstrap](paid, paid)[1])
+    reward, _ = rewards.rewards_of(cfg.reward, transitions.to_action_result(action, paid.info))
+    return np.asarray(reward), np.asarray(
+        transitions.BOOTSTRAPS[cfg.target.bootstrap](paid, paid)[1]
+    )
 
 
 @pytest.mark.parametrize("algo", ["csac", "vpg"])
@@ -71,7 +73,7 @@ def test_switches_combine(monkeypatch: pytest.MonkeyPatch):
     )
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
     physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
-    program, sources = step.make(cfg, Env(cfg, physics, blank)), {}
+    program, sources = programs.make(cfg, Env(cfg, physics, blank)), {}
 
     def seen(name: str, info: Info) -> None:
         sources[name] = "sensed" if info.outcome is info.outcome_by_gap else "truth"
@@ -85,17 +87,17 @@ def test_switches_combine(monkeypatch: pytest.MonkeyPatch):
         sources["logged"] = after.info.outcome
         return episodic(after, scenes_next)
 
-    def logged(**metrics: jax.Array) -> step.StepMetrics:
+    def logged(**metrics: jax.Array) -> transitions.StepMetrics:
         own = metrics["outcome"] is sources["logged"]
         sources["logged"] = "sensed" if own else "truth"
         return step_metrics(**metrics)
 
-    step_result, step_metrics = step.action_result, step.StepMetrics
-    episodic = step.BOOTSTRAPS["episodic"]
-    monkeypatch.setattr(step, "action_result", paid)
-    monkeypatch.setitem(step.BOOTSTRAPS, "episodic", bootstrapped)
-    monkeypatch.setattr(step, "StepMetrics", logged)
-    state = jax.eval_shape(lambda: step.init_state(program, jax.random.key(0)))
+    step_result, step_metrics = transitions.to_action_result, transitions.StepMetrics
+    episodic = transitions.BOOTSTRAPS["episodic"]
+    monkeypatch.setattr(transitions, "to_action_result", paid)
+    monkeypatch.setitem(transitions.BOOTSTRAPS, "episodic", bootstrapped)
+    monkeypatch.setattr(transitions, "StepMetrics", logged)
+    state = jax.eval_shape(lambda: programs.init_state(program, jax.random.key(0)))
     after, _ = jax.eval_shape(lambda state: step.train_step(program, state), state)
     kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state, after)]
     assert kinds[0] == kinds[1]

@@ -1,5 +1,4 @@
-"""A training step that is small, compiles fast and yet calls what every number of a config
-enters."""
+"""A small training step that compiles fast and uses every number of a config."""
 
 from typing import Any
 
@@ -13,13 +12,9 @@ from csac_jax.config import Config
 from csac_jax.nets import networks
 from csac_jax.replay import samplers
 from csac_jax.training import sharding
-from csac_jax.training.step import (
-    Hyperparams,
-    Program,
-    StepMetrics,
-    TrainState,
-    replace_hyperparams,
-)
+from csac_jax.training.program import Hyperparams, replace_hyperparams
+from csac_jax.training.step import Program, TrainState
+from csac_jax.training.transitions import StepMetrics
 from tests.metrics import step_metrics
 
 SCENES = 8
@@ -27,7 +22,7 @@ CFG = presets.smoke().change(train={"scenes": SCENES, "actions": 12 * SCENES})  
 
 
 def program(cfg: Config = CFG, env: Any = None, *_: Any, **__: Any) -> Program:
-    """In place of `step.make`: without environment and networks, whatever parts it is given."""
+    """Stands in for `program.make`: without environment and networks."""
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
     frames = maps.frames(cfg, networks.make(cfg.net))
     learner = CSAC(actor_critic.with_optimisers(cfg, frames, bounds))
@@ -37,7 +32,7 @@ def program(cfg: Config = CFG, env: Any = None, *_: Any, **__: Any) -> Program:
 def init_state(
     program: Program, key: jax.Array, hyperparams: Hyperparams | None = None
 ) -> TrainState:
-    """In place of `step.init_state`: scenes [E], networks [3], a ring [4]."""
+    """Stands in for `program.init_state`: scenes [E], networks [3], a ring [4]."""
     program = replace_hyperparams(program, hyperparams)
     params = jax.random.normal(jax.random.fold_in(key, 1), (3,))
     learner = {
@@ -50,11 +45,8 @@ def init_state(
     return TrainState(key, jnp.int32(0), scenes, learner, jnp.zeros(4))
 
 
-def train_step(
-    program: Program, state: TrainState, hyperparams: Hyperparams | None = None
-) -> tuple[TrainState, StepMetrics]:
-    """In place of `step.train_step`: physics, a batch, a gradient, a schedule that is a branch."""
-    program = replace_hyperparams(program, hyperparams)
+def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+    """Stands in for `step.train_step`: physics, a batch, a gradient, a branch by the step."""
     cfg, learner = program.cfg, program.learner.parts
     num = cfg.train.scenes
     key = jax.random.fold_in(state.key, state.step)
@@ -98,7 +90,7 @@ def train_step(
 
 
 def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
-    """What comes of every number of a config that the losses above do not show, [n]."""
+    """Returns numbers [n] that depend on every setting that the losses above do not use."""
     cfg, (low, high) = program.cfg, program.learner.parts.bounds
     key_noise, key_push = jax.random.split(key)
     share = step.astype(jnp.float32) / 10.0

@@ -1,4 +1,4 @@
-"""The reporter of a run: a live bar on a terminal, plain lines in a file."""
+"""A reporter of runs: a live bar on a terminal, plain lines in a file."""
 
 import datetime
 import time
@@ -12,7 +12,7 @@ PLAIN_INTERVAL = 10.0  # s between lines where there is no terminal
 
 
 def _describe(record: Record, eta: float | None) -> str:
-    """Speed, success, losses and remaining time `eta`, s, if known, in one line."""
+    """Describes a chunk in one line; `eta` is the remaining time, s, if known."""
     parts = [f"{record.actions_per_second:.1f}/s"]
     if record.grasp_success is not None:
         parts.append(f"grasp success {record.grasp_success:.0%} of last {record.grasps_counted}")
@@ -40,7 +40,7 @@ class Terminal:
     def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Prints a line above the bar."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
@@ -55,4 +55,4 @@ class Terminal:
             self._bar.update(task, completed=done, description=text, refresh=True)
         elif now - self._printed_at >= PLAIN_INTERVAL or done >= total_actions:
             self._printed_at = now
-            self.say(f"{done} of {total_actions} actions, {text}")
+            self.log(f"{done} of {total_actions} actions, {text}")

@@ -1,8 +1,8 @@
-"""Trackers: callbacks that send what a run logs to TensorBoard, Weights & Biases or MLflow.
+"""Trackers: callbacks that send the log of a run to TensorBoard, Weights & Biases or MLflow.
 
 Every number is a scalar over actions: those of a record by their names, outcomes as
 `outcomes/NAME`, those of an evaluation on the way as `eval/NAME` or `eval/PART/NAME`.
-Each library comes with an extra of its name. A resumed run goes on in the tracker's own run.
+Each library comes with an extra of its name. A resumed run continues the tracker's run.
 """
 
 import dataclasses
@@ -17,14 +17,14 @@ PROJECT = "csac_jax"
 
 
 def scalars(record: Record) -> dict[str, float]:
-    """The numbers of a record by name; None is left out."""
+    """Returns the numbers of a record by name, without None."""
     numbers = dataclasses.asdict(record)
     outcomes = {f"outcomes/{name}": count for name, count in numbers.pop("outcomes").items()}
     return {name: float(n) for name, n in (numbers | outcomes).items() if n is not None}
 
 
 def eval_scalars(table: dict[str, Any]) -> dict[str, float]:
-    """The values of an evaluation by name; those without cases are left out."""
+    """Returns the values of an evaluation by name, without those of no cases."""
     parts = table.get("parts", {"": table})
     return {
         "/".join(filter(None, ("eval", part, name))): float(entry["value"])
@@ -35,7 +35,7 @@ def eval_scalars(table: dict[str, Any]) -> dict[str, float]:
 
 
 class Tracker(Callback):
-    """What all trackers do: scalars over actions."""
+    """The base of all trackers: scalars over actions."""
 
     def chunk(self, record: Record, state: Any) -> None:
         self.log(scalars(record), record.actions)
@@ -44,7 +44,7 @@ class Tracker(Callback):
         self.log(eval_scalars(table), record.actions)
 
     def log(self, values: dict[str, float], actions: int) -> None:
-        """Takes the values after so many actions."""
+        """Sends the values after so many actions."""
         raise NotImplementedError
 
 
@@ -55,8 +55,9 @@ class TensorBoard(Tracker):
         from tensorboardX import SummaryWriter
 
         first = run.step * run.cfg.train.scenes + 1
-        own = {"purge_step": first, "filename_suffix": f".{first}"}  # else one second, one name
-        self._writer = SummaryWriter(str(run.run_dir / "tensorboard"), **own)
+        suffix = f".{first}"  # a second writer of the same second needs another file name
+        folder = str(run.run_dir / "tensorboard")
+        self._writer = SummaryWriter(folder, purge_step=first, filename_suffix=suffix)
 
     def log(self, values: dict[str, float], actions: int) -> None:
         for name, value in values.items():
@@ -111,12 +112,12 @@ class MLflow(Tracker):
 
     def _begin_run(self, run: RunInfo) -> str:
         name = os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT)
-        found = self._client.get_experiment_by_name(name)
-        experiment = found.experiment_id if found else self._client.create_experiment(name)
-        begun: str = self._client.create_run(experiment, run_name=run.run_dir.name).info.run_id
+        present = self._client.get_experiment_by_name(name)
+        experiment = present.experiment_id if present else self._client.create_experiment(name)
+        run_id: str = self._client.create_run(experiment, run_name=run.run_dir.name).info.run_id
         for setting, value in configs.flat(configs.to_dict(run.cfg)).items():
-            self._client.log_param(begun, setting, value)
-        return begun
+            self._client.log_param(run_id, setting, value)
+        return run_id
 
     def log(self, values: dict[str, float], actions: int) -> None:
         from mlflow.entities import Metric

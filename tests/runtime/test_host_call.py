@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from csac_jax.runtime import host_call
 from csac_jax.scene import model
-from csac_jax.sim import host_call
 from csac_jax.sim.c_physics import CPhysics
 from tests.sim import conftest
 
@@ -82,7 +82,7 @@ def test_error_of_the_function_is_raised(result: np.ndarray | None, error: str):
 PROGRAM = """
 import csac_jax, jax, numpy as np, sys
 from csac_jax.runtime import cache
-from csac_jax.sim import host_call
+from csac_jax.runtime import host_call
 cache.enable()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 factor = float(sys.argv[1])

@@ -5,7 +5,7 @@ import io
 
 from rich.console import Console
 
-from csac_jax.report import progress
+from csac_jax.training import progress
 from csac_jax.training.callbacks import Record
 
 BLANK = {field.name: 1 for field in dataclasses.fields(Record)}
@@ -20,7 +20,7 @@ def test_plain_lines_are_rare_but_the_last_is_there():
     end; the time left is said where it is known."""
     out = io.StringIO()
     with progress.Terminal(Console(file=out, width=200)) as terminal:
-        terminal.say("[bold] stays")
+        terminal.log("[bold] stays")
         for actions in (2, 4, 6):
             terminal.progress(_record(actions), 6, 4000.0 if actions > 2 else None)
     assert out.getvalue().splitlines() == [

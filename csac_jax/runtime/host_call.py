@@ -1,8 +1,8 @@
-"""A function of the host, called from compiled programs by a key, the same in every process.
+"""Functions of the host, called from compiled programs by a key, the same in every process.
 
-JAX keeps no program on disk that has a `jax.pure_callback`: only this process knows the function.
-Here a program holds a key, and one handler of XLA's foreign function interface looks it up. So what
-was compiled once is found again by the next process. CPU only.
+JAX caches no program on disk that has a `jax.pure_callback`: only this process knows the function.
+Here a program holds a key, and one handler of XLA's foreign function interface looks it up. So the
+next process can use the cached program. CPU only.
 
 The structs are those of XLA's `xla/ffi/api/c_api.h`, version 0.1 or later, whose fields are only
 ever added at the end.
@@ -23,7 +23,7 @@ _TYPES = {1: np.bool_, 4: np.int32, 6: np.uint8, 8: np.uint32, 11: np.float32}  
 
 
 class _Function(NamedTuple):
-    """What a key stands for."""
+    """A function of the host and the structure of its arguments."""
 
     call: Callable[..., Any]
     arguments: Any  # tree structure
@@ -33,7 +33,7 @@ _functions: dict[str, _Function] = {}
 
 
 def call(function: Callable[..., Any], key: str, result: Any, *arguments: Any) -> Any:
-    """`jax.pure_callback` with vmap_method broadcast_all, of a function that `key` identifies.
+    """Calls as `jax.pure_callback` with vmap_method broadcast_all a function that `key` identifies.
 
     Args: key, equal in two processes only if the functions are; result, a pytree of arrays like the
     result's. The function gets NumPy arrays that are its own only until it returns.
@@ -48,7 +48,7 @@ def call(function: Callable[..., Any], key: str, result: Any, *arguments: Any) -
 
 @functools.cache
 def _register() -> None:
-    """Makes the handler known to XLA, once a process."""
+    """Registers the handler with XLA, once a process."""
     make = ctypes.pythonapi.PyCapsule_New
     make.restype, make.argtypes = ctypes.py_object, (c_void_p, c_char_p, c_void_p)
     capsule = make(ctypes.cast(_handler, c_void_p), b"xla._CUSTOM_CALL_TARGET", None)
@@ -56,7 +56,7 @@ def _register() -> None:
 
 
 def _struct(name: str, **fields: Any) -> Any:
-    """A ctypes struct; those of the interface begin with their size and a list of extensions."""
+    """Makes a ctypes struct; those of the interface begin with their size and extensions."""
     return type(name, (ctypes.Structure,), {"_fields_": list(fields.items())})
 
 
@@ -94,7 +94,7 @@ _Frame = _struct(
 
 @ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
 def _handler(pointer: Any) -> int | None:
-    """What XLA calls, at first to ask for the version. Returns an error, or None."""
+    """Handles a call of XLA, at first for the version. Returns an error, or None."""
     frame = pointer.contents
     if frame.extension:
         _tell_version(frame)
@@ -103,13 +103,13 @@ def _handler(pointer: Any) -> int | None:
         _run(frame)
     except BaseException as error:  # nothing may pass through XLA
         message = f"{type(error).__name__}: {error}".encode()
-        told = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
-        return frame.api.contents.make_error(ctypes.byref(told))
+        fault = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
+        return frame.api.contents.make_error(ctypes.byref(fault))
     return None
 
 
 def _tell_version(frame: Any) -> None:
-    """Answers that the handler knows the version of the interface that XLA has."""
+    """Reports the version of the interface that XLA has as the handler's."""
     extension = ctypes.cast(frame.extension, POINTER(_Extension)).contents
     if extension.type == _METADATA:
         version = ctypes.cast(extension.value, POINTER(_Metadata)).contents.version
@@ -121,15 +121,15 @@ def _run(frame: Any) -> None:
     """Calls the function that the frame names, and writes what it returns."""
     text = frame.attributes.values[0].contents
     function = _functions[ctypes.string_at(text.start, text.length).decode()]
-    found = function.call(*jax.tree.unflatten(function.arguments, _arrays(frame.arguments)))
-    for array, value in zip(_arrays(frame.results), jax.tree.leaves(found), strict=True):
+    result = function.call(*jax.tree.unflatten(function.arguments, _arrays(frame.arguments)))
+    for array, value in zip(_arrays(frame.results), jax.tree.leaves(result), strict=True):
         if array.shape != np.shape(value):
             raise ValueError(f"a result has the shape {np.shape(value)}, not {array.shape}")
         array[...] = value
 
 
 def _arrays(buffers: Any) -> list[np.ndarray]:
-    """Views of buffers."""
+    """Returns views of buffers."""
     return [_array(buffers.values[i].contents) for i in range(buffers.size)]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from csac_jax import presets
 from csac_jax.io import configs
-from csac_jax.report import trackers
+from csac_jax.training import trackers
 from csac_jax.training.callbacks import Record, RunInfo, Summary
 
 CFG = presets.smoke()
