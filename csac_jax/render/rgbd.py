@@ -76,6 +76,6 @@ def _aim(camera: mujoco.MjvGLCamera, eye: Camera) -> None:
 
 
 def intrinsics(cfg: CameraConfig) -> dict[str, float]:
-    """Of a camera as `deploy.Policy.decide` takes them."""
+    """Of a camera as `deploy.CameraPolicy.decide` takes them."""
     names = ("width", "height", "fx", "fy", "cx", "cy")
     return dict(zip(names, (*cfg.size, *cfg.focal, *cfg.centre), strict=True))

@@ -14,7 +14,7 @@ import pytest
 
 from csac_jax import cli
 from csac_jax.config import CameraConfig
-from csac_jax.deploy import Policy
+from csac_jax.deploy import CameraPolicy
 from tests.deploy import image_files, scenes
 
 POSES = np.array([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])
@@ -24,17 +24,17 @@ EMPTY = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]))
 
 @pytest.fixture
 def given(tmp_path: Path) -> list[str]:
-    """Policy and files of an image of two blocks."""
+    """CameraPolicy and files of an image of two blocks."""
     return ["shipped", *image_files.write(tmp_path, IMAGE)]
 
 
 def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: the command prints and writes what `Policy.decide` returns, and draws it."""
+    """Claim: the command prints and writes what `CameraPolicy.decide` returns, and draws it."""
     files = ["--json", str(tmp_path / "out.json"), "--png", str(tmp_path / "out.png")]
     assert cli.main(["act", *given, "--top", "2", *files]) == 0
     lines = capsys.readouterr().out.splitlines()
     result = json.loads((tmp_path / "out.json").read_text())
-    wanted = Policy.load("shipped").decide(*IMAGE, top=2)
+    wanted = CameraPolicy.load("shipped").decide(*IMAGE, top=2)
     assert len(lines) == len(result["decisions"]) == 2
     for line, found, decision in zip(lines, result["decisions"], wanted, strict=True):
         assert f"{decision.primitive} at x {found['position'][0]:+.3f}" in line

@@ -27,7 +27,7 @@ def _view(image: Image = IMAGE, **changes: Any) -> View:
 
 
 def _check(view: View) -> None:
-    """What `Policy.decide` asks of a view."""
+    """What `CameraPolicy.decide` asks of a view."""
     checks.pose(view)
     checks.depth_unit(view, EXTENT)
     checks.table_height(checks.table(view, EXTENT), EXTENT)

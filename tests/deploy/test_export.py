@@ -15,7 +15,7 @@ import pytest
 from csac_jax import cli, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import Config
-from csac_jax.deploy import Policy, export, program
+from csac_jax.deploy import CameraPolicy, export, program
 from csac_jax.io import policy_file
 from csac_jax.vision.heightmap import Observation
 from tests.deploy import scenes
@@ -63,12 +63,12 @@ def _alone(script: str, file: Path, **arrays: np.ndarray) -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def policy() -> Policy:
-    return Policy.load("shipped")
+def policy() -> CameraPolicy:
+    return CameraPolicy.load("shipped")
 
 
 @pytest.fixture(scope="module")
-def obs(policy: Policy) -> Observation:
+def obs(policy: CameraPolicy) -> Observation:
     view = IMAGE.rgb.reshape(-1, 3), IMAGE.depth
     depth = np.nan_to_num(view[1])
     points = np.asarray(export._points(depth, LENS, IMAGE.pose.astype(np.float32))).reshape(-1, 3)
@@ -81,7 +81,7 @@ def _assert_close(found: list[Any], wanted: Any) -> None:
         np.testing.assert_allclose(one, np.asarray(other), atol=TOLERANCE, rtol=0, err_msg=name)
 
 
-def test_stablehlo_of_maps(policy: Policy, obs: Observation, tmp_path: Path, capsys: Any):
+def test_stablehlo_of_maps(policy: CameraPolicy, obs: Observation, tmp_path: Path, capsys: Any):
     """Claim: jax alone computes from maps what the policy does, to 1e-4."""
     file = tmp_path / "policy.stablehlo"
     assert cli.main(["export", "shipped", str(file), "--format", "stablehlo"]) == 0
@@ -92,8 +92,8 @@ def test_stablehlo_of_maps(policy: Policy, obs: Observation, tmp_path: Path, cap
 
 
 @pytest.mark.slow
-def test_stablehlo_of_an_image(policy: Policy, tmp_path: Path):
-    """Claim: jax alone computes from an image what `Policy.decide` returns."""
+def test_stablehlo_of_an_image(policy: CameraPolicy, tmp_path: Path):
+    """Claim: jax alone computes from an image what `CameraPolicy.decide` returns."""
     file, depth = tmp_path / "policy.stablehlo", np.nan_to_num(IMAGE.depth)
     options = ["--format", "stablehlo", "--input", "image"]
     assert cli.main(["export", "shipped", str(file), *options]) == 0
@@ -107,7 +107,7 @@ def test_stablehlo_of_an_image(policy: Policy, tmp_path: Path):
     np.testing.assert_allclose(found[4][:, :3], places, atol=1e-3)
 
 
-def test_onnx(policy: Policy, obs: Observation, tmp_path: Path):
+def test_onnx(policy: CameraPolicy, obs: Observation, tmp_path: Path):
     """Claim: onnxruntime alone computes Q and the best cell's action as the policy, to 1e-4."""
     file = tmp_path / "policy.onnx"
     assert cli.main(["export", "shipped", str(file), "--format", "onnx"]) == 0
@@ -184,7 +184,7 @@ def test_onnx_of_other_nets(name: str, empty: bool):
         np.testing.assert_allclose(found[4], stations, atol=TOLERANCE)
 
 
-def test_policy_file_of_a_policy_file(policy: Policy, tmp_path: Path):
+def test_policy_file_of_a_policy_file(policy: CameraPolicy, tmp_path: Path):
     """Claim: safetensors of the shipped policy is the shipped policy, with a digest."""
     file = tmp_path / "copy.safetensors"
     assert cli.main(["export", "shipped", str(file)]) == 0
@@ -193,7 +193,7 @@ def test_policy_file_of_a_policy_file(policy: Policy, tmp_path: Path):
     jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(policy.params))
 
 
-def test_policy_file_that_decides_otherwise(policy: Policy, tmp_path: Path):
+def test_policy_file_that_decides_otherwise(policy: CameraPolicy, tmp_path: Path):
     """Claim: a policy file is written with what --augment, --height-bonus and --retry ask for."""
     file = tmp_path / "high.safetensors"
     asked = ["--augment=on", "--height-bonus=3", "--retry=0.1"]
@@ -203,7 +203,7 @@ def test_policy_file_that_decides_otherwise(policy: Policy, tmp_path: Path):
     jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(policy.params))
 
 
-def test_average_of_policies(policy: Policy, tmp_path: Path):
+def test_average_of_policies(policy: CameraPolicy, tmp_path: Path):
     """Claim: `--average` writes the mean of each number of two policies, and the config of one."""
     other, file = tmp_path / "other.safetensors", tmp_path / "mean.safetensors"
     tripled = jax.tree.map(lambda leaf: 3.0 * leaf, policy.params)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from csac_jax.cli import main
-from csac_jax.deploy import Policy, record
+from csac_jax.deploy import CameraPolicy, record
 from csac_jax.deploy.record import Recorder
 from tests.deploy import image_files, scenes
 
@@ -73,14 +73,14 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def policy() -> Policy:
-    loaded = Policy.load("shipped")
+def policy() -> CameraPolicy:
+    loaded = CameraPolicy.load("shipped")
     loaded.warm_up(640, 480)
     return loaded
 
 
 @pytest.fixture(scope="module")
-def server(policy: Policy) -> Iterator[Server]:
+def server(policy: CameraPolicy) -> Iterator[Server]:
     from csac_jax.deploy import service
 
     running = Server(service.make(policy, "shipped", TOKEN))
@@ -89,7 +89,7 @@ def server(policy: Policy) -> Iterator[Server]:
 
 
 @pytest.fixture
-def recording(policy: Policy, tmp_path: Path) -> Iterator[Server]:
+def recording(policy: CameraPolicy, tmp_path: Path) -> Iterator[Server]:
     """A service that records into the test's folder."""
     from csac_jax.deploy import service
 
@@ -165,9 +165,11 @@ def test_full_disc_is_told(recording: Server, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_decides_as_the_library(server: Server):
-    """Claim: /decide answers what `Policy.decide` returns."""
+    """Claim: /decide answers what `CameraPolicy.decide` returns."""
     status, answer = server.ask("POST", "/decide", {**BODY, "top": 2})
-    wanted = json.loads(json.dumps([d.to_dict() for d in Policy.load().decide(*IMAGE, top=2)]))
+    wanted = json.loads(
+        json.dumps([d.to_dict() for d in CameraPolicy.load().decide(*IMAGE, top=2)])
+    )
     assert status == 200
     assert [d["primitive"] for d in answer["decisions"]] == [d["primitive"] for d in wanted]
     for found, decision in zip(answer["decisions"], wanted, strict=True):
