@@ -87,9 +87,7 @@ class Gripper:
     clearance: float  # m, least height of the tips above the table
     radius: float  # m, circle about the tool axis that holds the open hand
     body_radius: float  # m, capsule about the gripper's body
-    hand_capsule: tuple[
-        float, ...
-    ]  # m, about palm and fingers: from and to, back from tips; radius
+    hand_capsule: tuple[float, float, float]  # m, about palm and fingers: from, to, radius
     varies: tuple[Fingers, Fingers] | None = None  # least and most of an episode's; None: the same
 
     def __str__(self) -> str:

@@ -82,7 +82,7 @@ def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
 
     Raises SettingsError for arrays of a wrong form, FailedError if too little of it is seen.
     """
-    camera, pixels = images.Intrinsics.parse(intrinsics), np.asarray(rgb)
+    camera, pixels = images.Intrinsics.of(intrinsics), np.asarray(rgb)
     if pixels.shape != (*camera.shape, 3) or pixels.dtype != np.uint8:
         raise SettingsError("rgb: must be uint8 [rows, columns, 3] of the intrinsics' size")
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -114,13 +114,13 @@ def on_table(board: Located) -> np.ndarray:
     return np.linalg.inv(board.pose)
 
 
-def hand_eye(boards: Sequence[Located], grippers: Sequence[Any]) -> HandEye:
+def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> HandEye:
     """Computes the pose of a fixed camera by a board in the gripper; Park and Martin 1994.
 
-    Args: grippers [4, 4], gripper to robot, one for each image. Raises SettingsError for too few
-    poses, or for poses that differ by too little.
+    Args: robot, poses [4, 4] from gripper to robot, one for each image. Raises SettingsError for
+    too few poses, and for poses that differ too little.
     """
-    arms = [images.rigid(pose, "robot") for pose in grippers]
+    arms = [images.rigid(pose, "robot") for pose in robot]
     if len(arms) != len(boards) or len(arms) < LEAST_POSES:
         raise SettingsError(
             f"robot: give a pose of the arm for each image, {LEAST_POSES} or more, not "
@@ -149,5 +149,5 @@ def hand_eye(boards: Sequence[Located], grippers: Sequence[Any]) -> HandEye:
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The rotation vector [3] rad from one pose to another."""
+    """Returns the rotation vector [3] rad from one pose to another."""
     return cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0].ravel()

@@ -32,7 +32,7 @@ def seen_points(depth: Any, intrinsics: Any, pixels: Any) -> np.ndarray:
     Args: depth [h, w] m, 0 or NaN where there is none; intrinsics as for `CameraPolicy.decide`.
     Raises SettingsError for pixels outside of the image, or with no depth around them.
     """
-    camera, depth = images.Intrinsics.parse(intrinsics), np.asarray(depth, np.float64)
+    camera, depth = images.Intrinsics.of(intrinsics), np.asarray(depth, np.float64)
     if depth.shape != camera.shape:
         raise SettingsError("depth: its size is not that of the intrinsics")
     places = _points(pixels, 2, "pixels").round().astype(int)
