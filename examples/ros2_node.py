@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from csac_jax.deploy import Policy
+from csac_jax.deploy import CameraPolicy
 
 
 def image(message: Any) -> np.ndarray:
@@ -34,7 +34,7 @@ def image(message: Any) -> np.ndarray:
 
 
 def intrinsics(info: Any) -> dict[str, Any]:
-    """What `Policy.decide` takes, of a sensor_msgs/CameraInfo."""
+    """What `CameraPolicy.decide` takes, of a sensor_msgs/CameraInfo."""
     names = {"fx": info.k[0], "fy": info.k[4], "cx": info.k[2], "cy": info.k[5]}
     return {"width": info.width, "height": info.height, **names, "distortion": tuple(info.d)[:5]}
 
@@ -57,7 +57,7 @@ def main(*arguments: str) -> None:
 
     rclpy.init(args=list(arguments))
     node, newest = rclpy.create_node("csac_jax"), {}
-    policy = Policy.load(node.declare_parameter("policy", "shipped").value)
+    policy = CameraPolicy.load(node.declare_parameter("policy", "shipped").value)
     buffer = Buffer()
     TransformListener(buffer, node)
     for name, kind in (("color", Image), ("aligned_depth_to_color", Image)):

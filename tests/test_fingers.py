@@ -267,8 +267,8 @@ def test_robot_has_one_gripper(tmp_path: Path, capsys: pytest.CaptureFixture[str
     policy_file.save(path, _networks(CONFIG), CONFIG)
     assert main(["export", str(path), str(tmp_path / "copy.safetensors")]) == 0
     with pytest.raises(SettingsError, match=f"^{ASKED}"):
-        deploy.Policy.load(path).warm_up(64, 48)
-    deploy.Policy.load(path, gripper="2f85").warm_up(64, 48)
+        deploy.CameraPolicy.load(path).warm_up(64, 48)
+    deploy.CameraPolicy.load(path, gripper="2f85").warm_up(64, 48)
     given = ["export", str(path), str(program_file), "--format", "onnx"]
     capsys.readouterr()
     assert main(given) == 2

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from csac_jax import deploy, grippers
-from csac_jax.deploy import decision, program
+from csac_jax.deploy import decision, decision_program
 from csac_jax.errors import SettingsError
 from csac_jax.sim.primitives import Action
 
@@ -35,7 +35,7 @@ def test_shipped_grippers_name_their_sources():
     assert grippers.shipped() == ["2f85", "franka_hand", "rg2", "varied"]
     for name in grippers.shipped():
         sources = _numbers(name)["sources"]
-        assert {*sources} >= {*grippers._LENGTHS} - {"clearance"}
+        assert {*sources} >= {*grippers.LENGTHS} - {"clearance"}
         assert all(len(text) >= 4 for text in sources.values())
 
 
@@ -85,13 +85,13 @@ WRONG = {
     "missing": (("opening", None), "'opening' is missing"),
     "part": (("finger", {"thickness": 0.01, "width": 0.02}), "'finger.length' is missing"),
     "end": (("actuator", {"name": "finger", "open": 1.0}), "'actuator.closed' is missing"),
-    "unknown": (("fingers", 2), "'fingers' is unknown; the keys are: format, name"),
-    "format": (("format", 2), "'format' must be 1"),
-    "word": (("palm", 3), "'palm' must be a name"),
-    "pads": (("pads", ["pad"]), "'pads' must be the names of two geoms"),
+    "unknown": (("fingers", 2), "'fingers' is unknown"),
+    "format": (("format", 2), "'format' should be 1"),
+    "word": (("palm", 3), "'palm' should be a valid string"),
+    "pads": (("pads", ["pad"]), "'pads.1' is missing"),
     "joints": (("joints", {}), "'joints' must name 1 to 16"),
-    "text": (("depth", {"closed": "0.2", "open": 0.2}), "'depth.closed' must be a number"),
-    "nan": (("radius", float("nan")), "'radius' must be a number"),
+    "text": (("depth", {"closed": "0.2", "open": 0.2}), "'depth.closed' should be a valid number"),
+    "nan": (("radius", float("nan")), "'radius' must lie in 0 .. 1 m"),
     "millimetres": (("opening", {"closed": 0, "open": 110}), "'opening' must lie in 0 .. 1 m"),
     "swapped": (("opening", {"closed": 0.1, "open": 0}), "'opening' must grow from closed"),
     "moves": (("depth", {"closed": 0.2, "open": 0.21}), "'depth' must be the same at both ends"),
@@ -137,15 +137,17 @@ def test_no_gripper_is_one_line(source: str):
 @pytest.mark.mjx
 def test_deployed_policy_takes_another_gripper():
     """Claim: a deployed policy decides for the gripper that it is given, its own by default."""
-    assert deploy.Policy.load("shipped").cfg.sim.gripper == "rg2"
-    policy = deploy.Policy.load("shipped", gripper="2f85")
+    assert deploy.CameraPolicy.load("shipped").cfg.sim.gripper == "rg2"
+    policy = deploy.CameraPolicy.load("shipped", gripper="2f85")
     height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
-    stations = program.stations(policy.cfg, height, Action.grasp(0.0, 0.0, 0.0))
-    choice = program.Choice(Action.grasp(0.0, 0.0, 0.0), jnp.zeros(()), jnp.bool(True), stations)
-    decided = decision.of(jax.device_get(choice), np.eye(4))
+    stations = decision_program.stations(policy.cfg, height, Action.grasp(0.0, 0.0, 0.0))
+    choice = decision_program.Choice(
+        Action.grasp(0.0, 0.0, 0.0), jnp.zeros(()), jnp.bool(True), stations
+    )
+    decided = decision.from_choice(jax.device_get(choice), np.eye(4))
     assert decided.width == pytest.approx(0.085)
     with pytest.raises(SettingsError, match="neither one of"):
-        deploy.Policy.load("shipped", gripper="2f86")
+        deploy.CameraPolicy.load("shipped", gripper="2f86")
 
 
 def test_decisions_need_no_mujoco():
@@ -154,11 +156,11 @@ def test_decisions_need_no_mujoco():
         "import sys; sys.modules['mujoco'] = None\n"
         "import jax.numpy as jnp, csac_jax\n"
         "from csac_jax import presets\n"
-        "from csac_jax.deploy import program\n"
+        "from csac_jax.deploy import decision_program\n"
         "from csac_jax.sim.primitives import Action\n"
         "cfg = presets.smoke().change(sim={'gripper': '2f85'})\n"
         "height = jnp.zeros((cfg.heightmap.size,) * 2)\n"
-        "print(float(program.stations(cfg, height, Action.grasp(0.0, 0.0, 0.0))[0, 4]))\n"
+        "print(float(decision_program.stations(cfg, height, Action.grasp(0.0, 0.0, 0.0))[0, 4]))\n"
     )
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert float(found.stdout) == pytest.approx(0.0425)

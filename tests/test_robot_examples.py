@@ -152,7 +152,7 @@ def test_ros_images():
 
 
 def test_ros_camera_and_transform():
-    """Claim: camera_info and transform become what `Policy.decide` takes."""
+    """Claim: camera_info and transform become what `CameraPolicy.decide` takes."""
     info = SimpleNamespace(
         k=[600, 0, 320, 0, 610, 240, 0, 0, 1], d=[0.1] * 5, width=640, height=480
     )

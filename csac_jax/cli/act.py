@@ -32,11 +32,11 @@ class ActOptions:
     gripper: str | None = None
     """The robot's gripper, by name or folder; by default that of the training."""
     top: int = 1
-    """How many actions to give, best first."""
+    """Number of actions, best first."""
     check: bool = False
-    """Of an image of the empty table: says whether pose and intrinsics fit, and decides nothing."""
+    """Checks pose and intrinsics by an image of the empty table, and decides nothing."""
     record: Path | None = None
-    """Folder to keep the image and the decisions in, for finetune."""
+    """Folder that stores the image and the decisions, for finetune."""
     json: Path | None = None
     """File to write the result to, as JSON."""
     png: Path | None = None
@@ -54,36 +54,35 @@ def run(arguments: list[str]) -> int:
         with as_bad_arguments(ValueError):
             media.check_suffix(options.png, media.PICTURES)
     from csac_jax import deploy
-    from csac_jax.deploy import files
+    from csac_jax.deploy import image_files
 
-    workspace = None if options.workspace is None else files.read_pose(options.workspace)
-    policy = deploy.Policy.load(options.policy, workspace, options.gripper)
+    workspace = None if options.workspace is None else image_files.read_pose(options.workspace)
+    policy = deploy.CameraPolicy.load(options.policy, workspace, options.gripper)
     image = (
-        files.read_rgb(options.rgb),
-        files.read_depth(options.depth),
-        files.read_intrinsics(options.intrinsics),
-        files.read_pose(options.pose),
+        image_files.read_rgb(options.rgb),
+        image_files.read_depth(options.depth),
+        image_files.read_intrinsics(options.intrinsics),
+        image_files.read_pose(options.pose),
     )
     return (_check if options.check else _decide)(options, policy, image)
 
 
 def _decide(options: ActOptions, policy: Any, image: tuple[Any, Any, Any, Any]) -> int:
-    from csac_jax.deploy import files, images, record
+    from csac_jax.deploy import image_files, images, record
     from csac_jax.render import decision_picture, media
 
-    mask = None if options.mask is None else files.read_mask(options.mask)
+    mask = None if options.mask is None else image_files.read_mask(options.mask)
     recorder = None if options.record is None else record.Recorder(options.record, options.policy)
     decisions = policy.decide(*image, mask, options.top)
-    for number, one in enumerate(decisions, 1):
-        print(f"{number:2d} {decision_picture.line(one)}")
+    for number, action in enumerate(decisions, 1):
+        print(f"{number:2d} {decision_picture.line(action)}")
     if not decisions:
         print("nothing to act on")
     if options.png is not None:
         view, maps = images.make(*image, target_mask=mask), policy.maps(*image, mask)
-        media.write_picture(
-            options.png, decision_picture.picture(policy.cfg, view, decisions, maps)
-        )
-    result: dict[str, Any] = {"decisions": [one.to_dict() for one in decisions]}
+        drawing = decision_picture.picture(policy.cfg, view, decisions, maps)
+        media.write_picture(options.png, drawing)
+    result: dict[str, Any] = {"decisions": [action.to_dict() for action in decisions]}
     if recorder is not None:
         result["id"] = recorder.add((*image, mask), decisions)
         print(f"recorded as {options.record / result['id']}")

@@ -10,20 +10,21 @@ from csac_jax.cli.failures import BadArgumentsError, check_extra
 
 @dataclasses.dataclass(frozen=True)
 class CalibrateOptions:
-    """Finds the camera's pose by a printed board: of one image, where the board lies on the table
-    and its middle is the workspace's centre; or of several, where the gripper holds it."""
+    """Finds the camera's pose by a printed board.
+
+    The board lies on the table in one image, its middle the workspace's centre; or the gripper
+    holds it in several images."""
 
     board: Path | None = None
-    """Writes the board as a .png to print, and does nothing else."""
+    """Writes the board as a .png to print, and stops."""
     rgb: tuple[Path, ...] = ()
     """Colour images of the board: one of it on the table, or several of it in the gripper."""
     intrinsics: Path | None = None
     """JSON of the camera: width, height, fx, fy, cx, cy in px, and maybe distortion."""
     robot: tuple[Path, ...] = ()
-    """Of a board in the gripper, for each image: JSON with the 4 x 4 matrix from gripper to robot,
-    m."""
+    """For a board in the gripper: for each image a JSON with the matrix from gripper to robot."""
     workspace: Path | None = None
-    """Of a board in the gripper: JSON with the 4 x 4 matrix from workspace to robot, m."""
+    """For a board in the gripper: JSON with the 4 x 4 matrix from workspace to robot, m."""
     square: float = 0.03
     """Side of a printed square, m: measure it."""
     out: Path = Path("pose.json")
@@ -42,19 +43,19 @@ def run(arguments: list[str]) -> int:
     _check(options)
     import numpy as np
 
-    from csac_jax.deploy import files as image_files
+    from csac_jax.deploy import image_files
     from csac_jax.io import files
 
     assert options.intrinsics is not None
     lens = image_files.read_intrinsics(options.intrinsics)
-    found = [board.locate(printed, image_files.read_rgb(path), lens) for path in options.rgb]
-    for path, one in zip(options.rgb, found, strict=True):
-        print(f"{path}: {len(one.residual_mm)} corners, {_spread(one.residual_mm)}")
+    boards = [board.locate(printed, image_files.read_rgb(path), lens) for path in options.rgb]
+    for path, located in zip(options.rgb, boards, strict=True):
+        print(f"{path}: {len(located.residual_mm)} corners, {_spread(located.residual_mm)}")
     if options.workspace is None:
-        pose = board.on_table(found[0])
+        pose = board.on_table(boards[0])
     else:
         workspace = image_files.read_pose(options.workspace)
-        eye = board.hand_eye(found, [image_files.read_pose(path) for path in options.robot])
+        eye = board.hand_eye(boards, [image_files.read_pose(path) for path in options.robot])
         for path, off in zip(options.robot, eye.residual_mm, strict=True):
             print(f"{path}: {off:.2f} mm off")
         print(f"hand-eye: {_spread(eye.residual_mm)}")
@@ -74,7 +75,7 @@ def _check(options: CalibrateOptions) -> None:
 
 
 def _print(path: Path, printed: Any) -> int:
-    from csac_jax.deploy import board, files as image_files
+    from csac_jax.deploy import board, image_files
     from csac_jax.io import files
 
     if path.suffix != ".png":
@@ -89,5 +90,4 @@ def _print(path: Path, printed: Any) -> int:
 
 
 def _spread(residual_mm: Any) -> str:
-    """Errors in a few words."""
     return f"residual {residual_mm.mean():.2f} mm in the mean, {residual_mm.max():.2f} mm at most"

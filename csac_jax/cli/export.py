@@ -10,7 +10,7 @@ from csac_jax.cli import parsing, settings
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_extra
 from csac_jax.config import Config
 
-NEEDS = {"stablehlo": "flatbuffers", "onnx": "onnx"}  # modules of the extra `export`
+NEEDS = {"stablehlo": "flatbuffers", "onnx": "jax2onnx"}  # modules of the extra `export`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,19 +27,19 @@ class ExportOptions:
     gripper: str | None = None
     """The robot's gripper, by name or folder; by default that of the training."""
     augment: Literal["on", "off"] | None = None
-    """Whether Q is the mean over mirror images of the view, see `policy.augment` of `csac-jax train
+    """Takes the mean of Q over mirror images of the view, see `policy.augment` of `csac-jax train
     --help-all`; by default as the policy's."""
     average: str | None = None
     """Another policy, with the same networks and trained from the same start, such as the start
     itself. Each number of the networks is the mean of both policies' (Wortsman et al. 2022)."""
     height_bonus: float | None = None
-    """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
+    """Q's increase per metre of the surface under a cell, see `policy.height_bonus` of `csac-jax
     train --help-all`; by default as the policy's."""
     retry: float | None = None
-    """How boldly the policy draws another place after failed grasps, see `policy.retry` of
+    """Temperature of the draw of another place after failed grasps, see `policy.retry` of
     `csac-jax train --help-all`; by default as the policy's."""
     input: Literal["maps", "image"] = "maps"
-    """What a program takes: colour and height map, or (stablehlo) a camera's image and pose."""
+    """Input of a program: colour and height map, or (stablehlo) a camera's image and pose."""
     size: tuple[int, int] = (640, 480)
     """Width and height of that image, px."""
 
@@ -51,7 +51,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax import deploy
     from csac_jax.io import files, policy_file
 
-    policy = deploy.Policy.load(options.policy, gripper=options.gripper)
+    policy = deploy.CameraPolicy.load(options.policy, gripper=options.gripper)
     with as_bad_arguments(ValueError):
         cfg = policy.cfg.change(policy=settings.decision(options))
     params = policy.params if options.average is None else _mean(policy.params, options.average)
@@ -80,33 +80,33 @@ def _check(options: ExportOptions) -> None:
 
 
 def _mean(params: Any, source: str) -> Any:
-    """The mean of these networks and another policy's."""
+    """Returns the mean of these networks and another policy's."""
     import jax
 
     from csac_jax import deploy
     from csac_jax.io import leaves
 
-    other = deploy.Policy.load(source).params
-    if found := leaves.difference(leaves.layout(other), leaves.layout(params)):
-        name, has, asked = found
+    other = deploy.CameraPolicy.load(source).params
+    if difference := leaves.difference(leaves.layout(other), leaves.layout(params)):
+        name, has, asked = difference
         raise BadArgumentsError(
             f"--average {source}: has {name} as {has}, the first policy as {asked}; "
             "give policies with the same networks"
         )
-    return jax.tree.map(lambda one, two: 0.5 * (one + two), params, other)
+    return jax.tree.map(lambda a, b: 0.5 * (a + b), params, other)
 
 
 def _program(options: ExportOptions, cfg: Config, params: Any) -> bytes:
-    """The content of a file that holds a program."""
+    """Returns the content of a file that holds a program."""
     import jax
 
-    from csac_jax.deploy import export
+    from csac_jax.deploy import stablehlo
 
     params = jax.device_get(params)
     if options.format == "onnx":
-        from csac_jax.deploy import onnx_graph
+        from csac_jax.deploy import onnx
 
-        return onnx_graph.make(cfg, params)
+        return onnx.serialize(cfg, params)
     if options.input == "image":
-        return export.stablehlo(*export.from_image(cfg, params, options.size))
-    return export.stablehlo(*export.from_maps(cfg, params))
+        return stablehlo.serialize(*stablehlo.from_image(cfg, params, options.size))
+    return stablehlo.serialize(*stablehlo.from_maps(cfg, params))

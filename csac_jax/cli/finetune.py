@@ -18,8 +18,8 @@ INTERVAL = 10.0  # s between lines
 
 @dataclasses.dataclass(frozen=True)
 class FinetuneOptions:
-    """Goes on training a policy with the actions and outcomes that act or serve recorded. Nothing
-    is simulated."""
+    """Trains a policy further with the actions and outcomes that act or serve recorded. Nothing is
+    simulated."""
 
     policy: tyro.conf.Positional[str]
     """A policy file, one that comes with the package, such as shipped, or a run's folder."""
@@ -30,13 +30,13 @@ class FinetuneOptions:
     out: Path = Path("finetuned.safetensors")
     """Policy file to write, which must not exist."""
     updates: int = 150
-    """Updates of the critic; more where the record is larger than some hundred actions."""
+    """Updates of the critic; take more for a record of more than some hundred actions."""
     learning_rate: float = 3e-4
     """Adam's step size for the critic; the actor's is a third of it."""
     batch: int = 16
     """Actions that an update learns from."""
     seed: int = 0
-    """Number that the order of the actions follows from."""
+    """Seed of the order of the actions."""
     json: Path | None = None
     """File to write the result to, as JSON."""
 
@@ -47,26 +47,26 @@ def run(arguments: list[str]) -> int:
     _check(options)
     stop = signals.install()
     try:
-        from csac_jax.deploy import Policy, finetune
+        from csac_jax.deploy import CameraPolicy, fine_tuning
     except ModuleNotFoundError as error:
         raise BadArgumentsError(
             f"finetune needs {error.name}; copy the record to a machine where it is installed"
         ) from None
     from csac_jax.io import policy_file
 
-    policy = Policy.load(options.policy, gripper=options.gripper)
+    policy = CameraPolicy.load(options.policy, gripper=options.gripper)
     values = (options.updates, options.learning_rate, options.batch, options.seed)
-    settings = finetune.Settings(*values)
-    tuned, done = finetune.run(policy, options.record, settings, _printer(), stop)
+    settings = fine_tuning.Settings(*values)
+    tuned, summary = fine_tuning.run(policy, options.record, settings, _printer(), stop)
     policy_file.save(options.out, tuned.params, tuned.cfg)
     print(
-        f"learned from {done.actions} actions, {done.lifted} of them lifted something; "
-        f"TD error {done.td_error[0]:.3f} -> {done.td_error[1]:.3f}"
+        f"learned from {summary.actions} actions, {summary.lifted} of them lifted something; "
+        f"TD error {summary.td_error[0]:.3f} -> {summary.td_error[1]:.3f}"
     )
-    ended = "stopped" if done.stopped_by else "done"
-    print(f"{ended} after {done.updates} updates; wrote {options.out}")
-    asked = {"policy": options.policy, "record": str(options.record), **settings._asdict()}
-    output.write_result(options.json, {**asked, **done._asdict()}, tuned.cfg)
+    ended = "stopped" if summary.stopped_by else "done"
+    print(f"{ended} after {summary.updates} updates; wrote {options.out}")
+    inputs = {"policy": options.policy, "record": str(options.record), **settings._asdict()}
+    output.write_result(options.json, {**inputs, **summary._asdict()}, tuned.cfg)
     return stop.exit_code
 
 
@@ -85,18 +85,19 @@ def _check(options: FinetuneOptions) -> None:
 
 
 def _printer() -> Callable[[Any], None]:
-    """Prints how far the learning is, at first and then every INTERVAL."""
+    """Returns a callback that prints the progress, at first and then every INTERVAL."""
     printed = [-INTERVAL]
 
-    def show(now: Any) -> None:
-        if time.monotonic() - printed[0] < INTERVAL and now.updates < now.total:
+    def show(progress: Any) -> None:
+        if time.monotonic() - printed[0] < INTERVAL and progress.updates < progress.total:
             return
         printed[0] = time.monotonic()
         left = datetime.timedelta(
-            seconds=round(now.seconds * (now.total - now.updates) / now.updates)
+            seconds=round(progress.seconds * (progress.total / progress.updates - 1.0))
         )
         print(
-            f"{now.updates} of {now.total} updates, TD error {now.td_error:.3f}, {left} left",
+            f"{progress.updates} of {progress.total} updates, "
+            f"TD error {progress.td_error:.3f}, {left} left",
             flush=True,
         )
 

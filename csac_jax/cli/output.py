@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 
-class _Unbroken:
+class BrokenPipeGuard:
     """A stream that falls silent once `head`, which reads it, has had enough, or a disc is full."""
 
     def __init__(self, stream: Any) -> None:
@@ -48,7 +48,7 @@ def unbroken() -> Iterator[None]:
     """In the block a closed pipe silences stdout or stderr, and the work goes on."""
     sys.stdout, sys.stderr = sys.stdout or _nowhere(1), sys.stderr or _nowhere(2)
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(_Unbroken, before)
+    sys.stdout, sys.stderr = map(BrokenPipeGuard, before)
     try:
         yield
     finally:

@@ -28,7 +28,7 @@ class ServeOptions:
     workspace: Path | None = None
     """JSON with the 4 x 4 matrix from workspace to robot, for the waypoints' tool poses."""
     record: Path | None = None
-    """Folder to keep images, decisions and the outcomes posted in, for finetune; of one robot."""
+    """Folder of one robot that stores images, decisions and posted outcomes, for finetune."""
     gripper: str | None = None
     """The robot's gripper, by name or folder; by default that of the training."""
     size: tuple[int, int] = (640, 480)
@@ -48,10 +48,10 @@ def run(arguments: list[str]) -> int:
     import uvicorn
 
     from csac_jax import deploy
-    from csac_jax.deploy import files, record, service
+    from csac_jax.deploy import image_files, record, service
 
-    workspace = None if options.workspace is None else files.read_pose(options.workspace)
-    policy = deploy.Policy.load(options.policy, workspace, options.gripper)
+    workspace = None if options.workspace is None else image_files.read_pose(options.workspace)
+    policy = deploy.CameraPolicy.load(options.policy, workspace, options.gripper)
     recorder = None if options.record is None else record.Recorder(options.record, options.policy)
     policy.warm_up(*options.size)
     app = service.make(policy, options.policy, token, recorder)
@@ -60,7 +60,7 @@ def run(arguments: list[str]) -> int:
 
 
 def read_token(options: ServeOptions) -> str | None:
-    """The token that clients must send, None for none. Raises BadArgumentsError."""
+    """Returns the token that clients must send, or None. Raises BadArgumentsError."""
     if options.token_file is None:
         if options.host not in LOCAL:
             raise BadArgumentsError(

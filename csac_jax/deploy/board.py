@@ -1,8 +1,8 @@
 """The camera's pose from a printed board: ChArUco, by OpenCV (extra `calibrate`).
 
-The board lies on the table and its middle becomes the workspace's centre: one image. Or the gripper
-holds it, in several poses of the arm: hand-eye calibration. Its axes: x to the right of the page, y
-up the page, z out of it, from its middle.
+The board lies on the table in one image, and its middle becomes the workspace's centre. Or the
+gripper holds it in several poses of the arm: hand-eye calibration. Its axes begin at its middle: x
+to the right of the page, y up the page, z out of it.
 """
 
 import dataclasses
@@ -38,33 +38,33 @@ class Board:
 
     @functools.cached_property
     def charuco(self) -> Any:
-        """OpenCV's."""
+        """Returns OpenCV's board."""
         words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
         marker = _MARKER_SHARE * self.square
         return cv2.aruco.CharucoBoard((COLUMNS, ROWS), self.square, marker, words)
 
     @functools.cached_property
     def corners(self) -> np.ndarray:
-        """The inner corners [35, 3] m in the board's axes, by OpenCV's numbers."""
-        own = np.asarray(self.charuco.getChessboardCorners(), np.float64)
+        """Returns the inner corners [35, 3] m in the board's axes, by OpenCV's numbers."""
+        corners = np.asarray(self.charuco.getChessboardCorners(), np.float64)
         middle = 0.5 * self.square * np.array([COLUMNS, ROWS, 0])
-        return (own - middle) * [1.0, -1.0, -1.0]  # OpenCV's y runs down the page
+        return (corners - middle) * [1.0, -1.0, -1.0]  # OpenCV's y runs down the page
 
     def picture(self) -> np.ndarray:
-        """What to print at DPI [rows, columns] uint8, with the x and the y axis in the margin."""
+        """Draws the page to print at DPI, [rows, columns] uint8, with both axes in the margin."""
         size = [round(side * self.square / _INCH * DPI) for side in (COLUMNS, ROWS)]
         margin = round(_MARGIN / _INCH * DPI)
         page = np.pad(self.charuco.generateImage(size), margin, constant_values=255)
         corner, length = (margin // 2, page.shape[0] - margin // 2), 4 * margin
         for name, tip in (("x", (length, corner[1])), ("y", (corner[0], corner[1] - length))):
             cv2.arrowedLine(page, corner, tip, 0, 3, tipLength=0.05)
-            beside = (tip[0] + 10, tip[1] + 10) if name == "x" else (tip[0] - 10, tip[1] - 20)
-            cv2.putText(page, name, beside, cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 3)
+            label = (tip[0] + 10, tip[1] + 10) if name == "x" else (tip[0] - 10, tip[1] - 20)
+            cv2.putText(page, name, label, cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 3)
         return page
 
 
 class Located(NamedTuple):
-    """Where a board stands before a camera."""
+    """A board's pose before a camera."""
 
     pose: np.ndarray  # [4, 4] board to camera (x right, y down, z forward)
     residual_mm: np.ndarray  # [n] of each corner seen, from where the pose puts it, at the board
@@ -78,9 +78,9 @@ class HandEye(NamedTuple):
 
 
 def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
-    """Where the board is in an image [h, w, 3] uint8.
+    """Finds the board in an image [h, w, 3] uint8.
 
-    Raises SettingsError for arrays of a wrong form, FailedError where too little of it is seen.
+    Raises SettingsError for arrays of a wrong form, FailedError if too little of it is seen.
     """
     camera, pixels = images.Intrinsics.of(intrinsics), np.asarray(rgb)
     if pixels.shape != (*camera.shape, 3) or pixels.dtype != np.uint8:
@@ -109,22 +109,22 @@ def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
     return Located(pose, 1e3 * depth * np.linalg.norm(off, axis=1))
 
 
-def on_table(found: Located) -> np.ndarray:
-    """The camera's pose [4, 4] in the workspace, whose axes are those of the board on the table."""
-    return np.linalg.inv(found.pose)
+def on_table(board: Located) -> np.ndarray:
+    """Returns the camera's pose [4, 4] in the workspace, whose axes are the board's."""
+    return np.linalg.inv(board.pose)
 
 
-def hand_eye(found: Sequence[Located], grippers: Sequence[Any]) -> HandEye:
-    """The pose of a fixed camera by a board that the gripper holds; Park and Martin 1994.
+def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> HandEye:
+    """Computes the pose of a fixed camera by a board in the gripper; Park and Martin 1994.
 
-    Args: grippers [4, 4], gripper to robot, one for each image. Raises SettingsError for too few
-    poses, or for poses that differ by too little.
+    Args: robot, poses [4, 4] from gripper to robot, one for each image. Raises SettingsError for
+    too few poses, and for poses that differ too little.
     """
-    arms = [images.rigid(pose, "robot") for pose in grippers]
-    if len(arms) != len(found) or len(arms) < LEAST_POSES:
+    arms = [images.rigid(pose, "robot") for pose in robot]
+    if len(arms) != len(boards) or len(arms) < LEAST_POSES:
         raise SettingsError(
             f"robot: give a pose of the arm for each image, {LEAST_POSES} or more, not "
-            f"{len(arms)} for {len(found)}"
+            f"{len(arms)} for {len(boards)}"
         )
     axes = [_turn(arms[0], arm) for arm in arms[1:]]
     if np.linalg.svd(np.array(axes), compute_uv=False)[1] < LEAST_TURN:
@@ -134,20 +134,20 @@ def hand_eye(found: Sequence[Located], grippers: Sequence[Any]) -> HandEye:
     back = [np.linalg.inv(arm) for arm in arms]  # OpenCV's names are of a camera in the hand
     pose = np.eye(4)
     pose[:3, :3], place = cv2.calibrateHandEye(
-        [one[:3, :3] for one in back],
-        [one[:3, 3] for one in back],
-        [one.pose[:3, :3] for one in found],
-        [one.pose[:3, 3] for one in found],
+        [inverse[:3, :3] for inverse in back],
+        [inverse[:3, 3] for inverse in back],
+        [board.pose[:3, :3] for board in boards],
+        [board.pose[:3, 3] for board in boards],
         method=cv2.CALIB_HAND_EYE_PARK,
     )
     pose[:3, 3] = place.ravel()
     middles = np.array(
-        [(arm @ pose @ one.pose)[:3, 3] for arm, one in zip(back, found, strict=True)]
+        [(arm @ pose @ board.pose)[:3, 3] for arm, board in zip(back, boards, strict=True)]
     )
     off = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
     return HandEye(pose, 1e3 * off)
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The rotation vector [3] rad from one pose to another."""
+    """Returns the rotation vector [3] rad from one pose to another."""
     return cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0].ravel()

@@ -1,4 +1,4 @@
-"""The camera's pose from points that the robot has touched: hand-eye calibration, no target needed.
+"""The camera's pose from points that the robot has touched: hand-eye calibration without a board.
 
 Mark five places or more, not on one line, at different heights if possible. Note each one's pixel
 in an image, touch it with the point between the closed finger tips, and note where the robot is.
@@ -27,9 +27,9 @@ class Calibration(NamedTuple):
 
 
 def seen_points(depth: Any, intrinsics: Any, pixels: Any) -> np.ndarray:
-    """Points [n, 3] m in the camera's frame of pixels [n, 2], column and row.
+    """Returns the points [n, 3] m in the camera's frame of pixels [n, 2], column and row.
 
-    Args: depth [h, w] m, 0 or NaN where there is none; intrinsics as `Policy.decide` takes them.
+    Args: depth [h, w] m, 0 or NaN where there is none; intrinsics as for `CameraPolicy.decide`.
     Raises SettingsError for pixels outside of the image, or with no depth around them.
     """
     camera, depth = images.Intrinsics.of(intrinsics), np.asarray(depth, np.float64)
@@ -52,7 +52,7 @@ def _median_depth(depth: np.ndarray, col: int, row: int) -> float:
 
 
 def fit(seen: Any, touched: Any) -> Calibration:
-    """The rigid pose that maps seen points [n, 3] to touched ones [n, 3], m, by least squares.
+    """Fits the rigid pose that maps seen points [n, 3] to touched ones [n, 3], m: least squares.
 
     Closed form: Kabsch, Acta Crystallographica A 32, 1976. Raises SettingsError for fewer than
     LEAST points, for points on a line, and for distances that differ by more than SCALE_TOLERANCE.
@@ -65,7 +65,7 @@ def fit(seen: Any, touched: Any) -> Calibration:
         )
     from_mean, to_mean = seen - seen.mean(axis=0), touched - touched.mean(axis=0)
     if np.linalg.svd(to_mean, compute_uv=False)[1] < _LINE * len(seen) ** 0.5:
-        raise SettingsError("touched: the points lie on a line; choose some beside it")
+        raise SettingsError("touched: the points lie on a line; choose some off it")
     scale = float(np.linalg.norm(from_mean) / np.linalg.norm(to_mean))
     if abs(scale - 1.0) > SCALE_TOLERANCE:
         raise SettingsError(
@@ -80,7 +80,7 @@ def fit(seen: Any, touched: Any) -> Calibration:
 
 
 def _points(values: Any, size: int, name: str) -> np.ndarray:
-    """An array [n, size] of finite numbers. Raises SettingsError for what is none."""
+    """Converts values to an array [n, size]. Raises SettingsError unless all are finite numbers."""
     try:
         points = np.array(values, np.float64)
     except (TypeError, ValueError):

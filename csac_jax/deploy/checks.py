@@ -1,6 +1,6 @@
-"""Whether an image agrees with its camera's pose, with the table and with the workspace.
+"""Checks that an image agrees with its camera's pose, with the table and with the workspace.
 
-Each function raises ViewError, one line that says what is wrong by how much, or measures.
+They raise ViewError, one line that says what is wrong by how much.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ from scipy import ndimage
 from csac_jax.config import HeightmapConfig
 from csac_jax.constants import CHANGE_AREA
 from csac_jax.deploy import images
-from csac_jax.deploy.images import View
+from csac_jax.deploy.images import CameraView
 from csac_jax.errors import DataWarning, ViewError
 from csac_jax.scene.blocks import COLOURS
 
@@ -48,16 +48,16 @@ class Table:
 
     @property
     def tilt_deg(self) -> float:
-        """Angle between the plane and z = 0, degrees."""
+        """Returns the angle between the plane and z = 0, degrees."""
         return float(np.degrees(np.arctan(np.hypot(*self.slope))))
 
     def worst(self, extent: float) -> float:
-        """Largest distance from z = 0 over the square of side `extent` m, m."""
+        """Returns the largest distance from z = 0 over the square of side `extent` m, m."""
         return float(abs(self.height) + 0.5 * extent * np.abs(self.slope).sum())
 
 
-class Report(NamedTuple):
-    """What an image of the empty table says of the camera's pose and intrinsics."""
+class CameraReport(NamedTuple):
+    """Measurements in an image of the empty table, which show if pose and intrinsics fit."""
 
     height_mm: float  # of the table above z = 0, at the workspace's centre
     tilt_deg: float  # of the table
@@ -67,29 +67,29 @@ class Report(NamedTuple):
     covered_cm2: float  # area higher than 1 cm, which an empty table has none of
 
 
-def faults(report: Report) -> list[str]:
-    """What must be mended before decisions are taken, one line each."""
-    found = {
+def faults(report: CameraReport) -> list[str]:
+    """Lists what must be mended before decisions are taken, one line each."""
+    faults = {
         "the table is not at z = 0: measure the pose again": (
             report.worst_mm > 1e3 * TABLE_TOLERANCE
         ),
         "too little of the workspace is seen: move the camera": report.seen < SEEN_SHARE,
         "the table is not empty, or its depth too noisy": report.covered_cm2 > CHANGE_AREA,
     }
-    return [fault for fault, holds in found.items() if holds]
+    return [fault for fault, holds in faults.items() if holds]
 
 
-def pose(view: View) -> None:
-    """The camera stands above the table and sees the workspace's centre."""
-    given = view.pose
-    if np.abs(given[:3, 3]).max() > HIGHEST_POSE:
-        far = np.linalg.norm(given[:3, 3])
+def pose(view: CameraView) -> None:
+    """Checks that the camera stands above the table and sees the workspace's centre."""
+    pose = view.pose
+    if np.abs(pose[:3, 3]).max() > HIGHEST_POSE:
+        far = np.linalg.norm(pose[:3, 3])
         raise ViewError(f"camera_pose: the camera is {far:.0f} m away; its unit is m")
-    if _sees_centre(view, given):
+    if _sees_centre(view, pose):
         return
-    flipped = given @ np.diag([1.0, -1.0, -1.0, 1.0])
+    flipped = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
     others = {
-        "it seems to map workspace to camera; give its inverse": np.linalg.inv(given),
+        "it seems to map workspace to camera; give its inverse": np.linalg.inv(pose),
         "its axes seem to be OpenGL's; turn y and z round": flipped,
     }
     hints = [hint for hint, other in others.items() if _sees_centre(view, other)]
@@ -97,13 +97,13 @@ def pose(view: View) -> None:
     raise ViewError(f"camera_pose: the workspace's centre is not in the image; {hint}")
 
 
-def _sees_centre(view: View, given: np.ndarray) -> bool:
-    _, inside = images.project(view.intrinsics, given, np.zeros((1, 3)))
-    return bool(inside[0] and given[2, 3] > 0.0)
+def _sees_centre(view: CameraView, pose: np.ndarray) -> bool:
+    _, inside = images.project(view.intrinsics, pose, np.zeros((1, 3)))
+    return bool(inside[0] and pose[2, 3] > 0.0)
 
 
-def depth_unit(view: View, extent: float) -> None:
-    """Depth is in metres: it is about what the pose makes of a table."""
+def depth_unit(view: CameraView, extent: float) -> None:
+    """Checks that depth is in metres: near to a table's by the pose."""
     ratio = _depth_ratio(view, extent)
     power = round(np.log10(ratio))
     if power in _UNITS and abs(np.log10(ratio) - power) < 0.15:
@@ -111,8 +111,8 @@ def depth_unit(view: View, extent: float) -> None:
         raise ViewError(text)
 
 
-def _depth_ratio(view: View, extent: float) -> float:
-    """Median of measured over expected depth of the table in the workspace."""
+def _depth_ratio(view: CameraView, extent: float) -> float:
+    """Returns the median of measured over expected depth of the table in the workspace."""
     ray, depth = view.directions[view.sparse], view.depth[view.sparse]
     falling = ray[..., 2] < -1e-6
     expected = np.where(falling, -view.pose[2, 3] / np.where(falling, ray[..., 2], 1.0), 0.0)
@@ -123,24 +123,26 @@ def _depth_ratio(view: View, extent: float) -> float:
     return float(np.median(depth[here] / expected[here]))
 
 
-def table(view: View, extent: float) -> Table:
-    """The table under and around the workspace."""
+def table(view: CameraView, extent: float) -> Table:
+    """Finds the table under and around the workspace."""
     every, valid = view.points[view.sparse], view.valid[view.sparse]
     near = valid & np.all(np.abs(every[..., :2]) <= 0.5 * _AROUND * extent, axis=-1)
     points = every[near].astype(np.float64)
-    found = _largest_plane(points) if len(points) >= _LEAST else None
-    if found is None:
+    plane = _largest_plane(points) if len(points) >= _LEAST else None
+    if plane is None:
         ratio = _depth_ratio(view, extent)
         raise ViewError(
             "no table found where camera_pose says that the workspace is: depth there is "
             f"{ratio:.2f} times that of a table at z = 0; check the pose, and what stands in view"
         )
-    return found
+    return plane
 
 
 def _largest_plane(points: np.ndarray) -> Table | None:
-    """The plane with most of the points [n, 3] m; None if none has enough. RANSAC, then twice
-    least squares."""
+    """Fits the plane with most of the points [n, 3] m; None if no plane has enough.
+
+    RANSAC, then twice least squares.
+    """
     rng = np.random.default_rng(0)
     sample = points[rng.integers(len(points), size=_SAMPLE)]
     a, b, c = np.moveaxis(sample[rng.integers(_SAMPLE, size=(_TRIALS, 3))], 1, 0)
@@ -161,20 +163,20 @@ def _largest_plane(points: np.ndarray) -> Table | None:
     return Table(float(plane[0]), plane[1:], float(np.std(points[on, 2] - basis[on] @ plane)))
 
 
-def table_height(found: Table, extent: float) -> None:
-    """The table lies at z = 0."""
-    if found.worst(extent) > TABLE_TOLERANCE:
+def table_height(table: Table, extent: float) -> None:
+    """Checks that the table lies at z = 0."""
+    if table.worst(extent) > TABLE_TOLERANCE:
         raise ViewError(
-            f"the table lies {1e3 * found.height:+.0f} mm from z = 0, tilted by "
-            f"{found.tilt_deg:.1f} degrees: {1e3 * found.worst(extent):.0f} mm at a corner of the "
+            f"the table lies {1e3 * table.height:+.0f} mm from z = 0, tilted by "
+            f"{table.tilt_deg:.1f} degrees: {1e3 * table.worst(extent):.0f} mm at a corner of the "
             f"workspace, {1e3 * TABLE_TOLERANCE:.0f} are allowed; measure camera_pose again"
         )
 
 
-def seen(view: View, cfg: HeightmapConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Cells of the table [H, W] bool that lie in the image, and those that have a depth there.
+def seen(view: CameraView, cfg: HeightmapConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the table's cells [H, W] bool that lie in the image, and those with a depth there.
 
-    What an object hides counts as seen.
+    Cells behind an object count as seen.
     """
     along = (np.arange(cfg.size) - 0.5 * (cfg.size - 1)) * cfg.cell
     x, y = np.meshgrid(along, along)
@@ -184,8 +186,8 @@ def seen(view: View, cfg: HeightmapConfig) -> tuple[np.ndarray, np.ndarray]:
     return inside.reshape(x.shape), has_depth.reshape(x.shape)
 
 
-def coverage(view: View, cfg: HeightmapConfig) -> float:
-    """Share of the workspace that is seen; enough of it is."""
+def coverage(view: CameraView, cfg: HeightmapConfig) -> float:
+    """Returns the seen share of the workspace, which must be enough."""
     inside, has_depth = seen(view, cfg)
     share = float(has_depth.mean())
     if share < SEEN_SHARE:
@@ -200,11 +202,8 @@ def coverage(view: View, cfg: HeightmapConfig) -> float:
     return share
 
 
-def colours(view: View, extent: float) -> None:
-    """Warns of objects whose colours are those of the training's blocks with red and blue swapped.
-
-    Objects of other colours say nothing.
-    """
+def colours(view: CameraView, extent: float) -> None:
+    """Warns of objects with the colours of the training's blocks, red and blue swapped."""
     points, valid = view.points[view.sparse], view.valid[view.sparse]
     above = valid & (points[..., 2] > 0.02)
     above &= np.all(np.abs(points[..., :2]) <= 0.5 * extent, axis=-1)
@@ -218,6 +217,6 @@ def colours(view: View, extent: float) -> None:
 
 
 def _hue_distance(colour: np.ndarray) -> float:
-    """Mean distance of colours [n, 3], whatever their brightness, to the nearest block's."""
+    """Returns the mean distance of colours [n, 3] to the nearest block's, without brightness."""
     shares, blocks = (c / np.maximum(c.sum(axis=1, keepdims=True), 1e-6) for c in (colour, COLOURS))
     return float(np.linalg.norm(shares[:, None] - blocks[None], axis=-1).min(axis=1).mean())

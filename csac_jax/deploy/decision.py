@@ -1,4 +1,4 @@
-"""What a robot is told: a primitive, where, and the waypoints of the tool."""
+"""A decision for a robot: a primitive, its place, and the waypoints of the tool."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax.constants import Primitive
-from csac_jax.deploy.program import Choice
+from csac_jax.deploy.decision_program import Choice
 
 STATIONS = ("approach", "descend", "act", "retreat")
 
 
 class Waypoint(NamedTuple):
-    """Where the tool is to be, and how far the fingers are open on arrival."""
+    """A pose of the tool, and how far the fingers are open on arrival."""
 
     name: str  # of STATIONS; on the way to `act` the fingers close, or push
     position: tuple[float, float, float]  # m, between the finger tips, workspace frame
@@ -33,13 +33,13 @@ class Decision:
     waypoints: tuple[Waypoint, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Returns the decision as JSON values."""
         waypoints = [waypoint._asdict() for waypoint in self.waypoints]
         return {**dataclasses.asdict(self), "waypoints": waypoints}
 
 
-def of(choice: Choice, workspace_pose: np.ndarray) -> Decision:
-    """The decision of a choice on the host; `workspace_pose` [4, 4] maps workspace to robot."""
+def from_choice(choice: Choice, workspace_pose: np.ndarray) -> Decision:
+    """Converts a choice on the host; `workspace_pose` [4, 4] maps workspace to robot."""
     waypoints = tuple(
         _waypoint(name, station, workspace_pose)
         for name, station in zip(STATIONS, np.asarray(choice.stations, float), strict=True)

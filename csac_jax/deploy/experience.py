@@ -1,6 +1,6 @@
-"""From a record to what a learner replays: the height maps are those that decisions follow from.
+"""From a record to transitions for a learner. It sees the height maps that were decided on.
 
-Needs MuJoCo installed, as the learner's modules do; nothing is simulated. n = transitions.
+The learner's modules need MuJoCo installed, though nothing is simulated. n = transitions.
 """
 
 import functools
@@ -14,18 +14,18 @@ from csac_jax.agent.learner import Learner, Transition
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, OUTCOMES, Outcome, Primitive
-from csac_jax.deploy import Policy
+from csac_jax.deploy import CameraPolicy
 from csac_jax.deploy.record import PUSHED, Entry
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import PackedObservation
 
-_AT_ONCE = 32  # transitions that are judged together: their maps fill the memory
+_AT_ONCE = 32  # transitions that are rewarded together: their maps fill the memory
 
 
 class Experience(NamedTuple):
-    """What a record holds. NumPy leaves [n, ...]."""
+    """The content of a record. NumPy leaves [n, ...]."""
 
     obs: PackedObservation
     action: Action
@@ -34,11 +34,11 @@ class Experience(NamedTuple):
     terminated: Any  # [n] bool
 
 
-def load(policy: Policy, entries: list[Entry]) -> Experience:
-    """The actions of a record whose outcome is known, seen as `policy` sees.
+def load(policy: CameraPolicy, entries: list[Entry]) -> Experience:
+    """Loads the actions whose outcome is known, seen as `policy` sees.
 
-    What an action led to is seen in the next entry. An action without one is left out, unless its
-    scene ended. Raises SettingsError for damaged entries and where no action is left.
+    The next entry shows what an action led to. An action without one is left out, unless its scene
+    ended. Raises SettingsError for damaged entries, and if no action is left.
     """
     by_number = {int(entry.path.name): entry for entry in entries}
     maps: dict[int, PackedObservation] = {}
@@ -63,8 +63,8 @@ def load(policy: Policy, entries: list[Entry]) -> Experience:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
-def _observed(policy: Policy, entry: Entry) -> PackedObservation:
-    """What the policy sees in an entry's image. The mask counts where its task is to get one."""
+def _observed(policy: CameraPolicy, entry: Entry) -> PackedObservation:
+    """Returns the policy's view of an entry's image. The mask counts in the task `target`."""
     rgb, depth, lens, pose, mask = entry.image
     try:
         marked = mask if policy.cfg.task.kind == "target" else None
@@ -75,7 +75,7 @@ def _observed(policy: Policy, entry: Entry) -> PackedObservation:
 
 
 def _done(entry: Entry) -> tuple[Action, Any]:
-    """The action of an entry and its outcome, NumPy leaves [...]."""
+    """Returns the action of an entry and its outcome, NumPy leaves [...]."""
     primitive, place = entry.action
     pose: Any = np.array(place, np.float32)
     name = entry.outcome.outcome if entry.outcome else PUSHED
@@ -84,18 +84,20 @@ def _done(entry: Entry) -> tuple[Action, Any]:
     return Action(kind, pose), np.int32(level)
 
 
-def transitions(policy: Policy, learner: Learner, state: Any, found: Experience) -> Transition:
-    """The transitions of an experience, rewarded as in training, leaves [n, ...]."""
+def transitions(
+    policy: CameraPolicy, learner: Learner, state: Any, experience: Experience
+) -> Transition:
+    """Returns the transitions of an experience, rewarded as in training, leaves [n, ...]."""
     parts = []
-    for i in range(0, len(found.outcome), _AT_ONCE):
-        part = jax.tree.map(lambda leaf, i=i: leaf[i : i + _AT_ONCE], found)
-        parts.append(jax.device_get(_judged(policy.cfg, learner, state, part)))
+    for i in range(0, len(experience.outcome), _AT_ONCE):
+        part = jax.tree.map(lambda leaf, i=i: leaf[i : i + _AT_ONCE], experience)
+        parts.append(jax.device_get(_rewarded(policy.cfg, learner, state, part)))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _judged(cfg: Config, learner: Learner, state: Any, part: Experience) -> Transition:
-    """The transitions of a part; nothing is known of lost blocks and distances, which cost 0."""
+def _rewarded(cfg: Config, learner: Learner, state: Any, part: Experience) -> Transition:
+    """Rewards a part; lost blocks and distances are unknown and cost 0."""
     unknown = jnp.zeros(part.outcome.shape)
     obs, after = heightmap.unpack(part.obs), heightmap.unpack(part.next_obs)
     moved = jax.vmap(heightmap.moved_area, (None, 0, 0))(cfg.heightmap, obs.height, after.height)

@@ -1,4 +1,4 @@
-"""What a depth camera gives: colour, depth, intrinsics and a pose, checked; and their points.
+"""The image of a depth camera, checked: colour, depth, intrinsics and a pose; and its points.
 
 The camera's axes are OpenCV's: x right, y down, z forward. Pixel centres are whole numbers, depth
 is along z. A pose `T_workspace_camera` maps camera to workspace. h, w = rows and columns, px.
@@ -6,69 +6,67 @@ is along z. A pose `T_workspace_camera` maps camera to workspace. h, w = rows an
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+import pydantic
 
-from csac_jax.errors import SettingsError
+from csac_jax.errors import SettingsError, first_fault
 
 MOST_PIXELS = 4096  # of a side
 _ROUNDS = 20  # of the iteration that removes distortion, as in OpenCV's undistortPoints
 _RIGID = 1e-3  # largest error of a rotation matrix's products
 
 
+def _flat(values: Any) -> tuple[Any, ...]:
+    return () if values is None else tuple(np.ravel(values).tolist())
+
+
+_Pixels = Annotated[int, pydantic.Field(strict=True, ge=16, le=MOST_PIXELS)]
+_Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
+_Positive = Annotated[_Number, pydantic.Field(gt=0.0)]
+
+
 @dataclasses.dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera; raises SettingsError for one that cannot be."""
+    """A pinhole camera, which `of` checks."""
 
-    width: int  # px
-    height: int  # px
-    fx: float  # px
-    fy: float  # px
-    cx: float  # px, from the left
-    cy: float  # px, from the top
-    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 k3, OpenCV's; none: no distortion
+    __pydantic_config__: ClassVar = {"extra": "forbid", "revalidate_instances": "always"}
+    width: _Pixels
+    height: _Pixels
+    fx: _Positive  # px
+    fy: _Positive  # px
+    cx: _Number  # px, from the left
+    cy: _Number  # px, from the top
+    distortion: Annotated[tuple[_Number, ...], pydantic.BeforeValidator(_flat)] = ()  # OpenCV's
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            side = getattr(self, name)
-            if type(side) is not int or not 16 <= side <= MOST_PIXELS:
-                raise SettingsError(f"intrinsics.{name}: a number of pixels, 16 to {MOST_PIXELS}")
-        object.__setattr__(self, "distortion", tuple(np.ravel(self.distortion).tolist()))
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(isinstance(value, int | float) and np.isfinite(value) for value in numbers):
-            raise SettingsError("intrinsics: fx, fy, cx, cy and distortion must be finite numbers")
-        if min(self.fx, self.fy) <= 0.0:
-            raise SettingsError("intrinsics: fx and fy must be above 0, in pixels")
-        if not (0.0 <= self.cx <= self.width and 0.0 <= self.cy <= self.height):
-            raise SettingsError("intrinsics: cx and cy must lie in the image, in pixels")
         if len(self.distortion) not in (0, 4, 5):
-            raise SettingsError("intrinsics.distortion: 4 or 5 numbers, k1 k2 p1 p2 k3")
+            raise ValueError("distortion must have 4 or 5 numbers, k1 k2 p1 p2 k3")
+        if not (0.0 <= self.cx <= self.width and 0.0 <= self.cy <= self.height):
+            raise ValueError("cx and cy must lie in the image, in pixels")
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
-        """Intrinsics as such, or of a mapping with the names above. Raises SettingsError."""
-        if isinstance(values, cls):
-            return values
-        known = {field.name for field in dataclasses.fields(cls)}
-        needed = known - {"distortion"}
-        if not isinstance(values, dict) or not needed <= set(values) <= known:
-            raise SettingsError(
-                f"intrinsics: give {', '.join(sorted(needed))}, and maybe distortion"
-            )
+        """Returns checked intrinsics of others, or of a mapping. Raises SettingsError."""
         try:
-            return cls(**{**values, "distortion": values.get("distortion") or ()})
-        except (TypeError, ValueError) as error:
-            raise SettingsError(str(error)) from None
+            return _adapter().validate_python(values)
+        except pydantic.ValidationError as error:
+            raise SettingsError(f"intrinsics: {first_fault(error)}") from None
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the image."""
+        """Returns rows and columns of the image."""
         return self.height, self.width
 
 
+@functools.cache
+def _adapter() -> pydantic.TypeAdapter[Intrinsics]:
+    return pydantic.TypeAdapter(Intrinsics)
+
+
 def distort(intrinsics: Intrinsics, xy: np.ndarray) -> np.ndarray:
-    """Where a lens puts ideal image points `xy` [..., 2] at depth 1 (Brown's model, OpenCV)."""
+    """Distorts ideal image points `xy` [..., 2] at depth 1 by Brown's model, as OpenCV."""
     k1, k2, p1, p2, k3 = np.pad(np.array(intrinsics.distortion), (0, 5))[:5]
     x, y = xy[..., 0], xy[..., 1]
     square = x * x + y * y
@@ -80,25 +78,27 @@ def distort(intrinsics: Intrinsics, xy: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=4)
 def rays(intrinsics: Intrinsics) -> np.ndarray:
-    """Ideal directions [h, w, 3] float32 of all pixels in the camera's frame, 1 m long in depth.
+    """Returns the directions [h, w, 3] float32 of all pixels in the camera's frame, 1 m deep.
 
     Raises SettingsError for a distortion that has no inverse over the image.
     """
     u, v = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
-    seen = np.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy], -1)
-    ideal = seen
+    distorted = np.stack(
+        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy], -1
+    )
+    ideal = distorted
     if any(intrinsics.distortion):
         with np.errstate(all="ignore"):  # it may diverge
             for _ in range(_ROUNDS):
-                ideal = ideal + seen - distort(intrinsics, ideal)
-            error = np.abs(distort(intrinsics, ideal) - seen).max() * intrinsics.fx
+                ideal = ideal + distorted - distort(intrinsics, ideal)
+            error = np.abs(distort(intrinsics, ideal) - distorted).max() * intrinsics.fx
         if not error < 0.1:
             raise SettingsError("intrinsics.distortion: has no inverse over the image; rectify it")
     return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1).astype(np.float32)
 
 
 def rigid(matrix: Any, name: str) -> np.ndarray:
-    """A pose [4, 4] float64. Raises SettingsError for what is none."""
+    """Converts a matrix to a pose [4, 4] float64. Raises SettingsError if it is not rigid."""
     try:
         pose = np.array(matrix, np.float64)
     except (TypeError, ValueError):
@@ -116,15 +116,15 @@ def rigid(matrix: Any, name: str) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=4)
-def _turned(intrinsics: Intrinsics, rotation: bytes) -> np.ndarray:
-    """`rays` rotated by a matrix [3, 3] float64; cameras seldom move."""
+def _rotated_rays(intrinsics: Intrinsics, rotation: bytes) -> np.ndarray:
+    """Rotates `rays` by a matrix [3, 3] float64; cached, as cameras seldom move."""
     right, down, forward = np.frombuffer(rotation).reshape(3, 3).T.astype(np.float32)
     ideal = rays(intrinsics)
     return ideal[..., :1] * right + ideal[..., 1:2] * down + forward
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """One image of a scene; see `make`."""
 
     colour: np.ndarray  # [h, w, 3] uint8, red green blue
@@ -136,30 +136,30 @@ class View:
 
     @functools.cached_property
     def directions(self) -> np.ndarray:
-        """Rays [h, w, 3] float32 of the pixels in the workspace's frame, 1 m long in depth."""
-        return _turned(self.intrinsics, self.pose[:3, :3].tobytes())
+        """Returns the pixels' rays [h, w, 3] float32 in the workspace's frame, 1 m deep."""
+        return _rotated_rays(self.intrinsics, self.pose[:3, :3].tobytes())
 
     @functools.cached_property
     def points(self) -> np.ndarray:
-        """Points [h, w, 3] float32 m of the pixels in the workspace's frame."""
+        """Returns the pixels' points [h, w, 3] float32 m in the workspace's frame."""
         return self.depth[..., None] * self.directions + self.pose[:3, 3].astype(np.float32)
 
     @property
     def sparse(self) -> tuple[slice, slice]:
-        """Rows and columns of some 20,000 pixels all over the image, for measurements."""
+        """Returns rows and columns of some 20,000 pixels all over the image, for measurements."""
         step = max(1, int(np.sqrt(self.depth.size / 20_000)))
         return slice(None, None, step), slice(None, None, step)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points [n, 3] m of the workspace lie in the image: column and row [n, 2] px, and
-        which are in it [n] bool."""
+        """Projects points [n, 3] m of the workspace: column and row [n, 2] px, and [n] bool, True
+        inside the image."""
         return project(self.intrinsics, self.pose, points)
 
 
 def project(
     intrinsics: Intrinsics, pose: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """See `View.project`."""
+    """Projects points as `CameraView.project`."""
     x, y, depth = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     ahead = depth > 1e-3
     ideal = np.stack([x, y], axis=1) / np.where(ahead, depth, 1.0)[:, None]
@@ -172,19 +172,21 @@ def project(
     return pixel, ahead & near & inside
 
 
-def make(rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None) -> View:
-    """A view of the arrays that `Policy.decide` takes. Raises SettingsError for a wrong form."""
+def make(
+    rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
+) -> CameraView:
+    """Makes a view of the arguments of `CameraPolicy.decide`. Raises SettingsError for bad ones."""
     camera, pose = Intrinsics.of(intrinsics), rigid(camera_pose, "camera_pose")
     colour, metres = _colour(np.asarray(rgb)), _depth(np.asarray(depth))
     target = None if target_mask is None else _mask(np.asarray(target_mask))
     arrays = {"rgb": colour, "depth": metres, "target_mask": target}
     sizes = {name: array.shape[:2] for name, array in arrays.items() if array is not None}
     if set(sizes.values()) != {camera.shape}:
-        found = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
+        shown = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
         wanted = f"{camera.width} x {camera.height}"
-        raise SettingsError(f"{found}, intrinsics {wanted}: align them to one camera and one size")
+        raise SettingsError(f"{shown}, intrinsics {wanted}: align them to one camera and one size")
     valid = np.isfinite(metres) & (metres > 0.0)
-    return View(
+    return CameraView(
         colour, np.where(valid, metres, 0.0).astype(np.float32), valid, target, camera, pose
     )
 

@@ -7,8 +7,8 @@
     GET /health    {"status": "ok"}, with no token
     GET /version   versions, task and workspace of the policy
 
-Errors are {"detail": one line} with a status of 400 to 499, or 507 where the record's disc is
-full. Decisions are taken one by one, and requests wait for their turn.
+Errors are {"detail": one line} with a status of 400 to 499, or 507 if the record's disc is full.
+Decisions are taken one by one, and requests wait for their turn.
 """
 
 import asyncio
@@ -23,12 +23,14 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 import fastapi
+import numpy as np
 import pydantic
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 
-from csac_jax.deploy import Policy, files, images
-from csac_jax.deploy.record import Outcome, Recorder
+from csac_jax.deploy import CameraPolicy, image_files, images
+from csac_jax.deploy.image_files import PoseBody
+from csac_jax.deploy.record import Recorder, ReportedOutcome
 from csac_jax.errors import DataWarning, SettingsError, ViewError
 from csac_jax.runtime import provenance
 
@@ -43,34 +45,25 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Any], Awaitable[None]]
 
 
-class Pose(pydantic.BaseModel, extra="forbid"):
-    """A pose as its file has it."""
-
-    matrix: list[list[float]]
-
-
 class DecideRequest(pydantic.BaseModel, extra="forbid"):
     """The body of /decide."""
 
     rgb: str
     depth: str
     intrinsics: dict[str, Any]
-    pose: Pose
+    pose: PoseBody
     mask: str | None = None
     top: int = 1
 
 
-class OutcomeRequest(pydantic.BaseModel, extra="forbid", strict=True):
+class OutcomeRequest(ReportedOutcome, frozen=True):
     """The body of /outcome."""
 
     id: str
-    outcome: str
-    number: int = 1
-    ended: bool = False
 
 
-class Gate:
-    """Lets a request pass that has the token, and a body that is neither too large nor too slow."""
+class AuthMiddleware:
+    """Middleware that asks for the token and refuses bodies that are too large or too slow."""
 
     def __init__(self, app: Any, token: str | None) -> None:
         self._app, self._token = app, token
@@ -103,8 +96,10 @@ class Gate:
 
 
 async def _body(receive: Receive) -> bytes | None:
-    """The whole body; None if it is larger than LARGEST_BODY, of which MOST_DISCARDED are read:
-    a client that still sends would not see the answer."""
+    """Reads the whole body; returns None if it is larger than LARGEST_BODY.
+
+    Of a larger body up to MOST_DISCARDED is read: a client that still sends sees no answer.
+    """
     body, more, size = bytearray(), True, 0
     while more and size <= MOST_DISCARDED:
         message = await receive()
@@ -115,7 +110,7 @@ async def _body(receive: Receive) -> bytes | None:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """Gives the body once, then what the connection gives."""
+    """Returns the body once, then the connection's messages."""
     waiting = [body]
 
     async def first() -> Message:
@@ -132,10 +127,12 @@ async def _refuse(scope: Message, receive: Receive, send: Send, status: int, tex
 
 
 def make(
-    policy: Policy, source: str, token: str | None = None, recorder: Recorder | None = None
+    policy: CameraPolicy, source: str, token: str | None = None, recorder: Recorder | None = None
 ) -> Any:
-    """The service of a policy as an ASGI application; `source` is named by /version. Images,
-    decisions and outcomes are kept by the `recorder`, if there is one."""
+    """Builds the service of a policy as an ASGI application.
+
+    /version names the `source`. A `recorder` stores images, decisions and outcomes.
+    """
     app, turn = fastapi.FastAPI(openapi_url=None), threading.Lock()
     app.add_exception_handler(SettingsError, lambda _, error: _one_line(400, error))
     app.add_exception_handler(ViewError, lambda _, error: _one_line(422, error))
@@ -155,13 +152,13 @@ def make(
 
     @app.post("/decide")
     def decide(request: DecideRequest) -> dict[str, Any]:
-        given = _arrays(request)
+        image = _arrays(request)
         with turn, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DataWarning)
             begun = time.perf_counter()
-            decisions = policy.decide(*given, request.top)
+            decisions = policy.decide(*image, request.top)
             seconds = time.perf_counter() - begun
-            entry = None if recorder is None else recorder.add(given, decisions)
+            entry = None if recorder is None else recorder.add(image, decisions)
         return {
             "decisions": [decision.to_dict() for decision in decisions],
             "id": entry,
@@ -170,15 +167,15 @@ def make(
         }
 
     @app.post("/outcome")
-    def outcome(request: OutcomeRequest) -> dict[str, Any]:
+    def post_outcome(request: OutcomeRequest) -> dict[str, Any]:
         if recorder is None:
-            raise FileNotFoundError("nothing is recorded; start the service with --record DIR")
-        values = request.model_dump(exclude={"id"})
+            raise FileNotFoundError("the service records nothing; start it with a record")
+        outcome = ReportedOutcome(**request.model_dump(exclude={"id"}))
         with turn:
-            recorder.post(request.id, Outcome.of(values))
+            recorder.post(request.id, outcome)
         return {"id": request.id}
 
-    return Gate(app, token)
+    return AuthMiddleware(app, token)
 
 
 def _one_line(status: int, error: Exception) -> JSONResponse:
@@ -186,22 +183,22 @@ def _one_line(status: int, error: Exception) -> JSONResponse:
 
 
 def _invalid(error: Any) -> JSONResponse:
-    """The first fault of a body, without the body."""
+    """Returns the first fault of a body, without the body."""
     first = error.errors()[0]
     place = ".".join(map(str, first["loc"][:4]))
     return JSONResponse({"detail": f"{place}: {first['msg'][:200]}"}, 422)
 
 
 def _arrays(request: DecideRequest) -> tuple[Any, Any, Any, Any, Any]:
-    """What `Policy.decide` takes, without `top`."""
-    rgb, depth = files.decode(_png(request.rgb, "rgb")), files.decode(_png(request.depth, "depth"))
-    mask = None if request.mask is None else files.decode(_png(request.mask, "mask"))
-    metres = files.metres(depth, "depth")
+    """Decodes the arguments of `CameraPolicy.decide` but `top`."""
+    rgb, depth = _pixels(request.rgb, "rgb"), _pixels(request.depth, "depth")
+    mask = None if request.mask is None else _pixels(request.mask, "mask")
+    metres = image_files.metres(depth, "depth")
     return rgb, metres, request.intrinsics, request.pose.matrix, mask
 
 
-def _png(text: str, name: str) -> bytes:
-    """The bytes of a PNG in base64. Raises SettingsError for others, and for one too large."""
+def _pixels(text: str, name: str) -> np.ndarray:
+    """Decodes a PNG in base64. Raises SettingsError for anything else, and for one too large."""
     try:
         content = base64.b64decode(text, validate=True)
         signature, kind, width, height = _PNG.unpack_from(content)
@@ -211,4 +208,4 @@ def _png(text: str, name: str) -> bytes:
         raise SettingsError(f"{name}: must be a PNG in base64")
     if max(width, height) > images.MOST_PIXELS:
         raise SettingsError(f"{name}: at most {images.MOST_PIXELS} px a side")
-    return content
+    return image_files.decode(content)

@@ -11,7 +11,7 @@ from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.deploy import Maps, images
 from csac_jax.deploy.decision import Decision
-from csac_jax.deploy.images import View
+from csac_jax.deploy.images import CameraView
 from csac_jax.render import heatmaps
 
 HEIGHT = 640  # px
@@ -19,7 +19,7 @@ OTHERS = "#56B4E9"  # alternatives
 _LAYOUT = {"left": 0.01, "right": 0.93, "bottom": 0.09, "top": 0.93, "wspace": 0.12}
 
 
-def picture(cfg: Config, view: View, decisions: list[Decision], values: Maps) -> np.ndarray:
+def picture(cfg: Config, view: CameraView, decisions: list[Decision], values: Maps) -> np.ndarray:
     """Draws the image with the decisions, and Q of both primitives, [H, W, 3] uint8."""
     fig = heatmaps.figure(1.95 * HEIGHT, HEIGHT, HEIGHT)
     image, push, grasp = fig.subplot_mosaic("IIP;IIG", gridspec_kw=_LAYOUT).values()
@@ -32,7 +32,7 @@ def picture(cfg: Config, view: View, decisions: list[Decision], values: Maps) ->
     return heatmaps.pixels(fig)
 
 
-def _draw_image(cfg: Config, axes: Axes, view: View, decisions: list[Decision]) -> None:
+def _draw_image(cfg: Config, axes: Axes, view: CameraView, decisions: list[Decision]) -> None:
     """Draws the image with the workspace's border; the best decision on top."""
     axes.imshow(view.colour)
     axes.set_title(line(decisions[0]) if decisions else "nothing to act on", fontsize="medium")
@@ -59,7 +59,7 @@ def paths(decision: Decision, half_finger: float) -> list[np.ndarray]:
     return [places[:2], tips, *(np.stack([tip - across, tip + across]) for tip in tips)]
 
 
-def _draw_path(axes: Axes, view: View, path: np.ndarray, **style: Any) -> None:
+def _draw_path(axes: Axes, view: CameraView, path: np.ndarray, **style: Any) -> None:
     """Draws a line through points [n, 3] m of the workspace, as the camera sees it."""
     steps = np.linspace(0.0, 1.0, 16)[:, None]
     dense = [start + steps * (end - start) for start, end in itertools.pairwise(path)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from csac_jax.config import Config, RobotKind, SensorConfig, SimConfig
 from csac_jax.constants import OUTCOMES, Outcome
-from csac_jax.deploy import Policy, record
+from csac_jax.deploy import CameraPolicy, record
 from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.record import Recorder
 from csac_jax.env import Env
@@ -39,7 +39,7 @@ MOVED = 0.01  # m, a block that moves less has not changed the scene
 class Loop(NamedTuple):
     """A policy, and the scenes that it acts in."""
 
-    policy: Policy
+    policy: CameraPolicy
     env: Env
     episodes: int
     seed: int
@@ -47,8 +47,8 @@ class Loop(NamedTuple):
 
 
 def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
-    """Of the policy `source`, see `Policy.load`, in random10."""
-    policy = Policy.load(source)
+    """Of the policy `source`, see `CameraPolicy.load`, in random10."""
+    policy = CameraPolicy.load(source)
     clear = policy.cfg.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
     cfg = clear.change(sim={"physics": "c", "robot": robot})
     (env,) = suites.environments(cfg, "random10", episodes, seed).values()
@@ -162,7 +162,13 @@ def _episode(
         ended = not scene.in_play.any() or unchanged >= task.max_steps_without_change
         if loop.recorder is not None and decision is not None:
             ended_by_hand = ended or action == task.max_actions - 1
-            _record(loop.recorder, env.cfg, image, decision, record.Outcome(came, 1, ended_by_hand))
+            _record(
+                loop.recorder,
+                env.cfg,
+                image,
+                decision,
+                record.ReportedOutcome(outcome=came, number=1, ended=ended_by_hand),
+            )
         if ended:
             break
     studio.close()
@@ -213,7 +219,7 @@ _sensed = jax.jit(sensor.image, static_argnums=(1, 2))
 
 
 def _decide(
-    policy: Policy,
+    policy: CameraPolicy,
     cfg: Config,
     image: tuple[np.ndarray, np.ndarray],
     counts: collections.Counter[str],

@@ -11,8 +11,8 @@ import numpy as np
 from scipy import stats
 
 from csac_jax.config import SensorConfig
-from csac_jax.deploy import Policy, finetune
-from csac_jax.deploy.finetune import Settings
+from csac_jax.deploy import CameraPolicy, fine_tuning
+from csac_jax.deploy.fine_tuning import Settings
 from csac_jax.deploy.record import Recorder
 from csac_jax.env import Env
 from csac_jax.evaluation import metrics, suites
@@ -52,7 +52,7 @@ class World(NamedTuple):
     learn: Settings
 
 
-def world(policy: Policy, setting: World, episodes: int, seed: int) -> Env:
+def world(policy: CameraPolicy, setting: World, episodes: int, seed: int) -> Env:
     """random10 seen by that camera, with that gripper."""
     cfg = policy.cfg.change(sim={"physics": "c"}, heightmap={"view": "oblique"})
     lens = dataclasses.replace(cfg.camera, position=PLACES[setting.place])
@@ -63,14 +63,14 @@ def world(policy: Policy, setting: World, episodes: int, seed: int) -> Env:
 
 def measure(source: str, setting: World, grasps: int, seed: int) -> dict[str, Any]:
     """One seed: scenes, grasps, order of learning and held-out scenes follow from it."""
-    begun, policy = time.perf_counter(), Policy.load(source)
+    begun, policy = time.perf_counter(), CameraPolicy.load(source)
     env = world(policy, setting, 64, seed)
     with tempfile.TemporaryDirectory() as folder:
         recorder = Recorder(Path(folder), source)
         loop = _closed_loop.Loop(policy, env, 64, seed, recorder)
         counts = _closed_loop.collect(loop, SensorConfig(), grasps)
         recorded = time.perf_counter()
-        tuned, done = finetune.run(policy, Path(folder), setting.learn._replace(seed=seed))
+        tuned, done = fine_tuning.run(policy, Path(folder), setting.learn._replace(seed=seed))
     learned = time.perf_counter()
     held_out = world(policy, setting, setting.episodes, HELD_OUT + seed)
     found = {
@@ -88,7 +88,7 @@ def measure(source: str, setting: World, grasps: int, seed: int) -> dict[str, An
     }
 
 
-def _evaluate(policy: Policy, env: Env, episodes: int, seed: int) -> dict[str, Any]:
+def _evaluate(policy: CameraPolicy, env: Env, episodes: int, seed: int) -> dict[str, Any]:
     """What came of episodes, seen by the same camera; blocks taken per action, pushes included."""
     loop = _closed_loop.Loop(policy, env, episodes, seed)
     found = _closed_loop.measure(loop, SensorConfig())

@@ -2,9 +2,9 @@
 [--policy SOURCE] [--robot ur5|hand] [--sensor KIND] [--seed N]`.
 
 MuJoCo's OpenGL renderer draws colour and depth of the scenes of random10 through the config's
-camera. `deploy.Policy.decide` gets the image, C MuJoCo the waypoints. First with exact images, then
-with those that the sensor makes of them. An image that is refused counts as an action without
-change. EPISODES of each (100); the robot is out of the camera's view.
+camera. `deploy.CameraPolicy.decide` gets the image, C MuJoCo the waypoints. First with exact
+images, then with those that the sensor makes of them. An image that is refused counts as an
+action without change. EPISODES of each (100); the robot is out of the camera's view.
 """
 
 import json

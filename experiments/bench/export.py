@@ -1,8 +1,8 @@
 """Size and speed of exported policies, as JSON: `csac-jax bench export [--repeats N]`.
 
 The shipped policy decides on 20 images of blocks, drawn by examples/camera_image.py: by
-`Policy.decide`, and by the exported files. Beside the times: the largest difference of a Q (ONNX)
-and of any number of a decision (StableHLO) from the policy's own.
+`CameraPolicy.decide`, and by the exported files. Beside the times: the largest difference of a Q
+(ONNX) and of any number of a decision (StableHLO) from the policy's own.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from jax import export as jax_export
 
 from csac_jax import cli
 from csac_jax.config import CameraConfig
-from csac_jax.deploy import Policy, export, images, program
+from csac_jax.deploy import CameraPolicy, decision_program, images, stablehlo
 from csac_jax.vision import camera
 from examples import camera_image
 from experiments.bench._options import timed
@@ -52,7 +52,7 @@ def _largest(found: Any, wanted: Any) -> float:
 
 def measure(repeats: int) -> dict[str, Any]:
     """All of it."""
-    policy, given, sizes = Policy.load("shipped"), _images(), {}
+    policy, given, sizes = CameraPolicy.load("shipped"), _images(), {}
     with tempfile.TemporaryDirectory() as folder:
         content = {}
         for name, options in FORMATS.items():
@@ -65,11 +65,11 @@ def measure(repeats: int) -> dict[str, Any]:
         for name in ("maps.stablehlo", "image.stablehlo")
     )
     session = onnxruntime.InferenceSession(content["policy.onnx"])
-    own = jax.jit(export.from_image(policy.cfg, policy.params, CameraConfig().size)[0])
-    points = jax.jit(export._points)
-    observe = jax.jit(lambda *pixels: program.observe(policy.cfg, *pixels, None))
-    look = jax.jit(lambda obs: program.dense_maps(policy.cfg, policy.params, obs, False))
-    own_by_maps = jax.jit(export.from_maps(policy.cfg, policy.params)[0])
+    own = jax.jit(stablehlo.from_image(policy.cfg, policy.params, CameraConfig().size)[0])
+    points = jax.jit(stablehlo._points)
+    observe = jax.jit(lambda *pixels: decision_program.observe(policy.cfg, *pixels, None))
+    look = jax.jit(lambda obs: decision_program.dense_maps(policy.cfg, policy.params, obs, False))
+    own_by_maps = jax.jit(stablehlo.from_maps(policy.cfg, policy.params)[0])
     worst = dict.fromkeys(FORMATS, 0.0)
     for one in given:
         place = points(one["depth"], one["lens"], one["pose"]).reshape(-1, 3)

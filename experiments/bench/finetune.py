@@ -3,10 +3,10 @@
 [--learning-rate X] [--camera above|side]`.
 
 The shipped policy was trained with fingers that open 110 mm. Here they open OPENING-MM (65). For
-each of SEEDS (3): the policy acts through `deploy.Policy` on images of MuJoCo's renderer, random10,
-until GRASPS (500) are recorded as `act --record` does; it learns from them as `csac-jax finetune`
-does; and both policies act in EPISODES (24) other scenes, through the same camera. Gains are means
-over the seeds, with Student's interval.
+each of SEEDS (3): the policy acts through `deploy.CameraPolicy` on images of MuJoCo's renderer,
+random10, until GRASPS (500) are recorded as `act --record` does; it learns from them as
+`csac-jax finetune` does; and both policies act in EPISODES (24) other scenes, through the same
+camera. Gains are means over the seeds, with Student's interval.
 """
 
 import json

@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -14,7 +13,7 @@ import pytest
 
 from csac_jax import cli
 from csac_jax.config import CameraConfig
-from csac_jax.deploy import Policy
+from csac_jax.deploy import CameraPolicy
 from tests.deploy import image_files, scenes
 
 POSES = np.array([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])
@@ -24,17 +23,17 @@ EMPTY = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]))
 
 @pytest.fixture
 def given(tmp_path: Path) -> list[str]:
-    """Policy and files of an image of two blocks."""
+    """The policy and the files of an image of two blocks."""
     return ["shipped", *image_files.write(tmp_path, IMAGE)]
 
 
 def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: the command prints and writes what `Policy.decide` returns, and draws it."""
+    """Claim: the command prints and writes what `CameraPolicy.decide` returns, and draws it."""
     files = ["--json", str(tmp_path / "out.json"), "--png", str(tmp_path / "out.png")]
     assert cli.main(["act", *given, "--top", "2", *files]) == 0
     lines = capsys.readouterr().out.splitlines()
     result = json.loads((tmp_path / "out.json").read_text())
-    wanted = Policy.load("shipped").decide(*IMAGE, top=2)
+    wanted = CameraPolicy.load("shipped").decide(*IMAGE, top=2)
     assert len(lines) == len(result["decisions"]) == 2
     for line, found, decision in zip(lines, result["decisions"], wanted, strict=True):
         assert f"{decision.primitive} at x {found['position'][0]:+.3f}" in line
@@ -100,6 +99,7 @@ def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytes
     assert capsys.readouterr().out.splitlines() == [first]
     _ten_times(tmp_path)
     assert cli.main(["act", *given, "--record", str(record)]) == 1
+    assert "counts in 0.1 mm; multiply it by 0.1" in capsys.readouterr().err
     assert sorted(path.name for path in record.iterdir()) == ["000001", "record.json"]
 
 
@@ -124,68 +124,37 @@ def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture)
         assert bool(json.loads(json_file.read_text())["faults"]) == bool(code)
 
 
-def _no_file(folder: Path) -> None:
-    (folder / "rgb.png").unlink()
-
-
-def _cut(folder: Path) -> None:
-    (folder / "rgb.png").write_bytes((folder / "rgb.png").read_bytes()[:2000])
-
-
-def _eight_bits(folder: Path) -> None:
-    imageio.imwrite(folder / "depth.png", np.zeros((480, 640), np.uint8))
-
-
-def _small(folder: Path) -> None:
-    imageio.imwrite(folder / "rgb.png", IMAGE.rgb[::2, ::2])
-
-
-def _no_json(folder: Path) -> None:
-    (folder / "pose.json").write_text("1 0 0 0")
-
-
-def _other_names(folder: Path) -> None:
-    (folder / "pose.json").write_text(json.dumps({"pose": np.eye(4).tolist()}))
-
-
-def _no_matrix(folder: Path) -> None:
-    (folder / "pose.json").write_text(json.dumps({"matrix": [[1, 2], [3]]}))
-
-
-def _no_focal(folder: Path) -> None:
-    (folder / "intrinsics.json").write_text(json.dumps({"width": 640, "height": 480}))
-
-
 def _ten_times(folder: Path) -> None:
     depth = imageio.imread(folder / "depth.png")
     imageio.imwrite(folder / "depth.png", (10 * depth.clip(0, 6000)).astype(np.uint16))
 
 
 @pytest.mark.parametrize(
-    ("spoil", "code", "message"),
+    ("file", "content", "message"),
     [
-        (_no_file, 2, "there is no file"),
-        (_cut, 2, "rgb.png: "),
-        (_eight_bits, 2, "depth.png: is uint8; give a PNG of 16 bits, in mm"),
-        (_small, 2, "rgb 320 x 240, depth 640 x 480"),
-        (_no_json, 2, "pose.json is not readable JSON"),
-        (_other_names, 2, 'pose.json: give {"matrix": '),
-        (_no_matrix, 2, "matrix: must be a 4 x 4 matrix of numbers"),
-        (_no_focal, 2, "intrinsics.json: intrinsics: give cx, cy, fx, fy"),
-        (_ten_times, 1, "counts in 0.1 mm; multiply it by 0.1"),
+        ("rgb.png", None, "there is no file"),
+        ("rgb.png", b"\x89PNG\r\n\x1a\n" + b"1" * 2000, "rgb.png: "),
+        ("rgb.png", image_files.png(IMAGE.rgb[::2, ::2]), "rgb 320 x 240, depth 640 x 480"),
+        ("depth.png", image_files.png(IMAGE.rgb[..., 0]), "depth.png: is uint8; give a PNG of 16"),
+        ("pose.json", b"1 0 0 0", "pose.json: Invalid JSON"),
+        ("pose.json", b'{"pose": []}', "pose.json: 'matrix' is missing"),
+        ("pose.json", b'{"matrix": [[1, 2], [3]]}', "matrix: must be a 4 x 4 matrix of numbers"),
+        ("intrinsics.json", b'{"width": 640}', "intrinsics.json: intrinsics: 'height' is missing"),
     ],
 )
 def test_bad_files_are_one_line(
     given: list[str],
     tmp_path: Path,
     capsys: pytest.CaptureFixture,
-    spoil: Callable[[Path], None],
-    code: int,
+    file: str,
+    content: bytes | None,
     message: str,
 ):
     """Claim: what is wrong with a file is one line that names it."""
-    spoil(tmp_path)
-    assert cli.main(["act", *given]) == code
+    (tmp_path / file).unlink()
+    if content is not None:
+        (tmp_path / file).write_bytes(content)
+    assert cli.main(["act", *given]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1

@@ -1,5 +1,6 @@
 """An image as the files that `csac-jax act` reads."""
 
+import io
 import json
 from pathlib import Path
 
@@ -9,8 +10,15 @@ import numpy as np
 from tests.deploy.scenes import Image
 
 
+def png(pixels: np.ndarray) -> bytes:
+    """Encodes an image."""
+    buffer = io.BytesIO()
+    imageio.imwrite(buffer, pixels, format="png")
+    return buffer.getvalue()
+
+
 def rounded(image: Image) -> Image:
-    """The image with depths of whole millimetres, as a PNG holds them, 0 where there is none."""
+    """Returns the image with depths of whole millimetres, as a PNG holds them."""
     depth = np.round(1000 * np.nan_to_num(image.depth).clip(0, 60)) / 1000
     return image._replace(depth=depth.astype(np.float32))
 

@@ -19,7 +19,7 @@ MOST = 4  # blocks of most images
 
 
 class Image(NamedTuple):
-    """What `Policy.decide` takes."""
+    """What `CameraPolicy.decide` takes."""
 
     rgb: np.ndarray  # [h, w, 3] uint8
     depth: np.ndarray  # [h, w] float32 m

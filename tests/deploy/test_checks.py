@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax.config import CameraConfig, HeightmapConfig
 from csac_jax.deploy import checks, images
-from csac_jax.deploy.images import View
+from csac_jax.deploy.images import CameraView
 from csac_jax.errors import DataWarning, ViewError
 from tests.deploy import scenes
 from tests.deploy.scenes import Image
@@ -22,12 +22,12 @@ IMAGE = scenes.take(scenes.blocks_at([[0.1, 0.1, 0.4], [-0.1, 0.0, 1.0], [0.05, 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _view(image: Image = IMAGE, **changes: Any) -> View:
+def _view(image: Image = IMAGE, **changes: Any) -> CameraView:
     return images.make(*image._replace(**changes))
 
 
-def _check(view: View) -> None:
-    """What `Policy.decide` asks of a view."""
+def _check(view: CameraView) -> None:
+    """What `CameraPolicy.decide` asks of a view."""
     checks.pose(view)
     checks.depth_unit(view, EXTENT)
     checks.table_height(checks.table(view, EXTENT), EXTENT)

@@ -19,10 +19,10 @@ from csac_jax import cli, presets
 from csac_jax.agent import actor_critic, maps, values
 from csac_jax.config import CameraConfig
 from csac_jax.constants import Outcome
-from csac_jax.deploy import Policy, experience, finetune, record
+from csac_jax.deploy import CameraPolicy, experience, fine_tuning, record
 from csac_jax.deploy.decision import Decision
-from csac_jax.deploy.finetune import Settings
-from csac_jax.deploy.record import Recorder
+from csac_jax.deploy.fine_tuning import Settings
+from csac_jax.deploy.record import Recorder, ReportedOutcome
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.io import policy_file
 from csac_jax.runtime.signals import Stop
@@ -38,11 +38,11 @@ LEFT, RIGHT = (-0.1, 0.0), (0.1, 0.05)
 
 
 @pytest.fixture(scope="module")
-def policy() -> Policy:
+def policy() -> CameraPolicy:
     """An untrained one."""
     learner = actor_critic.make(CFG)
     params = jax.jit(lambda: actor_critic.init(jax.random.key(3), learner).online)()
-    return Policy(CFG, params)
+    return CameraPolicy(CFG, params)
 
 
 def _take(*places: tuple[float, float]) -> scenes.Image:
@@ -56,7 +56,7 @@ def _grasp(place: tuple[float, float], primitive: str = "grasp") -> Decision:
     return Decision(primitive, (*place, 0.02), 0.3, 0.11, 1.0, ())
 
 
-def write(folder: Path, *actions: tuple[scenes.Image, Decision, record.Outcome | None]) -> Path:
+def write(folder: Path, *actions: tuple[scenes.Image, Decision, ReportedOutcome | None]) -> Path:
     """A record of these actions, in their order."""
     recorder = Recorder(folder, "test")
     for image, decision, outcome in actions:
@@ -66,11 +66,11 @@ def write(folder: Path, *actions: tuple[scenes.Image, Decision, record.Outcome |
     return folder
 
 
-Lifted, Empty, Pushed = map(record.Outcome, ("lifted", "empty", "pushed"))
-End = record.Outcome("lifted", ended=True)
+Lifted, Empty, Pushed = (ReportedOutcome(outcome=name) for name in ("lifted", "empty", "pushed"))
+End = ReportedOutcome(outcome="lifted", ended=True)
 
 
-def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
+def test_transitions_are_those_of_training(policy: CameraPolicy, tmp_path: Path):
     """Claim: an action is stored with the map that it was decided on, the map of the next image,
     its pose, and the reward of eqs. 10 to 15; the end of a scene ends an episode; an action without
     outcome or without a next image is left out."""
@@ -93,7 +93,7 @@ def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
             if wanted is not None:
                 row = jax.tree.map(lambda leaf, n=number: leaf[n], seen)
                 jax.tree.map(np.testing.assert_array_equal, row, heightmap.pack(wanted))
-    program = offline.make(finetune.configure(CFG, Settings(batch=2), 4))
+    program = offline.make(fine_tuning.configure(CFG, Settings(batch=2), 4))
     learner = offline.init(program, policy.params)
     done = experience.transitions(policy, program.learner, learner, found)
     np.testing.assert_allclose(done.reward, [2.0, -0.5, 2.0, 2.0], atol=1e-6)
@@ -104,14 +104,14 @@ def test_transitions_are_those_of_training(policy: Policy, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
+def test_what_is_learnt_is_what_was_seen(policy: CameraPolicy, tmp_path: Path):
     """Claim: Q of a stored transition is the score that its decision was taken for."""
     recorder = Recorder(tmp_path, "test")
     decisions = policy.decide(*BOTH, top=3)
     recorder.add((*BOTH, None), decisions)
     recorder.add((*ONLY_LEFT, None), [])
     came = "pushed" if decisions[2].primitive == "push" else "empty"
-    recorder.post("000001", record.Outcome(came, number=3))
+    recorder.post("000001", ReportedOutcome(outcome=came, number=3))
     found = experience.load(policy, record.read(tmp_path))
     learner = actor_critic.make(CFG)
     obs = heightmap.unpack(jax.tree.map(jax.numpy.asarray, found.obs))
@@ -122,7 +122,7 @@ def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
     assert float(q) == pytest.approx(decisions[2].score, abs=1e-3)
 
 
-def test_pushes_are_judged_by_the_next_image(policy: Policy, tmp_path: Path):
+def test_pushes_are_judged_by_the_next_image(policy: CameraPolicy, tmp_path: Path):
     """Claim: a push earns as in training: by whether the map has changed, or by the critic."""
     folder = write(
         tmp_path,
@@ -133,13 +133,13 @@ def test_pushes_are_judged_by_the_next_image(policy: Policy, tmp_path: Path):
     cfg = CFG.change(reward={"push_effect": "change"})
     judge = dataclasses.replace(policy, cfg=cfg)
     found = experience.load(judge, record.read(folder))
-    program = offline.make(finetune.configure(cfg, Settings(batch=2), 2))
+    program = offline.make(fine_tuning.configure(cfg, Settings(batch=2), 2))
     learner = offline.init(program, policy.params)
     done = experience.transitions(judge, program.learner, learner, found)
     np.testing.assert_allclose(done.reward, [0.5, -0.5], atol=1e-6)
 
 
-def _q(policy: Policy, image: scenes.Image, place: tuple[float, float]) -> float:
+def _q(policy: CameraPolicy, image: scenes.Image, place: tuple[float, float]) -> float:
     """Q of a grasp at a place."""
     learner = actor_critic.make(policy.cfg)
     obs = policy.observe(*image)
@@ -163,11 +163,11 @@ def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("lesson") / "record", *LESSON)
 
 
-def test_it_learns_what_works(policy: Policy, lesson: Path):
+def test_it_learns_what_works(policy: CameraPolicy, lesson: Path):
     """Claim: after learning, Q of what lifted something is near its reward 2, Q of what failed near
     -0.5; config and the policy that was given stay."""
     before = jax.device_get(policy.params)
-    tuned, done = finetune.run(policy, lesson, SETTINGS)
+    tuned, done = fine_tuning.run(policy, lesson, SETTINGS)
     assert (done.actions, done.lifted, done.updates) == (12, 6, 100)
     assert done.td_error[1] < 0.2 < done.td_error[0]
     assert abs(_q(tuned, BOTH, RIGHT) - 2.0) < 0.3
@@ -176,19 +176,19 @@ def test_it_learns_what_works(policy: Policy, lesson: Path):
     jax.tree.map(np.testing.assert_array_equal, before, jax.device_get(policy.params))
 
 
-def test_stop_keeps_what_was_learned(policy: Policy, lesson: Path):
+def test_stop_keeps_what_was_learned(policy: CameraPolicy, lesson: Path):
     """Claim: a signal ends the learning after the step that runs, and its networks are returned;
     one that came before keeps those that were given."""
     stop, seen = Stop(), []
 
-    def interrupt(progress: finetune.Progress) -> None:
+    def interrupt(progress: fine_tuning.FineTuningProgress) -> None:
         seen.append(progress)
         stop.signal = signal.SIGINT
 
-    tuned, done = finetune.run(policy, lesson, SETTINGS, interrupt, stop)
+    tuned, done = fine_tuning.run(policy, lesson, SETTINGS, interrupt, stop)
     assert (done.updates, done.stopped_by, len(seen)) == (10, signal.SIGINT, 1)
     assert (seen[0].updates, seen[0].total) == (10, 100)
-    again, none = finetune.run(policy, lesson, SETTINGS, interrupt, stop)
+    again, none = fine_tuning.run(policy, lesson, SETTINGS, interrupt, stop)
     assert none.updates == 0
     jax.tree.map(np.testing.assert_array_equal, again.params, policy.params)
     changed = jax.tree.map(lambda a, b: bool(np.any(a != b)), tuned.params, policy.params)
@@ -196,7 +196,7 @@ def test_stop_keeps_what_was_learned(policy: Policy, lesson: Path):
 
 
 def test_command_writes_a_policy(
-    policy: Policy, lesson: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+    policy: CameraPolicy, lesson: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ):
     """Claim: the command writes a policy file that loads and decides, and says what it did; it
     overwrites nothing."""
@@ -219,7 +219,7 @@ def test_command_writes_a_policy(
     assert "learned from 12 actions, 6 of them lifted something; TD error" in told
     assert f"done after 100 updates; wrote {out}" in told
     assert json.loads((tmp_path / "done.json").read_text())["updates"] == 100
-    tuned = Policy.load(out)
+    tuned = CameraPolicy.load(out)
     assert tuned.cfg == CFG
     assert tuned.decide(*BOTH)
     assert cli.main(arguments) == 2
@@ -255,22 +255,22 @@ def _millimetres(folder: Path) -> None:
     ],
 )
 def test_bad_records_are_refused(
-    policy: Policy, tmp_path: Path, spoil: Callable[[Path], None], message: str
+    policy: CameraPolicy, tmp_path: Path, spoil: Callable[[Path], None], message: str
 ):
     """Claim: a record that nothing can be learned from, or that is damaged, is one line that says
     where."""
     folder = write(tmp_path / "record", (BOTH, _grasp(LEFT), Lifted), (BOTH, _grasp(LEFT), Lifted))
     spoil(folder)
     with pytest.raises(SettingsError, match=message) as found:
-        finetune.run(policy, folder)
+        fine_tuning.run(policy, folder)
     assert "\n" not in str(found.value)
 
 
-def test_loss_that_is_not_finite(policy: Policy, lesson: Path):
+def test_loss_that_is_not_finite(policy: CameraPolicy, lesson: Path):
     """Claim: where learning diverges, nothing is returned, and one line says what to change."""
     broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * np.nan, policy.params))
-    with pytest.raises(FailedError, match=r"not finite after 10 updates; lower --learning-rate"):
-        finetune.run(broken, lesson, SETTINGS)
+    with pytest.raises(FailedError, match=r"not finite after 10 updates; lower learning_rate"):
+        fine_tuning.run(broken, lesson, SETTINGS)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import csac_jax
 from csac_jax import presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import CameraConfig
-from csac_jax.deploy import Decision, Policy, program
+from csac_jax.deploy import CameraPolicy, Decision, decision_program
 from csac_jax.errors import SettingsError, ViewError
 from csac_jax.vision import camera, observe, raycast
 from tests.deploy import scenes
@@ -27,12 +27,12 @@ WORKSPACE = np.array([[0, -1, 0, 0.4], [1, 0, 0, -0.2], [0, 0, 1, 0.05], [0, 0, 
 
 
 @pytest.fixture(scope="module")
-def policy() -> Policy:
-    return csac_jax.deploy.Policy.load("shipped", WORKSPACE)
+def policy() -> CameraPolicy:
+    return csac_jax.deploy.CameraPolicy.load("shipped", WORKSPACE)
 
 
 @pytest.fixture(scope="module")
-def decisions(policy: Policy) -> list[Decision]:
+def decisions(policy: CameraPolicy) -> list[Decision]:
     return policy.decide(*IMAGE, top=4)
 
 
@@ -57,7 +57,7 @@ def test_decides_on_the_blocks(decisions: list[Decision]):
         assert decision.width == pytest.approx(0.11)
     places = np.array([decision.position[:2] for decision in decisions])
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)[np.triu_indices(4, 1)]
-    assert apart.min() >= program.APART - 1e-6
+    assert apart.min() >= decision_program.APART - 1e-6
     assert decisions[0].score == max(decision.score for decision in decisions)
 
 
@@ -79,7 +79,7 @@ def test_decides_as_in_simulation(decisions: list[Decision]):
     assert decisions[0].primitive == "grasp"
 
 
-def test_flying_pixels_are_left_out(policy: Policy):
+def test_flying_pixels_are_left_out(policy: CameraPolicy):
     """Claim: single pixels with depths that no neighbour has change the map by 2 mm at most."""
     rng = np.random.default_rng(0)
     flies = rng.uniform(size=IMAGE.depth.shape) < 0.005
@@ -118,25 +118,25 @@ def test_tool_is_in_the_robot_s_frame(decisions: list[Decision]):
         np.testing.assert_allclose(tool[:2, 0], [np.cos(yaw), np.sin(yaw)], atol=1e-6)
 
 
-def test_push_waypoints(policy: Policy):
+def test_push_waypoints(policy: CameraPolicy):
     """Claim: a push goes 10 cm along its yaw with closed fingers, 2 cm below the top, and ends at
     the workspace's edge."""
     height = np.full((64, 64), 0.05, np.float32)
     for x, length in ((0.0, 0.1), (0.2, 0.024)):
         action = csac_jax.Action.push(x, 0.0, 0.0)
-        stations = np.asarray(program.stations(policy.cfg, height, action))
+        stations = np.asarray(decision_program.stations(policy.cfg, height, action))
         np.testing.assert_allclose(stations[:, 0], [x, x, x + length, x + length], atol=1e-5)
         np.testing.assert_allclose(stations[:, 2], [0.13, 0.03, 0.03, 0.13], atol=1e-5)
         np.testing.assert_allclose(stations[:, 4], 0.0)
 
 
-def test_empty_table_has_no_decision(policy: Policy):
+def test_empty_table_has_no_decision(policy: CameraPolicy):
     """Claim: where there is nothing to act on, there is no decision."""
     assert policy.decide(*BARE_TABLE, top=3) == []
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
-def test_target_is_grasped(policy: Policy, number: int):
+def test_target_is_grasped(policy: CameraPolicy, number: int):
     """Claim: with a mask, the policy grasps the marked block alone, whichever it is."""
     x, y = POSES[number, :2]
     points = np.nan_to_num(IMAGE.depth)[..., None] * camera.directions(camera.make(scenes.CAMERA))
@@ -152,25 +152,25 @@ def test_policy_of_the_target_task_needs_a_mask():
     cfg = presets.smoke().change(task={"kind": "target"})
     params = jax.jit(lambda: actor_critic.init(jax.random.key(0), actor_critic.make(cfg)).online)()
     with pytest.raises(SettingsError, match="target_mask: this policy gets a marked object"):
-        Policy(cfg, params).decide(*IMAGE)
+        CameraPolicy(cfg, params).decide(*IMAGE)
     mask = np.asarray(IMAGE.depth > 0)
-    assert Policy(cfg, params).decide(*IMAGE, target_mask=mask)
+    assert CameraPolicy(cfg, params).decide(*IMAGE, target_mask=mask)
 
 
 @pytest.mark.parametrize("top", [0, 65])
-def test_top_has_bounds(policy: Policy, top: int):
+def test_top_has_bounds(policy: CameraPolicy, top: int):
     """Claim: a number of decisions out of range is refused."""
     with pytest.raises(SettingsError, match=r"top: must lie in 1 \.\. 64"):
         policy.decide(*IMAGE, top=top)
 
 
-def test_misfit_is_refused(policy: Policy):
+def test_misfit_is_refused(policy: CameraPolicy):
     """Claim: the checks come before a decision."""
     with pytest.raises(ViewError, match="millimetres"):
         policy.decide(IMAGE.rgb, 1000 * IMAGE.depth, *IMAGE[2:])
 
 
-def test_report_of_the_empty_table(policy: Policy):
+def test_report_of_the_empty_table(policy: CameraPolicy):
     """Claim: the check measures the table's height and what lies on it; two blocks of 10 x 5 cm
     cover at least their 100 cm^2."""
     pose = IMAGE.pose.copy()
@@ -192,10 +192,10 @@ import numpy as np
 from csac_jax import deploy
 image = np.load(sys.argv[1])
 given = json.loads(sys.argv[2])
-policy = deploy.Policy.load("shipped")
+policy = deploy.CameraPolicy.load("shipped")
 print(json.dumps(policy.decide(image["rgb"], image["depth"], given, image["pose"])[0].to_dict()))
 try:
-    deploy.Policy.load(sys.argv[3])
+    deploy.CameraPolicy.load(sys.argv[3])
 except deploy.SettingsError as error:
     print(error)
 """
@@ -221,7 +221,7 @@ def test_net_of_heights_sees_no_colours():
     cfg = presets.smoke().change(net={"colour": False})
     learner = actor_critic.make(cfg)
     params = jax.jit(lambda: actor_critic.init(jax.random.key(0), learner).online)()
-    heights = Policy(cfg, params)
+    heights = CameraPolicy(cfg, params)
     other = IMAGE._replace(rgb=np.roll(255 - IMAGE.rgb, 7, axis=1))
     first, second = (heights.decide(*image)[0].to_dict() for image in (IMAGE, other))
     assert first == second

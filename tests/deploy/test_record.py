@@ -3,15 +3,15 @@
 import concurrent.futures
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from csac_jax.deploy import record
 from csac_jax.deploy.decision import Decision
-from csac_jax.deploy.record import Outcome, Recorder
+from csac_jax.deploy.record import Recorder, ReportedOutcome
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
 
@@ -20,6 +20,10 @@ LENS = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "cx": 31.5, "cy": 23.
 POSE = np.array([[0, -1, 0, 0.1], [-1, 0, 0, 0.2], [0, 0, -1, 0.7], [0, 0, 0, 1]], float)
 GRASP = Decision("grasp", (0.01, -0.02, 0.03), 0.4, 0.11, 1.9, ())
 PUSH = Decision("push", (0.1, 0.2, 0.03), 5.4, 0.0, 0.9, ())
+
+
+def _outcome(outcome: str, **values: Any) -> ReportedOutcome:
+    return ReportedOutcome(outcome=outcome, **values)
 
 
 def image(mask: bool = False) -> record.Image:
@@ -36,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
     recorder = Recorder(tmp_path / "record", "shipped")
     recorder.add(image(), [GRASP, PUSH])
     recorder.add(image(mask=True), [PUSH])
-    recorder.post("000001", Outcome("dropped"))
+    recorder.post("000001", _outcome("dropped"))
     return tmp_path / "record"
 
 
@@ -62,12 +66,12 @@ def test_outcome_names_what_was_done(folder: Path):
     """Claim: an outcome chooses the decision that was carried out; a later one takes its place."""
     recorder = Recorder(folder, "shipped")
     first, second = record.read(folder)
-    assert first.outcome == Outcome("dropped")
+    assert first.outcome == _outcome("dropped")
     assert first.action == ("grasp", [0.01, -0.02, 0.4])
     assert second.outcome is None
-    recorder.post("000001", Outcome("pushed", number=2, ended=True))
+    recorder.post("000001", _outcome("pushed", number=2, ended=True))
     first, _ = record.read(folder)
-    assert first.outcome == Outcome("pushed", 2, True)
+    assert first.outcome == _outcome("pushed", number=2, ended=True)
     assert first.action == ("push", [0.1, 0.2, 5.4])
 
 
@@ -121,69 +125,53 @@ def test_number_that_is_taken_meanwhile(folder: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     ("name", "outcome", "error", "message"),
     [
-        ("000003", Outcome("lifted"), FileNotFoundError, "there is no decision 000003"),
-        ("../record", Outcome("lifted"), FileNotFoundError, "there is no decision ../record"),
-        ("000001", Outcome("lifted", 3), SettingsError, "number: there are 2 decisions, not 3"),
-        ("000001", Outcome("pushed"), SettingsError, "outcome: of a grasp it is nothing, empty"),
-        ("000002", Outcome("empty"), SettingsError, "outcome: of a push it is pushed, not empty"),
+        ("000003", _outcome("lifted"), FileNotFoundError, "there is no decision 000003"),
+        ("../record", _outcome("lifted"), FileNotFoundError, "there is no decision ../record"),
+        (
+            "000001",
+            _outcome("lifted", number=3),
+            SettingsError,
+            "number: there are 2 decisions, not 3",
+        ),
+        ("000001", _outcome("pushed"), SettingsError, "outcome: of a grasp it is nothing, empty"),
+        ("000002", _outcome("empty"), SettingsError, "outcome: of a push it is pushed, not empty"),
     ],
 )
 def test_outcomes_that_do_not_fit(
-    folder: Path, name: str, outcome: Outcome, error: type[Exception], message: str
+    folder: Path, name: str, outcome: ReportedOutcome, error: type[Exception], message: str
 ):
     """Claim: an outcome of no decision, or of another primitive, is refused in one line."""
     with pytest.raises(error, match=message):
         Recorder(folder, "shipped").post(name, outcome)
 
 
-def _no_head(folder: Path) -> None:
-    (folder / "record.json").unlink()
-
-
-def _newer(folder: Path) -> None:
-    (folder / "record.json").write_text('{"format": 2}')
-
-
-def _no_decision(folder: Path) -> None:
-    (folder / "000002" / "decision.json").unlink()
-
-
-def _cut_decision(folder: Path) -> None:
-    (folder / "000001" / "decision.json").write_text('{"decisions": [{"prim')
-
-
-def _other_decision(folder: Path) -> None:
-    (folder / "000001" / "decision.json").write_text('{"decisions": [{"primitive": "grasp"}]}')
-
-
-def _unknown_outcome(folder: Path) -> None:
-    (folder / "000001" / "outcome.json").write_text('{"outcome": "good"}')
-
-
-def _unknown_field(folder: Path) -> None:
-    (folder / "000001" / "outcome.json").write_text('{"outcome": "lifted", "speed": 1}')
-
-
-def _text_number(folder: Path) -> None:
-    (folder / "000001" / "outcome.json").write_text('{"outcome": "lifted", "number": "1"}')
-
-
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("file", "content", "message"),
     [
-        (_no_head, "is no record: it has no record.json"),
-        (_newer, "format 2 is unknown, this version reads 1; update csac-jax"),
-        (_no_decision, "there is no file .*000002/decision.json"),
-        (_cut_decision, "000001/decision.json: decision.json is not readable JSON"),
-        (_other_decision, "000001/decision.json has no decisions as `csac-jax act` writes them"),
-        (_unknown_outcome, "000001/outcome.json: outcome: must be one of nothing, empty"),
-        (_unknown_field, '000001/outcome.json: give {"outcome": NAME'),
-        (_text_number, "000001/outcome.json: number: must be that of a decision"),
+        ("record.json", None, "is no record: it has no record.json"),
+        ("record.json", '{"format": 2}', "format 2 is unknown, this version reads 1; update"),
+        ("000002/decision.json", None, "there is no file .*000002/decision.json"),
+        ("000001/decision.json", '{"decisions": [{"prim', "000001/decision.json: Invalid JSON"),
+        ("000001/decision.json", '{"decisions": [{"primitive": "grasp"}]}', "position' is missing"),
+        (
+            "000001/outcome.json",
+            '{"outcome": "good"}',
+            "outcome.json: 'outcome' should be 'nothing'",
+        ),
+        ("000001/outcome.json", '{"outcome": "lifted", "speed": 1}', "'speed' is unknown"),
+        (
+            "000001/outcome.json",
+            '{"outcome": "lifted", "number": "1"}',
+            "'number' should be a valid",
+        ),
+        ("000001/outcome.json", '{"outcome": "lifted", "number": 0}', "'number' should be greater"),
     ],
 )
-def test_damaged_records_are_refused(folder: Path, spoil: Callable[[Path], None], message: str):
+def test_damaged_records_are_refused(folder: Path, file: str, content: str | None, message: str):
     """Claim: what is wrong with a record is one line that names the file."""
-    spoil(folder)
+    (folder / file).unlink()
+    if content is not None:
+        (folder / file).write_text(content)
     with pytest.raises(SettingsError, match=message) as found:
         record.read(folder)
     assert "\n" not in str(found.value)

@@ -18,7 +18,7 @@ from csac_jax import deploy, grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import DenseNet121
-from csac_jax.deploy import decision, program
+from csac_jax.deploy import decision, decision_program
 from csac_jax.errors import DataWarning
 from csac_jax.io import configs, policy_file, weights
 from csac_jax.io.policy_file import PolicyFileError
@@ -104,15 +104,15 @@ def test_grippers_of_one_folder_name_are_two(tmp_path: Path, params: Params):
         shutil.copy(tmp_path / f"{name}.safetensors", older)
         _rewrite(older, as_remark)
     loaded = {
-        name: deploy.Policy.load(tmp_path / f"{name}.safetensors")
+        name: deploy.CameraPolicy.load(tmp_path / f"{name}.safetensors")
         for name in (*openings, *(f"{name}_older" for name in openings))
     }
     for name, policy in loaded.items():
         height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
         action = Action.grasp(0.0, 0.0, 0.0)
-        stations = program.stations(policy.cfg, height, action)
-        choice = program.Choice(action, jnp.zeros(()), jnp.bool(True), stations)
-        width = decision.of(jax.device_get(choice), np.eye(4)).width
+        stations = decision_program.stations(policy.cfg, height, action)
+        choice = decision_program.Choice(action, jnp.zeros(()), jnp.bool(True), stations)
+        width = decision.from_choice(jax.device_get(choice), np.eye(4)).width
         assert width == pytest.approx(openings[name.split("_")[0]])
 
 

@@ -14,7 +14,7 @@ import pytest
 from csac_jax import geometry
 from csac_jax.constants import Primitive
 from csac_jax.deploy import decision
-from csac_jax.deploy.program import Choice, stations
+from csac_jax.deploy.decision_program import Choice, stations
 from csac_jax.scene import blocks
 from csac_jax.sim import primitives
 from csac_jax.sim.primitives import Action
@@ -75,7 +75,7 @@ def test_waypoints_are_followed_as_planned(primitive: Primitive):
     action = Action(jnp.int32(primitive), jnp.array([-0.03, 0.02, 0.7]))
     plan = primitives.plan(CFG.sim, CFG.heightmap, height, action)
     choice = Choice(action, jnp.zeros(()), jnp.bool(True), stations(CFG, height, action))
-    decided = decision.of(jax.device_get(choice), np.eye(4))
+    decided = decision.from_choice(jax.device_get(choice), np.eye(4))
     found = _closed_loop.set_points(CFG.sim, decided)
     wanted = np.concatenate([plan.start[None], plan.control])
     np.testing.assert_allclose(found, wanted, atol=1e-4)

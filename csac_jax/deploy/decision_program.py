@@ -1,4 +1,4 @@
-"""From points and colours to actions: the compiled part of a policy that is deployed."""
+"""From points and colours to actions: the compiled part of a deployed policy."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -32,10 +32,10 @@ class Choice(NamedTuple):
 
 
 def observe(cfg: Config, points: Any, valid: Any, colour: Any, target: Any) -> Observation:
-    """The view from above of an image's pixels.
+    """Projects an image's pixels to the view from above. Leaves out points above VIEW_HEIGHT.
 
     Args: points [n, 3] m, workspace frame; valid [n] bool; colour [n, 3] uint8; target [n] bool, or
-    None if any object will do. Points above VIEW_HEIGHT are left out.
+    None if any object will do.
     """
     cells = heightmap.from_points(cfg.heightmap, points, valid & (points[:, 2] < VIEW_HEIGHT))
     seen = colour.at[cells.source].get(mode="promise_in_bounds").astype(jnp.float32) / 255.0
@@ -47,8 +47,10 @@ def observe(cfg: Config, points: Any, valid: Any, colour: Any, target: Any) -> O
 
 
 def fingers(cfg: Config) -> jax.Array | None:
-    """The gripper's, as the networks see it [3] m; None where they do not. Raises SettingsError
-    for a gripper that is none, but many."""
+    """Returns the gripper's numbers as the networks see them, [3] m; None if they do not.
+
+    Raises SettingsError for a gripper that varies: a robot has one.
+    """
     gripper = grippers.load(cfg.sim.gripper)
     if gripper.varies is not None:
         known = ", ".join(grippers.shipped())
@@ -57,8 +59,10 @@ def fingers(cfg: Config) -> jax.Array | None:
 
 
 def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool) -> DenseMaps:
-    """Dense maps of one state. With `only_target` a policy of the task `clear`, whose networks see
-    no target, may only grasp, and only the target."""
+    """Computes the dense maps of one state.
+
+    With `only_target`, a policy whose networks see no target may only grasp, and only the target.
+    """
     learner = actor_critic.make(cfg)
     batch = values.decision_maps(learner, params, jax.tree.map(lambda leaf: leaf[None], obs))
     state = jax.tree.map(lambda leaf: leaf[0], batch)
@@ -70,8 +74,8 @@ def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool)
 
 
 def choose(cfg: Config, state: DenseMaps, height: jax.Array) -> tuple[Choice, DenseMaps]:
-    """What the policy does in a state of height map [H, W] m, and the state without the cells near
-    that action."""
+    """Returns the best action in a state of height map [H, W] m, and the state without the cells
+    near it."""
     learner = actor_critic.make(cfg)
     best = policy.greedy(jax.random.key(0), learner, state, jnp.int32(0))
     pose = maps.denormalise(learner.frames, best.poses[best.primitive])
@@ -82,7 +86,7 @@ def choose(cfg: Config, state: DenseMaps, height: jax.Array) -> tuple[Choice, De
 
 
 def stations(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
-    """Set-points [4, 5] of the hand where the phases of the simulated primitive begin and end."""
+    """Returns the hand's set-points [4, 5] at the ends of the simulated primitive's phases."""
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
     is_grasp = action.primitive == Primitive.GRASP
     ends = [np.cumsum(phases) - 1 for phases in (cfg.sim.push_phases, cfg.sim.grasp_phases)]
@@ -91,7 +95,7 @@ def stations(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
 
 
 def _without(learner: ActorCritic, state: DenseMaps, action: Action) -> DenseMaps:
-    """The state without the cells of this primitive within APART of the action."""
+    """Removes the cells of this primitive within APART of the action."""
     offset = learner.frames.xy - action.pose[:2][None, None, None]
     far = jnp.sum(offset**2, axis=-1) >= APART**2  # [K, h, w]
     other = jnp.arange(len(Primitive)) != action.primitive
@@ -99,6 +103,6 @@ def _without(learner: ActorCritic, state: DenseMaps, action: Action) -> DenseMap
 
 
 def best_over_yaws(cfg: Config, state: DenseMaps) -> jax.Array:
-    """Largest Q over the yaws [P, H, W], -inf where there is nothing to act on; for pictures."""
+    """Returns the largest Q over the yaws [P, H, W], -inf if nothing is there; for pictures."""
     places = geometry.cell_centres(cfg.heightmap)
     return maps.best_over_yaws(actor_critic.make(cfg).frames, state, places)

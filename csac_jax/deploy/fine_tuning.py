@@ -1,6 +1,6 @@
-"""A policy that learns from a record of its own actions, see `record`; no scene is simulated.
+"""A policy learns from a record of its own actions, see `record`; no scene is simulated.
 
-    policy, summary = finetune.run(Policy.load("shipped"), Path("record"))
+    policy, summary = fine_tuning.run(CameraPolicy.load("shipped"), Path("record"))
 
 The learner's modules need MuJoCo installed.
 """
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from csac_jax.config import Config, UniformReplay
 from csac_jax.constants import Outcome
-from csac_jax.deploy import Policy, experience, record
+from csac_jax.deploy import CameraPolicy, experience, record
 from csac_jax.errors import FailedError
 from csac_jax.runtime import cache
 from csac_jax.runtime.signals import Stop
@@ -27,7 +27,7 @@ UPDATES = 10  # of the critic in a step, after which the actor has one (ours)
 
 
 class Settings(NamedTuple):
-    """How a record is learned from."""
+    """Settings of the learning."""
 
     updates: int = 150  # of the critic, rounded up to whole steps
     learning_rate: float = 3e-4  # Adam's step size, critic; the actor's is a third
@@ -35,8 +35,8 @@ class Settings(NamedTuple):
     seed: int = 0
 
 
-class Progress(NamedTuple):
-    """After a step."""
+class FineTuningProgress(NamedTuple):
+    """The state of the learning after a step."""
 
     updates: int
     total: int
@@ -44,8 +44,8 @@ class Progress(NamedTuple):
     seconds: float  # since the first step began
 
 
-class Summary(NamedTuple):
-    """What was done."""
+class FineTuningSummary(NamedTuple):
+    """The result of the learning."""
 
     actions: int  # transitions learned from
     lifted: int  # grasps among them that lifted something
@@ -56,8 +56,10 @@ class Summary(NamedTuple):
 
 
 def configure(cfg: Config, settings: Settings, num: int) -> Config:
-    """The config of a fine-tuning on `num` transitions. They are drawn uniformly: ranks by error
-    would repeat the few whose outcome was luck."""
+    """Returns the config of a fine-tuning on `num` transitions.
+
+    They are drawn uniformly: ranks by error would repeat the few whose outcome was luck.
+    """
     steps = -(-settings.updates // UPDATES)
     learn = {
         "learning_rate": settings.learning_rate,
@@ -72,47 +74,51 @@ def configure(cfg: Config, settings: Settings, num: int) -> Config:
 
 
 def run(
-    policy: Policy,
+    policy: CameraPolicy,
     folder: Path,
     settings: Settings = Settings(),  # noqa: B008, it is immutable
-    progress: Callable[[Progress], None] = lambda _: None,
+    on_progress: Callable[[FineTuningProgress], None] = lambda _: None,
     stop: Stop | None = None,
-) -> tuple[Policy, Summary]:
-    """The policy after learning from the record in `folder`, or until `stop`; its config stays.
+) -> tuple[CameraPolicy, FineTuningSummary]:
+    """Returns the policy after learning from the record in `folder`, or until `stop`.
 
-    Raises SettingsError for a record that nothing can be learned from, FailedError where a loss is
-    not finite.
+    Its config stays. Raises SettingsError for a record that nothing can be learned from,
+    FailedError if a loss is not finite.
     """
     cache.enable()
-    found = experience.load(policy, record.read(folder))
-    program = offline.make(configure(policy.cfg, settings, len(found.outcome)))
+    recorded = experience.load(policy, record.read(folder))
+    program = offline.make(configure(policy.cfg, settings, len(recorded.outcome)))
     key, learner = jax.random.key(settings.seed), offline.init(program, policy.params)
-    rewarded = experience.transitions(policy, program.learner, learner, found)
+    rewarded = experience.transitions(policy, program.learner, learner, recorded)
     state = OfflineState(key, jnp.int32(0), learner, offline.fill(program, rewarded))
-    state, errors, seconds = _learn(program, state, progress, stop or Stop())
+    state, errors, seconds = _learn(program, state, on_progress, stop or Stop())
     ends = (errors[0], errors[-1]) if errors else (0.0, 0.0)
     signal = None if stop is None else stop.signal
-    lifted = int((found.outcome == Outcome.LIFTED).sum())
-    done = Summary(len(found.outcome), lifted, len(errors) * UPDATES, ends, seconds, signal)
+    lifted = int((recorded.outcome == Outcome.LIFTED).sum())
+    done = FineTuningSummary(
+        len(recorded.outcome), lifted, len(errors) * UPDATES, ends, seconds, signal
+    )
     return dataclasses.replace(policy, params=state.learner.online), done
 
 
 def _learn(
-    program: offline.Program, state: OfflineState, progress: Callable[[Progress], None], stop: Stop
+    program: offline.Program,
+    state: OfflineState,
+    on_progress: Callable[[FineTuningProgress], None],
+    stop: Stop,
 ) -> tuple[OfflineState, list[float], float]:
-    """The state after all steps, the TD error of each, and the seconds that they took."""
+    """Runs all steps; returns the state, the TD error of each step, and the seconds."""
     total = program.cfg.train.steps
     errors: list[float] = []
-    one = offline.compile_step(program)
+    step = offline.compile_step(program)
     begun = time.perf_counter()
     while len(errors) < total and stop.signal is None:
-        state, losses = one(state)
+        state, losses = step(state)
         errors.append(float(losses["td_error"]))
         if not jnp.isfinite(losses["critic_loss"] + losses["actor_loss"]):
             raise FailedError(
-                f"the loss is not finite after {len(errors) * UPDATES} updates; "
-                "lower --learning-rate"
+                f"the loss is not finite after {len(errors) * UPDATES} updates; lower learning_rate"
             )
         seconds = time.perf_counter() - begun
-        progress(Progress(len(errors) * UPDATES, total * UPDATES, errors[-1], seconds))
+        on_progress(FineTuningProgress(len(errors) * UPDATES, total * UPDATES, errors[-1], seconds))
     return jax.block_until_ready(state), errors, time.perf_counter() - begun

@@ -22,7 +22,7 @@ import numpy as np
 
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
-from csac_jax.deploy import program
+from csac_jax.deploy import decision_program
 from csac_jax.vision import depth_camera
 from csac_jax.vision.heightmap import Observation
 
@@ -30,25 +30,33 @@ Outputs = tuple[jax.Array, ...]  # see above
 _ARRAY = jax.ShapeDtypeStruct
 
 
+def map_shapes(cfg: Config) -> tuple[Any, ...]:
+    """Returns the shapes of the arguments of `from_maps`."""
+    rows = (cfg.heightmap.size,) * 2
+    shapes = _ARRAY((*rows, 3), np.float32), _ARRAY(rows, np.float32), _ARRAY(rows, np.bool_)
+    return shapes if cfg.task.kind == "target" else shapes[:2]
+
+
 def from_maps(cfg: Config, params: Params) -> tuple[Callable[..., Outputs], tuple[Any, ...]]:
-    """The policy as a function of maps, and the shapes of its arguments."""
-    has_target, rows = cfg.task.kind == "target", (cfg.heightmap.size,) * 2
+    """Returns the policy as a function of maps, and the shapes of its arguments."""
 
     def decide(colour: jax.Array, height: jax.Array, *target: jax.Array) -> Outputs:
-        marked = target[0] if target else jnp.ones(rows, bool)
-        obs = Observation(colour, height, marked, program.fingers(cfg))
-        return _outputs(cfg, params, obs, has_target)
+        marked = target[0] if target else jnp.ones(height.shape, bool)
+        obs = Observation(colour, height, marked, decision_program.fingers(cfg))
+        return _outputs(cfg, params, obs)
 
-    shapes = _ARRAY((*rows, 3), np.float32), _ARRAY(rows, np.float32), _ARRAY(rows, np.bool_)
-    return decide, shapes if has_target else shapes[:2]
+    return decide, map_shapes(cfg)
 
 
 def from_image(
     cfg: Config, params: Params, size: tuple[int, int]
 ) -> tuple[Callable[..., Outputs], tuple[Any, ...]]:
-    """The policy as a function of an image of `size`, width and height px, and the shapes of its
-    arguments. It does not check that the image fits the pose, as `Policy.decide` does."""
-    has_target, rows = cfg.task.kind == "target", size[::-1]
+    """Returns the policy as a function of an image, and the shapes of its arguments.
+
+    It does not check that the image fits the pose, as `CameraPolicy.decide` does.
+    Args: size, width and height of the image, px.
+    """
+    rows = size[::-1]
 
     def decide(
         rgb: jax.Array, depth: jax.Array, lens: jax.Array, pose: jax.Array, *mask: jax.Array
@@ -56,8 +64,7 @@ def from_image(
         points = _points(depth, lens, pose).reshape(-1, 3)
         marked = mask[0].reshape(-1) if mask else None
         colour, valid = rgb.reshape(-1, 3), depth_camera.supported(depth, lens[0]).reshape(-1)
-        obs = program.observe(cfg, points, valid, colour, marked)
-        return _outputs(cfg, params, obs, has_target)
+        return _outputs(cfg, params, decision_program.observe(cfg, points, valid, colour, marked))
 
     shapes = (
         _ARRAY((*rows, 3), np.uint8),
@@ -66,11 +73,11 @@ def from_image(
         _ARRAY((4, 4), np.float32),
         _ARRAY(rows, np.bool_),
     )
-    return decide, shapes if has_target else shapes[:4]
+    return decide, shapes if cfg.task.kind == "target" else shapes[:4]
 
 
 def _points(depth: jax.Array, lens: jax.Array, pose: jax.Array) -> jax.Array:
-    """Points [h, w, 3] m of all pixels in the workspace's frame."""
+    """Returns the points [h, w, 3] m of all pixels in the workspace's frame."""
     rows, cols = depth.shape
     u, v = jnp.arange(cols, dtype=jnp.float32), jnp.arange(rows, dtype=jnp.float32)
     x, y = jnp.meshgrid((u - lens[2]) / lens[0], (v - lens[3]) / lens[1])
@@ -78,17 +85,16 @@ def _points(depth: jax.Array, lens: jax.Array, pose: jax.Array) -> jax.Array:
     return depth[..., None] * (x[..., None] * right + y[..., None] * down + forward) + place
 
 
-def _outputs(cfg: Config, params: Params, obs: Observation, has_target: bool) -> Outputs:
-    state = program.dense_maps(cfg, params, obs, has_target)
-    choice, _ = program.choose(cfg, state, obs.height)
+def _outputs(cfg: Config, params: Params, obs: Observation) -> Outputs:
+    state = decision_program.dense_maps(cfg, params, obs, cfg.task.kind == "target")
+    choice, _ = decision_program.choose(cfg, state, obs.height)
     action = choice.action
     return action.primitive, action.pose, choice.score, choice.valid, choice.stations
 
 
-def stablehlo(decide: Callable[..., Outputs], shapes: tuple[Any, ...]) -> bytes:
-    """A function in JAX's portable format, for the kind of device that JAX has here.
+def serialize(decide: Callable[..., Outputs], shapes: tuple[Any, ...]) -> bytes:
+    """Writes a function in JAX's portable format, for the kind of device that JAX has here.
 
     `jax.export.deserialize(bytearray(content)).call(*arrays)` runs it.
     """
-    exported = jax.export.export(jax.jit(decide))(*shapes)
-    return bytes(exported.serialize())
+    return bytes(jax.export.export(jax.jit(decide))(*shapes).serialize())

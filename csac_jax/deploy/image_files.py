@@ -1,0 +1,108 @@
+"""Images, intrinsics and poses as files. Each function raises SettingsError, one line."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import pydantic
+
+from csac_jax.deploy import images
+from csac_jax.deploy.images import Intrinsics
+from csac_jax.errors import SettingsError, first_fault
+from csac_jax.io import files
+
+
+class PoseBody(pydantic.BaseModel, extra="forbid"):
+    """A pose as its file has it, m."""
+
+    matrix: list[list[float]]  # 4 x 4
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """Reads a colour image [h, w, 3] uint8, of any format that keeps red first, such as PNG."""
+    return _read(path, decode)
+
+
+def read_depth(path: Path) -> np.ndarray:
+    """Reads depth [h, w] float32 m: a PNG of 16 bits in mm, or an .npy of floats in m."""
+    if path.suffix != ".npy":
+        return metres(_read(path, decode), str(path))
+    depth: np.ndarray = _read(path, _array)
+    if depth.dtype.kind != "f":
+        raise SettingsError(f"{path}: is {depth.dtype}; an .npy file holds metres as float32")
+    return depth
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Reads a mask [h, w] bool, True where an image or an .npy is not 0."""
+    mask: np.ndarray = _read(path, _array if path.suffix == ".npy" else decode)
+    if mask.ndim != 2:
+        raise SettingsError(f"{path}: a mask has one channel, not shape {list(mask.shape)}")
+    return mask != 0
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Reads {"width", "height", "fx", "fy", "cx", "cy", "distortion"?} in px, OpenCV's order."""
+    return _read(path, lambda content: Intrinsics.of(files.parse(content, "content")))
+
+
+def read_pose(path: Path) -> np.ndarray:
+    """Reads {"matrix": 4 x 4 rows}, m."""
+
+    def convert(content: bytes) -> np.ndarray:
+        return images.rigid(PoseBody.model_validate_json(content).matrix, "matrix")
+
+    return _read(path, convert)
+
+
+def read_model(path: Path, kind: type[pydantic.BaseModel]) -> Any:
+    """Reads JSON as a model; errors name the key."""
+    return _read(path, kind.model_validate_json)
+
+
+def metres(depth: np.ndarray, name: str) -> np.ndarray:
+    """Converts depth of an image of 16 bits, in mm, to float32 m."""
+    if depth.dtype.itemsize < 2 or depth.dtype.kind not in "iu":
+        raise SettingsError(f"{name}: is {depth.dtype}; give a PNG of 16 bits, in mm, or metres")
+    return (1e-3 * depth).astype(np.float32)
+
+
+def decode(content: bytes) -> np.ndarray:
+    """Decodes the pixels of an image file's content. Raises SettingsError."""
+    try:
+        return imageio.imread(content)
+    except Exception as error:  # damaged images raise nearly anything
+        raise SettingsError(f"the image is damaged: {files.first_line(error)}") from None
+
+
+def encode(pixels: np.ndarray, dots_per_inch: int = 72) -> bytes:
+    """Encodes pixels [h, w] or [h, w, 3] uint8 as a PNG."""
+    buffer = io.BytesIO()
+    imageio.imwrite(buffer, pixels, format="png", dpi=(dots_per_inch, dots_per_inch))
+    return buffer.getvalue()
+
+
+def encode_array(values: np.ndarray) -> bytes:
+    """Encodes an array as the content of an .npy file."""
+    buffer = io.BytesIO()
+    np.save(buffer, values, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _array(content: bytes) -> np.ndarray:
+    return np.load(io.BytesIO(content), allow_pickle=False)
+
+
+def _read(path: Path, convert: Callable[[bytes], Any]) -> Any:
+    """Reads a file and converts its content; errors name the file."""
+    try:
+        return convert(files.read_bytes(path))
+    except FileNotFoundError:
+        raise SettingsError(f"there is no file {path}") from None
+    except pydantic.ValidationError as error:
+        raise SettingsError(f"{path}: {first_fault(error)}") from None
+    except Exception as error:  # damaged files raise nearly anything
+        raise SettingsError(f"{path}: {files.first_line(error)}") from None
