@@ -38,6 +38,7 @@ ORDER = (
     ("presets",),
     ("algorithms",),
     ("config",),
+    ("section",),
     ("grippers",),
     ("constants", "errors", "cache_folder", "assets"),
     ("__init__",),
@@ -69,7 +70,7 @@ ONLY_IN = {
     "tensorboardX": ("report/trackers.py",),
     "wandb": ("report/trackers.py",),
     "mlflow": ("report/trackers.py",),
-    "yaml": ("io/config_file.py",),
+    "yaml": ("io/configs.py",),
     "trimesh": ("objects/conversion.py", "scene/descriptions.py", "render/viewer.py"),
     "coacd": ("objects/conversion.py",),
 }

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import tyro
 
-from csac_jax.cli import output, parsing, settings
+from csac_jax.cli import output, settings
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
 from csac_jax.config import Config
 from csac_jax.io import files
@@ -62,8 +62,6 @@ class EvalOptions:
 
 def run(arguments: list[str]) -> int:
     """Measures and prints; returns the exit code."""
-    if parsing.take(arguments, "--step")[0] is not None:
-        raise BadArgumentsError("--step: it is --which STEP now, next to best and last")
     options, view = settings.parse_view(EvalOptions, "eval", arguments)
     if options.episodes < 1:
         raise BadArgumentsError("--episodes: at least 1")
