@@ -417,7 +417,7 @@ class _AnyReplay(Section, section="replay"):
 class UniformReplay(_AnyReplay):
     """CSAC's replay: all transitions are equally likely."""
 
-    sampler: Literal["uniform"] = "uniform"  # See `BetaReplay`.
+    sampler: Literal["uniform"] = "uniform"  # Others: prioritised, beta, opposite.
 
 
 class PrioritisedReplay(_AnyReplay):
@@ -428,7 +428,7 @@ class PrioritisedReplay(_AnyReplay):
     alpha: ClassVar[float] = 0.6  # 0 is uniform, 1 proportional to the priority (their sec. 4)
     per_epsilon: ClassVar[float] = 0.01  # so that no transition is out of reach (ours)
 
-    sampler: Literal["prioritised"] = "prioritised"  # See `BetaReplay`.
+    sampler: Literal["prioritised"] = "prioritised"  # Others: uniform, beta, opposite.
 
 
 class BetaReplay(_AnyReplay):
@@ -454,7 +454,7 @@ class OppositeReplay(_AnyReplay):
 
     law: ClassVar[Pair] = (1.0, 2.0)  # (a, b) of the ranks (Zeng et al., code)
 
-    sampler: Literal["opposite"] = "opposite"  # See `BetaReplay`.
+    sampler: Literal["opposite"] = "opposite"  # Others: uniform, prioritised, beta.
 
 
 ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay | OppositeReplay

@@ -16,7 +16,7 @@ from csac_jax.grippers import Gripper
 try:
     from tyro._errors import on_parse_error
 except ImportError:  # another version: it prints the error in a box and exits with 2
-    on_parse_error = contextlib.nullcontext  # type: ignore[assignment, misc]
+    on_parse_error = contextlib.nullcontext  # type: ignore[assignment]
 
 PROGRAM = "csac-jax"
 Kind = TypeVar("Kind")

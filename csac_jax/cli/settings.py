@@ -141,7 +141,7 @@ def _some(section: type, some: Collection[str], hint: str = "") -> Any:
             Annotated[field.type, tyro.conf.arg(help_behavior_hint=hint)] if hint else field.type,
             dataclasses.field(default=field.default),
         )
-        for field in dataclasses.fields(section)  # type: ignore[arg-type]
+        for field in dataclasses.fields(section)
         if field.name in some
     ]
     kind = dataclasses.make_dataclass(section.__name__, fields, frozen=True)

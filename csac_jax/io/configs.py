@@ -85,7 +85,7 @@ def _validated(name: str, stored: Any) -> Any:
     try:
         return adapter.validate_json(text, strict=True)
     except ValueError as error:
-        first = error.errors(include_url=False)[0]  # type: ignore[attr-defined]
+        first = error.errors(include_url=False)[0]
     if first["type"] == "value_error":
         raise first["ctx"]["error"]
     place, what = ".".join(map(str, (name, *first["loc"]))), first["msg"]
