@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from csac_jax.config import Config
     from csac_jax.env import AutoResetEnv, Env, State, make_env
     from csac_jax.evaluation.policies import Policy
-    from csac_jax.io.config_file import load_config
+    from csac_jax.io.configs import load_config
     from csac_jax.replay.samplers import Sample, Sampler
     from csac_jax.sim.primitives import Action
     from csac_jax.training.callbacks import Callback, Record
@@ -72,8 +72,8 @@ _HOMES = {
     "csac_jax.config": ("Config",),
     "csac_jax.env": ("AutoResetEnv", "Env", "State", "make_env"),
     "csac_jax.evaluation.policies": ("Policy",),
+    "csac_jax.io.configs": ("load_config",),
     "csac_jax.replay.samplers": ("Sample", "Sampler"),
-    "csac_jax.io.config_file": ("load_config",),
     "csac_jax.sim.primitives": ("Action",),
     "csac_jax.training.callbacks": ("Callback", "Record"),
     "csac_jax.vision.heightmap": ("Observation", "unpack"),

@@ -1,4 +1,4 @@
-"""What goes wrong for a reason that the user can mend. A message is one line with the remedy."""
+"""Errors that the user can fix. A message is one line with the remedy."""
 
 from typing import Any
 
@@ -7,15 +7,15 @@ _REASONS["unexpected_keyword_argument"] = _REASONS["extra_forbidden"]
 
 
 class SettingsError(ValueError):
-    """Settings, arguments or files that do not fit one another or this machine."""
+    """Invalid settings, arguments or files (exit code 2 of a command)."""
 
 
-class DeviceError(Exception):
-    """A device that is asked for and is not there."""
+class DeviceError(SettingsError):
+    """A requested device that this machine lacks."""
 
 
 class FailedError(Exception):
-    """What was asked for has failed; the kind of errors of checkpoints, policies and runs."""
+    """Work that has failed (exit code 1); base of errors of checkpoints, policies and runs."""
 
 
 class ViewError(FailedError):

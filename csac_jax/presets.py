@@ -1,9 +1,10 @@
-"""Named configs. A preset is a function; `register` adds one of your own."""
+"""Named configs. A preset is a function; `register` adds your own."""
 
 from collections.abc import Callable
 
 from csac_jax.algorithms import unknown
 from csac_jax.config import Config, SceneConfig
+from csac_jax.errors import SettingsError
 
 TEN_BLOCKS = Config().change(
     scene={
@@ -28,8 +29,8 @@ PROTOCOL = TEN_BLOCKS.change(
 and another scene where none is left or the actions are spent; 2,500 actions in one scene at a time.
 
 C's physics are the fastest for one scene. The paper does not say after how many actions a scene is
-reset in training; 25 is ours. Pushes are labelled by the critic of now (ours): early ones would
-stay "worse" for ever.
+reset in training; 25 is ours. The current critic labels pushes (ours): early labels would stay
+"worse" otherwise.
 """
 SMALL_NET = {
     "stride": 4,
@@ -42,14 +43,14 @@ SMALL_NET = {
 
 
 def quick() -> Config:
-    """Learns to clear five blocks on a 2-core CPU; what was measured is in experiments/results.
+    """Learns to clear five blocks on a 2-core CPU; the measurements are in experiments/results.
 
     Blocks of one shape are alike in size, density and friction. Discount and the end of the Beta
-    law are not the literature's; neither is shown to be needed. Two cores can afford few passes: a
-    large step of the critic follows each step of all scenes, and exploration ends after some 500
-    actions. The actor learns on a part of the batch, and the net's features lie 28 mm apart, not
-    14; its maps' cells still 14, and its layers see as far. It has eight yaws, not sixteen; greedy
-    decisions are means over mirror images. What it costs: docs/benchmarks/speed-cpu.md.
+    law are not the literature's; neither is shown to be needed. Two cores can afford few passes:
+    the critic takes one large step for each step of all scenes, and exploration ends after some 500
+    actions. The actor learns on a part of the batch. The net's features lie 28 mm apart, not 14,
+    its maps' cells still 14; it has eight yaws, not sixteen. Greedy decisions are means over mirror
+    images. Costs: docs/benchmarks/speed-cpu.md.
     """
     return Config().change(
         preset="quick",
@@ -65,12 +66,12 @@ def quick() -> Config:
 
 
 def fast() -> Config:
-    """Ten blocks of all eight shapes, most scenes packed, 4,096 side by side, for one GPU.
+    """Learns on one GPU from 4,096 scenes of ten blocks of all eight shapes, most of them packed.
 
-    Updates are many and small, and what is drawn from the replay is shifted, as in `paper_small`. A
-    failed grasp costs more than a poor push, half of the random primitives are pushes, and blocks
-    that leave cost. Physics is Warp's where it is installed, hence meshes are of one size.
-    What it learns so, and otherwise: docs/benchmarks/learning-ablations.md.
+    Updates are many and small, and transitions drawn from the replay are shifted, as in
+    `paper_small`. A failed grasp costs more than a poor push, half of the random primitives are
+    pushes, and blocks that leave cost. Physics is Warp's where it is installed, so meshes are of
+    one size. Results: docs/benchmarks/learning-ablations.md.
     """
     packed = {"pool": 4096, "arranged": 0.75, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)}
     length = {"actions": 655360, "learning_starts": 4096, "chunk": 2, "save_every": 20}
@@ -91,9 +92,9 @@ def fast() -> Config:
 def objects() -> Config:
     """Learns to clear six objects of many shapes on two CPU cores.
 
-    The shapes are our own, of the families and seeds that train. They lie in piles and apart. The
-    tips go lower than for blocks, which low and hollow things need (`csac-jax bench grasp_depth`).
-    The net is that of `quick` with wider layers, the rewards are those of `fast`.
+    The shapes are procedural, of the families and seeds for training. They lie in piles and apart.
+    The tips go lower than for blocks, which low and hollow things need. The net is that of `quick`
+    with wider layers, the rewards are those of `fast`.
     """
     return quick().change(
         preset="objects",
@@ -118,13 +119,14 @@ def objects() -> Config:
 
 
 def objects_target() -> Config:
-    """The same for one object at a time, marked among the others."""
+    """Learns to get one object at a time, marked among the others; else as `objects`."""
     return objects().change(preset="objects_target", task={"kind": "target"})
 
 
 def grippers() -> Config:
-    """Learns to clear ten blocks with any gripper: its opening and its fingers differ in every
-    episode, and the net sees them. Made for a start from a policy of blocks, `--init shipped`.
+    """Learns to clear ten blocks with any gripper, whose size differs in every episode.
+
+    The net sees opening and fingers. It starts from a policy of blocks: `--init shipped`.
     """
     return TEN_BLOCKS.change(
         preset="grippers",
@@ -141,14 +143,14 @@ def grippers() -> Config:
 
 
 def paper() -> Config:
-    """The target protocol of the paper, for one GPU, with DenseNet-121 on maps of 224 cells.
+    """Follows the target protocol of the paper, on one GPU, with DenseNet-121, maps of 224 cells.
 
-    `--task.kind clear` is sec. 4.2's, the table cleared, by which the recorded runs were made.
+    `--task.kind clear` is that of sec. 4.2, the table cleared, as in the recorded runs.
 
     Adam 1e-4, gamma 0.5 and primitives at random from 0.5 down to 0.1 as in VPG; one update per
     action; places are explored by action noise alone, and nothing is augmented. Where the paper is
     silent: tau of SD3, two pixels per cell and two transitions per update, as many as in VPG, one
-    of them for the actor. Ours is that cells with nothing to act on are left out.
+    of them for the actor. Cells with nothing to act on are left out (ours).
     Result: experiments/results/paper.
     """
     rates = {"learning_rate": 1e-4, "actor_learning_rate": 1e-4, "lr_final_fraction": 1.0}
@@ -165,14 +167,13 @@ def paper() -> Config:
 
 
 def paper_small() -> Config:
-    """The protocol of `paper`, a target at a time, with the small net on maps of 64 cells.
+    """Follows the protocol of `paper`, a target at a time, with the small net on maps of 64 cells.
 
-    Also ours: batches of 32, and with them Adam 1e-3; one update an action, and shifts of what is
-    drawn from the replay, so that 2,500 actions are not learned by heart; the squared error of
-    Algorithm 1 line 21; discount 0.2; SD3's twin critics; random places at first, and exploration
-    that ends after some 1,000 actions. Meshes are of one size, which
-    `sim.physics warp` needs. What each is worth: docs/benchmarks/learning-ablations.md;
-    results: experiments/results/paper_small.
+    Also ours: batches of 32 with Adam 1e-3; one update an action, and shifts of the drawn
+    transitions against overfitting to 2,500 actions; the squared error of Algorithm 1 line 21;
+    discount 0.2; SD3's twin critics; random places at first; exploration ends after some 1,000
+    actions. Meshes are of one size, which `sim.physics warp` needs. Effect of each:
+    docs/benchmarks/learning-ablations.md.
     """
     return PROTOCOL.change(
         preset="paper_small",
@@ -184,7 +185,7 @@ def paper_small() -> Config:
 
 
 def smoke() -> Config:
-    """The whole pipeline in 64 actions, for tests: all is small, none left out, nothing learned."""
+    """Runs the whole pipeline in 64 actions, for tests; too small to learn."""
     return Config().change(
         preset="smoke",
         scene={"slots": ("box", "box", "prism"), "min_blocks": 2, "pool": 8, "settle_time": 1.0},
@@ -207,15 +208,17 @@ PRESETS: dict[str, Preset] = {
 
 
 def register(name: str, preset: Preset) -> None:
-    """Makes `preset`, a function that returns a config, known as `name` to API and commands.
-    Raises ValueError if the name is taken."""
+    """Registers `preset`, a function that returns a config, for API and commands.
+
+    Raises SettingsError if the name is taken.
+    """
     if name in PRESETS:
-        raise ValueError(f"preset '{name}' exists; choose another name")
+        raise SettingsError(f"preset '{name}' exists; choose another name")
     PRESETS[name] = preset
 
 
 def get(name: str) -> Config:
-    """The preset `name`. Raises ValueError for an unknown name."""
+    """Returns the preset `name`. Raises SettingsError for an unknown name."""
     if name not in PRESETS:
-        raise ValueError(unknown("preset", name, PRESETS))
+        raise SettingsError(unknown("preset", name, PRESETS))
     return PRESETS[name]().change(preset=name)

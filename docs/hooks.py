@@ -21,12 +21,13 @@ sys.path.insert(0, str(ROOT))  # the package of this checkout, even where anothe
 
 from latex2mathml.converter import convert  # noqa: E402
 from mkdocs.structure.files import File  # noqa: E402
+from tyro import _docstrings  # noqa: E402
 
 import csac_jax  # noqa: E402
 from csac_jax import cli, config  # noqa: E402
-from csac_jax.cli import settings  # noqa: E402
-from csac_jax.config import Config, Section  # noqa: E402
+from csac_jax.config import Config  # noqa: E402
 from csac_jax.evaluation import metrics, suites  # noqa: E402
+from csac_jax.section import Section  # noqa: E402
 from csac_jax.training import loop  # noqa: E402
 
 SOURCES = ROOT / "build" / "sources"  # mkdocs.yml names it, too
@@ -136,12 +137,20 @@ def settings_tables() -> str:
 
 def _settings_of(section: str, kind: Any) -> str:
     """A table of the settings of a section."""
-    docs = settings.field_docs(kind)
+    docs = _field_docs(kind)
     rows = [
         (f"`{section}.{field.name}`", _value(field.default), _allowed(field), docs[field.name])
         for field in dataclasses.fields(kind)
     ]
     return _table(("setting", "default", "allowed", "meaning"), rows)
+
+
+def _field_docs(kind: Any) -> dict[str, str]:
+    """Returns the text beside or below each field of a dataclass, as the help shows it."""
+    docs = {
+        f.name: _docstrings.get_field_docstring(kind, f.name, ()) for f in dataclasses.fields(kind)
+    }
+    return {name: " ".join((text or "").split()) for name, text in docs.items()}
 
 
 def _value(value: Any) -> str:
@@ -185,7 +194,7 @@ def printed_help(command: str) -> str:
 
 def record_table() -> str:
     """The fields of a line of metrics.jsonl."""
-    docs = settings.field_docs(loop.Record)
+    docs = _field_docs(loop.Record)
     fields = dataclasses.fields(loop.Record)
     return _table(("field", "meaning"), [(f"`{f.name}`", docs.get(f.name, "")) for f in fields])
 

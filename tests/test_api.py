@@ -18,7 +18,7 @@ from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config, DenseNet121
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import monitor
-from csac_jax.io import checkpoint, config_file, policy_file
+from csac_jax.io import checkpoint, configs, policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
@@ -210,7 +210,7 @@ def test_run_is_complete(trained, capsys: pytest.CaptureFixture):
     assert (run.cfg, run.summary.actions, run.summary.stopped_by) == (SMOKE, 64, None)
     assert [record.actions for record in records] == [8 * n for n in range(1, 9)]
     assert capsys.readouterr().out == ""
-    assert config_file.load_config(run.run_dir / "config.json") == run.cfg
+    assert configs.load_config(run.run_dir / "config.json") == run.cfg
 
 
 @pytest.mark.slow

@@ -38,6 +38,7 @@ ORDER = (
     ("algorithms",),
     ("runtime",),
     ("config",),
+    ("section",),
     ("grippers",),
     ("constants", "errors", "cache_folder", "assets"),
     ("__init__",),
@@ -69,7 +70,7 @@ ONLY_IN = {
     "tensorboardX": ("training/trackers.py",),
     "wandb": ("training/trackers.py",),
     "mlflow": ("training/trackers.py",),
-    "yaml": ("io/config_file.py",),
+    "yaml": ("io/configs.py",),
     "trimesh": ("objects", "render/viewer.py"),
     "coacd": ("objects/conversion.py",),
 }

@@ -1,8 +1,8 @@
 """The command `csac-jax`. Exit codes: 0 done, 1 failed, 2 bad arguments, 130 and 143 stopped by
 SIGINT and SIGTERM.
 
-A file per command, whose `run` takes its arguments and returns the exit code. JAX is imported only
-once the arguments are known to be good, so that help and complaints come at once.
+Each command has a file, whose `run` takes its arguments and returns the exit code. JAX is imported
+only after the arguments are checked, so that help and errors come at once.
 """
 
 import contextlib
@@ -32,8 +32,9 @@ from csac_jax.cli import (
     sweep,
     train,
 )
-from csac_jax.cli.failures import PROGRAM, BadArgumentsError, complain
-from csac_jax.errors import DataWarning, DeviceError, FailedError, SettingsError
+from csac_jax.cli.failures import complain
+from csac_jax.cli.parsing import PROGRAM
+from csac_jax.errors import DataWarning, FailedError, SettingsError
 from csac_jax.io import files
 
 _OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # XLA's name for it
@@ -60,7 +61,7 @@ A robot learns to push and grasp in clutter.
 
   train PRESET       train with a preset: {", ".join(presets.PRESETS)}
                      --algo NAME: {", ".join(algorithms.ALGORITHMS)}
-  train --resume DIR go on with a run that was stopped
+  train --resume DIR continue a run that was stopped
   sweep PRESET       train several seeds and settings side by side, in one program
                      --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or one that is shipped
@@ -69,7 +70,7 @@ A robot learns to push and grasp in clutter.
   act POLICY         decide where to grasp or push in a camera's image
   serve POLICY       answer images by decisions over HTTP
   finetune POLICY DIR
-                     learn from what act or serve recorded in DIR
+                     learn from actions that act or serve recorded in DIR
   report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
   objects COMMAND    make, import or show a library of objects
@@ -93,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _logged() -> Iterator[None]:
-    """In the block stderr has a line for what the package logs about long work."""
+    """Prints the package's log of long work to stderr."""
     logger, handler = logging.getLogger(csac_jax.__name__), logging.StreamHandler()
     level, propagate = logger.level, logger.propagate
     logger.addHandler(handler)
@@ -108,23 +109,23 @@ def _logged() -> Iterator[None]:
 
 
 def _warner() -> Callable[..., None]:
-    """What prints each warning in one line, as errors are, once wherever it comes from."""
-    said = set()
+    """Returns a function that prints each different warning once, in one line."""
+    printed = set()
 
     def warn(message: object, category: type[Warning], *place: Any, **more: Any) -> None:
         line = f"{PROGRAM}: warning: {' '.join(str(message).split())}"
-        if line not in said:
-            said.add(line)
+        if line not in printed:
+            printed.add(line)
             print(line, file=sys.stderr)
 
     return warn
 
 
 def _guarded(arguments: list[str]) -> int:
-    """The exit code of a command; what the user can mend is one line."""
+    """Runs a command; returns its exit code. Prints an error that the user can fix in one line."""
     try:
         return _dispatch(arguments)
-    except (BadArgumentsError, SettingsError, DeviceError) as error:
+    except SettingsError as error:
         return complain(2, error)
     except (FailedError, OSError) as error:
         return complain(1, error)
@@ -141,7 +142,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(csac_jax.__version__)
         return 0
     if name not in COMMANDS:
-        raise BadArgumentsError(algorithms.unknown("command", name, COMMANDS))
+        raise SettingsError(algorithms.unknown("command", name, COMMANDS))
     try:
         return COMMANDS[name](_on_device(rest))
     except (RuntimeError, AssertionError) as error:
@@ -155,12 +156,12 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _on_device(arguments: list[str]) -> list[str]:
-    """The arguments without --device, which decides where JAX computes."""
+    """Selects the device that --device names; returns the other arguments."""
     device, rest = parsing.take(arguments, "--device")
     if device is None:
         return arguments
     if device not in ("cpu", "gpu"):
-        raise BadArgumentsError(f"--device: '{device}' is not one of: cpu, gpu")
+        raise SettingsError(f"--device: '{device}' is not one of: cpu, gpu")
     from csac_jax.runtime import devices
 
     devices.select("cpu" if device == "cpu" else "gpu")

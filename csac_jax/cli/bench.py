@@ -5,7 +5,8 @@ from pathlib import Path
 
 import csac_jax
 from csac_jax.algorithms import unknown
-from csac_jax.cli.failures import PROGRAM, BadArgumentsError
+from csac_jax.cli.parsing import PROGRAM, SHORT_HELP
+from csac_jax.errors import SettingsError
 
 BENCHMARKS = Path(csac_jax.__file__).parents[1] / "experiments" / "bench"
 
@@ -13,20 +14,11 @@ BENCHMARKS = Path(csac_jax.__file__).parents[1] / "experiments" / "bench"
 def run(arguments: list[str]) -> int:
     """Runs `main` of a script; returns the exit code."""
     scripts = {path.stem: path for path in sorted(BENCHMARKS.glob("[!_]*.py"))}
-    if not scripts:
-        raise BadArgumentsError(f"bench: no scripts in {BENCHMARKS}; they come with a checkout")
     name, *rest = arguments or [""]
-    if name in ("-h", "--help"):
+    if name in SHORT_HELP:
         print(f"usage: {PROGRAM} bench NAME ..., with NAME one of: {', '.join(scripts)}")
-        return 0
-    if name not in scripts:
-        raise BadArgumentsError(f"bench: {unknown('benchmark', name, scripts)}")
-    try:
-        script = runpy.run_path(str(scripts[name]))
-    except ModuleNotFoundError as error:
-        raise BadArgumentsError(
-            f"bench {name} needs the module {error.name}; install the extra of pyproject.toml that "
-            "brings it: pip install 'csac-jax[EXTRA]'"
-        ) from None
-    script["main"](rest)
+    elif name not in scripts:
+        raise SettingsError(f"bench: {unknown('benchmark', name, scripts)} (in {BENCHMARKS})")
+    else:
+        runpy.run_path(str(scripts[name]))["main"](rest)
     return 0

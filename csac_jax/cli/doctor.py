@@ -1,4 +1,4 @@
-"""`csac-jax doctor`: whether this machine computes right, and whether a run fits its memory."""
+"""`csac-jax doctor`: self-test of this machine, and the memory that a run needs."""
 
 import contextlib
 import dataclasses
@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import output, parsing, train
-from csac_jax.cli.failures import BadArgumentsError, complain
+from csac_jax.cli.failures import complain
 from csac_jax.config import Config
-from csac_jax.errors import FailedError
+from csac_jax.errors import FailedError, SettingsError
 
 _HANGS = "the self-test hangs: too few threads for batched MJX? Set PJRT_NPROC=8 and try again"
 
 
 @dataclasses.dataclass(frozen=True)
 class DoctorOptions:
-    """Prints versions, devices and protections, and checks that this machine computes right."""
+    """Prints versions, devices and protections, and tests the numbers of this machine."""
 
     preset: str | None = None
     """Preset, with settings as for `train`: also prints the memory that a run's state takes."""
@@ -52,9 +52,9 @@ def run(arguments: list[str]) -> int:
 
 
 def _read(arguments: list[str]) -> tuple[DoctorOptions | train.TrainOptions, Config | None]:
-    """The options, and with --preset the config of such a run."""
+    """Returns the options, and with --preset the config of such a run."""
     preset, others = parsing.take(arguments, "--preset")
-    build, others = "--build" in others, [each for each in others if each != "--build"]
+    build, others = "--build" in others, [flag for flag in others if flag != "--build"]
     if parsing.asks_help(arguments) or (preset is None and not build):
         return parsing.parse(DoctorOptions, arguments, "doctor"), None
     options, cfg = train.read([preset or "fast", *others])
@@ -62,19 +62,19 @@ def _read(arguments: list[str]) -> tuple[DoctorOptions | train.TrainOptions, Con
 
 
 def _on_warp(cfg: Config) -> Config:
-    """The config with the physics of this machine, which are to be Warp's."""
+    """Returns the config with the physics of this machine. Raises SettingsError without Warp."""
     from csac_jax.sim import backend
 
     cfg = backend.resolve(cfg)
     if cfg.sim.physics != "warp":
-        raise BadArgumentsError(
+        raise SettingsError(
             f"--build: only warp has kernels to build, and sim.physics is {cfg.sim.physics} here"
         )
     return cfg
 
 
 def _build_kernels(cfg: Config) -> dict[str, Any]:
-    """Builds what Warp needs for such a run; returns the seconds for the JSON."""
+    """Builds Warp's kernels for such a run; returns the seconds for the JSON."""
     from csac_jax.scene import model
     from csac_jax.sim import physics
 
@@ -86,7 +86,7 @@ def _build_kernels(cfg: Config) -> dict[str, Any]:
 
 
 def _print_memory(cfg: Config) -> dict[str, Any]:
-    """Prints what a run's state takes; returns it for the JSON."""
+    """Prints the memory of a run's state; returns it for the JSON."""
     from csac_jax.training import memory
 
     parts, available = memory.state_bytes(cfg), memory.limit()

@@ -1,4 +1,4 @@
-"""What commands write: lines that a closed pipe cannot stop, JSON with its provenance."""
+"""Output of commands: lines that a closed pipe cannot stop, JSON with its provenance."""
 
 import contextlib
 import os
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 
 
 class BrokenPipeGuard:
-    """A stream that falls silent once `head`, which reads it, has had enough, or a disc is full."""
+    """A stream that ignores a closed pipe, as of `head`, and a full disc."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        return self._tried(lambda: self._stream.write(text)) or len(text)
+        return self._attempt(lambda: self._stream.write(text)) or len(text)
 
     def flush(self) -> None:
-        self._tried(self._stream.flush)
+        self._attempt(self._stream.flush)
 
-    def _tried(self, call: Callable[[], Any]) -> Any:
+    def _attempt(self, call: Callable[[], Any]) -> Any:
         try:
             return call()
         except OSError:
@@ -36,17 +36,19 @@ class BrokenPipeGuard:
         return getattr(self._stream, name)
 
 
-def _nowhere(number: int) -> TextIO:
-    """A stream in place of stdout or stderr that the process began without. It takes their number,
-    else the next file that is opened would get what libraries print."""
+def _null_stream(number: int) -> TextIO:
+    """Opens a stream in place of a missing stdout or stderr, with its number.
+
+    Otherwise the next opened file would receive what libraries print.
+    """
     os.dup2(os.open(os.devnull, os.O_WRONLY), number)
     return open(number, "w", closefd=False)
 
 
 @contextlib.contextmanager
 def unbroken() -> Iterator[None]:
-    """In the block a closed pipe silences stdout or stderr, and the work goes on."""
-    sys.stdout, sys.stderr = sys.stdout or _nowhere(1), sys.stderr or _nowhere(2)
+    """Lets the work in the block continue if stdout or stderr is closed."""
+    sys.stdout, sys.stderr = sys.stdout or _null_stream(1), sys.stderr or _null_stream(2)
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = map(BrokenPipeGuard, before)
     try:
@@ -58,7 +60,7 @@ def unbroken() -> Iterator[None]:
 
 
 def progress() -> "Progress":
-    """Lines on the terminal of what is in work and how far it is; nothing elsewhere."""
+    """Returns a progress display for terminals; it prints nothing elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 

@@ -1,47 +1,84 @@
-"""Command line -> dataclass, by tyro, whose boxed complaints become one line."""
+"""Command line -> dataclass, by tyro; a bad argument is one line."""
 
 import argparse
 import contextlib
-import io
-import os
-import re
+import dataclasses
+import difflib
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
-from csac_jax.cli.failures import PROGRAM, BadArgumentsError
 from csac_jax.config import SimConfig
+from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
 
+try:
+    from tyro._errors import on_parse_error
+except ImportError:  # another version: it prints the error in a box and exits with 2
+    on_parse_error = contextlib.nullcontext  # type: ignore[assignment]
+
+PROGRAM = "csac-jax"
 Kind = TypeVar("Kind")
 SHORT_HELP = {"-h", "--help"}
 
 
 def parse(
-    kind: type[Kind], arguments: list[str], command: str, default: Any = tyro.MISSING_NONPROP
+    kind: type[Kind],
+    arguments: Sequence[str],
+    command: str,
+    default: Any = tyro.MISSING_NONPROP,
+    description: str | None = None,
 ) -> Kind:
-    """`arguments` of `command` as a `kind`; settings come with a `default`. Prints help and exits
-    if it is asked for. Raises BadArgumentsError for bad ones."""
+    """Parses the arguments of a command as a `kind`; settings come with a `default`.
+
+    Prints help and exits if it is asked for. Raises SettingsError for bad arguments.
+    """
     prog = f"{PROGRAM} {command}"
-    if asks_help(arguments):
-        with _registry():
-            tyro.cli(kind, prog=prog, args=["--help"], default=default)
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint), _wide_terminal(), _registry():
-            return tyro.cli(kind, prog=prog, args=arguments, default=default)
-    except SystemExit:
-        help_flag = "--help" if default is tyro.MISSING_NONPROP else "--help-all"
-        raise BadArgumentsError(_one_line(complaint.getvalue(), f"{prog} {help_flag}")) from None
+    more = f"{prog} {'--help' if default is tyro.MISSING_NONPROP else '--help-all'}"
+
+    def refuse(event: Any) -> None:
+        if text := _message(event, kind):
+            raise SettingsError(f"{text}; see {more}")
+
+    args = ["--help"] if asks_help(arguments) else list(arguments)
+    with on_parse_error(refuse), _registry():
+        return tyro.cli(kind, prog=prog, args=args, default=default, description=description)
 
 
-def inherited(kind: Any, text: str) -> Any:
-    """The type of a setting that is the policy's unless it is given, with its help."""
-    return Annotated[kind, tyro.conf.arg(help=text, help_behavior_hint="(default: the policy's)")]
+def _message(event: Any, kind: Any) -> str | None:
+    """Returns one line about tyro's error event, None for an event of an unknown kind."""
+    argument = getattr(event, "argument", None)
+    flag = f"{argument.display_name()}: " if argument is not None else ""
+    match type(event).__name__:
+        case "UnrecognizedArgs":
+            near = difflib.get_close_matches(event.tokens[0].split("=")[0], _flags(kind), 1)
+            meant = f"; perhaps you meant {near[0]}" if near else ""
+            return f"unknown arguments: {' '.join(event.tokens)}{meant}"
+        case "MissingArgs":
+            missing = [one.arg.display_name() for one in event.missing_arguments]
+            return f"these arguments are missing: {', '.join(missing)}"
+        case "InvalidChoice":
+            return f"{flag}'{event.value}' is not one of: {', '.join(event.choices)}"
+        case "BadValue":
+            return f"{flag}a value is missing"
+        case "InstantiationFailure":
+            return f"{flag}{event.message}"
+    return None
 
 
-def _registry() -> tyro.constructors.ConstructorRegistry:
+def _flags(kind: Any, prefix: str = "--") -> list[str]:
+    """Returns the flags of a dataclass and of its sections."""
+    flags: list[str] = []
+    for field in dataclasses.fields(kind):
+        name = prefix + field.name.replace("_", "-")
+        is_section = dataclasses.is_dataclass(field.type)
+        flags += _flags(field.type, f"{name}.") if is_section else [name]
+    return flags
+
+
+@contextlib.contextmanager
+def _registry() -> Iterator[None]:
     """Adds to tyro that a gripper is given by its name or folder."""
     registry = tyro.constructors.ConstructorRegistry()
 
@@ -57,40 +94,18 @@ def _registry() -> tyro.constructors.ConstructorRegistry:
             str_from_instance=lambda value: [str(value)],
         )
 
-    return registry
+    with registry:
+        yield
 
 
 def asks_help(arguments: Sequence[str]) -> bool:
-    """Whether help is asked for, which comes before all else."""
+    """Returns whether help is asked for, which comes before all else."""
     return not {*SHORT_HELP, "--help-all"}.isdisjoint(arguments)
 
 
 def take(arguments: Sequence[str], option: str) -> tuple[str | None, list[str]]:
-    """The last value of an option, None without one, and all other arguments."""
+    """Returns the last value of an option that decides how the others are read, and the others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument(option, dest="value", nargs="?")
-    found, rest = parser.parse_known_args(arguments)
-    return found.value, rest
-
-
-@contextlib.contextmanager
-def _wide_terminal() -> Iterator[None]:
-    """Keeps tyro from breaking its messages into lines."""
-    before = dict(os.environ)
-    os.environ["COLUMNS"] = "1000"
-    try:
-        yield
-    finally:
-        del os.environ["COLUMNS"]
-        os.environ.update(before)
-
-
-def _one_line(box: str, help_command: str) -> str:
-    """The message in tyro's box, between its first two rules, and its first suggestion."""
-    plain = re.sub(r"\x1b\[[0-9;]*m|│", "", box)
-    parts = re.split(r"(?m)^(?:[╭╰].*| *[─-]{3,} *)$", plain)
-    message = " ".join(parts[1].split()).rstrip(".") if len(parts) > 1 else ""
-    message = re.sub(r"^Error parsing [\w.]+: (?=[\w.]+: )", "", message)
-    hint = re.search(r"Perhaps you meant:\s+(\S+)", plain)
-    meant = f"; perhaps you meant {hint[1]}" if hint else ""
-    return f"{message or 'the arguments cannot be read'}{meant}; see {help_command}"
+    parsed, rest = parser.parse_known_args(arguments)
+    return parsed.value, rest

@@ -15,20 +15,20 @@ from csac_jax.render import gl
 
 @dataclasses.dataclass(frozen=True)
 class PlayOptions:
-    """Runs one episode and says what every action did. Draws it if asked to, with no display."""
+    """Runs one episode and prints the effect of every action. Draws it if asked to."""
 
     scene: str = "random"
-    """What lies on the table: random (dropped blocks), a shipped case by name, a case file, or
-    objects of a library: pile, objects_packed, objects10."""
+    """Scene: random (dropped blocks), a shipped case by name, a case file, or objects of a library:
+    pile, objects_packed, objects10."""
     objects: str | None = None
-    """Library that those draw from: a folder, or made:SEED:COUNT for our own shapes."""
+    """Library of those objects: a folder, or made:SEED:COUNT for procedural shapes."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
-    """What moves the gripper: nothing, it floats; or an arm."""
+    """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"
-    """What acts: oracle (reads the blocks' poses), random (a random place above a block), one that
+    """Policy: oracle (reads the blocks' poses), random (a random place above a block), one that
     comes with the package, such as shipped, the folder of a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
-    """What moves the blocks: C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
+    """C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None
     """File to write a video to: .mp4, .mkv, .mov, .gif or .webp."""
     png: Path | None = None
@@ -39,10 +39,10 @@ class PlayOptions:
     """Show height map and action next to the scene; of a learned policy also Q of both primitives,
     best over yaws, and the candidates of its search."""
     viewer: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Show the episode to walk around in: in MuJoCo's window where there is a display, else as a
-    page for the browser (extra `viewer`)."""
+    """Show the episode in 3-D: in MuJoCo's window where there is a display, else as a page for the
+    browser (extra `viewer`)."""
     seed: int = 0
-    """Number that the scene and the policy's noise follow from."""
+    """Seed of the scene and of the policy's noise."""
     json: Path | None = None
     """File to write the result to, as JSON."""
 
@@ -101,7 +101,7 @@ def _check(options: PlayOptions) -> None:
 
 
 def _policy(source: str) -> Any:
-    """The policy; without networks it has the config of `quick`."""
+    """Returns the policy; one without networks has the config of `quick`."""
     from csac_jax.evaluation import policies
 
     kinds = {"oracle": policies.OraclePolicy, "random": policies.RandomPolicy}
@@ -109,8 +109,10 @@ def _policy(source: str) -> Any:
 
 
 def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any, list[Any]]:
-    """The environment and the records of the episode's steps, each printed as it happens; `view`
-    says what is changed in the policy's config."""
+    """Returns the environment and the records of the episode's steps; prints each at once.
+
+    `view` holds changes of the policy's config.
+    """
     from csac_jax.evaluation import rollout, suites
     from csac_jax.render import episode
     from csac_jax.runtime import cache
@@ -139,7 +141,7 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
 
 
 def _suite(scene: str) -> str:
-    """The suite of one part whose scenes are asked for. Raises ValueError if there is none."""
+    """Returns the suite of one part with these scenes. Raises ValueError if there is none."""
     from csac_jax.evaluation import suites
     from csac_jax.scene import cases
 

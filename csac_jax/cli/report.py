@@ -6,7 +6,8 @@ from pathlib import Path
 import tyro
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import PROGRAM, BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.cli.parsing import PROGRAM
 from csac_jax.errors import FailedError
 from csac_jax.io import files
 

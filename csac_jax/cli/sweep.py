@@ -8,9 +8,11 @@ from typing import Any, Literal
 import tyro
 
 from csac_jax import presets
-from csac_jax.cli import failures, output, parsing, settings
-from csac_jax.cli.failures import PROGRAM, BadArgumentsError, as_bad_arguments
+from csac_jax.cli import failures, output, settings
+from csac_jax.cli.failures import as_bad_arguments
+from csac_jax.cli.parsing import PROGRAM
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 from csac_jax.io import files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import grid
@@ -21,8 +23,6 @@ EXAMPLES = (
     "fast --seeds 4 --devices 4 --init shipped",
     "paper_small --vary algo=csac,csac_beta --vary task=clear,packed --evaluate 500",
 )
-
-
 STUDY = "study.md"
 
 
@@ -30,33 +30,33 @@ STUDY = "study.md"
 class SweepOptions:
     """Trains several seeds with several settings side by side in one program.
 
-    --resume goes on with a sweep that was stopped. Every setting of a preset is an option."""
+    --resume continues a sweep that was stopped. Every setting of a preset is an option."""
 
     seeds: int = 4
     """Seeds of every setting: --seed, --seed + 1, ..."""
     vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=A,B,...: a setting, algo, task (clear, target, packed) or switch (none, sensed,
-    anywhere, oblique, noisy, ur5, together), and the values it takes; once per setting, every
-    combination is run. Colons separate a tuple's items: replay.end=1:4,1:12."""
+    anywhere, oblique, noisy, ur5, together), and its values; once per setting, every combination
+    is run. Colons separate a tuple's items: replay.end=1:4,1:12."""
     evaluate: int = 0
-    """Episodes that every final policy is evaluated in; with some, the sweep ends with a table,
-    study.md, and a figure, study.png, in its folder."""
+    """Episodes to evaluate every final policy in; then a table, study.md, and a figure, study.png,
+    are written to the sweep's folder."""
     run_dir: Path | None = None
     """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
     resume: Path | None = None
-    """Folder of a sweep to go on with, by itself: its settings are the sweep's."""
+    """Folder of a sweep to continue, without other options: its settings are the sweep's."""
     shard: Literal["seeds", "scenes"] = "seeds"
-    """What several devices divide: the seeds, or the scenes and batches of each seed."""
+    """Division among several devices: seeds, or the scenes and batches of each seed."""
     devices: int | None = None
-    """Devices to use; one if not given, and with several processes all that they have."""
+    """Devices to use; by default one, with several processes all of theirs."""
     coordinator: str | None = None
     """ADDRESS:PORT of the first of several processes of the same command; see docs/cluster.md."""
     processes: int | None = None
-    """How many processes there are."""
+    """Number of processes."""
     process_id: int | None = None
     """Number of this process, from 0."""
     cluster: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Join the processes of a job of SLURM, Open MPI or Kubernetes, which JAX finds itself."""
+    """Join the processes of a job of SLURM, Open MPI or Kubernetes, which JAX finds by itself."""
     config: Path | None = None
     """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
     init: str | None = None
@@ -71,9 +71,6 @@ class SweepOptions:
 
 def run(arguments: list[str]) -> int:
     """Trains all; returns the exit code."""
-    if parsing.SHORT_HELP.intersection(arguments):
-        settings.print_help(SweepOptions, "sweep", EXAMPLES, arguments)
-        return 0
     stop = signals.install()
     options, plan = read(arguments)
     begun, resume = time.time(), options.resume is not None
@@ -82,10 +79,10 @@ def run(arguments: list[str]) -> int:
 
     name = f"sweep-{plan.points[0].cfg.preset}"
     folder = options.resume or options.run_dir or api.new_folder(name)
-    how = (options.devices, options.shard, options.init)
+    asked = (options.devices, options.shard, options.init)
     try:
-        result = api.run_sweep(plan, folder, *how, verbose=True, stop=stop, resume=resume)
-    except FileExistsError:  # somebody has made it meanwhile
+        result = api.run_sweep(plan, folder, *asked, verbose=True, stop=stop, resume=resume)
+    except FileExistsError:  # another process made it meanwhile
         raise failures.exists(folder) from None
     if cluster.is_first():
         _report(options, folder, result, round(time.time() - begun, 1))
@@ -122,29 +119,27 @@ def _write_study(folder: Path) -> None:
 
 
 def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
-    """Options and plan of a sweep: from the command line, or from the folder if it is resumed."""
+    """Returns options and plan of a sweep: from the command line, or from a resumed folder."""
     preset, flags = settings.split(arguments)
     options, cfg = _parse(preset, flags)
     if options.seeds < 1 or options.seed + options.seeds > 2**31:
-        raise BadArgumentsError("--seeds: at least 1, and no seed may exceed 2147483647")
+        raise SettingsError("--seeds: at least 1, and no seed may exceed 2147483647")
     _join(options)
     if options.resume is None:
         settings.check_new("sweep", preset, options.config, options.run_dir)
         return options, _new_plan(preset, flags, options)
     given = (preset, options.vary, options.run_dir, options.evaluate, options.config)
     if any(given) or options.seeds != SweepOptions.seeds or cfg != presets.get("quick"):
-        raise BadArgumentsError(
-            "sweep --resume: a sweep goes on with its own settings; leave all others out"
-        )
+        raise SettingsError("sweep --resume: a sweep keeps its own settings; leave all others out")
     from csac_jax.sweeps import runner
 
     return options, runner.read_plan(options.resume)
 
 
 def _parse(preset: str | None, flags: list[str]) -> tuple[SweepOptions, Config]:
-    """Options of a sweep and the config of a point, whose own flags come last."""
+    """Returns options of a sweep and the config of a point, whose own flags come last."""
     command = f"sweep {preset or 'PRESET'}"
-    return settings.parse(SweepOptions, command, settings.base(preset, flags), flags)
+    return settings.parse(SweepOptions, command, settings.base(preset, flags), flags, EXAMPLES)
 
 
 def _join(options: SweepOptions) -> None:
@@ -153,8 +148,8 @@ def _join(options: SweepOptions) -> None:
     if not options.cluster and place == (None, None, None):
         return
     if options.run_dir is None and options.resume is None:
-        raise BadArgumentsError(
-            "sweep: several processes need --run-dir, one folder that all of them see"
+        raise SettingsError(
+            "sweep: several processes need --run-dir, a folder that all of them share"
         )
     from csac_jax.runtime import cluster
 
@@ -165,7 +160,7 @@ def _join(options: SweepOptions) -> None:
 def _new_plan(preset: str | None, flags: list[str], options: SweepOptions) -> Any:
     with as_bad_arguments(ValueError):
         points = grid.points(options.vary, lambda own: _parse(preset, [*flags, *own])[1])
-    from csac_jax.sim import backend  # with JAX, so after those complaints
+    from csac_jax.sim import backend  # with JAX, so after those errors
     from csac_jax.sweeps import runner
 
     devices, runs = _devices(options), options.seeds * len(points)  # at most so many side by side
@@ -180,6 +175,6 @@ def _new_plan(preset: str | None, flags: list[str], options: SweepOptions) -> An
 
 
 def _devices(options: SweepOptions) -> int:
-    """Devices of a sweep, those of other processes too; 2 stands for several."""
+    """Returns the devices of a sweep, of other processes too; 2 stands for several."""
     alone = options.processes in (None, 1) and not options.cluster
     return (options.devices or 1) if alone else 2

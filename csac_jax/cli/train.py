@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from csac_jax.cli import failures, output, parsing, settings
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
 from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import signals
 
 EXAMPLES = (
@@ -17,22 +17,20 @@ EXAMPLES = (
     "fast --init shipped                 # start from the shipped policy's networks",
     "quick --replay.sampler beta --replay.end 1 4",
     "--config my.toml --learn.tau 0.02   # settings in a file, flags win over it",
-    "quick --eval-every 500 --log wandb  # measured on the way, and tracked",
-    "--resume runs/a                     # go on with a run that was stopped",
+    "quick --eval-every 500 --log wandb  # evaluated during training, and tracked",
+    "--resume runs/a                     # continue a run that was stopped",
 )
-
-
 MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}  # of trackers
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainOptions:
-    """Trains a policy into a new folder, or goes on with a run: --resume RUN."""
+    """Trains a policy into a new folder, or continues a run: --resume RUN."""
 
     run_dir: Path | None = None
     """Folder of the run, which must not exist; runs/PRESET-SEED-TIME if not given."""
     resume: Path | None = None
-    """Folder of a run to go on with; more --train.actions make it longer."""
+    """Folder of a run to continue; more --train.actions make it longer."""
     step: int | None = None
     """Checkpoint to resume from, by its step; the newest sound one if not given."""
     config: Path | None = None
@@ -40,9 +38,9 @@ class TrainOptions:
     init: str | None = None
     """Start from the networks of a run, a policy file or `shipped`; brings its net settings."""
     log: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ()
-    """Trackers that get every number, each by an extra of its name."""
+    """Trackers that get every number, each needs the extra of its name."""
     eval_every: int = 0
-    """Actions between evaluations of the policy of now; RUN/best keeps the state that did best."""
+    """Actions between evaluations of the current policy; RUN/best keeps the best state."""
     eval_suite: str = EVAL_SUITE
     """Suite of these evaluations, as of `csac-jax eval`."""
     eval_episodes: int = EVAL_EPISODES
@@ -57,9 +55,6 @@ class TrainOptions:
 
 def run(arguments: list[str]) -> int:
     """Trains; returns the exit code."""
-    if parsing.SHORT_HELP.intersection(arguments):
-        settings.print_help(TrainOptions, "train", EXAMPLES, arguments)
-        return 0
     stop = signals.install()
     options, cfg = read(arguments)
     begun, resume = time.time(), options.resume is not None
@@ -81,7 +76,7 @@ def run(arguments: list[str]) -> int:
             eval_episodes=options.eval_episodes,
             stop=stop,
         )
-    except FileExistsError:  # somebody has made it meanwhile
+    except FileExistsError:  # another process made it meanwhile
         raise failures.exists(folder) from None
     seconds = round(time.time() - begun, 1)
     result = {"run_dir": str(folder), **done.summary._asdict(), "wall_seconds": seconds}
@@ -91,9 +86,7 @@ def run(arguments: list[str]) -> int:
 
 
 def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
-    """Options and config of a run, from the command line and, if it is resumed, its checkpoint."""
-    if "--tensorboard" in arguments:
-        raise BadArgumentsError("--tensorboard: it is --log tensorboard now")
+    """Returns options and config of a run: from the command line, and from a resumed checkpoint."""
     preset, flags = settings.split(arguments)
     resumed, _ = parsing.take(flags, "--resume")
     if resumed is None or parsing.asks_help(flags):
@@ -103,13 +96,14 @@ def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
 
         base = checkpoint.load_config(Path(resumed))
         base = dataclasses.replace(base, preset=preset or base.preset)
-    options, cfg = settings.parse(TrainOptions, f"train {preset or 'PRESET'}", base, flags)
+    command = f"train {preset or 'PRESET'}"
+    options, cfg = settings.parse(TrainOptions, command, base, flags, EXAMPLES)
     if options.step is not None and options.resume is None:
-        raise BadArgumentsError("--step: give it with --resume RUN")
+        raise SettingsError("--step: give it with --resume RUN")
     if options.resume is None:
         settings.check_new("train", preset, options.config, options.run_dir)
     elif (options.run_dir, options.init, options.config) != (None, None, None):
-        raise BadArgumentsError("--resume: a resumed run takes no --run-dir, --init or --config")
+        raise SettingsError("--resume: a resumed run takes no --run-dir, --init or --config")
     _check(options)
     failures.check_physics(cfg)
     return options, cfg
@@ -117,8 +111,8 @@ def read(arguments: list[str]) -> tuple[TrainOptions, Config]:
 
 def _check(options: TrainOptions) -> None:
     if options.eval_every < 0 or options.eval_episodes < 1:
-        raise BadArgumentsError("--eval-every, --eval-episodes: at least 1")
+        raise SettingsError("--eval-every, --eval-episodes: at least 1")
     if not options.eval_every and options.eval_suite != EVAL_SUITE:
-        raise BadArgumentsError("--eval-suite: give it with --eval-every N")
+        raise SettingsError("--eval-suite: give it with --eval-every N")
     for name in options.log:
         failures.check_extra(f"--log {name}", MODULES[name], name)

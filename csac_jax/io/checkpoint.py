@@ -4,11 +4,11 @@
     RUN/checkpoints/STEP/state/...        arrays, by Orbax
     RUN/checkpoints/STEP/config, extra    JSON, by Orbax
     RUN/checkpoints/STEP/manifest.sha256  digest of every file above
-    RUN/checkpoints/set-aside/STEP        one that was passed over on resuming, or saved once more
+    RUN/checkpoints/set-aside/STEP        a step that was skipped on resuming, or saved again
 
 A step is written under another name and renamed once its manifest is there: it appears complete or
 not at all. Orbax restores flipped bits and casts other dtypes silently. So every file is checked
-against the manifest, and every leaf's shape and dtype against what the program expects.
+against the manifest, and every leaf against the shape and dtype that the program expects.
 """
 
 import collections
@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import orbax.checkpoint as ocp
 import tensorstore
 
@@ -49,7 +48,7 @@ _DRAFT = ".saving"
 
 
 class CheckpointError(FailedError):
-    """A checkpoint that is missing, damaged or another program's; the message has the remedy."""
+    """A missing or damaged checkpoint, or another program's; the message has the remedy."""
 
 
 def check_path(run_dir: Path) -> None:
@@ -63,12 +62,11 @@ def check_path(run_dir: Path) -> None:
 
 
 def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any]) -> Path:
-    """Writes `state` (a pytree of arrays and typed keys) as `step`; returns once it is complete.
-    The last two are kept.
+    """Writes `state` (a pytree of arrays and typed keys) as `step`; keeps the last two steps.
 
-    Removes what a killed process left; sets a folder of that step aside. `extra` is anything that
-    JSON can hold. With several processes all must call it. Raises CheckpointError where it cannot
-    be written, as on a full disc; earlier checkpoints stay as they are.
+    Returns once the step is complete. Removes the drafts of a killed process; sets a folder of that
+    step aside. `extra` is any JSON content. With several processes all must call it. Raises
+    CheckpointError if it cannot be written, as on a full disc; earlier checkpoints stay.
     """
     root = _root(run_dir)
     draft, folder = root / _DRAFT, root / str(step)
@@ -97,15 +95,17 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
             _clean(root, times=10)
         raise CheckpointError(
             f"step {step} could not be saved in {root} ({files.first_line(error)}); earlier "
-            "checkpoints are intact; make room there and go on with --resume"
+            "checkpoints are intact; make room there and resume the run"
         ) from error
     cluster.wait(f"saved {folder}")
     return folder
 
 
 def _check_complete(draft: Path, arrays: dict[str, Any]) -> None:
-    """Raises OSError where Orbax wrote less than all arrays without an error of its own: one call
-    that a full disc refuses is enough."""
+    """Raises OSError if arrays are missing.
+
+    Orbax raises no error of its own where a full disc refuses a single call.
+    """
     spec = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{draft / 'state'}/"}}
     store = tensorstore.KvStore.open(spec).result()
     parts = collections.Counter(key.rpartition(b"/")[0].decode() for key in store.list().result())
@@ -120,7 +120,7 @@ def _check_complete(draft: Path, arrays: dict[str, Any]) -> None:
 
 
 def load_config(run_dir: Path, step: int | None = None) -> Config:
-    """The config of a checkpoint; see `restore`."""
+    """Reads the config of a checkpoint; see `restore`."""
     folder = sound(run_dir, step)
     try:
         return configs.from_dict(_read(folder, config=ocp.args.JsonRestore())["config"])
@@ -134,21 +134,19 @@ def load_config(run_dir: Path, step: int | None = None) -> Config:
 def restore(
     run_dir: Path, abstract_state: Any, step: int | None = None
 ) -> tuple[Any, dict[str, Any]]:
-    """State and `extra`, as they were given to `save`, of a step, by default the newest sound one.
+    """Reads state and `extra` of a step, by default the newest sound one.
 
     `abstract_state` has the state's structure, shapes and dtypes, as `jax.eval_shape` gives them. A
-    leaf that has a sharding is laid out by it, however it was when it was saved; the others go to
-    the first device. Raises CheckpointError; warns of damaged steps that it passes over.
+    leaf with a sharding is laid out by it, whatever its layout when it was saved; the others go to
+    the first device. Raises CheckpointError; warns of damaged steps that it skips.
     """
     folder = sound(run_dir, step)
     record = _read(folder, extra=ocp.args.JsonRestore())["extra"]
-    every, layout = leaves.named(abstract_state), leaves.layout(abstract_state)
-    added = [name for name in renames.ADDED if name in every and name not in record["layout"]]
-    wanted = {name: leaf for name, leaf in every.items() if name not in added}
+    wanted, layout = leaves.named(abstract_state), leaves.layout(abstract_state)
     old = {name: _old_name(name, record["layout"]) for name in wanted}
-    found = leaves.difference(record["layout"], {old[name]: layout[name] for name in wanted})
-    if found is not None:
-        name, has, needs = found
+    different = leaves.difference(record["layout"], {old[name]: layout[name] for name in wanted})
+    if different is not None:
+        name, has, needs = different
         raise CheckpointError(
             f"checkpoint {folder} holds {name} as {has}, the program needs {needs}; "
             "use the version of csac_jax that saved it"
@@ -156,19 +154,16 @@ def restore(
     provenance.warn_if_other(record.get("versions"), f"checkpoint {folder}")
     arrays = {old[name]: _abstract_array(leaf) for name, leaf in wanted.items()}
     arrays = _read(folder, state=ocp.args.StandardRestore(arrays))["state"]
-    if (found_step := _own_step(arrays)) not in (None, int(folder.name)):
-        raise CheckpointError(f"checkpoint {folder} holds step {found_step}; remove that folder")
-    state = [
-        _zeros(leaf) if name in added else _typed(arrays[old[name]], leaf)
-        for name, leaf in every.items()
-    ]
+    if (saved := _own_step(arrays)) not in (None, int(folder.name)):
+        raise CheckpointError(f"checkpoint {folder} holds step {saved}; remove that folder")
+    state = [_typed(arrays[old[name]], leaf) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(abstract_state), state), record["extra"]
 
 
 def sound(run_dir: Path, step: int | None = None) -> Path:
-    """Folder of a step, by default of the newest one whose files are what was saved.
+    """Returns the folder of a step, by default of the newest one with undamaged files.
 
-    Raises CheckpointError where there is none; warns of newer ones that are damaged.
+    Raises CheckpointError if there is none; warns of newer ones that are damaged.
     """
     root = _root(run_dir)
     steps = [step] if step is not None else _steps(run_dir)[::-1]
@@ -176,8 +171,8 @@ def sound(run_dir: Path, step: int | None = None) -> Path:
     for number in steps:
         folder = root / str(number)
         if (fault := _fault(folder)) is None:
-            for said in faults:
-                warnings.warn(f"{said}; going back to step {number}", DataWarning, stacklevel=2)
+            for text in faults:
+                warnings.warn(f"{text}; going back to step {number}", DataWarning, stacklevel=2)
             return folder
         faults.append(f"checkpoint {folder} {fault}")
     if not faults:
@@ -190,24 +185,23 @@ def sound(run_dir: Path, step: int | None = None) -> Path:
 
 
 def set_aside(run_dir: Path, step: int | None = None) -> None:
-    """Moves the steps that are newer than `step`, by default the newest sound one, out of the
-    way."""
+    """Moves steps newer than `step`, by default the newest sound one, to another folder."""
     set_aside_after(run_dir, int(sound(run_dir, step).name))
 
 
 def set_aside_after(run_dir: Path, step: int) -> None:
-    """Moves the steps that are newer than `step` out of the way, sound or not."""
+    """Moves steps newer than `step`, sound or not, to another folder."""
     for number in [number for number in _steps(run_dir) if number > step]:
         _set_aside(_root(run_dir) / str(number))
 
 
 def load_extra(run_dir: Path) -> dict[str, Any]:
-    """The `extra` of the newest sound step, see `save`."""
+    """Returns the `extra` of the newest sound step, see `save`."""
     return _read(sound(run_dir), extra=ocp.args.JsonRestore())["extra"]["extra"]
 
 
 def latest_step(run_dir: Path) -> int | None:
-    """The newest step that was saved under `run_dir`, sound or not; None if there is none."""
+    """Returns the newest saved step, sound or not; None if there is none."""
     return max(_steps(run_dir), default=None)
 
 
@@ -221,7 +215,7 @@ def _set_aside(folder: Path) -> None:
 def _publish(draft: Path, folder: Path) -> None:
     """Gives a complete step its name and drops those before the last two."""
     if folder.exists():
-        _set_aside(folder)  # not removed: a kill may come before the next line has run
+        _set_aside(folder)  # not removed: a kill may come before the next line runs
     draft.rename(folder)
     files.sync_folder(folder.parent)
     for number in _steps(folder.parents[1])[:-KEPT]:
@@ -229,8 +223,10 @@ def _publish(draft: Path, folder: Path) -> None:
 
 
 def _clean(root: Path, times: int = 1) -> None:
-    """Removes what a save that did not end has left, again and again for half a second: threads of
-    Orbax's may still be on their way, and a full disc may refuse to open a folder."""
+    """Removes the drafts of an incomplete save, `times` times in half a second.
+
+    Orbax's threads may still write, and a full disc may refuse to open a folder.
+    """
     for number in range(times):
         if number:
             time.sleep(0.05)
@@ -239,7 +235,7 @@ def _clean(root: Path, times: int = 1) -> None:
 
 
 def _name_run(root: Path) -> str:
-    """The name of the run that saves here; a new one where there is none."""
+    """Returns the name of the run that saves here; draws one if there is none."""
     if cluster.is_first() and _run_name(root) is None:
         sound = (root / str(step) for step in _steps(root.parent)[::-1])
         saved = next((_record(folder) for folder in sound if _fault(folder) is None), {})
@@ -250,7 +246,7 @@ def _name_run(root: Path) -> str:
 
 
 def _run_name(root: Path) -> str | None:
-    """The name of the run whose checkpoints these are; None without one, or a damaged one."""
+    """Returns the name of the run of these checkpoints, None if it is missing or damaged."""
     if not (root / _RUN).is_file():
         return None
     name, _, digest = (root / _RUN).read_bytes().partition(b" ")
@@ -263,9 +259,9 @@ def _root(run_dir: Path) -> Path:
 
 @contextlib.contextmanager
 def _checkpointer() -> Iterator[ocp.Checkpointer]:
-    """Orbax's; it may raise, but not print tracebacks of what it raises as well.
+    """Opens Orbax's checkpointer, which may raise but not print tracebacks as well.
 
-    Folders are made at once: where that fails in a thread of Orbax's, it waits for 5 minutes.
+    Folders are made at once: if that fails in a thread, Orbax waits for 5 minutes.
     """
     at_once = ocp.AsyncOptions(create_directories_asynchronously=False)
     options = ocp.CompositeOptions(async_options=at_once)
@@ -275,12 +271,12 @@ def _checkpointer() -> Iterator[ocp.Checkpointer]:
     handler = ocp.CompositeCheckpointHandler(composite_options=options)
     with ocp.Checkpointer(handler) as checkpointer:
         yield checkpointer
-    # Not after an error: its threads may still be on their way.
+    # Not after an error: its threads may still run.
     logger.disabled, sys.unraisablehook = was, hook
 
 
 def _unraisable(hook: Callable[[Any], object], unraisable: Any) -> None:
-    """Passes on what cannot be raised, but for writes that end after another one has failed."""
+    """Ignores writes that end after another one has failed; passes on other errors."""
     if "Event loop is closed" not in str(unraisable.exc_value):
         hook(unraisable)
 
@@ -297,18 +293,18 @@ def _read(folder: Path, **items: Any) -> Any:
 
 
 def _steps(run_dir: Path) -> list[int]:
-    """Saved steps, the oldest first."""
+    """Returns the saved steps, the oldest first."""
     names = [path.name for path in _root(run_dir).glob("*")]
     return sorted(int(name) for name in names if re.fullmatch("0|[1-9][0-9]{0,17}", name))
 
 
 def _old_name(name: str, layout: dict[str, str]) -> str:
-    """Name of a leaf in a checkpoint of this layout, which may be an older one."""
+    """Returns the name of a leaf in a checkpoint of this layout, which may be older."""
     older = {new: old for old, new in renames.STATE.items()}
     return name if name in layout else older.get(name, name)
 
 
-# Orbax gets a flat dict of plain arrays; typed keys travel as their bits.
+# Orbax gets a flat dict of plain arrays; typed keys are stored as their bits.
 
 
 def _is_key(leaf: Any) -> bool:
@@ -325,13 +321,8 @@ def _abstract_array(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(array.shape, array.dtype, sharding=place)
 
 
-def _zeros(leaf: Any) -> jax.Array:
-    array = _abstract_array(leaf)
-    return jnp.zeros(array.shape, array.dtype, device=array.sharding)
-
-
 def _typed(array: Any, leaf: Any) -> Any:
-    """An array as it was saved, a key again if the abstract leaf is one."""
+    """Returns an array as it was saved, a typed key if the abstract leaf is one."""
     if not _is_key(leaf):
         return array
     impl = jax.random.key_impl(jax.lax.full((), 0, leaf.dtype))
@@ -339,7 +330,7 @@ def _typed(array: Any, leaf: Any) -> Any:
 
 
 def _record(folder: Path) -> dict[str, Any]:
-    """What a step says of itself. Raises OSError, and ValueError for what `save` never wrote."""
+    """Reads the record of a step. Raises OSError, and ValueError for other content."""
     record = files.read_object(folder / "extra" / "metadata")
     if not all(isinstance(record.get(name), dict) for name in ("layout", "extra")):
         raise ValueError("it is no checkpoint of csac_jax")
@@ -347,13 +338,13 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 def _own_step(arrays: dict[str, Any]) -> int | None:
-    """The step that a state says it is of; None if it does not say."""
+    """Returns the step counter in a state, None without one."""
     step = arrays.get("step")
     return int(step) if step is not None and step.shape == () else None
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file of a step but the manifest."""
+    """Returns the SHA-256 of each file of a step but the manifest."""
     digests = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name != MANIFEST:
@@ -364,13 +355,13 @@ def _digests(folder: Path) -> dict[str, str]:
 
 
 def _fault(folder: Path) -> str | None:
-    """What is wrong with the files of a step, None if nothing is."""
+    """Returns the fault of the files of a step, None if they are sound."""
     try:
         wanted = files.read_object(folder / MANIFEST)
-        found = _digests(folder)
-        for name in sorted(wanted.keys() | found.keys()):
-            if found.get(name) != wanted.get(name):
-                return f"is damaged ({name} {'has changed' if name in found else 'is missing'})"
+        actual = _digests(folder)
+        for name in sorted(wanted.keys() | actual.keys()):
+            if actual.get(name) != wanted.get(name):
+                return f"is damaged ({name} {'has changed' if name in actual else 'is missing'})"
         record = _record(folder)
         run = _run_name(folder.parent)
     except (FileNotFoundError, NotADirectoryError):

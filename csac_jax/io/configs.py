@@ -1,68 +1,70 @@
-"""Config to JSON and back. Old formats are translated; a missing setting takes its default.
+"""Config to JSON and back, and configs in files: TOML, YAML or JSON, a run's config.json too.
 
-An unknown setting, a wrong type or a value out of range raises ValueError in one line.
+    preset = "quick"
+    algo = "vpg"
+    seed = 1
+    [learn]
+    tau = 0.01
+
+Such a file changes settings of its preset. One with a `format`, as runs write it, holds all; a
+setting that it lacks takes its default. Values are read as data: nothing in a file is executed.
 """
 
 import dataclasses
 import functools
 import json
-import math
+import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from csac_jax import config, grippers
-from csac_jax.config import CameraConfig, Config, SimConfig
+from csac_jax import algorithms, config, grippers, presets
+from csac_jax.config import Config, SimConfig
+from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
-from csac_jax.io import renames
+from csac_jax.io import files, renames
+from csac_jax.section import Section, names, shown
+
+FORMAT = 2
 
 
 def to_dict(cfg: Config) -> dict[str, Any]:
-    """A config as plain JSON values, with the number of its format."""
-    gripper = cfg.sim.gripper
-    if isinstance(gripper, Gripper):
-        cfg = cfg.change(sim={"gripper": ""})
-    values = {"format": renames.FORMAT, **json.loads(json.dumps(dataclasses.asdict(cfg)))}
-    if isinstance(gripper, Gripper):
-        numbers = grippers.to_numbers(gripper)
-        values["sim"]["gripper"] = {"folder": str(gripper.folder), **numbers}
+    """Returns a config as plain JSON values, with the number of its format."""
+    sections = {
+        name: _section_dict(value) if isinstance(value, Section) else value
+        for name, value in vars(cfg).items()
+    }
+    return {"format": FORMAT, **json.loads(json.dumps(sections))}
+
+
+def _section_dict(section: Section) -> dict[str, Any]:
+    values = dict(vars(section))
+    if isinstance(own := values.get("gripper"), Gripper):
+        values["gripper"] = {"folder": str(own.folder), **grippers.to_numbers(own)}
     return values
 
 
 def from_dict(values: Any) -> Config:
-    """The inverse of `to_dict`, for every format written so far. Raises ValueError."""
+    """Reads what `to_dict` returned, of older versions too. Raises SettingsError in one line for an
+    unknown setting, a wrong type or a value out of range."""
     if not isinstance(values, dict):
-        raise ValueError(f"config: must be an object, not {config.shown(values)}")
-    values = dict(values)
-    number = values.pop("format", 1)
-    if number not in (1, renames.FORMAT):
-        raise ValueError(
-            f"format: {config.shown(number)} is unknown, "
-            f"this version reads up to {renames.FORMAT}; update csac-jax"
-        )
-    try:
-        values = _from_format_1(values) if number == 1 else _without_constants(values)
-    except (TypeError, KeyError, IndexError, AttributeError, OverflowError):
-        raise ValueError("a setting of the old format has a value of another kind") from None
-    values["algo"] = algorithm(values)
-    return Config(**{name: _validated(name, value) for name, value in values.items()})
-
-
-def algorithm(values: dict[str, Any]) -> Any:
-    """Today's name of the algorithm of a stored config; the default's where it has none."""
-    stored, target = values.get("algo", Config.algo), values.get("target")
-    former, setting = renames.ALGORITHMS.get(str(stored), (stored, ""))
-    return stored if isinstance(target, dict) and setting in target else former
+        raise SettingsError(f"config: must be an object, not {shown(values)}")
+    if (number := values.get("format")) != FORMAT:
+        told = f"{shown(number)} is unknown, this version reads {FORMAT}"
+        raise SettingsError(f"format: {told}; use the csac-jax that wrote it")
+    stored = renames.current({name: one for name, one in values.items() if name != "format"})
+    return Config(**{name: _validated(name, value) for name, value in stored.items()})
 
 
 def differences(a: Config, b: Config) -> list[str]:
-    """Dotted names of the settings in which two configs differ, in order of their definition."""
+    """Returns the dotted names of the settings that differ, in order of their definition."""
     flat_a, flat_b = flat(to_dict(a)), flat(to_dict(b))
-    names = dict.fromkeys([*flat_a, *flat_b])
-    return [name for name in names if flat_a.get(name) != flat_b.get(name)]
+    both = dict.fromkeys([*flat_a, *flat_b])
+    return [name for name in both if flat_a.get(name) != flat_b.get(name)]
 
 
 def flat(values: dict[str, Any]) -> dict[str, Any]:
-    """Dotted name of each setting -> its value."""
+    """Returns the value of each setting by its dotted name."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         fields = value if isinstance(value, dict) else {}
@@ -70,17 +72,8 @@ def flat(values: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _kind(name: str, stored: Any) -> Any:
-    """Type of a section or a setting outside them; of alternatives, the one that is stored."""
-    if name not in config.names(Config):
-        raise ValueError(f"{name}: unknown setting")
-    tag, _ = config.ALTERNATIVES.get(name, ("", ()))
-    if tag and isinstance(stored, dict) and tag in stored:
-        return config.alternative_kind(name, stored[tag])
-    return type(getattr(Config, name))
-
-
 def _validated(name: str, stored: Any) -> Any:
+    """Checks and builds a section, or a setting outside them."""
     if name == "sim" and isinstance(stored, dict) and isinstance(stored.get("gripper"), dict):
         sim = _validated(name, stored | {"gripper": SimConfig.gripper})
         return dataclasses.replace(sim, gripper=_own_gripper(stored["gripper"]))
@@ -88,7 +81,7 @@ def _validated(name: str, stored: Any) -> Any:
     try:
         text = json.dumps(stored)
     except RecursionError:
-        raise ValueError(f"{name}: is nested too deeply") from None
+        raise SettingsError(f"{name}: is nested too deeply") from None
     try:
         return adapter.validate_json(text, strict=True)
     except ValueError as error:
@@ -97,17 +90,26 @@ def _validated(name: str, stored: Any) -> Any:
         raise first["ctx"]["error"]
     place, what = ".".join(map(str, (name, *first["loc"]))), first["msg"]
     if first["type"] == "unexpected_keyword_argument":
-        raise ValueError(f"{place}: unknown setting")
-    raise ValueError(f"{place}: {what[0].lower()}{what[1:]}, not {config.shown(first['input'])}")
+        raise SettingsError(f"{place}: unknown setting")
+    raise SettingsError(f"{place}: {what[0].lower()}{what[1:]}, not {shown(first['input'])}")
+
+
+def _kind(name: str, stored: Any) -> Any:
+    """Returns the type of a section, of the alternative that is stored, or of another setting."""
+    if name not in names(Config):
+        raise SettingsError(f"{name}: unknown setting")
+    tag, _ = config.ALTERNATIVES.get(name, ("", ()))
+    if tag and isinstance(stored, dict) and tag in stored:
+        return config.alternative_kind(name, stored[tag])
+    return type(getattr(Config, name))
 
 
 def _own_gripper(stored: dict[str, Any]) -> Gripper:
-    """Builds the gripper that `to_dict` wrote. Raises ValueError for numbers that are none."""
     numbers = {name: value for name, value in stored.items() if name != "folder"}
     try:
         return grippers.from_numbers(Path(str(stored.get("folder"))), numbers)
     except ValueError as error:
-        raise ValueError(f"sim.gripper: {error}") from None
+        raise SettingsError(f"sim.gripper: {error}") from None
 
 
 @functools.cache
@@ -117,70 +119,84 @@ def _adapter(kind: Any) -> Any:
     return pydantic.TypeAdapter(kind)
 
 
-def _without_constants(values: dict[str, Any]) -> dict[str, Any]:
-    """The values of a config of format 2 without what is no setting any more."""
-    values = dict(values)
-    for name in (*renames.CONSTANTS, *renames.DROPPED):
-        section, field = name.split(".")
-        stored = values.get(section)
-        if not isinstance(stored, dict) or field not in stored:
+def load_config(path: str | Path, preset: str | None = None, algo: str | None = None) -> Config:
+    """Reads the config of a file; settings of the file win over what `algo` brings.
+
+    Args: preset, given elsewhere, which the file's must not contradict; algo, which wins over the
+    file's. Raises SettingsError, one line that names the file and the key.
+    """
+    try:
+        return _configured(_read(Path(path)), preset, algo)
+    except (OSError, ValueError) as error:
+        text = error.strerror if isinstance(error, OSError) else str(error)
+        raise SettingsError(f"{path}: {' '.join(str(text).split())}") from None
+
+
+def _configured(values: dict[str, Any], preset: str | None, algo: str | None) -> Config:
+    own = values.pop("preset", None)
+    if preset is not None and own not in (None, preset):
+        raise SettingsError(f"preset: is {shown(own)}; leave out {preset}, or change the file")
+    name = preset or own
+    if not isinstance(name, str):
+        raise SettingsError('preset: is missing; add one, such as preset = "quick"')
+    if "format" in values:
+        cfg = from_dict(values | {"preset": name})
+        return cfg if algo is None else algorithms.configure(cfg, algo)
+    cfg, own_algo = presets.get(name), values.pop("algo", None)
+    if (chosen := algo or own_algo) is not None:
+        cfg = algorithms.configure(cfg, str(chosen))
+    return from_dict(_changed(cfg, renames.current(values)))
+
+
+def _changed(base: Config, values: dict[str, Any]) -> dict[str, Any]:
+    """Returns the values of a whole config: `base` with those of a file."""
+    whole = to_dict(base)
+    for name, value in values.items():
+        section = getattr(base, name, None)
+        if not isinstance(section, Section):
+            whole[name] = value
             continue
-        constant = name in renames.CONSTANTS and hasattr(_kind(section, stored), field)
-        if constant:
-            _require_same(name, stored[field], getattr(_kind(section, stored), field))
-        if constant or name in renames.DROPPED:
-            values[section] = {key: value for key, value in stored.items() if key != field}
-    return values
+        if not isinstance(value, dict):
+            raise SettingsError(f"{name}: must be a section of settings, not {shown(value)}")
+        tag, _ = config.ALTERNATIVES.get(name, ("", ()))
+        if tag in value:
+            section = config.alternative(section, value[tag])
+        whole[name] = _section_dict(section) | value
+    return whole
 
 
-def _from_format_1(values: dict[str, Any]) -> dict[str, Any]:
-    """The values of a config of format 1 under today's names."""
-    every = {name: value for name, value in flat(values).items() if "." in name}
-    old = {name: value for name, value in every.items() if name not in renames.DROPPED}
-    if old.pop("learn.target_update", "soft") == "hard":
-        old["learn.tau"] = 1.0
-    old.pop("net.weights", None)
-    for name, kept in renames.GONE.items():
-        _require_same(name, old.pop(name, kept), kept)
-    noise, clip = old.get("explore.noise_std", 0.0), old.pop("explore.noise_clip", None)
-    if noise and clip is not None:
-        _require_same("explore.noise_clip", clip, 3.0 * noise)
-    sim = SimConfig(grasp_phases=tuple(old.get("sim.grasp_phases", SimConfig.grasp_phases)))
-    push_phases = tuple(old.pop("sim.push_phases", sim.push_phases))
-    _require_same("sim.push_phases", push_phases, sim.push_phases)
-    if isinstance(extent := old.get("scene.drop_extent"), float):
-        old["scene.drop_extent"] = [extent, extent]
-    scale = old.pop("camera.scale", 1.0)
-    new = {name: value for name, value in values.items() if not isinstance(value, dict)}
-    for name, value in old.items():
-        _put(new, values, renames.SETTINGS.get(name, name), value)
-    if scale != 1.0:
-        fields = {name: tuple(value) for name, value in new.get("camera", {}).items()}
-        new["camera"] = dataclasses.asdict(CameraConfig(**fields).scaled(scale))
-    return new
+def _read(path: Path) -> dict[str, Any]:
+    """Reads the content of a file as JSON values."""
+    if path.suffix not in READERS:
+        raise SettingsError(f"the name of a config file ends in {', '.join(READERS)}")
+    kind, parse = READERS[path.suffix]
+    text = files.read_bytes(path).decode()
+    try:
+        content = json.loads(json.dumps(parse(text), default=str))
+    except RecursionError:
+        raise SettingsError("is nested too deeply") from None
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+        raise SettingsError(f"is no readable {kind} ({error})") from None
+    if not isinstance(content, dict):
+        raise SettingsError("must hold settings by name")
+    return content
 
 
-def _require_same(name: str, value: Any, now: Any) -> None:
-    """Raises ValueError unless a file has today's value of what is no setting any more."""
-    value, now = (list(one) if isinstance(one, tuple) else one for one in (value, now))
-    close = isinstance(value, float) and isinstance(now, float) and math.isclose(value, now)
-    if value != now and not close:
-        raise ValueError(f"{name}: is {now} now and cannot be {value}")
+def _yaml(text: str) -> Any:
+    """Reads plain values. Refuses aliases: a short file could stand for an endless one."""
+    import yaml
+
+    try:
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise SettingsError("aliases (*name) are not read; write the values out")
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SettingsError(f"is no readable YAML ({error})") from None
 
 
-def _put(new: dict[str, Any], values: dict[str, Any], name: str, value: Any) -> None:
-    """Sets the setting `section.field` or `section.field.place`; a constant, or a setting of
-    another alternative, is left out."""
-    section, field, *place = name.split(".")
-    kind = _kind(section, values.get(section))
-    _, alternatives = config.ALTERNATIVES.get(section, ("", ()))
-    if field in config.names(kind):
-        fields = new.setdefault(section, {})
-        if place:
-            fields = fields.setdefault(field, list(getattr(kind, field)))
-        fields[int(place[0]) if place else field] = value
-    elif field in vars(kind):
-        now = vars(kind)[field]
-        _require_same(name, value, now[int(place[0])] if place else now)
-    elif not any(field in vars(other) for other in alternatives):
-        raise ValueError(f"{name}: unknown setting")
+READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    ".toml": ("TOML", tomllib.loads),
+    ".yaml": ("YAML", _yaml),
+    ".yml": ("YAML", _yaml),
+    ".json": ("JSON", json.loads),
+}

@@ -1,4 +1,4 @@
-"""Files of a run, written so that they are never seen half-written. Needs no JAX.
+"""Files of a run; each appears whole or not at all. Needs no JAX.
 
 RUN/config.json     the config, for people; the checkpoint holds its own copy
 RUN/metrics.jsonl   one `callbacks.Record` per chunk
@@ -29,8 +29,7 @@ LARGEST = 2**30  # bytes of a file that is read at once
 
 
 def replace(path: Path, content: str | bytes) -> None:
-    """Writes a file such that it appears all at once, or raises OSError and leaves nothing; its
-    folder is made."""
+    """Writes a file at once, or raises OSError and leaves nothing. Creates its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     try:
@@ -46,7 +45,7 @@ def replace(path: Path, content: str | bytes) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Returns once the names in a folder would survive a power failure."""
+    """Waits until the names in a folder survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -60,7 +59,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object of a file. Raises ValueError for any other content, OSError."""
+    """Returns the JSON object of a file. Raises ValueError for other content, OSError."""
     content = parse(read_bytes(path), path.name)
     if not isinstance(content, dict):
         raise ValueError(f"{path.name} holds no JSON object")
@@ -68,7 +67,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def parse(text: str | bytes, name: str) -> Any:
-    """The content of JSON text. Raises ValueError, also for what nests too deep for Python."""
+    """Returns the content of JSON text. Raises ValueError, also for too deep nesting."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -76,8 +75,10 @@ def parse(text: str | bytes, name: str) -> Any:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a regular file. Raises OSError for a pipe or device, which may never end, and
-    for more than LARGEST."""
+    """Returns the content of a regular file.
+
+    Raises OSError for a pipe or device, which may never end, and for more than LARGEST.
+    """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST:
         reason = "is a folder, a pipe or a device, or larger than 1 GiB"
@@ -86,14 +87,14 @@ def read_bytes(path: Path) -> bytes:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message, without the rest of a trace."""
+    """Returns the first line of an error's message, without the rest of a trace."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl by today's names; warns of lines that are damaged.
+    """Returns the lines of a metrics.jsonl with the names of today. Warns of damaged lines.
 
     The last line may have been cut off in writing, which is no damage.
     """
@@ -106,7 +107,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def _record(line: bytes) -> dict[str, Any] | None:
-    """A line of a log; None if it is damaged, or lacks what every line has."""
+    """Returns a line of a log, None if it is damaged or lacks a required number."""
     try:
         record = renamed(parse(line, "line"))
     except ValueError:
@@ -124,7 +125,7 @@ def _is_number(value: Any) -> bool:
 
 
 def renamed(content: Any) -> Any:
-    """A line of a log, or an evaluation without its config, with today's names of metrics."""
+    """Renames the metrics of a line of a log, or of an evaluation without its config."""
     if not isinstance(content, dict):
         return content
     return {renames.METRICS.get(name, name): renamed(value) for name, value in content.items()}

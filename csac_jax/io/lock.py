@@ -1,4 +1,4 @@
-"""A lock on the folder of a run, so that two processes never write it at once."""
+"""A lock on the folder of a run: two processes never write it at once."""
 
 import contextlib
 import os
@@ -17,26 +17,27 @@ HOLDER = ".lock-holder"
 
 
 class LockedError(FailedError):
-    """A folder that another process is writing; the message names it."""
+    """A folder that another process writes; the message names the process."""
 
 
 @contextlib.contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Holds the lock of a folder that exists; it dies with this process.
+    """Holds the lock of an existing folder; the lock ends with this process.
 
-    Raises LockedError where another process holds it. Warns where the last holder, on another
-    host, did not let go: some shared folders know no locks between hosts.
+    Raises LockedError if another process holds it. Warns if the last holder, on another host, did
+    not release it: some shared folders have no locks between hosts.
     """
     lock, holder = filelock.FileLock(folder / LOCK), folder / HOLDER
     try:
         lock.acquire(timeout=0)
     except filelock.Timeout:
-        raise LockedError(
-            f"{folder} is in use by {_said(holder) or 'a process'}; wait until it ends, or stop it"
-        ) from None
+        user = _name_of(holder) or "a process"
+        raise LockedError(f"{folder} is in use by {user}; wait until it ends, or stop it") from None
     host = socket.gethostname()
-    if (last := _said(holder)) and not last.endswith(f" on {host}"):
-        text = f"{folder} was in use by {last} and not let go; see that it does not run any more"
+    if (last := _name_of(holder)) and not last.endswith(f" on {host}"):
+        text = (
+            f"{folder} was in use by {last} and not released; check that it does not run any more"
+        )
         warnings.warn(text, DataWarning, stacklevel=3)
     try:
         files.replace(holder, f"process {os.getpid()} on {host}")
@@ -46,7 +47,7 @@ def exclusive(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def _said(holder: Path) -> str:
+def _name_of(path: Path) -> str:
     with contextlib.suppress(OSError, UnicodeDecodeError):
-        return holder.read_text()
+        return path.read_text()
     return ""

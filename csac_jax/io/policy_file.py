@@ -1,8 +1,8 @@
 """A policy in a .safetensors file: its networks' variables and the config they were trained with.
 
-Nothing in such a file is executed. It holds a digest of all its content, and the versions that made
-it. Those of `SHIPPED` come with the package, see docs/policies.md. Their digests stand here, so
-that a replaced file is noticed.
+Nothing in such a file is executed. It holds a digest of its content, and the versions of the
+libraries that made it. Files of `SHIPPED` come with the package, see docs/policies.md. Their
+digests are here, which detects a replaced file.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ SHIPPED = {
     "shipped_target": _FOLDER / "target.safetensors",
 }
 _SHA256 = {
-    SHIPPED["shipped"]: "e5a7d1d90b63c40535493ad68819a33d5f97cac52b776f1cd5e9bb13a241bf0c",
+    SHIPPED["shipped"]: "28e4450df466158ece399eace4a792748c65f3d430210f145b6621c4d5344cd2",
     SHIPPED["shipped_camera"]: "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
     SHIPPED["shipped_clutter"]: "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
     SHIPPED["shipped_grippers"]: "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
@@ -42,11 +42,11 @@ _SHA256 = {
     SHIPPED["shipped_target"]: "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",
 }
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
-_GRIPPER = "gripper"  # remark of older files: the numbers of a gripper of one's own
+_GRIPPER = "gripper"  # remark of older files: the numbers of the user's own gripper
 
 
 class PolicyFileError(FailedError):
-    """A file that is no policy, or a damaged one; the message is one line with the remedy."""
+    """A file that is no policy or is damaged; the message is one line with the remedy."""
 
 
 def save(path: Path, params: Params, cfg: Config) -> None:
@@ -70,7 +70,7 @@ def check_finite(source: Any, params: Any) -> None:
 
 
 def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
-    """SHA-256 of a policy's content but the digest itself."""
+    """Returns the SHA-256 of a policy's content but the digest itself."""
     content = hashlib.sha256()
     for name in sorted(remarks.keys() - {_DIGEST}):
         content.update(f"{name}={remarks[name]}\n".encode())
@@ -81,7 +81,7 @@ def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
 
 
 def find(source: str | Path) -> Path:
-    """The policy file or run's folder that `source` names. Raises FileNotFoundError."""
+    """Returns the policy file or run folder that `source` names. Raises FileNotFoundError."""
     path = SHIPPED.get(str(source), Path(source))
     if not path.exists():
         known = ", ".join(SHIPPED)
@@ -92,7 +92,7 @@ def find(source: str | Path) -> Path:
 
 
 def is_policy(path: Path) -> bool:
-    """Whether a .safetensors file holds a config."""
+    """Returns whether a .safetensors file holds a config."""
     try:
         with safetensors.safe_open(path, "numpy") as file:
             return _CONFIG in (file.metadata() or {})
@@ -101,52 +101,68 @@ def is_policy(path: Path) -> bool:
 
 
 def load(path: Path) -> tuple[Config, Params]:
-    """Config and networks of a policy. Raises PolicyFileError for a file that is none, is damaged
-    or another version's. Warns of one without a digest, and of one by other versions."""
+    """Reads config and networks of a policy.
+
+    Raises PolicyFileError for a file that is no policy, is damaged or needs another version. Warns
+    of a file without a digest, and of one that other versions of the libraries made.
+    """
     ours = path in _SHA256
     if ours and hashlib.sha256(path.read_bytes()).hexdigest() != _SHA256[path]:
         raise PolicyFileError(f"{path} is not the file that this version ships; reinstall csac-jax")
+    remarks, tensors = _content(path)
+    if _DIGEST not in remarks:
+        text = f"{path} has no digest, so damage goes unseen; csac-jax export writes one"
+        warnings.warn(text, DataWarning, stacklevel=2)
+    elif remarks[_DIGEST] != _digest(remarks, tensors):
+        raise PolicyFileError(f"{path} is damaged: its digest differs; give another file")
+    cfg, versions = _config(path, remarks)
+    if not ours:
+        provenance.warn_if_other(versions, str(path))
+    return cfg, _params(path, cfg, tensors)
+
+
+def _content(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Returns remarks and tensors of a policy's file."""
     try:
         with safetensors.safe_open(path, "numpy") as file:
             remarks = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no dict
     except Exception as error:  # a damaged header raises nearly anything
-        raise PolicyFileError(
-            f"{path} cannot be read as .safetensors ({files.first_line(error)}); give another file"
-        ) from None
+        reason = files.first_line(error)
+        text = f"{path} cannot be read as .safetensors ({reason}); give another file"
+        raise PolicyFileError(text) from None
     if _CONFIG not in remarks:
-        raise PolicyFileError(
-            f"{path} holds no config: it is no policy; csac-jax export writes one"
-        )
-    if _DIGEST not in remarks and not ours:
-        text = f"{path} has no digest, so damage goes unseen; csac-jax export writes one"
-        warnings.warn(text, DataWarning, stacklevel=2)
-    elif not ours and remarks[_DIGEST] != _digest(remarks, tensors):
-        raise PolicyFileError(f"{path} is damaged: its digest differs; give another file")
+        text = f"{path} holds no config: it is no policy; csac-jax export writes one"
+        raise PolicyFileError(text)
+    return remarks, tensors
+
+
+def _config(path: Path, remarks: dict[str, str]) -> tuple[Config, Any]:
+    """Returns the config and the versions of the libraries that made the file."""
     try:
         cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG))
         if _GRIPPER in remarks:
             numbers = files.parse(remarks[_GRIPPER], _GRIPPER)
             gripper = grippers.from_numbers(Path(str(cfg.sim.gripper)), numbers)
             cfg = cfg.change(sim={"gripper": gripper})
-        made = files.parse(remarks.get(_VERSIONS, "{}"), _VERSIONS)
-        if not ours:
-            provenance.warn_if_other(made, str(path))
+        return cfg, files.parse(remarks.get(_VERSIONS, "{}"), _VERSIONS)
     except ValueError as error:
-        raise PolicyFileError(
-            f"{path} was made by another version of csac_jax ({error}); use that version"
-        ) from None
+        text = f"{path} was made by another version of csac_jax ({error}); use that version"
+        raise PolicyFileError(text) from None
+
+
+def _params(path: Path, cfg: Config, tensors: dict[str, np.ndarray]) -> Params:
+    """Returns the networks of a config from tensors by name."""
     try:
         blank = actor_critic.abstract_params(cfg)
     except Exception as error:  # sizes that no network can have
-        raise PolicyFileError(
-            f"{path} has a config without networks ({files.first_line(error)}); give another file"
-        ) from None
-    if found := leaves.difference(leaves.layout(tensors), leaves.layout(blank)):
-        name, has, asked = found
-        raise PolicyFileError(
-            f"{path} holds {name} as {has}, its config asks for {asked}; export it anew"
-        )
+        reason = files.first_line(error)
+        text = f"{path} has a config without networks ({reason}); give another file"
+        raise PolicyFileError(text) from None
+    if different := leaves.difference(leaves.layout(tensors), leaves.layout(blank)):
+        name, has, asked = different
+        text = f"{path} holds {name} as {has}, its config asks for {asked}; export it again"
+        raise PolicyFileError(text)
     check_finite(path, tensors)
     params = [tensors[name] for name in leaves.named(blank)]
-    return cfg, jax.tree.unflatten(jax.tree.structure(blank), params)
+    return jax.tree.unflatten(jax.tree.structure(blank), params)

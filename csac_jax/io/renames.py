@@ -1,9 +1,23 @@
-"""Names of older files: tables map an old name to the one of today.
+"""Names in stored files that have changed: each table maps an old name to the name of today.
 
-Format 1 is everything written before configs had a `format`; format 2 is today's.
+A config is renamed as it is read, see `configs.from_dict`; so are the values of `sweep --vary`.
 """
 
-FORMAT = 2
+from collections.abc import Mapping
+from typing import Any
+
+SETTINGS: dict[str, str | None] = {
+    "cem.std_estimator": None,
+    "learn.target_update_period": None,
+    "reward.distance_weight": None,
+    "reward.eta": None,
+    "target.samples": None,
+}
+"""Settings by their dotted names; None: the setting is gone, whatever its value."""
+
+VALUES: dict[str, dict[str, str]] = {}
+"""Values of a setting by its name of today. One that ends with a colon stands for all texts that
+begin with it."""
 
 METRICS = {
     "left": "blocks_lost",
@@ -15,73 +29,35 @@ METRICS = {
 }
 """Keys of metrics.jsonl and of results of `eval --json`, and the suite of that name."""
 
-STATE = {
-    "scenes.idle": "scenes.steps_without_change",
-    "scenes.noise": "scenes.noise_key",
-    "scenes.info.left": "scenes.info.blocks_lost",
-    "scenes.info.saturated": "scenes.info.contact_overflow",
-    "scenes.info.ill": "scenes.info.physics_diverged",
-}
+STATE: dict[str, str] = {}
 """Leaves of a checkpoint."""
 
-ADDED = ("scenes.failed_grasps",)
-"""Leaves that older checkpoints lack: they are 0 there."""
 
-SETTINGS = {
-    "learn.rate_end": "learn.lr_final_fraction",
-    "replay.beta_end": "replay.end",
-    "replay.beta_middle": "replay.middle",
-    "replay.beta_middle_at": "replay.middle_at",
-    "replay.beta_start": "replay.start",
-    "replay.beta_uniform_at": "replay.middle_at",
-    "replay.floor": "replay.per_epsilon",
-    "reward.distance": "reward.distance_weight",
-    "reward.farthest": "reward.distance_cap",
-    "reward.left": "reward.lost_block_penalty",
-    "reward.reach": "reward.success_bonus",
-    "task.max_idle": "task.max_steps_without_change",
-    "train.max_actions": "task.max_actions",
-    "train.max_idle": "task.max_steps_without_change",
-    "train.warmup": "train.learning_starts",
-}
-"""Settings of format 1; a number at the end is a place in a tuple."""
+def current(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the values of a stored config under the names of today."""
+    new = {name: dict(one) if isinstance(one, dict) else one for name, one in values.items()}
+    for old, name in SETTINGS.items():
+        section, _, field = old.partition(".")
+        if isinstance(new.get(section), dict) and field in new[section]:
+            value = new[section].pop(field)
+            if name is not None:
+                section, _, field = name.partition(".")
+                new.setdefault(section, {})[field] = value
+    for name, texts in VALUES.items():
+        section, _, field = name.partition(".")
+        if isinstance(new.get(section), dict) and field in new[section]:
+            new[section][field] = _current_value(texts, new[section][field])
+    return new
 
-_TUPLES = {
-    "explore.epsilon_primitive": ("primitive_start", "primitive_end"),
-    "explore.epsilon_place": ("place_start", "place_end"),
-    "replay.is_beta": ("weight_start", "weight_end"),
-    "reward.eta": ("eta0", "eta1"),
-    "reward.grasp_levels": ("nothing", "empty", "touched", "dropped", "lifted"),
-    "reward.push_levels": ("push_worse", "push_better"),
-    "scene.size_jitter": ("size_spread", "mesh_spread"),
-    "sensor.depth_noise": ("depth_floor", "depth_square"),
-    "sensor.pose_noise": ("position", "rotation"),
-}
-for name, items in _TUPLES.items():
-    section = name.split(".")[0]
-    SETTINGS |= {f"{section}.{item}": f"{name}.{place}" for place, item in enumerate(items)}
 
-GONE = {
-    "learn.augment_turn": 0.0,
-    "net.border": False,
-    "policy.mask": True,
-    "sim.clearance": 0.012,  # the gripper's now, as is the next
-    "sim.window": 0.02,
-}
-"""Settings of format 1 whose part is gone: a file must hold this value."""
+def current_setting(name: str, value: str) -> tuple[str, str]:
+    """Returns the name and the value of today of a varied setting."""
+    name = SETTINGS.get(name) or name
+    return name, _current_value(VALUES.get(name, {}), value)
 
-CONSTANTS = ("reward.eta", "reward.distance_weight", "net.block_layers")
-"""Settings of format 2 that are constants now: a file must hold their value."""
 
-DROPPED = (
-    "cem.spread",
-    "cem.std_estimator",
-    "target.samples",
-    "learn.copy_every",
-    "learn.target_update_period",
-)
-"""Settings that are no more, of which files may hold any values: a policy acts alike without."""
-
-ALGORITHMS = {"vpg": ("vpg_episodic", "bootstrap")}
-"""Algorithm that has changed -> its former name now, and the setting of `target` that files which
-mean the former one lack."""
+def _current_value(texts: Mapping[str, str], value: Any) -> Any:
+    for old, new in texts.items():
+        if value == old or (old[-1:] == ":" and isinstance(value, str) and value.startswith(old)):
+            return new + value[len(old) :]
+    return value

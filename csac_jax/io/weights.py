@@ -1,4 +1,4 @@
-"""Pretrained weights from a file that the user brings."""
+"""Pretrained weights from a user's file."""
 
 from pathlib import Path
 from typing import Any
@@ -6,22 +6,23 @@ from typing import Any
 import safetensors.numpy
 
 from csac_jax.config import DenseNet121
+from csac_jax.errors import SettingsError
 from csac_jax.io import files
 from csac_jax.nets import torchvision
 
 
 def read(cfg: DenseNet121, path: Path) -> Any:
-    """Variables of a trunk from a file with torchvision's names; nothing in it is executed.
+    """Reads a trunk's variables from a file with torchvision's names. Executes nothing.
 
-    Raises ValueError in one line, naming the tensor if one is missing, extra or misshapen.
+    Raises SettingsError, one line that names a missing, extra or misshapen tensor.
     """
     try:
         tensors = safetensors.numpy.load_file(path)
     except Exception as error:  # KeyError for a type that NumPy lacks, others for a damaged header
-        raise ValueError(
+        raise SettingsError(
             f"{path} cannot be read as .safetensors ({files.first_line(error)}); give another file"
         ) from None
     try:
         return torchvision.variables(cfg, tensors)
     except ValueError as error:
-        raise ValueError(f"in {path}, {error}; bring torchvision's densenet121") from error
+        raise SettingsError(f"in {path}, {error}; give torchvision's densenet121") from error

@@ -303,7 +303,8 @@ def _variant(path: Path, config: Json) -> Variant:
 
 def variant(config: Json) -> Variant:
     """What a recorded config is a variant of. Settings that the config lacks are passed over."""
-    preset, algo = config.get("preset", ""), configs.algorithm(config)
+    config = renames.current(config)
+    preset, algo = config.get("preset", ""), config.get("algo", "csac_beta")
     base: Json = {}
     with contextlib.suppress(ValueError):  # a name that is no more
         base = _preset_settings(preset, algo)

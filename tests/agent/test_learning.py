@@ -87,7 +87,6 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
         pytest.param("csac_per", 2.0, marks=SLOW),
         pytest.param("csac_beta", 2.0, marks=SLOW),
         pytest.param("vpg", 2.0, marks=SLOW),
-        pytest.param("vpg_episodic", 1.0, marks=SLOW),
         pytest.param("reactive", 1.0, marks=SLOW),
         pytest.param("grasp_only", 1.0, marks=SLOW),
     ],
@@ -108,14 +107,13 @@ def test_bandit_is_solved(algo, value):
         pytest.param("csac_per", 1.2, 1.6, marks=SLOW),
         pytest.param("csac_beta", 1.2, 1.6, marks=SLOW),
         pytest.param("vpg", 1.25, 1.4, marks=SLOW),
-        pytest.param("vpg_episodic", 0.9, 1.1, marks=SLOW),
     ],
 )
 def test_two_steps_are_learned(algo, low, high):
     """Claim: a push that makes the only grasp possible is learned, then that grasp, in two actions.
 
     The push is worth r + gamma V': CSAC 0.5 + 0.5 softmax, at most 1.5, as the softmax is at most
-    2; VPG 0.5 + 0.5 (1 + 0.5 V), which is V = 4 / 3, or 0.5 + 0.5 where the episode ends.
+    2; VPG 0.5 + 0.5 (1 + 0.5 V), which is V = 4 / 3.
     """
     learned = learn(toys.two_step, algo, actions=1600, cap=CAP)
     assert learned.success >= 0.98
@@ -140,12 +138,11 @@ def test_grasping_alone_fails():
         pytest.param("reactive", None, 0.5, True, marks=SLOW),
         pytest.param("reactive", -0.2, 0.0, False, marks=SLOW),
         pytest.param("vpg", -0.2, 0.533, True, marks=SLOW),
-        pytest.param("vpg_episodic", -0.2, 0.4, True, marks=SLOW),
     ],
 )
 def test_without_a_future_a_push_must_pay_by_itself(algo, push, value, solves):
     """Claim: with gamma = 0 the push is made if it earns 0.5 at once, and not if it costs 0.1; a
-    gamma of 0.5 pays for it: -0.1 + 0.5, or V = -0.1 + 0.5 (1 + 0.5 V)."""
+    gamma of 0.5 pays for it: V = -0.1 + 0.5 (1 + 0.5 V)."""
     learned = learn(toys.two_step, algo, actions=1200, cap=CAP, push=push)
     assert learned.success >= 0.98 if solves else learned.success == 0.0
     assert_allclose(learned.value, value, atol=0.1)

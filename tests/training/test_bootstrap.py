@@ -58,13 +58,6 @@ def values(algo: str) -> np.ndarray:
     return q[1:]
 
 
-def test_former_rule_pushes_the_last_block():
-    """Claim: where the last grasp has no future, the optimal action on the last block is a push, on
-    and on: 1 / (1 - 0.5) of 0.5, against 0.94 + 0.06 x 0.5."""
-    push, grasp = values("vpg_episodic")[0]
-    np.testing.assert_allclose([push, grasp], [1.0, 0.97], atol=1e-5)
-
-
 def test_vpgs_rule_grasps_the_last_block():
     """Claim: where the last grasp bootstraps from the fresh scene and a failed one from nothing,
     the optimal action is a grasp with any number of blocks: V = 0.94 (1 + 0.5 V)."""
@@ -89,10 +82,10 @@ def test_episode_that_is_cut_off_goes_on(bootstrap):
 
 @pytest.mark.slow
 @pytest.mark.optax
-@pytest.mark.parametrize(("algo", "follows"), [("vpg", True), ("vpg_episodic", False)])
+@pytest.mark.parametrize(("algo", "follows"), [("vpg", True), ("csac", False)])
 def test_step_stores_what_is_acted_in_next(algo, follows):
     """Claim: by VPG's rule a stored action of an episode that ends is followed by the observation
-    that the next action was taken in, by the former rule by the last of its own."""
+    that the next action was taken in, by CSAC's rule by the last of its own."""
     cfg = toys.config(algo, actions=96, max_actions=4)
     program = programs.make(cfg, env=toys.bandit(cfg))
     state, metrics = programs.compile_chunk(program, cfg.train.steps)(programs.init(program))
