@@ -1,4 +1,4 @@
-"""A gripper whose opening and fingers differ in every episode, and what knows of them."""
+"""A gripper whose opening and fingers differ in every episode."""
 
 import dataclasses
 import functools
@@ -66,8 +66,8 @@ def _fields(world: model.World, fingers: Fingers) -> model.BlockFields:
 
 
 def test_every_episode_has_its_own(env: Env, states: State):
-    """Claim: fingers of an episode lie within the gripper's ranges and fill them, no two episodes
-    have the same, and the net is shown them; a gripper without ranges has one kind."""
+    """Claim: fingers of episodes fill the gripper's ranges, all differ, and are observed; a gripper
+    without ranges has one kind."""
     drawn = np.stack(states.scene.fingers, axis=1)
     low, high = (np.array(ends, np.float32) for ends in VARIED.varies)
     assert (drawn >= low).all()
@@ -87,8 +87,8 @@ def test_every_episode_has_its_own(env: Env, states: State):
 @pytest.mark.slow
 @pytest.mark.mjx
 def test_fingers_stay_for_the_episode(env: Env, states: State):
-    """Claim: a step keeps the fingers, also where physics fails; the next episode has others; and a
-    scene that is given has the largest, or those that it comes with."""
+    """Claim: a step keeps the fingers, also where physics fails; the next episode has others; a
+    given scene has its own, or the largest."""
     first = jax.tree.map(lambda leaf: leaf[0], states)
     spoilt = first.replace(obs=first.obs.replace(height=first.obs.height.at[0, 0].set(jnp.nan)))
     step = jax.jit(env.step)
@@ -125,8 +125,8 @@ def test_wrong_ranges_are_one_line(tmp_path: Path, varies: Any, line: str):
 
 @pytest.mark.parametrize("fingers", [THIN, VARIED.fingers, VARIED.varies[0]])
 def test_pads_in_mujoco(fingers: Fingers):
-    """Claim: in C MuJoCo, opened as a grasp begins, the pads' inner faces are the opening apart.
-    The pads are as thick and wide as the fingers, and their bounding spheres hold them."""
+    """Claim: in C MuJoCo, at a grasp's start, the pads' inner faces are the opening apart; pads and
+    their bounding spheres have the fingers' sizes."""
     world = model.build(CONFIG.scene, CONFIG.sim)
     own = model.with_blocks(world, _fields(world, fingers))
     data = mujoco.MjData(own)
@@ -155,9 +155,8 @@ def test_hand_opens_as_far_as_the_fingers():
     assert plan.start[4] == plan.control[:, 4].max() == np.float32(0.04)
     assert plan.control[-1, 4] == 0.0
     assert _plan(None).start[4] == np.float32(0.07)
-    push = primitives.plan(
-        CONFIG.sim, CONFIG.heightmap, jnp.zeros((32, 32)), Action.push(0.0, 0.0, 0.0), THIN
-    )
+    bare, action = jnp.zeros((32, 32)), Action.push(0.0, 0.0, 0.0)
+    push = primitives.plan(CONFIG.sim, CONFIG.heightmap, bare, action, THIN)
     assert push.control[:, 4].max() == 0.0
 
 
@@ -188,9 +187,8 @@ def test_oracle_takes_what_fits(env: Env):
     """Claim: the planner takes the high block if narrower than the opening, else the low one."""
     half = jnp.array([[0.026, 0.026, 0.06], [0.025, 0.025, 0.02], [0.02, 0.02, 0.02]])
     position = jnp.array([[-0.08, 0.0, 0.06], [0.08, 0.0, 0.02], [3.6, 0.0, 1.0]])
-    scene = _scene().replace(
-        half_size=half, position=position, in_play=jnp.array([True, True, False])
-    )
+    here = jnp.array([True, True, False])
+    scene = _scene().replace(half_size=half, position=position, in_play=here)
     for opening, x in ((0.073, -0.08), (0.071, 0.08)):
         own = scene.replace(fingers=Fingers(jnp.float32(opening), *scene.fingers[1:]))
         taken = oracle.grasp(CONFIG, own, env.reset_to(own).obs.height)
@@ -210,9 +208,8 @@ def test_net_sees_the_fingers(states: State):
 
 
 def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State):
-    """Claim: networks that see no gripper, or no gripper and no target, go on from what they know:
-    Q is the same for all fingers until they learn. Refused are those that lack another input than
-    the last: a policy that sees a target and no gripper, and one that sees no colours."""
+    """Claim: networks without the last inputs, gripper and target, are a start: Q is the same for
+    all fingers. Those that lack another input are refused."""
     blind = presets.smoke().change(sim={"physics": "c"})
     params = _networks(blind)
     path = tmp_path / "policy.safetensors"
@@ -261,8 +258,8 @@ def test_gymnasium_shows_the_fingers(monkeypatch: pytest.MonkeyPatch, env: Env):
 
 @pytest.mark.mjx
 def test_robot_has_one_gripper(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Claim: a policy for any gripper can be exported as it is. What decides for a robot, or is a
-    program, asks which gripper that has, in one line."""
+    """Claim: a policy for any gripper is exported as it is; a program, or a decision for a robot,
+    asks for its gripper in one line."""
     path, program_file = tmp_path / "policy.safetensors", tmp_path / "program.onnx"
     policy_file.save(path, _networks(CONFIG), CONFIG)
     assert main(["export", str(path), str(tmp_path / "copy.safetensors")]) == 0

@@ -45,14 +45,13 @@ def test_gap_is_the_inverse_of_the_joints(name: str, xp: Any):
     """Claim: joints and actuator follow the opening; the first joint gives the gap back."""
     gripper = grippers.load(name)
     half = xp.linspace(*gripper.half, 50)
-    for joint, (closed, opened) in zip(
-        gripper.joint_positions(half, xp), gripper.positions, strict=True
-    ):
+    joints = gripper.joint_positions(half, xp)
+    for joint, (closed, opened) in zip(joints, gripper.positions, strict=True):
         np.testing.assert_allclose([joint[0], joint[-1]], [closed, opened], atol=1e-6)
         assert (np.diff(joint) * np.sign(opened - closed) > 0.0).all()
     ends = gripper.set_point(half, xp)
     np.testing.assert_allclose([ends[0], ends[-1]], gripper.set_points, atol=1e-6)
-    gap = gripper.gap(gripper.joint_positions(half, xp)[0], xp)
+    gap = gripper.gap(joints[0], xp)
     np.testing.assert_allclose(gap, 2.0 * half - gripper.opening[0], atol=1e-6)
 
 
@@ -128,9 +127,8 @@ def test_files_that_are_no_numbers_are_refused(tmp_path: Path, text: str):
 @pytest.mark.parametrize("source", ["rg3", "", "/nowhere", "a\nb"])
 def test_no_gripper_is_one_line(source: str):
     """Claim: a name without a gripper says which there are."""
-    with pytest.raises(
-        SettingsError, match="neither one of 2f85, franka_hand, rg2, varied nor a folder"
-    ):
+    message = "neither one of 2f85, franka_hand, rg2, varied nor a folder"
+    with pytest.raises(SettingsError, match=message):
         grippers.load(source)
 
 

@@ -30,8 +30,8 @@ def _decision(x: float = 0.4) -> dict[str, Any]:
 
 
 class FakeArm:
-    """Both interfaces of an arm. A move begins late: its progress is at first that of the one
-    before, then 0, then another negative number. `contact` numbers a move at which force jumps."""
+    """Both interfaces of an arm. A move begins late: its progress is first that of the last move,
+    then 0, then another negative number. At the move `contact` force jumps."""
 
     def __init__(self, contact: int | None = None) -> None:
         self.log: list[Any] = []
@@ -74,25 +74,19 @@ def test_set_points_are_the_tool_s_poses():
         np.testing.assert_allclose(turned, tool[:3, :3], atol=1e-9)
 
 
-@pytest.mark.parametrize("x", [2.0, float("nan")])
-def test_pose_out_of_reach_is_refused(x: float):
-    """Claim: nothing moves if one set-point is out of reach or no number."""
-    arm = FakeArm()
-    with pytest.raises(ValueError, match="out of reach, or lower than"):
-        UR["execute"](arm, arm, arm.gripper, _decision(x), ARGS)
-    assert arm.log == []
-
-
-def test_low_or_unsafe_pose_is_refused():
-    """Claim: so it is below the lowest height, and outside of the controller's limits."""
-    arm = FakeArm()
-    low = SimpleNamespace(**{**vars(ARGS), "lowest": 0.15})
-    with pytest.raises(ValueError, match=r"lower than 0\.15 m"):
-        UR["execute"](arm, arm, arm.gripper, _decision(), low)
-    high = _decision()
+def test_pose_out_of_reach_is_refused():
+    """Claim: nothing moves if a set-point is no number, out of reach, too low, or unsafe."""
+    arm, low, high = FakeArm(), SimpleNamespace(**{**vars(ARGS), "lowest": 0.15}), _decision()
     high["waypoints"][0]["tool"][2][3] = 0.6
-    with pytest.raises(ValueError, match="safety limits"):
-        UR["execute"](arm, arm, arm.gripper, high, ARGS)
+    cases = [
+        (_decision(2.0), ARGS, "out of reach, or lower than"),
+        (_decision(float("nan")), ARGS, "out of reach, or lower than"),
+        (_decision(), low, r"lower than 0\.15 m"),
+        (high, ARGS, "safety limits"),
+    ]
+    for decision, arguments, message in cases:
+        with pytest.raises(ValueError, match=message):
+            UR["execute"](arm, arm, arm.gripper, decision, arguments)
     assert arm.log == []
 
 
@@ -153,15 +147,13 @@ def test_ros_images():
 
 def test_ros_camera_and_transform():
     """Claim: camera_info and transform become what `CameraPolicy.decide` takes."""
-    info = SimpleNamespace(
-        k=[600, 0, 320, 0, 610, 240, 0, 0, 1], d=[0.1] * 5, width=640, height=480
-    )
+    matrix = [600, 0, 320, 0, 610, 240, 0, 0, 1]
+    info = SimpleNamespace(k=matrix, d=[0.1] * 5, width=640, height=480)
     camera = csac_jax.deploy.images.Intrinsics.of(ROS["intrinsics"](info))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (600, 610, 320, 240)
     assert camera.distortion == (0.1,) * 5
     half = float(np.sqrt(0.5))
     turn = SimpleNamespace(x=0.0, y=0.0, z=half, w=half)  # 90 degrees about z
-    pose = ROS["matrix"](
-        SimpleNamespace(rotation=turn, translation=SimpleNamespace(x=1.0, y=2.0, z=3.0))
-    )
+    move = SimpleNamespace(x=1.0, y=2.0, z=3.0)
+    pose = ROS["matrix"](SimpleNamespace(rotation=turn, translation=move))
     np.testing.assert_allclose(pose @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-9)

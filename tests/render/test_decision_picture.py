@@ -33,8 +33,8 @@ def _picture(action: csac_jax.Action) -> np.ndarray:
 
 
 def test_grasp_is_drawn_where_it_is():
-    """Claim: a grasp at y = +0.1 m lies left of the image's middle, one at y = -0.1 m right of it,
-    since the camera looks along x; in pixels at their projections, 70 px either side."""
+    """Claim: grasps at y = 0.1 and -0.1 m are drawn at their projections, left and right of the
+    image's middle: the camera looks along x."""
     middle = [_coloured(_picture(csac_jax.Action.grasp(0.0, y, 0.0)))[:, 0] for y in (0.1, -0.1)]
     left, right = (np.median(columns) for columns in middle)
     pixel, _ = VIEW.project(np.array([[0.0, 0.1, 0.015], [0.0, -0.1, 0.015]]))

@@ -1,6 +1,5 @@
 """`csac-jax play` from the arguments to the files, with our rays."""
 
-import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,12 +16,8 @@ from csac_jax.scene import layout
 
 pytestmark = pytest.mark.mjx
 
-CUBE = {
-    "shape": "cube",
-    "colour": "red",
-    "position": [0.05, 0.0, 0.025],
-    "quaternion": [1, 0, 0, 0],
-}
+PLACE = {"position": [0.05, 0.0, 0.025], "quaternion": [1, 0, 0, 0]}
+CUBE = {"shape": "cube", "colour": "red", **PLACE}
 
 
 @pytest.fixture
@@ -44,21 +39,15 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
     assert "lifted (red); reward +1.00; 0 blocks left" in lines[0]
     assert lines[1] == "the table is clear after 1 action: 1 block taken"
     result = json.loads((here / "a" / "b.json").read_text())
-    assert (result["actions"], result["cleared"], result["completed"], result["renderer"]) == (
-        1,
-        1,
-        True,
-        "rays",
-    )
-    assert result["blocks_lost"] == 0
+    wanted = {"actions": 1, "cleared": 1, "completed": True, "renderer": "rays", "blocks_lost": 0}
+    assert result == result | wanted
     # 4 ms a substep, 25 a second
     assert imageio_ffmpeg.count_frames_and_secs("a/b.mp4")[0] == 1 + 190 // 10 + episode.HOLD
     frames = imageio_ffmpeg.read_frames("a/b.mp4")
     width, height = next(frames)["size"]
     assert (width, height) == (96 + 56, 64 + 4)  # the height map to the right, text below
-    pictures = [
-        np.frombuffer(frame, np.uint8).reshape(height, width, 3)[:64, :96] for frame in frames
-    ]
+    flat = (np.frombuffer(frame, np.uint8) for frame in frames)
+    pictures = [frame.reshape(height, width, 3)[:64, :96] for frame in flat]
     red = [np.argwhere(_is_red(image)) for image in pictures]
     row = [places[:, 0].mean() for places in red]
     assert row[-1] < row[0] - 5  # the cube is seen to rise
@@ -75,39 +64,31 @@ def _step(
     failed: int = 0,
 ) -> Any:
     """The parts of a step that an episode's summary reads."""
-    info = SimpleNamespace(
-        cleared=cleared, blocks_lost=blocks_lost, physics_diverged=np.bool_(diverged)
-    )
-    after = SimpleNamespace(
-        info=info,
-        terminated=np.bool_(terminated),
-        reward=reward,
-        scene=SimpleNamespace(target=target),
-        actions=np.int32(actions),
-        failed_grasps=np.int32(failed),
-    )
-    return SimpleNamespace(after=after)
+    info = {"cleared": cleared, "blocks_lost": blocks_lost, "physics_diverged": np.bool_(diverged)}
+    counts = {"actions": np.int32(actions), "failed_grasps": np.int32(failed)}
+    after = {"info": SimpleNamespace(**info), "terminated": np.bool_(terminated), **counts}
+    scene = SimpleNamespace(target=target)
+    return SimpleNamespace(after=SimpleNamespace(**after, reward=reward, scene=scene))
+
+
+DONE, LOST = _step(cleared=1, terminated=True), "1 block left the workspace"
 
 
 @pytest.mark.parametrize(
     ("steps", "said"),
     [
-        (
-            [_step(cleared=2), _step(cleared=1, terminated=True)],
-            "the table is clear after 2 actions: 3 blocks taken",
-        ),
+        ([_step(cleared=2), DONE], "the table is clear after 2 actions: 3 blocks taken"),
         (
             [_step(blocks_lost=1, terminated=True)],
-            "no block is left within reach after 1 action: "
-            "0 blocks taken, 1 block left the workspace",
+            f"no block is left within reach after 1 action: 0 blocks taken, {LOST}",
         ),
         (
             [_step(blocks_lost=1), _step(cleared=1, reward=1.0, target=0, terminated=True)],
-            "the target is taken after 2 actions: 1 block taken, 1 block left the workspace",
+            f"the target is taken after 2 actions: 1 block taken, {LOST}",
         ),
         (
             [_step(blocks_lost=1, target=0, terminated=True)],
-            "the target is lost after 1 action: 0 blocks taken, 1 block left the workspace",
+            f"the target is lost after 1 action: 0 blocks taken, {LOST}",
         ),
         ([_step(actions=30)], "stopped at the action limit after 1 action: 0 blocks taken"),
         ([_step()], "stopped since nothing changed any more after 1 action: 0 blocks taken"),
@@ -117,9 +98,7 @@ def _step(
 )
 def test_summary_says_what_became_of_the_blocks(steps: list[Any], said: str):
     """Claim: the last line of an episode tells blocks taken from blocks lost, and why it ended."""
-    cfg = presets.smoke()
-    task = dataclasses.replace(cfg.task, max_actions=30)
-    env = Env(dataclasses.replace(cfg, task=task), None, None, max_failures=2)
+    env = Env(presets.smoke().change(task={"max_actions": 30}), None, None, max_failures=2)
     assert episode.summary(env, steps) == said
     taken = ("the table is clear", "the target is taken")
     assert episode.completed(steps) == said.startswith(taken)
@@ -156,9 +135,7 @@ def test_bad_arguments_are_one_line(
     assert captured.out == ""
 
 
-def test_video_without_the_extra_names_it(
-    here, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-):
+def test_video_without_the_extra_names_it(here, capsys, monkeypatch: pytest.MonkeyPatch):
     """Claim: without ffmpeg's wheel, --video says how to get it, before simulating."""
     import importlib.util
 

@@ -34,7 +34,7 @@ def test_png_is_what_was_drawn(tmp_path: Path):
 
 @pytest.mark.parametrize("suffix", media.VIDEOS)
 def test_video_has_every_picture(tmp_path: Path, suffix: str):
-    """Claim: a video has every picture, its size and about its colour, without warnings."""
+    """Claim: a video has every picture, its size and about its colour, 25 a second; no warnings."""
     path = tmp_path / "new" / f"a{suffix}"
     jax.devices()  # warns of forks from now on
     with warnings.catch_warnings(record=True) as complaints:
@@ -46,37 +46,26 @@ def test_video_has_every_picture(tmp_path: Path, suffix: str):
     for shade, frame in zip(SHADES, frames, strict=True):
         assert frame.shape[:2] == (48, 34)
         assert np.abs(frame[..., :3].astype(int) - shade).mean() < 6
+    assert _seconds(path) == pytest.approx(len(SHADES) / 25, abs=0.01)
 
 
-@pytest.mark.parametrize("suffix", media.VIDEOS)
-def test_video_runs_at_25_pictures_a_second(tmp_path: Path, suffix: str):
-    """Claim: a second of video is 25 pictures."""
-    path = tmp_path / f"a{suffix}"
-    media.write_video(path, (np.full((16, 16, 3), shade, np.uint8) for shade in SHADES))
-    if suffix in media.FILMS:
-        _, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
-        assert seconds == pytest.approx(len(SHADES) / 25, abs=0.01)
-        return
+def _seconds(path: Path) -> float:
+    if path.suffix in media.FILMS:
+        return imageio_ffmpeg.count_frames_and_secs(str(path))[1]
+    total = 0
     with Image.open(path) as image:
-        durations = []
         for number in range(len(SHADES)):
             image.seek(number)
             image.load()
-            durations.append(image.info["duration"])
-    assert durations == [40] * len(SHADES)  # ms
+            total += image.info["duration"]  # ms
+    return 1e-3 * total
 
 
-@pytest.mark.parametrize("name", ["a.txt", "a", "a.mp4", "a.bmp"])
-def test_unknown_picture_format_names_those_that_work(tmp_path: Path, name: str):
+@pytest.mark.parametrize("name", ["a.txt", "a", "a.bmp"])
+def test_unknown_format_names_those_that_work(tmp_path: Path, name: str):
     """Claim: another suffix is one line that names the formats, and writes nothing."""
     with pytest.raises(ValueError, match=r"its name must end in one of: \.png, \.jpg, .*\.gif$"):
         media.write_picture(tmp_path / name, np.zeros((4, 4, 3), np.uint8))
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["a.txt", "a", "a.png"])
-def test_unknown_video_format_names_those_that_work(tmp_path: Path, name: str):
-    """Claim: another suffix is one line that names the formats, and writes nothing."""
     with pytest.raises(ValueError, match=r"its name must end in one of: \.mp4, .*\.webp$"):
         media.write_video(tmp_path / name, iter([np.zeros((4, 4, 3), np.uint8)]))
     assert not list(tmp_path.iterdir())

@@ -22,8 +22,8 @@ HIGHEST = to_hex(colormaps["viridis"](1.0))
 
 
 def _step(primitive: int, pose: tuple[float, float, float], learned: bool) -> SimpleNamespace:
-    """A block at x 0.1, y -0.15 m; Q of pushes highest at x -0.1, y 0.1 m; push candidates at
-    x 0.15, y 0.15 m, grasp candidates at x -0.15, y 0.15 m."""
+    """A block at (0.1, -0.15) m; Q of pushes highest at (-0.1, 0.1) m; push candidates at
+    (0.15, 0.15) m, grasp candidates at (-0.15, 0.15) m."""
     height, q = np.zeros((SIZE, SIZE)), np.full((2, SIZE, SIZE), -np.inf)
     row, col = _cell(0.1, -0.15)
     height[row - 1 : row + 2, col - 1 : col + 2] = 0.1
@@ -73,9 +73,8 @@ def test_height_map_and_grasp_lie_where_they_are():
     colours, places = _drawn(fig, _map(fig, "Height map"))
     inner = np.abs(places).max(axis=1) < 0.215  # without the frame
     dark = inner & (colours.max(axis=1) < 100)
-    np.testing.assert_allclose(
-        places[dark].mean(axis=0), [0.1, -0.15], atol=0.5 * CFG.heightmap.cell
-    )
+    block = places[dark].mean(axis=0)
+    np.testing.assert_allclose(block, [0.1, -0.15], atol=0.5 * CFG.heightmap.cell)
     hand = _places(fig, "Height map", heatmaps.CHOSEN)
     np.testing.assert_allclose(hand.mean(axis=0), [-0.1, 0.05], atol=0.003)
     width, height = np.ptp(hand, axis=0)
@@ -102,6 +101,10 @@ def test_learned_policy_shows_its_maps():
     assert not len(_places(fig, "Grasp value, best +0.00", HIGHEST))
     invalid = np.abs(_places(fig, "Push value", heatmaps.INVALID)).max(axis=1)
     assert invalid.min() == pytest.approx((0.5 * SIZE - 4) * CFG.heightmap.cell, abs=0.003)
+    step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True)
+    step.debug.q[:] = -np.inf
+    nowhere = panels.figure(CFG, step, HEIGHT)
+    assert len(_places(nowhere, "Push value, nowhere", heatmaps.INVALID)) > 20000
     for primitive, x in ((Primitive.PUSH, 0.15), (Primitive.GRASP, -0.15)):
         places = _places(fig, "Height map", panels.CANDIDATES[primitive])
         np.testing.assert_allclose(places.mean(axis=0), [x, 0.15], atol=0.003)
@@ -155,11 +158,3 @@ def test_panels_are_drawn_once(monkeypatch: pytest.MonkeyPatch):
     for shade in range(5):
         assert complete(np.full((120, 160, 3), shade, np.uint8), "push")[0, 0, 0] == shade
     assert len(drawn) == 2  # panels and text
-
-
-def test_nothing_to_act_on():
-    """Claim: Q maps without a valid cell are drawn, too."""
-    step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True)
-    step.debug.q[:] = -np.inf
-    fig = panels.figure(CFG, step, HEIGHT)
-    assert len(_places(fig, "Push value, nowhere", heatmaps.INVALID)) > 20000

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -51,7 +50,8 @@ def test_rays_show_what_stands_where():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     drawn = picture.renderer(model, VIEW, None)(data)
-    assert (drawn.shape, drawn.dtype) == ((64, 96, 3), np.uint8)
+    assert (type(drawn), drawn.shape, drawn.dtype) == (np.ndarray, (64, 96, 3), np.uint8)
+    assert drawn[-1].min() > 80  # the floor, whatever its colour in the model
     red, green = (_where(drawn, channel) for channel in (0, 1))
     assert green[1] < 48 < red[1]  # y > 0 is left for who looks along x
     assert green[0] < red[0]  # the taller one
@@ -67,9 +67,8 @@ def _where(drawn: np.ndarray, channel: int) -> np.ndarray:
 
 def test_both_ways_of_drawing_agree():
     """Claim: MuJoCo's renderer and our rays show the same to the pixel, under a white sky."""
-    done = subprocess.run(
-        [sys.executable, "-c", _BOTH], capture_output=True, text=True, timeout=300
-    )
+    command = [sys.executable, "-c", _BOTH]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     if done.returncode == 3:
         pytest.skip("no OpenGL here")
     assert done.returncode == 0, done.stderr
@@ -91,19 +90,17 @@ def test_broken_opengl_gives_way_to_rays(monkeypatch: pytest.MonkeyPatch):
     assert picture.renderer(model, VIEW, "egl")(mujoco.MjData(model)).shape == (64, 96, 3)
 
 
-@pytest.mark.parametrize(
-    ("given", "working", "chosen"),
-    [
-        (None, ("egl", "osmesa"), "egl"),
-        (None, ("osmesa",), "osmesa"),
-        (None, (), None),
-        ("glfw", ("egl",), "glfw"),
-        ("off", ("egl",), None),
-    ],
-)
-def test_choice_of_opengl(
-    monkeypatch: pytest.MonkeyPatch, given: str | None, working: tuple, chosen: str | None
-):
+CHOICES = [  # what is set, what works, what is chosen
+    (None, ("egl", "osmesa"), "egl"),
+    (None, ("osmesa",), "osmesa"),
+    (None, (), None),
+    ("glfw", ("egl",), "glfw"),
+    ("off", ("egl",), None),
+]
+
+
+@pytest.mark.parametrize(("given", "working", "chosen"), CHOICES)
+def test_choice_of_opengl(monkeypatch: pytest.MonkeyPatch, given, working, chosen):
     """Claim: EGL is tried first, then OSMesa; what the user has set stands."""
     monkeypatch.delenv(gl.VARIABLE, raising=False)
     if given is not None:
@@ -116,17 +113,3 @@ def test_choice_of_opengl(
 def test_probe_fails_on_a_backend_that_is_none():
     """Claim: the probe tells a backend that does not draw."""
     assert not gl._draws("nonsense")
-
-
-def test_no_image_is_kept_on_the_device():
-    """Claim: pictures are NumPy arrays."""
-    model = mujoco.MjModel.from_xml_string(BALL)
-    assert not isinstance(picture.renderer(model, VIEW, None)(mujoco.MjData(model)), jax.Array)
-
-
-def test_floor_is_light():
-    """Claim: the floor is drawn light, whatever its colour in the model."""
-    model = mujoco.MjModel.from_xml_string(BALL)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert picture.renderer(model, VIEW, None)(data)[-1].min() > 80

@@ -5,13 +5,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import geometry
 from csac_jax.constants import Primitive
 from csac_jax.deploy import decision
 from csac_jax.deploy.decision_program import Choice, stations
@@ -30,15 +30,9 @@ def _rays() -> tuple[np.ndarray, np.ndarray]:
     """Depth [h, w] m, 0 where nothing is hit, and colour [h, w, 3] of the same scene."""
     scene = jax.tree.map(jnp.asarray, draw_rgbd.scene())
     slot = blocks.parts(CFG.scene.slots).slot
-    shapes = raycast.Polytopes(
-        *blocks.half_spaces(CFG.scene.slots, scene.half_size),
-        scene.position[slot],
-        jax.vmap(geometry.quat_to_matrix)(scene.quaternion)[slot],
-        jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
-    )
-    hits = jax.jit(camera.cast_rays, static_argnums=1)(
-        draw_rgbd.eye(), raycast.cast_polytopes, shapes
-    )
+    shapes = observe.polytopes(CFG.scene.slots, scene)
+    cast = jax.jit(camera.cast_rays, static_argnums=1)
+    hits = cast(draw_rgbd.eye(), raycast.cast_polytopes, shapes)
     lit = observe.surface_tables(shapes, jnp.ones(len(slot), bool)).colour[hits.surface]
     return np.where(hits.valid, hits.distance, 0.0), np.asarray(lit)
 
@@ -54,9 +48,8 @@ def _drawn(out: Path) -> np.lib.npyio.NpzFile:
 
 
 def test_image_agrees_with_rays(tmp_path: Path):
-    """Claim: with an axis off the middle and pixels that are not square, depths are those of our
-    rays to 2 mm in all but one in a thousand pixels, the robot is not seen, and blocks have their
-    hues."""
+    """Claim: off the middle, with pixels that are not square, depths are our rays' to 2 mm in all
+    but 1 of 1,000 pixels, without the robot, and blocks have their hues."""
     drawn = _drawn(tmp_path / "image.npz")
     depth, lit = _rays()
     both = (depth > 0) & (drawn["depth"] > 0)
@@ -81,16 +74,22 @@ def test_waypoints_are_followed_as_planned(primitive: Primitive):
     np.testing.assert_allclose(found, wanted, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_bench_finetune():
-    """Claim: the benchmark records grasps of another gripper, learns from them and compares."""
-    flags = ["--seeds", "1", "--grasps", "12", "--updates", "10", "--batch", "2", "--episodes", "1"]
-    command = [sys.executable, "-m", "csac_jax", "bench", "finetune", *flags]
+def _bench(name: str, *flags: str) -> Any:
+    """A benchmark's JSON; skips without OpenGL."""
+    command = [sys.executable, "-m", "csac_jax", "bench", name, *flags]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     if "OpenGL" in done.stderr:
         pytest.skip("OpenGL works neither by EGL nor by OSMesa")
     assert done.returncode == 0, done.stderr
-    (seed,) = json.loads(done.stdout)["seeds"]
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_bench_finetune():
+    """Claim: the benchmark records grasps of another gripper, learns from them and compares."""
+    given = "--seeds 1 --grasps 12 --updates 10 --batch 2 --episodes 1"
+    done = _bench("finetune", *given.split())
+    (seed,) = done["seeds"]
     assert seed["recorded"]["grasps"] >= 12
     assert seed["learned"]["actions"] >= 12
     assert seed["learned"]["lifted"] == seed["recorded"]["lifted"]
@@ -101,13 +100,7 @@ def test_bench_finetune():
 @pytest.mark.slow
 def test_closed_loop():
     """Claim: the benchmark counts grasps, lifts and refusals, clean and with noise, as JSON."""
-    flags = ["--episodes", "1", "--robot", "hand"]
-    command = [sys.executable, "-m", "csac_jax", "bench", "closed_loop", *flags]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
-    if "OpenGL" in done.stderr:
-        pytest.skip("OpenGL works neither by EGL nor by OSMesa")
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    found = _bench("closed_loop", "--episodes", "1", "--robot", "hand")
     for name, kind in (("clean", "none"), ("noise", "d415")):
         part = found[name]
         assert part["sensor"] == kind

@@ -57,11 +57,9 @@ def test_surfaces_are_as_large_as_mujocos(robot: Any):
 
 
 @pytest.mark.slow
-def test_page_follows_the_motion(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
-):
-    """Claim: `play --viewer` without a display serves a page on this machine; its parts lie where
-    MuJoCo has the geoms in every picture; Ctrl-C ends it well."""
+def test_page_follows_the_motion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
+    """Claim: `play --viewer` without a display serves a page, whose parts lie where MuJoCo has the
+    geoms in every picture; Ctrl-C ends it."""
     pytest.importorskip("viser")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(gl, "has_display", lambda: False)

@@ -31,7 +31,7 @@ WARP = pytest.param("warp", marks=[pytest.mark.slow, _NO_WARP])
 
 
 def place(**shapes: tuple[float, float, float]) -> Scene:
-    """A scene of up to two cubes and a prism on the table at (x, y, yaw); other slots are parked."""
+    """A scene of up to two cubes and a prism at (x, y, yaw) on the table; other slots parked."""
     scene = layout.parked(CONFIG.scene.slots)
     position, quaternion = scene.position.copy(), scene.quaternion.copy()
     slots = {"cube": 0, "other": 1, "prism": 2}

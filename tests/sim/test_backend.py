@@ -1,6 +1,5 @@
 """`sim.physics auto`: what it stands for, whatever this machine has."""
 
-import dataclasses
 import functools
 import subprocess
 import sys
@@ -25,16 +24,10 @@ def _config(kind: PhysicsKind, mesh_jitter: float = 0.0, scenes: int = 256) -> C
     )
 
 
-def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch):
-    """Claim: where Warp is installed, `fast` runs on it on a GPU, else in MJX's own physics."""
-    monkeypatch.setattr(backend.jax, "default_backend", lambda: "gpu")
-    for installed, chosen in ((True, "warp"), (False, "mjx")):
-        monkeypatch.setattr(
-            backend.importlib.util,
-            "find_spec",
-            lambda name, there=installed: object() if there else None,
-        )
-        assert backend.resolve(presets.fast()).sim.physics == chosen
+def _machine(patch: pytest.MonkeyPatch, platform: str, has_warp: bool) -> None:
+    patch.setattr(backend.jax, "default_backend", lambda: platform)
+    spec = object() if has_warp else None
+    patch.setattr(backend.importlib.util, "find_spec", lambda name: spec)
 
 
 @pytest.mark.parametrize(
@@ -52,18 +45,20 @@ def test_choice(
     monkeypatch: pytest.MonkeyPatch, platform, installed, measured, mesh_jitter, scenes, chosen
 ):
     """Claim: `auto` is `c` on a CPU; `warp` if faster, on CUDA, installed and able; else `mjx`."""
-    monkeypatch.setattr(backend.jax, "default_backend", lambda: platform)
-    monkeypatch.setattr(
-        backend.importlib.util, "find_spec", lambda name: object() if installed else None
-    )
+    _machine(monkeypatch, platform, installed)
     monkeypatch.setattr(backend, "WARP_SCENES", measured)
     cfg = _config("auto", mesh_jitter, scenes)
-    assert backend.resolve(cfg) == dataclasses.replace(
-        cfg, sim=dataclasses.replace(cfg.sim, physics=chosen)
-    )
+    assert backend.resolve(cfg) == cfg.change(sim={"physics": chosen})
     assert backend.resolve(cfg, 2).sim.physics == "mjx"
     if (platform, installed, mesh_jitter) == ("gpu", True, 0.0):
         assert backend.resolve(cfg, 1, 2).sim.physics == "warp"
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_fast_runs_on_warp(monkeypatch: pytest.MonkeyPatch, installed: bool):
+    """Claim: where Warp is installed, `fast` runs on it on a GPU, else in MJX's own physics."""
+    _machine(monkeypatch, "gpu", installed)
+    assert backend.resolve(presets.fast()).sim.physics == ("warp" if installed else "mjx")
 
 
 @pytest.mark.parametrize(
@@ -71,8 +66,7 @@ def test_choice(
 )
 def test_choice_for_objects(monkeypatch: pytest.MonkeyPatch, platform, scenes, chosen):
     """Claim: objects are on Warp in many scenes on one GPU, else in C MuJoCo; never in MJX."""
-    monkeypatch.setattr(backend.jax, "default_backend", lambda: platform)
-    monkeypatch.setattr(backend.importlib.util, "find_spec", lambda name: object())
+    _machine(monkeypatch, platform, has_warp=True)
     cfg = presets.get("objects").change(train={"scenes": scenes}, replay={"capacity": 2048})
     assert backend.resolve(cfg).sim.physics == chosen
     assert backend.resolve(cfg, 2).sim.physics == "c"

@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -31,8 +30,11 @@ def pushed(c_world: model.World) -> tuple:
 
 
 def _assert_equal(ours: Trajectory, theirs: Trajectory) -> None:
-    for mine, reference in zip(ours, theirs, strict=True):
-        np.testing.assert_array_equal(mine, reference)
+    jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+
+
+def _fields(world: model.World, scene: layout.Scene) -> model.BlockFields:
+    return jax.device_get(model.scene_fields(world, scene))
 
 
 def test_trajectory_goes_the_way_of_the_run(c_world: model.World, pushed: tuple):
@@ -41,9 +43,8 @@ def test_trajectory_goes_the_way_of_the_run(c_world: model.World, pushed: tuple)
     recorded = c_physics.trajectory(c_world, fields, scene, joints)
     after, trace = jax.jit(CPhysics(c_world, conftest.CONFIG.sim).run)(scene, joints)
     assert recorded.qpos.shape == (len(joints.control), c_world.model.nq)
-    np.testing.assert_array_equal(
-        recorded.qpos[-1][c_world.block_qpos[:, :3]].astype(np.float32)[0], after.position[0]
-    )
+    last = recorded.qpos[-1][c_world.block_qpos[0, :3]].astype(np.float32)
+    np.testing.assert_array_equal(last, after.position[0])
     moved = recorded.qpos[:, c_world.block_qpos[0, 0]]
     assert trace.touched
     assert moved[0] < 0.061 < moved[-1] - 0.04
@@ -61,10 +62,11 @@ def test_trajectory_that_the_robot_cannot_follow_is_empty(c_world: model.World, 
 
 def test_trajectory_needs_no_touch_sensors(world: model.World, c_world: model.World, pushed: tuple):
     """Claim: a world that was built for MJX moves in C as one that was built for C."""
-    ours = c_physics.trajectory(world, *(pushed[i] for i in (1, 0, 2)))
-    np.testing.assert_array_equal(
-        ours.qpos, c_physics.trajectory(c_world, *(pushed[i] for i in (1, 0, 2))).qpos
+    scene, *rest = pushed
+    ours, theirs = (
+        c_physics.trajectory(built, rest[0], scene, rest[1]) for built in (world, c_world)
     )
+    np.testing.assert_array_equal(ours.qpos, theirs.qpos)
 
 
 def test_trajectory_keeps_parked_blocks_where_they_are(c_world: model.World, pushed: tuple):
@@ -101,21 +103,19 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     large = dataclasses.replace(scene, half_size=1.1 * np.asarray(scene.half_size))
     spun = dataclasses.replace(scene, velocity=np.array(scene.velocity))
     spun.velocity[0, 3:] = [0.0, 0.0, 250.0]
-    broken = dataclasses.replace(
-        scene, position=np.where(np.arange(3) == 2, np.nan, scene.position).astype(np.float32)
-    )
+    nowhere = np.where(np.arange(3) == 2, np.nan, scene.position).astype(np.float32)
+    broken = dataclasses.replace(scene, position=nowhere)
     scenes = jax.tree.map(lambda *leaves: np.stack(leaves), scene, large, spun, broken, scene)
     batch = jax.tree.map(lambda leaf: np.stack([leaf] * 5), joints)
     run = jax.jit(jax.vmap(CPhysics(c_world, conftest.CONFIG.sim).run))
     after, _ = run(scenes, batch)
     ends = []
     for i, one in {0: scene, 1: large, 2: spun, 4: scene}.items():
-        fields = jax.device_get(model.scene_fields(c_world, one))
+        fields = _fields(c_world, one)
         end = slow_loop.trajectory(c_world, fields, one, joints).qpos[-1]
         ends.append(end[c_world.block_qpos[0]].astype(np.float32))
-        np.testing.assert_array_equal(
-            np.concatenate([after.position[i, 0], after.quaternion[i, 0]]), ends[-1]
-        )
+        pose = np.concatenate([after.position[i, 0], after.quaternion[i, 0]])
+        np.testing.assert_array_equal(pose, ends[-1])
     assert len({tuple(end) for end in ends}) == 3
     np.testing.assert_array_equal(after.position[3, 0], broken.position[0])
 
@@ -146,29 +146,24 @@ def test_limit_of_speed_is_held_after_every_substep(
     _assert_equal(c_physics.trajectory(c_world, fields, scene, joints), wanted)
 
 
-def _rollouts(physics: CPhysics, rows: list[tuple]) -> list[Trajectory]:
-    """The trajectories of scenes, each in a simulator of its own meanwhile."""
-
-    def one(row: tuple) -> Trajectory:
-        with physics._simulator() as simulator:
-            return c_physics._rollout(physics.world, simulator, *row)
-
-    return list(physics._threads.map(one, rows))
-
-
 def test_simulators_are_used_again(
     c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch
 ):
     """Claim: calls leave nothing behind: other sizes, parked blocks, two at the same time."""
     scene, _, joints = pushed
-    larger = [
-        dataclasses.replace(scene, half_size=k * np.asarray(scene.half_size))
-        for k in (1.0, 1.1, 1.2)
-    ]
-    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in larger]
+    half = np.asarray(scene.half_size)
+    larger = [dataclasses.replace(scene, half_size=k * half) for k in (1.0, 1.1, 1.2)]
+    rows = [(one, _fields(c_world, one), joints) for one in larger]
     wanted = [slow_loop.trajectory(c_world, fields, one, joints) for one, fields, _ in rows]
     monkeypatch.setattr(c_physics.os, "sched_getaffinity", lambda _: range(3))
-    rollouts = functools.partial(_rollouts, CPhysics(c_world, conftest.CONFIG.sim))
+    physics = CPhysics(c_world, conftest.CONFIG.sim)
+
+    def one(row: tuple) -> Trajectory:
+        with physics._simulator() as simulator:
+            return c_physics._rollout(c_world, simulator, *row)
+
+    def rollouts(chosen: list[tuple]) -> list[Trajectory]:
+        return list(physics._threads.map(one, chosen))
 
     def check(chosen: list[int]) -> None:
         for i, recorded in zip(chosen, rollouts([rows[i] for i in chosen]), strict=True):
@@ -191,7 +186,7 @@ def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed
         conftest.place(cube=(0.06, 0.0, 0.0), other=(-0.1, 0.0, 0.0), prism=(0.0, 0.1, 0.0)),
     ]
     scenes.append(dataclasses.replace(scenes[2], half_size=1.1 * np.asarray(scenes[2].half_size)))
-    rows = [(one, jax.device_get(model.scene_fields(c_world, one)), joints) for one in scenes]
+    rows = [(one, _fields(c_world, one), joints) for one in scenes]
 
     def after(simulator: CSimulator, row: tuple) -> bytes:
         c_physics._rollout(c_world, simulator, *row)

@@ -41,14 +41,11 @@ class Case(NamedTuple):
     contacts: int = 0
 
 
+CORNER = PAD + DIAGONAL * np.cos(TILT) + HALF * np.sin(TILT) - DEEP
 CASES = {
     "face on pad": Case((PAD + HALF - DEEP, 0.004, 0.035), (0, 0, 0), contacts=4),
     "edge on pad": Case((PAD + DIAGONAL - DEEP, 0.001, 0.035), (45, 0, 0), contacts=2),
-    "corner on pad": Case(
-        (PAD + DIAGONAL * np.cos(TILT) + HALF * np.sin(TILT) - DEEP, 0.0, 0.045),
-        (45, np.degrees(TILT), 0),
-        contacts=1,
-    ),
+    "corner on pad": Case((CORNER, 0.0, 0.045), (45, np.degrees(TILT), 0), contacts=1),
     "pressing": Case((FAR, 0.1, FAR), (0, 0, 0), fingers=0.055),
 }
 TOUCHING = [name for name, case in CASES.items() if case.contacts]
@@ -68,9 +65,8 @@ def _state(world: model.World, case: Case) -> tuple[np.ndarray, np.ndarray]:
     qpos[world.robot_qpos] = ctrl_hand = np.array([0.0, 0.0, 0.012, 0.0, 0.0, 0.0])
     address = world.block_qpos[0]
     qpos[address[:3]] = case.cube
-    qpos[address[3:]] = Rotation.from_euler("zyx", case.turn, degrees=True).as_quat(
-        scalar_first=True
-    )
+    turn = Rotation.from_euler("zyx", case.turn, degrees=True)
+    qpos[address[3:]] = turn.as_quat(scalar_first=True)
     ctrl[:4], ctrl[4] = ctrl_hand[:4], case.fingers
     return qpos, ctrl
 
@@ -93,19 +89,14 @@ def ours(world: model.World, scene: layout.Scene) -> Ends:
         its = mjx_physics.scene_model(physics, scene)
         return mjx_step.step(its, physics.data.replace(qpos=qpos, ctrl=ctrl))
 
-    states = [
-        np.float32(column)
-        for column in zip(*(_state(world, case) for case in CASES.values()), strict=True)
-    ]
+    columns = zip(*(_state(world, case) for case in CASES.values()), strict=True)
+    states = [np.float32(column) for column in columns]
     data = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*states))
     contact = data._impl.contact
     active = contact.dist < contact.includemargin
     deep = np.sum(contact.dist < 0.0, axis=1).tolist()
-    return Ends(
-        data.qvel,
-        [np.sort(dist[row]) for dist, row in zip(contact.dist, active, strict=True)],
-        deep,
-    )
+    depths = [np.sort(dist[row]) for dist, row in zip(contact.dist, active, strict=True)]
+    return Ends(data.qvel, depths, deep)
 
 
 @pytest.fixture(scope="module")

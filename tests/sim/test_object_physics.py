@@ -11,21 +11,15 @@ from csac_jax.config import Config
 from csac_jax.env import Env
 from csac_jax.objects import families, library
 from csac_jax.scene import model, pool
+from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend, c_physics, oracle, physics, primitives
 from csac_jax.sim.c_physics import CPhysics
 from tests.sim.conftest import TWO_OBJECTS, bar, grasped_bar, thrown_objects
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
+SCENE = {"slots": ("object",) * 3, "min_blocks": 3, "objects": "made:0:42", "settle_time": 1.0}
 CONFIG = Config().change(
-    scene={
-        "slots": ("object",) * 3,
-        "min_blocks": 3,
-        "objects": "made:0:42",
-        "drop_extent": (0.3, 0.3),
-        "settle_time": 1.0,
-    },
-    sim={"physics": "c"},
-    task={"kind": "clear"},
+    scene=SCENE | {"drop_extent": (0.3, 0.3)}, sim={"physics": "c"}, task={"kind": "clear"}
 )
 
 
@@ -84,17 +78,22 @@ def test_objects_need_a_library():
         dataclasses.replace(CONFIG.scene, slots=("box", "object"), min_blocks=2, arranged=0.5)
 
 
+def _grasp(env: Env, scene: Scene) -> tuple:
+    """The scene, its fields, and the joints of the planner's grasp; NumPy."""
+    state = jax.jit(env.reset_to)(scene)
+    height = state.obs.height
+    grasp = oracle.grasp(CONFIG, state.scene, height)
+    plan = primitives.plan(CONFIG.sim, CONFIG.heightmap, height, grasp)
+    fields = model.scene_fields(env.physics.world, scene)
+    return jax.device_get((scene, fields, primitives.joint_trajectory(CONFIG.sim, plan)))
+
+
 def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
     """Claim: while the hand is far away nothing moves at all, to the bit; what it grasps moves."""
-    scene = jax.tree.map(lambda leaf: leaf[0], env.scenes)
-    state = jax.jit(env.reset_to)(scene)
-    grasp = oracle.grasp(CONFIG, state.scene, state.obs.height)
-    plan = primitives.plan(CONFIG.sim, CONFIG.heightmap, state.obs.height, grasp)
-    joints = jax.device_get(primitives.joint_trajectory(CONFIG.sim, plan))
     world = env.physics.world
-    fields = jax.device_get(model.scene_fields(world, scene))
-    seen = c_physics.trajectory(world, fields, scene, joints)
-    speed = np.abs(seen.qvel[:, world.block_dofs]).max(axis=(1, 2))
+    scene, fields, joints = _grasp(env, jax.tree.map(lambda leaf: leaf[0], env.scenes))
+    qvel = c_physics.trajectory(world, fields, scene, joints).qvel
+    speed = np.abs(qvel[:, world.block_dofs]).max(axis=(1, 2))
     asleep = slice(20, 35)  # of the 60 substeps that the hand comes down in
     assert (speed[asleep] == 0.0).all()
     assert speed[60:].max() > 0.05
@@ -103,18 +102,9 @@ def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
 @pytest.mark.slow
 def test_a_scene_moves_the_same_after_any_other(env: Env):
     """Claim: what slept in a simulator's last scene does not show in the next one, to the bit."""
-    state = jax.jit(jax.vmap(env.reset_to))(env.scenes)
-    height = state.obs.height
-    grasps = jax.vmap(lambda one, seen: oracle.grasp(CONFIG, one, seen))(state.scene, height)
-    plans = jax.vmap(lambda seen, one: primitives.plan(CONFIG.sim, CONFIG.heightmap, seen, one))(
-        height, grasps
-    )
-    joints = jax.vmap(lambda one: primitives.joint_trajectory(CONFIG.sim, one))(plans)
     world, used = env.physics.world, c_physics.CSimulator(env.physics.world)
-    fields = jax.vmap(lambda one: model.scene_fields(world, one))(env.scenes)
-    batch = jax.device_get((env.scenes, fields, joints))
-    for i in range(len(height)):
-        row = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
+    for i in range(6):
+        row = _grasp(env, jax.tree.map(lambda leaf, i=i: leaf[i], env.scenes))
         again = c_physics._rollout(world, used, *row)
         fresh = c_physics._rollout(world, c_physics.CSimulator(world), *row)
         np.testing.assert_array_equal(again.qpos, fresh.qpos)
@@ -133,9 +123,8 @@ def _slip(cfg: Config) -> float:
 
 
 def test_held_objects_do_not_slip(tmp_path: Path):
-    """Claim: what the hand holds hangs still, as by Coulomb's law: the fingers press with 40 N at a
-    friction of 1.2, and the weight is 1.4 N. A block of the same shape and weight slips, by
-    pyramids, see docs/benchmarks/physics-parity.md."""
+    """Claim: a held object of 1.4 N hangs still, by Coulomb's law (40 N at a friction of 1.2). A
+    block of its shape and weight slips, by friction pyramids."""
     a_second = CONFIG.change(sim={"grasp_phases": (60, 50, 250)})
     assert _slip(a_second.change(scene=bar(tmp_path))) < 1e-4
     block = {"slots": ("box",), "min_blocks": 1, "objects": ""}

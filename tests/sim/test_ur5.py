@@ -1,6 +1,8 @@
 """Arms with grippers: they follow plans, grasp, and press no harder than they should."""
 
 import functools
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,16 +28,14 @@ BLOCK = 8  # address in qpos of the block
 _joints = jax.jit(functools.partial(primitives.joint_trajectory, SIM))
 
 
-def _part(name: str) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_file(str(assets() / f"{name}.xml"))
-
-
 @functools.cache
 def _model(with_block: bool = False) -> mujoco.MjModel:
     """Table, arm, hand and at will a cube, with the solver as in training."""
-    spec = _part("table")
+    spec, part = (
+        mujoco.MjSpec.from_file(str(assets() / f"{name}.xml")) for name in ("table", "blocks")
+    )
     robots.add(spec, SIM, RG2)
-    spec.attach(_part("blocks"), prefix="blocks/", frame=spec.worldbody.add_frame())
+    spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
     if with_block:
         body = spec.worldbody.add_body(name="block")
         body.add_freejoint()
@@ -47,29 +47,33 @@ def _model(with_block: bool = False) -> mujoco.MjModel:
 
 
 @functools.cache
-def _plan(
-    primitive: Primitive, x: float, y: float, yaw: float, top: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _plan(primitive: Primitive, x: float, y: float, yaw: float, top: float) -> tuple:
     """Set-points [1 + T, 5] of a primitive over a flat surface, and joint targets [1 + T, 7]."""
     action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
-    plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(
-        jnp.full((MAP.size, MAP.size), top), action
-    )
+    height = jnp.full((MAP.size, MAP.size), top)
+    plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(height, action)
     joints = _joints(plan)
     assert joints.reachable
     target = jnp.concatenate([joints.start[None, :7], joints.control])
     return np.concatenate([plan.start[None], plan.control]), np.asarray(target)
 
 
-def _start(
-    model: mujoco.MjModel, target: np.ndarray, block: tuple[float, float] = (9.0, 9.0)
-) -> mujoco.MjData:
+def _start(model: mujoco.MjModel, target: np.ndarray, block: Any = (9.0, 9.0)) -> mujoco.MjData:
     data = mujoco.MjData(model)
     data.qpos[:FINGER] = target[0, :6]
     data.qpos[FINGER : FINGER + 2] = target[0, 6]
     if model.nq > BLOCK:
         data.qpos[BLOCK : BLOCK + 7] = [*block, CUBE, 1, 0, 0, 0]
     return data
+
+
+def _motion(model: mujoco.MjModel, target: np.ndarray, *block: Any) -> Iterator[mujoco.MjData]:
+    """The data, one and the same, after every substep."""
+    data = _start(model, target, *block)
+    for command in target[1:]:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        yield data
 
 
 CORNERS = [(x, y, yaw, 0.0) for x in (-0.224, 0.224) for y in (-0.224, 0.224) for yaw in (0.0, 2.0)]
@@ -83,10 +87,7 @@ def test_arm_follows_the_plan(primitive: Primitive):
     ends = np.cumsum(SIM.grasp_phases if primitive == Primitive.GRASP else SIM.push_phases)
     for place in PLACES:
         control, target = _plan(primitive, *place)
-        data = _start(model, target)
-        for index in range(1, len(target)):
-            data.ctrl[:] = target[index]
-            mujoco.mj_step(model, data)
+        for index, data in enumerate(_motion(model, target), 1):
             if index in ends:
                 mujoco.mj_kinematics(model, data)
                 error = data.site("ur5/tip").xpos - control[index, :3]
@@ -96,12 +97,8 @@ def test_arm_follows_the_plan(primitive: Primitive):
 @pytest.mark.parametrize("x", [-0.2, 0.0, 0.2])
 def test_arm_lifts_a_cube(x: float):
     """Claim: a grasp of the arm lifts a cube by as much as the hand, at the gap of its width."""
-    model = _model(with_block=True)
     control, target = _plan(Primitive.GRASP, x, 0.1, 0.0, 2 * CUBE)
-    data = _start(model, target, (x, 0.1))
-    for command in target[1:]:
-        data.ctrl[:] = command
-        mujoco.mj_step(model, data)
+    *_, data = _motion(_model(with_block=True), target, (x, 0.1))
     rise = control[:, 2].max() - control[:, 2].min()
     assert abs(data.qpos[BLOCK + 2] - CUBE - rise) < 0.01
     assert abs(2 * data.qpos[FINGER] - 2 * CUBE) < 0.005
@@ -110,19 +107,15 @@ def test_arm_lifts_a_cube(x: float):
 @pytest.mark.parametrize(("x", "side"), [(-0.2, 1), (0.0, 1), (0.2, -1)])
 def test_arm_presses_within_reason(x: float, side: int):
     """Claim: a finger that comes down on a cube neither sinks 15 mm in nor carries it off."""
-    model = _model(with_block=True)
     _, target = _plan(Primitive.GRASP, x, 0.0, 0.0, 2 * CUBE)
-    data = _start(model, target, (x + side * 0.055, 0.0))
-    for command in target[1:]:
-        data.ctrl[:] = command
-        mujoco.mj_step(model, data)
+    for data in _motion(_model(with_block=True), target, (x + side * 0.055, 0.0)):
         assert data.contact.dist.min(initial=0.0) > -0.015
     assert data.qpos[BLOCK + 2] < 2 * CUBE
 
 
 def test_gripper_ends_at_the_flange():
-    """Claim: the tip frame is the gripper's depth below the flange, where its visible body ends;
-    nothing of the arm collides, and gravity is compensated in all of it."""
+    """Claim: the tip frame is the gripper's depth below the flange; the arm collides with nothing
+    and is free of gravity."""
     model = _model()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -131,9 +124,8 @@ def test_gripper_ends_at_the_flange():
     assert height == pytest.approx(RG2.depth[1], abs=1e-6)
     body = model.geom("hand/body")
     assert body.pos[2] + body.size[2] == pytest.approx(RG2.depth[1])
-    assert (model.geom("hand/palm").pos + model.geom("hand/palm").size)[2] == pytest.approx(
-        body.pos[2] - body.size[2]
-    )
+    palm = model.geom("hand/palm")
+    assert palm.pos[2] + palm.size[2] == pytest.approx(body.pos[2] - body.size[2])
     arm = [index for index in range(model.ngeom) if model.geom(index).name.startswith("ur5/")]
     assert len(arm) == 8
     assert not model.geom_contype[arm].any()
@@ -144,9 +136,8 @@ def test_gripper_ends_at_the_flange():
 @pytest.mark.mjx
 @pytest.mark.slow
 def test_arm_follows_the_plan_in_mjx():
-    """Claim: in MJX, too, the tips are within 3 mm of the set-point as each phase of a push ends.
-    Only there: while an actuator is at its limit, MJX's implicit integrator still counts its
-    damping, and C MuJoCo does not."""
+    """Claim: so it is in MJX as each phase of a push ends; between, MJX's integrator counts the
+    damping of an actuator at its limit."""
     model = _model()
     device, blank = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
 
@@ -162,7 +153,6 @@ def test_arm_follows_the_plan_in_mjx():
     for place in ((-0.224, -0.224, 0.0, 0.0), (0.224, 0.0, 3.0, 0.1)):
         control, target = _plan(Primitive.PUSH, *place)
         joints = run(jnp.asarray(_start(model, target).qpos, jnp.float32), jnp.asarray(target[1:]))
-        tips = jax.vmap(functools.partial(kinematics.forward, kinematics.arm(SIM)))(
-            joints[ends - 1]
-        ).position
+        forward = jax.vmap(functools.partial(kinematics.forward, kinematics.arm(SIM)))
+        tips = forward(joints[ends - 1]).position
         assert np.linalg.norm(tips - control[ends, :3], axis=1).max() < 0.003, place

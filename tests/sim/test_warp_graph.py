@@ -1,19 +1,13 @@
 """A step of Warp launches, repeated, where Warp is installed."""
 
-import importlib.util
 from unittest import mock
 
 import pytest
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("warp") is None,
-    reason="Warp is an extra: pip install 'csac-jax[warp]'",
-)
-
 
 def test_a_step_allocates_once():
     """Claim: steps work in the arrays of the first one, which begin anew as they are asked for."""
-    import warp as wp
+    wp = pytest.importorskip("warp")
 
     from csac_jax.sim import warp_graph
 

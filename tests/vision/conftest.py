@@ -13,9 +13,9 @@ from csac_jax.vision import raycast
 _OCTAGON = [(np.cos(a), np.sin(a)) for a in np.pi / 4 * (np.arange(8) + 0.5)]
 _MESHES = {
     "prism": [
-        (x, y, z)
+        (x, 0.025 * side, z)
         for x, z in ((-0.0467, -0.0243), (0.0467, -0.0243), (0.0, 0.0243))
-        for y in (-0.025, 0.025)
+        for side in (-1, 1)
     ],
     "octagon": [(0.0242 * x, 0.0242 * y, z) for x, y in _OCTAGON for z in (-0.025, 0.025)],
 }
@@ -96,11 +96,21 @@ def reference() -> Reference:
     for geom in range(len(_GEOMS)):
         faces, offsets = _half_spaces(model, geom + 1)
         normal[geom, : len(faces)], offset[geom, : len(faces)] = faces, offsets
-    polytopes = raycast.Polytopes(
-        normal=jnp.asarray(normal, jnp.float32),
-        offset=jnp.asarray(offset, jnp.float32),
-        position=jnp.asarray(data.geom_xpos[1:], jnp.float32),
-        rotation=jnp.asarray(data.geom_xmat[1:].reshape(-1, 3, 3), jnp.float32),
-        colour=jnp.asarray(np.random.default_rng(0).uniform(size=(len(_GEOMS), 3)), jnp.float32),
-    )
+    colour = np.random.default_rng(0).uniform(size=(len(_GEOMS), 3))
+    pose = data.geom_xpos[1:], data.geom_xmat[1:].reshape(-1, 3, 3)
+    leaves = (jnp.asarray(leaf, jnp.float32) for leaf in (normal, offset, *pose, colour))
+    polytopes = raycast.Polytopes(*leaves)
     return Reference(model, data, polytopes)
+
+
+def cubes(*places: tuple[float, float, float]) -> raycast.Polytopes:
+    """White cubes with sides of 5 cm, middles at these places, m."""
+    count = len(places)
+    normal = np.concatenate([np.eye(3), -np.eye(3)])
+    return raycast.Polytopes(
+        normal=jnp.asarray(np.tile(normal, (count, 1, 1)), jnp.float32),
+        offset=jnp.full((count, 6), 0.025),
+        position=jnp.array(places, jnp.float32),
+        rotation=jnp.tile(jnp.eye(3), (count, 1, 1)),
+        colour=jnp.ones((count, 3)),
+    )

@@ -1,6 +1,6 @@
 """Models with every kind of geom, and many rays through them by C MuJoCo."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -44,12 +44,10 @@ def blocks_and_arm(rng: np.random.Generator) -> Placed:
     quaternion = rng.normal(size=(len(SHAPES), 4))
     data.qpos[world.robot_qpos] = rng.uniform(-1.5, 1.5, len(world.robot_qpos))
     data.qpos[world.robot_qpos[-2:]] = rng.uniform(0.0, 0.05)
-    data.qpos[world.block_qpos[:, :3]] = rng.uniform(
-        [-0.2, -0.2, 0.02], [0.2, 0.2, 0.2], (len(SHAPES), 3)
-    )
-    data.qpos[world.block_qpos[:, 3:]] = quaternion / np.linalg.norm(
-        quaternion, axis=1, keepdims=True
-    )
+    low, high = [-0.2, -0.2, 0.02], [0.2, 0.2, 0.2]
+    data.qpos[world.block_qpos[:, :3]] = rng.uniform(low, high, (len(SHAPES), 3))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    data.qpos[world.block_qpos[:, 3:]] = quaternion
     mujoco.mj_kinematics(model, data)
     return Placed(model, data)
 
@@ -85,17 +83,10 @@ def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
     return solids.place(geoms.read(model), *poses)
 
 
-def cast(
-    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, direction: np.ndarray
-) -> Rays:
+def cast(model: mujoco.MjModel, data: mujoco.MjData, origin: Any, direction: Any) -> Rays:
     """R rays along `direction` [R, 3] from `origin` [3] by C; `mj_multiRay` loses some at edges."""
     num = len(direction)
-    found, distance, geom, normal = (
-        np.zeros((1, 1), np.int32),
-        np.zeros(num),
-        np.zeros(num, np.int32),
-        np.zeros((num, 3)),
-    )
+    distance, geom, normal = np.zeros(num), np.zeros(num, np.int32), np.zeros((num, 3))
     start, along = origin.astype(np.float64)[:, None], direction.astype(np.float64)[:, :, None]
     found, surface = np.zeros((1, 1), np.int32), np.zeros((3, 1))
     for ray in range(num):

@@ -7,7 +7,7 @@ import numpy as np
 
 
 def main(model_path: str, pose_path: str, out_path: str) -> None:
-    """Reads model, qpos, pose [3, 3] (position, forward, up), focal, size; writes depth [H, W] m."""
+    """Reads model, qpos, pose [3, 3] (position, forward, up), focal, size; writes [H, W] m."""
     model, given = mujoco.MjModel.from_binary_path(model_path), np.load(pose_path)
     width, height = map(int, given["size"])
     model.vis.global_.fovy = np.degrees(2.0 * np.arctan(0.5 * height / given["focal"]))

@@ -76,9 +76,8 @@ def _settled_pile(rng: np.random.Generator) -> tuple[Config, Scene, Placed]:
 def test_a_settled_pile_agrees_with_mujoco():
     """Claim: a settled pile of ten is as high as C's to 0.1 mm, 0.1 mm off edges."""
     cfg, scene, pile = _settled_pile(np.random.default_rng(0))
-    height = np.asarray(
-        jax.jit(lambda scene: observe.observe(cfg, scene))(jax.tree.map(jnp.asarray, scene)).height
-    )
+    look = jax.jit(lambda scene: observe.observe(cfg, scene).height)
+    height = np.asarray(look(jax.tree.map(jnp.asarray, scene)))
     centres = np.asarray(geometry.cell_centres(cfg.heightmap), np.float64).reshape(-1, 2)
     down, expected = np.array([[0.0, 0.0, -1.0]]), []
     for shift in ((0.0, 0.0), (1e-4, 0.0), (-1e-4, 0.0), (0.0, 1e-4), (0.0, -1e-4)):
@@ -106,10 +105,8 @@ def test_target_mask_shows_the_target(reference):
 
 def test_blocks_above_the_view_are_not_seen(reference):
     """Claim: what is parked above VIEW_HEIGHT leaves no trace."""
-    parked = reference.polytopes.replace(
-        position=reference.polytopes.position + jnp.array([[0.0, 0.0, 0.6]])
-    )
-    obs = _look(HeightmapConfig(64), parked)
+    position = reference.polytopes.position + jnp.array([[0.0, 0.0, 0.6]])
+    obs = _look(HeightmapConfig(64), reference.polytopes.replace(position=position))
     assert np.all(np.asarray(obs.height) == 0.0)
 
 
@@ -124,29 +121,18 @@ def test_packing_rounds(seed):
         target=jnp.asarray(rng.uniform(size=(8, 8)) < 0.5),
     )
     packed = heightmap.pack(obs)
-    assert (packed.colour.dtype, packed.height.dtype, packed.target.dtype) == (
-        jnp.uint8,
-        jnp.uint16,
-        jnp.bool_,
-    )
+    assert [leaf.dtype for leaf in jax.tree.leaves(packed)] == [jnp.uint8, jnp.uint16, jnp.bool_]
     back = heightmap.unpack(packed)
     np.testing.assert_allclose(back.height, obs.height, rtol=0, atol=0.05e-3 + 1e-7)
     np.testing.assert_allclose(back.colour, obs.colour, rtol=0, atol=0.5 / 255 + 1e-6)
     np.testing.assert_array_equal(back.target, obs.target)
-    for again, once in zip(
-        jax.tree.leaves(heightmap.pack(back)), jax.tree.leaves(packed), strict=True
-    ):
-        np.testing.assert_array_equal(again, once)
+    jax.tree.map(np.testing.assert_array_equal, heightmap.pack(back), packed)
 
 
 def test_packing_cuts_off():
     """Claim: values beyond the packed range are cut off, not wrapped round."""
-    obs = heightmap.Observation(
-        colour=jnp.array([[[-0.1, 1.2, 1.0]]]),
-        height=jnp.array([[-0.01, 7.0]]),
-        target=jnp.ones((1, 2), bool),
-    )
-    packed = heightmap.pack(obs)
+    colour, height = jnp.array([[[-0.1, 1.2, 1.0]]]), jnp.array([[-0.01, 7.0]])
+    packed = heightmap.pack(heightmap.Observation(colour, height, jnp.ones((1, 2), bool)))
     np.testing.assert_array_equal(packed.height, [[0, 65535]])
     np.testing.assert_array_equal(packed.colour, [[[0, 255, 255]]])
 
@@ -156,9 +142,9 @@ def test_areas_survive_another_resolution(size):
     """Claim: a block 6 cm square that moves by its own length moves 72 cm^2 at any resolution."""
     cfg = HeightmapConfig(size)
     x, y = np.moveaxis(np.asarray(geometry.cell_centres(cfg)), -1, 0)
-    before = jnp.asarray(np.where((np.abs(x) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32)
-    after = jnp.asarray(
-        np.where((np.abs(x - 0.06) < 0.03) & (np.abs(y) < 0.03), 0.05, 0.0), jnp.float32
+    rows = np.abs(y) < 0.03
+    before, after = (
+        jnp.where(rows & (np.abs(x - place) < 0.03), 0.05, 0.0) for place in (0.0, 0.06)
     )
     edge = 4 * 6 * cfg.cell * 100 / 2  # half a cell along the outline, cm^2
     assert abs(float(heightmap.moved_area(cfg, before, after)) - 72.0) <= 2 * edge

@@ -1,6 +1,8 @@
 """Objects of many convex parts, seen by our rays and by C MuJoCo's."""
 
 import functools
+import subprocess
+import sys
 
 import jax
 import mujoco
@@ -50,9 +52,7 @@ def in_c(world: model.World, scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjDat
     return exact, data
 
 
-def met(
-    placed: tuple[mujoco.MjModel, mujoco.MjData], origin: np.ndarray, direction: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def met(placed: tuple, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances [R] and geoms [R] of rays [R, 3] by C MuJoCo."""
     geom, found = np.zeros((1, 1), np.int32), []
     for start, along in zip(origin, direction, strict=True):
@@ -120,11 +120,8 @@ def test_windows_are_smaller_than_the_view():
     assert camera.window(CONFIG.camera, 0.448, 0.25, 10.0) == CONFIG.camera.size[::-1]
 
 
-def test_observation_needs_no_mujoco(tmp_path):
+def test_observation_needs_no_mujoco():
     """Claim: objects are seen without MuJoCo."""
-    import subprocess
-    import sys
-
     code = (
         "import sys; from csac_jax.vision import observe; from csac_jax.scene import stock;"
         "assert 'mujoco' not in sys.modules"

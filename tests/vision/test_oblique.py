@@ -13,6 +13,7 @@ from csac_jax.config import CameraConfig, HeightmapConfig
 from csac_jax.runtime import compiler
 from csac_jax.vision import camera, heightmap, observe, raycast
 from csac_jax.vision.heightmap import Observation
+from tests.vision.conftest import cubes
 
 CFG = HeightmapConfig(64, view="oblique")
 _EYE, _FINE = (camera.make(CameraConfig().scaled(share)) for share in (0.25, 0.5))
@@ -56,11 +57,8 @@ def test_points_agree_with_numpy(seed):
 
 
 def test_the_view_agrees_with_numpy(reference):
-    """Claim: from the same depth image, height, colour and target mask are those of NumPy, bit for
-    bit.
-
-    Not compiled as a whole: a fused multiply-add may move a point across the border of a cell.
-    """
+    """Claim: of a depth image, height, colour and target mask are NumPy's, bit for bit (uncompiled:
+    a fused multiply-add may move a point to another cell)."""
     seen = camera.cast_rays(_EYE, raycast.cast_polytopes, reference.polytopes)
     is_target = jnp.arange(6) == 4
     tables = observe.surface_tables(reference.polytopes, is_target)
@@ -72,16 +70,15 @@ def test_the_view_agrees_with_numpy(reference):
     empty = source < 0
     assert 0.02 < empty.mean() < 0.5
     np.testing.assert_array_equal(obs.height, height)
-    np.testing.assert_array_equal(
-        obs.colour, np.where(empty[..., None], 0.0, np.asarray(tables[0])[row])
-    )
+    colour = np.where(empty[..., None], 0.0, np.asarray(tables[0])[row])
+    np.testing.assert_array_equal(obs.colour, colour)
     np.testing.assert_array_equal(obs.target, np.where(empty, False, np.asarray(tables[1])[row]))
     assert np.asarray(obs.target).any()
 
 
 def test_the_view_does_not_depend_on_rounding(reference):
-    """Claim: compiled as a whole by kernels that work points out twice, and round otherwise, the
-    view is as by default, but where a point crosses the border of a cell."""
+    """Claim: by kernels that compute points twice and round differently, the view is as by default,
+    but where a point crosses the border of a cell."""
     options: Any = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
     if not all(compiler.knows(name, value) for name, value in options.items()):
         pytest.skip("this XLA has no other kernels")
@@ -106,20 +103,17 @@ def _views(polytopes: raycast.Polytopes, eye: camera.Camera) -> tuple[Observatio
     """From above, and by a camera; any block will do."""
     tables = observe.surface_tables(polytopes, jnp.ones(len(polytopes.offset), bool))
     hits = camera.cast_rays(eye, raycast.cast_polytopes, polytopes)
-    return observe.ortho(CFG, observe.Shapes(polytopes), tables), observe.from_pixels(
-        CFG, eye, hits, tables
-    )
+    above = observe.ortho(CFG, observe.Shapes(polytopes), tables)
+    return above, observe.from_pixels(CFG, eye, hits, tables)
 
 
 def test_both_views_agree_where_the_camera_sees(reference):
-    """Claim: away from edges, cells that the camera sees are as high as from above, to the slope
-    within a cell; the rest is empty, and in the clearing task the target mask is all ones."""
+    """Claim: away from edges, cells that the camera sees are as high as from above, to a cell's
+    slope; the rest is empty; if any block is wanted, the target mask is all ones."""
     above, beside = jax.device_get(_views(reference.polytopes, _EYE))
     filled = beside.colour.sum(-1) > 0.0
-    flat = np.abs(
-        above.height[1:-1, 1:-1, None, None]
-        - np.lib.stride_tricks.sliding_window_view(above.height, (3, 3))
-    )
+    windows = np.lib.stride_tricks.sliding_window_view(above.height, (3, 3))
+    flat = np.abs(above.height[1:-1, 1:-1, None, None] - windows)
     flat = np.pad(flat.max((2, 3)) < 0.004, 1)
     assert (filled & flat).mean() > 0.5
     off = np.abs(beside.height - above.height)[filled & flat]
@@ -131,19 +125,12 @@ def test_both_views_agree_where_the_camera_sees(reference):
 
 def test_a_block_casts_a_shadow():
     """Claim: of a cube the top is seen, and nothing behind it as far as the sight line says."""
-    cube = raycast.Polytopes(
-        normal=jnp.asarray(np.concatenate([np.eye(3), -np.eye(3)])[None], jnp.float32),
-        offset=jnp.full((1, 6), 0.025),
-        position=jnp.array([[0.0, 0.0, 0.025]]),
-        rotation=jnp.eye(3)[None],
-        colour=jnp.ones((1, 3)),
-    )
+    cube = cubes((0.0, 0.0, 0.025))
     _, obs = _views(cube, _FINE)
     height, filled = np.asarray(obs.height), np.asarray(obs.colour).sum(-1) > 0.0
     x = np.asarray(geometry.cell_centres(CFG))[0, :, 0]
     middle = slice(30, 34)  # rows at y = 0
-    # where the line over the far top edge meets the table
-    end = 0.025 + (0.025 + 0.5) * 0.05 / (0.5 - 0.05)
+    end = 0.025 + 0.525 * 0.05 / 0.45  # where the line over the far top edge meets the table
     np.testing.assert_allclose(height[middle][:, np.abs(x) < 0.02], 0.05, atol=1e-4)
     assert not filled[middle][:, (x > 0.03) & (x < end - 0.008)].any()
     assert filled[middle][:, x > end + 0.008].mean() > 0.95

@@ -1,5 +1,7 @@
 """The raycaster against C MuJoCo, and laws that hold for any scene."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,9 +32,8 @@ def _random_rays(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.n
     through = rng.uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 0.25], (count, 3))
     direction = through - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return origin.astype(np.float32).astype(np.float64), direction.astype(np.float32).astype(
-        np.float64
-    )
+    origin, direction = (rays.astype(np.float32) for rays in (origin, direction))
+    return origin.astype(np.float64), direction.astype(np.float64)
 
 
 def _random_scene(rng: np.random.Generator, geoms: int = 4, faces: int = 8) -> raycast.Polytopes:
@@ -42,23 +43,27 @@ def _random_scene(rng: np.random.Generator, geoms: int = 4, faces: int = 8) -> r
     cuts /= np.linalg.norm(cuts, axis=-1, keepdims=True)
     quat = rng.normal(size=(geoms, 4))
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
-    return raycast.Polytopes(
-        normal=jnp.asarray(
-            np.concatenate([np.tile(box, (geoms, 1, 1)), cuts], axis=1), jnp.float32
-        ),
-        offset=jnp.asarray(rng.uniform(0.01, 0.05, (geoms, faces)), jnp.float32),
-        position=jnp.asarray(
-            rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.15], (geoms, 3)), jnp.float32
-        ),
-        rotation=jax.vmap(geometry.quat_to_matrix)(jnp.asarray(quat, jnp.float32)),
-        colour=jnp.zeros((geoms, 3), jnp.float32),
+    position = rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.15], (geoms, 3))
+    normal = np.concatenate([np.tile(box, (geoms, 1, 1)), cuts], axis=1)
+    offset = rng.uniform(0.01, 0.05, (geoms, faces))
+    normal, offset, position, quat = (
+        jnp.asarray(leaf, jnp.float32) for leaf in (normal, offset, position, quat)
     )
+    rotation = jax.vmap(geometry.quat_to_matrix)(quat)
+    return raycast.Polytopes(normal, offset, position, rotation, jnp.zeros((geoms, 3)))
 
 
 def _cast(polytopes: raycast.Polytopes, origin: np.ndarray, direction: np.ndarray) -> raycast.Hit:
-    return _cast_all(
-        polytopes, jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32)
-    )
+    return _cast_all(polytopes, *(jnp.asarray(leaf, jnp.float32) for leaf in (origin, direction)))
+
+
+def _assert_same(hit: raycast.Hit, clear: np.ndarray, distance: Any, geom: Any) -> np.ndarray:
+    """Hits, geoms and distances of clear rays are C's; returns those that hit, [R] bool."""
+    hit, met = jax.device_get(hit), clear & (geom > -2)
+    np.testing.assert_array_equal(hit.valid[clear], geom[clear] > -2)
+    np.testing.assert_array_equal(hit.geom[met], geom[met])
+    np.testing.assert_allclose(hit.distance[met], distance[met], rtol=0, atol=1e-4)
+    return met
 
 
 def test_rays_agree_with_mujoco(reference):
@@ -69,10 +74,7 @@ def test_rays_agree_with_mujoco(reference):
     clear = ~reference.near_edge(origin, direction, shift=1e-4)
     assert clear.mean() > 0.95
     assert len(np.unique(geom[clear])) == 8  # six blocks, the table, and rays that miss
-    np.testing.assert_array_equal(np.asarray(hit.valid)[clear], geom[clear] > -2)
-    met = clear & (geom > -2)
-    np.testing.assert_array_equal(np.asarray(hit.geom)[met], geom[met])
-    np.testing.assert_allclose(np.asarray(hit.distance)[met], distance[met], rtol=0, atol=1e-4)
+    met = _assert_same(hit, clear, distance, geom)
     np.testing.assert_allclose(np.asarray(hit.normal)[met], normal[met], rtol=0, atol=1e-3)
     assert np.all(np.isinf(np.asarray(hit.distance)[clear & (geom == -2)]))
 
@@ -89,10 +91,7 @@ def test_rays_along_the_axes_agree_with_mujoco(reference):
     clear = ~upright.near_edge(origin, direction, shift=1e-4)
     assert clear.mean() > 0.9
     assert len(np.unique(geom[clear])) >= 6
-    np.testing.assert_array_equal(np.asarray(hit.valid)[clear], geom[clear] > -2)
-    met = clear & (geom > -2)
-    np.testing.assert_array_equal(np.asarray(hit.geom)[met], geom[met])
-    np.testing.assert_allclose(np.asarray(hit.distance)[met], distance[met], rtol=0, atol=1e-4)
+    _assert_same(hit, clear, distance, geom)
 
 
 def _upright(reference):
@@ -129,9 +128,8 @@ def test_turned_and_scaled(seed, yaw, scale):
     rng = np.random.default_rng(seed)
     polytopes = _random_scene(rng)
     origin, direction = _random_rays(rng, 64)
-    turn = np.asarray(
-        geometry.quat_to_matrix(geometry.quat_from_yaw(jnp.asarray(yaw, jnp.float32)))
-    )
+    quat = geometry.quat_from_yaw(jnp.asarray(yaw, jnp.float32))
+    turn = np.asarray(geometry.quat_to_matrix(quat))
     turned = polytopes.replace(
         position=jnp.asarray(np.asarray(polytopes.position) @ turn.T),
         rotation=jnp.asarray(turn[None] @ np.asarray(polytopes.rotation)),
@@ -140,9 +138,7 @@ def test_turned_and_scaled(seed, yaw, scale):
     other = _cast(turned, origin @ turn.T, scale * direction @ turn.T)
     same = np.asarray((one.geom == other.geom) & (one.valid == other.valid))
     assert same.mean() >= 0.96  # a ray at an edge may fall to either side
-    close = np.isclose(
-        np.asarray(one.distance), scale * np.asarray(other.distance), rtol=0, atol=1e-4
-    )
+    close = np.isclose(one.distance, scale * np.asarray(other.distance), rtol=0, atol=1e-4)
     assert (close | ~same).mean() >= 0.96
     assert not np.isnan(np.asarray(other.distance)).any()
 
@@ -201,10 +197,8 @@ def test_a_broken_scene_spoils_no_other():
     origin, direction = _random_rays(rng, 300)
     broken = polytopes.replace(position=polytopes.position.at[1].set(jnp.nan))
     gone = polytopes.replace(offset=polytopes.offset.at[1].set(-1.0))
-    for a, b in zip(
-        *(jax.tree.leaves(_cast(p, origin, direction)) for p in (broken, gone)), strict=True
-    ):
-        np.testing.assert_array_equal(a, b)
+    seen = (_cast(scene, origin, direction) for scene in (broken, gone))
+    jax.tree.map(np.testing.assert_array_equal, *seen)
 
 
 def test_no_array_over_rays_geoms_and_faces():
