@@ -19,10 +19,8 @@ def choices(cfg: ExploreConfig, taken: int, primitive: int = 1) -> tuple[np.ndar
     """Primitives [NUM] and poses [NUM, 3] under as many keys."""
     greedy = explore.Greedy(jnp.int32(primitive), GREEDY_POSES, jnp.zeros(2))
     keys = jax.random.split(jax.random.key(0), NUM)
-    choose = jax.jit(
-        jax.vmap(lambda key: explore.choose(key, cfg, jnp.int32(taken), greedy, RANDOM_PLACES))
-    )
-    primitives, poses = choose(keys)
+    choose = lambda key: explore.choose(key, cfg, jnp.int32(taken), greedy, RANDOM_PLACES)  # noqa: E731
+    primitives, poses = jax.jit(jax.vmap(choose))(keys)
     return np.asarray(primitives), np.asarray(poses)
 
 

@@ -23,7 +23,6 @@ pytestmark = pytest.mark.optax
 
 EPISODES = 128
 CAP = 4  # actions of an episode of the two-step problem
-SLOW = pytest.mark.slow
 
 
 class Learned(NamedTuple):
@@ -48,9 +47,8 @@ def learn(
     begun, ended, primitives = jax.jit(functools.partial(_play, toy, actor_critic.make(cfg)))(
         jax.random.key(99), state.learner.online
     )
-    chosen = np.array(
-        maps.allowed_primitives(cfg.policy)
-    )  # an output of a primitive never taken is never trained
+    # An output of a primitive never taken is never trained.
+    chosen = np.array(maps.allowed_primitives(cfg.policy))
     value = jnp.max(jnp.where(begun.valid, begun.q, -jnp.inf)[:, chosen], axis=(1, 2, 3, 4))
     return Learned(
         success=float(np.mean(ended.terminated)),
@@ -80,18 +78,12 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
     return values.dense_maps(learner, params, first.obs), last, primitives
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "value"),
-    [
-        pytest.param("csac", 2.0, marks=SLOW),
-        pytest.param("csac_per", 2.0, marks=SLOW),
-        pytest.param("csac_beta", 2.0, marks=SLOW),
-        pytest.param("vpg", 2.0, marks=SLOW),
-        pytest.param("vpg_episodic", 1.0, marks=SLOW),
-        pytest.param("reactive", 1.0, marks=SLOW),
-        pytest.param("grasp_only", 1.0, marks=SLOW),
-    ],
-)
+    [("csac", 2.0), ("csac_per", 2.0), ("csac_beta", 2.0), ("vpg", 2.0), ("vpg_episodic", 1.0),
+     ("reactive", 1.0), ("grasp_only", 1.0)],
+)  # fmt: skip
 def test_bandit_is_solved(algo, value):
     """Claim: every algorithm finds the one good block among duds, and what lifting it earns: 2 by
     CSAC, 1 / (1 - 0.5) by VPG, whose next episode follows, 1 by the other baselines."""
@@ -101,16 +93,12 @@ def test_bandit_is_solved(algo, value):
     assert_allclose(learned.value, value, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "low", "high"),
-    [
-        pytest.param("csac", 1.2, 1.6, marks=SLOW),
-        pytest.param("csac_per", 1.2, 1.6, marks=SLOW),
-        pytest.param("csac_beta", 1.2, 1.6, marks=SLOW),
-        pytest.param("vpg", 1.25, 1.4, marks=SLOW),
-        pytest.param("vpg_episodic", 0.9, 1.1, marks=SLOW),
-    ],
-)
+    [("csac", 1.2, 1.6), ("csac_per", 1.2, 1.6), ("csac_beta", 1.2, 1.6), ("vpg", 1.25, 1.4),
+     ("vpg_episodic", 0.9, 1.1)],
+)  # fmt: skip
 def test_two_steps_are_learned(algo, low, high):
     """Claim: a push that makes the only grasp possible is learned, then that grasp, in two actions.
 
@@ -134,15 +122,12 @@ def test_grasping_alone_fails():
     assert_allclose(learned.value, 0.0, atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "push", "value", "solves"),
-    [
-        pytest.param("reactive", None, 0.5, True, marks=SLOW),
-        pytest.param("reactive", -0.2, 0.0, False, marks=SLOW),
-        pytest.param("vpg", -0.2, 0.533, True, marks=SLOW),
-        pytest.param("vpg_episodic", -0.2, 0.4, True, marks=SLOW),
-    ],
-)
+    [("reactive", None, 0.5, True), ("reactive", -0.2, 0.0, False), ("vpg", -0.2, 0.533, True),
+     ("vpg_episodic", -0.2, 0.4, True)],
+)  # fmt: skip
 def test_without_a_future_a_push_must_pay_by_itself(algo, push, value, solves):
     """Claim: with gamma = 0 the push is made if it earns 0.5 at once, and not if it costs 0.1; a
     gamma of 0.5 pays for it: -0.1 + 0.5, or V = -0.1 + 0.5 (1 + 0.5 V)."""

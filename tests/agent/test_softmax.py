@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from csac_jax.agent import box, losses
+from csac_jax.agent import losses
 from csac_jax.config import TargetConfig
 from tests.agent.reference import exact_softmax
 from tests.sections import with_constants
@@ -68,34 +68,28 @@ def test_log_density_is_that_of_the_samples(cfg, mean):
 def test_no_atoms_at_the_bounds():
     """Claim: no two noisy actions share the bound, as the clipped normals of line 13 would."""
     noise, _ = sampled_noise(with_constants(CFG, std=0.5, clip=0.5), (0.0, 0.9, 0.0))
-    for dim in range(3):
-        assert np.sum(noise[:, dim] == noise[:, dim].max()) <= 2
+    assert np.all(np.sum(noise == noise.max(axis=0), axis=0) <= 2)
 
 
 def test_mean_outside_the_box_is_brought_in():
-    """Claim: a proposal beyond the walls counts as one on them."""
-    outside, inside = (
-        noisy_actions(jax.random.key(0), CFG, jnp.array(mean))
-        for mean in ([1.3, 0.0, 1.5], [1.0, 0.0, -0.5])
+    """Claim: a proposal beyond the walls counts as one on them; another key draws others."""
+    outside, inside, other = (
+        noisy_actions(jax.random.key(seed), CFG, jnp.array(mean))
+        for seed, mean in ((0, [1.3, 0.0, 1.5]), (0, [1.0, 0.0, -0.5]), (1, [1.0, 0.0, -0.5]))
     )
     assert_allclose(outside[0], inside[0], atol=1e-6)
     assert_allclose(outside[1], inside[1], atol=1e-5)
-
-
-def test_keys_differ():
-    """Claim: two keys give two sets of actions."""
-    first, other = (noisy_actions(jax.random.key(i), CFG, jnp.zeros(3))[0] for i in range(2))
-    assert np.all(first != other)
+    assert np.all(other[0] != inside[0])
 
 
 def test_expectation_by_hand():
     """Claim: q = 0, 1 at beta = ln 3 gives 3/4; with p = 1/2, 1/4 the weights are 2 and 12:
-    12/14."""
-    q, beta = jnp.array([0.0, 1.0]), float(np.log(3.0))
+    12/14. Of the exact value only valid cells count."""
+    q, beta, half = jnp.array([0.0, 1.0]), float(np.log(3.0)), jnp.log(jnp.array([0.5, 0.25]))
     assert_allclose(losses.softmax(q, jnp.zeros(2), beta), 0.75, rtol=1e-6)
-    assert_allclose(
-        losses.softmax(q, jnp.log(jnp.array([0.5, 0.25])), beta), 12.0 / 14.0, rtol=1e-6
-    )
+    assert_allclose(losses.softmax(q, half, beta), 12.0 / 14.0, rtol=1e-6)
+    exact = exact_softmax(jnp.array([0.0, 1.0, 5.0]), beta, jnp.array([True, True, False]))
+    assert_allclose(exact, 0.75, rtol=1e-6)
 
 
 def test_expectation_lies_between_mean_and_maximum():
@@ -115,17 +109,7 @@ def test_expectation_lies_between_mean_and_maximum():
 def test_expectation_does_not_overflow():
     """Claim: exponents of a million overflow nothing, up or down."""
     q = jnp.array([1e5, -1e5, 9e4])
-    assert losses.softmax(q, jnp.zeros(3), 20.0) == 1e5
-    assert losses.softmax(-q, jnp.zeros(3), 20.0) == 1e5
-    assert exact_softmax(q, 20.0, jnp.array([True, True, True])) == 1e5
-
-
-def test_exact_by_hand():
-    """Claim: only valid cells count: q = 0, 1 of [0, 1, 5] at beta = ln 3 give 3/4."""
-    value = exact_softmax(
-        jnp.array([[0.0, 1.0, 5.0]]), float(np.log(3.0)), jnp.array([[True, True, False]])
-    )
-    assert_allclose(value, 0.75, rtol=1e-6)
+    assert losses.softmax(q, jnp.zeros(3), 20.0) == losses.softmax(-q, jnp.zeros(3), 20.0) == 1e5
 
 
 @pytest.mark.parametrize("beta", [0.0, 2.0, 10.0])
@@ -142,13 +126,11 @@ def test_expectation_is_that_of_the_continuous_softmax(beta):
         plane = jnp.sum(waves * action[None, :2], axis=-1)
         return jnp.mean(jnp.sin(plane + phases + jnp.pi * action[2]))
 
-    axes = []
-    for dim in range(3):
-        _, low, high = reference(cfg, mean, dim)
-        axes.append(mean[dim] + low + (high - low) * (np.arange(48) + 0.5) / 48)
-    grid = jnp.asarray(
-        np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), jnp.float32
-    )
+    bounds = [reference(cfg, mean, dim)[1:] for dim in range(3)]
+    share = (np.arange(48) + 0.5) / 48
+    axes = [m + low + (high - low) * share for m, (low, high) in zip(mean, bounds, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = jnp.asarray(grid, jnp.float32)
     true = exact_softmax(jax.vmap(q)(grid), beta, jnp.ones(48**3, bool))
 
     def estimate(i):
@@ -159,11 +141,6 @@ def test_expectation_is_that_of_the_continuous_softmax(beta):
     estimates = np.asarray(jax.lax.map(estimate, jnp.arange(200)))
     assert abs(estimates.mean() - true) <= 4 * estimates.std() / np.sqrt(200) + 1e-4
     assert estimates.std() < 0.02
-
-
-def test_only_yaw_wraps():
-    """Claim: of a pose (x, y, yaw), yaw alone wraps."""
-    assert box.POSE_WRAPS.tolist() == [False, False, True]
 
 
 def _random_map(seed: int) -> tuple[jax.Array, jax.Array]:

@@ -56,7 +56,6 @@ class Toy:
 
     cfg: Config
     kinds: tuple[int, ...]  # of the blocks of a fresh scene
-    reach: float = 1.0  # m from its middle, within which a block can be lifted
 
     def reset(self, key: jax.Array) -> State:
         """Blocks in places of their own, each as likely as any other."""
@@ -70,12 +69,9 @@ class Toy:
         """The picture of a scene."""
         size = self.cfg.heightmap.size
         cell = jnp.arange(size, dtype=jnp.int32) // (size // GRID)
-        there = (cell[:, None, None] * GRID + cell[None, :, None]) == layout.place[
-            None, None
-        ]  # [H, W, N]
-        colour = jnp.einsum(
-            "hwn,nc->hwc", there.astype(jnp.float32), jnp.asarray(COLOURS)[layout.kind]
-        )
+        number = cell[:, None, None] * GRID + cell[None, :, None]
+        there = number == layout.place[None, None]  # [H, W, N]
+        colour = there.astype(jnp.float32) @ jnp.asarray(COLOURS)[layout.kind]
         taken = jnp.any(there, axis=-1)
         return Observation(
             colour=jnp.where(taken[..., None], colour, jnp.asarray(TABLE)[None, None]),
@@ -95,24 +91,19 @@ class Toy:
         hit = layout.place == row * GRID + col  # [N]
         kind = jnp.where(hit, layout.kind, -1)
         grasped = action.primitive == Primitive.GRASP
-        middle = (jnp.stack([col, row]).astype(jnp.float32) + 0.5) * (extent / GRID) - 0.5 * extent
-        near = jnp.linalg.norm(action.pose[:2] - middle) <= self.reach
-        lifted = grasped & near & jnp.any(kind == GOOD)
+        lifted = grasped & jnp.any(kind == GOOD)
         outcome = jnp.where(jnp.any(hit), jnp.int32(Outcome.TOUCHED), jnp.int32(Outcome.EMPTY))
         outcome = jnp.where(lifted, jnp.int32(Outcome.LIFTED), outcome)
         opened = ~grasped & jnp.any(kind == LATCH) & jnp.any(layout.kind == LOCKED)
         layout = layout.replace(kind=jnp.where(opened & (layout.kind == LOCKED), GOOD, layout.kind))
-        actions, steps_without_change = (
-            state.actions + 1,
-            jnp.where(lifted | opened, 0, state.steps_without_change + 1),
-        )
+        actions = state.actions + 1
         return state.replace(
             scene=layout,
             obs=self.observe(layout),
             terminated=lifted,
             truncated=(actions >= self.cfg.task.max_actions) & ~lifted,
             actions=actions,
-            steps_without_change=steps_without_change,
+            steps_without_change=jnp.where(lifted | opened, 0, state.steps_without_change + 1),
             info=state.info.replace(
                 outcome=jnp.where(grasped, outcome, jnp.int32(Outcome.NOTHING)),
                 moved=jnp.where(opened, 2.0 * CHANGE_AREA, 0.0),
@@ -130,12 +121,6 @@ def two_step(cfg: Config) -> Toy:
     """A block that can be grasped only after a push of another: without a push nothing is ever
     lifted."""
     return Toy(cfg, (LOCKED, LATCH, DUD))
-
-
-def precise(cfg: Config) -> Toy:
-    """One good block among duds, which can be lifted near its middle alone: where four cells of the
-    maps meet, and further from their middles than it may be."""
-    return Toy(cfg, (GOOD, DUD, DUD), reach=0.025)
 
 
 def config(algo: str, actions: int, max_actions: int, push: float | None = None) -> Config:
