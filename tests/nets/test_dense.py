@@ -39,22 +39,15 @@ def _apply(params: dict, maps: np.ndarray, cfg: SmallNet = CFG) -> np.ndarray:
     return np.asarray(jax.jit(dense.Critic(cfg).apply)(params, jnp.asarray(maps, jnp.float32))[0])
 
 
-def _convolve(
-    maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int
-) -> np.ndarray:
+def _convolve(maps, kernel, stride: int, dilation: int, padding: int) -> np.ndarray:
     padded = np.pad(maps, ((0, 0), (padding,) * 2, (padding,) * 2, (0, 0)))
-    size = kernel.shape[0]
-    rows, cols = (
-        (length - dilation * (size - 1) - 1) // stride + 1 for length in padded.shape[1:3]
-    )
-    out = np.zeros((*maps.shape[:1], rows, cols, kernel.shape[3]))
-    for i in range(size):
-        for j in range(size):
-            top, left = i * dilation, j * dilation
-            out += (
-                padded[:, top : top + rows * stride : stride, left : left + cols * stride : stride]
-                @ kernel[i, j]
-            )
+    size, lengths = kernel.shape[0], padded.shape[1:3]
+    rows, cols = ((length - dilation * (size - 1) - 1) // stride + 1 for length in lengths)
+    out = np.zeros((len(maps), rows, cols, kernel.shape[3]))
+    for i, j in np.ndindex(size, size):
+        down = slice(i * dilation, i * dilation + rows * stride, stride)
+        right = slice(j * dilation, j * dilation + cols * stride, stride)
+        out += padded[:, down, right] @ kernel[i, j]
     return out
 
 
@@ -137,19 +130,11 @@ def test_finer_maps_lie_where_their_cells_do(stride: int, finer: int):
     what the net sees."""
     cfg = dataclasses.replace(COARSE, stride=stride, subcells=finer)
     maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
-    got, values = (
-        _apply(params, maps, cfg),
-        _numpy_net(params, maps, cfg),
-    )  # values [2, h, w, s s OUTPUTS]
+    got, values = _apply(params, maps, cfg), _numpy_net(params, maps, cfg)  # [2, h, w, s s OUTPUTS]
     assert got.shape == (2, 16 * finer // stride, 24 * finer // stride, dense.OUTPUTS)
-    for i in range(finer):
-        for j in range(finer):
-            for output in range(dense.OUTPUTS):
-                cells, channel = (
-                    got[:, i::finer, j::finer, output],
-                    (finer * i + j) * dense.OUTPUTS + output,
-                )
-                assert_allclose(cells, values[..., channel], rtol=1e-3, atol=1e-4)
+    for i, j, output in np.ndindex(finer, finer, dense.OUTPUTS):
+        channel = values[..., (finer * i + j) * dense.OUTPUTS + output]
+        assert_allclose(got[:, i::finer, j::finer, output], channel, rtol=1e-3, atol=1e-4)
 
 
 def test_bare_table_is_zero():

@@ -54,16 +54,14 @@ def _keras_name(modules: tuple[str, ...]) -> str:
 
 
 def _outputs(tree: Any, modules: tuple[str, ...] = ()) -> Iterator[tuple[str, jax.Array]]:
-    """Keras's name and output of every module in the captured intermediates but dense layers, which
-    give what their last convolution gives, whole blocks and the trunk."""
+    """Keras's name and output of every captured module but dense layers, which give what their last
+    convolution gives, whole blocks and the trunk."""
     for name, entry in tree.items():
         if name != "__call__":
             yield from _outputs(entry, (*modules, name))
         elif modules and not modules[-1].startswith("dense"):
-            yield (
-                _keras_name(modules),
-                entry[0].maps if modules[-1].startswith("transition") else entry[0],
-            )
+            is_piece = modules[-1].startswith("transition")
+            yield _keras_name(modules), entry[0].maps if is_piece else entry[0]
 
 
 def _weights(
@@ -72,20 +70,14 @@ def _weights(
     """Keras's name and weights of every layer that has some."""
     params, statistics = variables
     for name, entry in params.items():
+        own, keras_name = statistics.get(name, {}), (*modules, name)
         if "kernel" in entry:
-            yield _keras_name((*modules, name)), [np.asarray(entry["kernel"])]
+            yield _keras_name(keras_name), [np.asarray(entry["kernel"])]
         elif "scale" in entry:
-            own = statistics[name]
-            yield (
-                _keras_name((*modules, name)),
-                [np.asarray(w) for w in (*_scale(entry), own["mean"], own["var"])],
-            )
+            leaves = entry["scale"], entry["bias"], own["mean"], own["var"]
+            yield _keras_name(keras_name), [np.asarray(leaf) for leaf in leaves]
         else:
-            yield from _weights((entry, statistics.get(name, {})), (*modules, name))
-
-
-def _scale(entry: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
-    return entry["scale"], entry["bias"]
+            yield from _weights((entry, own), keras_name)
 
 
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
@@ -134,20 +126,14 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
         layer = net.get_layer(name)
         layer.set_weights(weights)
         if len(weights) == 4:
-            layer.momentum, layer.epsilon = (
-                0.9,
-                1e-5,
-            )  # torchvision's in place of Keras's 0.99 and 1.001e-5
+            # torchvision's in place of Keras's 0.99 and 1.001e-5
+            layer.momentum, layer.epsilon = 0.9, 1e-5
             norms.append(name)
-    kinds = ("_conv", "_bn", "_pool")
-    wanted = [
-        layer.name for layer in net.layers if layer.name.endswith(kinds) or layer.name == "bn"
-    ]
+    kinds = ("_conv", "_bn", "_pool", "bn")
+    wanted = [layer.name for layer in net.layers if layer.name.endswith(kinds)]
     whole = keras.Model(net.inputs, [net.get_layer(name).output for name in wanted])
-    trained, other = (
-        [v.value for v in group]
-        for group in (whole.trainable_variables, whole.non_trainable_variables)
-    )
+    groups = whole.trainable_variables, whole.non_trainable_variables
+    trained, other = ([v.value for v in group] for group in groups)
 
     def run(trained: Any, other: Any, maps: jax.Array, train: bool) -> Any:
         return whole.stateless_call(trained, other, maps, training=train)
@@ -156,10 +142,8 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
 
     def call(maps: jax.Array, train: bool) -> Any:
         outputs, after = compiled(trained, other, maps, train)
-        by_path = {
-            variable.path: value
-            for variable, value in zip(whole.non_trainable_variables, after, strict=True)
-        }
+        paths = [variable.path for variable in whole.non_trainable_variables]
+        by_path = dict(zip(paths, after, strict=True))
         statistics = {
             name: [by_path.get(v.path, v.value) for v in net.get_layer(name).variables]
             for name in norms
@@ -189,9 +173,8 @@ def test_number_of_parameters():
     trunk = densenet.DenseNetTrunk(DenseNet121(norm="batch"))
     blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
     variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
-    sizes = {
-        name: sum(leaf.size for leaf in jax.tree.leaves(entry)) for name, entry in variables.items()
-    }
+    size = lambda entry: sum(leaf.size for leaf in jax.tree.leaves(entry))  # noqa: E731
+    sizes = {name: size(entry) for name, entry in variables.items()}
     assert sizes == {"params": PARAMETERS - 83_648, "batch_stats": 83_648}
     assert jax.eval_shape(trunk.apply, variables, blank).shape == (1, 2, 2, 1024)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.float32.dtype}
@@ -215,18 +198,15 @@ def test_trunks_see_colour_height_and_mask():
 
 def test_a_zoomed_trunk_doubles_its_cells():
     """Claim: with a zoom a trunk says of maps what one without says of pixels repeated."""
-    whole, doubling = (
-        densenet.DenseNetTrunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2)
-    )
+    nets = (densenet.DenseNetTrunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2))
+    whole, doubling = (jax.jit(net.apply) for net in nets)
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
-    variables = random_variables(whole, 0, (1, 64, 64, 3))
-    repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
-    got, wanted = (
-        jax.jit(doubling.apply)(variables, maps),
-        jax.jit(whole.apply)(variables, repeated),
-    )
+    variables = random_variables(densenet.DenseNetTrunk(TINY), 0, (1, 64, 64, 3))
+    got = doubling(variables, maps)
     assert got.shape == (2, 2, 3, 8)
-    assert_allclose(got, wanted, atol=1e-4)  # rounding, which norms of random scales amplify
+    repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
+    # Rounding, which norms of random scales amplify.
+    assert_allclose(got, whole(variables, repeated), atol=1e-4)
 
 
 def test_inputs():
@@ -263,16 +243,14 @@ def test_head_upsamples(zoom: int, output_stride: int, factor: int):
     """Claim: maps have the resolution that `output_stride` says; they are bilinear between the
     features' cells, which keep their places, and constant features give a constant map."""
     cfg = with_constants(DenseNet121(zoom=zoom), output_stride=output_stride)
-    plane = jnp.asarray(
-        np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None], jnp.float32
-    )
+    plane = np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None]
+    plane = jnp.asarray(plane, jnp.float32)
     got = np.asarray(densenet._upsample(plane, 32 // (cfg.zoom * cfg.output_stride)))[0, ..., 0]
     assert got.shape == (4 * factor, 5 * factor)
     at = [(np.arange(n * factor) + 0.5) / factor - 0.5 for n in (4, 5)]
-    inner = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]
-    assert_allclose(
-        got[np.ix_(*inner)], np.add.outer(3.0 * at[0][inner[0]], at[1][inner[1]]), atol=1e-5
-    )
+    rows, cols = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]
+    expected = np.add.outer(3.0 * at[0][rows], at[1][cols])
+    assert_allclose(got[np.ix_(rows, cols)], expected, atol=1e-5)
 
 
 def test_group_norm_sees_one_map():
@@ -305,6 +283,7 @@ def test_bfloat16_is_near_float32():
     maps = jnp.asarray(np.random.default_rng(4).normal(size=(1, 64, 64, 4)), jnp.float32)
     variables = random_variables(densenet.DenseNetCritic(TINY), 0, maps.shape)
     with jax.numpy_dtype_promotion("standard"):
-        q, _ = jax.jit(densenet.DenseNetCritic(HALF).apply)(variables, maps)
-    wanted, _ = jax.jit(densenet.DenseNetCritic(TINY).apply)(variables, maps)
+        q, wanted = (
+            jax.jit(densenet.DenseNetCritic(cfg).apply)(variables, maps)[0] for cfg in (HALF, TINY)
+        )
     assert 0.0 < np.abs(q - wanted).max() <= 0.05 * np.abs(wanted).max()
