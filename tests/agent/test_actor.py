@@ -85,8 +85,7 @@ def test_pose_is_finite_where_nothing_is_valid(frames, pose, logits, valid):
 
 @pytest.mark.parametrize("axis", range(3))
 def test_mean_moves_towards_a_growing_neighbour(frames, pose, axis):
-    """Claim: the pose is differentiable: as a neighbour's logit grows, in the next column, row or
-    yaw, it moves there by what the gradient says."""
+    """Claim: as a neighbour's logit grows, the pose moves there as the gradient says."""
     best = (2, 8, 9)
     logits = 0.1 * np.random.default_rng(3).normal(size=frames.inside.shape).astype(np.float32)
     logits[best] = 2.0

@@ -121,8 +121,7 @@ def test_losses_are_weighted(learner, state, batch, update):
 
 @pytest.mark.slow
 def test_target_carries_no_gradient(learner, state, batch):
-    """Claim: the critic's loss has exactly no gradient in the target networks and the reward, but
-    one in its own."""
+    """Claim: the critic's loss has no gradient in target networks and reward, but in its own."""
 
     def loss(online, target, reward):
         before = state.replace(online=online, target=target)
@@ -225,8 +224,7 @@ def test_target_moves_by_tau(learner, state, batch, update):
 
 @pytest.mark.parametrize("value", [1.5, 100.0, -100.0])
 def test_bootstrap(learner, state, batch, update, value):
-    """Claim: y = r + gamma V(s') by the target critic, V kept within the possible returns; y = r
-    after a true end."""
+    """Claim: y = r + gamma V(s') by the target critic, V within the returns; y = r after an end."""
     known = state.replace(target=_constant(state.target, value))
     half = jnp.arange(B) < B // 2
     going, ended, mixed = (
@@ -249,8 +247,7 @@ def _smooth(frames) -> DenseMaps:
 
 @pytest.mark.slow
 def test_next_value_lies_within_the_map(learner):
-    """Claim: the softmax value is never outside of the map's values, grows with the inverse
-    temperature, and comes near the largest value."""
+    """Claim: the softmax value lies within the map's values and rises with beta to the largest."""
     state = _smooth(learner.frames)
     low, high = float(state.q.min()), float(state.q.max())
     means = []
@@ -296,8 +293,7 @@ def test_next_value_ignores_what_is_bare(learner):
 
 
 def test_best_grasp():
-    """Claim: the largest value over valid grasps, never a push's nor an invalid one's; 0 if nothing
-    can be grasped."""
+    """Claim: the largest value over valid grasps, never a push's nor an invalid one's, else 0."""
     q = np.random.default_rng(0).normal(size=(2, 4, 6, 6)).astype(np.float32) - 3.0
     valid = np.random.default_rng(1).uniform(size=q.shape) < 0.2
     q[Primitive.PUSH] += 9.0
@@ -425,8 +421,7 @@ def test_twin_critics(learner, batch, randomised):
 
 
 def test_without_an_actor(learner, state, observations):
-    """Claim: without an actor the logits are the critic's map, ten to one, and an update of the
-    actor changes nothing."""
+    """Claim: without an actor the logits are the critic's map, ten to one, and none is updated."""
     own = _changed(learner, learn={"actor": False})
     state_maps = _look(own)(state.online, heightmap.pack(observations(2, 4)))
     assert_allclose(state_maps.logits, 10.0 * state_maps.q, rtol=1e-6)

@@ -90,8 +90,7 @@ def _moved(variables: Any, by: float) -> Any:
 
 
 def test_acting_uses_running_statistics(learner, state, observations):
-    """Claim: a state's maps do not depend on what else is looked at, but on the running statistics
-    of both nets."""
+    """Claim: a state's maps depend on the running statistics, not on the other states."""
     look = jax.jit(lambda params, obs: values.dense_maps(learner, params, obs))
     obs = observations(2, 4)
     others = jax.tree.map(lambda leaf: leaf.at[1].set(jnp.zeros((), leaf.dtype)), obs)
@@ -107,8 +106,7 @@ def test_acting_uses_running_statistics(learner, state, observations):
 
 @pytest.mark.slow
 def test_learning_uses_the_batchs_statistics(state, batch, update, updated):
-    """Claim: while learning, Q(s, a) of a transition depends on the batch, and not on the running
-    statistics."""
+    """Claim: while learning, Q(s, a) depends on the batch, not on running statistics."""
     flat = jax.tree.map(lambda leaf: leaf.at[1:].set(jnp.zeros((), leaf.dtype)), batch.obs)
     alone = update(state, batch.replace(obs=flat))[1]
     assert abs(float(alone.error[0] - updated[1].error[0])) > 1e-3
@@ -156,8 +154,7 @@ def test_targets_follow_statistics_too(learner, state, updated):
 
 @pytest.mark.slow
 def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
-    """Claim: an update of the actor moves its parameters and statistics, and none of the
-    critic's."""
+    """Claim: an update of the actor moves its own parameters and statistics alone."""
     obs = heightmap.unpack(batch.obs)
     after, _ = jax.jit(lambda state: actor.update(learner, state, obs))(state)
     before, moved = state.online.actor, after.online.actor

@@ -18,8 +18,7 @@ YAWS = jnp.arange(16, dtype=jnp.float32) / 8 - 1.0
 
 
 def peaks(centres, heights, widths, action: jax.Array) -> jax.Array:
-    """Highest of P bell curves at `action` [3]; the maximum of the map is the largest height, at
-    its centre."""
+    """Returns the highest of P bell curves at `action` [3]."""
     offset = box.wrap_yaw(action[None] - centres)
     return jnp.max(heights * jnp.exp(-0.5 * jnp.sum(offset**2, axis=-1) / widths**2))
 
@@ -43,8 +42,7 @@ def search(cfg: CEMConfig, score: cem.Score, mean, start=NO_START, seed: int = 0
 
 
 def search_random_maps(num_start: int) -> tuple[np.ndarray, np.ndarray]:
-    """Values that searches find on random maps of one to five peaks, and their best pixels', in
-    maxima."""
+    """Returns values of searches on random maps, and their best pixels', in maxima."""
 
     def run(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         key_num, key_centre, key_height, key_width, key_mean, key_search = jax.random.split(key, 6)
@@ -96,8 +94,7 @@ def test_more_rounds_come_nearer():
 
 
 def test_best_sample_is_kept():
-    """Claim: the result is the best sample ever seen: a needle among the starting points survives
-    all rounds."""
+    """Claim: the result is the best sample ever seen, a needle among the starting points too."""
     needle = jnp.array([0.7, 0.7, 0.0])
 
     def score(action):
@@ -127,8 +124,7 @@ def test_scores_that_are_not_numbers():
 
 
 def test_search_goes_on_where_no_score_was_found():
-    """Claim: a round without any value leaves mean and std as they are, so that later rounds may
-    still find one."""
+    """Claim: a round without any value leaves mean and std as they are."""
     score = lambda action: jnp.where(jnp.max(jnp.abs(action - 0.25)) < 0.06, 1.0, -jnp.inf)  # noqa: E731
     result = search(CEMConfig(rounds=40), score, jnp.zeros(3), num=50)  # P(hit) = 0.0014 a sample
     assert np.mean(result.value == 1.0) > 0.8
@@ -191,8 +187,7 @@ def test_wrap():
 
 
 def test_last_rounds_are_what_the_search_tries():
-    """Claim: `candidates` are the samples of the last round: the best of all rounds' is the result
-    of the search."""
+    """Claim: `candidates` are the samples of the last round."""
     score, start = (
         one_peak([0.3, -0.2, 0.9], 0.3),
         jnp.array([[-0.6, 0.7, -0.4], [-0.5, 0.5, -0.5]]),

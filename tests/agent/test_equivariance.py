@@ -56,8 +56,7 @@ def net(request, cfg) -> Fixed:
 
 
 def _hills(seed: int, yaw: float) -> Observation:
-    """One scene of five smooth coloured hills within 0.17 m of the centre, turned by `yaw`, leaves
-    [1, ...]."""
+    """Draws four smooth coloured hills near the centre, turned by `yaw`, leaves [1, ...]."""
     rng = np.random.default_rng(seed)
     along = ((np.arange(SIZE) + 0.5) / SIZE - 0.5) * 0.448
     x, y = _rotated(along[None, :], along[:, None], yaw)  # where it was before
@@ -113,6 +112,7 @@ def test_quarter_turn(net, seed):
     before, after = net.look(net.params, obs), net.look(net.params, _quarter(obs))
     assert_allclose(after.q[:, :, then], before.q[:, :, first], atol=1e-5)
     assert_array_equal(after.valid[:, :, then], before.valid[:, :, first])
+    assert_allclose(after.logits[:, :, then], before.logits[:, :, first], atol=1e-3)
     assert np.std(before.q) > 0.01
     (primitive, pose), (other, turned) = _best(net, before, first), _best(net, after, then)
     assert primitive == other
@@ -135,8 +135,7 @@ def test_one_yaw_step(net, seed):
 
 
 def _symmetric(params: Any) -> Any:
-    """The small net made blind to a half turn: kernels that are their own half turn, a push back
-    worth one ahead."""
+    """Makes the small net blind to a half turn: symmetric kernels, a push back as one ahead."""
 
     def fold(path: Any, leaf: jax.Array) -> jax.Array:
         if leaf.ndim >= 4 and path[-1].key == "kernel":  # [M, k, k, I, O] of the critic

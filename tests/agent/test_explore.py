@@ -41,8 +41,7 @@ def test_probability(actions, expected):
 
 @pytest.mark.parametrize("taken", [0, 300, 10**6])
 def test_shares_of_primitives_and_places(taken):
-    """Claim: pushes come with eps push_fraction, random places with their own eps, both as of the
-    actions taken."""
+    """Claim: pushes have probability eps push_fraction, random places their own eps."""
     cfg = ExploreConfig(
         epsilon_primitive=(0.5, 0.1), epsilon_place=(0.5, 0.02), decay=0.998, push_fraction=0.25
     )
@@ -53,8 +52,7 @@ def test_shares_of_primitives_and_places(taken):
 
 
 def test_pose_belongs_to_the_primitive():
-    """Claim: a forced primitive acts at its own greedy pose up to the noise, or at its own random
-    place exactly."""
+    """Claim: a forced primitive acts at its own greedy pose or its own random place."""
     cfg = ExploreConfig(epsilon_primitive=(1.0, 0.1), push_fraction=0.5)
     primitives, poses = choices(cfg, 0)
     greedy = np.asarray(GREEDY_POSES)[primitives]
@@ -76,8 +74,7 @@ def test_no_exploration_is_greedy():
 
 
 def test_action_noise_is_a_clipped_normal():
-    """Claim: in each dimension, noise has spread delta, is bounded by c = 3 delta, and is c as
-    often as a normal passes it."""
+    """Claim: noise is a normal of spread delta, clipped at 3 delta, in each dimension."""
     cfg = ExploreConfig(noise_std=0.05)
     keys = jax.random.split(jax.random.key(1), NUM)
     noise = np.asarray(jax.vmap(lambda key: explore.action_noise(key, cfg, jnp.zeros(3)))(keys))

@@ -37,8 +37,7 @@ class Learned(NamedTuple):
 def learn(
     problem: Callable[..., Toy], algo: str, actions: int, cap: int, push: float | None = None
 ) -> Learned:
-    """Trains an algorithm on a problem for a number of actions and plays EPISODES fresh
-    episodes."""
+    """Trains an algorithm on a problem and plays EPISODES fresh episodes."""
     cfg = toys.config(algo, actions, cap, push)
     toy = problem(cfg)
     program = step.make(cfg, env=toy)
@@ -114,8 +113,7 @@ def test_two_steps_are_learned(algo, low, high):
 
 @pytest.mark.slow
 def test_grasping_alone_fails():
-    """Claim: where only a push makes a grasp possible, grasp_only never pushes, lifts nothing and
-    expects nothing."""
+    """Claim: where only a push makes a grasp possible, grasp_only lifts and expects nothing."""
     learned = learn(toys.two_step, "grasp_only", actions=800, cap=CAP)
     assert learned.success == 0.0
     assert learned.pushes == [0.0] * CAP

@@ -58,8 +58,7 @@ def _assert_best(frames, state: DenseMaps, action: Action) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_greedy_avoids_what_is_bare(frames, best, seed):
-    """Claim: the action is on a valid cell, though invalid ones are worth more, and no worse than
-    the best cell."""
+    """Claim: the action is valid and worth the best cell, though invalid cells are worth more."""
     state = _state(frames, seed)
     state = state.replace(q=jnp.where(state.valid, state.q, 3.0))
     _assert_best(frames, state, best(state))
@@ -97,16 +96,14 @@ def test_random_grasps_land_on_blocks(cfg, frames, observations):
 
 @pytest.mark.slow
 def test_without_exploration_it_acts_greedily(cfg, frames, parts):
-    """Claim: with no noise, random primitive nor random place, what is tried is valid and worth the
-    best value."""
+    """Claim: with all exploration off, what is tried is worth the best value."""
     calm = ExploreConfig(noise_std=0.0, epsilon_primitive=(0.0, 0.0), epsilon_place=(0.0, 0.0))
     state = _state(frames, 7)
     _assert_best(frames, state, _explore(parts(cfg.change(explore=calm)), state, KEYS))
 
 
 def test_best_pixel(cfg, frames, parts):
-    """Claim: with `argmax` a primitive's pose is that of NumPy's largest valid cell, exactly,
-    whatever the key."""
+    """Claim: with `argmax` a primitive's pose is NumPy's largest valid cell, whatever the key."""
     own, state = parts(cfg.change(policy={"place": "argmax"})), _state(frames, 4)
     run = jax.jit(jax.vmap(lambda key: policy.greedy(key, own, state, jnp.int32(0))))
     choice = run(jax.random.split(jax.random.key(0), 3))
@@ -168,8 +165,7 @@ def test_retries_follow_boltzmann(cfg, frames, parts, failed):
 @pytest.mark.parametrize("steps_without_change", [0, 1])
 @pytest.mark.slow
 def test_rule_reaches_the_action(cfg, frames, parts, steps_without_change):
-    """Claim: what is done follows the rule with and without exploration, where values say the
-    opposite."""
+    """Claim: what is done follows the rule, where values say the opposite."""
     rule = {"policy": {"primitive": "rule"}, "explore": {"epsilon_primitive": (0.0, 0.0)}}
     own, state = parts(cfg.change(**rule)), _state(frames, 5)
     wrong = Primitive.GRASP if steps_without_change else Primitive.PUSH
@@ -187,8 +183,7 @@ def test_grasp_only_never_pushes(cfg, frames, parts):
 
 
 def _peaked(key: jax.Array, frames) -> DenseMaps:
-    """Maps of one to five peaks of different heights and widths for grasps; the actor's logits are
-    noise."""
+    """Draws one to five peaks of grasp values; the actor's logits are noise."""
     key_num, key_centre, key_height, key_width, key_logits = jax.random.split(key, 5)
     present = jnp.arange(5) < jax.random.randint(key_num, (), 1, 6)
     heights = jnp.where(present, jax.random.uniform(key_height, (5,), minval=0.3, maxval=1.0), 0.0)
@@ -230,8 +225,7 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, parts, start, le
 
 @pytest.mark.slow
 def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
-    """Claim: with the options that a training program is compiled with on a CPU, 200 searches end
-    where they do by XLA's own."""
+    """Claim: with the options of training on a CPU, 200 searches end where they do by XLA's own."""
 
     def search(i: jax.Array) -> jax.Array:
         keys = jax.random.split(jax.random.fold_in(jax.random.key(5), i))
@@ -247,8 +241,7 @@ def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
 
 
 def test_random_places_reach_all_that_is_valid(frames):
-    """Claim: where every cell is valid, random places of both primitives reach the whole
-    workspace."""
+    """Claim: random places of both primitives reach the whole workspace."""
     valid = jnp.broadcast_to(frames.inside, (2, *frames.inside.shape))
     place = jax.jit(jax.vmap(lambda key: policy.random_places(key, frames, valid)))
     u = place(jax.random.split(jax.random.key(0), 400))

@@ -143,8 +143,7 @@ def test_replicas_ask_for_the_neediests_quarters(learner, randomised, observatio
 
 
 def test_relabelling_is_the_difference_of_two_rewards():
-    """Claim: a renewed reward is what the action would have earned with the new label, whatever
-    else it earned or lost."""
+    """Claim: a renewed reward is what the action would have earned with the new label."""
     cfg, no = RewardConfig(lost_block_penalty=3.0), jnp.array(False)
     worse, better = (
         test_rewards.reward(cfg, Primitive.PUSH, after=gain, blocks_lost=1) for gain in (0.0, 1.0)

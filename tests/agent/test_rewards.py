@@ -37,8 +37,7 @@ def reward(
     ("outcome", "expected"), list(zip(Outcome, (-1.0, -0.5, -0.25, 0.0, 2.0), strict=True))
 )
 def test_grasp_rewards(outcome, expected):
-    """Claim: eqs. 12 and 15 by hand: -1, -0.5, -0.25, 0, and 1 for the lift plus 1 for the block in
-    the hand."""
+    """Claim: eqs. 12 and 15 by hand: -1, -0.5, -0.25, 0, and 1 plus 1 for the lift."""
     assert reward(CFG, Primitive.GRASP, outcome) == expected
 
 
@@ -78,8 +77,7 @@ def test_distance_is_a_loss():
 
 @pytest.mark.parametrize("primitive", [Primitive.PUSH, Primitive.GRASP])
 def test_blocks_that_left_cost_once(primitive):
-    """Claim: with a penalty of 0.75 an action that loses one block, or three, pays 0.75 less; by
-    default it pays nothing less."""
+    """Claim: an action that loses one block, or three, pays the penalty once."""
     strict = RewardConfig(lost_block_penalty=0.75)
     for cfg, lost, penalty in ((strict, 0, 0.0), (strict, 1, 0.75), (strict, 3, 0.75), (CFG, 2, 0)):
         got = reward(cfg, primitive, Outcome.LIFTED, after=1.0, blocks_lost=lost)
@@ -112,8 +110,7 @@ def test_scale():
 )
 @pytest.mark.parametrize("gamma", [0.0, 0.5, 0.9])
 def test_bounds_hold_and_are_reached(cfg, gamma):
-    """Claim: every discounted return of one action done 1 to 200 times lies within, and some reach
-    both ends."""
+    """Claim: returns of an action done 1 to 200 times lie within, and reach both ends."""
     flags = (False, True)
     cases = itertools.product((0, 1), Outcome, (0.0, 1.0, 3.0), (0.0,), (0.0, 1.0), flags, (0, 1))
     results = rewards.ActionResult(*map(jnp.asarray, zip(*cases, strict=True)))
@@ -126,8 +123,7 @@ def test_bounds_hold_and_are_reached(cfg, gamma):
 
 
 def test_default_bounds():
-    """Claim: with the default rewards and gamma 0.5, returns lie between -2 and 4, with VPG's
-    between 0 and 2."""
+    """Claim: with gamma 0.5, returns lie between -2 and 4, with VPG's rewards between 0 and 2."""
     assert rewards.bounds(CFG, 0.5) == (-2.0, 4.0)
     assert rewards.bounds(algorithms.VPG_REWARD, 0.5) == (0.0, 2.0)
 

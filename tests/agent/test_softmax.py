@@ -41,8 +41,7 @@ def sampled_noise(cfg: TargetConfig, mean: tuple[float, ...]) -> tuple[np.ndarra
 @pytest.mark.parametrize("cfg", CONFIGS)
 @pytest.mark.parametrize("mean", MEANS)
 def test_noise_is_truncated_normal(cfg, mean):
-    """Claim: noise follows SciPy's truncated normal, between its bounds, also at the walls and over
-    half a turn."""
+    """Claim: noise follows SciPy's truncated normal, at the walls and over half a turn too."""
     noise, _ = sampled_noise(cfg, mean)
     for dim in range(3):
         law, low, high = reference(cfg, mean, dim)
@@ -54,8 +53,7 @@ def test_noise_is_truncated_normal(cfg, mean):
 @pytest.mark.parametrize("cfg", CONFIGS)
 @pytest.mark.parametrize("mean", MEANS)
 def test_log_density_is_that_of_the_samples(cfg, mean):
-    """Claim: the log density is SciPy's, and 1 / p averages to the volume of the support: p
-    integrates to 1."""
+    """Claim: the log density is SciPy's, and 1 / p averages to the volume of the support."""
     noise, log_density = sampled_noise(cfg, mean)
     laws = [reference(cfg, mean, dim) for dim in range(3)]
     inside = [np.clip(noise[:, dim], low, high) for dim, (_, low, high) in enumerate(laws)]
@@ -93,8 +91,7 @@ def test_expectation_by_hand():
 
 
 def test_expectation_lies_between_mean_and_maximum():
-    """Claim: beta = 0 is the mean weighted by 1 / p, large beta the maximum, all others lie
-    between, in order."""
+    """Claim: beta = 0 is the mean weighted by 1 / p, large beta the maximum, in order."""
     key_q, key_density = jax.random.split(jax.random.key(0))
     q, log_density = jax.random.normal(key_q, (50,)), jax.random.normal(key_density, (50,))
     weight = np.exp(-np.asarray(log_density, np.float64))
@@ -114,8 +111,7 @@ def test_expectation_does_not_overflow():
 
 @pytest.mark.parametrize("beta", [0.0, 2.0, 10.0])
 def test_expectation_is_that_of_the_continuous_softmax(beta):
-    """Claim: the estimate's mean is the softmax over all actions in reach, found by summing over a
-    fine grid."""
+    """Claim: the estimate's mean is the softmax summed over a fine grid of actions."""
     cfg = with_constants(TargetConfig(), samples=4096, std=0.2, clip=0.5)
     mean = (0.8, -0.3, 0.9)
     key_wave, key_phase, key_sample = jax.random.split(jax.random.key(5), 3)
@@ -144,8 +140,7 @@ def test_expectation_is_that_of_the_continuous_softmax(beta):
 
 
 def _random_map(seed: int) -> tuple[jax.Array, jax.Array]:
-    """Random values [400] and a random law [400] over their cells, none of which is rare: p >= 0.1
-    / 400."""
+    """Draws values [400] and a law [400] over their cells, p >= 0.1 / 400."""
     rng = np.random.default_rng(seed)
     law = 0.9 * rng.dirichlet(np.ones(400)) + 0.1 / 400
     return jnp.asarray(rng.uniform(-1.0, 2.0, 400), jnp.float32), jnp.asarray(law, jnp.float32)
@@ -188,8 +183,7 @@ def test_estimate_is_unbiased_on_random_maps(seed):
 
 
 def test_exact_tends_to_mean_and_maximum():
-    """Claim: over a map, softmax_0 is the mean of the valid cells and softmax of a large beta their
-    maximum."""
+    """Claim: softmax_0 is the mean of the valid cells, that of a large beta their maximum."""
     q, _ = _random_map(0)
     valid = jnp.arange(400) % 3 == 0
     chosen = np.asarray(q)[::3]

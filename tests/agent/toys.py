@@ -118,8 +118,7 @@ def bandit(cfg: Config) -> Toy:
 
 
 def two_step(cfg: Config) -> Toy:
-    """A block that can be grasped only after a push of another: without a push nothing is ever
-    lifted."""
+    """One block that can be grasped only after a push of another."""
     return Toy(cfg, (LOCKED, LATCH, DUD))
 
 

@@ -29,7 +29,7 @@ def _random(rows: int, cols: int, size: int, inputs: int = 3, outputs: int = 5) 
     return [jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes]
 
 
-def _numpy(
+def numpy_convolution(
     maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int
 ) -> np.ndarray:
     """The sum over taps, cell by cell, in float64."""
@@ -55,11 +55,10 @@ def _plain(maps, kernel, stride, dilation, padding):
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_forward_is_numpys(setting, backend, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the value is the sum over the kernel's taps, zeros around; in the form for a CPU and
-    in that for a GPU."""
+    """Claim: the value is the sum over the kernel's taps, in the form for a CPU and for a GPU."""
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     maps, kernel = _random(*setting[:3])
-    expected = _numpy(maps, kernel, *setting[3:])
+    expected = numpy_convolution(maps, kernel, *setting[3:])
     assert_allclose(conv2d(maps, kernel, *setting[3:]), expected, atol=2e-5)
 
 
@@ -89,8 +88,7 @@ def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.Monk
 @pytest.mark.parametrize("dilation", [1, 2, 4])
 @pytest.mark.parametrize("size", [1, 3, 5])
 def test_taps_are_a_convolution(size: int, dilation: int):
-    """Claim: by taps, each of three runs under `vmap` has the values and the gradients of JAX's own
-    convolution."""
+    """Claim: by taps, runs under `vmap` have the values and gradients of JAX's convolution."""
     rng, padding = np.random.default_rng(0), dilation * (size // 2)
     shapes = (3, 2, 9, 12, 4), (3, size, size, 4, 5), (3, 2, 9, 12, 5)
     maps, kernels, gradients = (jnp.asarray(rng.normal(size=one), jnp.float32) for one in shapes)

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax.config import SmallNet
 from csac_jax.nets import dense, networks
+from tests.nets.test_convolution import numpy_convolution
 from tests.sections import with_constants
 
 CFG = SmallNet(growth=8, dilations=(1, 2), stem=16, head=8)
@@ -39,18 +40,6 @@ def _apply(params: dict, maps: np.ndarray, cfg: SmallNet = CFG) -> np.ndarray:
     return np.asarray(jax.jit(dense.Critic(cfg).apply)(params, jnp.asarray(maps, jnp.float32))[0])
 
 
-def _convolve(maps, kernel, stride: int, dilation: int, padding: int) -> np.ndarray:
-    padded = np.pad(maps, ((0, 0), (padding,) * 2, (padding,) * 2, (0, 0)))
-    size, lengths = kernel.shape[0], padded.shape[1:3]
-    rows, cols = ((length - dilation * (size - 1) - 1) // stride + 1 for length in lengths)
-    out = np.zeros((len(maps), rows, cols, kernel.shape[3]))
-    for i, j in np.ndindex(size, size):
-        down = slice(i * dilation, i * dilation + rows * stride, stride)
-        right = slice(j * dilation, j * dilation + cols * stride, stride)
-        out += padded[:, down, right] @ kernel[i, j]
-    return out
-
-
 def _norm(maps: np.ndarray, weights: dict) -> np.ndarray:
     """Group norm, then the positive part."""
     batch, rows, cols, channels = maps.shape
@@ -61,15 +50,17 @@ def _norm(maps: np.ndarray, weights: dict) -> np.ndarray:
 
 
 def _numpy_net(params: dict, maps: np.ndarray, cfg: SmallNet = CFG) -> np.ndarray:
-    """The critic's values of each cell of the features, in float64: kernels twice the stride wide
-    lie half of it over the edge."""
+    """Computes the critic's values of each cell of the features in float64."""
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params["params"])
     trunk, head = weights["trunk"], weights["head"]
     stem = trunk["Convolution_0"]["kernel"]
     assert stem.shape[0] == 2 * cfg.stride
-    features = _norm(_convolve(maps, stem, cfg.stride, 1, cfg.stride // 2), trunk["GroupNorm_0"])
+    features = _norm(
+        numpy_convolution(maps, stem, cfg.stride, 1, cfg.stride // 2), trunk["GroupNorm_0"]
+    )
     for layer, dilation in enumerate(cfg.dilations, start=1):
-        new = _convolve(features, trunk[f"Convolution_{layer}"]["kernel"], 1, dilation, dilation)
+        kernel = trunk[f"Convolution_{layer}"]["kernel"]
+        new = numpy_convolution(features, kernel, 1, dilation, dilation)
         features = np.concatenate([features, _norm(new, trunk[f"GroupNorm_{layer}"])], axis=-1)
     hidden = np.maximum(features @ head["Dense_0"]["kernel"] + head["Dense_0"]["bias"], 0.0)
     return hidden @ head["Dense_1"]["kernel"] + head["Dense_1"]["bias"]
@@ -77,8 +68,7 @@ def _numpy_net(params: dict, maps: np.ndarray, cfg: SmallNet = CFG) -> np.ndarra
 
 @pytest.mark.parametrize("cfg", [CFG, COARSE])
 def test_net_is_numpys(cfg: SmallNet):
-    """Claim: densely connected, group norm over the whole map, 1/stride of the resolution, three
-    maps."""
+    """Claim: densely connected, group norm over the whole map, 1/stride resolution, three maps."""
     maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
     got = _apply(params, maps, cfg)
     assert got.shape == (2, 16 // cfg.stride, 24 // cfg.stride, dense.OUTPUTS)
@@ -87,8 +77,7 @@ def test_net_is_numpys(cfg: SmallNet):
 
 @pytest.mark.slow
 def test_half_precision_is_near(params):
-    """Claim: in bfloat16, 8 bits of mantissa, maps stay float32 and within 2 % of their spread;
-    gradients too."""
+    """Claim: in bfloat16 maps stay float32, within 2 % of their spread; gradients too."""
     maps = jnp.asarray(np.random.default_rng(0).normal(size=(4, 32, 32, CHANNELS)), jnp.float32)
 
     def run(dtype: str):
@@ -138,8 +127,7 @@ def test_finer_maps_lie_where_their_cells_do(stride: int, finer: int):
 
 
 def test_bare_table_is_zero():
-    """Claim: where nothing lies the input is 0, whatever the table's colour; a block's height
-    comes out near 1."""
+    """Claim: bare table is 0, whatever its colour; a block's height comes out near 1."""
     height = jnp.array([[0.0, 0.001], [0.05, 0.025]])
     net_input = np.asarray(networks.make(CFG).inputs(jnp.full((2, 2, 3), 0.9), height, None))
     assert_array_equal(net_input[0, 0], 0.0)

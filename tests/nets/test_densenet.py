@@ -81,8 +81,7 @@ def _weights(
 
 
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
-    """Compares every module with Keras's in both modes of batch norm; returns how many outputs were
-    compared."""
+    """Compares every module with Keras's in both modes of batch norm; returns their number."""
     cfg = with_constants(DenseNet121(norm="batch"), block_layers=block_layers)
     trunk = densenet.DenseNetTrunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
@@ -115,8 +114,7 @@ def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
 
 
 def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Callable, list[str]]:
-    """(maps, train) -> (outputs, statistics by layer) of Keras's net with our weights; names of the
-    outputs."""
+    """Builds Keras's net with our weights: (maps, train) -> outputs, statistics; names."""
     import keras
     from keras.src.applications.densenet import DenseNet
 
@@ -168,8 +166,7 @@ def test_every_stage_of_densenet_121_is_kerass():
 
 
 def test_number_of_parameters():
-    """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running
-    statistics."""
+    """Claim: a trunk has 7,037,504 parameters, 83,648 of which are running statistics."""
     trunk = densenet.DenseNetTrunk(DenseNet121(norm="batch"))
     blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
     variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
@@ -181,8 +178,7 @@ def test_number_of_parameters():
 
 
 def test_trunks_see_colour_height_and_mask():
-    """Claim: a trunk each for colour, for height and for the mask, the latter two three times over;
-    cells are repeated as far as the trunk does not double them itself."""
+    """Claim: a trunk each for colour, height and mask, the latter two three times over."""
     maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
     zoomed = DenseNet121(zoom=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
@@ -254,8 +250,7 @@ def test_head_upsamples(zoom: int, output_stride: int, factor: int):
 
 
 def test_group_norm_sees_one_map():
-    """Claim: with group norm the maps of a picture do not depend on what else is in the batch, in
-    the head either."""
+    """Claim: with group norm a picture's maps do not depend on the rest of the batch."""
     head = densenet.DenseNetHead(TINY)
     features = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, 2, 16)), jnp.float32)
     variables = random_variables(head, 0, (1, 2, 2, 16))

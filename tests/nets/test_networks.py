@@ -75,8 +75,7 @@ SMALL = {"kind": "small"}
     ],
 )
 def test_config_that_no_net_can_have(size: int, net: dict[str, Any], message: str):
-    """Claim: sizes that the strides do not divide, and settings that do not go together, are
-    refused in one line as the config is built, with margins that would do."""
+    """Claim: settings that do not go together are refused in one line, with good margins."""
     with pytest.raises(ValueError, match=f"^{message}") as raised:
         _config(size, **net)
     assert "\n" not in str(raised.value)
@@ -99,8 +98,7 @@ def test_suggested_margins_do():
     ("stride", "finer", "cells"), [(2, 1, 2), (2, 2, 1), (4, 1, 4), (4, 2, 2), (4, 4, 1)]
 )
 def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
-    """Claim: a cell of the small net's maps is stride / subcells cells of its input, in frames as
-    in what it gives."""
+    """Claim: a cell of the small net's maps is stride / subcells cells of its input."""
     layers = {"dilations": (1,), "growth": 4}
     cfg = _config(64, kind="small", margin=0.125, stride=stride, subcells=finer, **layers)
     nets, blank = networks.make(cfg.net), jnp.zeros((1, 72, 72, 4))
@@ -121,8 +119,7 @@ def test_every_kind_has_its_networks():
 @pytest.mark.parametrize("target", [True, False])
 @pytest.mark.parametrize("kind", ["small", "densenet121"])
 def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: bool):
-    """Claim: either net, with and without colour and mask, gives maps of the size that the frames
-    say, and the actor's head gives maps of the same size from its features."""
+    """Claim: critic and head give maps of the size that the frames say."""
     cfg = presets.smoke().change(
         heightmap={"size": 64},
         net=dataclasses.replace(TINY[kind], colour=colour),
@@ -164,8 +161,7 @@ def test_states_of_densenet_are_seen_in_groups():
 
 @pytest.mark.parametrize("kind", ["small", "densenet121"])
 def test_looks_at_any_number_of_states_share_products(kind: str):
-    """Claim: one state and eight go through products of the same shapes with DenseNet-121, of
-    others with the small net, which takes all at once."""
+    """Claim: one state and eight share the shapes of products with DenseNet-121 alone."""
     nets = networks.make(TINY[kind])
     variables = jax.eval_shape(nets.critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
 

@@ -42,8 +42,7 @@ def _assert_same(one: Function, other: Function, inputs: Any, gradient: jax.Arra
     ],
 )
 def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
-    """Claim: value, and gradients for maps and kernel, are those of a convolution with zeros
-    around."""
+    """Claim: value and gradients are those of a convolution with zeros around."""
     shapes = (2, 8, 12, 4), (size, size, 4, 5), (2, 8 // stride, 12 // stride, 5)
     maps, kernel, gradient = _random(0, *shapes)
 
@@ -60,8 +59,7 @@ def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
 
 
 def test_doubled_cells_are_pixels_twice_over():
-    """Claim: the first convolution says of doubled cells what it says of pixels repeated; gradients
-    too."""
+    """Claim: the first convolution takes doubled cells as pixels repeated; gradients too."""
     maps, kernel, gradient = _random(1, (2, 8, 12, 3), (7, 7, 3, 5), (2, 8, 12, 5))
 
     def see(doubled: bool, maps: jax.Array, kernel: jax.Array) -> jax.Array:
@@ -78,8 +76,7 @@ def _flax_pool(maps: jax.Array) -> jax.Array:
 
 
 def test_max_pool_is_flaxs():
-    """Claim: the maximum of shifted maps is a max pool with padding, gradient included, without the
-    operation that GPUs lack when results are to repeat."""
+    """Claim: value and gradient are those of a max pool, without `select_and_scatter`."""
     maps, weight = _random(0, (2, 8, 12, 3), (2, 4, 6, 3))
     maps = jnp.maximum(maps, 0.0)
     assert_array_equal(products.max_pool(maps), _flax_pool(maps))

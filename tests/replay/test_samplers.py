@@ -64,8 +64,7 @@ def ranks(values: np.ndarray, slots: np.ndarray) -> np.ndarray:
 
 
 def assert_fits(cells: np.ndarray, probability: np.ndarray) -> None:
-    """Chi-square over groups of cells expected at least 20 times, and Kolmogorov over all in their
-    order."""
+    """Checks cells by chi-square over groups of 20 expected, and by Kolmogorov in their order."""
     expected = probability / probability.sum() * cells.size
     count = np.bincount(cells, minlength=expected.size)
     assert np.all(count[expected == 0.0] == 0)
@@ -85,8 +84,7 @@ def assert_fits(cells: np.ndarray, probability: np.ndarray) -> None:
 )  # fmt: skip
 @pytest.mark.parametrize("size", [CAPACITY, 400])
 def test_ranks_follow_the_beta_law(a, b, size):
-    """Claim: rank / n ~ Beta(a, b), rank 0 the largest value, in a ring that is full or partly
-    filled."""
+    """Claim: rank / n ~ Beta(a, b), rank 0 the largest value, in a full or partly filled ring."""
     values = np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)
     values[size:] *= 100.0  # garbage
     slots = np.asarray(beta_slots(jax.random.key(0), jnp.array(values), jnp.int32(size), a, b, NUM))
@@ -99,8 +97,7 @@ def test_ranks_follow_the_beta_law(a, b, size):
     ("a", "b"), [(0.2, 1.0), (0.5, 0.5), (0.3, 4.0), (1.0, 12.0), (1.0, 1.0), (40.0, 3.0)]
 )
 def test_beta_draws_follow_scipys_law(a, b):
-    """Claim: draws with traced a and b have the distribution that SciPy knows, by Kolmogorov's test
-    of 400,000."""
+    """Claim: draws with traced a and b have SciPy's distribution."""
     draws = jax.jit(samplers._beta, static_argnums=3)(jax.random.key(3), a, b, 400_000)
     assert stats.kstest(np.asarray(draws, np.float64), stats.beta(a, b).cdf).pvalue > P
 
@@ -143,8 +140,7 @@ def test_large_rings_follow_the_beta_law(a, b):
 
 
 def test_drawing_has_no_open_loop():
-    """Claim: no sampler has a loop of unknown length, whose condition a GPU hands to the host at
-    every turn."""
+    """Claim: no sampler has a loop of unknown length, for which a GPU waits for the host."""
     for sampler in SAMPLERS.values():
         draw = lambda key, s=sampler: s.sample(key, stored(s, np.zeros(9)), 0.5, 64)  # noqa: E731
         text = str(jax.make_jaxpr(draw)(jax.random.key(0)))
@@ -168,8 +164,7 @@ LAWS = {
      ("one giant", 0.6, CAPACITY), ("one giant", 1.0, 700)],
 )  # fmt: skip
 def test_prioritised_draws_follow_the_priorities(law, alpha, size):
-    """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + epsilon, in a ring that is
-    full or partly filled."""
+    """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + epsilon."""
     own = prioritised(alpha=alpha, per_epsilon=1e-6)
     errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
     slots, _ = drawn(own, stored(own, errors, size))
@@ -188,8 +183,7 @@ def test_uniform_slots_are_uniform(size):
 
 @pytest.mark.parametrize("capacity", [2, 7, 8, 9, 64, 65, 1000, 4096])
 def test_every_capacity_has_its_pyramid(capacity):
-    """Claim: whatever the capacity, P(i) = m_i / sum m, here with masses 1, 2, 3 ...; with no mass
-    at all, slots are still slots."""
+    """Claim: whatever the capacity, P(i) = m_i / sum m; without mass, slots are still slots."""
     masses = np.arange(1, capacity + 1)
     draw = lambda masses: np.asarray(proportional_slots(jax.random.key(1), masses, NUM))  # noqa: E731
     assert_fits(draw(jnp.asarray(masses, jnp.float32)), masses)
@@ -231,8 +225,7 @@ def test_what_has_no_mass_is_never_picked(zeros):
     [prioritised(alpha=1.0, per_epsilon=1e-3), samplers.make(BetaReplay(start=(1.0, 12.0)))],
 )
 def test_items_with_large_errors_are_drawn_most(sampler):
-    """Claim: through the ring, with items numbered from 1 and wrapped, the largest error is drawn
-    most."""
+    """Claim: through the wrapped ring, the item of the largest error is drawn most."""
     state = ring.init(sampler.init(8), {"id": jnp.int32(0)})
     for i in range(1, 12):
         state = ring.add(state, {"id": jnp.array([i])}, jnp.array([True]))
@@ -335,8 +328,7 @@ def test_half_of_vpgs_batch_is_new(scenes, num, ages):
 
 
 def test_without_an_opposite_only_the_new_counts():
-    """Claim: where no transition has the opposite outcome, the draw against it has no weight, and
-    no unfilled slot is drawn."""
+    """Claim: without an opposite outcome, the draw against it has no weight."""
     sampler = samplers.make(OppositeReplay())
     state = tried([1, 0, 1, 1, 1], [0.0, 0.5, 0.0, 1.0, 1.0], np.ones(5), 3, head=3)
     slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
@@ -357,8 +349,7 @@ def test_nan_is_ranked_first():
 
 @pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
 def test_errors_that_are_not_numbers(sampler):
-    """Claim: after updates with NaN and infinite errors, slots are inside, weights positive and at
-    most 1."""
+    """Claim: after NaN and infinite errors, slots are inside, weights in (0, 1]."""
     state = stored(sampler, [0.5, 2.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0], 4)
     for errors in ([jnp.nan, 1.0, -2.0], [jnp.inf, -jnp.inf, jnp.nan], [jnp.nan] * 3):
         state = sampler.update(state, jnp.array([0, 2, 3]), jnp.array(errors))
@@ -371,8 +362,7 @@ def test_errors_that_are_not_numbers(sampler):
 @pytest.mark.parametrize("size", [0, 1, 2, 7, 8])
 @pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
 def test_slots_are_always_inside(sampler, size, progress):
-    """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots. Weights
-    are at most 1."""
+    """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots."""
     slots, weights = drawn(sampler, stored(sampler, jnp.ones(8), size), 500, progress)
     assert (slots.dtype, weights.dtype) == (np.int32, np.float32)
     assert slots.min() >= 0
@@ -385,8 +375,7 @@ def test_slots_are_always_inside(sampler, size, progress):
 @pytest.mark.parametrize("progress", [-1.0, 0.0, 0.3, 1.0, 2.0])
 @pytest.mark.parametrize("law", LAWS)
 def test_weights_by_formula(progress, law):
-    """Claim: w_i = (n P(i))^-beta / max_j w_j over the batch, beta from the first to the
-    second of `is_beta` in a line."""
+    """Claim: w_i = (n P(i))^-beta / max_j w_j, beta from first to second of `is_beta` in a line."""
     sampler = prioritised(is_beta=(0.2, 0.8))
     errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
     slots, weights = drawn(sampler, stored(sampler, errors, 900), 64, progress)
@@ -437,8 +426,7 @@ def test_batched_seeds_are_each_by_itself(sampler):
      (0.7, (1.0, 6.5)), (1.0, (1.0, 12.0)), (2.0, (1.0, 12.0))],
 )  # fmt: skip
 def test_schedule_by_hand(progress, expected):
-    """Claim: (a, b) goes from (0.5, 0.5) to (1, 1) at 40 % and on to (1, 12), in straight lines,
-    and stays there."""
+    """Claim: (a, b) goes from (0.5, 0.5) to (1, 1) at 40 % and on to (1, 12), and stays there."""
     assert_allclose(
         samplers.beta_schedule(BetaReplay(), jnp.float32(progress)), expected, rtol=1e-5
     )
