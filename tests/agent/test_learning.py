@@ -26,7 +26,7 @@ CAP = 4  # actions of an episode of the two-step problem
 
 
 class Learned(NamedTuple):
-    """What a learned policy does in fresh episodes, without exploration."""
+    """Results of a learned policy in fresh episodes, without exploration."""
 
     success: float  # share of episodes that end with the good block lifted
     actions: float  # mean per episode

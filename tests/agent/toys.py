@@ -40,7 +40,7 @@ TABLE = np.array([0.3, 0.3, 0.3], np.float32)
 
 @struct.dataclass
 class Layout:
-    """Which block lies where. N = blocks."""
+    """Blocks of a scene. N = blocks."""
 
     place: jax.Array  # [N] int32, row * GRID + column
     kind: jax.Array  # [N] int32
@@ -84,7 +84,7 @@ class Toy:
         return self.reset(key)
 
     def step(self, state: State, action: Action) -> State:
-        """What the action does to the block at its place; nothing where there is none."""
+        """Applies an action to the block at its place, if there is one."""
         extent = self.cfg.heightmap.extent
         col, row = jnp.clip((action.pose[:2] / extent + 0.5) * GRID, 0, GRID - 1).astype(jnp.int32)
         layout = state.scene
