@@ -38,25 +38,31 @@ def valid(frames) -> np.ndarray:
     return np.ones(frames.inside.shape, bool)
 
 
-def _assert_at(frames, pose, cell: tuple[int, int, int], yaw: bool = True) -> None:
-    assert_allclose(pose[:2], frames.xy[cell], atol=0.01 * frames.cell)
-    if yaw:
-        assert_allclose(np.sin(0.5 * (pose[2] - frames.yaws[cell[0]])), 0.0, atol=0.005)
+STEPS = [(0, 2), (2, 0), (2, 2), (1, 2), (0, -2)]
 
 
-def test_two_peaks(frames, pose, logits):
-    """Claim: of two peaks the mean is at the higher one, not between them."""
-    high, low = (2, 4, 4), (2, 13, 12)
-    for best, other in ((high, low), (low, high)):
-        logits[best], logits[other] = 20.0, 19.9
-        _assert_at(frames, pose(logits), best)
-
-
-@pytest.mark.parametrize("step", [(0, 2), (2, 0), (2, 2), (1, 2), (0, -2)])
-def test_two_peaks_side_by_side(frames, pose, logits, step):
-    """Claim: nor is it between two equally high peaks with a dip of one cell between them."""
-    logits[2, 8, 9], logits[2, 8 + step[0], 9 + step[1]] = 20.0, 20.0 - 1e-4
-    _assert_at(frames, pose(logits), (2, 8, 9), yaw=False)
+@pytest.mark.parametrize(
+    ("peaks", "invalid", "best"),
+    [
+        ({(2, 4, 4): 20.0, (2, 13, 12): 19.9}, [], (2, 4, 4)),
+        ({(2, 4, 4): 19.9, (2, 13, 12): 20.0}, [], (2, 13, 12)),
+        # equally high, with a dip of one cell between them
+        *(({(2, 8, 9): 20.0, (2, 8 + r, 9 + c): 19.9999}, [], (2, 8, 9)) for r, c in STEPS),
+        # higher, but not valid
+        ({(4, 10, 10): 20.0, (4, 10, 11): 40.0, (1, 3, 3): 50.0}, [(4, 10, 11), (1, 3, 3)],
+         (4, 10, 10)),
+        ({(6, 8, 9): 30.0}, [...], (6, 8, 9)),  # nothing is valid
+    ],
+)  # fmt: skip
+def test_pose_is_at_the_highest_valid_peak(frames, pose, logits, valid, peaks, invalid, best):
+    """Claim: the mean is at the highest valid cell, neither between two peaks nor drawn by a cell
+    that is not valid; without a valid cell, at the highest."""
+    for cell, value in peaks.items():
+        logits[cell] = value
+    for cell in invalid:
+        valid[cell] = False
+    got = pose(logits, valid)
+    assert_allclose(got[:2], frames.xy[best], atol=0.01 * frames.cell)
 
 
 def test_sharp_peaks_are_reproduced(frames, pose, logits):
@@ -66,21 +72,10 @@ def test_sharp_peaks_are_reproduced(frames, pose, logits):
     cells[:4] = [[0, 0, 0], [3, 0, end], [7, end, 0], [1, end, end]]
     for cell in map(tuple, cells):
         logits[cell] = 25.0
-        _assert_at(frames, pose(logits), cell)
+        got = pose(logits)
+        assert_allclose(got[:2], frames.xy[cell], atol=0.01 * frames.cell)
+        assert_allclose(np.sin(0.5 * (got[2] - frames.yaws[cell[0]])), 0.0, atol=0.005)
         logits[cell] = 0.0
-
-
-def test_invalid_cells_do_not_attract(frames, pose, logits, valid):
-    """Claim: the mean is at the highest valid cell; no invalid cell next to it moves it."""
-    logits[1, 3, 3], valid[1, 3, 3] = 50.0, False
-    logits[4, 10, 10], logits[4, 10, 11], valid[4, 10, 11] = 20.0, 40.0, False
-    _assert_at(frames, pose(logits, valid), (4, 10, 10), yaw=False)
-
-
-def test_pose_is_finite_where_nothing_is_valid(frames, pose, logits, valid):
-    """Claim: without a valid cell the pose is that of the highest one."""
-    logits[6, 8, 9] = 30.0
-    _assert_at(frames, pose(logits, ~valid), (6, 8, 9), yaw=False)
 
 
 @pytest.mark.parametrize("axis", range(3))

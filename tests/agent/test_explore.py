@@ -101,18 +101,12 @@ def test_action_noise_stays_in_the_box():
 
 
 def test_random_cell_is_uniform_over_valid_cells():
-    """Claim: valid cells are drawn equally often (chi-square), others never."""
+    """Claim: valid cells are drawn equally often (chi-square), others never; cell 0 if none is."""
     valid = jnp.array([False, True, True, False, True, False, False, True, True, False])
     keys = jax.random.split(jax.random.key(3), NUM)
     cells = np.asarray(jax.vmap(lambda key: explore.random_cell(key, valid))(keys))
     count = np.bincount(cells, minlength=10)
     assert np.all(count[~np.asarray(valid)] == 0)
     assert stats.chisquare(count[np.asarray(valid)]).pvalue > 1e-4
-
-
-@pytest.mark.parametrize(
-    ("valid", "cell"), [([False] * 4, 0), ([False, False, False, True], 3), ([True], 0)]
-)
-def test_random_cell_edges(valid, cell):
-    """Claim: the only valid cell is drawn, and cell 0 if there is none."""
-    assert explore.random_cell(jax.random.key(0), jnp.array(valid)) == cell
+    for valid, cell in (([False] * 4, 0), ([False, False, False, True], 3), ([True], 0)):
+        assert explore.random_cell(jax.random.key(0), jnp.array(valid)) == cell

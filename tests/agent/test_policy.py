@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from csac_jax import algorithms
 from csac_jax.agent import box, maps, policy
 from csac_jax.agent.maps import DenseMaps
-from csac_jax.config import CEMConfig, ExploreConfig
+from csac_jax.config import CEMConfig
 from csac_jax.constants import Primitive
 from csac_jax.runtime import compiler
 from csac_jax.sim.outcome import BARE
@@ -92,14 +92,6 @@ def test_random_grasps_land_on_blocks(cfg, frames, observations):
     index = np.round(np.asarray(maps.yaw_index(frames, action.pose[:, 2]))) % frames.yaws.size
     assert set(index) == set(range(frames.yaws.size))
     assert np.mean(height > BARE) < 0.3  # it would be easy otherwise
-
-
-@pytest.mark.slow
-def test_without_exploration_it_acts_greedily(cfg, frames, parts):
-    """Claim: with all exploration off, what is tried is worth the best value."""
-    calm = ExploreConfig(noise_std=0.0, epsilon_primitive=(0.0, 0.0), epsilon_place=(0.0, 0.0))
-    state = _state(frames, 7)
-    _assert_best(frames, state, _explore(parts(cfg.change(explore=calm)), state, KEYS))
 
 
 def test_best_pixel(cfg, frames, parts):

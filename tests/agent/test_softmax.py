@@ -63,12 +63,6 @@ def test_log_density_is_that_of_the_samples(cfg, mean):
     assert abs(inverse.mean() - volume) <= 4 * inverse.std() / np.sqrt(NUM) + 1e-5 * volume
 
 
-def test_no_atoms_at_the_bounds():
-    """Claim: no two noisy actions share the bound, as the clipped normals of line 13 would."""
-    noise, _ = sampled_noise(with_constants(CFG, std=0.5, clip=0.5), (0.0, 0.9, 0.0))
-    assert np.all(np.sum(noise == noise.max(axis=0), axis=0) <= 2)
-
-
 def test_mean_outside_the_box_is_brought_in():
     """Claim: a proposal beyond the walls counts as one on them; another key draws others."""
     outside, inside, other = (

@@ -152,16 +152,9 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
 
 
 @pytest.mark.slow
-def test_every_stage_is_kerass():
-    """Claim: with weights ported, every convolution, norm and transition is Keras's within 1e-4 of
-    the largest value, batch norm both with running statistics and with the batch's, which move the
-    running ones alike."""
-    assert _compare((2, 1, 1, 1), 64) == 2 + 5 * 4 + 3 * 3 + 1
-
-
-@pytest.mark.slow
 def test_every_stage_of_densenet_121_is_kerass():
-    """Claim: the same for all 121 layers."""
+    """Claim: with weights ported, every convolution, norm and transition is Keras's within 1e-4 of
+    the largest value, batch norm both with running statistics and with the batch's."""
     assert _compare((6, 12, 24, 16), 64) == 2 + 58 * 4 + 3 * 3 + 1
 
 
