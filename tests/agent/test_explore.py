@@ -30,15 +30,6 @@ def assert_share(event: np.ndarray, expected: float) -> None:
     assert abs(event.mean() - expected) <= 4 * error, (event.mean(), expected)
 
 
-@pytest.mark.parametrize(
-    ("actions", "expected"),
-    [(0, 0.5), (1, 0.499), (100, 0.5 * 0.998**100), (5000, 0.1), (10**6, 0.1)],
-)
-def test_probability(actions, expected):
-    """Claim: max(end, start decay^actions), by hand."""
-    assert_allclose(explore.probability(0.5, 0.1, 0.998, jnp.int32(actions)), expected, rtol=1e-4)
-
-
 @pytest.mark.parametrize("taken", [0, 300, 10**6])
 def test_shares_of_primitives_and_places(taken):
     """Claim: pushes have probability eps push_fraction, random places their own eps."""

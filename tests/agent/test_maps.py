@@ -146,17 +146,6 @@ def test_unfolding(frames):
     assert_allclose(frames.xy[half:], frames.xy[:half, ::-1, ::-1], atol=1e-7)
 
 
-def test_gripper_is_symmetric(frames):
-    """Claim: a grasp's value at yaw + pi is that at yaw, wherever it is read; a push's is not."""
-    values, poses, turn = maps.unfold(jnp.asarray(_halves(frames))), _poses(100), (0, 0, np.pi)
-    apart = [
-        np.abs(_read(frames, values, p, poses) - _read(frames, values, p, poses + np.array(turn)))
-        for p in (GRASP, PUSH)
-    ]
-    assert apart[0].max() < 1e-4
-    assert apart[1].mean() > 0.1
-
-
 # m, a block that covers whole cells
 CENTRE, HALF = np.array([0.056, -0.035]), np.array([0.028, 0.021])
 

@@ -232,14 +232,6 @@ def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
     assert_allclose(sooner, by_default, rtol=0.0, atol=1e-5)
 
 
-def test_random_places_reach_all_that_is_valid(frames):
-    """Claim: random places of both primitives reach the whole workspace."""
-    valid = jnp.broadcast_to(frames.inside, (2, *frames.inside.shape))
-    place = jax.jit(jax.vmap(lambda key: policy.random_places(key, frames, valid)))
-    u = place(jax.random.split(jax.random.key(0), 400))
-    assert np.all(np.abs(u[..., :2]).max(axis=0) > 0.9)
-
-
 @pytest.mark.slow
 def test_candidates_are_those_of_the_search(cfg, frames, parts):
     """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
