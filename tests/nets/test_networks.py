@@ -1,4 +1,4 @@
-"""Which network a config asks for, and which configs are refused."""
+"""Networks by config, and configs that are refused."""
 
 import dataclasses
 import functools

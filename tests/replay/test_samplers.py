@@ -1,4 +1,4 @@
-"""Which transitions are drawn, against the laws by SciPy."""
+"""Drawn transitions against the laws by SciPy."""
 
 import dataclasses
 import functools
