@@ -36,7 +36,7 @@ class Weights:
     """
 
     tilt: float = 2.0  # of an edge against the pad, per rad
-    offset: float = 10.0  # of the middle of what is held from the hand's, along the closing, per m
+    offset: float = 10.0  # of the held part's middle from the hand's, along the closing, per m
     middle: float = 10.0  # the same across, where the hand would turn what it lifts
     width: float = 2.5  # per m
     grip: float = 20.0  # gain per m that the tips reach below what lies between the pads

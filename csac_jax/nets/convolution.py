@@ -1,16 +1,12 @@
-"""2-D convolution with a fast gradient, inside `lax.scan` on a CPU and with dilation on a GPU.
+"""2-D convolution in the form that is fast on the device at hand; each choice was measured.
 
-CPU: autodiff makes convolutions with batch and channels swapped. XLA runs these many times slower
-inside a while loop (jaxlib 0.10.1; `experiments/bench` times both ways). Here the swap is a
-transpose and every convolution is plain.
+CPU: XLA is slow at convolutions with batch and channels swapped inside `lax.scan`, which autodiff
+makes. Here the swap is a transpose and every convolution is plain.
 
-GPU: the gradient of a dilated kernel is computed tap by tap; as one convolution it takes several
-times as long (jaxlib 0.11, H200). The first convolution, of few channels and many taps, is a matrix
-product: a forward pass takes a fifth less. On a CPU that would be slower.
-
-GPU, several runs under `vmap`: XLA makes their convolutions grouped ones, which are slow. By taps a
-convolution is one product of matrices, whose parts are shifted and added (`experiments/bench`). Its
-product needs memory, so thousands of passes keep the grouped one.
+GPU: the gradient of a dilated kernel is computed tap by tap, and the first convolution, of few
+channels and many taps, is a matrix product. Under `vmap` of several runs XLA makes grouped
+convolutions, which are slow. By taps a convolution is one matrix product, whose parts are shifted
+and added. Its product needs memory, so thousands of passes keep the grouped one.
 """
 
 import functools
@@ -23,7 +19,7 @@ import jax.numpy as jnp
 _convolve = functools.partial(
     jax.lax.conv_general_dilated, dimension_numbers=("NHWC", "HWIO", "NHWC")
 )
-_MOST_PRODUCTS = 1 << 26  # numbers of a run by taps, ours: 0.13 GB in bfloat16
+_MOST_PRODUCTS = 1 << 26  # most numbers of a run by taps (ours): 0.13 GB in bfloat16
 
 
 def conv2d(

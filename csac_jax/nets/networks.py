@@ -23,7 +23,7 @@ FINGERS_MEAN = np.array([0.1, 0.014, 0.02], np.float32)  # m, `grippers.Fingers`
 FINGERS_STD = np.array([0.025, 0.004, 0.004], np.float32)
 MIRRORS = ((), (2,), (3,), (2, 3))  # axes of passes that are turned; columns lie along the frame
 AHEAD_AND_BACK = (1, 0, 2)  # `dense.OUTPUTS`, pushes swapped, as in a mirror along the frame
-_FULL = 640  # px, ours: side of passes of which one state is seen at a time
+_FULL = 640  # px (ours): side of passes at which the critic gets one state at a time
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Networks:
     colour: bool  # the critic sees colours
     height_scale: float = 0.05  # m, becomes 1; a block's height
     colour_scale: Any = (0.5, 1.0)  # mean and standard deviation, of all colours or of each [3]
-    zoom: int = 0  # pixels of the input per cell of the map; 0: any number of states at a time
+    zoom: int = 0  # pixels of the input per cell of the map; 0: all states at a time
     one_vector: bool = False  # the optimiser sees one vector: a GPU is slow with many small arrays
 
     def inputs(

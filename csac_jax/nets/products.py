@@ -1,7 +1,7 @@
 """Convolutions and pools of DenseNet-121 as matrix products and shifted maps, for `vmap`.
 
-Under `vmap` over trunks XLA's own convolutions become grouped ones, which are slow on GPUs. XLA
-also tunes each of them, which takes minutes in all (`experiments/bench`).
+Under `vmap` over trunks XLA's own convolutions become grouped ones, which are slow on GPUs and
+take minutes to tune.
 """
 
 import functools
@@ -20,7 +20,7 @@ _KAIMING = nn.initializers.variance_scaling(2.0, "fan_in", "normal")  # torchvis
 
 
 class TapConvolution(nn.Module):
-    """Convolution without bias, zero-padded: [B, H, W, I] -> [B, H, W, features]."""
+    """Zero-padded convolution without bias: [B, H, W, I] -> [B, H, W, features]."""
 
     features: int
     size: int  # cells, side of the kernel, odd

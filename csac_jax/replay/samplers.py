@@ -1,4 +1,4 @@
-"""Which transitions are replayed: uniform (CSAC), prioritised (CSAC-PER), by rank (CSAC-beta), or
+"""Samplers of replayed transitions: uniform (CSAC), prioritised (CSAC-PER), by rank (CSAC-beta), or
 of opposite outcomes (VPG).
 
 Algorithm 1 lines 15-16. A custom sampler is any object with the methods of `Sampler`.
@@ -60,7 +60,6 @@ def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array
     slots. Draws are independent, not stratified as in sec. B.2.1.
 
     Args: masses [C], at least 0, and 0 where nothing is stored: such slots are never drawn.
-
     Returns: [num] int32 slots, with repetition; slot 0 .. C - 1 if all masses are 0.
     """
     node = jnp.zeros(num, jnp.int32)
@@ -130,7 +129,6 @@ def beta_slots(
     sqrt(CANDIDATES)); of the laws of CSAC sec. 4.3, no decile's share changes by 0.001.
 
     Args: values [C], any beyond `size`; size [] filled slots.
-
     Returns: [num] int32 slots, with repetition, all filled; slot 0 .. C - 1 if nothing is stored.
     """
     key_rank, key_ties = jax.random.split(key)

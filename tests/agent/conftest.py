@@ -35,8 +35,7 @@ def learner(cfg: Config) -> ActorCritic:
 
 @pytest.fixture(scope="session")
 def randomised() -> Callable[[LearnerState], LearnerState]:
-    """Gives networks whose every parameter is random, so that maps vary by about 1; target and
-    online differ."""
+    """Makes every parameter random, so that maps vary by about 1; target and online differ."""
 
     def noisy(params, seed: int):
         rng = np.random.default_rng(seed)

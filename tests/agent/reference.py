@@ -1,4 +1,4 @@
-"""What estimates are compared with."""
+"""Exact values that estimates are compared with."""
 
 import jax
 import jax.numpy as jnp

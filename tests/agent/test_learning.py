@@ -23,11 +23,10 @@ pytestmark = pytest.mark.optax
 
 EPISODES = 128
 CAP = 4  # actions of an episode of the two-step problem
-SLOW = pytest.mark.slow
 
 
 class Learned(NamedTuple):
-    """What a learned policy does in fresh episodes, without exploration."""
+    """Results of a learned policy in fresh episodes, without exploration."""
 
     success: float  # share of episodes that end with the good block lifted
     actions: float  # mean per episode
@@ -38,8 +37,7 @@ class Learned(NamedTuple):
 def learn(
     problem: Callable[..., Toy], algo: str, actions: int, cap: int, push: float | None = None
 ) -> Learned:
-    """Trains an algorithm on a problem for a number of actions and plays EPISODES fresh
-    episodes."""
+    """Trains an algorithm on a problem and plays EPISODES fresh episodes."""
     cfg = toys.config(algo, actions, cap, push)
     toy = problem(cfg)
     program = programs.make(cfg, env=toy)
@@ -48,9 +46,8 @@ def learn(
     begun, ended, primitives = jax.jit(functools.partial(_play, toy, actor_critic.make(cfg)))(
         jax.random.key(99), state.learner.online
     )
-    chosen = np.array(
-        maps.allowed_primitives(cfg.policy)
-    )  # an output of a primitive never taken is never trained
+    # An output of a primitive never taken is never trained.
+    chosen = np.array(maps.allowed_primitives(cfg.policy))
     value = jnp.max(jnp.where(begun.valid, begun.q, -jnp.inf)[:, chosen], axis=(1, 2, 3, 4))
     return Learned(
         success=float(np.mean(ended.terminated)),
@@ -80,17 +77,12 @@ def _play(toy: Toy, learner: ActorCritic, key: jax.Array, params: Params):
     return values.dense_maps(learner, params, first.obs), last, primitives
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "value"),
-    [
-        pytest.param("csac", 2.0, marks=SLOW),
-        pytest.param("csac_per", 2.0, marks=SLOW),
-        pytest.param("csac_beta", 2.0, marks=SLOW),
-        pytest.param("vpg", 2.0, marks=SLOW),
-        pytest.param("reactive", 1.0, marks=SLOW),
-        pytest.param("grasp_only", 1.0, marks=SLOW),
-    ],
-)
+    [("csac", 2.0), ("csac_per", 2.0), ("csac_beta", 2.0), ("vpg", 2.0), ("reactive", 1.0),
+     ("grasp_only", 1.0)],
+)  # fmt: skip
 def test_bandit_is_solved(algo, value):
     """Claim: every algorithm finds the one good block among duds, and what lifting it earns: 2 by
     CSAC, 1 / (1 - 0.5) by VPG, whose next episode follows, 1 by the other baselines."""
@@ -100,15 +92,11 @@ def test_bandit_is_solved(algo, value):
     assert_allclose(learned.value, value, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "low", "high"),
-    [
-        pytest.param("csac", 1.2, 1.6, marks=SLOW),
-        pytest.param("csac_per", 1.2, 1.6, marks=SLOW),
-        pytest.param("csac_beta", 1.2, 1.6, marks=SLOW),
-        pytest.param("vpg", 1.25, 1.4, marks=SLOW),
-    ],
-)
+    [("csac", 1.2, 1.6), ("csac_per", 1.2, 1.6), ("csac_beta", 1.2, 1.6), ("vpg", 1.25, 1.4)],
+)  # fmt: skip
 def test_two_steps_are_learned(algo, low, high):
     """Claim: a push that makes the only grasp possible is learned, then that grasp, in two actions.
 
@@ -124,22 +112,18 @@ def test_two_steps_are_learned(algo, low, high):
 
 @pytest.mark.slow
 def test_grasping_alone_fails():
-    """Claim: where only a push makes a grasp possible, grasp_only never pushes, lifts nothing and
-    expects nothing."""
+    """Claim: where only a push makes a grasp possible, grasp_only lifts and expects nothing."""
     learned = learn(toys.two_step, "grasp_only", actions=800, cap=CAP)
     assert learned.success == 0.0
     assert learned.pushes == [0.0] * CAP
     assert_allclose(learned.value, 0.0, atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algo", "push", "value", "solves"),
-    [
-        pytest.param("reactive", None, 0.5, True, marks=SLOW),
-        pytest.param("reactive", -0.2, 0.0, False, marks=SLOW),
-        pytest.param("vpg", -0.2, 0.533, True, marks=SLOW),
-    ],
-)
+    [("reactive", None, 0.5, True), ("reactive", -0.2, 0.0, False), ("vpg", -0.2, 0.533, True)],
+)  # fmt: skip
 def test_without_a_future_a_push_must_pay_by_itself(algo, push, value, solves):
     """Claim: with gamma = 0 the push is made if it earns 0.5 at once, and not if it costs 0.1; a
     gamma of 0.5 pays for it: V = -0.1 + 0.5 (1 + 0.5 V)."""

@@ -8,7 +8,6 @@ from csac_jax import presets
 from csac_jax.agent import losses
 from csac_jax.config import Config
 from csac_jax.constants import Outcome, Primitive
-from csac_jax.sweeps import replicas
 from tests.agent.test_rewards import reward
 
 
@@ -51,15 +50,3 @@ def test_push_pays_below_a_share_of_lifts(bonus, gamma, threshold):
     exact = (push - failure - gamma * push) / (success - failure - gamma * push)
     assert exact == pytest.approx(threshold, abs=1e-3)
     assert _threshold(cfg) == pytest.approx(exact, abs=2e-3)
-
-
-def test_bonus_and_discount_are_compared_in_one_program():
-    """Claim: a sweep over success bonus and discount, on packed scenes too, is one program."""
-    base = presets.paper_small().change(scene={"arranged": 1.0})
-    configs = [
-        base.change(reward={"success_bonus": bonus}, target={"gamma": gamma})
-        for bonus in (0.0, 1.0)
-        for gamma in (0.2, 0.5, 0.8)
-    ]
-    (group,) = replicas.group_configs(configs)
-    assert set(group.hyperparams) == {"reward.success_bonus", "target.gamma"}

@@ -39,10 +39,10 @@ def test_cells_out_of_reach_are_masked(frames: maps.Frames):
 def test_all_cells_leave_out_what_is_out_of_reach(frames: maps.Frames):
     """Claim: so it is where actions may begin anywhere; the floating hand reaches all."""
     anywhere = FAR.change(policy={"cells": "all"})
-    found = maps.frames(anywhere, networks.make(anywhere.net))
+    free = maps.frames(anywhere, networks.make(anywhere.net))
     empty = jnp.zeros((FAR.heightmap.size,) * 2)
     obs = Observation(jnp.zeros((*empty.shape, 3)), empty, empty > 0)
-    valid = np.asarray(maps.actionable_cells(found, obs))
-    assert_array_equal(valid, found.inside[None] & frames.reachable)
+    valid = np.asarray(maps.actionable_cells(free, obs))
+    assert_array_equal(valid, free.inside[None] & frames.reachable)
     hand = maps.frames(presets.smoke(), networks.make(FAR.net))
     assert hand.reachable.all()

@@ -13,12 +13,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from csac_jax.agent import actor_critic, critic, rewards, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.learner import Transition
+from csac_jax.config import RewardConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
 from csac_jax.training import program as programs
 from csac_jax.vision import heightmap
-from tests.agent import toys
+from tests.agent import test_rewards
 
 pytestmark = pytest.mark.optax
 B = 6
@@ -111,28 +112,23 @@ def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
     """Claim: in parts of the batch phi_g is what it is all at once, and 0 where nobody asks."""
     state = randomised(actor_critic.init(jax.random.key(0), learner))
     obs = observations(num, 3)
-    maps = jax.jit(lambda: values.dense_maps(learner, state.target, obs))()
-    every = jax.vmap(values.best_grasp)(maps)
+    all_maps = jax.jit(lambda: values.dense_maps(learner, state.target, obs))()
+    phi = jax.vmap(values.best_grasp)(all_maps)
     best_grasps = jax.jit(lambda asked: values.best_grasps(learner, state.target, obs, asked))
     for seed in range(3):
         wanted = np.random.default_rng(seed).random(num) < 0.5
-        found = best_grasps(jnp.asarray(wanted))
-        assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+        expected = np.where(wanted, phi, 0.0)
+        assert_allclose(best_grasps(jnp.asarray(wanted)), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_replicas_ask_for_the_neediests_quarters(
-    learner, randomised, observations, monkeypatch: pytest.MonkeyPatch
-):
+def test_replicas_ask_for_the_neediests_quarters(learner, randomised, observations, monkeypatch):
     """Claim: under vmap phi_g is what it is alone, in as many quarters as one replica asks for."""
     state = randomised(actor_critic.init(jax.random.key(0), learner))
-    obs = observations(8, 3)
+    obs, dense_maps = observations(8, 3), values.dense_maps
     wanted = np.zeros((3, 8), bool)
     wanted[0, [1, 6]] = wanted[1, [0, 3, 7]] = True  # one quarter of two, two quarters, none
-    every = jax.vmap(values.best_grasp)(
-        jax.jit(lambda: values.dense_maps(learner, state.target, obs))()
-    )
+    phi = jax.vmap(values.best_grasp)(jax.jit(lambda: dense_maps(learner, state.target, obs))())
     passed: list[int] = []
-    dense_maps = values.dense_maps
 
     def counted(*args):
         jax.debug.callback(lambda: passed.append(1))
@@ -140,31 +136,17 @@ def test_replicas_ask_for_the_neediests_quarters(
 
     monkeypatch.setattr(values, "dense_maps", counted)
     ask = functools.partial(values.best_grasps, learner, state.target, obs)
-    found = jax.jit(jax.vmap(ask))(jnp.asarray(wanted))
+    got = jax.jit(jax.vmap(ask))(jnp.asarray(wanted))
     jax.effects_barrier()
-    assert_allclose(found, np.where(wanted, every, 0.0), rtol=1e-4, atol=1e-5)
+    assert_allclose(got, np.where(wanted, phi, 0.0), rtol=1e-4, atol=1e-5)
     assert len(passed) == 2
 
 
 def test_relabelling_is_the_difference_of_two_rewards():
-    """Claim: a renewed reward is what the action would have earned with the new label, whatever
-    else it earned or lost."""
-    cfg = toys.config("csac", 8, 1).change(reward={"lost_block_penalty": 3.0}).reward
-    no = jnp.zeros((), bool)
+    """Claim: a renewed reward is what the action would have earned with the new label."""
+    cfg, no = RewardConfig(lost_block_penalty=3.0), jnp.array(False)
     worse, better = (
-        rewards.reward(
-            cfg,
-            rewards.ActionResult(
-                primitive=jnp.int32(Primitive.PUSH),
-                outcome=jnp.int32(0),
-                distance=jnp.float32(0.0),
-                phi_before=jnp.float32(0.0),
-                phi_after=jnp.float32(gain),
-                changed=no,
-                blocks_lost=jnp.int32(1),
-            ),
-        )
-        for gain in (0.0, 1.0)
+        test_rewards.reward(cfg, Primitive.PUSH, after=gain, blocks_lost=1) for gain in (0.0, 1.0)
     )
-    assert rewards.relabel(cfg, worse, no, ~no) == better != worse
-    assert rewards.relabel(cfg, better, ~no, no) == worse
+    assert rewards.relabel(cfg, jnp.float32(worse), no, ~no) == better != worse
+    assert rewards.relabel(cfg, jnp.float32(better), ~no, no) == worse

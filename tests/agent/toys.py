@@ -40,7 +40,7 @@ TABLE = np.array([0.3, 0.3, 0.3], np.float32)
 
 @struct.dataclass
 class Layout:
-    """Which block lies where. N = blocks."""
+    """Blocks of a scene. N = blocks."""
 
     place: jax.Array  # [N] int32, row * GRID + column
     kind: jax.Array  # [N] int32
@@ -56,7 +56,6 @@ class Toy:
 
     cfg: Config
     kinds: tuple[int, ...]  # of the blocks of a fresh scene
-    reach: float = 1.0  # m from its middle, within which a block can be lifted
 
     def reset(self, key: jax.Array) -> State:
         """Blocks in places of their own, each as likely as any other."""
@@ -70,12 +69,9 @@ class Toy:
         """The picture of a scene."""
         size = self.cfg.heightmap.size
         cell = jnp.arange(size, dtype=jnp.int32) // (size // GRID)
-        there = (cell[:, None, None] * GRID + cell[None, :, None]) == layout.place[
-            None, None
-        ]  # [H, W, N]
-        colour = jnp.einsum(
-            "hwn,nc->hwc", there.astype(jnp.float32), jnp.asarray(COLOURS)[layout.kind]
-        )
+        number = cell[:, None, None] * GRID + cell[None, :, None]
+        there = number == layout.place[None, None]  # [H, W, N]
+        colour = there.astype(jnp.float32) @ jnp.asarray(COLOURS)[layout.kind]
         taken = jnp.any(there, axis=-1)
         return Observation(
             colour=jnp.where(taken[..., None], colour, jnp.asarray(TABLE)[None, None]),
@@ -88,31 +84,26 @@ class Toy:
         return self.reset(key)
 
     def step(self, state: State, action: Action) -> State:
-        """What the action does to the block at its place; nothing where there is none."""
+        """Applies an action to the block at its place, if there is one."""
         extent = self.cfg.heightmap.extent
         col, row = jnp.clip((action.pose[:2] / extent + 0.5) * GRID, 0, GRID - 1).astype(jnp.int32)
         layout = state.scene
         hit = layout.place == row * GRID + col  # [N]
         kind = jnp.where(hit, layout.kind, -1)
         grasped = action.primitive == Primitive.GRASP
-        middle = (jnp.stack([col, row]).astype(jnp.float32) + 0.5) * (extent / GRID) - 0.5 * extent
-        near = jnp.linalg.norm(action.pose[:2] - middle) <= self.reach
-        lifted = grasped & near & jnp.any(kind == GOOD)
+        lifted = grasped & jnp.any(kind == GOOD)
         outcome = jnp.where(jnp.any(hit), jnp.int32(Outcome.TOUCHED), jnp.int32(Outcome.EMPTY))
         outcome = jnp.where(lifted, jnp.int32(Outcome.LIFTED), outcome)
         opened = ~grasped & jnp.any(kind == LATCH) & jnp.any(layout.kind == LOCKED)
         layout = layout.replace(kind=jnp.where(opened & (layout.kind == LOCKED), GOOD, layout.kind))
-        actions, steps_without_change = (
-            state.actions + 1,
-            jnp.where(lifted | opened, 0, state.steps_without_change + 1),
-        )
+        actions = state.actions + 1
         return state.replace(
             scene=layout,
             obs=self.observe(layout),
             terminated=lifted,
             truncated=(actions >= self.cfg.task.max_actions) & ~lifted,
             actions=actions,
-            steps_without_change=steps_without_change,
+            steps_without_change=jnp.where(lifted | opened, 0, state.steps_without_change + 1),
             info=state.info.replace(
                 outcome=jnp.where(grasped, outcome, jnp.int32(Outcome.NOTHING)),
                 moved=jnp.where(opened, 2.0 * CHANGE_AREA, 0.0),
@@ -127,15 +118,8 @@ def bandit(cfg: Config) -> Toy:
 
 
 def two_step(cfg: Config) -> Toy:
-    """A block that can be grasped only after a push of another: without a push nothing is ever
-    lifted."""
+    """One block that can be grasped only after a push of another."""
     return Toy(cfg, (LOCKED, LATCH, DUD))
-
-
-def precise(cfg: Config) -> Toy:
-    """One good block among duds, which can be lifted near its middle alone: where four cells of the
-    maps meet, and further from their middles than it may be."""
-    return Toy(cfg, (GOOD, DUD, DUD), reach=0.025)
 
 
 def config(algo: str, actions: int, max_actions: int, push: float | None = None) -> Config:

@@ -23,14 +23,13 @@ SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first five
 ]
 
 
-def _drawn(
-    rows: int, cols: int, size: int, inputs: int = 3, outputs: int = 5
-) -> tuple[jax.Array, jax.Array]:
+def _random(rows: int, cols: int, size: int, inputs: int = 3, outputs: int = 5) -> list[jax.Array]:
+    """Maps and a kernel."""
     rng, shapes = np.random.default_rng(0), ((2, rows, cols, inputs), (size, size, inputs, outputs))
-    return (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
+    return [jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes]
 
 
-def _numpy(
+def numpy_convolution(
     maps: np.ndarray, kernel: np.ndarray, stride: int, dilation: int, padding: int
 ) -> np.ndarray:
     """The sum over taps, cell by cell, in float64."""
@@ -47,26 +46,20 @@ def _numpy(
 
 
 def _plain(maps, kernel, stride, dilation, padding):
+    window, axes = [(padding, padding)] * 2, ("NHWC", "HWIO", "NHWC")
     return jax.lax.conv_general_dilated(
-        maps,
-        kernel,
-        (stride, stride),
-        [(padding, padding)] * 2,
-        rhs_dilation=(dilation, dilation),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        maps, kernel, (stride,) * 2, window, rhs_dilation=(dilation,) * 2, dimension_numbers=axes
     )
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_forward_is_numpys(setting, backend, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the value is the sum over the kernel's taps, zeros around; in the form for a CPU and
-    in that for a GPU."""
+    """Claim: the value is the sum over the kernel's taps, in the form for a CPU and for a GPU."""
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    maps, kernel = _drawn(*setting[:3])
-    assert_allclose(
-        conv2d(maps, kernel, *setting[3:]), _numpy(maps, kernel, *setting[3:]), atol=2e-5
-    )
+    maps, kernel = _random(*setting[:3])
+    expected = numpy_convolution(maps, kernel, *setting[3:])
+    assert_allclose(conv2d(maps, kernel, *setting[3:]), expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
@@ -79,28 +72,23 @@ def test_gradients_are_jaxs(setting, channels, backend, monkeypatch: pytest.Monk
     In the form for a CPU and in that for a GPU, both computed here.
     """
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    maps, kernel = _drawn(*setting[:3], *channels)
-    close = (
-        1e-4 if backend == "gpu" and setting[2] == 8 else 3e-5
-    )  # 320 products, summed in another order
+    maps, kernel = _random(*setting[:3], *channels)
+    many = backend == "gpu" and setting[2] == 8  # 320 products, summed in another order
 
     def loss(conv):
         return lambda maps, kernel: jnp.sum(jnp.sin(conv(maps, kernel, *setting[3:])))
 
     wanted = jax.jit(jax.grad(loss(_plain), argnums=(0, 1)))(maps, kernel)
     ours = jax.grad(loss(conv2d), argnums=(0, 1))
-    _, scanned = jax.jit(lambda m, k: jax.lax.scan(lambda c, _: (c, ours(m, k)), 0, length=2))(
-        maps, kernel
-    )
-    for name, got, want in zip(("maps", "kernel"), scanned, wanted, strict=True):
-        assert_allclose(got[1], want, atol=close, err_msg=name)
+    scan = jax.jit(lambda *args: jax.lax.scan(lambda c, _: (c, ours(*args)), 0, length=2)[1])
+    for name, got, want in zip(("maps", "kernel"), scan(maps, kernel), wanted, strict=True):
+        assert_allclose(got[1], want, atol=1e-4 if many else 3e-5, err_msg=name)
 
 
 @pytest.mark.parametrize("dilation", [1, 2, 4])
 @pytest.mark.parametrize("size", [1, 3, 5])
 def test_taps_are_a_convolution(size: int, dilation: int):
-    """Claim: by taps, each of three runs under `vmap` has the values and the gradients of JAX's own
-    convolution."""
+    """Claim: by taps, runs under `vmap` have the values and gradients of JAX's convolution."""
     rng, padding = np.random.default_rng(0), dilation * (size // 2)
     shapes = (3, 2, 9, 12, 4), (3, size, size, 4, 5), (3, 2, 9, 12, 5)
     maps, kernels, gradients = (jnp.asarray(rng.normal(size=one), jnp.float32) for one in shapes)
@@ -111,11 +99,11 @@ def test_taps_are_a_convolution(size: int, dilation: int):
         value, back = jax.vjp(lambda m, k: convolve_by_taps(m, k, dilation), maps, kernel)
         return value, *back(gradient)
 
-    found = ours(maps, kernels, gradients)
+    results = ours(maps, kernels, gradients)
     for run in range(3):
         plain = lambda m, k: _plain(m, k, 1, dilation, padding)  # noqa: E731
         value, back = jax.vjp(plain, maps[run], kernels[run])
-        for got, wanted in zip(found, (value, *back(gradients[run])), strict=True):
+        for got, wanted in zip(results, (value, *back(gradients[run])), strict=True):
             assert_allclose(got[run], wanted, atol=1e-4)
 
 
@@ -132,14 +120,10 @@ def test_runs_side_by_side_convolve_by_taps_on_a_gpu(monkeypatch: pytest.MonkeyP
     maps = jax.random.normal(jax.random.key(0), (2, 24, 24, 4))
     variables = taps.critic.init(jax.random.key(1), maps)
     many = jax.ShapeDtypeStruct((8192, 64, 64, 4), jnp.float32)
-    for critic, shown, convolves in (
-        (plain.critic, maps, True),
-        (taps.critic, maps, False),
-        (taps.critic, many, True),
-    ):
-        text = str(jax.make_jaxpr(critic.apply)(variables, shown))
+    cases = ((plain.critic, maps, True), (taps.critic, maps, False), (taps.critic, many, True))
+    for critic, inputs, convolves in cases:
+        text = str(jax.make_jaxpr(critic.apply)(variables, inputs))
         assert ("conv_general_dilated" in text) is convolves
-    for got, wanted in zip(
-        taps.critic.apply(variables, maps), plain.critic.apply(variables, maps), strict=True
-    ):
+    both = (net.critic.apply(variables, maps) for net in (taps, plain))
+    for got, wanted in zip(*both, strict=True):
         assert_allclose(got, wanted, atol=2e-2)  # bfloat16's

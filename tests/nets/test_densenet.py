@@ -54,16 +54,14 @@ def _keras_name(modules: tuple[str, ...]) -> str:
 
 
 def _outputs(tree: Any, modules: tuple[str, ...] = ()) -> Iterator[tuple[str, jax.Array]]:
-    """Keras's name and output of every module in the captured intermediates but dense layers, which
-    give what their last convolution gives, whole blocks and the trunk."""
+    """Keras's name and output of every captured module but dense layers, which give what their last
+    convolution gives, whole blocks and the trunk."""
     for name, entry in tree.items():
         if name != "__call__":
             yield from _outputs(entry, (*modules, name))
         elif modules and not modules[-1].startswith("dense"):
-            yield (
-                _keras_name(modules),
-                entry[0].maps if modules[-1].startswith("transition") else entry[0],
-            )
+            is_piece = modules[-1].startswith("transition")
+            yield _keras_name(modules), entry[0].maps if is_piece else entry[0]
 
 
 def _weights(
@@ -72,25 +70,18 @@ def _weights(
     """Keras's name and weights of every layer that has some."""
     params, statistics = variables
     for name, entry in params.items():
+        own, keras_name = statistics.get(name, {}), (*modules, name)
         if "kernel" in entry:
-            yield _keras_name((*modules, name)), [np.asarray(entry["kernel"])]
+            yield _keras_name(keras_name), [np.asarray(entry["kernel"])]
         elif "scale" in entry:
-            own = statistics[name]
-            yield (
-                _keras_name((*modules, name)),
-                [np.asarray(w) for w in (*_scale(entry), own["mean"], own["var"])],
-            )
+            leaves = entry["scale"], entry["bias"], own["mean"], own["var"]
+            yield _keras_name(keras_name), [np.asarray(leaf) for leaf in leaves]
         else:
-            yield from _weights((entry, statistics.get(name, {})), (*modules, name))
-
-
-def _scale(entry: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
-    return entry["scale"], entry["bias"]
+            yield from _weights((entry, own), keras_name)
 
 
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
-    """Compares every module with Keras's in both modes of batch norm; returns how many outputs were
-    compared."""
+    """Compares every module with Keras's in both modes of batch norm; returns their number."""
     cfg = with_constants(DenseNet121(norm="batch"), block_layers=block_layers)
     trunk = densenet.DenseNetTrunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
@@ -123,8 +114,7 @@ def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
 
 
 def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Callable, list[str]]:
-    """(maps, train) -> (outputs, statistics by layer) of Keras's net with our weights; names of the
-    outputs."""
+    """Builds Keras's net with our weights: (maps, train) -> outputs, statistics; names."""
     import keras
     from keras.src.applications.densenet import DenseNet
 
@@ -134,20 +124,14 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
         layer = net.get_layer(name)
         layer.set_weights(weights)
         if len(weights) == 4:
-            layer.momentum, layer.epsilon = (
-                0.9,
-                1e-5,
-            )  # torchvision's in place of Keras's 0.99 and 1.001e-5
+            # torchvision's in place of Keras's 0.99 and 1.001e-5
+            layer.momentum, layer.epsilon = 0.9, 1e-5
             norms.append(name)
-    kinds = ("_conv", "_bn", "_pool")
-    wanted = [
-        layer.name for layer in net.layers if layer.name.endswith(kinds) or layer.name == "bn"
-    ]
+    kinds = ("_conv", "_bn", "_pool", "bn")
+    wanted = [layer.name for layer in net.layers if layer.name.endswith(kinds)]
     whole = keras.Model(net.inputs, [net.get_layer(name).output for name in wanted])
-    trained, other = (
-        [v.value for v in group]
-        for group in (whole.trainable_variables, whole.non_trainable_variables)
-    )
+    groups = whole.trainable_variables, whole.non_trainable_variables
+    trained, other = ([v.value for v in group] for group in groups)
 
     def run(trained: Any, other: Any, maps: jax.Array, train: bool) -> Any:
         return whole.stateless_call(trained, other, maps, training=train)
@@ -156,10 +140,8 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
 
     def call(maps: jax.Array, train: bool) -> Any:
         outputs, after = compiled(trained, other, maps, train)
-        by_path = {
-            variable.path: value
-            for variable, value in zip(whole.non_trainable_variables, after, strict=True)
-        }
+        paths = [variable.path for variable in whole.non_trainable_variables]
+        by_path = dict(zip(paths, after, strict=True))
         statistics = {
             name: [by_path.get(v.path, v.value) for v in net.get_layer(name).variables]
             for name in norms
@@ -170,36 +152,26 @@ def _keras(block_layers: tuple[int, ...], size: int, variables: Any) -> tuple[Ca
 
 
 @pytest.mark.slow
-def test_every_stage_is_kerass():
-    """Claim: with weights ported, every convolution, norm and transition is Keras's within 1e-4 of
-    the largest value, batch norm both with running statistics and with the batch's, which move the
-    running ones alike."""
-    assert _compare((2, 1, 1, 1), 64) == 2 + 5 * 4 + 3 * 3 + 1
-
-
-@pytest.mark.slow
 def test_every_stage_of_densenet_121_is_kerass():
-    """Claim: the same for all 121 layers."""
+    """Claim: with weights ported, every convolution, norm and transition is Keras's within 1e-4 of
+    the largest value, batch norm both with running statistics and with the batch's."""
     assert _compare((6, 12, 24, 16), 64) == 2 + 58 * 4 + 3 * 3 + 1
 
 
 def test_number_of_parameters():
-    """Claim: a trunk without its top has 7,037,504 parameters, 83,648 of which are running
-    statistics."""
+    """Claim: a trunk has 7,037,504 parameters, 83,648 of which are running statistics."""
     trunk = densenet.DenseNetTrunk(DenseNet121(norm="batch"))
     blank = jax.ShapeDtypeStruct((1, 64, 64, 3), jnp.float32)
     variables = jax.eval_shape(trunk.init, jax.random.key(0), blank)
-    sizes = {
-        name: sum(leaf.size for leaf in jax.tree.leaves(entry)) for name, entry in variables.items()
-    }
+    size = lambda entry: sum(leaf.size for leaf in jax.tree.leaves(entry))  # noqa: E731
+    sizes = {name: size(entry) for name, entry in variables.items()}
     assert sizes == {"params": PARAMETERS - 83_648, "batch_stats": 83_648}
     assert jax.eval_shape(trunk.apply, variables, blank).shape == (1, 2, 2, 1024)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.float32.dtype}
 
 
 def test_trunks_see_colour_height_and_mask():
-    """Claim: a trunk each for colour, for height and for the mask, the latter two three times over;
-    cells are repeated as far as the trunk does not double them itself."""
+    """Claim: a trunk each for colour, height and mask, the latter two three times over."""
     maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
     zoomed = DenseNet121(zoom=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
@@ -215,18 +187,15 @@ def test_trunks_see_colour_height_and_mask():
 
 def test_a_zoomed_trunk_doubles_its_cells():
     """Claim: with a zoom a trunk says of maps what one without says of pixels repeated."""
-    whole, doubling = (
-        densenet.DenseNetTrunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2)
-    )
+    nets = (densenet.DenseNetTrunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2))
+    whole, doubling = (jax.jit(net.apply) for net in nets)
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
-    variables = random_variables(whole, 0, (1, 64, 64, 3))
-    repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
-    got, wanted = (
-        jax.jit(doubling.apply)(variables, maps),
-        jax.jit(whole.apply)(variables, repeated),
-    )
+    variables = random_variables(densenet.DenseNetTrunk(TINY), 0, (1, 64, 64, 3))
+    got = doubling(variables, maps)
     assert got.shape == (2, 2, 3, 8)
-    assert_allclose(got, wanted, atol=1e-4)  # rounding, which norms of random scales amplify
+    repeated = jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2)
+    # Rounding, which norms of random scales amplify.
+    assert_allclose(got, whole(variables, repeated), atol=1e-4)
 
 
 def test_inputs():
@@ -263,21 +232,18 @@ def test_head_upsamples(zoom: int, output_stride: int, factor: int):
     """Claim: maps have the resolution that `output_stride` says; they are bilinear between the
     features' cells, which keep their places, and constant features give a constant map."""
     cfg = with_constants(DenseNet121(zoom=zoom), output_stride=output_stride)
-    plane = jnp.asarray(
-        np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None], jnp.float32
-    )
+    plane = np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None]
+    plane = jnp.asarray(plane, jnp.float32)
     got = np.asarray(densenet._upsample(plane, 32 // (cfg.zoom * cfg.output_stride)))[0, ..., 0]
     assert got.shape == (4 * factor, 5 * factor)
     at = [(np.arange(n * factor) + 0.5) / factor - 0.5 for n in (4, 5)]
-    inner = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]
-    assert_allclose(
-        got[np.ix_(*inner)], np.add.outer(3.0 * at[0][inner[0]], at[1][inner[1]]), atol=1e-5
-    )
+    rows, cols = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]
+    expected = np.add.outer(3.0 * at[0][rows], at[1][cols])
+    assert_allclose(got[np.ix_(rows, cols)], expected, atol=1e-5)
 
 
 def test_group_norm_sees_one_map():
-    """Claim: with group norm the maps of a picture do not depend on what else is in the batch, in
-    the head either."""
+    """Claim: with group norm a picture's maps do not depend on the rest of the batch."""
     head = densenet.DenseNetHead(TINY)
     features = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, 2, 16)), jnp.float32)
     variables = random_variables(head, 0, (1, 2, 2, 16))
@@ -290,21 +256,17 @@ def test_group_norm_sees_one_map():
 HALF = with_constants(TINY, dtype="bfloat16")
 
 
-def test_bfloat16_has_float32_parameters():
-    """Claim: in bfloat16 parameters and Q stay float32, features are bfloat16."""
-    critic, maps = densenet.DenseNetCritic(HALF), jax.ShapeDtypeStruct((1, 64, 64, 4), jnp.float32)
-    with jax.numpy_dtype_promotion("standard"):  # Flax's norm promotes in half precision
-        (q, features), variables = jax.eval_shape(critic.init_with_output, jax.random.key(0), maps)
-    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
-    assert (q.dtype, features.dtype) == (jnp.float32, jnp.bfloat16)
-
-
 @pytest.mark.slow
 def test_bfloat16_is_near_float32():
-    """Claim: Q in bfloat16 is that in float32 within 5 % of the largest."""
+    """Claim: Q in bfloat16 is that in float32 within 5 % of the largest; parameters and Q stay
+    float32, features are bfloat16."""
+    critic, plain = (densenet.DenseNetCritic(cfg) for cfg in (HALF, TINY))
     maps = jnp.asarray(np.random.default_rng(4).normal(size=(1, 64, 64, 4)), jnp.float32)
-    variables = random_variables(densenet.DenseNetCritic(TINY), 0, maps.shape)
-    with jax.numpy_dtype_promotion("standard"):
-        q, _ = jax.jit(densenet.DenseNetCritic(HALF).apply)(variables, maps)
-    wanted, _ = jax.jit(densenet.DenseNetCritic(TINY).apply)(variables, maps)
+    variables = random_variables(plain, 0, maps.shape)
+    with jax.numpy_dtype_promotion("standard"):  # Flax's norm promotes in half precision
+        abstract = jax.eval_shape(critic.init, jax.random.key(0), maps)
+        q, features = jax.jit(critic.apply)(variables, maps)
+    assert {leaf.dtype for leaf in jax.tree.leaves(abstract)} == {jnp.dtype("float32")}
+    assert (q.dtype, features.dtype) == (jnp.float32, jnp.bfloat16)
+    wanted, _ = jax.jit(plain.apply)(variables, maps)
     assert 0.0 < np.abs(q - wanted).max() <= 0.05 * np.abs(wanted).max()

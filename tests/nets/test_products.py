@@ -17,14 +17,20 @@ from csac_jax.nets import products
 Function = Callable[[jax.Array, jax.Array], jax.Array]  # of maps and kernel
 
 
-def _both(one: Function, other: Function, given: Any, gradient: jax.Array) -> Any:
-    """Value and gradients of two functions."""
+def _random(seed: int, *shapes: tuple[int, ...]) -> list[jax.Array]:
+    rng = np.random.default_rng(seed)
+    return [jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes]
 
-    def seen(function: Function) -> Any:
-        value, back = jax.vjp(function, *given)
+
+def _assert_same(one: Function, other: Function, inputs: Any, gradient: jax.Array) -> None:
+    """Compares values and gradients of two functions."""
+
+    def evaluate(function: Function) -> Any:
+        value, back = jax.vjp(function, *inputs)
         return value, *back(gradient)
 
-    return jax.jit(lambda: (seen(one), seen(other)))()
+    for got, wanted in zip(*jax.jit(lambda: (evaluate(one), evaluate(other)))(), strict=True):
+        assert_allclose(got, wanted, atol=1e-4)  # sums of up to 192 products of numbers near 1
 
 
 @pytest.mark.parametrize(
@@ -36,11 +42,9 @@ def _both(one: Function, other: Function, given: Any, gradient: jax.Array) -> An
     ],
 )
 def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
-    """Claim: value, and gradients for maps and kernel, are those of a convolution with zeros
-    around."""
-    rng = np.random.default_rng(0)
+    """Claim: value and gradients are those of a convolution with zeros around."""
     shapes = (2, 8, 12, 4), (size, size, 4, 5), (2, 8 // stride, 12 // stride, 5)
-    maps, kernel, gradient = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
+    maps, kernel, gradient = _random(0, *shapes)
 
     def ours(maps: jax.Array, kernel: jax.Array) -> jax.Array:
         return module.apply({"params": {"kernel": kernel}}, maps)
@@ -51,18 +55,12 @@ def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
             maps, kernel, (stride, stride), pad, dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
 
-    for got, wanted in zip(*_both(ours, plain, (maps, kernel), gradient), strict=True):
-        assert_allclose(got, wanted, atol=1e-4)
+    _assert_same(ours, plain, (maps, kernel), gradient)
 
 
 def test_doubled_cells_are_pixels_twice_over():
-    """Claim: the first convolution says of doubled cells what it says of pixels repeated; gradients
-    too."""
-    rng = np.random.default_rng(1)
-    maps, kernel, gradient = (
-        jnp.asarray(rng.normal(size=shape), jnp.float32)
-        for shape in ((2, 8, 12, 3), (7, 7, 3, 5), (2, 8, 12, 5))
-    )
+    """Claim: the first convolution takes doubled cells as pixels repeated; gradients too."""
+    maps, kernel, gradient = _random(1, (2, 8, 12, 3), (7, 7, 3, 5), (2, 8, 12, 5))
 
     def see(doubled: bool, maps: jax.Array, kernel: jax.Array) -> jax.Array:
         return products.Stem(5, doubled, jnp.float32).apply({"params": {"kernel": kernel}}, maps)
@@ -70,26 +68,22 @@ def test_doubled_cells_are_pixels_twice_over():
     def repeated(maps: jax.Array, kernel: jax.Array) -> jax.Array:
         return see(False, jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2), kernel)
 
-    ours = functools.partial(see, True)
-    for got, wanted in zip(*_both(ours, repeated, (maps, kernel), gradient), strict=True):
-        # sums of up to 192 products of numbers near 1
-        assert_allclose(got, wanted, atol=1e-4)
+    _assert_same(functools.partial(see, True), repeated, (maps, kernel), gradient)
+
+
+def _flax_pool(maps: jax.Array) -> jax.Array:
+    return nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))
 
 
 def test_max_pool_is_flaxs():
-    """Claim: the maximum of shifted maps is a max pool with padding, gradient included, without the
-    operation that GPUs lack when results are to repeat."""
-    rng = np.random.default_rng(0)
-    maps = jnp.asarray(np.maximum(rng.normal(size=(2, 8, 12, 3)), 0.0), jnp.float32)
-    pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
-    assert_array_equal(products.max_pool(maps), pool(maps))
-    weight = jnp.asarray(rng.normal(size=(2, 4, 6, 3)), jnp.float32)
-    losses = [lambda maps, f=f: jnp.sum(weight * f(maps)) for f in (products.max_pool, pool)]
+    """Claim: value and gradient are those of a max pool, without `select_and_scatter`."""
+    maps, weight = _random(0, (2, 8, 12, 3), (2, 4, 6, 3))
+    maps = jnp.maximum(maps, 0.0)
+    assert_array_equal(products.max_pool(maps), _flax_pool(maps))
+    losses = [lambda maps, f=f: jnp.sum(weight * f(maps)) for f in (products.max_pool, _flax_pool)]
     got, wanted = (jax.jit(jax.grad(loss))(maps) for loss in losses)
-    positive = (
-        maps > 0.0
-    )  # at 0 several cells are the largest; the ReLU before takes the gradient away there
-    assert_allclose(jnp.where(positive, got, 0.0), jnp.where(positive, wanted, 0.0), atol=1e-6)
+    # At 0 several cells are the largest; the ReLU before takes the gradient away there.
+    assert_allclose(jnp.where(maps > 0.0, got, 0.0), jnp.where(maps > 0.0, wanted, 0.0), atol=1e-6)
     named = ["select_and_scatter" in str(jax.make_jaxpr(jax.grad(loss))(maps)) for loss in losses]
     assert named == [False, True]
 
@@ -97,8 +91,5 @@ def test_max_pool_is_flaxs():
 def test_max_pool_chooses_the_first_of_the_largest():
     """Claim: where several cells are the largest the gradient is the first one's, as Flax's is."""
     maps = jnp.asarray(np.random.default_rng(2).integers(1, 4, size=(2, 8, 12, 3)), jnp.float32)
-    pool = lambda maps: nn.max_pool(maps, (3, 3), (2, 2), ((1, 1), (1, 1)))  # noqa: E731
-    got, wanted = (
-        jax.grad(lambda maps, f=f: jnp.sum(f(maps)))(maps) for f in (products.max_pool, pool)
-    )
-    assert_array_equal(got, wanted)
+    pools = products.max_pool, _flax_pool
+    assert_array_equal(*(jax.grad(lambda maps, f=f: jnp.sum(f(maps)))(maps) for f in pools))
