@@ -82,7 +82,7 @@ def _damaged(prepare: Prepare, kind: str, tally: Tally, rng: Rng, tries: int, fo
 
 
 def _params(number: int) -> Any:
-    """Networks of CFG, all numbers different."""
+    """Draws networks of CFG."""
     rng = np.random.default_rng(number)
     blank = actor_critic.abstract_params(CFG)
     return jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
@@ -125,7 +125,7 @@ def _pool(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
 
 
 def _cache(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
-    """An entry of the cache of compiled programs, packed as this package has JAX pack it."""
+    """Writes an entry of the cache of compiled programs, packed as by this package."""
     path = folder / "entry-cache"
     program = jax.jit(lambda x: jnp.tanh(x) @ jnp.sort(x).T).lower(jnp.ones((8, 8))).compile()
     whole = program.runtime_executable().serialize()
@@ -144,8 +144,7 @@ def _cache(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
 
 @contextlib.contextmanager
 def _packing() -> Iterator[None]:
-    """JAX packs as it does once the cache is on, where a zstandard without checksums is
-    installed."""
+    """Packs as JAX does once the cache is on, with a zstandard without checksums."""
     plain = SimpleNamespace(compress=bytes, decompress=bytes)
     module = SimpleNamespace(ZstdCompressor=lambda: plain, ZstdDecompressor=lambda: plain)
     with mock.patch.multiple(compilation_cache, zstd=None, zstandard=module):
@@ -184,7 +183,7 @@ def _line(number: int) -> str:
 
 
 def _fault_of_log(path: Path, written: list[bytes]) -> str | None:
-    """What is wrong with how a log is cut to the steps so far."""
+    """Cuts a log to its steps; returns a fault in the result."""
     before = path.read_bytes()
     *whole, _ = before.split(b"\n")
     with warnings.catch_warnings(record=True) as damage:
@@ -207,7 +206,7 @@ def _fault_of_log(path: Path, written: list[bytes]) -> str | None:
 
 @fault("numbers changed by hand in sweep.json", 100)
 def _numbers(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """By hand the digest is kept, or taken out too; then what the runs themselves say counts."""
+    """Changes numbers of a plan with its digest kept or removed; the runs' own configs count."""
     path, read, expected = _sweep(folder)
     whole = json.loads(path.read_text())
     for run in runner.runs_of(_plan()):
@@ -224,7 +223,7 @@ def _numbers(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 
 def _places(content: Any, depth: int = 8) -> Iterator[tuple[Any, Any]]:
-    """Every container of JSON content, so many levels deep, with each of its keys."""
+    """Yields every container of JSON content, to a depth, with each of its keys."""
     for key in list(content) if isinstance(content, dict) else range(len(content)):
         yield content, key
         if isinstance(content[key], dict | list) and depth:
@@ -238,7 +237,7 @@ def _is_number(place: tuple[Any, Any]) -> bool:
 
 @fault("foreign and swapped policy files", 100)
 def _foreign(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Files of other programs; tensors of one policy under the remarks of another."""
+    """Reads files of other programs, and tensors of one policy under the remarks of another."""
     path, read, expected = _policy(folder)
     junk = rng.bytes(4096)
     own = path.read_bytes()
@@ -289,7 +288,7 @@ def _foreign(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("numbers that are not finite in policy files", 60)
 def _not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """They are neither written nor read, though the digest is right."""
+    """Writes and reads networks that are not finite, with a right digest: both are refused."""
     path, read, expected = _policy(folder)
     for number in tally.each(range(tries)):
         params = _params(number)
@@ -304,7 +303,7 @@ def _not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
             _judge(tally, "written", lambda p=params: policy_file.save(path, p, CFG), expected)
 
 
-# Hostile content: valid files in which something stands that nobody would write.
+# Hostile content: valid files with values that nobody would write.
 
 _DEEP: Any = json.loads("[" * 400 + "]" * 400)
 _VALUES: list[Any] = [
@@ -325,7 +324,7 @@ def _copied(content: Any) -> Any:
 
 
 def _hostile(valid: Any) -> st.SearchStrategy[Any]:
-    """Any JSON, or valid content of which one to three places hold it, are gone or have a twin."""
+    """Draws any JSON, or valid content with one to three places changed, removed or doubled."""
 
     @st.composite
     def changed(draw: st.DrawFn) -> Any:
@@ -350,7 +349,7 @@ def _hostile(valid: Any) -> st.SearchStrategy[Any]:
 
 
 def _texts(valid: Any) -> st.SearchStrategy[bytes]:
-    """Files of such content; now and then no JSON at all, or too deep for any reader."""
+    """Draws files of such content; now and then no JSON at all, or too deep for any reader."""
     written = _hostile(valid).map(lambda content: json.dumps(content).encode())
     broken = st.binary(max_size=40) | st.sampled_from(
         [b"[" * 10**5, b'{"a":' * 10**5, b"\xff", b""]
@@ -383,7 +382,7 @@ def _say(text: bytes) -> str:
 
 @fault("hostile config files", 500)
 def _configs(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """They are refused, or are configs that come back as they were written."""
+    """Reads hostile configs: refused, or they come back as they were written."""
     path = folder / files.CONFIG
     texts = _texts(configs.to_dict(CFG))
 
@@ -398,7 +397,7 @@ def _configs(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("hostile case files", 500)
 def _cases(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """They are refused, or are arrangements that lie in the workspace."""
+    """Reads hostile cases: refused, or they lie in the workspace."""
     path = folder / "case.json"
     valid = json.loads(cases.shipped(cases.names()[0]).read_text())
     reach = 0.5 * CFG.heightmap.extent
@@ -414,7 +413,7 @@ def _cases(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("hostile sweep.json", 300)
 def _plans(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """They are refused, or all their runs lie inside the sweep's folder, each in its own."""
+    """Reads hostile plans: refused, or all runs lie in the sweep's folder, each in its own."""
     path = folder / files.SWEEP_PLAN
     valid = json.loads(runner.plan_text(_plan()))
     del valid[runner.DIGEST]
@@ -433,7 +432,7 @@ def _plans(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("hostile manifests", 200)
 def _manifests(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """The step is passed over, for the one before."""
+    """Reads hostile manifests: the step is skipped for the one before."""
     state = {"step": jnp.int32(4)}
     for step in (4, 8):
         checkpoint.save(folder, step, {"step": jnp.int32(step)}, CFG, {})
@@ -453,7 +452,7 @@ def _manifests(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("hostile records of runs and evaluations", 300)
 def _records(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """A report leaves them out with a note, or shows them."""
+    """Reports hostile records: they are left out with a note, or shown."""
     share = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 10}
     config = configs.to_dict(CFG)
     part = {**dict.fromkeys(results.METRICS, share), "counts": {"episodes": 10}}

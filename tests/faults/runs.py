@@ -71,7 +71,7 @@ class _Run:
 
 @fault("SIGKILL at a random time", tries=100)
 def sigkill(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Runs of ten processes, each killed within its first second or so; the next one resumes."""
+    """Kills ten processes of a run, each within its first second or so; the next one resumes."""
     for number in tally.each(range(tries)):
         if number % 10 == 0:
             run = _Run(folder / str(number), tally)
@@ -83,7 +83,7 @@ def sigkill(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("SIGTERM", tries=20)
 def sigterm(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """A run that is told to stop saves and ends, complete to the step that its log ends with."""
+    """Stops a run; it saves and ends, complete to the last step of its log."""
     run = _Run(folder / "run", tally)
     for number in tally.each(range(tries)):
         child = run.child(1, float(rng.uniform(0.0, 0.3)))
@@ -147,7 +147,7 @@ def _injected(run: _Run, name: str, inject: str) -> tuple[toy.Child, bool]:
 
 @fault("SIGKILL at a system call of a save", tries=400, slow=True)
 def sigkill_in_save(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Every call that writes, of a chunk, its log and its save."""
+    """Kills at every call that writes, of a chunk, its log and its save."""
     run = _Run(folder / "run", tally)
     for name, number in tally.each(_chosen(rng, _calls(folder), tries)):
         child, _ = _injected(run, name, f"signal=KILL:when={number}")
@@ -156,7 +156,7 @@ def sigkill_in_save(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("disc full from a system call on", tries=200)
 def disc_full(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """ENOSPC from every call on that could need room, in turn; see `file_too_large` for `write`."""
+    """Returns ENOSPC from every call on that could need room; for `write` see `file_too_large`."""
     run = _Run(folder / "run", tally)
     needs = ("mkdir", "openat", "pwrite64", "fsync", "ftruncate", "rename")
     calls = [call for call in _calls(folder) if call[0] in needs]
@@ -168,7 +168,7 @@ def disc_full(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("disc full in the middle of a file", tries=60)
 def file_too_large(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Writes beyond some size fail (RLIMIT_FSIZE), whatever the file."""
+    """Fails writes beyond some size (RLIMIT_FSIZE), whatever the file."""
     run = _Run(folder / "run", tally)
     for _ in tally.each(range(tries)):
         largest = int(10 ** rng.uniform(0.0, 4.0)) - 1
@@ -255,7 +255,7 @@ SWAPPED: dict[str, Callable[[Path, Path], object]] = {
 
 @fault("swapped, missing and foreign step folders", tries=len(SWAPPED))
 def swapped(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """The right steps remain, or those before them; the run continues from there."""
+    """Moves step folders; the right steps remain, or those before them, and the run continues."""
     for name, seed in (("sound", 5), ("other", 6)):
         toy.train(folder / name, 3, seed=seed)
     other, reference = folder / "other", toy.Reference()
@@ -298,7 +298,7 @@ def _content(folder: Path) -> dict[str, bytes]:
 
 @fault("two resumes at once", tries=10)
 def two_at_once(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """The second is refused; once the first is killed, another one continues."""
+    """Resumes twice: the second is refused; once the first is killed, another one continues."""
     run = _Run(folder / "run", tally)
     for number in tally.each(range(tries)):
         first, second, about = run.child(1, held=True), run.child(steps=1), f"try {number}"
@@ -313,7 +313,7 @@ def two_at_once(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("a loss or parameter that is not finite", tries=20)
 def not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Training stops; the last good checkpoint stays the newest, and is what is restored."""
+    """Stops a training by NaN; the last good checkpoint stays the newest and is restored."""
     reference = toy.Reference()
     for number in tally.each(range(tries)):
         run_dir, step = folder / str(number), int(rng.integers(1, 4))
@@ -328,7 +328,7 @@ def not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("clock that goes backwards", tries=10)
 def clock(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """At each look the wall clock shows an earlier time; the run continues and its log is whole."""
+    """Turns the wall clock back at each look; the run continues and its log is whole."""
     reference = toy.Reference()
     for number in tally.each(range(tries)):
         run_dir, about = folder / str(number), f"try {number}"
@@ -348,7 +348,7 @@ def clock(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("read-only folders", tries=12)
 def read_only(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """A run that may not write says so in one line, and changes nothing."""
+    """Closes folders to a run; it says so in one line and changes nothing."""
     with tempfile.TemporaryDirectory() as name:  # pytest's own are closed to other users
         base = Path(name)
         base.chmod(0o755)
@@ -382,8 +382,7 @@ REFUSED = ("[a-z]", "a*", "a?", "back\\slash", "\udcff")
 
 @fault("paths with spaces, quotes and non-Latin letters", tries=len(NAMES) + len(REFUSED))
 def odd_paths(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """A run in such a folder is trained, saved, resumed and restored as any other, or refused
-    before anything is trained."""
+    """Trains and resumes in folders with odd names, or refuses them before any training."""
     reference = toy.Reference()
     for name in tally.each(_chosen(rng, [*NAMES, *REFUSED], tries)):
         run_dir = folder / name / "run"
@@ -396,7 +395,7 @@ def odd_paths(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 @fault("closed pipe, full or missing stdout", tries=12)
 def closed_pipe(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """`train ... | head -1` and the like: the run continues, is saved and its result is written."""
+    """Closes the output, as `train ... | head -1`; the run continues and writes its result."""
     reference, steps = toy.Reference(), 6
     ends = ["head", "true", ">/dev/full", ">&-", "2>&-", "2>/dev/full"]
     for number in tally.each(range(tries)):
@@ -473,8 +472,7 @@ PROGRAMS = {
 
 @fault("fork, and import in a thread", tries=6)
 def fork_and_thread(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Training works in a thread that imports the package, and in a child forked before JAX has
-    started; a child forked later, that leaves JAX alone, does no harm."""
+    """Trains in a thread that imports the package, in a child forked before JAX, after a fork."""
     for number in tally.each(range(tries)):
         about, source = list(PROGRAMS.items())[number % len(PROGRAMS)]
         run_dir = folder / str(number)
@@ -494,8 +492,7 @@ VICTIMS = (
 
 @fault("names of sweeps that lead elsewhere", tries=len(VICTIMS))
 def sweep_names(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """`sweep --resume` refuses a sweep.json with such a name, whatever its digest, or stays within
-    its own folder."""
+    """Resumes a sweep.json with such a name: refused, or it stays within its own folder."""
     for name in tally.each(_chosen(rng, list(VICTIMS), tries)):
         own = folder / str(tally.tries)
         victim, sweep = own / "victim", own / "sweep"
@@ -540,8 +537,7 @@ def _sweep_program(group: object) -> SimpleNamespace:
 
 @fault("NaN in one of 64 scenes, a reward, a gradient, a weight", tries=20, slow=True)
 def nan_in_training(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """The real training step. A scene's NaN stays there and is counted; NaN that reaches the
-    networks is reported at once."""
+    """Spoils the real step: a scene's NaN stays there, NaN in the networks is reported at once."""
     cfg = presets.smoke().change(
         sim={"physics": "c"},
         replay={"capacity": 128},
