@@ -129,8 +129,7 @@ def _shown(cfg: Config, dotted: str) -> str:
 
 
 def table() -> list[str]:
-    """The rows of docs/paper.md that say what each algorithm sets, from the functions on the preset
-    `quick`."""
+    """Returns the rows of docs/paper.md: the settings of each algorithm on the preset `quick`."""
     variants = [algorithms.configure(presets.quick(), name) for name in NAMES]
     flat = [configs.differences(variants[0], cfg) for cfg in variants]
     names = {name for row in flat for name in row if "." in name}

@@ -14,7 +14,7 @@ BOXES = ("box",) * 3
 
 
 def _config(settings: dict) -> Config:
-    """`quick` with settings by their dotted names."""
+    """Returns `quick` with settings by their dotted names."""
     sections = {}
     for name, value in settings.items():
         section, _, field = name.rpartition(".")

@@ -15,7 +15,7 @@ SCRIPTS = sorted(
 
 
 def _module(name: str) -> types.ModuleType | None:
-    """A module of ours; None if a package that it needs is not installed."""
+    """Imports a module of ours; returns None without a package that it needs."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -25,9 +25,7 @@ def _module(name: str) -> types.ModuleType | None:
 
 
 def missing(source: str) -> list[str]:
-    """Attributes of modules of ours that a script reads and that are not there, as `module.name`.
-
-    Modules are those that it imports by `from`; a name that it binds otherwise is left out."""
+    """Returns the missing attributes of our modules that a script reads, as `module.name`."""
     nodes = list(ast.walk(ast.parse(source)))
     modules = {}
     for node in nodes:

@@ -58,7 +58,7 @@ def test_extras_are_sorted_and_pinned():
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with wheel and sdist."""
+    """Builds wheel and sdist; returns their folder."""
     folder = tmp_path_factory.mktemp("dist")
     pytest.importorskip("build.__main__")  # a folder "build" would pass for the package
     command = [sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT)]

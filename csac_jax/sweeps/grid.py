@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from csac_jax.algorithms import unknown
 from csac_jax.config import ALTERNATIVES, Config, Section
 from csac_jax.errors import SettingsError
+from csac_jax.io import renames
 
 BASE = "base"  # name of the only point where nothing is varied
 LONGEST = 120  # characters of a point's name, which is a folder's
@@ -96,6 +97,8 @@ def _axis(text: str) -> tuple[str, list[str]]:
     name, values = name.replace("-", "_"), rest.split(",")
     if not equals or not all(values):
         raise SettingsError(f"vary {text}: give a setting and its values: learn.tau=0.01,0.02")
+    values = [renames.current_setting(name, value)[1] for value in values]
+    name, _ = renames.current_setting(name, values[0])
     kind_of(name)
     if len(set(values)) < len(values):
         raise SettingsError(f"vary {text}: a value is given twice")

@@ -27,7 +27,7 @@ from csac_jax.config import Config, shown
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import NO_CASES
-from csac_jax.io import checkpoint, configs, files, lock
+from csac_jax.io import checkpoint, configs, files, lock, renames
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import grid
@@ -130,7 +130,11 @@ def read_plan(folder: Path) -> SweepPlan:
         if stored.keys() - {"episodes"} != {"seeds", "settings"}:
             raise ValueError("it is no plan of a sweep")
         points = [
-            SweepPoint(point["name"], point["values"], configs.from_dict(point["config"]))
+            SweepPoint(
+                point["name"],
+                dict(renames.current_setting(*pair) for pair in point["values"].items()),
+                configs.from_dict(point["config"]),
+            )
             for point in stored["settings"]
         ]
         plan = SweepPlan(stored["seeds"], points, stored.get("episodes", 0))

@@ -182,8 +182,7 @@ STUDY = "--seeds 2 --vary algo=csac_beta,vpg --vary task=clear,packed --vary tra
 
 
 def _episodes(lifted: int) -> metrics.Episodes:
-    """Four episodes of one block and one action: so many of their grasps lift it, the others touch
-    it."""
+    """Builds four episodes of one block and one grasp: so many lift it, the others touch it."""
     done, ones = np.arange(4) < lifted, np.ones((4, 1), np.int32)
     return metrics.Episodes(
         valid=ones > 0,
@@ -359,7 +358,7 @@ def test_devices_of_other_processes_count():
 
 
 def _study_commands() -> list[list[str]]:
-    """The arguments of every sweep of docs/study.md, its shell variables put in."""
+    """Returns the arguments of every sweep of docs/study.md, with its shell variables."""
     page = (Path(cli.__file__).parents[2] / "docs" / "study.md").read_text()
     values = dict(re.findall(r'^    (\w+)="(.*)"$', page, re.MULTILINE))
     lines = re.findall(r"^    \$S (.*)$", page, re.MULTILINE)

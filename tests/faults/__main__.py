@@ -50,7 +50,7 @@ def main(names: list[str]) -> int:
 
 
 def with_table(page: str, text: str) -> str:
-    """A page with `text` between its markers."""
+    """Returns a page with `text` between its markers."""
     pattern = f"{re.escape(BEGIN)}.*{re.escape(END)}"
     new, number = re.subn(pattern, lambda _: f"{BEGIN}\n{text}{END}", page, flags=re.DOTALL)
     if number != 1:

@@ -1,32 +1,31 @@
-"""Faults that are injected by the hundred, and what came of each try.
+"""Faults that are injected by the hundred, and the result of each try.
 
-A fault is a function (rng, tries, folder) -> Tally, named by `@fault`. `make test-faults` injects
+A fault is a function (tally, rng, tries, folder), named by `@fault`. `make test-faults` injects
 all; `make test` a tenth, in `test_faults.py`. The modules in MODULES register them.
 """
 
 import dataclasses
 import importlib
-import importlib.util
 import os
 import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 MODULES = ("runs", "inputs")  # of this folder
 ROOT = Path(__file__).parents[2]  # of the repository
 SHARE = 10  # `make test` injects one try in so many
-
 HANG = 10.0  # s: an answer that takes longer, beyond what the work itself needs, is a hang
 
 
 @dataclasses.dataclass
 class Tally:
-    """What came of the tries of one fault. All but `tries` are to be 0."""
+    """Results of the tries of one fault. All but `tries` must be 0."""
 
     tries: int = 0
     lost: int = 0  # data that had been saved and could not be had back, or was deleted
@@ -35,14 +34,29 @@ class Tally:
     hangs: int = 0
     remarks: list[str] = dataclasses.field(default_factory=list)  # of each try that went wrong
 
-    def count(self, kind: str, remark: str) -> None:
-        """A try that went wrong; `kind` is one of the names above."""
-        setattr(self, kind, getattr(self, kind) + 1)
-        self.remarks.append(remark)
+    def each(self, items: Iterable[Any]) -> Iterator[Any]:
+        """Yields the items, each of which is a try."""
+        for item in items:
+            self.tries += 1
+            yield item
+
+    def check(self, good: Any, kind: str, remark: str) -> None:
+        """Counts a try that went wrong; `kind` is one of the names above."""
+        if not good:
+            setattr(self, kind, getattr(self, kind) + 1)
+            self.remarks.append(remark)
+
+    def sound(self, fault: str | None, kind: str, about: str) -> None:
+        """Counts a fault that was found, if any."""
+        self.check(fault is None, kind, f"{about}: {fault}")
 
     @property
     def bad(self) -> int:
+        """Returns the number of tries that went wrong."""
         return self.lost + self.silent + self.tracebacks + self.hangs
+
+
+Inject = Callable[[Tally, np.random.Generator, int, Path], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +65,7 @@ class Fault:
 
     name: str
     tries: int  # of the whole suite
-    inject: Callable[[np.random.Generator, int, Path], Tally]
+    inject: Inject
     slow: bool = False  # takes long: no part of it is in `make test`
 
 
@@ -59,26 +73,27 @@ FAULTS: dict[str, Fault] = {}
 
 
 class MissingToolError(Exception):
-    """What a fault needs, and this machine lacks; the message is the reason."""
+    """A tool that a fault needs, and this machine lacks; the message is the reason."""
 
 
 def load() -> dict[str, Fault]:
-    """All faults, by name."""
+    """Returns all faults, by name."""
     for name in MODULES:
-        if importlib.util.find_spec(f"tests.faults.{name}") is not None:
-            importlib.import_module(f"tests.faults.{name}")
+        importlib.import_module(f"tests.faults.{name}")
     return FAULTS
 
 
 def run(one: Fault, tries: int, folder: Path) -> Tally:
     """Injects a fault; its tries are the same at every call."""
-    return one.inject(np.random.default_rng(zlib.crc32(one.name.encode())), tries, folder)
+    tally = Tally()
+    one.inject(tally, np.random.default_rng(zlib.crc32(one.name.encode())), tries, folder)
+    return tally
 
 
-def fault(name: str, tries: int, slow: bool = False) -> Callable[..., Callable[..., Tally]]:
+def fault(name: str, tries: int, slow: bool = False) -> Callable[[Inject], Inject]:
     """Registers a function as the fault `name`, which the whole suite injects `tries` times."""
 
-    def register(inject: Callable[..., Tally]) -> Callable[..., Tally]:
+    def register(inject: Inject) -> Inject:
         FAULTS[name] = Fault(name, tries, inject, slow)
         return inject
 
@@ -87,36 +102,15 @@ def fault(name: str, tries: int, slow: bool = False) -> Callable[..., Callable[.
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """How a process ended."""
+    """The end of a process."""
 
     code: int | None  # None where it hung
     output: str
     errors: str
-    seconds: float
 
 
-def command(
-    arguments: Sequence[str],
-    limit: float,
-    env: dict[str, str] | None = None,
-    folder: Path = ROOT,
-    prefix: Sequence[str] = (),
-) -> Answer:
-    """Runs `python ARGUMENTS` in a folder; it hangs if it takes longer than `limit` s.
-
-    Args: env, variables beyond this process's; prefix, a program that starts Python, as strace.
-    """
-    process = start(arguments, env, folder, prefix)
-    return wait(process, limit)
-
-
-def start(
-    arguments: Sequence[str],
-    env: dict[str, str] | None = None,
-    folder: Path = ROOT,
-    prefix: Sequence[str] = (),
-) -> subprocess.Popen[str]:
-    """Starts what `command` runs."""
+def start(arguments: Sequence[str], prefix: Sequence[str] = ()) -> subprocess.Popen[str]:
+    """Starts `python ARGUMENTS` in the repository; `prefix` is a program that starts Python."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     quiet = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0", "PYTHONPATH": path}
     return subprocess.Popen(
@@ -125,29 +119,26 @@ def start(
         stderr=subprocess.PIPE,
         text=True,
         errors="replace",
-        cwd=folder,
-        env={**os.environ, **quiet, **(env or {})},
+        cwd=ROOT,
+        env={**os.environ, **quiet},
     )
 
 
 def wait(process: subprocess.Popen[str], limit: float) -> Answer:
-    """How a process ends; it is killed after `limit` s."""
-    begun = time.monotonic()
+    """Returns the end of a process; kills it after `limit` s."""
     try:
         output, errors = process.communicate(timeout=limit)
-        return Answer(process.returncode, output, errors, time.monotonic() - begun)
+        return Answer(process.returncode, output, errors)
     except subprocess.TimeoutExpired:
         process.kill()
-        output, errors = process.communicate()
-        return Answer(None, output, errors, time.monotonic() - begun)
+        return Answer(None, *process.communicate())
 
 
 def judge(tally: Tally, answer: Answer, about: str) -> None:
     """Counts an answer that hung or has a traceback."""
-    if answer.code is None:
-        tally.count("hangs", f"{about}: hung")
-    elif "Traceback (most recent call last)" in answer.errors:
-        tally.count("tracebacks", f"{about}: {answer.errors.strip().splitlines()[-1]}")
+    tally.check(answer.code is not None, "hangs", f"{about}: hung")
+    broken = "Traceback (most recent call last)" in answer.errors
+    tally.check(not broken, "tracebacks", f"{about}: {answer.errors.strip().splitlines()[-1:]}")
 
 
 def refused(
@@ -157,21 +148,30 @@ def refused(
     begun = time.monotonic()
     try:
         call()
-        tally.count("silent", f"{about}: taken")
+        tally.check(False, "silent", f"{about}: taken")
     except expected as error:
-        if "\n" in str(error):
-            tally.count("tracebacks", f"{about}: more than one line: {str(error)!r}")
+        lines = str(error).count("\n")
+        tally.check(not lines, "tracebacks", f"{about}: more than one line: {str(error)!r}")
     except Exception as error:
-        tally.count("tracebacks", f"{about}: {type(error).__name__}: {error}")
-    if time.monotonic() - begun > HANG:
-        tally.count("hangs", f"{about}: took more than {HANG:.0f} s")
+        tally.check(False, "tracebacks", f"{about}: {type(error).__name__}: {error}")
+    took = time.monotonic() - begun
+    tally.check(took <= HANG, "hangs", f"{about}: took more than {HANG:.0f} s")
+
+
+def works(tally: Tally, about: str, call: Callable[[], Any], kind: str = "lost") -> Any:
+    """Returns the result of a call that must not raise; counts an error and returns None."""
+    try:
+        return call()
+    except Exception as error:
+        tally.check(False, kind, f"{about}: {type(error).__name__}: {error}")
+        return None
 
 
 DAMAGES = ("bit flips", "truncations", "zeroed blocks")
 
 
 def damage(rng: np.random.Generator, kind: str, path: Path) -> str:
-    """Damages a file of at least one byte in place, in words; its bytes are sure to differ."""
+    """Damages a file of at least one byte in place; returns a description. Its bytes differ."""
     data = bytearray(path.read_bytes())
     before = bytes(data)
     where = int(rng.integers(len(data)))
@@ -189,7 +189,7 @@ def damage(rng: np.random.Generator, kind: str, path: Path) -> str:
 
 
 def table(tallies: Iterable[tuple[str, Tally]]) -> str:
-    """The results as a Markdown table."""
+    """Returns the results as a Markdown table."""
     lines = [
         "| fault | tries | lost | silent | tracebacks | hangs |",
         "|---|---:|---:|---:|---:|---:|",

@@ -35,10 +35,13 @@ from tests.faults.harness import DAMAGES, Tally, fault
 
 CFG = presets.smoke()
 LONGEST = 1000  # characters of a message: it is one line, not the file again
+Rng = np.random.Generator
+Prepare = Callable[[Path], tuple[Path, Callable[[], Any], type[Exception]]]
+"""Writes a file; returns its path, its reader and the error that refuses it."""
 
 
 class _SoundError(Exception):
-    """What was read is what was written: there is nothing to refuse."""
+    """The file was read as it was written: there is nothing to refuse."""
 
 
 class _RefusedError(Exception):
@@ -49,7 +52,6 @@ def _judge(
     tally: Tally, about: str, read: Callable[[], Any], expected: type[Exception] | tuple = ()
 ) -> None:
     """Counts a call that neither raises `expected` in one line nor says that all is sound."""
-    tally.tries += 1
     kinds = (*expected, _SoundError) if isinstance(expected, tuple) else (expected, _SoundError)
 
     def call() -> None:
@@ -65,42 +67,22 @@ def _judge(
         harness.refused(tally, about, call, kinds)
 
 
-def _damaged(
-    rng: np.random.Generator,
-    tries: int,
-    kind: str,
-    path: Path,
-    read: Callable[[], Any],
-    expected: type[Exception],
-) -> Tally:
+def _damaged(prepare: Prepare, kind: str, tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Damages a file again and again. It must be refused, or read as before."""
-    tally, whole, right = Tally(), path.read_bytes(), read()
+    path, read, expected = prepare(folder)
+    whole, right = path.read_bytes(), read()
 
     def again() -> None:
         if read() == right:
             raise _SoundError
 
-    for _ in range(tries):
+    for _ in tally.each(range(tries)):
         path.write_bytes(whole)
-        about = harness.damage(rng, kind, path)
-        _judge(tally, about, again, expected)
-    return tally
-
-
-def _every_damage(
-    what: str, prepare: Callable[[Path], tuple[Path, Callable[[], Any], type[Exception]]]
-) -> None:
-    """Registers the faults of a kind of file; `prepare` writes one and says how it is read."""
-    for kind in DAMAGES:
-
-        def inject(rng: np.random.Generator, tries: int, folder: Path, kind: str = kind) -> Tally:
-            return _damaged(rng, tries, kind, *prepare(folder))
-
-        fault(f"{kind} in {what}", 200)(inject)
+        _judge(tally, harness.damage(rng, kind, path), again, expected)
 
 
 def _params(number: int) -> Any:
-    """Networks of CFG, all numbers different."""
+    """Draws networks of CFG."""
     rng = np.random.default_rng(number)
     blank = actor_critic.abstract_params(CFG)
     return jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
@@ -143,7 +125,7 @@ def _pool(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
 
 
 def _cache(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
-    """An entry of the cache of compiled programs, packed as this package has JAX pack it."""
+    """Writes an entry of the cache of compiled programs, packed as by this package."""
     path = folder / "entry-cache"
     program = jax.jit(lambda x: jnp.tanh(x) @ jnp.sort(x).T).lower(jnp.ones((8, 8))).compile()
     whole = program.runtime_executable().serialize()
@@ -162,8 +144,7 @@ def _cache(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
 
 @contextlib.contextmanager
 def _packing() -> Iterator[None]:
-    """JAX packs as it does once the cache is on, where a zstandard without checksums is
-    installed."""
+    """Packs as JAX does once the cache is on, with a zstandard without checksums."""
     plain = SimpleNamespace(compress=bytes, decompress=bytes)
     module = SimpleNamespace(ZstdCompressor=lambda: plain, ZstdDecompressor=lambda: plain)
     with mock.patch.multiple(compilation_cache, zstd=None, zstandard=module):
@@ -177,33 +158,23 @@ for _what, _prepare in {
     "the scene pool": _pool,
     "compiled programs": _cache,
 }.items():
-    _every_damage(_what, _prepare)
+    for _kind in DAMAGES:
+        fault(f"{_kind} in {_what}", 200)(functools.partial(_damaged, _prepare, _kind))
+
+
+def _damaged_log(kind: str, tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Damages a log: readable lines stay, the others are counted, the whole file is kept. A digit
+    that has changed to another goes unseen."""
+    path, lines = folder / files.METRICS, [_line(number).encode() for number in range(40)]
+    for _ in tally.each(range(tries)):
+        path.write_bytes(b"".join(line + b"\n" for line in lines))
+        about = harness.damage(rng, kind, path)
+        found = harness.works(tally, about, lambda: _fault_of_log(path, lines) or "", "tracebacks")
+        tally.check(not found, "lost", f"{about}: {found}")
 
 
 for _kind in DAMAGES:
-
-    def _log_fault(rng: np.random.Generator, tries: int, folder: Path, kind: str = _kind) -> Tally:
-        """A damaged log: readable lines stay, the others are counted, the whole file is kept. A
-        digit that has changed to another goes unseen."""
-        tally, path = Tally(), folder / files.METRICS
-        lines = [_line(number).encode() for number in range(40)]
-        for _ in range(tries):
-            path.write_bytes(b"".join(line + b"\n" for line in lines))
-            about = harness.damage(rng, kind, path)
-            found: list[str] = []
-            _judge(tally, about, functools.partial(_cut, path, lines, found))
-            tally.lost += len(found)
-            tally.remarks += [f"{about}: {text}" for text in found]
-        return tally
-
-    fault(f"{_kind} in metrics.jsonl", 200)(_log_fault)
-
-
-def _cut(path: Path, written: list[bytes], found: list[str]) -> None:
-    """Cuts a log, and adds what is wrong with that to `found`."""
-    if text := _fault_of_log(path, written):
-        found.append(text)
-    raise _SoundError
+    fault(f"{_kind} in metrics.jsonl", 200)(functools.partial(_damaged_log, _kind))
 
 
 def _line(number: int) -> str:
@@ -212,7 +183,7 @@ def _line(number: int) -> str:
 
 
 def _fault_of_log(path: Path, written: list[bytes]) -> str | None:
-    """What is wrong with how a log is cut to the steps so far."""
+    """Cuts a log to its steps; returns a fault in the result."""
     before = path.read_bytes()
     *whole, _ = before.split(b"\n")
     with warnings.catch_warnings(record=True) as damage:
@@ -234,13 +205,13 @@ def _fault_of_log(path: Path, written: list[bytes]) -> str | None:
 
 
 @fault("numbers changed by hand in sweep.json", 100)
-def _numbers(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """By hand the digest is kept, or taken out too; then what the runs themselves say counts."""
+def _numbers(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Changes numbers of a plan with its digest kept or removed; the runs' own configs count."""
     path, read, expected = _sweep(folder)
-    whole, tally = json.loads(path.read_text()), Tally()
+    whole = json.loads(path.read_text())
     for run in runner.runs_of(_plan()):
         files.write_json(folder / run.folder / files.CONFIG, configs.to_dict(run.cfg))
-    for number in range(tries):
+    for number in tally.each(range(tries)):
         changed = _copied(whole)
         places = [place for place in _places(changed["settings"]) if _is_number(place)]
         container, key = places[int(rng.integers(len(places)))]
@@ -249,11 +220,10 @@ def _numbers(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
             del changed[runner.DIGEST]
         path.write_text(json.dumps(changed))
         _judge(tally, f"{key} doubled, digest {'out' if number % 2 else 'kept'}", read, expected)
-    return tally
 
 
 def _places(content: Any, depth: int = 8) -> Iterator[tuple[Any, Any]]:
-    """Every container of JSON content, so many levels deep, with each of its keys."""
+    """Yields every container of JSON content, to a depth, with each of its keys."""
     for key in list(content) if isinstance(content, dict) else range(len(content)):
         yield content, key
         if isinstance(content[key], dict | list) and depth:
@@ -266,10 +236,10 @@ def _is_number(place: tuple[Any, Any]) -> bool:
 
 
 @fault("foreign and swapped policy files", 100)
-def _foreign(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """Files of other programs; tensors of one policy under the remarks of another."""
-    path, tally, junk = folder / "policy.safetensors", Tally(), rng.bytes(4096)
-    _, read, expected = _policy(folder)
+def _foreign(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Reads files of other programs, and tensors of one policy under the remarks of another."""
+    path, read, expected = _policy(folder)
+    junk = rng.bytes(4096)
     own = path.read_bytes()
     with safetensors.safe_open(path, "numpy") as file:
         remarks = file.metadata()
@@ -310,19 +280,17 @@ def _foreign(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         ),
     }
     kinds = list(contents)
-    for number in range(tries):
+    for number in tally.each(range(tries)):
         kind = kinds[number % len(kinds)]
         path.write_bytes(contents[kind]())
         _judge(tally, kind, read, expected)
-    return tally
 
 
 @fault("numbers that are not finite in policy files", 60)
-def _not_finite(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """They are neither written nor read, though the digest is right."""
-    path, tally = folder / "policy.safetensors", Tally()
-    _, read, expected = _policy(folder)
-    for number in range(tries):
+def _not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Writes and reads networks that are not finite, with a right digest: both are refused."""
+    path, read, expected = _policy(folder)
+    for number in tally.each(range(tries)):
         params = _params(number)
         each = jax.tree.leaves(params)
         leaf = each[int(rng.integers(len(each)))]
@@ -333,10 +301,9 @@ def _not_finite(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
             _judge(tally, "read", read, expected)
         else:
             _judge(tally, "written", lambda p=params: policy_file.save(path, p, CFG), expected)
-    return tally
 
 
-# Hostile content: valid files in which something stands that nobody would write.
+# Hostile content: valid files with values that nobody would write.
 
 _DEEP: Any = json.loads("[" * 400 + "]" * 400)
 _VALUES: list[Any] = [
@@ -357,7 +324,7 @@ def _copied(content: Any) -> Any:
 
 
 def _hostile(valid: Any) -> st.SearchStrategy[Any]:
-    """Any JSON, or valid content of which one to three places hold it, are gone or have a twin."""
+    """Draws any JSON, or valid content with one to three places changed, removed or doubled."""
 
     @st.composite
     def changed(draw: st.DrawFn) -> Any:
@@ -382,7 +349,7 @@ def _hostile(valid: Any) -> st.SearchStrategy[Any]:
 
 
 def _texts(valid: Any) -> st.SearchStrategy[bytes]:
-    """Files of such content; now and then no JSON at all, or too deep for any reader."""
+    """Draws files of such content; now and then no JSON at all, or too deep for any reader."""
     written = _hostile(valid).map(lambda content: json.dumps(content).encode())
     broken = st.binary(max_size=40) | st.sampled_from(
         [b"[" * 10**5, b'{"a":' * 10**5, b"\xff", b""]
@@ -391,9 +358,9 @@ def _texts(valid: Any) -> st.SearchStrategy[bytes]:
 
 
 def _each(
-    rng: np.random.Generator, tries: int, texts: st.SearchStrategy[bytes], path: Path
+    tally: Tally, rng: Rng, tries: int, texts: st.SearchStrategy[bytes], path: Path
 ) -> Iterator[bytes]:
-    """Writes `tries` drawn files at `path`, one after the other."""
+    """Writes `tries` drawn files at `path`, one after the other, each a try."""
     drawn: list[bytes] = []
     quiet = settings(
         max_examples=tries,
@@ -403,11 +370,8 @@ def _each(
         suppress_health_check=list(HealthCheck),
     )
 
-    def keep(text: bytes) -> None:
-        drawn.append(text)
-
-    quiet(seed(int(rng.integers(2**31)))(given(texts)(keep)))()
-    for text in drawn:
+    quiet(seed(int(rng.integers(2**31)))(given(texts)(lambda text: drawn.append(text))))()
+    for text in tally.each(drawn):
         path.write_bytes(text)
         yield text
 
@@ -417,27 +381,24 @@ def _say(text: bytes) -> str:
 
 
 @fault("hostile config files", 500)
-def _configs(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """They are refused, or are configs that come back as they were written."""
-    tally, path = Tally(), folder / files.CONFIG
-    old = {"sim": {"push_phases": [1, 2, 3]}, "explore": {"noise_clip": 0.03, "noise_std": 0.01}}
-    valid = configs.to_dict(CFG)
-    texts = _texts(valid) | _texts({**valid, "format": 1, **old, "camera": {"scale": 0.5}})
+def _configs(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Reads hostile configs: refused, or they come back as they were written."""
+    path = folder / files.CONFIG
+    texts = _texts(configs.to_dict(CFG))
 
     def read() -> None:
         cfg = configs.from_dict(files.read_object(path))
         if configs.from_dict(json.loads(json.dumps(configs.to_dict(cfg)))) == cfg:
             raise _SoundError
 
-    for text in _each(rng, tries, texts, path):
+    for text in _each(tally, rng, tries, texts, path):
         _judge(tally, _say(text), read, ValueError)
-    return tally
 
 
 @fault("hostile case files", 500)
-def _cases(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """They are refused, or are arrangements that lie in the workspace."""
-    tally, path = Tally(), folder / "case.json"
+def _cases(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Reads hostile cases: refused, or they lie in the workspace."""
+    path = folder / "case.json"
     valid = json.loads(cases.shipped(cases.names()[0]).read_text())
     reach = 0.5 * CFG.heightmap.extent
 
@@ -446,15 +407,14 @@ def _cases(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         if np.isfinite(scene.position).all() and np.abs(scene.position[:, :2]).max() <= reach:
             raise _SoundError
 
-    for text in _each(rng, tries, _texts(valid), path):
+    for text in _each(tally, rng, tries, _texts(valid), path):
         _judge(tally, _say(text), read, ValueError)
-    return tally
 
 
 @fault("hostile sweep.json", 300)
-def _plans(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """They are refused, or all their runs lie inside the sweep's folder, each in its own."""
-    tally, path = Tally(), folder / files.SWEEP_PLAN
+def _plans(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Reads hostile plans: refused, or all runs lie in the sweep's folder, each in its own."""
+    path = folder / files.SWEEP_PLAN
     valid = json.loads(runner.plan_text(_plan()))
     del valid[runner.DIGEST]
 
@@ -466,15 +426,14 @@ def _plans(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         ):
             raise _SoundError
 
-    for text in _each(rng, tries, _texts(valid), path):
+    for text in _each(tally, rng, tries, _texts(valid), path):
         _judge(tally, _say(text), read, (SweepError, OSError))
-    return tally
 
 
 @fault("hostile manifests", 200)
-def _manifests(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """The step is passed over, for the one before."""
-    tally, state = Tally(), {"step": jnp.int32(4)}
+def _manifests(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Reads hostile manifests: the step is skipped for the one before."""
+    state = {"step": jnp.int32(4)}
     for step in (4, 8):
         checkpoint.save(folder, step, {"step": jnp.int32(step)}, CFG, {})
     path = folder / checkpoint.FOLDER / "8" / checkpoint.MANIFEST
@@ -485,17 +444,16 @@ def _manifests(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         if found == "4" or (found == "8" and json.loads(path.read_text()) == valid):
             raise _SoundError
 
-    for text in _each(rng, tries, _texts(valid), path):
+    for text in _each(tally, rng, tries, _texts(valid), path):
         _judge(tally, _say(text), read, CheckpointError)
     path.write_text(json.dumps(valid))
     assert int(checkpoint.restore(folder, jax.eval_shape(lambda: state))[0]["step"]) == 8
-    return tally
 
 
 @fault("hostile records of runs and evaluations", 300)
-def _records(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """A report leaves them out with a note, or shows them."""
-    tally, share = Tally(), {"value": 0.5, "low": 0.4, "high": 0.6, "n": 10}
+def _records(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Reports hostile records: they are left out with a note, or shown."""
+    share = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 10}
     config = configs.to_dict(CFG)
     part = {**dict.fromkeys(results.METRICS, share), "counts": {"episodes": 10}}
     part |= {"failures": {"grasp_dropped": share}}
@@ -519,6 +477,5 @@ def _records(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
             json.dumps(tables.as_json(report))
             raise _SoundError
 
-        for text in _each(rng, -(-tries // len(valid)), _texts(content), own / name):
+        for text in _each(tally, rng, -(-tries // len(valid)), _texts(content), own / name):
             _judge(tally, f"{name} {_say(text)}", read, (ValueError, FailedError))
-    return tally

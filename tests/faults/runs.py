@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -29,85 +29,78 @@ from csac_jax.training.loop import TrainingError
 from tests.faults import harness, toy, toy_cli
 from tests.faults.harness import MissingToolError, Tally, fault
 
+Rng = np.random.Generator
 WORK = 60.0  # s: what starting a process and its saves may take on a busy machine
 CALLS = "openat,mkdir,rename,unlink,unlinkat,rmdir,write,pwrite64,fsync,ftruncate"
 
 
 class _Run:
-    """A run that processes resume again and again, and what is known of it."""
+    """A run that processes resume again and again, and its last saved step."""
 
-    def __init__(self, folder: Path, tally: Tally, seed: int = 5) -> None:
-        self.folder, self.tally, self.seed, self.saved = folder, tally, seed, 0
-        self._reference = toy.Reference(seed)
+    def __init__(self, folder: Path, tally: Tally) -> None:
+        self.folder, self.tally, self.saved = folder, tally, 0
+        self._reference = toy.Reference()
 
-    def order(self, **more: object) -> toy.Order:
-        """An order to go on."""
+    def child(self, saves: int | None = None, wait: float = 0.0, **more: object) -> toy.Child:
+        """Starts a process that continues; listens until so many saves, then `wait` s more."""
         begun = checkpoint.latest_step(self.folder) is not None
         if not begun:  # killed before its first save: there is nothing to lose
             shutil.rmtree(self.folder, ignore_errors=True)
-        return toy.Order(self.folder, begun, self.seed, **more)
+        child = toy.Child(toy.Order(self.folder, begun, **more))
+        if saves:
+            child.listen(WORK, saves=saves)
+        if wait:
+            child.listen(wait)
+        return child
 
-    def judge(
-        self, child: toy.Child, about: str, refused: bool = False, killed: bool = False
-    ) -> None:
-        """Counts what came of a process that has ended; whether it may have refused, was killed."""
-        self.tally.tries += 1
+    def judge(self, child: toy.Child, about: str, refused: bool = False, kill: bool = False):
+        """Counts the result of a process that has ended, which may have refused or was killed."""
         self.saved = max(self.saved, child.saved)
-        if problem := child.problem(refused, killed):
-            self.tally.count("tracebacks", f"{about}: {problem}")
-        if found := toy.fault_of(self.folder, self._reference, self.saved):
-            self.tally.count("lost", f"{about}: {found}")
+        self.tally.sound(child.problem(refused, kill), "tracebacks", about)
+        found = toy.fault_of(self.folder, self._reference, self.saved)
+        self.tally.sound(found, "lost", about)
 
-    def left_over(self, about: str) -> None:
-        """Counts what a save that failed has left."""
+    def judge_full(self, child: toy.Child, ended: bool, about: str) -> None:
+        """Counts the result on a full disc: one line, and no drafts."""
+        self.tally.check(ended, "hangs", f"{about}: hung")
+        self.judge(child, about, refused=True)
         drafts = re.compile(r"\.tmp$|\.saving|orbax-checkpoint-tmp")
-        for path in self.folder.rglob("*"):
-            if drafts.search(path.name):
-                self.tally.count("lost", f"{about}: left {path}")
+        left = [path for path in self.folder.rglob("*") if drafts.search(path.name)]
+        self.tally.check(not left, "lost", f"{about}: left {left}")
 
 
 @fault("SIGKILL at a random time", tries=100)
-def sigkill(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """Runs of ten processes, each killed within its first second or so; the next one resumes."""
-    tally = Tally()
-    for number in range(-(-tries // 10)):
-        run = _Run(folder / str(number), tally)
-        for _ in range(min(10, tries - tally.tries)):
-            child = toy.Child(run.order())
-            about = f"try {tally.tries}"
-            if rng.random() < 0.8:
-                child.listen(WORK, saves=int(rng.integers(1, 4)))
-            child.listen(float(rng.uniform(0.0, 0.4)))
-            child.kill()
-            run.judge(child, about, killed=True)
-    return tally
+def sigkill(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Kills ten processes of a run, each within its first second or so; the next one resumes."""
+    for number in tally.each(range(tries)):
+        if number % 10 == 0:
+            run = _Run(folder / str(number), tally)
+        saves = int(rng.integers(1, 4)) if rng.random() < 0.8 else None
+        child = run.child(saves, float(rng.uniform(0.0, 0.4)))
+        child.kill()
+        run.judge(child, f"try {number}", kill=True)
 
 
 @fault("SIGTERM", tries=20)
-def sigterm(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """A run that is told to stop saves and ends, complete to the step that its log ends with."""
-    tally = Tally()
+def sigterm(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Stops a run; it saves and ends, complete to the last step of its log."""
     run = _Run(folder / "run", tally)
-    for number in range(tries):
-        child = toy.Child(run.order())
-        child.listen(WORK, saves=1)
-        child.listen(float(rng.uniform(0.0, 0.3)))
+    for number in tally.each(range(tries)):
+        child = run.child(1, float(rng.uniform(0.0, 0.3)))
         child.process.terminate()
-        if not child.end(harness.HANG):
-            tally.count("hangs", f"try {number}: did not end")
+        tally.check(child.end(harness.HANG), "hangs", f"try {number}: did not end")
         run.judge(child, f"try {number}")
         steps = len((run.folder / "metrics.jsonl").read_text().splitlines())
-        if steps != run.saved or not child.done:
-            tally.count("lost", f"try {number}: ends at step {steps}, saved {run.saved}")
-    return tally
+        good = steps == run.saved and child.done
+        tally.check(good, "lost", f"try {number}: ends at step {steps}, saved {run.saved}")
 
 
 def _calls(folder: Path) -> list[tuple[str, int]]:
-    """The system calls that write, of a chunk and its save: (name, number of it in a thread)."""
+    """Returns the system calls that write, of a chunk and its save: name, number in a thread."""
     log = folder / "calls"
     child = toy.Child(toy.Order(folder / "counted", steps=2, held=True))
     child.listen(WORK, saves=1)
-    with _strace(child.process.pid, "-o", str(log), "-e", f"trace={CALLS}"):
+    with _strace(child, "-o", str(log), "-e", f"trace={CALLS}"):
         child.go()
         child.end(WORK)
     counts: dict[tuple[str, str], int] = {}
@@ -120,11 +113,11 @@ def _calls(folder: Path) -> list[tuple[str, int]]:
 
 
 @contextlib.contextmanager
-def _strace(process: int, *arguments: str):
-    """In the block all threads of a process are traced."""
+def _strace(child: toy.Child, *arguments: str) -> Iterator[None]:
+    """Traces all threads of a process in the block."""
     if shutil.which("strace") is None:
         raise MissingToolError("strace is not installed")
-    command = ["strace", "-f", "-p", str(process), *arguments]
+    command = ["strace", "-f", "-p", str(child.process.pid), *arguments]
     tracer = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     try:
         assert tracer.stderr is not None
@@ -137,280 +130,225 @@ def _strace(process: int, *arguments: str):
         tracer.communicate()
 
 
-def _chosen(rng: np.random.Generator, calls: list, tries: int) -> list:
-    """All of them, in turn, or as many as there are tries, at random."""
-    if tries >= len(calls):
-        return calls
-    return [calls[i] for i in sorted(rng.choice(len(calls), tries, replace=False))]
+def _chosen(rng: Rng, items: list, tries: int) -> list:
+    """Returns all of them, in turn, or as many as there are tries, at random."""
+    if tries >= len(items):
+        return items
+    return [items[i] for i in sorted(rng.choice(len(items), tries, replace=False))]
+
+
+def _injected(run: _Run, name: str, inject: str) -> tuple[toy.Child, bool]:
+    """Runs a process whose second save meets a fault of a system call; returns if it ended."""
+    child = run.child(1, held=True, steps=2)
+    with _strace(child, "-o", "/dev/null", "-e", f"trace={name}", "-e", f"inject={name}:{inject}"):
+        child.go()
+        return child, child.end(WORK)
 
 
 @fault("SIGKILL at a system call of a save", tries=400, slow=True)
-def sigkill_in_save(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """Every call that writes, of a chunk, its log and its save."""
-    tally = Tally()
+def sigkill_in_save(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Kills at every call that writes, of a chunk, its log and its save."""
     run = _Run(folder / "run", tally)
-    for name, number in _chosen(rng, _calls(folder), tries):
-        child = toy.Child(run.order(held=True, steps=2))
-        child.listen(WORK, saves=1)
-        inject = f"inject={name}:signal=KILL:when={number}"
-        with _strace(child.process.pid, "-o", "/dev/null", "-e", f"trace={name}", "-e", inject):
-            child.go()
-            child.end(WORK)
-        run.judge(child, f"{name} {number}", killed=True)
-    return tally
+    for name, number in tally.each(_chosen(rng, _calls(folder), tries)):
+        child, _ = _injected(run, name, f"signal=KILL:when={number}")
+        run.judge(child, f"{name} {number}", kill=True)
 
 
 @fault("disc full from a system call on", tries=200)
-def disc_full(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """ENOSPC from every call on that could need room, in turn; see `file_too_large` for `write`."""
-    tally = Tally()
+def disc_full(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Returns ENOSPC from every call on that could need room; for `write` see `file_too_large`."""
     run = _Run(folder / "run", tally)
     needs = ("mkdir", "openat", "pwrite64", "fsync", "ftruncate", "rename")
     calls = [call for call in _calls(folder) if call[0] in needs]
-    for name, number in _chosen(rng, calls, tries):
-        child = toy.Child(run.order(held=True, steps=2))
-        child.listen(WORK, saves=1)
+    for name, number in tally.each(_chosen(rng, calls, tries)):
         since = "" if name == "openat" else "+"  # to clean up is to open folders
-        inject = f"inject={name}:error=ENOSPC:when={number}{since}"
-        with _strace(child.process.pid, "-o", "/dev/null", "-e", f"trace={name}", "-e", inject):
-            child.go()
-            ended = child.end(WORK)
-        _judge_full(run, child, ended, f"{name} {number}")
-    return tally
+        child, ended = _injected(run, name, f"error=ENOSPC:when={number}{since}")
+        run.judge_full(child, ended, f"{name} {number}")
 
 
 @fault("disc full in the middle of a file", tries=60)
-def file_too_large(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """Writes beyond some size fail (RLIMIT_FSIZE), whatever the file."""
-    tally = Tally()
+def file_too_large(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Fails writes beyond some size (RLIMIT_FSIZE), whatever the file."""
     run = _Run(folder / "run", tally)
-    for _ in range(tries):
+    for _ in tally.each(range(tries)):
         largest = int(10 ** rng.uniform(0.0, 4.0)) - 1
-        child = toy.Child(run.order(largest=largest, steps=2))
-        ended = child.end(WORK)
-        _judge_full(run, child, ended, f"files up to {largest} bytes")
-    return tally
+        child = run.child(largest=largest, steps=2)
+        run.judge_full(child, child.end(WORK), f"files up to {largest} bytes")
 
 
-def _judge_full(run: _Run, child: toy.Child, ended: bool, about: str) -> None:
-    """A run on a disc that is full says so in one line, and leaves no drafts."""
-    if not ended:
-        run.tally.count("hangs", f"{about}: hung")
-    run.judge(child, about, refused=True)
-    run.left_over(about)
-
-
-def _damaged(kind: str):
-    """The fault of damage to one file among all under a run's checkpoints."""
-
-    def inject(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-        tally = Tally()
-        sound, copy = folder / "sound", folder / "copy"
-        toy.train(sound, 3)
-        reference = toy.Reference()
-        names = [path for path in sorted(sound.rglob("checkpoints/**/*")) if path.is_file()]
-        names = [path.relative_to(sound) for path in names if path.stat().st_size]
-        for _ in range(tries):
-            shutil.rmtree(copy, ignore_errors=True)
-            shutil.copytree(sound, copy)
-            name = names[int(rng.integers(len(names)))]
-            about = harness.damage(rng, kind, copy / name)
-            tally.tries += 1
-            step = _judge_restored(tally, copy, reference, at_least=2, about=about)
-            if step == 3 and name.parts[1] == "3" and name.name != checkpoint.MANIFEST:
-                tally.count("silent", f"{about}: unnoticed")
-        return tally
-
-    fault(f"{kind} in a checkpoint", tries=200)(inject)
-
-
-def _judge_restored(
-    tally: Tally, run_dir: Path, reference: toy.Reference, at_least: int, about: str
-) -> int | None:
-    """Counts a run whose newest sound state is not right, or lies before step `at_least`; returns
-    its step."""
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            cfg = checkpoint.load_config(run_dir)
-            state, extra = checkpoint.restore(run_dir, toy.abstract_state())
-    except Exception as error:
-        tally.count("lost", f"{about}: {type(error).__name__}: {error}")
-        return None
-    step = int(state.step)
-    right = toy.bits(state) == reference.state(step) and len(extra["grasps"]) == toy.E * step
-    if not right or cfg != toy.config():
-        tally.count("silent", f"{about}: step {step} is restored with other numbers")
-    if step < at_least:
-        tally.count("lost", f"{about}: step {step} is restored")
-    newest = checkpoint.latest_step(run_dir)
-    if step != newest and not any(issubclass(one.category, DataWarning) for one in caught):
-        tally.count("silent", f"{about}: went back from step {newest} to {step} without a word")
-    return step
+def _damaged(kind: str, tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Damages one file among all under a run's checkpoints."""
+    sound, copy = folder / "sound", folder / "copy"
+    toy.train(sound, 3)
+    reference = toy.Reference()
+    paths = [path for path in sorted(sound.rglob("checkpoints/**/*")) if path.is_file()]
+    names = [path.relative_to(sound) for path in paths if path.stat().st_size]
+    for _ in tally.each(range(tries)):
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(sound, copy)
+        name = names[int(rng.integers(len(names)))]
+        about = harness.damage(rng, kind, copy / name)
+        step = _judge_restored(tally, copy, reference, about)
+        spared = step != 3 or name.parts[1] != "3" or name.name == checkpoint.MANIFEST
+        tally.check(spared, "silent", f"{about}: unnoticed")
 
 
 for _kind in harness.DAMAGES:
-    _damaged(_kind)
+    fault(f"{_kind} in a checkpoint", tries=200)(functools.partial(_damaged, _kind))
 
 
-def _swapped(steps: Path, other: Path) -> dict[str, Callable[[], object]]:
-    """What can happen to the folders of two runs, with steps 2 and 3."""
+def _judge_restored(tally: Tally, run_dir: Path, reference: toy.Reference, about: str):
+    """Counts a run whose newest sound state is wrong or lies before step 2; returns its step."""
 
-    def turn_round() -> None:
-        (steps / "2").rename(steps / "x")
-        (steps / "3").rename(steps / "2")
-        (steps / "x").rename(steps / "3")
+    def restored() -> tuple:
+        cfg = checkpoint.load_config(run_dir)
+        return cfg, *checkpoint.restore(run_dir, toy.abstract_state())
 
-    def replace_newest() -> None:
-        shutil.rmtree(steps / "3")
-        shutil.copytree(other / "3", steps / "3")
-
-    return {
-        "newest one is another run's": replace_newest,
-        "newer one is another run's": lambda: shutil.copytree(other / "3", steps / "4"),
-        "newer one is a link to another run's": lambda: (steps / "4").symlink_to(other / "3"),
-        "steps have each other's names": turn_round,
-        "newest one has a newer name": lambda: (steps / "3").rename(steps / "9"),
-        "older one has a newer name": lambda: (steps / "2").rename(steps / "9"),
-        "newest one is missing": lambda: shutil.rmtree(steps / "3"),
-        "state is missing": lambda: shutil.rmtree(steps / "3" / "state"),
-        "extra is missing": lambda: shutil.rmtree(steps / "3" / "extra"),
-        "manifest is missing": lambda: (steps / "3" / checkpoint.MANIFEST).unlink(),
-        "file too many": lambda: (steps / "3" / "state" / "more").write_text("x"),
-        "empty folder with a newer name": lambda: (steps / "9").mkdir(),
-        "file with a newer name": lambda: (steps / "9").write_text("x"),
-        "superscript digit": lambda: (steps / "\u00b2").mkdir(),
-        "leading zero": lambda: shutil.copytree(other / "3", steps / "007"),
-        "many digits": lambda: (steps / ("9" * 30)).mkdir(),
-        "name of the run is missing": lambda: (steps / "run").unlink(),
-        "name of the run is empty": lambda: (steps / "run").write_text(""),
-        "log is a folder of the draft's name": lambda: (steps / ".saving").mkdir(),
-    }
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if (found := harness.works(tally, about, restored)) is None:
+            return None
+    cfg, state, extra = found
+    step, newest = int(state.step), checkpoint.latest_step(run_dir)
+    right = toy.bits(state) == reference.state(step) and len(extra["grasps"]) == toy.E * step
+    right = right and cfg == toy.config()
+    tally.check(right, "silent", f"{about}: step {step} is restored with other numbers")
+    tally.check(step >= 2, "lost", f"{about}: step {step} is restored")
+    told = step == newest or any(issubclass(one.category, DataWarning) for one in caught)
+    tally.check(told, "silent", f"{about}: went back from step {newest} to {step} without a word")
+    return step
 
 
-@fault("swapped, missing and foreign step folders", tries=19)
-def swapped(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """The right steps remain, or those before them; the run goes on from there."""
-    tally = Tally()
+def _turn_round(steps: Path) -> None:
+    for old, new in (("2", "x"), ("3", "2"), ("x", "3")):
+        (steps / old).rename(steps / new)
+
+
+def _replace_newest(steps: Path, other: Path) -> None:
+    shutil.rmtree(steps / "3")
+    shutil.copytree(other / "3", steps / "3")
+
+
+SWAPPED: dict[str, Callable[[Path, Path], object]] = {
+    "newest one is another run's": _replace_newest,
+    "newer one is another run's": lambda steps, other: shutil.copytree(other / "3", steps / "4"),
+    "newer one is a link to another's": lambda steps, other: (steps / "4").symlink_to(other / "3"),
+    "steps have each other's names": lambda steps, _: _turn_round(steps),
+    "newest one has a newer name": lambda steps, _: (steps / "3").rename(steps / "9"),
+    "older one has a newer name": lambda steps, _: (steps / "2").rename(steps / "9"),
+    "newest one is missing": lambda steps, _: shutil.rmtree(steps / "3"),
+    "state is missing": lambda steps, _: shutil.rmtree(steps / "3" / "state"),
+    "extra is missing": lambda steps, _: shutil.rmtree(steps / "3" / "extra"),
+    "manifest is missing": lambda steps, _: (steps / "3" / checkpoint.MANIFEST).unlink(),
+    "file too many": lambda steps, _: (steps / "3" / "state" / "more").write_text("x"),
+    "empty folder with a newer name": lambda steps, _: (steps / "9").mkdir(),
+    "file with a newer name": lambda steps, _: (steps / "9").write_text("x"),
+    "superscript digit": lambda steps, _: (steps / "\u00b2").mkdir(),
+    "leading zero": lambda steps, other: shutil.copytree(other / "3", steps / "007"),
+    "many digits": lambda steps, _: (steps / ("9" * 30)).mkdir(),
+    "name of the run is missing": lambda steps, _: (steps / "run").unlink(),
+    "name of the run is empty": lambda steps, _: (steps / "run").write_text(""),
+    "log is a folder of the draft's name": lambda steps, _: (steps / ".saving").mkdir(),
+}
+"""Accidents of the step folders of a run, with steps 2 and 3; the other's are beside them."""
+
+
+@fault("swapped, missing and foreign step folders", tries=len(SWAPPED))
+def swapped(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Moves step folders; the right steps remain, or those before them, and the run continues."""
     for name, seed in (("sound", 5), ("other", 6)):
         toy.train(folder / name, 3, seed=seed)
     other, reference = folder / "other", toy.Reference()
     before = _content(other)
-    cases = list(_swapped(folder, folder))
-    for name in _chosen(rng, cases, tries):
+    for name in tally.each(_chosen(rng, list(SWAPPED), tries)):
         run_dir = folder / f"{tally.tries}"
         shutil.copytree(folder / "sound", run_dir)
-        _swapped(run_dir / "checkpoints", other / "checkpoints")[name]()
-        tally.tries += 1
+        SWAPPED[name](run_dir / "checkpoints", other / "checkpoints")
         if name == "steps have each other's names":
             _put_names_right(tally, run_dir, name)
-        _judge_restored(tally, run_dir, reference, at_least=2, about=name)
+        _judge_restored(tally, run_dir, reference, name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             _judge_resumed(tally, run_dir, reference, name)
-    if _content(other) != before:
-        tally.count("lost", "the other run has changed")
-    return tally
+    tally.check(_content(other) == before, "lost", "the other run has changed")
 
 
 def _put_names_right(tally: Tally, run_dir: Path, about: str) -> None:
     """Follows the message that refuses steps with each other's names."""
     try:
         checkpoint.sound(run_dir)
-        tally.count("silent", f"{about}: taken")
+        tally.check(False, "silent", f"{about}: taken")
     except checkpoint.CheckpointError as error:
-        if "rename it to 2" not in str(error):
-            tally.count("lost", f"{about}: {error}")
-    steps = run_dir / "checkpoints"
-    _swapped(steps, steps)["steps have each other's names"]()
+        tally.check("rename it to 2" in str(error), "lost", f"{about}: {error}")
+    _turn_round(run_dir / "checkpoints")
 
 
 def _judge_resumed(tally: Tally, run_dir: Path, reference: toy.Reference, about: str) -> None:
-    """Counts a run that does not go on, or not to the right numbers."""
-    try:
-        summary = toy.train(run_dir, 2, resume=True)
-    except Exception as error:
-        tally.count("lost", f"{about}: resumed, {type(error).__name__}: {error}")
-        return
-    if found := toy.fault_of(run_dir, reference, summary.step):
-        tally.count("lost", f"{about}: resumed, {found}")
+    """Counts a run that does not continue, or not to the right numbers."""
+    resume = functools.partial(toy.train, run_dir, 2, resume=True)
+    if (summary := harness.works(tally, f"{about}: resumed", resume)) is not None:
+        tally.sound(toy.fault_of(run_dir, reference, summary.step), "lost", f"{about}: resumed")
 
 
 def _content(folder: Path) -> dict[str, bytes]:
-    """Every file of a folder."""
+    """Returns every file of a folder."""
     paths = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 @fault("two resumes at once", tries=10)
-def two_at_once(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """The second is refused; once the first is killed, another one goes on."""
-    tally = Tally()
+def two_at_once(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Resumes twice: the second is refused; once the first is killed, another one continues."""
     run = _Run(folder / "run", tally)
-    for number in range(tries):
-        first = toy.Child(run.order(held=True))
-        first.listen(WORK, saves=1)
-        second = toy.Child(run.order(steps=1))
-        about = f"try {number}"
-        if not second.end(WORK):
-            tally.count("hangs", f"{about}: the second hung")
-        if second.error is None or "in use by process" not in second.error:
-            tally.count("silent", f"{about}: the second said {second.error!r}")
+    for number in tally.each(range(tries)):
+        first, second, about = run.child(1, held=True), run.child(steps=1), f"try {number}"
+        tally.check(second.end(WORK), "hangs", f"{about}: the second hung")
+        refused = second.error is not None and "in use by process" in second.error
+        tally.check(refused, "silent", f"{about}: the second said {second.error!r}")
         if rng.random() < 0.5:
             first.go()
         first.kill()
-        run.judge(first, about, killed=True)
-    return tally
+        run.judge(first, about, kill=True)
 
 
 @fault("a loss or parameter that is not finite", tries=20)
-def not_finite(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """Training stops; the last good checkpoint stays the newest, and is what is restored."""
-    tally = Tally()
+def not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Stops a training by NaN; the last good checkpoint stays the newest and is restored."""
     reference = toy.Reference()
-    for number in range(tries):
+    for number in tally.each(range(tries)):
         run_dir, step = folder / str(number), int(rng.integers(1, 4))
         kind = ("loss", "parameter")[number % 2]
-        bad = toy.Losses(**{kind: step})
         about = f"{kind} of step {step}"
-        tally.tries += 1
-        train = functools.partial(toy.train, run_dir, 6, bad=bad)
+        train = functools.partial(toy.train, run_dir, 6, bad=toy.Losses(**{kind: step}))
         harness.refused(tally, about, train, TrainingError)
-        if found := toy.fault_of(run_dir, reference, step):
-            tally.count("lost", f"{about}: {found}")
-        if (newest := checkpoint.latest_step(run_dir)) != step:
-            tally.count("silent", f"{about}: step {newest} was saved")
-    return tally
+        tally.sound(toy.fault_of(run_dir, reference, step), "lost", about)
+        newest = checkpoint.latest_step(run_dir)
+        tally.check(newest == step, "silent", f"{about}: step {newest} was saved")
 
 
 @fault("clock that goes backwards", tries=10)
-def clock(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """At each look the wall clock shows an earlier time; the run goes on and its log is whole."""
-    tally = Tally()
+def clock(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Turns the wall clock back at each look; the run continues and its log is whole."""
     reference = toy.Reference()
-    for number in range(tries):
+    for number in tally.each(range(tries)):
         run_dir, about = folder / str(number), f"try {number}"
 
+        def twice(run_dir: Path = run_dir) -> None:
+            toy.train(run_dir, 2)
+            toy.train(run_dir, 2, resume=True)
+
         now = itertools.accumulate(rng.exponential(600.0, 100_000), lambda a, b: a - b, initial=2e9)
-        tally.tries += 1
         with mock.patch.object(time, "time", functools.partial(next, now)):
-            try:
-                toy.train(run_dir, 2)
-                toy.train(run_dir, 2, resume=True)
-            except Exception as error:
-                tally.count("tracebacks", f"{about}: {type(error).__name__}: {error}")
-        if found := toy.fault_of(run_dir, reference, 4):
-            tally.count("lost", f"{about}: {found}")
+            harness.works(tally, about, twice, "tracebacks")
+        tally.sound(toy.fault_of(run_dir, reference, 4), "lost", about)
         seconds = [line["seconds"] for line in files.read_log(run_dir / "metrics.jsonl")]
-        if min(seconds) < 0.0 or seconds != sorted(seconds):
-            tally.count("silent", f"{about}: the log's seconds are {seconds}")
-    return tally
+        rising = min(seconds) >= 0.0 and seconds == sorted(seconds)
+        tally.check(rising, "silent", f"{about}: the log's seconds are {seconds}")
 
 
 @fault("read-only folders", tries=12)
-def read_only(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """A run that may not write says so in one line, and changes nothing."""
-    tally = Tally()
+def read_only(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Closes folders to a run; it says so in one line and changes nothing."""
     with tempfile.TemporaryDirectory() as name:  # pytest's own are closed to other users
         base = Path(name)
         base.chmod(0o755)
@@ -418,109 +356,74 @@ def read_only(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         places = [base / "run", base / "run" / "checkpoints", base / "new"]
         user = 65534 if os.geteuid() == 0 else None  # root writes anywhere
         before = _content(base)
-        for number in range(tries):
+        for number in tally.each(range(tries)):
             place = places[number % len(places)]
-            run_dir = place if place.name == "new" else base / "run"
-            closed = base if place.name == "new" else place
+            new = place.name == "new"
+            closed = base if new else place
             mode = closed.stat().st_mode
             closed.chmod(0o555)
-            child = toy.Child(toy.Order(run_dir, place.name != "new", steps=1, user=user))
-            ended = child.end(WORK)
+            child = toy.Child(
+                toy.Order(place if new else base / "run", not new, steps=1, user=user)
+            )
+            ended, about = child.end(WORK), f"{place.name} is read-only"
             closed.chmod(mode)
-            tally.tries += 1
-            _judge_refusal(tally, child, ended, f"{place.name} is read-only")
-        if _content(base) != before:
-            tally.count("lost", "a file has changed")
-    return tally
-
-
-def _judge_refusal(tally: Tally, child: toy.Child, ended: bool, about: str) -> None:
-    if not ended:
-        tally.count("hangs", f"{about}: hung")
-    elif problem := child.problem(refused=True):
-        tally.count("tracebacks", f"{about}: {problem}")
-    elif child.error is None:
-        tally.count("silent", f"{about}: was not refused")
+            tally.check(ended, "hangs", f"{about}: hung")
+            tally.sound(child.problem(refused=True, killed=not ended), "tracebacks", about)
+            tally.check(child.error or not ended, "silent", f"{about}: was not refused")
+        tally.check(_content(base) == before, "lost", "a file has changed")
 
 
 NAMES = (
-    "a b",
-    "it's",
-    'say "so"',
-    "\u5b66\u4e60",
-    "\u00fcb\u00e9r",
-    "\U0001f916",
-    "$HOME;`x`",
-    "-rf",
-    "a#b%20&c",
-    "a{b}|c<d>",
-    "x" * 200,
+    *("a b", "it's", 'say "so"', "\u5b66\u4e60", "\u00fcb\u00e9r", "\U0001f916", "$HOME;`x`"),
+    *("-rf", "a#b%20&c", "a{b}|c<d>", "x" * 200),
 )
-
-
 REFUSED = ("[a-z]", "a*", "a?", "back\\slash", "\udcff")
 
 
 @fault("paths with spaces, quotes and non-Latin letters", tries=len(NAMES) + len(REFUSED))
-def odd_paths(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """A run in such a folder is trained, saved, resumed and restored as any other, or refused
-    before anything is trained."""
-    tally = Tally()
+def odd_paths(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Trains and resumes in folders with odd names, or refuses them before any training."""
     reference = toy.Reference()
-    for name in _chosen(rng, [*NAMES, *REFUSED], tries):
+    for name in tally.each(_chosen(rng, [*NAMES, *REFUSED], tries)):
         run_dir = folder / name / "run"
-        tally.tries += 1
+        train = functools.partial(toy.train, run_dir, 1)
         if name in REFUSED:
-            train = functools.partial(toy.train, run_dir, 1)
             harness.refused(tally, ascii(name), train, checkpoint.CheckpointError)
-            continue
-        try:
-            toy.train(run_dir, 1)
-        except Exception as error:
-            tally.count("tracebacks", f"{name}: {type(error).__name__}: {error}")
-            continue
-        _judge_resumed(tally, run_dir, reference, name)
-    return tally
+        elif harness.works(tally, name, train, "tracebacks") is not None:
+            _judge_resumed(tally, run_dir, reference, name)
 
 
 @fault("closed pipe, full or missing stdout", tries=12)
-def closed_pipe(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """`train ... | head -1` and the like: the run goes on, is saved and its result is written."""
-    tally = Tally()
-    reference = toy.Reference()
-    steps = 6
-    ends = ["head", "true", "/dev/full", ">&-", "2>&-", "2>/dev/full"]
-    for number in range(tries):
-        end, run_dir = ends[number % len(ends)], folder / f"run {number}"
-        tally.tries += 1
-        answer = _with_stdout(end, run_dir, folder / f"{number}.json", steps)
+def closed_pipe(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Closes the output, as `train ... | head -1`; the run continues and writes its result."""
+    reference, steps = toy.Reference(), 6
+    ends = ["head", "true", ">/dev/full", ">&-", "2>&-", "2>/dev/full"]
+    for number in tally.each(range(tries)):
+        end, run_dir, result = (
+            *(ends[number % len(ends)], folder / f"run {number}"),
+            folder / f"{number}.json",
+        )
         about = f"stdout is {end}"
+        answer = _with_stdout(end, run_dir, result, steps)
         harness.judge(tally, answer, about)
         found = toy.fault_of(run_dir, reference, steps)
-        written = (run_dir / "train.json", folder / f"{number}.json")
-        if found is None and not all(path.is_file() for path in written):
+        if found is None and not ((run_dir / "train.json").is_file() and result.is_file()):
             found = "there is no result"
-        if found:
-            tally.count("lost", f"{about}: {found}; {answer.code} {answer.errors[-300:]!r}")
-    return tally
+        tally.check(not found, "lost", f"{about}: {found}; {answer.code} {answer.errors[-300:]!r}")
 
 
 def _with_stdout(end: str, run_dir: Path, result: Path, steps: int) -> harness.Answer:
-    """The command line's answer where its output ends so."""
+    """Returns the command line's answer where its output ends so."""
     options = ["smoke", "--run-dir", str(run_dir), "--json", str(result), "--seed", "5"]
     options += ["--train.actions", str(steps * toy.E), *toy_cli.OPTIONS]
-    arguments = ["-m", "tests.faults.toy_cli", "train", *options]
-    if ">" in end:  # a shell closes it
-        shell = ["sh", "-c", f'exec "$@" {end}', "sh"]
-        return harness.command(arguments, WORK, prefix=shell)
-    if end == "/dev/full":
-        return harness.command(arguments, WORK, prefix=["sh", "-c", 'exec "$@" >/dev/full', "sh"])
-    process = harness.start(arguments)
-    assert process.stdout is not None
-    if end == "head":
-        process.stdout.readline()
-    process.stdout.close()
-    process.stdout = None
+    shell = ["sh", "-c", f'exec "$@" {end}', "sh"] if ">" in end else []
+    process = harness.start(["-m", "tests.faults.toy_cli", "train", *options], shell)
+    if not shell:
+        assert process.stdout is not None
+        if end == "head":
+            process.stdout.readline()
+        process.stdout.close()
+        process.stdout = None
     return harness.wait(process, WORK)
 
 
@@ -560,54 +463,37 @@ assert os.wait()[1] == 0
 toy.train(Path({run!r}), 1, resume=True)
 print([step])
 """
+PROGRAMS = {
+    "import in a thread": IMPORT_IN_THREAD,
+    "fork before": FORK_BEFORE,
+    "fork after": FORK_AFTER,
+}
 
 
 @fault("fork, and import in a thread", tries=6)
-def fork_and_thread(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """Training works in a thread that imports the package, and in a child forked before JAX has
-    started; a child forked later, that leaves JAX alone, does no harm."""
-    tally = Tally()
-    sources = [IMPORT_IN_THREAD, FORK_BEFORE, FORK_AFTER]
-    for number in range(tries):
+def fork_and_thread(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Trains in a thread that imports the package, in a child forked before JAX, after a fork."""
+    for number in tally.each(range(tries)):
+        about, source = list(PROGRAMS.items())[number % len(PROGRAMS)]
         run_dir = folder / str(number)
-        source = sources[number % len(sources)].format(run=str(run_dir))
-        tally.tries += 1
-        answer = harness.command(["-c", source], WORK)
-        about = ("import in a thread", "fork before", "fork after")[number % len(sources)]
+        answer = harness.wait(harness.start(["-c", source.format(run=str(run_dir))]), WORK)
         harness.judge(tally, answer, about)
-        if answer.code != 0 or "[2]" not in answer.output:
-            tally.count("lost", f"{about}: {answer.code} {answer.errors[-300:]!r}")
-        elif found := toy.fault_of(run_dir, toy.Reference(), 2):
-            tally.count("lost", f"{about}: {found}")
-    return tally
+        done = answer.code == 0 and "[2]" in answer.output
+        tally.check(done, "lost", f"{about}: {answer.code} {answer.errors[-300:]!r}")
+        if done:
+            tally.sound(toy.fault_of(run_dir, toy.Reference(), 2), "lost", about)
 
 
 VICTIMS = (
-    "../victim",
-    "..",
-    ".",
-    "",
-    "/",
-    "../victim/",
-    "a/../../victim",
-    "{root}/victim",
-    "a\0b",
-    None,
-    7,
-    ["a"],
-    "groups",
-    "sweep.json",
-    "link",
-    "..\\victim",
+    *("../victim", "..", ".", "", "/", "../victim/", "a/../../victim", "{root}/victim", "a\0b"),
+    *(None, 7, ["a"], "groups", "sweep.json", "link", "..\\victim"),
 )
 
 
 @fault("names of sweeps that lead elsewhere", tries=len(VICTIMS))
-def sweep_names(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """`sweep --resume` refuses a sweep.json with such a name, whatever its digest, or stays within
-    its own folder."""
-    tally = Tally()
-    for name in _chosen(rng, list(VICTIMS), tries):
+def sweep_names(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Resumes a sweep.json with such a name: refused, or it stays within its own folder."""
+    for name in tally.each(_chosen(rng, list(VICTIMS), tries)):
         own = folder / str(tally.tries)
         victim, sweep = own / "victim", own / "sweep"
         for seed in (5, 6):
@@ -618,22 +504,18 @@ def sweep_names(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
         shown = name.format(root=own) if isinstance(name, str) else name
         point = SweepPoint(shown, {}, toy.config())  # type: ignore[arg-type]
         (sweep / "sweep.json").write_text(runner.plan_text(runner.SweepPlan(2, [point])))
-        tally.tries += 1
-        about = f"name {name!r}"
 
         def resume(sweep: Path = sweep) -> None:
             plan = runner.read_plan(sweep)
             reporter = toy.Quiet(stop_after=2)
             runner.run(plan, sweep, _sweep_program, reporter, reporter.stop, resume=True)
 
-        harness.refused(tally, about, resume, runner.SweepError)
-        if _content(victim) != before:
-            tally.count("lost", f"{about}: the victim has changed")
-    return tally
+        harness.refused(tally, f"name {name!r}", resume, runner.SweepError)
+        tally.check(_content(victim) == before, "lost", f"name {name!r}: the victim has changed")
 
 
 def _sweep_program(group: object) -> SimpleNamespace:
-    """In place of a `SweepProgram`, of two seeds."""
+    """Returns a stand-in for a `SweepProgram`, of two seeds."""
 
     def init() -> toy.State:
         states = [toy.first_state(seed) for seed in (5, 6)]
@@ -649,19 +531,13 @@ def _sweep_program(group: object) -> SimpleNamespace:
     def replica(state: toy.State, index: int) -> toy.State:
         return toy.State(state.key[index], state.step, state.total[index], state.packed[index])
 
-    return SimpleNamespace(
-        init=init,
-        compile_chunk=compile_chunk,
-        replica=replica,
-        abstract=lambda: jax.eval_shape(init),
-    )
+    parts = {"init": init, "compile_chunk": compile_chunk, "replica": replica}
+    return SimpleNamespace(abstract=lambda: jax.eval_shape(init), **parts)
 
 
 @fault("NaN in one of 64 scenes, a reward, a gradient, a weight", tries=20, slow=True)
-def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally:
-    """The real training step. A scene's NaN stays there and is counted; NaN that reaches the
-    networks is told at once."""
-    tally = Tally()
+def nan_in_training(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
+    """Spoils the real step: a scene's NaN stays there, NaN in the networks is reported at once."""
     cfg = presets.smoke().change(
         sim={"physics": "c"},
         replay={"capacity": 128},
@@ -675,24 +551,23 @@ def nan_in_training(rng: np.random.Generator, tries: int, folder: Path) -> Tally
         return state, jax.device_get(metrics)
 
     start, _ = run(start)
-    for number in range(tries):
+    for number in tally.each(range(tries)):
         kind = ("scene", "reward", "gradient", "weight")[number % 4]
-        tally.tries += 1
         state, told = start, None
         for _ in range(100 if kind == "reward" else 1):  # until it is drawn
             state, metrics = run(_poisoned(rng, state, kind))
             if told := loop.not_finite(metrics):
                 break
         sound = _finite(state.learner) and _finite(state.scenes)
-        expected = told is None if kind == "scene" else told is not None
         diverged = int(metrics.physics_diverged.sum())
-        if sound != (told is None) or not expected or (kind == "scene" and diverged != 1):
-            tally.count("silent", f"NaN in a {kind}: told {told}, sound {sound}, {diverged} scenes")
-    return tally
+        good = sound == (told is None) and (kind == "scene") == (told is None)
+        good = good and (kind != "scene" or diverged == 1)
+        text = f"NaN in a {kind}: told {told}, sound {sound}, {diverged} scenes"
+        tally.check(good, "silent", text)
 
 
-def _poisoned(rng: np.random.Generator, state: step.TrainState, kind: str) -> step.TrainState:
-    """The state with one NaN more."""
+def _poisoned(rng: Rng, state: step.TrainState, kind: str) -> step.TrainState:
+    """Returns the state with one NaN more."""
 
     def spoilt(leaf: jax.Array) -> jax.Array:
         flat = np.array(leaf)

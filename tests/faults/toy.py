@@ -40,7 +40,7 @@ LONG = 10_000 * E  # actions that no try comes to the end of
 
 @struct.dataclass
 class State:
-    """What a training has: keys, counters, numbers."""
+    """State of a training: key, counter, numbers."""
 
     key: jax.Array
     step: jax.Array
@@ -49,24 +49,24 @@ class State:
 
 
 def config(actions: int = LONG, seed: int = 5) -> Config:
-    """Chunks of one step, each of them saved."""
+    """Returns a config with chunks of one step, each of them saved."""
     train = TrainConfig(scenes=E, actions=actions, learning_starts=4 * E, chunk=1, save_every=1)
     return presets.smoke().change(train=dataclasses.asdict(train), seed=seed)
 
 
 def first_state(seed: int = 5) -> State:
-    """The state of step 0."""
+    """Returns the state of step 0."""
     zeros = jnp.zeros(4, jnp.float32), jnp.zeros((64, 64), jnp.uint16)
     return State(jax.random.key(seed), jnp.int32(0), *zeros)
 
 
 def abstract_state() -> Any:
-    """What `checkpoint.restore` expects."""
+    """Returns the shapes and dtypes of a state."""
     return jax.eval_shape(first_state)
 
 
 class Losses(NamedTuple):
-    """Where numbers that are not finite enter, by step."""
+    """Steps at which numbers that are not finite enter."""
 
     loss: int = -1
     parameter: int = -1
@@ -76,7 +76,7 @@ SOUND = Losses()
 
 
 def compile_chunk(num_steps: int, bad: Losses = SOUND) -> Any:
-    """In place of `halves.compile_chunk`."""
+    """Replaces `halves.compile_chunk`."""
 
     def step(state: State, _: None) -> tuple[State, StepMetrics]:
         outcome = (jnp.arange(E, dtype=jnp.int32) + state.step) % 5
@@ -98,18 +98,18 @@ def compile_chunk(num_steps: int, bad: Losses = SOUND) -> Any:
 
 
 class Quiet:
-    """A reporter that keeps what is said; sets the stop flag after `stop_after` chunks."""
+    """A reporter that records messages; sets the stop flag after `stop_after` chunks."""
 
     def __init__(self, stop: signals.Stop | None = None, stop_after: int | None = None) -> None:
         self.stop, self.said, self.chunks = stop or signals.Stop(), [], 0
         self._stop_after = stop_after
 
     def log(self, text: str) -> None:
-        """Reporter."""
+        """Records a message."""
         self.said.append(text)
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """Reporter."""
+        """Counts a chunk."""
         self.chunks += 1
         if self.chunks == self._stop_after:
             self.stop.signal = 15
@@ -139,7 +139,7 @@ def train(
 
 
 def bits(state: State) -> bytes:
-    """All numbers of a state."""
+    """Returns all numbers of a state."""
     leaves = jax.random.key_data(state.key), state.step, state.total, state.packed
     return b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
 
@@ -153,7 +153,7 @@ class Reference:
         self.outcomes: list[dict[str, int]] = []
 
     def state(self, step: int) -> bytes:
-        """The numbers of the state of a step."""
+        """Returns the numbers of the state of a step."""
         while len(self.states) <= step:
             self._state, metrics = self._chunk(self._state)
             self.states.append(bits(self._state))
@@ -164,9 +164,11 @@ class Reference:
 
 
 def fault_of(run_dir: Path, reference: Reference, saved: int) -> str | None:
-    """What is wrong with a run of which `saved` was the last step whose save returned, if anything:
-    its newest sound checkpoint is that or a newer one, and has its state bit for bit; its log
-    reaches as far and has the right lines."""
+    """Returns the fault of a run whose last finished save was of step `saved`, if any.
+
+    Its newest sound checkpoint must be that or a newer one, with its state bit for bit; its log
+    must reach as far and have the right lines.
+    """
     if saved == 0 and checkpoint.latest_step(run_dir) is None:
         return None
     try:
@@ -192,7 +194,7 @@ def _log_fault(log: Path, reference: Reference, step: int) -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class Order:
-    """What a process of its own is to do: train without end, or `steps` steps."""
+    """Task of a process: to train without end, or `steps` steps."""
 
     run_dir: Path
     resume: bool = False
@@ -204,7 +206,7 @@ class Order:
 
 
 class Child:
-    """A process that carries out an order, and what it has said."""
+    """A process that carries out an order, and its messages."""
 
     def __init__(self, order: Order) -> None:
         context = multiprocessing.get_context("forkserver")
@@ -242,8 +244,8 @@ class Child:
                 self._errors += part
 
     def problem(self, refused: bool, killed: bool = False) -> str | None:
-        """What is wrong with its answer, if anything: a traceback, an error where none may be, or
-        one of several lines, or silence."""
+        """Returns the fault of its answer, if any: a traceback, an error where none may be or of
+        several lines, or silence."""
         if self.traceback is not None:
             return self.traceback
         if self.error is not None and ("\n" in self.error or not refused):
@@ -270,14 +272,14 @@ class Child:
         return not hung
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """Kills it by SIGKILL."""
         self.process.kill()
         self.process.join()
         self.listen(0.1)
 
 
 def _obey(pipe: Any, stderr: Any, order: Order) -> None:
-    """The main function of such a process."""
+    """Carries out an order: the main function of such a process."""
     os.dup2(stderr.fileno(), 2)
     stderr.close()
     jax.config.update("jax_platforms", "cpu")

@@ -1,11 +1,10 @@
 """Checkpoints: what comes back, and what is refused."""
 
 import dataclasses
-import functools
 import json
 import shutil
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +17,8 @@ from flax import struct
 
 from csac_jax import presets
 from csac_jax.errors import DataWarning
-from csac_jax.io import checkpoint, leaves, renames
+from csac_jax.io import checkpoint
 from csac_jax.io.checkpoint import CheckpointError
-from csac_jax.training import program as programs
 
 CFG = presets.smoke()
 
@@ -40,8 +38,7 @@ class State:
 
 
 def _state(seed: int = 0) -> State:
-    """A state with the kinds of leaves that a run has: keys, nested containers, small dtypes,
-    NaN."""
+    """Returns a state with keys, nested containers, small dtypes and NaN."""
     key = jax.random.key(seed)
     drawn = np.random.default_rng(seed)
     return State(
@@ -104,15 +101,10 @@ def test_state_comes_back_bit_for_bit(run_dir: Path):
     assert jax.random.bits(state.key) == jax.random.bits(_state(8).key)
 
 
-def test_config_comes_back(run_dir: Path):
-    """Claim: the config is read from the checkpoint alone."""
-    assert checkpoint.load_config(run_dir) == CFG
-
-
-def test_relative_folder(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the run's folder may be given relative to the working directory."""
+def test_config_comes_back(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the config is read from the checkpoint alone; the folder may be a relative path."""
     monkeypatch.chdir(run_dir.parent)
-    assert checkpoint.load_config(Path(run_dir.name)) == CFG
+    assert checkpoint.load_config(run_dir) == checkpoint.load_config(Path(run_dir.name)) == CFG
 
 
 def test_last_two_are_kept(run_dir: Path):
@@ -136,7 +128,7 @@ def test_temporary_folders_are_removed(run_dir: Path):
 
 
 def _falls_back(run_dir: Path, message: str) -> None:
-    """Step 8 is refused, with this message; without a step asked for, step 4 is taken, and said."""
+    """Checks that step 8 is refused with this message, and step 4 restored with a warning."""
     with pytest.raises(CheckpointError, match=rf"8 {message}.*; saved are: 4") as caught:
         checkpoint.restore(run_dir, _abstract(), 8)
     assert "\n" not in str(caught.value)
@@ -199,37 +191,35 @@ def test_threads_that_write_on_leave_no_draft(run_dir: Path, monkeypatch: pytest
 
 
 def _failing_from(name: str, call: Any, fail: Any) -> Any:
-    """`call`, or `fail` where its first argument has this name."""
+    """Returns `call`, or `fail` for a first argument of this name."""
     return lambda path, target: (fail if path.name == name else call)(path, target)
 
 
-@pytest.mark.parametrize("position", [0.0, 0.5, 0.99])
-def test_flipped_bit_is_seen(run_dir: Path, position: float):
-    """Claim: a step with a flipped bit is not restored; the newest sound one is, with a warning
-    that names the file."""
+def _flip(position: float) -> Callable[[Path], None]:
+    def flip(file: Path) -> None:
+        data = bytearray(file.read_bytes())
+        data[int(position * len(data))] ^= 1
+        file.write_bytes(data)
+
+    return flip
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_flip(0.0), "has changed"),
+        (_flip(0.5), "has changed"),
+        (_flip(0.99), "has changed"),
+        (lambda file: file.write_bytes(file.read_bytes()[:-1]), "has changed"),
+        (Path.unlink, "is missing"),
+    ],
+)
+def test_damage_is_seen(run_dir: Path, damage: Callable[[Path], None], message: str):
+    """Claim: a step with a flipped bit, a cut-off file or without one is not restored; the newest
+    sound one is, with a warning that names the file. One without manifest is half-written."""
     file = _data_file(run_dir, 8)
-    data = bytearray(file.read_bytes())
-    data[int(position * len(data))] ^= 1
-    file.write_bytes(data)
-    _falls_back(run_dir, rf"is damaged.*{file.name} has changed")
-
-
-def test_truncated_file_is_seen(run_dir: Path):
-    """Claim: so is a step with a cut-off file."""
-    file = _data_file(run_dir, 8)
-    file.write_bytes(file.read_bytes()[:-1])
-    _falls_back(run_dir, rf"is damaged.*{file.name} has changed")
-
-
-def test_deleted_file_is_seen(run_dir: Path):
-    """Claim: so is a step without one of its files."""
-    file = _data_file(run_dir, 8)
-    file.unlink()
-    _falls_back(run_dir, f"is damaged.*{file.name} is missing")
-
-
-def test_half_written_step_is_seen(run_dir: Path):
-    """Claim: a step without its manifest is half-written."""
+    damage(file)
+    _falls_back(run_dir, f"is damaged.*{file.name} {message}")
     (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).unlink()
     _falls_back(run_dir, "is missing or half-written")
 
@@ -296,52 +286,44 @@ def test_damaged_step_is_set_aside(run_dir: Path):
     assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(4))
 
 
-def test_other_versions_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", ["csac-jax", "jax", "mujoco"])
+def test_other_versions_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
     """Claim: a checkpoint of another version of the package, JAX or MuJoCo comes back with a
     warning that names both versions."""
     here = checkpoint.provenance.versions()
-    for name in ("csac-jax", "jax", "mujoco"):
-        old = {**here, name: "0.0.1"}
-        monkeypatch.setattr(checkpoint.provenance, "versions", lambda old=old: old)
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.provenance, "versions", lambda: {**here, name: "0.0.1"})
         checkpoint.save(tmp_path, 4, _state(4), CFG, {})
-        monkeypatch.undo()
-        with pytest.warns(DataWarning, match=rf"with {name} 0\.0\.1, this is {here[name]}"):
-            assert _same(checkpoint.restore(tmp_path, _abstract())[0], _state(4))
+    with pytest.warns(DataWarning, match=rf"with {name} 0\.0\.1, this is {here[name]}"):
+        assert _same(checkpoint.restore(tmp_path, _abstract())[0], _state(4))
 
 
-def test_no_sound_step_is_left(run_dir: Path):
-    """Claim: with no sound step left the message says so."""
+def test_no_sound_step_is_left(run_dir: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Claim: without a sound step, or without any, the message says so."""
     for step in (4, 8):
         _data_file(run_dir, step).unlink()
     with pytest.raises(CheckpointError, match="train again"):
         checkpoint.restore(run_dir, _abstract())
-
-
-def test_missing_checkpoint(tmp_path: Path):
-    """Claim: a folder without a checkpoint is an error that says so."""
-    assert checkpoint.latest_step(tmp_path) is None
+    empty = tmp_path_factory.mktemp("empty")
+    assert checkpoint.latest_step(empty) is None
     with pytest.raises(CheckpointError, match="there is no checkpoint under"):
-        checkpoint.load_config(tmp_path)
+        checkpoint.load_config(empty)
 
 
-def test_other_dtype_or_shape_is_refused(run_dir: Path):
-    """Claim: a leaf of another dtype or shape, one too many or too few is an error, not a cast."""
-    wanted = _abstract()
-    for change, message in (
-        (
-            {"step": jax.ShapeDtypeStruct((), jnp.float32)},
-            r"step as int32\[\], the program needs float32\[\]",
-        ),
-        (
-            {"step": jax.ShapeDtypeStruct((2,), jnp.int32)},
-            r"step as int32\[\], the program needs int32\[2\]",
-        ),
-        ({"params": {**wanted.params, "c": wanted.step}}, r"params\.c as nothing"),
-        ({"params": {"b": wanted.params["b"]}}, "the program needs nothing"),
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"step": jax.ShapeDtypeStruct((), jnp.float32)}, r"as int32\[\], .* needs float32\[\]"),
+        ({"step": jax.ShapeDtypeStruct((2,), jnp.int32)}, r"as int32\[\], .* needs int32\[2\]"),
+        ({"params": {"b": jax.ShapeDtypeStruct((2,), jnp.bool_)}}, "the program needs nothing"),
+        ({"moments": (jax.ShapeDtypeStruct((), jnp.int32),)}, r"moments\.0 as nothing"),
         ({"key": jax.eval_shape(lambda: jax.random.key(0, impl="rbg"))}, r"key as key<fry>\[\]"),
-    ):
-        with pytest.raises(CheckpointError, match=message):
-            checkpoint.restore(run_dir, dataclasses.replace(wanted, **change))
+    ],
+)
+def test_other_dtype_or_shape_is_refused(run_dir: Path, change: dict[str, Any], message: str):
+    """Claim: a leaf of another dtype or shape, one too many or too few is an error, not a cast."""
+    with pytest.raises(CheckpointError, match=message):
+        checkpoint.restore(run_dir, dataclasses.replace(_abstract(), **change))
 
 
 def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -354,67 +336,13 @@ def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         checkpoint.load_config(tmp_path)
 
 
-def _tree(leaves: dict[str, jax.Array]) -> dict[str, Any]:
-    """Nested dicts with these leaves by dotted name."""
-    tree: dict[str, Any] = {}
-    for name, leaf in leaves.items():
-        *path, last = name.split(".")
-        functools.reduce(lambda node, part: node.setdefault(part, {}), path, tree)[last] = leaf
-    return tree
-
-
-def _leaves(names: Iterable[str]) -> dict[str, jax.Array]:
-    """A leaf for each name, all different, the first a key; that of the step is 4."""
-    first, *others = names
-    plain = {name: jnp.arange(3.0) + i for i, name in enumerate(others)}
-    return {first: jax.random.key(5), **plain, "step": jnp.int32(4)}
-
-
-def _same_leaves(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    return jax.tree.map(_bits, a) == jax.tree.map(_bits, b)
-
-
-def test_old_names_of_leaves_are_read(tmp_path: Path):
-    """Claim: a checkpoint whose leaves have the old names of `renames.STATE` comes back under
-    today's, each leaf in its place, next to leaves that kept their names."""
-    old = _leaves([*renames.STATE, "step", "scenes.reward"])
-    new = {renames.STATE.get(name, name): leaf for name, leaf in old.items()}
-    assert len(new) == len(old)
-    checkpoint.save(tmp_path, 4, _tree(old), CFG, {})
-    state, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
-    assert _same_leaves(state, _tree(new))
-
-
-def test_new_names_of_leaves_are_read(tmp_path: Path):
-    """Claim: today's names are read as they are, in a checkpoint that holds an old name too: then
-    the program is told of a leaf that it does not know."""
-    new = _leaves([*renames.STATE.values(), "step"])
-    checkpoint.save(tmp_path, 4, _tree(new), CFG, {})
-    state, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
-    assert _same_leaves(state, _tree(new))
-    more = {**new, "step": jnp.int32(8), "scenes.idle": jnp.int32(0)}
-    checkpoint.save(tmp_path, 8, _tree(more), CFG, {})
-    with pytest.raises(CheckpointError, match=r"scenes\.idle as int32\[\], the program needs noth"):
-        checkpoint.restore(tmp_path, jax.eval_shape(lambda: _tree(new)))
-
-
-def test_added_leaves_are_zero_in_older_checkpoints(tmp_path: Path):
-    """Claim: leaves of `renames.ADDED` that a checkpoint lacks are zeros; those that it has are as
-    they were saved."""
-    first, second = jnp.full(3, 7, jnp.int32), jnp.full(3, 2, jnp.int32)
-    older = {"scenes.actions": first, "step": jnp.int32(4)}
-    newer = older | {"step": jnp.int32(8)} | dict.fromkeys(renames.ADDED, second)
-    abstract = jax.eval_shape(lambda: _tree(newer))
-    for step, saved in ((4, older), (8, newer)):
-        checkpoint.save(tmp_path, step, _tree(saved), CFG, {})
-        state, _ = checkpoint.restore(tmp_path, abstract, step)
-        wanted = dict.fromkeys(renames.ADDED, jnp.zeros_like(second)) | saved
-        assert _same_leaves(state, _tree(wanted))
-
-
-def test_states_leaves_have_the_names_of_today():
-    """Claim: `renames.STATE` and `renames.ADDED` name leaves that a run's state has."""
-    cfg = CFG.change(sensor={"dropped": 0.1})  # only with noise there is a key of noise
-    names = leaves.named(programs.abstract_state(cfg)).keys()
-    assert {*renames.STATE.values(), *renames.ADDED} <= names
-    assert not set(renames.STATE) & names
+def test_old_names_of_leaves_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: leaves with the old names of `renames.STATE` come back under the names of today, next
+    to leaves that kept their names; those of today are read as they are."""
+    monkeypatch.setattr(checkpoint.renames, "STATE", {"a.old": "a.new"})
+    old = {"a": {"old": jax.random.key(5), "b": jnp.arange(3.0)}, "step": jnp.int32(4)}
+    new = {"a": {"new": old["a"]["old"], "b": old["a"]["b"]}, "step": jnp.int32(4)}
+    for stored in (old, new):
+        checkpoint.save(tmp_path, 4, stored, CFG, {})
+        state, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: new))
+        assert jax.tree.map(_bits, state) == jax.tree.map(_bits, new)

@@ -1,20 +1,25 @@
-"""Config to JSON and back."""
+"""Config to JSON and back, and configs in files, against the presets and `Config.change`."""
 
 import dataclasses
 import json
 import math
+import re
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import csac_jax
 from csac_jax import algorithms, presets
-from csac_jax.config import Config, LearnConfig, SimConfig, UniformReplay
-from csac_jax.io import configs, renames
+from csac_jax.config import BetaReplay, Config, LearnConfig, SimConfig
+from csac_jax.errors import SettingsError
+from csac_jax.io import configs, files, renames
+from csac_jax.sweeps import grid, runner
 
-FORMATS = Path(__file__).parent / "formats"
-SAVED = presets.quick().change(  # as it was when the files there were written
+STORED = Path(__file__).parent / "formats" / "format-2.json"
+SAVED = presets.quick().change(  # as it was when that file was written
     net={"growth": 32, "rotations": 16},
     policy={"augment": False},
     explore={"decay": 0.998},
@@ -35,48 +40,46 @@ def test_config_survives_json(name: str):
     assert hash(back) == hash(cfg)
 
 
-@pytest.mark.parametrize(
-    ("path", "value", "message"),
-    [
-        ("learn.bath", 3, "learn.bath: unknown setting"),
-        ("learn.batch", "3", "learn.batch: input should be a valid integer"),
-        ("learn.batch", 3.0, "learn.batch: input should be a valid integer"),
-        ("learn.batch", True, "learn.batch: input should be a valid integer"),
-        ("learn.tau", "x", "learn.tau: input should be a valid number"),
-        ("learn", 3, "learn: input should be an object"),
-        ("scene.slots", ["ball"], r"scene.slots.0: input should be 'box'"),
-        ("sim.grasp_phases", [1, 2], "sim.grasp_phases.2: field required"),
-        ("replay.sampler", "best", "replay.sampler: 'best' is not one of: uniform, prioritised"),
-        ("replay.alpha", 0.5, "replay.alpha: unknown setting"),
-        ("learn.tau", 2.0, "learn.tau: must be above 0"),
-        ("format", 3, "format: 3 is unknown"),
-    ],
-)
-def test_what_does_not_fit_is_named(path: str, value: Any, message: str):
-    """Claim: an unknown key, a wrong type or a value out of range is an error that names the
-    setting."""
-    values = _through_text(Config())
-    *parents, last = path.split(".")
-    place = values
-    for parent in parents:
-        place = place[parent]
-    place[last] = value
-    with pytest.raises(ValueError, match=message):
-        configs.from_dict(values)
+def test_format_is_stored():
+    """Claim: the format has a stored file, which is what is written today."""
+    stored = json.loads(STORED.read_text())
+    assert stored == _through_text(SAVED)
+    assert configs.from_dict(stored) == SAVED
 
 
-def test_missing_settings_take_their_defaults():
-    """Claim: a config without a setting, or a whole section, is read with the defaults."""
+def test_missing_and_gone_settings():
+    """Claim: a config without a setting, or a whole section, is read with the defaults; one with a
+    setting that is gone without it; JSON's 1 is 1.0 where a float is wanted."""
     values = _through_text(presets.quick())
     del values["cem"]["rounds"], values["camera"]
-    assert configs.from_dict(values) == presets.quick()
-
-
-def test_whole_number_is_a_float():
-    """Claim: JSON's 1 is read as 1.0 where a float is wanted."""
-    values = _through_text(Config())
+    values["target"]["samples"] = 8
     values["learn"]["tau"] = 1
+    assert configs.from_dict(values) == presets.quick().change(learn={"tau": 1.0})
     assert type(configs.from_dict(values).learn.tau) is float
+
+
+def test_old_names_are_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: settings, values and metrics by the names of `renames` are those of today: in stored
+    configs, in a user's file, in a stored sweep and in `--vary`."""
+    monkeypatch.setattr(renames, "SETTINGS", {"scene.packed": "task.kind", "learn.huber": None})
+    texts = {"one": "target", "all:": "cl"}
+    monkeypatch.setattr(renames, "VALUES", {"task.kind": texts})
+    values = _through_text(presets.smoke())
+    del values["task"]["kind"]
+    values["scene"]["packed"] = "one"
+    values["learn"]["huber"] = 3
+    wanted = presets.smoke().change(task={"kind": "target"})
+    assert configs.from_dict(values) == wanted
+    path = tmp_path / "my.toml"
+    path.write_text('preset = "smoke"\n[scene]\npacked = "one"\n[learn]\nhuber = 2\n')
+    assert configs.load_config(path) == wanted
+    (point, other) = grid.points(["scene.packed=one,all:ear"], lambda flags: presets.smoke())
+    assert (point.values, other.values) == ({"task.kind": "target"}, {"task.kind": "clear"})
+    plan = runner.SweepPlan(2, [point._replace(cfg=wanted, name="x")])
+    older = plan._replace(points=[plan.points[0]._replace(values={"scene.packed": "one"})])
+    (tmp_path / files.SWEEP_PLAN).write_text(runner.plan_text(older))
+    assert runner.read_plan(tmp_path) == plan
+    assert files.renamed({"a": {"ill": 1}}) == {"a": {"physics_diverged": 1}}
 
 
 def test_differences_are_named_in_order():
@@ -89,96 +92,6 @@ def test_differences_are_named_in_order():
     assert configs.differences(a, Config()) == []
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_every_format_is_read(number: int):
-    """Claim: a config of every format that was ever written is read: `quick` as it was saved."""
-    stored = json.loads((FORMATS / f"format-{number}.json").read_text())
-    assert stored.get("format", 1) == number
-    assert configs.from_dict(stored) == SAVED
-
-
-def test_first_configs_of_format_2_are_read():
-    """Claim: so is one of format 2 with settings that are constants now, unless its value is
-    another that a policy acts by."""
-    stored = json.loads((FORMATS / "format-2-first.json").read_text())
-    assert configs.from_dict(stored) == SAVED
-    stored["target"]["samples"] = 8
-    assert configs.from_dict(stored) == SAVED
-    stored["reward"]["eta"] = [0.5, 1.0]
-    with pytest.raises(ValueError, match=r"^reward\.eta: is \[0\.0, 1\.0\] now"):
-        configs.from_dict(stored)
-    paper = configs.to_dict(presets.paper())
-    paper["net"]["block_layers"] = [6, 12, 24, 16]
-    assert configs.from_dict(paper) == presets.paper()
-    paper["net"]["block_layers"] = [6, 12, 48, 32]
-    with pytest.raises(ValueError, match=r"^net\.block_layers: is \[6, 12, 24, 16\] now"):
-        configs.from_dict(paper)
-
-
-@pytest.mark.parametrize("file", ["format-1.json", "format-2-first.json"])
-def test_former_vpg_keeps_what_it_was(file: str):
-    """Claim: a stored config of the algorithm `vpg` from before it was changed is one of
-    `vpg_episodic`; one of today's keeps its name."""
-    stored = json.loads((FORMATS / file).read_text()) | {"algo": "vpg"}
-    assert configs.from_dict(stored).algo == "vpg_episodic"
-    today = algorithms.configure(presets.quick(), "vpg")
-    assert configs.from_dict(_through_text(today)) == today
-
-
-def test_newest_format_is_stored():
-    """Claim: the newest format has a stored file, which is what is written today."""
-    stored = json.loads((FORMATS / f"format-{renames.FORMAT}.json").read_text())
-    assert stored == _through_text(SAVED)
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"learn.target_update": "hard", "learn.copy_every": 7}, {"learn.tau": 1.0}),
-        ({"replay.sampler": "uniform"}, {"replay": UniformReplay()}),
-        ({"reward.left": 3.0, "reward.lifted": 2.0}, {"reward.lost_block_penalty": 3.0}),
-        ({"camera.scale": 0.5}, {"camera.size": (320, 240), "camera.centre": (159.5, 119.5)}),
-        ({"scene.drop_extent": 0.2}, {"scene.drop_extent": (0.2, 0.2)}),
-        ({"train.max_idle": 10}, {}),
-        ({"target.samples": 8}, {}),
-    ],
-)
-def test_format_1_is_translated(changes: dict[str, Any], expected: dict[str, Any]):
-    """Claim: settings of format 1 that have another name, form or place today keep their
-    meaning."""
-    values = json.loads((FORMATS / "format-1.json").read_text())
-    for name, value in changes.items():
-        section, field = name.split(".")
-        values[section][field] = value
-    cfg = configs.from_dict(values)
-    for name, value in expected.items():
-        found: Any = cfg
-        for part in name.split("."):
-            found = getattr(found, part)
-        assert found == value
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("sim.timestep", 0.002), ("net.border", True), ("explore.noise_clip", 0.5)]
-)
-def test_format_1_with_what_is_gone_is_refused(name: str, value: Any):
-    """Claim: a constant or gone setting is refused if a file needs another value."""
-    values = json.loads((FORMATS / "format-1.json").read_text())
-    section, field = name.split(".")
-    values[section][field] = value
-    with pytest.raises(ValueError, match=rf"^{name}: "):
-        configs.from_dict(values)
-
-
-def _refused(values: Any, message: str) -> None:
-    begun = time.monotonic()
-    with pytest.raises(ValueError, match=message) as caught:
-        configs.from_dict(values)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 200
-    assert time.monotonic() - begun < 5.0
-
-
 def _nested(depth: int) -> Any:
     value: Any = 0
     for _ in range(depth):
@@ -189,8 +102,21 @@ def _nested(depth: int) -> Any:
 @pytest.mark.parametrize(
     ("section", "values", "message"),
     [
-        ("learn", {"tau": 10**400}, r"learn\.tau: must be finite, not inf"),
-        ("learn", {"learning_rate": math.nan}, r"learn\.learning_rate: must be finite|not nan"),
+        ("learn", {"bath": 3}, r"learn\.bath: unknown setting"),
+        ("learn", {"batch": "3"}, r"learn\.batch: input should be a valid integer"),
+        ("learn", {"batch": 3.0}, r"learn\.batch: input should be a valid integer"),
+        ("learn", {"batch": True}, r"learn\.batch: input should be a valid integer"),
+        ("learn", {"tau": "x"}, r"learn\.tau: input should be a valid number"),
+        ("learn", {"tau": 2.0}, r"learn\.tau: must be at most 1, not 2\.0"),
+        ("learn", 3, "learn: input should be an object"),
+        ("scene", {"slots": ["ball"]}, r"scene\.slots\.0: input should be 'box'"),
+        ("sim", {"grasp_phases": [1, 2]}, r"sim\.grasp_phases\.2: field required"),
+        ("replay", {"sampler": "best"}, r"replay\.sampler: 'best' is not one of: uniform"),
+        ("replay", {"sampler": "uniform", "end": [1, 2]}, r"replay\.end: unknown setting"),
+        ("format", 3, "format: 3 is unknown"),
+        ("format", 1, "format: 1 is unknown, this version reads 2; use the csac-jax that wrote"),
+        ("learn", {"tau": 10**400}, r"learn\.tau: must be at most 1, not inf"),
+        ("learn", {"learning_rate": math.nan}, r"learn\.learning_rate: .*not nan"),
         ("train", {"actions": 10**400}, r"train\.actions: must be at most 9007199254740992"),
         ("net", {"dilations": [1] * 100_000}, r"net\.dilations: at most 64 items, not 100000"),
         ("scene", {"slots": ["box"] * 100_000}, r"scene\.slots: at most 64 items, not 100000"),
@@ -199,33 +125,146 @@ def _nested(depth: int) -> Any:
         ("learn", {f"k{i}": i for i in range(20_000)}, r"learn\.k0: unknown setting"),
         ("net", {"kind": ["small"]}, "net.kind: "),
         ("net", {"kind": "small", "": 1}, "net.: unknown setting"),
-        ("learn", {"": "csac"}, "learn.: unknown setting"),
     ],
 )
-def test_hostile_values_are_one_line(section: str, values: dict[str, Any], message: str):
-    """Claim: numbers beyond floats, lists without end, deep nesting and thousands of keys are
-    refused at once, in one short line."""
-    _refused({"format": renames.FORMAT, section: values}, message)
+def test_bad_values_are_one_line(section: str, values: Any, message: str):
+    """Claim: an unknown key, a wrong type, a value out of range, numbers beyond floats, lists
+    without end and deep nesting are refused at once, in a short line that names the setting."""
+    _refused({"format": configs.FORMAT, section: values}, message)
 
 
-@pytest.mark.parametrize("number", [1, renames.FORMAT])
-def test_thousands_of_sections_are_one_line(number: int):
+def test_thousands_of_sections_are_one_line():
     """Claim: 20,000 sections are refused as fast as one."""
-    _refused(
-        {"format": number, **{f"k{i}": {"a": 1} for i in range(20_000)}}, "k0.*: unknown setting"
-    )
+    sections = {f"k{i}": {"a": 1} for i in range(20_000)}
+    _refused({"format": configs.FORMAT, **sections}, "k0.*: unknown setting")
+
+
+def _refused(values: Any, message: str) -> None:
+    begun = time.monotonic()
+    with pytest.raises(SettingsError, match=message) as caught:
+        configs.from_dict(values)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200
+    assert time.monotonic() - begun < 5.0
+
+
+TOML = """
+preset = "smoke"
+seed = 3
+[learn]
+tau = 1
+[replay]
+sampler = "beta"
+end = [1, 5]
+[scene]
+slots = ["box", "prism"]
+"""
+YAML = """
+preset: smoke
+seed: 3
+learn: {tau: 1}
+replay: {sampler: beta, end: [1, 5]}
+scene: {slots: [box, prism]}
+"""
+WANTED = presets.smoke().change(
+    seed=3,
+    learn={"tau": 1.0},
+    replay={"sampler": "beta", "end": (1.0, 5.0)},
+    scene={"slots": ("box", "prism")},
+)
+
+
+def _file(folder: Path, text: str, suffix: str = ".toml") -> Path:
+    path = folder / f"my{suffix}"
+    path.write_bytes(text.encode(errors="surrogateescape"))
+    return path
 
 
 @pytest.mark.parametrize(
-    ("section", "values"),
+    ("suffix", "text"),
+    [(".toml", TOML), (".yaml", YAML), (".yml", YAML), (".json", json.dumps(tomllib.loads(TOML)))],
+    ids=("toml", "yaml", "yml", "json"),
+)
+def test_file_changes_its_preset(tmp_path: Path, suffix: str, text: str):
+    """Claim: TOML, YAML and JSON say the same; other settings are the preset's; whole numbers are
+    good where the setting is a fraction."""
+    path = _file(tmp_path, text, suffix)
+    assert configs.load_config(path) == configs.load_config(path, "smoke") == WANTED
+
+
+def test_files_of_the_manual_load(tmp_path: Path):
+    """Claim: every TOML file that the documentation shows is a config."""
+    pages = Path(csac_jax.__file__).parents[1].glob("docs/**/*.md")
+    shown = [one for page in pages for one in re.findall("(?s)```toml\n(.*?)```", page.read_text())]
+    assert shown
+    for text in shown:
+        assert configs.load_config(_file(tmp_path, text)) != presets.quick()
+
+
+def test_config_of_a_run_is_taken_whole(tmp_path: Path):
+    """Claim: the config.json of a run gives its config, also of an unknown preset."""
+    cfg = WANTED.change(preset="mine", algo="vpg", train={"actions": 128})
+    path = _file(tmp_path, json.dumps(configs.to_dict(cfg)), ".json")
+    assert configs.load_config(path) == cfg
+    assert configs.load_config(path, algo="csac") == algorithms.configure(cfg, "csac")
+
+
+def test_algorithm_comes_before_the_settings(tmp_path: Path):
+    """Claim: `algo` of a file makes the preset one of that algorithm, one given elsewhere wins over
+    it, and settings of the file win over both; another alternative of a section keeps the settings
+    that both have."""
+    path = _file(tmp_path, 'preset = "smoke"\nalgo = "vpg"\n[target]\ngamma = 0.3\n')
+    for algo, wanted in ((None, "vpg"), ("csac", "csac")):
+        base = algorithms.configure(presets.smoke(), wanted)
+        assert configs.load_config(path, algo=algo) == base.change(target={"gamma": 0.3})
+    path = _file(tmp_path, 'preset = "smoke"\nalgo = "csac"\n[replay]\nsampler = "beta"\n')
+    capacity = presets.smoke().replay.capacity
+    assert configs.load_config(path).replay == BetaReplay(capacity=capacity)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text", "message"),
     [
-        ("sim", {"grasp_phases": 5}),
-        ("sim", {"push_phases": None}),
-        ("explore", {"noise_std": "a", "noise_clip": 1.0}),
-        ("camera", {"scale": "a"}),
-        ("camera", {"scale": 0.5, "size": 3}),
+        (".toml", "[learn]\ntau = 0.1", r'preset: is missing; add one, such as preset = "quick"$'),
+        (".toml", "preset = 3", "preset: is missing"),
+        (".toml", 'preset = "quik"', "unknown preset 'quik'; did you mean quick"),
+        (".toml", "SMOKE[learn]\nbath = 3", r"learn\.bath: unknown setting$"),
+        (".toml", "SMOKE[lern]\nbatch = 3", "lern: unknown setting$"),
+        (".toml", 'SMOKElearn = "fast"', "learn: must be a section of settings, not 'fast'$"),
+        (".toml", "SMOKE[learn]\ntau = 2.0", r"learn\.tau: must be at most 1, not 2\.0$"),
+        (".toml", "SMOKE[learn]\ntau = nan", r"learn\.tau: "),
+        (".toml", "SMOKE[learn]\nbatch = 2020-01-01", r"learn\.batch: input should be a valid int"),
+        (".toml", "SMOKEseed = true", "seed: input should be a valid integer, not True$"),
+        (".toml", 'SMOKE[replay]\nsampler = "best"', r"replay\.sampler: 'best' is not one of: uni"),
+        (".toml", 'SMOKEalgo = "dqn"', "unknown algorithm 'dqn'; choose one of"),
+        (".toml", "SMOKEformat = 9", "format: 9 is unknown, this version reads"),
+        (".toml", "SMOKE[learn\n", r"is no readable TOML \("),
+        (".toml", "\udcff", ".*decode"),
+        (".ini", "", "the name of a config file ends in .toml, .yaml, .yml, .json"),
+        (".yaml", "a: [1", "is no readable YAML"),
+        (".yaml", "- 1", "must hold settings by name"),
+        (".yaml", "a: &a [1]\nb: *a", "aliases"),
+        (".yaml", "seed: !!python/object/apply:os.getpid []", "is no readable YAML"),
+        (".yaml", "[" * 1_500, "is "),
+        (".json", "{", "is no readable JSON"),
+        (".json", "[" * 100_000, "is nested too deeply"),
     ],
 )
-def test_old_format_with_other_kinds_of_values(section: str, values: dict[str, Any]):
-    """Claim: a file of the old format whose values are of other kinds is one line."""
-    _refused({section: values}, "old format has a value of another kind")
+def test_fault_names_file_and_key(tmp_path: Path, suffix: str, text: str, message: str):
+    """Claim: a file that is no config, of another kind, with code, aliases or deep nesting is one
+    line with the file's name and the key at fault; nothing in it is executed."""
+    path = _file(tmp_path, text.replace("SMOKE", 'preset = "smoke"\n'), suffix)
+    with pytest.raises(SettingsError, match=f"^{path}: {message}") as caught:
+        configs.load_config(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_or_contradicting_file_is_named(tmp_path: Path):
+    """Claim: a file that is not there, a folder, or one of another preset is one line."""
+    (tmp_path / "folder.toml").mkdir()
+    for name in ("no.toml", "folder.toml"):
+        with pytest.raises(SettingsError, match=rf"{name}: .*(No such file|folder)"):
+            configs.load_config(tmp_path / name, "smoke")
+    path = _file(tmp_path, 'preset = "quick"')
+    with pytest.raises(SettingsError, match="preset: is 'quick'; leave out smoke, or change the"):
+        configs.load_config(path, "smoke")

@@ -132,7 +132,7 @@ def test_bad_tensor_is_named(tmp_path, tensors, change, message):
     the file's."""
     change(tensors)
     path = _file(tmp_path / "w.safetensors", tensors)
-    with pytest.raises(ValueError, match=f"^in .*w.safetensors, {message}; bring .*$"):
+    with pytest.raises(ValueError, match=f"^in .*w.safetensors, {message}; give .*$"):
         weights.read(NET, path)
 
 
