@@ -286,9 +286,8 @@ class _GroupTraining:
             self.state = program.init()
         else:
             self.state, extra = checkpoint.restore(folder, program.abstract())
-            stored = extra["runs"] if "runs" in extra else extra["members"]  # its older name
-            self.loop_states = [loop.LoopState(*loop_state) for loop_state, _ in stored]
-            self.failed = [failed for _, failed in stored]
+            self.loop_states = [loop.LoopState(*loop_state) for loop_state, _ in extra["runs"]]
+            self.failed = [failed for _, failed in extra["runs"]]
             if cluster.is_first():
                 checkpoint.set_aside(folder)
         self.step = int(self.state.step)

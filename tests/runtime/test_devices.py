@@ -1,4 +1,4 @@
-"""Devices that JAX is told to use."""
+"""The choice of JAX's devices."""
 
 import os
 import subprocess
@@ -47,7 +47,7 @@ else:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("cpu", "cpu\n"), ("gpu", "--device gpu: JAX finds none")]
+    ("name", "said"), [("cpu", "cpu\n"), ("gpu", "device gpu: JAX finds none")]
 )
 def test_selected_device_goes_before_the_variable(name: str, said: str):
     """Claim: the device that is selected is used, whatever JAX_PLATFORMS says; one that is not
@@ -70,5 +70,5 @@ def test_device_of_another_kind():
     devices.require()
     used = devices.jax.default_backend()
     devices.require(used)
-    with pytest.raises(DeviceError, match=f"--device none: .* leave it out for the {used}"):
+    with pytest.raises(DeviceError, match=f"device none: .* leave it out for the {used}"):
         devices.require("none")

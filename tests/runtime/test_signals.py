@@ -18,10 +18,7 @@ from csac_jax.training import program as programs
 pytestmark = [pytest.mark.mjx, pytest.mark.optax, pytest.mark.slow]
 
 MOMENTS = 5
-LINES = (
-    "run ",
-    "compiled in",
-)  # printed when the run's folder is chosen, and when its first chunk begins
+LINES = ("run ", "compiled in")  # printed with the run's folder, and before its first chunk
 
 
 def _command(*arguments: str | Path) -> list[str]:
@@ -43,10 +40,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def _state(run_dir: Path) -> list[np.ndarray]:
     program = programs.make(checkpoint.load_config(run_dir))
     state, _ = checkpoint.restore(run_dir, jax.eval_shape(lambda: programs.init(program)))
-    return [
-        np.asarray(leaf)
-        for leaf in jax.tree.leaves(state.replace(key=jax.random.key_data(state.key)))
-    ]
+    return [*map(np.asarray, jax.tree.leaves(state.replace(key=jax.random.key_data(state.key))))]
 
 
 def _run(run_dir: Path, environment: dict[str, str]) -> subprocess.Popen:
@@ -70,12 +64,8 @@ def reference(
     """Leaves of the uninterrupted run's last state, and the time from each kind of line to the
     run's end, s."""
     folder = tmp_path_factory.mktemp("reference")
-    subprocess.run(
-        _command("smoke", "--run-dir", folder / "cold"),
-        env=environment,
-        check=True,
-        capture_output=True,
-    )
+    cold = _command("smoke", "--run-dir", folder / "cold")
+    subprocess.run(cold, env=environment, check=True, capture_output=True)
     begun = {}
     with _run(folder / "warm", environment) as run:
         for start in LINES:
