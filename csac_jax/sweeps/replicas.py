@@ -127,7 +127,7 @@ class SweepProgram:
         return self._jitted_init().eval_shape(self.replicas)
 
     def compile_chunk(self, num_steps: int) -> Any:
-        """Jits a function state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
+        """Returns a jitted state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
 
         The state is donated. With a mesh over seeds each device scans its own replicas; metrics end
         up on every device.

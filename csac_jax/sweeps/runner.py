@@ -70,7 +70,7 @@ class SweepRun(NamedTuple):
 
 
 class SweepResult(NamedTuple):
-    """How a sweep ended."""
+    """The end of a sweep."""
 
     summary: dict[str, Any]  # as in summary.json
     compile_seconds: list[float]  # of each group that was compiled
@@ -277,7 +277,7 @@ class _GroupTraining:
     def __init__(
         self, sweep_folder: Path, folder: Path, runs: list[SweepRun], program: SweepProgram
     ) -> None:
-        """Continues from the newest checkpoint, if there is one, and cuts the logs to it."""
+        """Restores the newest checkpoint, if there is one, and cuts the logs to it."""
         self.folder, self.runs, self.program, self.cfg = folder, runs, program, runs[0].cfg
         self.paths = [sweep_folder / run.folder for run in runs]
         self.loop_states = [loop.LoopState(0.0, [])] * len(runs)

@@ -55,7 +55,7 @@ def fill(program: Program, transitions: Transition) -> ReplayState:
 
 @functools.lru_cache(maxsize=2)
 def compile_step(program: Program):
-    """Jits a function state -> (state, losses), of one step; the state is donated."""
+    """Returns a jitted function state -> (state, losses), of one step; the state is donated."""
 
     cfg = program.cfg
 

@@ -58,7 +58,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
 
 def act_half(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
-    """Acts and remembers, lines 8-15; the metrics are those of a step that learns nothing."""
+    """Takes the actions of a step and stores them, lines 8-15; metrics without losses."""
     cfg, env, learner, scenes = program.cfg, program.env, program.learner, state.scenes
     key_act, _, key_reset = _step_keys(state.key, state.step)
 

@@ -343,10 +343,7 @@ def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
     assert cfg.net == api.load_policy("shipped").cfg.net
     assert cfg.learn.batch == SMOKE.learn.batch
     code, line = _fails(capsys, "train", "fast", "--init", "shipped", "--net.growth", "8")
-    assert (code, "--init shipped: its networks are not those of these settings" in line) == (
-        2,
-        True,
-    )
+    assert (code, "init shipped: its networks are not those of these settings" in line) == (2, True)
 
 
 def test_nothing_is_overwritten(capsys: pytest.CaptureFixture, run_dir: Path):
@@ -572,7 +569,7 @@ def test_both_names_are_commands():
     ("device", "code", "line"),
     [
         ("cpu", 2, "csac-jax: there is no file or folder nowhere; give folders of runs"),
-        ("gpu", 2, "csac-jax: --device gpu: JAX finds none here; leave it out for the cpu"),
+        ("gpu", 2, "csac-jax: device gpu: JAX finds none here; leave it out for the cpu"),
     ],
 )
 def test_device_is_selected(device: str, code: int, line: str):
@@ -671,8 +668,7 @@ def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
     code, line = _fails(capsys, "train", "quick", "--replay.capacity", str(2**30))
     assert code == 2
     match = re.fullmatch(
-        r"csac-jax: replay.capacity: .* GiB, .*; lower --replay.capacity from \d+ to (\d+) .*\n",
-        line,
+        r"csac-jax: replay.capacity: .* GiB, .*; lower replay.capacity from \d+ to (\d+) .*\n", line
     )
     assert match
     assert list(tmp_path.iterdir()) == []

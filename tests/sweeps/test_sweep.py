@@ -52,10 +52,8 @@ class Programs:
         seeds = [cfg.seed + 100 * (cfg.learn.tau == 0.5) + uniform for cfg in group.configs]
 
         def init() -> State:
-            states = [State(jax.random.key(seed), jnp.int32(0), jnp.zeros(4)) for seed in seeds]
-            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states).replace(
-                step=jnp.int32(0)
-            )
+            keys = jnp.stack([jax.random.key(seed) for seed in seeds])
+            return State(keys, jnp.int32(0), jnp.zeros((len(seeds), 4)))
 
         def chunk(num_steps: int):
             self.compiled += 1
@@ -64,10 +62,8 @@ class Programs:
 
             def one(state: State, fails: jax.Array):
                 state, metrics = Fake()._step(state, None)
-                late = fails & (state.step > 8)
-                return state, metrics._replace(
-                    critic_loss=jnp.where(late, jnp.nan, metrics.critic_loss)
-                )
+                loss = jnp.where(fails & (state.step > 8), jnp.nan, metrics.critic_loss)
+                return state, metrics._replace(critic_loss=loss)
 
             every = jax.vmap(one, in_axes=(axes, 0), out_axes=(axes, 0))
             return jax.jit(
@@ -85,7 +81,6 @@ class Listener(test_loop.Listener):
     """Keeps what a sweep reports; sets the stop flag after `stop_after` chunks."""
 
     def progress(self, record, total_actions, eta) -> None:
-        """Reporter."""
         assert total_actions == 72 * SEEDS * len(PLAN.points)
         super().progress(record, 72, eta)
 

@@ -88,11 +88,9 @@ class Listener:
             self.stop.signal = signal
 
     def log(self, text: str) -> None:
-        """Reporter."""
         self.said.append(text)
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """Reporter."""
         assert total_actions == self._total
         assert eta is None or eta >= 0.0
         self.records.append(record)
