@@ -292,7 +292,6 @@ def _is_weights(source: str | Path) -> bool:
 
 
 def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
-    """Returns the points of every combination of the values."""
     for name in vary:
         grid.kind_of(name)
 
@@ -303,11 +302,11 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
         base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
         return programs.replace_settings(base, settings)
 
-    return grid.combine(vary, configure)
+    points: list[SweepPoint] = _checked(grid.combine, vary, configure)
+    return points
 
 
 def _first_line(folder: Path, cfg: Config) -> str:
-    """Describes a run that begins."""
     scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
     return (
         f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "

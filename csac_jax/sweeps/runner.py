@@ -95,26 +95,15 @@ def run(
     if not resume and cluster.is_first():
         folder.mkdir(parents=True)
         files.replace(folder / files.SWEEP_PLAN, plan_text(plan))
-    with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
-        return _run(plan, folder, make_program, reporter, stop)
-
-
-def _run(
-    plan: SweepPlan,
-    folder: Path,
-    make_program: Callable[[ProgramGroup], SweepProgram],
-    reporter: loop.Reporter,
-    stop: Stop,
-) -> SweepResult:
-    """Runs as `run` does; nobody else writes in the folder."""
     sweep = _Sweep(folder, groups_of(plan), reporter, stop)
-    for index, (group, _) in enumerate(sweep.groups):
-        group_folder = folder / "groups" / str(index)
-        if not sweep.stopping() and not (group_folder / DONE).exists():
-            sweep.train_group(index, group_folder, make_program(group))
-    summary = summarise(plan, folder)
-    if cluster.is_first():
-        files.write_json(folder / SUMMARY, summary)
+    with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
+        for index, (group, _) in enumerate(sweep.groups):
+            group_folder = folder / "groups" / str(index)
+            if not sweep.stopping() and not (group_folder / DONE).exists():
+                sweep.train_group(index, group_folder, make_program(group))
+        summary = summarise(plan, folder)
+        if cluster.is_first():
+            files.write_json(folder / SUMMARY, summary)
     done = f"done; saved in {folder}, results in {folder / SUMMARY}"
     stopped = f"stopped and saved; continue with: csac-jax sweep --resume {folder}"
     reporter.log(done if sweep.stopped is None else stopped)

@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 
 from csac_jax.runtime import host_call
-from csac_jax.scene import model
-from csac_jax.sim.c_physics import CPhysics
-from tests.sim import conftest
 
 ROOT = Path(host_call.__file__).parents[2]
 RESULT = {
@@ -102,15 +99,3 @@ def test_second_process_finds_the_program(tmp_path: Path):
     )
     assert first.split() == ["0", "0.0", "2.0", "4.0"]
     assert second.split() == ["1", "0.0", "3.0", "6.0"]
-
-
-def test_key_tells_worlds_apart(c_world: model.World):
-    """Claim: worlds that are built alike have one key, others another."""
-    sim = conftest.CONFIG.change(sim={"physics": "c"}).sim
-    again = model.build(conftest.CONFIG.scene, sim)
-    arm = conftest.CONFIG.change(sim={"physics": "c", "robot": "ur5"}).sim
-    more = conftest.CONFIG.change(scene={"slots": (*conftest.CONFIG.scene.slots, "box")}).scene
-    key = CPhysics(c_world, sim)._key
-    assert CPhysics(again, sim)._key == key
-    assert CPhysics(c_world, arm)._key != key
-    assert CPhysics(model.build(more, sim), sim)._key != key

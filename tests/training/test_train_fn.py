@@ -13,7 +13,7 @@ from tests.agent import toys
 from tests.training.test_step import leaves
 
 SCENES, STEPS = 8, 12
-CFG = toys.config("csac", actions=SCENES * STEPS, max_actions=2).change(train={"chunk": 4})
+CFG = toys.config("grasp_only", SCENES * STEPS, max_actions=2).change(train={"chunk": 4})
 
 
 @pytest.mark.optax
