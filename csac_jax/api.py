@@ -25,14 +25,7 @@ from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
-from csac_jax.training import (
-    callbacks as followers,
-    loop,
-    memory,
-    program as programs,
-    sharding,
-    split_step,
-)
+from csac_jax.training import callbacks as followers, loop, memory, programs, sharding, split_step
 from csac_jax.training.callbacks import Callback, Record, Summary
 from csac_jax.training.progress import Terminal
 from csac_jax.training.sharding import Shard

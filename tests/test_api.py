@@ -22,7 +22,7 @@ from csac_jax.io import checkpoint, config_file, policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
-from csac_jax.training import program as programs, step
+from csac_jax.training import programs, step
 from csac_jax.training.callbacks import Record
 from csac_jax.vision.heightmap import Observation
 

@@ -14,8 +14,8 @@ from csac_jax.io import configs
 from csac_jax.runtime import signals
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.replicas import group_configs
-from csac_jax.training import program as programs, step
-from csac_jax.training.program import Hyperparams
+from csac_jax.training import programs, step
+from csac_jax.training.programs import Hyperparams
 from csac_jax.training.step import Program, TrainState
 from experiments import search
 from tests.training import toys

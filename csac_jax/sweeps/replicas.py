@@ -21,8 +21,8 @@ from csac_jax.config import Config, SmallNet
 from csac_jax.nets import chunked_vmap
 from csac_jax.nets.chunked_vmap import Batching
 from csac_jax.runtime import compiler
-from csac_jax.training import memory, program as programs, step
-from csac_jax.training.program import Hyperparams
+from csac_jax.training import memory, programs, step
+from csac_jax.training.programs import Hyperparams
 from csac_jax.training.sharding import AXIS, Shard
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics

@@ -18,7 +18,7 @@ from csac_jax.config import Config
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
 from csac_jax.runtime import compiler
-from csac_jax.training import program as programs, step
+from csac_jax.training import programs, step
 from csac_jax.training.step import Program
 
 

@@ -43,7 +43,7 @@ from csac_jax.replay import ring
 from csac_jax.runtime import cache, compiler, provenance
 from csac_jax.sim import backend
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs, split_step, step, transitions
+from csac_jax.training import programs, split_step, step, transitions
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
 from experiments.bench._options import Parser, config, split, with_blocks

@@ -15,7 +15,7 @@ from csac_jax.config import OffsetNet
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from experiments.bench import between_cells
 from tests.agent import toys
 

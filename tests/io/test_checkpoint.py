@@ -20,7 +20,7 @@ from csac_jax import presets
 from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint, leaves, renames
 from csac_jax.io.checkpoint import CheckpointError
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 
 CFG = presets.smoke()
 

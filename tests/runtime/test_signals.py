@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from csac_jax.io import checkpoint
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 
 pytestmark = [pytest.mark.mjx, pytest.mark.optax, pytest.mark.slow]
 

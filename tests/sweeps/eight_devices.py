@@ -16,7 +16,7 @@ import numpy as np
 
 from csac_jax.io import checkpoint
 from csac_jax.sweeps import replicas
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from tests.training import toys
 from tests.training.test_step import leaves
 

@@ -17,7 +17,7 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.sweeps import replicas
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from tests.sweeps.eight_devices import difference
 
 SCENES = 8

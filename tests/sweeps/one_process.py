@@ -12,7 +12,7 @@ from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from tests.training import toys
 
 

@@ -9,7 +9,7 @@ from csac_jax.config import Config
 from csac_jax.errors import SettingsError
 from csac_jax.io import configs
 from csac_jax.sweeps import grid
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 
 
 def _points(varied: list[str]) -> list[grid.SweepPoint]:

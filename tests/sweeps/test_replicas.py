@@ -11,7 +11,7 @@ import pytest
 from csac_jax import algorithms, presets
 from csac_jax.sweeps import replicas
 from csac_jax.sweeps.replicas import SweepProgram
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from tests.training import toys
 
 pytestmark = pytest.mark.optax

@@ -19,7 +19,7 @@ from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.replicas import ProgramGroup
 from csac_jax.sweeps.runner import SweepError, SweepPlan
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from tests.training import test_loop
 from tests.training.test_loop import CFG, Fake, State
 

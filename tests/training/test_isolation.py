@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from csac_jax.training.step import TrainState
 from csac_jax.training.transitions import StepMetrics
 

@@ -52,7 +52,7 @@ class Fake:
         self._nan_at, self._ill, self._lost_at = nan_at, (ill_from, ill_to), lost_at
 
     def compile_chunk(self, num_steps: int):
-        """Stands in for `program.compile_chunk`, with the program bound."""
+        """Stands in for `programs.compile_chunk`, with the program bound."""
         self.compiled.append(num_steps)
         return jax.jit(
             lambda state: jax.lax.scan(self._step, state, length=num_steps), donate_argnums=0

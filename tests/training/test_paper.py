@@ -16,7 +16,7 @@ from csac_jax.env import Env
 from csac_jax.io import checkpoint
 from csac_jax.nets import chunked_vmap
 from csac_jax.sweeps import replicas
-from csac_jax.training import program as programs, step
+from csac_jax.training import programs, step
 from tests.sweeps.test_replicas import assert_close
 from tests.training.test_step import assert_same, copy, equal, leaves
 

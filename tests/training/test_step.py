@@ -25,7 +25,7 @@ from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs, split_step, step, trace_cache, transitions
+from csac_jax.training import programs, split_step, step, trace_cache, transitions
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision.heightmap import Observation

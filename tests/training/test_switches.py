@@ -13,7 +13,7 @@ from csac_jax.env import Env, Info, State
 from csac_jax.scene import layout, model
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs, step, transitions
+from csac_jax.training import programs, step, transitions
 from csac_jax.vision.heightmap import Observation
 
 LEVELS = jnp.arange(len(Outcome), dtype=jnp.int32)

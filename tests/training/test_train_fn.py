@@ -8,7 +8,7 @@ import pytest
 
 import csac_jax
 from csac_jax.io import checkpoint
-from csac_jax.training import program as programs, trace_cache
+from csac_jax.training import programs, trace_cache
 from tests.agent import toys
 from tests.training.test_step import leaves
 
