@@ -19,7 +19,7 @@ from csac_jax.io import checkpoint, files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import final, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import loop, step
+from csac_jax.training import loop, programs, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
@@ -262,10 +262,9 @@ def test_policies_are_measured_with_their_own_robot(
 
 def _with_toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """Puts a small step in place of the learner's."""
-    toy = {"make": lambda cfg, *_, **__: toys.program(cfg)}
-    toy |= {"init_state": toys.init_state, "train_step": toys.train_step}
-    for name, part in toy.items():
-        monkeypatch.setattr(step, name, part)
+    monkeypatch.setattr(programs, "make", lambda cfg, *_, **__: toys.program(cfg))
+    monkeypatch.setattr(programs, "init_state", toys.init_state)
+    monkeypatch.setattr(step, "train_step", toys.train_step)
 
 
 @pytest.mark.optax
