@@ -838,7 +838,7 @@ def test_automatic_physics_is_resolved(monkeypatch: pytest.MonkeyPatch):
     begun = []
     monkeypatch.setattr(api, "Terminal", Terminal)
     monkeypatch.setattr(api.cache, "enable", lambda: None)
-    monkeypatch.setattr(api.step, "make", lambda cfg, **_: None)
+    monkeypatch.setattr(api.programs, "make", lambda cfg, **_: None)
     monkeypatch.setattr(api.loop, "run", lambda cfg, *_, **__: begun.append(cfg) or SUMMARY)
     for flags in (["smoke", "--seed", "3"], ["--resume", str(folder)]):
         assert cli.main(["train", *flags, "--sim.physics", "auto"]) == 0
