@@ -114,7 +114,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     assert isinstance(learner, CSAC)
     parts = learner.parts
     scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
-    keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
+    keys, key = step.numbered_keys(jax.random.key(1), num), jax.random.key(2)
     choose = jax.vmap(policy.act, (0, None, 0, 0, None))
 
     def act(keys: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
@@ -134,7 +134,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         return ring.add(replay, transition, ~after.info.physics_diverged)
 
     def replace(keys: jax.Array, after: Any) -> Any:
-        return step._where(after.done, jax.vmap(env.auto_reset)(keys, after), after)
+        return transitions.where(after.done, jax.vmap(env.auto_reset)(keys, after), after)
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
@@ -203,7 +203,7 @@ def _learning(
         return jax.vmap(actor_critic.next_value, (None, 0, 0))(parts, keys, maps)
 
     draw = jit(
-        lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
+        lambda replay: step.draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
     )
     value = jit(next_value)
     critic = jit(
