@@ -253,20 +253,6 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     _assert_same(state.scenes, fresh.scenes)
 
 
-@pytest.mark.slow
-@pytest.mark.mjx
-@pytest.mark.optax
-def test_complete_run_is_made_longer(trained, tmp_path: Path):
-    """Claim: a complete run that is resumed with more `train.actions` takes them."""
-    run, _ = trained
-    records: list[Record] = []
-    longer = SMOKE.change(train={"actions": 72})
-    done = api.train(longer, run.run_dir, resume=True, callbacks=[records.append], verbose=False)
-    assert [record.actions for record in records] == [72]
-    assert (done.summary.step, done.summary.actions) == (36, 72)
-    assert int(_saved(done).learner.updates) > 0
-
-
 class Sweeps:
     """Stands in for `runner.run`: keeps what it is called with."""
 

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import algorithms, presets
 from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint
 from csac_jax.replay import ring
@@ -251,14 +250,3 @@ def test_runs_must_fit_together(monkeypatch: pytest.MonkeyPatch):
         else:
             with pytest.raises(SettingsError, match=r"replay\.capacity: .* enough for 4 of 6 runs"):
                 runner.check_room(plan, devices)
-
-
-def test_plan_of_an_older_version_is_read():
-    """Claim: the file of a sweep that an older version began is read, whatever its settings were
-    called then."""
-    plan = runner.read_plan(Path(__file__).parent / "stored")
-    assert (plan.seeds, [point.name for point in plan.points]) == (2, ["algo=csac", "algo=vpg"])
-    assert [point.cfg for point in plan.points] == [
-        algorithms.configure(presets.smoke(), algo).change(seed=3)
-        for algo in ("csac", "vpg_episodic")  # what `vpg` was
-    ]
