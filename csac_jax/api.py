@@ -25,14 +25,7 @@ from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
-from csac_jax.training import (
-    callbacks as followers,
-    loop,
-    memory,
-    program as programs,
-    sharding,
-    split_step,
-)
+from csac_jax.training import callbacks as followers, loop, memory, programs, sharding, split_step
 from csac_jax.training.callbacks import Callback, Record, Summary
 from csac_jax.training.progress import Terminal
 from csac_jax.training.sharding import Shard
@@ -292,7 +285,6 @@ def _is_weights(source: str | Path) -> bool:
 
 
 def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
-    """Returns the points of every combination of the values."""
     for name in vary:
         grid.kind_of(name)
 
@@ -303,11 +295,11 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
         base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
         return programs.replace_settings(base, settings)
 
-    return grid.combine(vary, configure)
+    points: list[SweepPoint] = _checked(grid.combine, vary, configure)
+    return points
 
 
 def _first_line(folder: Path, cfg: Config) -> str:
-    """Describes a run that begins."""
     scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
     return (
         f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "

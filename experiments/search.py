@@ -30,7 +30,7 @@ from csac_jax.sim import backend
 from csac_jax.sweeps import grid, runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult, SweepRun, runs_of
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 
 METHODS = ("grasp_only", "reactive", "vpg", "csac", "csac_per", "csac_beta")
 FIRST_SEED = 1_000_000  # of the search: results begin at 0

@@ -22,7 +22,7 @@ from csac_jax.io import checkpoint, configs, policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
-from csac_jax.training import program as programs, step
+from csac_jax.training import programs, step
 from csac_jax.training.callbacks import Record
 from csac_jax.vision.heightmap import Observation
 
@@ -30,10 +30,11 @@ SMOKE = presets.smoke().change(sim={"physics": "c"})  # compiles in half of the 
 
 
 def test_public_names_exist():
-    """Claim: every name of `__all__` is there, and `dir` lists them."""
+    """Claim: every name of `__all__` is there, `dir` lists them, and no other name exists."""
     for name in csac_jax.__all__:
         assert getattr(csac_jax, name).__doc__, name
     assert set(csac_jax.__all__) < set(dir(csac_jax))
+    assert not hasattr(csac_jax, "make_robot")
 
 
 def test_import_leaves_jax_alone():
@@ -44,11 +45,6 @@ def test_import_leaves_jax_alone():
             [sys.executable, "-c", f"{code}; {loaded}"], check=True, capture_output=True, text=True
         )
         assert out.stdout.strip().endswith("set()")
-
-
-def test_unknown_name_is_an_attribute_error():
-    """Claim: a name that the package lacks is an AttributeError that says so."""
-    assert not hasattr(csac_jax, "make_robot")
 
 
 def _learner_state(cfg: Config, seed: int = 0) -> LearnerState:
@@ -86,28 +82,20 @@ def _assert_starts_from(state: LearnerState, params: Params, fresh: LearnerState
     assert int(state.updates) == 0
 
 
-def test_first_state_has_the_networks_of_the_policy(tmp_path: Path):
-    """Claim: `init` puts a policy's networks into online and target ones; the optimisers are those
-    of a fresh run."""
+@pytest.mark.parametrize("seeds", [None, 2, 3])
+def test_first_states_have_the_networks_of_the_policy(tmp_path: Path, seeds: int | None):
+    """Claim: `init` puts a policy's networks into online and target ones of a run, or of each run
+    of a sweep, whose states have an axis of runs; the optimisers are those of a fresh run."""
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
-    start = api.initial_networks(SMOKE, tmp_path / "policy.safetensors")
-    assert start is not None
-    fresh = _learner_state(SMOKE)
-    _assert_starts_from(start(fresh), params, fresh)
+    start: Any = api.initial_networks(SMOKE, tmp_path / "policy.safetensors")
     assert api.initial_networks(SMOKE, None) is None
-
-
-@pytest.mark.parametrize("seeds", [2, 3])
-def test_first_states_of_several_runs_have_the_networks_of_the_policy(tmp_path: Path, seeds: int):
-    """Claim: so do the runs of a sweep, each of them, whose states have an axis of runs."""
-    params = _policy(tmp_path / "policy.safetensors", SMOKE)
-    start = api.initial_networks(SMOKE, tmp_path / "policy.safetensors")
-    assert start is not None
-    each = [_learner_state(SMOKE, seed) for seed in range(seeds)]
-    found = start(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
-    for k, fresh in enumerate(each):
-        own = jax.tree.map(lambda leaf, k=k: leaf[k], found)
-        _assert_starts_from(own, params, fresh)
+    states = [_learner_state(SMOKE, seed) for seed in range(seeds or 1)]
+    if seeds is None:
+        _assert_starts_from(start(states[0]), params, states[0])
+        return
+    started = start(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    for k, fresh in enumerate(states):
+        _assert_starts_from(jax.tree.map(lambda leaf, k=k: leaf[k], started), params, fresh)
 
 
 def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
@@ -129,20 +117,19 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
     _assert_same(state.target, state.online)
 
 
+_DENSENET = {"net": {"kind": "densenet121", "margin": 0.0}}
+_TARGET = {"task": {"kind": "target"}}
+
+
 @pytest.mark.parametrize(
     "changes",
     [
         {"net": {"growth": 8}},
         {"net": {"dilations": (1, 2, 1)}},
         {"net": {"colour": False}},
-        pytest.param({"net": {"kind": "densenet121", "margin": 0.0}}, marks=pytest.mark.slow),
         {"learn": {"critics": 2}},
-        {"learn": {"critics": 2}, "task": {"kind": "target"}},
-        {"net": {"growth": 8}, "task": {"kind": "target"}},
-        pytest.param(
-            {"net": {"kind": "densenet121", "margin": 0.0}, "task": {"kind": "target"}},
-            marks=pytest.mark.slow,
-        ),
+        {"learn": {"critics": 2}} | _TARGET,
+        pytest.param(_DENSENET | _TARGET, marks=pytest.mark.slow),
     ],
 )
 def test_other_networks_are_refused(tmp_path: Path, changes: dict[str, Any]):
@@ -150,7 +137,7 @@ def test_other_networks_are_refused(tmp_path: Path, changes: dict[str, Any]):
     of one line, before there is a folder."""
     path = tmp_path / "policy.safetensors"
     _policy(path, SMOKE)
-    with pytest.raises(SettingsError, match=f"^--init {path}: its networks are not") as caught:
+    with pytest.raises(SettingsError, match=f"^init {path}: its networks are not") as caught:
         api.train(SMOKE.change(**changes), tmp_path / "run", init=path, verbose=False)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
@@ -217,35 +204,35 @@ def test_run_is_complete(trained, capsys: pytest.CaptureFixture):
 @pytest.mark.mjx
 @pytest.mark.optax
 def test_evaluated_run_is_the_same(trained, tmp_path: Path):
-    """Claim: evaluations on the way change no bit of a run's log and end; each is what `evaluate`
-    says of the state then; RUN/best is a run like any other; a resumed run goes on with them."""
+    """Claim: evaluations change no bit of a run's log and end; each is what `evaluate`
+    says of the state then; RUN/best is a run like any other; a resumed run continues them."""
     run, records = trained
 
     class Tables(csac_jax.Callback):
         def __init__(self) -> None:
-            self.found: dict[int, Any] = {}
+            self.tables: dict[int, Any] = {}
 
         def evaluated(self, record: Record, table: dict[str, Any]) -> None:
-            self.found[record.actions] = table
+            self.tables[record.actions] = table
 
     seen, again = Tables(), []
-    how = {"eval_every": 24, "eval_episodes": 3, "eval_suite": "in_distribution"}
-    done = api.train(SMOKE, tmp_path / "run", callbacks=[again.append, seen], verbose=False, **how)
+    plan = {"eval_every": 24, "eval_episodes": 3, "eval_suite": "in_distribution"}
+    done = api.train(SMOKE, tmp_path / "run", callbacks=[again.append, seen], verbose=False, **plan)
     timed = {"seconds": 0.0, "actions_per_second": 0.0}
     for one, other in zip(again, records, strict=True):
         assert dataclasses.replace(one, **timed) == dataclasses.replace(other, **timed)
     for part in ("step", "scenes", "learner", "replay"):
         _assert_same(getattr(_saved(done), part), getattr(_saved(run), part))
-    assert list(seen.found) == [24, 48, 64]
+    assert list(seen.tables) == [24, 48, 64]
     last = csac_jax.evaluate(done.policy, episodes=3, seed=monitor.SEED)
-    assert last == seen.found[64]
-    best = max(seen.found, key=lambda n: (monitor.score_of(seen.found[n]), -n))
+    assert last == seen.tables[64]
+    best = max(seen.tables, key=lambda n: (monitor.score_of(seen.tables[n]), -n))
     policy = csac_jax.load_policy(done.run_dir, which="best")
-    assert csac_jax.evaluate(policy, episodes=3, seed=monitor.SEED) == seen.found[best]
+    assert csac_jax.evaluate(policy, episodes=3, seed=monitor.SEED) == seen.tables[best]
     assert policy.params is not None
     longer = SMOKE.change(train={"actions": 72})
     api.train(longer, done.run_dir, resume=True, callbacks=[seen], verbose=False)
-    assert list(seen.found) == [24, 48, 64, 72]
+    assert list(seen.tables) == [24, 48, 64, 72]
 
 
 @pytest.mark.mjx
@@ -266,36 +253,20 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     _assert_same(state.scenes, fresh.scenes)
 
 
-@pytest.mark.slow
-@pytest.mark.mjx
-@pytest.mark.optax
-def test_complete_run_is_made_longer(trained, tmp_path: Path):
-    """Claim: a complete run that is resumed with more `train.actions` takes them."""
-    run, _ = trained
-    records: list[Record] = []
-    longer = SMOKE.change(train={"actions": 72})
-    done = api.train(longer, run.run_dir, resume=True, callbacks=[records.append], verbose=False)
-    assert [record.actions for record in records] == [72]
-    assert (done.summary.step, done.summary.actions) == (36, 72)
-    assert int(_saved(done).learner.updates) > 0
-
-
 class Sweeps:
-    """In place of `runner.run`: keeps what it is called with."""
+    """Stands in for `runner.run`: keeps what it is called with."""
 
     def __init__(self) -> None:
         self.called: list[Any] = []
-        self.resume: list[bool] = []
 
     def __call__(self, plan, folder, make_program, reporter, stop, resume=False) -> SweepResult:
         self.called.append((plan, folder, make_program, stop))
-        self.resume.append(resume)
         return SweepResult({"seeds": plan.seeds}, [], None)
 
 
 @pytest.fixture
 def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Sweeps:
-    """No run is trained, folders are made in `tmp_path`."""
+    """A sweep that trains no run; folders are made in `tmp_path`."""
     stub = Sweeps()
     monkeypatch.setattr(api.runner, "run", stub)
     monkeypatch.chdir(tmp_path)
@@ -304,11 +275,19 @@ def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Sweeps:
 
 def test_sweep_has_every_combination(sweeps: Sweeps, capsys: pytest.CaptureFixture):
     """Claim: `sweep` runs every combination of the values, algorithms before settings, and returns
-    the summary; it says which folder it takes."""
+    the summary; it says which folder it takes, unless told not to. With nothing to vary there is
+    one point; folder and stop are the caller's."""
+    mine = Stop()
+    api.sweep(SMOKE, run_dir="mine", stop=mine, verbose=False)
+    ((plan, folder, _, stop),) = sweeps.called
+    assert (plan.seeds, [point.cfg for point in plan.points]) == (4, [SMOKE])
+    assert (folder, stop) == (Path("mine"), mine)
+    assert capsys.readouterr().out == ""
+    sweeps.called.clear()
     vary = {"learn.tau": (0.1, 0.2), "algo": ("csac", "vpg"), "replay.capacity": (128,)}
     assert api.sweep(SMOKE.change(seed=3), 2, vary) == {"seeds": 2}
     ((plan, folder, _, stop),) = sweeps.called
-    assert (plan.seeds, sweeps.resume, stop.signal) == (2, [False], None)
+    assert (plan.seeds, stop.signal) == (2, None)
     assert folder.parent == Path("runs")
     assert folder.name.startswith("sweep-smoke-20")
     assert f"sweep {folder}" in capsys.readouterr().out
@@ -320,17 +299,6 @@ def test_sweep_has_every_combination(sweeps: Sweeps, capsys: pytest.CaptureFixtu
         assert point.values == {"learn.tau": str(tau), "algo": algo, "replay.capacity": "128"}
         wanted = algorithms.configure(SMOKE.change(seed=3), algo)
         assert point.cfg == wanted.change(learn={"tau": tau}, replay={"capacity": 128})
-
-
-def test_sweep_of_seeds_alone_is_one_point(sweeps: Sweeps, tmp_path: Path, capsys):
-    """Claim: with nothing to vary there is one point; the folder and the stop are the caller's, and
-    nothing is printed unless it is asked for."""
-    stop = Stop()
-    api.sweep(SMOKE, run_dir=tmp_path / "mine", stop=stop, verbose=False)
-    ((plan, folder, _, given),) = sweeps.called
-    assert (plan.seeds, [point.cfg for point in plan.points]) == (4, [SMOKE])
-    assert (folder, given) == (tmp_path / "mine", stop)
-    assert capsys.readouterr().out == ""
 
 
 def test_sweep_decides_on_physics(sweeps: Sweeps, monkeypatch: pytest.MonkeyPatch):
@@ -368,10 +336,10 @@ def test_runs_of_a_sweep_start_from_a_policy(sweeps: Sweeps, tmp_path: Path, mon
     [
         ({"vary": {"learn.bath": (1,)}}, r"'learn\.bath' is no setting"),
         ({"vary": {"learn": (1,)}}, r"'learn' is no setting"),
-        ({"vary": {"seed": (1, 2)}}, r"seeds are varied by"),
+        ({"vary": {"seed": (1, 2)}}, r"leave seed out"),
         ({"vary": {"learn.tau": (2.0,)}}, r"^learn\.tau: must be above 0"),
         ({"vary": {"algo": ("dqn",)}}, r"unknown algorithm 'dqn'"),
-        ({"devices": 10_000}, r"--devices: 10000 asked for"),
+        ({"devices": 10_000}, r"devices: 10000 asked for"),
     ],
 )
 def test_sweep_refuses_what_cannot_be(sweeps: Sweeps, arguments: dict[str, Any], message: str):

@@ -1,10 +1,10 @@
-"""Where this user's programs cache what they trust."""
+"""The user's cache folder."""
 
 import os
 import pathlib
 import stat
 from pathlib import Path
-from typing import NoReturn
+from unittest import mock
 
 import pytest
 
@@ -19,20 +19,15 @@ def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "cache"
 
 
-def _nobody(*_: object) -> NoReturn:
-    raise RuntimeError("Could not determine home directory.")
-
-
 def test_only_the_user_can_read_it(home: Path):
     """Claim: every folder below the cache directory is made with mode 0700."""
     folder = cache_folder.private("xla", "a")
     assert folder == home / "csac_jax" / "xla" / "a"
-    for each in (folder, folder.parent, folder.parent.parent):
-        assert stat.S_IMODE(each.stat().st_mode) == 0o700
+    for level in (folder, folder.parent, folder.parent.parent):
+        assert stat.S_IMODE(level.stat().st_mode) == 0o700
 
 
-@pytest.mark.parametrize("level", range(3))
-@pytest.mark.parametrize("mode", [0o770, 0o707, 0o777])
+@pytest.mark.parametrize(("level", "mode"), [(0, 0o770), (1, 0o707), (2, 0o777)])
 def test_folder_that_others_can_write_is_not_used(level: int, mode: int):
     """Claim: where others can write into the folder, or one above it, nothing is cached."""
     folder = cache_folder.private("xla", "a")
@@ -57,7 +52,7 @@ def test_user_without_a_home_caches_nothing(monkeypatch: pytest.MonkeyPatch):
     nothing fails."""
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.delenv("HOME", raising=False)
-    monkeypatch.setattr(pathlib.Path, "home", _nobody)
+    monkeypatch.setattr(pathlib.Path, "home", mock.Mock(side_effect=RuntimeError("no home")))
     assert cache_folder.private("pools") is None
     assert cache._folder() is None
 

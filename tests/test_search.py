@@ -14,8 +14,7 @@ from csac_jax.io import configs
 from csac_jax.runtime import signals
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.replicas import group_configs
-from csac_jax.training import program as programs, step
-from csac_jax.training.program import Hyperparams
+from csac_jax.training import programs, step
 from csac_jax.training.step import Program, TrainState
 from experiments import search
 from tests.training import toys
@@ -61,10 +60,10 @@ def test_values_fill_their_ranges():
         assert 0.42 < np.mean(values < middle) < 0.58, name  # a binomial's 3 sigma: 0.075
 
 
-def _train_step(program: Program, state: TrainState, hyperparams: Hyperparams | None = None):
+def _train_step(program: Program, state: TrainState):
     """The small step, with grasps that succeed more often for a larger discount."""
-    state, metrics = toys.train_step(program, state, hyperparams)
-    gamma = programs.replace_hyperparams(program, hyperparams).cfg.target.gamma
+    state, metrics = toys.train_step(program, state)
+    gamma = program.cfg.target.gamma
     outcome = jnp.where(jnp.abs(state.scenes) < 0.2 + gamma, 4, 2).astype(jnp.int32)
     return state, metrics._replace(outcome=outcome)
 

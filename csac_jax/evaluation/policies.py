@@ -21,7 +21,7 @@ from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.sim import oracle
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from csac_jax.vision.heightmap import Observation
 
 Which = int | Literal["last", "best"]  # checkpoint of a run, see `load`

@@ -16,7 +16,7 @@ _LARGEST = 5  # networks of DenseNet-121 in a chunk, ours: five seeds are one, 1
 
 
 class Batching(NamedTuple):
-    """How the networks of a learner work where its runs are vmapped."""
+    """The way in which the networks of vmapped runs work."""
 
     side_by_side: bool = False  # in the form for several runs, see `Networks.side_by_side`
     networks_at_once: int | None = None  # one chunk of `vmap_in_chunks`; None: all

@@ -48,7 +48,7 @@ def enable() -> Path | None:
 
 
 def _date_entries(folder: Path) -> None:
-    """Dates entries that a killed process left without a time of last use; JAX fails on them."""
+    """Sets the time of last use of entries that a killed process left; JAX fails without."""
     for entry in folder.glob("*-cache"):
         last_use = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
         if not last_use.exists():

@@ -84,7 +84,7 @@ def has_library() -> bool:
 
 
 def _convolve(maps: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Convolves maps [B, H, W, I] with a kernel [3, 3, I, O], zeros around."""
+    """Returns the convolution of maps [B, H, W, I] with a kernel [3, 3, I, O], zeros around."""
     layout = ("NHWC", "HWIO", "NHWC")
     sides = [(1, 1)] * 2
     return jax.lax.conv_general_dilated(maps, kernel, (1, 1), sides, dimension_numbers=layout)

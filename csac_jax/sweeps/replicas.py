@@ -21,8 +21,8 @@ from csac_jax.config import Config, SmallNet
 from csac_jax.nets import chunked_vmap
 from csac_jax.nets.chunked_vmap import Batching
 from csac_jax.runtime import compiler
-from csac_jax.training import memory, program as programs, step
-from csac_jax.training.program import Hyperparams
+from csac_jax.training import memory, programs, step
+from csac_jax.training.programs import Hyperparams
 from csac_jax.training.sharding import AXIS, Shard
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
@@ -127,7 +127,7 @@ class SweepProgram:
         return self._jitted_init().eval_shape(self.replicas)
 
     def compile_chunk(self, num_steps: int) -> Any:
-        """Jits a function state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
+        """Returns a jitted state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
 
         The state is donated. With a mesh over seeds each device scans its own replicas; metrics end
         up on every device.

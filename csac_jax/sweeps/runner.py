@@ -70,7 +70,7 @@ class SweepRun(NamedTuple):
 
 
 class SweepResult(NamedTuple):
-    """How a sweep ended."""
+    """The end of a sweep."""
 
     summary: dict[str, Any]  # as in summary.json
     compile_seconds: list[float]  # of each group that was compiled
@@ -95,26 +95,15 @@ def run(
     if not resume and cluster.is_first():
         folder.mkdir(parents=True)
         files.replace(folder / files.SWEEP_PLAN, plan_text(plan))
-    with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
-        return _run(plan, folder, make_program, reporter, stop)
-
-
-def _run(
-    plan: SweepPlan,
-    folder: Path,
-    make_program: Callable[[ProgramGroup], SweepProgram],
-    reporter: loop.Reporter,
-    stop: Stop,
-) -> SweepResult:
-    """Runs as `run` does; nobody else writes in the folder."""
     sweep = _Sweep(folder, groups_of(plan), reporter, stop)
-    for index, (group, _) in enumerate(sweep.groups):
-        group_folder = folder / "groups" / str(index)
-        if not sweep.stopping() and not (group_folder / DONE).exists():
-            sweep.train_group(index, group_folder, make_program(group))
-    summary = summarise(plan, folder)
-    if cluster.is_first():
-        files.write_json(folder / SUMMARY, summary)
+    with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
+        for index, (group, _) in enumerate(sweep.groups):
+            group_folder = folder / "groups" / str(index)
+            if not sweep.stopping() and not (group_folder / DONE).exists():
+                sweep.train_group(index, group_folder, make_program(group))
+        summary = summarise(plan, folder)
+        if cluster.is_first():
+            files.write_json(folder / SUMMARY, summary)
     done = f"done; saved in {folder}, results in {folder / SUMMARY}"
     stopped = f"stopped and saved; continue with: csac-jax sweep --resume {folder}"
     reporter.log(done if sweep.stopped is None else stopped)
@@ -281,7 +270,7 @@ class _GroupTraining:
     def __init__(
         self, sweep_folder: Path, folder: Path, runs: list[SweepRun], program: SweepProgram
     ) -> None:
-        """Continues from the newest checkpoint, if there is one, and cuts the logs to it."""
+        """Restores the newest checkpoint, if there is one, and cuts the logs to it."""
         self.folder, self.runs, self.program, self.cfg = folder, runs, program, runs[0].cfg
         self.paths = [sweep_folder / run.folder for run in runs]
         self.loop_states = [loop.LoopState(0.0, [])] * len(runs)
@@ -290,9 +279,8 @@ class _GroupTraining:
             self.state = program.init()
         else:
             self.state, extra = checkpoint.restore(folder, program.abstract())
-            stored = extra["runs"] if "runs" in extra else extra["members"]  # its older name
-            self.loop_states = [loop.LoopState(*loop_state) for loop_state, _ in stored]
-            self.failed = [failed for _, failed in stored]
+            self.loop_states = [loop.LoopState(*loop_state) for loop_state, _ in extra["runs"]]
+            self.failed = [failed for _, failed in extra["runs"]]
             if cluster.is_first():
                 checkpoint.set_aside(folder)
         self.step = int(self.state.step)

@@ -75,10 +75,12 @@ class Callback:
 
 def joined(callbacks: Sequence[Callback | Callable[[Record], None]]) -> Callback:
     """Joins callbacks into one, called in order; functions are called with each chunk's record."""
-    return _Joined([call if isinstance(call, Callback) else _Function(call) for call in callbacks])
+    return _Joined(
+        [call if isinstance(call, Callback) else _FunctionCallback(call) for call in callbacks]
+    )
 
 
-class _Function(Callback):
+class _FunctionCallback(Callback):
     def __init__(self, call: Callable[[Record], None]) -> None:
         self._call = call
 

@@ -9,7 +9,7 @@ import jax
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
 from csac_jax.replay import ring
-from csac_jax.training import program, split_step
+from csac_jax.training import programs, split_step
 
 GIB = 2**30
 
@@ -25,7 +25,7 @@ def limit() -> int:
 
 def state_bytes(cfg: Config) -> dict[str, int]:
     """Returns the bytes of a run's state by part; tracing the networks takes seconds."""
-    state = program.abstract_state(cfg)
+    state = programs.abstract_state(cfg)
     parts = {"replay": state.replay, "scenes": state.scenes, "networks": state.learner}
 
     def size(part: Any) -> int:
@@ -36,7 +36,7 @@ def state_bytes(cfg: Config) -> dict[str, int]:
 
 def check(cfg: Config, runs: int = 1) -> None:
     """Raises SettingsError if a device cannot hold the rings of `runs` runs side by side."""
-    available, slot = limit(), ring.bytes_needed(1, program.example(cfg))
+    available, slot = limit(), ring.bytes_needed(1, programs.example(cfg))
     needed, capacity = runs * cfg.replay.capacity * slot, available // (runs * slot)
     if needed <= available:
         return

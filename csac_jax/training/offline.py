@@ -18,7 +18,7 @@ from csac_jax.config import Config
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.ring import ReplayState
 from csac_jax.runtime import compiler
-from csac_jax.training import program as programs, step
+from csac_jax.training import programs, step
 from csac_jax.training.step import Program
 
 
@@ -55,7 +55,7 @@ def fill(program: Program, transitions: Transition) -> ReplayState:
 
 @functools.lru_cache(maxsize=2)
 def compile_step(program: Program):
-    """Jits a function state -> (state, losses), of one step; the state is donated."""
+    """Returns a jitted function state -> (state, losses), of one step; the state is donated."""
 
     cfg = program.cfg
 

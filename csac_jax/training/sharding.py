@@ -26,7 +26,7 @@ def map_scenes(mesh: Mesh | None, function: Callable) -> Callable:
 
 
 def shard_batch(mesh: Mesh | None, tree: Any) -> Any:
-    """Lays out leaves [B, ...], of which each device of a mesh holds its share."""
+    """Splits leaves [B, ...] among the devices of a mesh."""
     if mesh is None:
         return tree
     along = NamedSharding(mesh, PartitionSpec(AXIS))

@@ -13,13 +13,13 @@ import numpy as np
 
 from csac_jax.config import Config
 from csac_jax.runtime import compiler
-from csac_jax.training import program as programs, step, trace_cache
+from csac_jax.training import programs, step, trace_cache
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 
 
 def compile_chunk(program: Program, num_steps: int, cached: bool = False) -> Any:
-    """Returns a chunk as `program.compile_chunk` does, or one that has `lower` alone.
+    """Returns a chunk as `programs.compile_chunk` does, or one that has `lower` alone.
 
     With `cached`, traced programs are cached on disk where they can be, see `trace_cache`: for a
     program without parts of a user's own.

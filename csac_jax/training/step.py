@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from csac_jax import env as environment
 from csac_jax.agent import augment
 from csac_jax.agent.csac import CSAC
-from csac_jax.agent.learner import Learner
+from csac_jax.agent.learner import Learner, Transition
 from csac_jax.config import Config
 from csac_jax.env import Env
 from csac_jax.replay import ring
@@ -58,7 +58,7 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
 
 def act_half(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
-    """Acts and remembers, lines 8-15; the metrics are those of a step that learns nothing."""
+    """Takes the actions of a step and stores them, lines 8-15; metrics without losses."""
     cfg, env, learner, scenes = program.cfg, program.env, program.learner, state.scenes
     key_act, _, key_reset = _step_keys(state.key, state.step)
 
@@ -106,24 +106,19 @@ def learn(
 
     Returns: the learner's state, the priorities of the replay [C], the losses by name.
     """
-    cfg, learner, sampler = program.cfg, program.learner, program.sampler
+    cfg, learner = program.cfg, program.learner
     total = max(cfg.train.steps * cfg.learn.updates, 1)
 
     def update(carry: tuple[Any, jax.Array], i: jax.Array) -> Any:
         state, priority = carry
-        key_sample, key_augment, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
+        *keys_draw, key_update = jax.random.split(jax.random.fold_in(key, i), 3)
         progress = (done + i).astype(jnp.float32) / total
         current = replay.replace(priority=priority)
 
-        # Draw a batch (lines 15-16).
-        slots, weights = sampler.sample(key_sample, current, progress, cfg.learn.batch)
-        batch = sharding.shard_batch(program.mesh, ring.gather(current, slots))
-        augmented = jax.vmap(augment.augment, (0, None, 0))
-        batch = augmented(numbered_keys(key_augment, cfg.learn.batch), cfg, batch)
-
-        # Update critic and targets (lines 17-21, 24-26).
+        # Draw a batch, then update critic and targets (lines 15-21, 24-26).
+        slots, weights, batch = draw(program, keys_draw, current, progress)
         state, info = learner.update(key_update, state, batch, weights)
-        current = sampler.update(current, slots, info.error)
+        current = program.sampler.update(current, slots, info.error)
         return (state, current.priority), (info, batch.obs)
 
     start, numbers = (state, replay.priority), jnp.arange(cfg.learn.updates)
@@ -141,6 +136,20 @@ def learn(
         "q_mean": jnp.mean(info.q),
     }
     return state, priority, losses
+
+
+def draw(
+    program: Program, keys: list[jax.Array], replay: ReplayState, progress: jax.Array
+) -> tuple[jax.Array, jax.Array, Transition]:
+    """Draws a batch by the sampler and augments it: slots [B], weights [B], leaves [B, ...].
+
+    Args: keys, to sample and to augment; progress [], share of all updates that are done.
+    """
+    cfg, (key_sample, key_augment) = program.cfg, keys
+    slots, weights = program.sampler.sample(key_sample, replay, progress, cfg.learn.batch)
+    batch = sharding.shard_batch(program.mesh, ring.gather(replay, slots))
+    augmented = jax.vmap(augment.augment, (0, None, 0))
+    return slots, weights, augmented(numbered_keys(key_augment, cfg.learn.batch), cfg, batch)
 
 
 def first_to_learn(cfg: Config) -> int:

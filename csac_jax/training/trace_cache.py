@@ -30,7 +30,7 @@ _UNTRACED = ("cache", "logging")  # parts of names of JAX's settings that leave 
 
 
 def jit(program: Program, half: Callable[..., Any], cached: bool) -> Any:
-    """Jits a half of `step.train_step`; what is returned has `lower` alone if it can be `cached`.
+    """Returns a jitted half of `step.train_step`, or what has `lower` alone if it can be `cached`.
 
     The state is donated. A cached program has no parts of a user's own.
     """

@@ -25,7 +25,7 @@ from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
 from csac_jax.runtime import compiler, provenance
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from csac_jax.vision.heightmap import Observation
 from experiments.bench._options import read
 from experiments.bench._timing import medians

@@ -31,7 +31,7 @@ from csac_jax.nets import dense, networks
 from csac_jax.nets.convolution import conv2d
 from csac_jax.runtime import compiler, provenance
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from csac_jax.vision import heightmap
 from experiments.bench._options import Parser, config, split
 from experiments.bench._timing import medians

@@ -43,7 +43,7 @@ from csac_jax.replay import ring
 from csac_jax.runtime import cache, compiler, provenance
 from csac_jax.sim import backend
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs, split_step, step, transitions
+from csac_jax.training import programs, split_step, step, transitions
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
 from experiments.bench._options import Parser, config, split, with_blocks
@@ -114,7 +114,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     assert isinstance(learner, CSAC)
     parts = learner.parts
     scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
-    keys, key = step._keys(jax.random.key(1), num), jax.random.key(2)
+    keys, key = step.numbered_keys(jax.random.key(1), num), jax.random.key(2)
     choose = jax.vmap(policy.act, (0, None, 0, 0, None))
 
     def act(keys: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
@@ -134,7 +134,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         return ring.add(replay, transition, ~after.info.physics_diverged)
 
     def replace(keys: jax.Array, after: Any) -> Any:
-        return step._where(after.done, jax.vmap(env.auto_reset)(keys, after), after)
+        return transitions.where(after.done, jax.vmap(env.auto_reset)(keys, after), after)
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     stages = {
@@ -203,7 +203,7 @@ def _learning(
         return jax.vmap(critic.next_value, (None, 0, 0))(parts, keys, maps)
 
     draw = jit(
-        lambda replay: step._draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
+        lambda replay: step.draw(program, list(jax.random.split(key)), replay, jnp.float32(0.5))
     )
     value = jit(next_value)
     learn_critic = jit(lambda nets, batch, weights: critic.update(key, parts, nets, batch, weights))

@@ -27,7 +27,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.runtime import cache, provenance
 from csac_jax.sim import backend
 from csac_jax.sweeps import replicas
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from experiments.bench._options import Parser, config, split
 
 KINDS = {  # the first that a kernel's name holds

@@ -27,7 +27,7 @@ from csac_jax.config import Config
 from csac_jax.runtime import compiler, provenance
 from csac_jax.sim import backend
 from csac_jax.sweeps import grid, replicas, runner
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from experiments.bench._options import Parser, config, split
 
 

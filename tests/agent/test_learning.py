@@ -15,7 +15,7 @@ from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.agent.actor_critic import ActorCritic, Params
 from csac_jax.constants import Primitive
 from csac_jax.env import State
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from tests.agent import toys
 from tests.agent.toys import Toy
 

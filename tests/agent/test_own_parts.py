@@ -15,7 +15,7 @@ from csac_jax.nets import dense
 from csac_jax.replay import ring
 from csac_jax.replay.samplers import Sample, Sampler
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs, step, transitions
+from csac_jax.training import programs, step, transitions
 from tests.agent import toys
 
 pytestmark = pytest.mark.optax

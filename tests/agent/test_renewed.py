@@ -17,7 +17,7 @@ from csac_jax.config import RewardConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from csac_jax.vision import heightmap
 from tests.agent import test_rewards
 

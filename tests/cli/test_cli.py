@@ -424,7 +424,7 @@ def test_examples_of_the_help_are_read(run_dir: Path, config_file: Path):
     ("device", "code", "line"),
     [
         ("cpu", 2, "csac-jax: there is no file or folder nowhere; give folders of runs"),
-        ("gpu", 2, "csac-jax: --device gpu: JAX finds none here; leave it out for the cpu"),
+        ("gpu", 2, "csac-jax: device gpu: JAX finds none here; leave it out for the cpu"),
     ],
 )
 def test_device_is_selected(device: str, code: int, line: str):
@@ -553,7 +553,7 @@ def test_automatic_physics_is_resolved(monkeypatch: pytest.MonkeyPatch):
     begun = []
     monkeypatch.setattr(api, "Terminal", Terminal)
     monkeypatch.setattr(api.cache, "enable", lambda: None)
-    monkeypatch.setattr(api.step, "make", lambda cfg, **_: None)
+    monkeypatch.setattr(api.programs, "make", lambda cfg, **_: None)
     monkeypatch.setattr(api.loop, "run", lambda cfg, *_, **__: begun.append(cfg) or SUMMARY)
     for flags in (["smoke", "--seed", "3"], ["--resume", str(folder)]):
         assert cli.main(["train", *flags, "--sim.physics", "auto"]) == 0

@@ -19,7 +19,7 @@ from csac_jax.errors import FailedError, SceneError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.render import gl
 from csac_jax.runtime import cache, signals
-from csac_jax.training import loop, program as programs
+from csac_jax.training import loop, programs
 from csac_jax.training.callbacks import Summary
 from csac_jax.training.progress import Terminal
 

@@ -19,7 +19,7 @@ from csac_jax.io import checkpoint, files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import final, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import loop, step
+from csac_jax.training import loop, programs, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
@@ -61,30 +61,30 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ),
         (
             "smoke --vary learn.tua=0.1",
-            "--vary: 'learn.tua' is no setting; perhaps you meant learn.tau",
+            "vary: 'learn.tua' is no setting; perhaps you meant learn.tau",
         ),
-        ("smoke --vary learn.tau=", "--vary learn.tau=: give a setting and its values"),
+        ("smoke --vary learn.tau=", "vary learn.tau=: give a setting and its values"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
         ("smoke --vary learn.tau=0.1,2", "learn.tau: must be above 0, at most 1, not 2.0"),
         ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
-        ("smoke --vary learn.tau=0.1,0.10", "--vary: two settings have the same values"),
-        ("smoke --devices 4096", "--devices: 4096 asked for, there are "),
+        ("smoke --vary learn.tau=0.1,0.10", "vary: two settings have the same values"),
+        ("smoke --devices 4096", "devices: 4096 asked for, there are "),
         (
             "smoke --sim.physics c --devices 2",
             "--sim.physics: c computes on the host's cores, for one device",
         ),
-        ("smoke --replay.capacity 65536 --seeds 9999", "lower --seeds or raise --devices"),
+        ("smoke --replay.capacity 65536 --seeds 9999", "lower seeds or raise devices"),
         ("smoke --seeds -1", "--seeds: at least 1"),
-        ("smoke --seeds 1000000", "--seeds: 1 to 10000 runs in all"),
-        ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "--seeds: 1 to 10000 runs in all"),
+        ("smoke --seeds 1000000", "seeds: 1 to 10000 runs in all"),
+        ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "seeds: 1 to 10000 runs in all"),
         (
             f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary explore.decay={TAUS}",
-            "--vary: more than 10000 combinations",
+            "vary: more than 10000 combinations",
         ),
         ("smoke --cluster", "several processes need --run-dir"),
         (
             "smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2",
-            "--process-id: must lie in 0 .. 1",
+            "process_id: must lie in 0 .. 1",
         ),
         ("smoke --run-dir .", ". exists; give another --run-dir"),
         ("--resume x --learn.tau 0.1", "leave all others out"),
@@ -173,7 +173,7 @@ def test_plans_without_evaluation_are_read(tmp_path: Path):
     (tmp_path / files.SWEEP_PLAN).write_text(json.dumps(content))
     assert command.read(["--resume", str(tmp_path)])[1] == plan._replace(episodes=0)
     (tmp_path / files.SWEEP_PLAN).write_text(json.dumps({**content, "episodes": "7"}))
-    with pytest.raises(runner.SweepError, match="--evaluate: 0 to"):
+    with pytest.raises(runner.SweepError, match="episodes: 0 to"):
         command.read(["--resume", str(tmp_path)])
 
 
@@ -261,10 +261,9 @@ def test_policies_are_measured_with_their_own_robot(
 
 def _with_toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """Puts a small step in place of the learner's."""
-    toy = {"make": lambda cfg, *_, **__: toys.program(cfg)}
-    toy |= {"init_state": toys.init_state, "train_step": toys.train_step}
-    for name, part in toy.items():
-        monkeypatch.setattr(step, name, part)
+    monkeypatch.setattr(programs, "make", lambda cfg, *_, **__: toys.program(cfg))
+    monkeypatch.setattr(programs, "init_state", toys.init_state)
+    monkeypatch.setattr(step, "train_step", toys.train_step)
 
 
 @pytest.mark.optax
@@ -281,7 +280,7 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
             ["smoke", "--seeds", "2", "--run-dir", "run"] if number == 2 else ["--resume", "run"]
         )
         assert cli.main(["sweep", *first]) == 128 + number
-        assert "go on with: csac-jax sweep --resume run" in capsys.readouterr().out
+        assert "continue with: csac-jax sweep --resume run" in capsys.readouterr().out
     monkeypatch.setattr(signals, "install", signals.Stop)
     assert cli.main(["sweep", "--resume", "run", "--json", "out.json"]) == 0
     assert "interquartile mean of 2 seeds" in capsys.readouterr().out
@@ -299,7 +298,7 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     ("arguments", "message"),
     [
         ("--seeds 0", "bench sweep: --seeds, --steps, --repeats: at least 1"),
-        ("--devices 4096", "bench sweep: --devices: 4096 asked for"),
+        ("--devices 4096", "bench sweep: devices: 4096 asked for"),
         ("fats", "bench sweep: unknown preset 'fats'"),
         (
             "--learn.batch 8000 --train.learning_starts 8000",

@@ -24,7 +24,7 @@ from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint, files
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import loop, program as programs, step, transitions
+from csac_jax.training import loop, programs, step, transitions
 from csac_jax.training.loop import TrainingError
 from tests.faults import harness, toy, toy_cli
 from tests.faults.harness import MissingToolError, Tally, fault

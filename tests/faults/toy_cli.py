@@ -10,7 +10,7 @@ from collections.abc import Callable
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 from csac_jax import cli
 from csac_jax.config import Config
-from csac_jax.training import memory, program as programs, split_step
+from csac_jax.training import memory, programs, split_step
 from tests.faults import toy
 
 OPTIONS = ("--train.scenes", f"{toy.E}", "--train.chunk", "1", "--train.save-every", "1")

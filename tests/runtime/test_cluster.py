@@ -5,17 +5,17 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
 import csac_jax
-from csac_jax.io import files
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import cluster
 from csac_jax.sweeps.runner import SUMMARY
+from tests.training import test_loop
 
 ROOT = Path(csac_jax.__file__).parents[1]
-UNTIMED = ("seconds", "actions_per_second")
 
 
 def _free_port() -> int:
@@ -25,25 +25,14 @@ def _free_port() -> int:
 
 
 def _sweep(folder: Path, processes: int, shard: str = "seeds", after: int = 0) -> list[int]:
-    """Exit codes of the processes of a sweep."""
+    """Returns the exit codes of the processes of a sweep."""
+    command = [sys.executable, "-m", "tests.sweeps.one_process", str(folder), str(after), shard]
     place = [f"127.0.0.1:{_free_port()}", str(processes)]
-    runs = []
-    for number in range(processes):
-        own = [*place, str(number)] if processes > 1 else []
-        command = [
-            sys.executable,
-            "-m",
-            "tests.sweeps.one_process",
-            str(folder),
-            str(after),
-            shard,
-            *own,
-        ]
-        variables = {**os.environ, "JAX_PLATFORMS": "cpu"}
-        variables.pop("XLA_FLAGS", None)
-        runs.append(
-            subprocess.Popen(command, cwd=ROOT, env=variables, stderr=subprocess.PIPE, text=True)
-        )
+    variables = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    variables.pop("XLA_FLAGS", None)
+    pipes: Any = {"cwd": ROOT, "env": variables, "stderr": subprocess.PIPE, "text": True}
+    numbers = [[*place, str(k)] for k in range(processes)] if processes > 1 else [[]]
+    runs = [subprocess.Popen([*command, *number], **pipes) for number in numbers]
     try:
         said = [run.communicate(timeout=300)[1] for run in runs]
     finally:
@@ -54,12 +43,8 @@ def _sweep(folder: Path, processes: int, shard: str = "seeds", after: int = 0) -
 
 
 def _logs(folder: Path) -> dict[str, list[dict]]:
-    """Every run's lines, without what depends on the clock."""
-    found = {path.parent.name: files.read_log(path) for path in folder.rglob("metrics.jsonl")}
-    return {
-        name: [{k: v for k, v in line.items() if k not in UNTIMED} for line in log]
-        for name, log in found.items()
-    }
+    """Returns every run's lines, without what depends on the clock."""
+    return {path.parent.name: test_loop._log(path.parent) for path in folder.rglob("metrics.jsonl")}
 
 
 def _assert_close(ours: dict[str, list[dict]], theirs: dict[str, list[dict]]) -> None:
@@ -67,12 +52,7 @@ def _assert_close(ours: dict[str, list[dict]], theirs: dict[str, list[dict]]) ->
     for name, log in ours.items():
         assert len(log) == len(theirs[name]) == 3
         for line, other in zip(log, theirs[name], strict=True):
-            assert line.keys() == other.keys()
-            for key, value in line.items():
-                if isinstance(value, float):
-                    np.testing.assert_allclose(value, other[key], 1e-5, err_msg=key)
-                else:
-                    assert value == other[key], key
+            assert line == pytest.approx(other, rel=1e-5, abs=0.0)
 
 
 @pytest.mark.slow
@@ -88,24 +68,15 @@ def test_two_processes_are_one(shard: str, tmp_path: Path):
     assert all(len(log) == 1 for log in _logs(tmp_path / "again").values())
     assert _sweep(tmp_path / "again", 2, shard) == [0, 0]
     assert _logs(tmp_path / "again") == _logs(tmp_path / "two")
-    assert sorted(path.name for path in (tmp_path / "two").iterdir()) == [
-        ".lock",
-        "a",
-        "groups",
-        SUMMARY,
-        "sweep.json",
-    ]
+    names = {path.name for path in (tmp_path / "two").iterdir()}
+    assert names == {".lock", "a", "groups", SUMMARY, "sweep.json"}
 
 
-def test_number_beyond_the_processes():
+def test_place_among_the_processes():
     """Claim: a process whose number is not among those that there are is refused before it waits
-    for anybody."""
-    with pytest.raises(ValueError, match=r"--process-id: must lie in 0 \.\. 1, not 2"):
+    for anybody; without other processes nobody is asked."""
+    with pytest.raises(SettingsError, match=r"process_id: must lie in 0 \.\. 1, not 2"):
         cluster.join("127.0.0.1:1", 2, 2)
-
-
-def test_one_process_agrees_with_itself():
-    """Claim: without other processes nobody is asked."""
     assert [cluster.agree(signal) for signal in (None, 2, 15)] == [None, 2, 15]
     assert cluster.is_first()
     cluster.wait("nobody")

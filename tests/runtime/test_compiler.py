@@ -28,16 +28,13 @@ def forgotten(monkeypatch: pytest.MonkeyPatch):
 def _convolutions(cfg) -> list[tuple[int, ...]]:
     """Side of the maps, channels in and out, kernel, stride, dilation, padding of each in the small
     net."""
-    side = round(cfg.heightmap.size * (1.0 + cfg.net.margin))
-    net, layers = cfg.net, enumerate(cfg.net.dilations)
+    side, net = round(cfg.heightmap.size * (1.0 + cfg.net.margin)), cfg.net
     stem = (side, 4, net.stem, 2 * net.stride, net.stride, 1, net.stride // 2)
-    return [
-        stem,
-        *(
-            (side // net.stride, net.stem + i * net.growth, net.growth, 3, 1, d, d)
-            for i, d in layers
-        ),
+    layers = [
+        (side // net.stride, net.stem + i * net.growth, net.growth, 3, 1, d, d)
+        for i, d in enumerate(net.dilations)
     ]
+    return [stem, *layers]
 
 
 @pytest.mark.parametrize("setting", _convolutions(presets.quick()))
@@ -54,61 +51,42 @@ def test_library_is_right(setting):
         out, back = jax.vjp(lambda maps, kernel: conv2d(maps, kernel, *rest), maps, kernel)
         return out, *back(gradient)
 
-    wanted, got = (
-        jax.jit(both, compiler_options=asked)(*drawn) for asked in (None, compiler.LIBRARY)
-    )
+    options = (None, compiler.LIBRARY)
+    wanted, got = (jax.jit(both, compiler_options=chosen)(*drawn) for chosen in options)
     for name, new, old in zip(("value", "maps", "kernel"), got, wanted, strict=True):
-        np.testing.assert_allclose(
-            new, old, rtol=0.0, atol=1e-5 * np.max(np.abs(old)), err_msg=name
-        )
+        bound = 1e-5 * np.max(np.abs(old))
+        np.testing.assert_allclose(new, old, rtol=0.0, atol=bound, err_msg=name)
 
 
 def test_library_takes_all_but_kernel_gradients():
     """Claim: the library computes values and maps' gradients of dense layers; kernel gradients stay
     with Eigen."""
-    maps, kernel, gradient = (
-        jnp.ones((20, 12, 12, 40)),
-        jnp.ones((3, 3, 40, 24)),
-        jnp.ones((20, 12, 12, 24)),
-    )
+    maps, kernel, gradient = map(jnp.ones, ((20, 12, 12, 40), (3, 3, 40, 24), (20, 12, 12, 24)))
+    conv = lambda m, k: conv2d(m, k, 1, 1, 1)  # noqa: E731
 
     def taken(function, *arguments) -> bool:
-        return (
-            TAKEN
-            in jax.jit(function, compiler_options=compiler.LIBRARY)
-            .lower(*arguments)
-            .compile()
-            .as_text()
-        )
+        lowered = jax.jit(function, compiler_options=compiler.LIBRARY).lower(*arguments)
+        return TAKEN in lowered.compile().as_text()
 
-    assert taken(lambda m, k: conv2d(m, k, 1, 1, 1), maps, kernel)
-    assert taken(
-        lambda g, k: jax.vjp(lambda m: conv2d(m, k, 1, 1, 1), maps)[1](g), gradient, kernel
-    )
-    assert not taken(
-        lambda g, m: jax.vjp(lambda k: conv2d(m, k, 1, 1, 1), kernel)[1](g), gradient, maps
-    )
+    assert taken(conv, maps, kernel)
+    assert taken(lambda g, k: jax.vjp(lambda m: conv(m, k), maps)[1](g), gradient, kernel)
+    assert not taken(lambda g, m: jax.vjp(lambda k: conv(m, k), kernel)[1](g), gradient, maps)
 
 
 @pytest.mark.usefixtures("forgotten")
-@pytest.mark.parametrize(
-    "asked", [{"xla_no_such_option": "1"}, {next(iter(compiler.LIBRARY)): "NO_SUCH_TYPE"}]
-)
-def test_an_xla_without_it_is_asked_for_nothing(
-    monkeypatch: pytest.MonkeyPatch, asked: dict[str, str]
-):
-    """Claim: where XLA does not know the library, training goes on without it."""
-    monkeypatch.setattr(compiler, "LIBRARY", asked)
-    assert not compiler.has_library()
-    assert compiler.options(presets.quick()) == compiler.SOONER
-
-
-@pytest.mark.usefixtures("forgotten")
-def test_a_library_that_is_wrong_is_not_used(monkeypatch: pytest.MonkeyPatch):
-    """Claim: it is used only where a convolution by it is right."""
-    convolve = compiler._convolve
-    monkeypatch.setattr(compiler, "_convolve", lambda *inputs: 1.001 * convolve(*inputs))
-    assert not compiler.has_library()
+def test_library_that_is_lacking_or_wrong_is_not_used(monkeypatch: pytest.MonkeyPatch):
+    """Claim: where XLA does not know the library, or it is wrong, training is compiled without."""
+    convolve, flag = compiler._convolve, next(iter(compiler.LIBRARY))
+    for name, value in (
+        ("LIBRARY", {"xla_no_such_option": "1"}),
+        ("LIBRARY", {flag: "NO_SUCH_TYPE"}),
+        ("_convolve", lambda *inputs: 1.001 * convolve(*inputs)),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(compiler, name, value)
+            compiler.has_library.cache_clear()
+            assert not compiler.has_library()
+            assert compiler.options(presets.quick()) == compiler.SOONER
 
 
 @pytest.mark.usefixtures("forgotten")
@@ -153,34 +131,28 @@ def test_products_of_densenet_are_the_vendors_on_a_gpu(
 
 def test_library_is_right_in_groups():
     """Claim: so is it for two critics side by side, whose convolutions are grouped."""
-    rng = np.random.default_rng(0)
-    maps, kernels = (
-        rng.normal(size=shape).astype(np.float32) for shape in ((2, 4, 9, 9, 40), (2, 3, 3, 40, 24))
-    )
-    each = jax.vmap(lambda maps, kernel: conv2d(maps, kernel, 1, 2, 2))
-    wanted, got = (
-        jax.jit(each, compiler_options=asked)(maps, kernels) for asked in (None, compiler.LIBRARY)
-    )
+    rng, shapes = np.random.default_rng(0), ((2, 4, 9, 9, 40), (2, 3, 3, 40, 24))
+    inputs = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
+    grouped = jax.vmap(lambda maps, kernel: conv2d(maps, kernel, 1, 2, 2))
+    options = (None, compiler.LIBRARY)
+    wanted, got = (jax.jit(grouped, compiler_options=chosen)(*inputs) for chosen in options)
     np.testing.assert_allclose(got, wanted, atol=1e-4)
 
 
 @pytest.mark.parametrize("was_on", [True, False])
 @pytest.mark.parametrize("fails", [False, True])
-def test_the_collector_rests_while_a_program_is_traced(was_on: bool, fails: bool):
-    """Claim: it is off as the function is traced, and as it was before after that, even if that
-    fails."""
+def test_collector_is_off_while_a_program_is_traced(was_on: bool, fails: bool):
+    """Claim: it is off as the function is traced, and as before after that, even on failure."""
     seen = []
 
     def function(x):
         seen.append(gc.isenabled())
-        if fails:
-            raise ZeroDivisionError
-        return 2.0 * x
+        return 2.0 * x if not fails else x / None
 
     try:
         if not was_on:
             gc.disable()
-        with pytest.raises(ZeroDivisionError) if fails else contextlib.nullcontext():
+        with pytest.raises(TypeError) if fails else contextlib.nullcontext():
             assert compiler.lower(jax.jit(function), 1.5).compile()(1.5) == 3.0
         assert gc.isenabled() == was_on
     finally:

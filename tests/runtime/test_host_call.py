@@ -1,4 +1,4 @@
-"""Functions of the host in compiled programs: values, errors, and programs found on disk."""
+"""Functions of the host in compiled programs: values, errors, and programs from the cache."""
 
 import os
 import subprocess
@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 
 from csac_jax.runtime import host_call
-from csac_jax.scene import model
-from csac_jax.sim.c_physics import CPhysics
-from tests.sim import conftest
 
 ROOT = Path(host_call.__file__).parents[2]
 RESULT = {
@@ -25,9 +22,9 @@ RESULT = {
 }
 
 
-def _function(given: dict[str, Any], number: Any) -> dict[str, Any]:
-    """Some result of a batch of any shape."""
-    x, axes = given["x"], np.shape(number)
+def _function(inputs: dict[str, Any], number: Any) -> dict[str, Any]:
+    """Computes some result of a batch of any shape."""
+    x, axes = inputs["x"], np.shape(number)
     return {
         "y": np.sin(x) + number[..., None],
         "count": np.full(axes, x.shape[-1], np.int32),
@@ -49,15 +46,13 @@ def test_call_is_that_of_jax(shape: tuple[int, ...]):
     """Claim: results are those of `jax.pure_callback`, of one call, of a batch and of a scan, for
     all types and an array without elements."""
     x = jnp.linspace(-1.0, 1.0, int(np.prod(shape))).reshape(shape)
-    found = []
+    results = []
     for call in (_ours, _theirs):
         for _ in shape[1:]:
             call = jax.vmap(call)
-        last, rows = jax.jit(
-            lambda x, call=call: jax.lax.scan(lambda c, _: (call(c)["y"], call(c)), x, length=3)
-        )(x)
-        found.append((last, rows))
-    jax.tree.map(np.testing.assert_array_equal, *found)
+        body = lambda c, _, call=call: (call(c)["y"], call(c))  # noqa: E731
+        results.append(jax.jit(lambda x, body=body: jax.lax.scan(body, x, length=3))(x))
+    jax.tree.map(np.testing.assert_array_equal, *results)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +61,7 @@ def test_call_is_that_of_jax(shape: tuple[int, ...]):
 )
 def test_error_of_the_function_is_raised(result: np.ndarray | None, error: str):
     """Claim: what the function raises, or returns in a wrong shape, is an error of the program that
-    says so; the process goes on."""
+    says so; the process continues."""
 
     def function(x: np.ndarray) -> np.ndarray:
         if result is None:
@@ -81,8 +76,7 @@ def test_error_of_the_function_is_raised(result: np.ndarray | None, error: str):
 
 PROGRAM = """
 import csac_jax, jax, numpy as np, sys
-from csac_jax.runtime import cache
-from csac_jax.runtime import host_call
+from csac_jax.runtime import cache, host_call
 cache.enable()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 factor = float(sys.argv[1])
@@ -98,29 +92,10 @@ def test_second_process_finds_the_program(tmp_path: Path):
     """Claim: a program that calls the host is taken from the cache by the next process, and calls
     that process's function."""
     settings = {"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
-    found = [
-        subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", PROGRAM, factor],
-            env={**os.environ, **settings},
-            capture_output=True,
-            text=True,
-            timeout=120,
-            cwd=ROOT,
-        )
-        for factor in ("2", "3")
-    ]
-    assert [done.returncode for done in found] == [0, 0], found[-1].stderr
-    assert found[0].stdout.split() == ["0", "0.0", "2.0", "4.0"]
-    assert found[1].stdout.split() == ["1", "0.0", "3.0", "6.0"]
-
-
-def test_key_tells_worlds_apart(c_world: model.World):
-    """Claim: worlds that are built alike have one key, others another."""
-    sim = conftest.CONFIG.change(sim={"physics": "c"}).sim
-    again = model.build(conftest.CONFIG.scene, sim)
-    arm = conftest.CONFIG.change(sim={"physics": "c", "robot": "ur5"}).sim
-    more = conftest.CONFIG.change(scene={"slots": (*conftest.CONFIG.scene.slots, "box")}).scene
-    key = CPhysics(c_world, sim)._key
-    assert CPhysics(again, sim)._key == key
-    assert CPhysics(c_world, arm)._key != key
-    assert CPhysics(model.build(more, sim), sim)._key != key
+    command = [sys.executable, "-W", "ignore", "-c", PROGRAM]
+    pipes: Any = {"env": {**os.environ, **settings}, "cwd": ROOT, "timeout": 120}
+    first, second = (
+        subprocess.check_output([*command, factor], text=True, **pipes) for factor in "23"
+    )
+    assert first.split() == ["0", "0.0", "2.0", "4.0"]
+    assert second.split() == ["1", "0.0", "3.0", "6.0"]

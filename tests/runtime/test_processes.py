@@ -18,17 +18,17 @@ _NAMES = "abcd"
 
 
 def _each(work: Any, jobs: int, folder: Path) -> tuple[dict[int, Any], list[tuple]]:
-    """What tasks of these names gave, by number, and what they said."""
-    found: dict[int, Any] = {}
-    heard: list[tuple] = []
+    """Returns results of tasks by number, and their reports."""
+    results: dict[int, Any] = {}
+    reports: list[tuple] = []
     tasks = [(name, folder, jobs) for name in _NAMES]
-    processes.each(work, tasks, jobs, lambda *said: heard.append(said), found.__setitem__)
-    return found, heard
+    processes.each(work, tasks, jobs, lambda *r: reports.append(r), results.__setitem__)
+    return results, reports
 
 
 def test_each_process_has_a_core(tmp_path: Path):
     """Claim: results come with their tasks' numbers, from processes with a core each, that compute
-    on the CPU; what they say is heard in order."""
+    on the CPU; their reports come in order."""
     found, heard = _each(workers.where, 2, tmp_path)
     assert "".join(found[number][0] for number in range(4)) == _NAMES
     by_process = {process: cores for _, cores, process, _ in found.values()}

@@ -34,15 +34,24 @@ def _start(rounds: int) -> subprocess.Popen:
     return process
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_first_signal_sets_the_flag(number: signal.Signals, code: int):
-    """Claim: the first signal lets the program come to its end, which is told of it, and says
-    so."""
+@pytest.mark.parametrize(
+    ("events", "code"),
+    [
+        ([signal.SIGINT], 130),
+        ([signal.SIGTERM], 143),
+        ([signal.SIGINT, 0.05, signal.SIGINT], 130),  # as of timeout(1)
+        ([signal.SIGINT, 0.2, signal.SIGTERM], 130),
+    ],
+)
+def test_first_signal_sets_the_flag(events: list, code: int):
+    """Claim: the first signal lets the program come to its end, and says so once; its echo, or one
+    of another kind, changes nothing. Events: signals, and pauses in s."""
     process = _start(SHORT)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=20)
-    assert process.returncode == code
-    assert number.name in errors
+    for event in events:
+        time.sleep(event) if isinstance(event, float) else process.send_signal(event)
+    said, errors = process.communicate(timeout=20)
+    assert (process.returncode, said) == (code, "ended\n")
+    assert errors.count(f"{events[0].name}: saving") == 1
 
 
 def test_second_signal_of_a_kind_ends_at_once():
@@ -55,26 +64,3 @@ def test_second_signal_of_a_kind_ends_at_once():
     process.communicate(timeout=15)
     assert process.returncode == 130
     assert time.monotonic() - begun < 10.0
-
-
-def test_echo_of_a_signal_is_the_same():
-    """Claim: two signals of a kind within moments, as of timeout(1), which signals the process and
-    then its group, let the program come to its end."""
-    process = _start(SHORT)
-    process.send_signal(signal.SIGINT)
-    time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    said, errors = process.communicate(timeout=20)
-    assert (process.returncode, said) == (130, "ended\n")
-    assert errors.count("SIGINT") == 1
-
-
-def test_signal_of_another_kind_does_not_end_at_once():
-    """Claim: SIGTERM after SIGINT changes nothing: the program still comes to its end, as
-    SIGINT's."""
-    process = _start(SHORT)
-    process.send_signal(signal.SIGINT)
-    time.sleep(0.2)
-    process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=20)
-    assert process.returncode == 130

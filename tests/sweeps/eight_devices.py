@@ -1,5 +1,4 @@
-"""Run with eight virtual devices and a small step in place of the learner's: prints, as JSON, how
-replicas on eight of them differ from those on one.
+"""Compares replicas on eight virtual devices with those on one, with a small step; prints JSON.
 
 python -m tests.sweeps.eight_devices FOLDER
 """
@@ -17,23 +16,22 @@ import numpy as np
 
 from csac_jax.io import checkpoint
 from csac_jax.sweeps import replicas
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from tests.training import toys
+from tests.training.test_step import leaves
 
 SEEDS = {"seeds": 8, "scenes": 2}
 STEPS = 4
 
 
 def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
-    """State after two chunks, their metrics, and the second chunk's state from a checkpoint of the
-    first."""
-    cfg = toys.CFG
-    (group,) = replicas.group_configs(
-        [dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])]
-    )
-    program = replicas.SweepProgram(
-        toys.program(cfg), replicas.group_replicas(group), sharding.make(devices), shard
-    )
+    """Returns the state after two chunks, their metrics, and the second chunk's state from a
+    checkpoint of the first."""
+    cfg, mesh = toys.CFG, sharding.make(devices)
+    configs = [dataclasses.replace(cfg, seed=k) for k in range(SEEDS[shard])]
+    (group,) = replicas.group_configs(configs)
+    seeds = replicas.group_replicas(group)
+    program = replicas.SweepProgram(toys.program(cfg), seeds, mesh, shard)
     state = program.init()
     places = jax.tree.map(lambda leaf: leaf.sharding, state)
     chunk = program.compile_chunk(STEPS).lower(state).compile()
@@ -47,46 +45,33 @@ def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
     return state, jax.device_get([first, second]), again
 
 
-def _leaves(tree: Any) -> list[np.ndarray]:
-    is_key = [
-        jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in jax.tree.leaves(tree)
-    ]
-    leaves = zip(jax.tree.leaves(tree), is_key, strict=True)
-    return [np.asarray(jax.random.key_data(leaf) if key else leaf) for leaf, key in leaves]
-
-
-def _difference(a: Any, b: Any) -> float:
-    """Largest difference of two trees, relative to the larger of 1 and the value."""
-    pairs = zip(_leaves(a), _leaves(b), strict=True)
-    return max(
-        float(np.max(np.abs(x.astype(float) - y) / np.maximum(np.abs(y), 1.0))) for x, y in pairs
-    )
+def difference(a: Any, b: Any) -> float:
+    """Returns the largest difference of two trees, relative to the larger of 1 and the value."""
+    pairs = zip(leaves(a), leaves(b), strict=True)
+    errors = (np.abs(x.astype(float) - y) / np.maximum(np.abs(y), 1.0) for (_, x), (_, y) in pairs)
+    return max(float(np.max(error)) for error in errors)
 
 
 def compare(shard: str, folder: Path) -> dict[str, Any]:
-    """What differs between one device and eight."""
+    """Compares one device and eight."""
+    folders = [folder / f"{shard}-{n}" for n in (1, 8)]
     (one, seen, _), (eight, others, again) = (
-        run(shard, n, folder / f"{shard}-{n}") for n in (1, 8)
+        run(shard, n, path) for n, path in zip((1, 8), folders, strict=True)
     )
     abstract = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), one)
-    elsewhere, _ = checkpoint.restore(
-        folder / f"{shard}-8", abstract
-    )  # saved on eight, read on one
-    parts = [
-        leaf.addressable_shards[0].data.shape for leaf in (eight.scenes, eight.learner["online"])
-    ]
+    by_one, by_eight = (checkpoint.restore(path, abstract)[0] for path in folders)  # read on one
+    parts = [leaf.addressable_shards[0].data for leaf in (eight.scenes, eight.learner["online"])]
+    pairs = zip(seen, others, strict=True)
     return {
-        "metrics": max(
-            _difference(a._asdict(), b._asdict()) for a, b in zip(seen, others, strict=True)
-        ),
-        "state": _difference(one, eight),
-        "resumed": _difference(eight, again),
-        "moved": _difference(elsewhere, checkpoint.restore(folder / f"{shard}-1", abstract)[0]),
-        "parts": parts,
+        "metrics": max(difference(a._asdict(), b._asdict()) for a, b in pairs),
+        "state": difference(one, eight),
+        "resumed": difference(eight, again),
+        "moved": difference(by_eight, by_one),
+        "parts": [part.shape for part in parts],
     }
 
 
 if __name__ == "__main__":
     programs.init_state, step.train_step = toys.init_state, toys.train_step
-    found = {shard: compare(shard, Path(sys.argv[1])) for shard in SEEDS}
-    print(json.dumps({"devices": len(jax.devices()), **found}))
+    results = {shard: compare(shard, Path(sys.argv[1])) for shard in SEEDS}
+    print(json.dumps({"devices": len(jax.devices()), **results}))

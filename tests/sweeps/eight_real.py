@@ -1,5 +1,4 @@
-"""Run with eight virtual devices: training steps of `smoke` with a scene on each of them and with
-all on one; prints, as JSON, how they differ.
+"""Compares training steps of `smoke` on eight virtual devices, a scene each, with one; prints JSON.
 
 python -m tests.sweeps.eight_real
 
@@ -7,7 +6,6 @@ Physics are C's, which take scenes one by one: MJX rounds a batch of one scene o
 eight.
 """
 
-import dataclasses
 import json
 from typing import Any
 
@@ -19,25 +17,21 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.sweeps import replicas
-from csac_jax.training import program as programs, sharding, step
-from tests.sweeps.eight_devices import _difference
+from csac_jax.training import programs, sharding, step
+from tests.sweeps.eight_devices import difference
 
 SCENES = 8
 STEPS = 8
 
 
 def config() -> Config:
-    """`smoke` with eight scenes; it learns from the first step on."""
-    cfg = presets.smoke()
-    return dataclasses.replace(
-        cfg,
-        sim=dataclasses.replace(cfg.sim, physics="c"),
-        train=dataclasses.replace(cfg.train, scenes=SCENES, actions=SCENES * STEPS),
-    )
+    """Returns `smoke` with eight scenes; it learns from the first step on."""
+    train = {"scenes": SCENES, "actions": SCENES * STEPS}
+    return presets.smoke().change(sim={"physics": "c"}, train=train)
 
 
 def run(program: step.Program, devices: int) -> tuple[Any, Any]:
-    """State and metrics [T, 1, ...] after STEPS steps."""
+    """Returns state and metrics [T, 1, ...] after STEPS steps."""
     (group,) = replicas.group_configs([program.cfg])
     line = sharding.make(devices)
     together = replicas.SweepProgram(program, replicas.group_replicas(group), line, "scenes")
@@ -45,17 +39,16 @@ def run(program: step.Program, devices: int) -> tuple[Any, Any]:
 
 
 def compare(one: tuple[Any, Any], other: tuple[Any, Any]) -> dict[str, Any]:
-    """What differs: entries of metrics that are counted or told apart, floats relative to the
-    larger of 1 and them."""
+    """Compares integers by their number of differences, floats by their largest difference."""
     (state, seen), (others_state, others_seen) = one, other
     pairs = list(zip(seen, others_seen, strict=True))
     floats = [pair for pair in pairs if pair[0].dtype == np.float32]
     return {
         "counts": sum(int(np.sum(x != y)) for x, y in pairs if x.dtype != np.float32),
-        "metrics": _difference([x for x, _ in floats], [y for _, y in floats]),
-        "scenes": _difference(state.scenes, others_state.scenes),
-        "stored": _difference(state.replay.items, others_state.replay.items),
-        "critic": _difference(state.learner.online.critic, others_state.learner.online.critic),
+        "metrics": difference([x for x, _ in floats], [y for _, y in floats]),
+        "scenes": difference(state.scenes, others_state.scenes),
+        "stored": difference(state.replay.items, others_state.replay.items),
+        "critic": difference(state.learner.online.critic, others_state.learner.online.critic),
         "learned": int(np.sum(seen.learned)),
         "grasps": int(np.sum(seen.primitive)),
     }

@@ -12,35 +12,32 @@ from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import replicas, runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.training import programs, sharding, step
 from tests.training import toys
 
 
 class Reporter:
-    """Says nothing; as the last process, stops the sweep after some chunks."""
+    """A silent reporter that, in the last process, stops the sweep after some chunks."""
 
     def __init__(self, stop: Stop, after: int) -> None:
         self._stop, self._after = stop, after
 
     def log(self, text: str) -> None:
-        """Reporter."""
+        """Ignores a line."""
 
     def progress(self, record: object, total_actions: int, eta: float | None) -> None:
-        """Reporter."""
+        """Counts chunks."""
         self._after -= 1
         if self._after == 0:
             self._stop.signal = 15
 
 
 def main(folder: str, after: str, shard: str, *place: str) -> int:
-    """Exit code: 0 if the sweep is done, 15 if it was stopped."""
+    """Returns the exit code: 0 if the sweep is done, 15 if it was stopped."""
     if place:
         cluster.join(place[0], int(place[1]), int(place[2]))
-    programs.init_state, step.train_step, programs.make = (
-        toys.init_state,
-        toys.train_step,
-        toys.program,
-    )
+    programs.init_state, step.train_step = toys.init_state, toys.train_step
+    programs.make = toys.program
     line, stop = sharding.make(None), Stop()
     assert (line is not None) == bool(place)
     plan = runner.SweepPlan(2, [SweepPoint("a", {}, toys.CFG)])

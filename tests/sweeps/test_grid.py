@@ -1,4 +1,4 @@
-"""What --vary asks for."""
+"""Points of a sweep from varied values."""
 
 import pytest
 
@@ -6,9 +6,10 @@ from csac_jax import presets
 from csac_jax.cli import settings
 from csac_jax.cli.sweep import SweepOptions
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 from csac_jax.io import configs
 from csac_jax.sweeps import grid
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 
 
 def _points(varied: list[str]) -> list[grid.SweepPoint]:
@@ -29,24 +30,20 @@ def test_every_combination():
     assert found[1].cfg == ["--replay.sampler", "uniform", "--learn.learning-rate", "-1"]
 
 
-def test_nothing_varied_is_one_point():
-    """Claim: with nothing to vary there is one point, with no flags."""
-    assert _points([]) == [grid.SweepPoint("base", {}, [])]
-
-
 def test_kinds_of_values():
     """Claim: colons separate the items of a tuple, switches are true or false, the algorithm is
-    varied by its name."""
+    varied by its name; with nothing to vary there is one point."""
     flags = [point.cfg for point in _points(["replay.end=1:4,1:12"])]
     assert flags == [["--replay.end", "1", "4"], ["--replay.end", "1", "12"]]
     flags = [point.cfg for point in _points(["learn.actor=true,false"])]
     assert flags == [["--learn.actor"], ["--learn.no-actor"]]
     assert _points(["algo=csac_per"])[0].cfg == ["--algo", "csac_per"]
+    assert _points([]) == [grid.SweepPoint("base", {}, [])]
 
 
 def test_tasks_are_several_settings():
-    """Claim: a task is varied by its name, which stands for what is to be done and in which scenes;
-    an unknown one is refused with the nearest."""
+    """Claim: a task is varied by its name, which stands for a task and its scenes; an
+    unknown one is refused with the nearest."""
     flags = {point.values["task"]: point.cfg for point in _points(["task=clear,target,packed"])}
     assert flags == {
         "clear": ["--task.kind", "clear", "--scene.arranged", "0.0"],
@@ -90,7 +87,7 @@ def test_long_names_give_way_to_numbers():
     [
         (["learn.tua=1"], "'learn.tua' is no setting; perhaps you meant learn.tau"),
         (["learn=1"], "'learn' is no setting"),
-        (["seed=1,2"], "seeds are varied by --seeds"),
+        (["seed=1,2"], "leave seed out"),
         (["learn.tau"], "give a setting and its values"),
         (["learn.tau="], "give a setting and its values"),
         (["learn.tau=0.1,,0.2"], "give a setting and its values"),
@@ -104,5 +101,5 @@ def test_long_names_give_way_to_numbers():
 )
 def test_bad_input(varied: list[str], message: str):
     """Claim: what cannot be varied is named, with the remedy."""
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(SettingsError, match=message):
         _points(varied)

@@ -10,8 +10,8 @@ import pytest
 
 from csac_jax import algorithms, presets
 from csac_jax.sweeps import replicas
-from csac_jax.sweeps.replicas import Replicas, SweepProgram
-from csac_jax.training import program as programs, sharding, step
+from csac_jax.sweeps.replicas import SweepProgram
+from csac_jax.training import programs, sharding, step
 from tests.training import toys
 
 pytestmark = pytest.mark.optax
@@ -40,7 +40,7 @@ OTHER = {
 
 @pytest.fixture(autouse=True)
 def toy_step(monkeypatch: pytest.MonkeyPatch):
-    """The small step in place of the real one."""
+    """Replaces the real step by the small one."""
     monkeypatch.setattr(programs, "init_state", toys.init_state)
     monkeypatch.setattr(step, "train_step", toys.train_step)
 
@@ -54,23 +54,24 @@ def _program(group: replicas.ProgramGroup, parts: int = 1) -> SweepProgram:
     return SweepProgram(toys.program(group.configs[0]), replicas.group_replicas(group), parts=parts)
 
 
-def _run(group: replicas.ProgramGroup, chunks: int = 2) -> tuple[Any, list[Any]]:
-    program = _program(group)
-    chunk, state, seen = program.compile_chunk(4), program.init(), []
+def _chunks(chunk: Any, state: Any, chunks: int) -> tuple[Any, list[Any]]:
+    """Returns the state after some chunks, and their metrics."""
+    seen = []
     for _ in range(chunks):
         state, metrics = chunk(state)
         seen.append(jax.device_get(metrics))
     return state, seen
+
+
+def _run(group: replicas.ProgramGroup, chunks: int = 2) -> tuple[Any, list[Any]]:
+    program = _program(group)
+    return _chunks(program.compile_chunk(4), program.init(), chunks)
 
 
 def _alone(cfg, chunks: int = 2) -> tuple[Any, list[Any]]:
-    """As `train` runs it: its numbers are constants, its state has no axis of replicas."""
+    """Runs as `train` does: settings are constants, the state has no axis of replicas."""
     program = toys.program(cfg)
-    chunk, state, seen = programs.compile_chunk(program, 4), programs.init(program), []
-    for _ in range(chunks):
-        state, metrics = chunk(state)
-        seen.append(jax.device_get(metrics))
-    return state, seen
+    return _chunks(programs.compile_chunk(program, 4), programs.init(program), chunks)
 
 
 def assert_close(a: Any, b: Any, rtol: float, atol: float = 1e-6) -> None:
@@ -167,9 +168,8 @@ def test_number_of_parts(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(replicas.memory, "limit", lambda: 8 * state)
     assert [replicas.num_parts(small, runs) for runs in (1, 3, 4, 5)] == [1, 3, 4, 1]
     assert [replicas.num_parts(cfg, 2) for cfg in (mjx, large)] == [2, 1]
-    assert (
-        replicas.num_parts(small, 4, sharding.Mesh(np.array(jax.devices()), (sharding.AXIS,))) == 1
-    )
+    mesh = sharding.Mesh(np.array(jax.devices()), (sharding.AXIS,))
+    assert replicas.num_parts(small, 4, mesh) == 1
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert [replicas.num_parts(small, runs) for runs in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
     assert replicas.num_parts(large, 2) == replicas.num_parts(mjx, 2) == 1
@@ -188,15 +188,11 @@ def test_settings_that_are_numbers_share_a_program():
     assert replicas.group_configs([vpg, reactive])[0].hyperparams == ("target.gamma",)
 
 
-def test_seeds_alone_keep_their_constants():
-    """Claim: where only seeds differ, nothing is traced: settings stay constants of the program."""
-    each = replicas.group_replicas(_seeds(2))
-    assert each == Replicas(each.seed, None)
-    assert each.seed.tolist() == [0, 1]
-
-
 def test_bounds_are_those_of_the_settings():
-    """Claim: traced bounds of returns are those that each setting has by itself."""
+    """Claim: traced bounds of returns are those that each setting has by itself. Where only seeds
+    differ, nothing is traced."""
+    seeds = replicas.group_replicas(_seeds(2))
+    assert (seeds.hyperparams, seeds.seed.tolist()) == (None, [0, 1])
     other = toys.CFG.change(target={"gamma": 0.25})
     (group,) = replicas.group_configs([toys.CFG, other])
     each = replicas.group_replicas(group)

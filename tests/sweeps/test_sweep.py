@@ -1,4 +1,4 @@
-"""The host's side of a sweep, with a tiny program in place of the learner."""
+"""The host's loop of a sweep, with a tiny program in place of the learner."""
 
 import json
 from pathlib import Path
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint
 from csac_jax.replay import ring
 from csac_jax.runtime.signals import Stop
@@ -17,7 +18,7 @@ from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.replicas import ProgramGroup
 from csac_jax.sweeps.runner import SweepError, SweepPlan
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from tests.training import test_loop
 from tests.training.test_loop import CFG, Fake, State
 
@@ -44,16 +45,14 @@ class Programs:
         self._nan_run = nan_run
 
     def __call__(self, group: ProgramGroup) -> SimpleNamespace:
-        """What the host needs of a `SweepProgram`."""
+        """Stands in for a `SweepProgram`."""
         self.groups.append(group)
         uniform = 200 * (group.configs[0].replay.sampler == "uniform")
         seeds = [cfg.seed + 100 * (cfg.learn.tau == 0.5) + uniform for cfg in group.configs]
 
         def init() -> State:
-            states = [State(jax.random.key(seed), jnp.int32(0), jnp.zeros(4)) for seed in seeds]
-            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states).replace(
-                step=jnp.int32(0)
-            )
+            keys = jnp.stack([jax.random.key(seed) for seed in seeds])
+            return State(keys, jnp.int32(0), jnp.zeros((len(seeds), 4)))
 
         def chunk(num_steps: int):
             self.compiled += 1
@@ -62,10 +61,8 @@ class Programs:
 
             def one(state: State, fails: jax.Array):
                 state, metrics = Fake()._step(state, None)
-                late = fails & (state.step > 8)
-                return state, metrics._replace(
-                    critic_loss=jnp.where(late, jnp.nan, metrics.critic_loss)
-                )
+                loss = jnp.where(fails & (state.step > 8), jnp.nan, metrics.critic_loss)
+                return state, metrics._replace(critic_loss=loss)
 
             every = jax.vmap(one, in_axes=(axes, 0), out_axes=(axes, 0))
             return jax.jit(
@@ -83,7 +80,6 @@ class Listener(test_loop.Listener):
     """Keeps what a sweep reports; sets the stop flag after `stop_after` chunks."""
 
     def progress(self, record, total_actions, eta) -> None:
-        """Reporter."""
         assert total_actions == 72 * SEEDS * len(PLAN.points)
         super().progress(record, 72, eta)
 
@@ -143,20 +139,11 @@ def test_group_is_compiled_once(uninterrupted):
 
 
 def test_groups_make_room(uninterrupted):
-    """Claim: once its runs are saved, nothing is left of a group but the mark that it is
-    done."""
-    folder, *_ = uninterrupted
-    left = sorted(
-        path.relative_to(folder).as_posix()
-        for path in (folder / "groups").rglob("*")
-        if path.is_file()
-    )
-    assert left == ["groups/0/done", "groups/1/done"]
-
-
-def test_progress_is_of_the_whole_sweep(uninterrupted):
-    """Claim: a line per chunk, whose actions grow to those of all runs of all points."""
-    _, listener, *_ = uninterrupted
+    """Claim: once its runs are saved, nothing is left of a group but the mark that it is done. A
+    line is shown per chunk, whose actions grow to those of all runs of all points."""
+    folder, listener, *_ = uninterrupted
+    left = [path for path in (folder / "groups").rglob("*") if path.is_file()]
+    assert sorted(left) == [folder / "groups" / str(k) / "done" for k in range(2)]
     actions = [record.actions for record in listener.records]
     assert actions == [*range(48, 289, 48), *range(312, 433, 24)]
 
@@ -168,15 +155,14 @@ def test_summary_is_that_of_the_logs(uninterrupted):
     stored = json.loads((folder / "summary.json").read_text())
     assert stored == result.summary
     assert stored["complete"]
-    for one, point in zip(stored["settings"], PLAN.points, strict=True):
-        logs = [test_loop._log(folder / row["run_dir"])[-1] for row in one["runs"]]
-        assert [row["seed"] for row in one["runs"]] == [5, 6]
-        assert [row["grasp_success"] for row in one["runs"]] == [
-            line["grasp_success"] for line in logs
-        ]
-        success = one["grasp_success"]
-        assert success["value"] == pytest.approx(np.mean([line["grasp_success"] for line in logs]))
-        assert (one["name"], one["values"], success["n"]) == (point.name, point.values, SEEDS)
+    for row, point in zip(stored["settings"], PLAN.points, strict=True):
+        logs = [test_loop._log(folder / run["run_dir"])[-1] for run in row["runs"]]
+        assert [run["seed"] for run in row["runs"]] == [5, 6]
+        rates = [line["grasp_success"] for line in logs]
+        assert [run["grasp_success"] for run in row["runs"]] == rates
+        success = row["grasp_success"]
+        assert success["value"] == pytest.approx(np.mean(rates))
+        assert (row["name"], row["values"], success["n"]) == (point.name, point.values, SEEDS)
 
 
 @pytest.mark.parametrize("moment", [1, CHUNKS, CHUNKS + 2])
@@ -239,7 +225,7 @@ def test_run_without_a_finite_loss_is_given_up(uninterrupted, tmp_path: Path):
 
 def test_bad_folders(tmp_path: Path):
     """Claim: a folder that exists is left alone, one without a sweep or with a damaged one cannot
-    be resumed."""
+    be resumed; two points of the same config are refused."""
     with pytest.raises(FileExistsError):
         _run(tmp_path, Listener())
     assert list(tmp_path.iterdir()) == []
@@ -248,10 +234,6 @@ def test_bad_folders(tmp_path: Path):
     (tmp_path / "sweep.json").write_text("{")
     with pytest.raises(SweepError, match="cannot be read"):
         runner.read_plan(tmp_path)
-
-
-def test_equal_settings_are_refused():
-    """Claim: two points that are the same config are an error before anything starts."""
     with pytest.raises(SweepError, match="same values"):
         runner.groups_of(SweepPlan(1, [_point("a"), _point("b")]))
 
@@ -266,21 +248,5 @@ def test_runs_must_fit_together(monkeypatch: pytest.MonkeyPatch):
         if fits:
             runner.check_room(plan, devices)
         else:
-            with pytest.raises(ValueError, match=r"replay\.capacity: .* enough for 4 of 6 runs"):
+            with pytest.raises(SettingsError, match=r"replay\.capacity: .* enough for 4 of 6 runs"):
                 runner.check_room(plan, devices)
-
-
-def test_group_of_an_older_version_goes_on(
-    uninterrupted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Claim: a group's checkpoint that names its runs `members` is resumed as any other."""
-    save, folder = checkpoint.save, tmp_path / "run"
-
-    def save_as_before(path, step, state, cfg, extra):
-        save(path, step, state, cfg, {"members": extra["runs"]} if "runs" in extra else extra)
-
-    monkeypatch.setattr(checkpoint, "save", save_as_before)
-    assert _run(folder, Listener(1)).stopped_by == 2
-    monkeypatch.setattr(checkpoint, "save", save)
-    assert _run(folder, Listener(), resume=True).stopped_by is None
-    assert _final(folder) == _final(uninterrupted[0])

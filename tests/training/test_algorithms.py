@@ -9,7 +9,7 @@ import pytest
 from csac_jax import algorithms, presets
 from csac_jax.constants import Primitive
 from csac_jax.io import checkpoint
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from tests.training.test_step import assert_same, copy
 
 pytestmark = [pytest.mark.mjx, pytest.mark.slow]

@@ -1,4 +1,4 @@
-"""What follows an action in the TD target, in the Markov decision process of a few blocks."""
+"""Bootstrapping of the TD target, in the Markov decision process of a few blocks."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,8 @@ from csac_jax import algorithms, presets
 from csac_jax.agent import losses, rewards
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Info, State
-from csac_jax.training import program as programs, step, transitions
+from csac_jax.sim.primitives import Action
+from csac_jax.training import programs, transitions
 from csac_jax.vision.heightmap import Observation
 from tests.agent import toys
 
@@ -35,7 +36,7 @@ def state(blocks: jax.Array, event: jax.Array) -> State:
 
 
 def values(algo: str) -> np.ndarray:
-    """Q [FULL, 2] of push and grasp with 1 .. FULL blocks left: iterated to the fixed point.
+    """Computes Q [FULL, 2] of push and grasp with 1 .. FULL blocks left, by value iteration.
 
     A push changes the scene and lifts nothing; a grasp lifts with P, else it changes nothing.
     """
@@ -43,9 +44,8 @@ def values(algo: str) -> np.ndarray:
     after = state(BLOCKS - (EVENT == 2).astype(jnp.int32), EVENT)
     fresh = state(jnp.where(after.terminated, FULL, BLOCKS), EVENT)
     seen, terminated = transitions.BOOTSTRAPS[cfg.target.bootstrap](after, fresh)
-    result = transitions.to_action_result(
-        step.Action(PRIMITIVE, jnp.zeros((len(EVENT), 3))), after.info
-    )
+    action = Action(PRIMITIVE, jnp.zeros((len(EVENT), 3)))
+    result = transitions.to_action_result(action, after.info)
     reward = jax.vmap(rewards.reward, (None, 0))(cfg.reward, result)
     following = np.asarray(seen.height, int)
     weight = np.array([1.0, 1.0 - P, P])
@@ -69,13 +69,12 @@ def test_vpgs_rule_grasps_the_last_block():
 
 
 @pytest.mark.parametrize("bootstrap", list(transitions.BOOTSTRAPS))
-def test_episode_that_is_cut_off_goes_on(bootstrap):
+def test_episode_that_is_cut_off_continues(bootstrap):
     """Claim: an action that had an effect bootstraps from its own scene where the episode is cut
     off."""
     after = state(jnp.array([2]), jnp.array([0])).replace(truncated=jnp.array([True]))
-    seen, terminated = transitions.BOOTSTRAPS[bootstrap](
-        after, state(jnp.array([FULL]), jnp.array([0]))
-    )
+    fresh = state(jnp.array([FULL]), jnp.array([0]))
+    seen, terminated = transitions.BOOTSTRAPS[bootstrap](after, fresh)
     assert seen.height.tolist() == [2.0]
     assert not terminated.any()
 

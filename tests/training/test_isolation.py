@@ -1,5 +1,4 @@
-"""What is written into one scene stays there: 64 scenes side by side in the compiled training
-step."""
+"""Scenes of the compiled training step do not affect one another: 64 scenes, one of them bad."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -11,14 +10,12 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.training import program as programs
+from csac_jax.training import programs
 from csac_jax.training.step import TrainState
 from csac_jax.training.transitions import StepMetrics
 
-pytestmark = [
-    pytest.mark.mjx,
-    pytest.mark.slow,
-]  # minutes of compilation; tests/test_env.py has the small version
+# minutes of compilation; tests/test_env.py has the small version
+pytestmark = [pytest.mark.mjx, pytest.mark.slow]
 
 SCENES = 64
 CFG = presets.smoke().change(
@@ -64,8 +61,7 @@ def chunk() -> Iterator[Any]:
 def _written(
     state: TrainState, part: str, leaf: str, scene: int, entry: int, value: float
 ) -> TrainState:
-    """The state with `value` in one entry of one leaf of one scene; what an integer or a bool makes
-    of it, there."""
+    """Writes `value`, cast to the leaf's dtype, into one entry of one leaf of one scene."""
     tree = getattr(state.scenes, part)
     old = np.array(getattr(tree, leaf))
     flat = old.reshape(SCENES, -1)
@@ -86,20 +82,24 @@ def _stored(run: Run) -> list[np.ndarray]:
     return _rows(run.state.replay.items, np.arange(int(run.state.replay.size)))
 
 
-def _assert_isolated(good: Run, bad: Run, scene: int, what: str) -> None:
+def _assert_others_same(good: Run, bad: Run, scene: int, what: str = "") -> np.ndarray:
+    """Returns which scenes are not `scene`, after a comparison of their states."""
     others = np.arange(SCENES) != scene
-    for ours, theirs in zip(
-        _rows(good.state.scenes, others), _rows(bad.state.scenes, others), strict=True
-    ):
+    rows = (_rows(run.state.scenes, others) for run in (good, bad))
+    for ours, theirs in zip(*rows, strict=True):
         np.testing.assert_array_equal(ours, theirs, err_msg=what)
+    return others
+
+
+def _assert_isolated(good: Run, bad: Run, scene: int, what: str) -> None:
+    others = _assert_others_same(good, bad, scene, what)
     np.testing.assert_array_equal(bad.metrics.physics_diverged, ~others, err_msg=what)
     assert (bad.metrics.truncated[scene], bad.metrics.terminated[scene]) == (True, False), what
     assert (bad.metrics.cleared[scene], bad.metrics.blocks_lost[scene]) == (0, 0), what
     for ours, theirs in zip(_stored(good), _stored(bad), strict=True):
         np.testing.assert_array_equal(ours[others], theirs, err_msg=what)
-    for leaf in jax.tree.leaves(
-        (bad.state.scenes, bad.state.learner, bad.state.replay, bad.metrics)
-    ):
+    state = bad.state
+    for leaf in jax.tree.leaves((state.scenes, state.learner, state.replay, bad.metrics)):
         leaf = np.asarray(leaf)
         assert leaf.dtype.kind != "f" or np.isfinite(leaf).all(), what
 
@@ -109,7 +109,7 @@ def _entries(state: TrainState, part: str, leaf: str) -> int:
 
 
 def test_good_scenes_are_none_of_them_ill(chunk):
-    """Claim: with nothing amiss physics diverges in no scene and every transition is stored."""
+    """Claim: without a bad entry physics diverges in no scene and every transition is stored."""
     _, _, good = chunk
     assert not good.metrics.physics_diverged.any()
     assert good.state.replay.size == SCENES
@@ -128,9 +128,8 @@ def test_bad_entry_stays_in_its_scene(chunk):
             for value in BAD:
                 scene = count % SCENES
                 what = f"{part}.{leaf}[{scene}, {entry}] = {value}"
-                _assert_isolated(
-                    good, run(_written(state, part, leaf, scene, entry, value)), scene, what
-                )
+                bad = run(_written(state, part, leaf, scene, entry, value))
+                _assert_isolated(good, bad, scene, what)
                 count += 1
     assert count > 400
 
@@ -144,11 +143,7 @@ def test_block_out_of_place_stays_in_its_scene(chunk):
         for entry in range(_entries(state, "scene", "in_play")):
             was = bool(state.scenes.scene.in_play[scene, entry])
             bad = run(_written(state, "scene", "in_play", scene, entry, 1.0))
-            others = np.arange(SCENES) != scene
-            for ours, theirs in zip(
-                _rows(good.state.scenes, others), _rows(bad.state.scenes, others), strict=True
-            ):
-                np.testing.assert_array_equal(ours, theirs)
+            others = _assert_others_same(good, bad, scene)
             np.testing.assert_array_equal(bad.metrics.physics_diverged, ~others & (not was))
             seen.add(was)
     assert seen == {False, True}
@@ -161,10 +156,6 @@ def test_bad_counter_stays_in_its_scene(chunk, leaf: str):
     scene = 5
     wild = jnp.asarray(getattr(state.scenes, leaf)).at[scene].set(1_000_000)
     bad = run(dataclasses.replace(state, scenes=dataclasses.replace(state.scenes, **{leaf: wild})))
-    others = np.arange(SCENES) != scene
-    for ours, theirs in zip(
-        _rows(good.state.scenes, others), _rows(bad.state.scenes, others), strict=True
-    ):
-        np.testing.assert_array_equal(ours, theirs)
+    _assert_others_same(good, bad, scene)
     assert not bad.metrics.physics_diverged.any()
     assert bad.state.scenes.actions[scene] <= 1

@@ -52,7 +52,7 @@ class Fake:
         self._nan_at, self._ill, self._lost_at = nan_at, (ill_from, ill_to), lost_at
 
     def compile_chunk(self, num_steps: int):
-        """Stands in for `program.compile_chunk`, with the program bound."""
+        """Stands in for `programs.compile_chunk`, with the program bound."""
         self.compiled.append(num_steps)
         return jax.jit(
             lambda state: jax.lax.scan(self._step, state, length=num_steps), donate_argnums=0
@@ -88,11 +88,9 @@ class Listener:
             self.stop.signal = signal
 
     def log(self, text: str) -> None:
-        """Reporter."""
         self.said.append(text)
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """Reporter."""
         assert total_actions == self._total
         assert eta is None or eta >= 0.0
         self.records.append(record)

@@ -10,7 +10,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.errors import SettingsError
 from csac_jax.replay import ring
-from csac_jax.training import memory, program as programs, split_step
+from csac_jax.training import memory, programs, split_step
 
 SMOKE = presets.smoke()
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.config import DenseNet121
+from csac_jax.config import Config, DenseNet121
 from csac_jax.env import Env
 from csac_jax.io import checkpoint
 from csac_jax.nets import chunked_vmap
 from csac_jax.sweeps import replicas
-from csac_jax.training import program as programs
+from csac_jax.training import programs, step
 from tests.sweeps.test_replicas import assert_close
-from tests.training.test_step import assert_same, copy, equal
+from tests.training.test_step import assert_same, copy, equal, leaves
 
 pytestmark = pytest.mark.mjx
 TRUNK = 7_037_504
@@ -38,34 +38,31 @@ class Still(Env):
     """The environment without physics: compiles fast."""
 
     def step(self, state, action):
-        """The scene as it was."""
         return state.replace(actions=state.actions + 1)
 
 
+def _still(cfg: Config) -> step.Program:
+    program = programs.make(cfg)
+    env = Still(cfg, program.env.physics, program.env.scenes)
+    return dataclasses.replace(program, env=env)
+
+
 @pytest.mark.slow
-def test_paper_has_densenet_121_three_times():
-    """Claim: the state of the preset `paper` can be made: a trunk each for colour, height and
-    target mask, online and target, and a ring that holds all 2,500 actions."""
-    cfg = presets.paper()
-    state = programs.abstract_state(cfg)
+def test_paper_can_be_traced():
+    """Claim: the training step of `paper` can be traced, and gives back a state of the same types:
+    a trunk each for colour, height and target mask, online and target, and a ring that holds all
+    2,500 actions."""
+    program = programs.make(presets.paper().change(scene={"pool": 1}))
+    state = jax.eval_shape(lambda: programs.init(program))
     for params in (state.learner.online, state.learner.target):
         trunks = [params.critic[kind]["trunk"] for kind in ("params", "batch_stats")]
         assert sum(leaf.size for leaf in jax.tree.leaves(trunks)) == 3 * TRUNK
         assert params.critic["params"]["head"]["conv0"]["kernel"].shape == (1, 3072, 64)
     assert state.replay.items.obs.height.shape == (2500, 224, 224)
-    assert cfg.train.steps == cfg.train.actions == 2500
-
-
-@pytest.mark.slow
-def test_paper_can_be_traced():
-    """Claim: the whole training step of `paper` can be traced, and gives back a state of the same
-    shapes and types."""
-    program = programs.make(presets.paper().change(scene={"pool": 1}))
-    state = jax.eval_shape(lambda: programs.init(program))
+    assert program.cfg.train.steps == program.cfg.train.actions == 2500
     after, metrics = jax.eval_shape(programs.compile_chunk(program, 1), state)
-    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
-        lambda leaf: (leaf.shape, leaf.dtype), state
-    )
+    kind = lambda leaf: (leaf.shape, leaf.dtype)  # noqa: E731
+    assert jax.tree.map(kind, after) == jax.tree.map(kind, state)
     assert metrics.critic_loss.shape == (1,)
 
 
@@ -74,18 +71,15 @@ def test_run_with_batch_norm_resumes(tmp_path):
     """Claim: a run of DenseNet with batch norm learns, moves its statistics, and goes on after a
     checkpoint as if nothing had happened, in every bit of every leaf."""
     cfg = presets.smoke().change(net=dataclasses.replace(TINY, norm="batch"))
-    program = programs.make(cfg)
-    program = dataclasses.replace(program, env=Still(cfg, program.env.physics, program.env.scenes))
+    program = _still(cfg)
     begun = programs.init(program)
     chunk = programs.compile_chunk(program, 4).lower(begun).compile()
     first, _ = chunk(copy(begun))
     second, metrics = chunk(copy(first))
     assert np.all(np.isfinite(metrics.critic_loss))
     for name in ("critic", "actor"):
-        before, after = (
-            getattr(state.learner.online, name)["batch_stats"] for state in (first, second)
-        )
-        assert not equal(before, after), name
+        nets = [getattr(state.learner.online, name) for state in (first, second)]
+        assert not equal(*(net["batch_stats"] for net in nets)), name
     checkpoint.save(tmp_path, 4, first, cfg, {})
     restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: begun))
     again, repeated = chunk(restored)
@@ -102,15 +96,12 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
     are vmapped.
 
     Products are rounded otherwise, and where a gradient is next to nothing Adam takes a step, 1e-4,
-    either way: hence a wide bound for all, and a narrow one for all but a few in a thousand
+    either way: so a wide bound for all, and a narrow one for all but a few in a thousand
     numbers.
     """
     monkeypatch.setattr(chunked_vmap, "_LARGEST", size)
     configs = [presets.smoke().change(net=TINY, seed=k) for k in range(4)]
-    program = programs.make(configs[0])
-    program = dataclasses.replace(
-        program, env=Still(configs[0], program.env.physics, program.env.scenes)
-    )
+    program = _still(configs[0])
 
     def lowered(configs):
         (group,) = replicas.group_configs(configs)
@@ -125,16 +116,12 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
     for k, cfg in enumerate(configs):
         one = dataclasses.replace(program, cfg=cfg)
         alone, seen = programs.compile_chunk(one, 6)(programs.init(one))
-        for mine, want in (
-            (replicas.replica(after, k), alone),
-            (jax.tree.map(lambda leaf, k=k: leaf[:, k], metrics), seen),
-        ):
+        measured = jax.tree.map(lambda leaf, k=k: leaf[:, k], metrics)
+        for mine, want in ((replicas.replica(after, k), alone), (measured, seen)):
             assert_close(mine, want, 1e-3, 1e-3)
             assert _share_apart(mine, want, 1e-5) < 2e-3
         for name in ("primitive", "outcome", "reward"):
-            np.testing.assert_array_equal(
-                getattr(metrics, name)[:, k], getattr(seen, name), err_msg=name
-            )
+            assert np.array_equal(getattr(measured, name), getattr(seen, name)), name
         assert np.all(np.isfinite(seen.critic_loss))
 
     slower = configs[3].change(learn={"tau": 0.5})
@@ -144,19 +131,13 @@ def test_runs_side_by_side_work_in_chunks(size: int, monkeypatch: pytest.MonkeyP
 
 
 def _share_apart(mine: Any, want: Any, bound: float) -> float:
-    """Share of all numbers in two trees that are further apart than this, relative or absolute."""
-    pairs = [
-        (np.asarray(one), np.asarray(other))
-        for one, other in zip(jax.tree.leaves(mine), jax.tree.leaves(want), strict=True)
-        if not jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key)
-    ]
-    return sum(np.sum(~np.isclose(*pair, bound, bound)) for pair in pairs) / sum(
-        one.size for one, _ in pairs
-    )
+    """Returns the share of numbers in two trees that are further apart than the bound."""
+    pairs = [(a, b) for (_, a), (_, b) in zip(leaves(mine), leaves(want), strict=True)]
+    apart = sum(np.sum(~np.isclose(*pair, bound, bound)) for pair in pairs)
+    return apart / sum(a.size for a, _ in pairs)
 
 
 def _runs_together(lowered) -> set[int]:
-    """Of how many runs the first convolution's products are made at a time, of 48 numbers a
-    cell."""
+    """Returns for how many runs at a time the first convolution's products are made."""
     two = r"dot_general.* batching_dims = \[\d+, \d+\] .*: \(tensor<(\d+)x\d+x\d+x48xf32>,"
     return {int(runs) for runs in re.findall(two, lowered.as_text())}

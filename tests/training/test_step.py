@@ -25,7 +25,7 @@ from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs, split_step, step, trace_cache, transitions
+from csac_jax.training import programs, split_step, step, trace_cache, transitions
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision.heightmap import Observation
@@ -54,7 +54,7 @@ def copy(state: TrainState) -> TrainState:
 
 
 def half_in_reach(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
-    """In place of `physics.reachable`, which is true for a floating hand."""
+    """Stands in for `physics.reachable`, which is true for a floating hand."""
     del cfg, height
     return action.pose[0] < 0.0
 
@@ -88,13 +88,14 @@ def run() -> Run:
 
 
 def leaves(tree: Any) -> list[tuple[str, np.ndarray]]:
-    """Names and values of all leaves; keys as their bits."""
+    """Returns names and values of all leaves; keys as their bits."""
+
+    def value(leaf: Any) -> np.ndarray:
+        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+
     named = jax.tree_util.tree_leaves_with_path(tree)
-    is_key = [jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) for _, leaf in named]
-    return [
-        (jax.tree_util.keystr(path), np.asarray(jax.random.key_data(leaf) if key else leaf))
-        for (path, leaf), key in zip(named, is_key, strict=True)
-    ]
+    return [(jax.tree_util.keystr(path), value(leaf)) for path, leaf in named]
 
 
 def assert_same(first: Any, other: Any) -> None:
@@ -103,9 +104,8 @@ def assert_same(first: Any, other: Any) -> None:
 
 
 def equal(first: Any, other: Any) -> bool:
-    return all(
-        np.array_equal(a, b) for (_, a), (_, b) in zip(leaves(first), leaves(other), strict=True)
-    )
+    pairs = zip(leaves(first), leaves(other), strict=True)
+    return all(np.array_equal(a, b) for (_, a), (_, b) in pairs)
 
 
 @pytest.mark.slow
@@ -132,15 +132,11 @@ def test_two_programs_do_what_one_does(run: Run):
         chunk = split_step.compile_chunk(run.program, T).lower(run.states[0]).compile()
     for number in range(2):  # each from the same state: physics makes much of what rounding does
         state, metrics = chunk(copy(run.states[number]))
-        pairs = ((run.states[number + 1], state), (run.metrics[number], metrics))
-        for name, wanted, got in (
-            (name, a, b)
-            for one, other in pairs
-            for (name, a), (_, b) in zip(leaves(one), leaves(other), strict=True)
-        ):
-            if name.removeprefix(".") in transitions.LOSSES:
-                wanted, got = (np.where(metrics.learned, loss, 0.0) for loss in (wanted, got))
-            np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-5, err_msg=name)
+        wanted = (run.states[number + 1], run.metrics[number])
+        for (name, a), (_, b) in zip(leaves(wanted), leaves((state, metrics)), strict=True):
+            if name.rpartition(".")[2] in transitions.LOSSES:
+                a, b = (np.where(metrics.learned, loss, 0.0) for loss in (a, b))
+            np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5, err_msg=name)
     assert metrics.learned.all()
     assert not run.metrics[0].learned.all()
 
@@ -221,8 +217,8 @@ def test_chunk_does_not_speak_to_the_host(run):
     names = set(primitives(run.traced.jaxpr.jaxpr))
     assert {"scan", "while", "conv_general_dilated", "sort"} <= names  # it was searched in depth
     assert not {name for name in names if any(word in name for word in HOST)}
-    loud = jax.make_jaxpr(lambda x: jax.lax.cond(x > 0, lambda: jax.debug.print("{}", x), int))
-    assert any(word in name for name in primitives(loud(1.0).jaxpr) for word in HOST)
+    loud = jax.make_jaxpr(jax.vmap(jax.jit(lambda x: jax.debug.print("{x}", x=x))))(jnp.ones(2))
+    assert any(word in name for name in primitives(loud.jaxpr) for word in HOST)
 
 
 def test_replay_is_updated_in_place(run):
@@ -294,9 +290,8 @@ def test_seeds_differ(run):
     for name in ("scenes", "learner"):
         assert not equal(getattr(begun, name), getattr(run.states[0], name)), name
     state, _ = run.chunk(begun)
-    poses, others = (
-        np.asarray(s.replay.items.action.pose[:NUM_SEEN]) for s in (run.states[1], state)
-    )
+    pose = lambda state: np.asarray(state.replay.items.action.pose[:NUM_SEEN])  # noqa: E731
+    poses, others = pose(run.states[1]), pose(state)
     assert np.all(np.any(poses != others, axis=1))
 
 
@@ -327,11 +322,9 @@ def test_nothing_is_learned_before_the_warm_up(run):
     for name in ("critic", "actor"):
         before, after = (getattr(s.learner.online, name) for s in (run.states[0], run.states[1]))
         assert not equal(before, after), name
-    assert [int(s.learner.updates) for s in run.states] == [
-        CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)
-    ]
-    for counted in run.states:
-        assert step.updates_done(CFG, counted.step) == counted.learner.updates
+    updates = [int(s.learner.updates) for s in run.states]
+    assert updates == [CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)]
+    assert updates == [int(step.updates_done(CFG, s.step)) for s in run.states]
     assert all(np.all(np.isfinite(m.critic_loss)) for m in run.metrics)
 
 
@@ -352,18 +345,13 @@ def test_every_action_is_stored(run):
     state, metrics = run.states[-1], run.metrics
     size = int(state.replay.size)
     assert size == 3 * NUM_SEEN == int(state.replay.head)
-    items = jax.tree.map(
-        lambda leaf: np.asarray(leaf[:size]).reshape(3 * T, CFG.train.scenes, *leaf.shape[1:]),
-        state.replay.items,
-    )
-    for name, stored in (
-        ("reward", items.reward),
-        ("primitive", items.action.primitive),
-        ("terminated", items.terminated),
-    ):
-        np.testing.assert_array_equal(
-            stored, np.concatenate([getattr(m, name) for m in metrics]), err_msg=name
-        )
+    shape = (3 * T, CFG.train.scenes)
+    rows = lambda leaf: np.asarray(leaf[:size]).reshape(*shape, *leaf.shape[1:])  # noqa: E731
+    items = jax.tree.map(rows, state.replay.items)
+    stored = {"reward": items.reward, "primitive": items.action.primitive}
+    for name, values in (stored | {"terminated": items.terminated}).items():
+        wanted = np.concatenate([getattr(m, name) for m in metrics])
+        np.testing.assert_array_equal(values, wanted, err_msg=name)
     done = np.concatenate([m.terminated | m.truncated for m in metrics])[:-1]
     assert not np.all(done)
     np.testing.assert_array_equal(items.next_obs.height[:-1][~done], items.obs.height[1:][~done])
@@ -399,15 +387,11 @@ def test_finished_scenes_are_replaced(run):
 def test_a_cleared_table_is_a_true_end(run):
     """Claim: an empty scene terminates, is stored as such and is replaced by one with blocks."""
     scenes = run.states[0].scenes
-    empty = jax.vmap(lambda scene: Env.reset_to(run.program.env, scene))(
-        scenes.scene.replace(
-            in_play=jnp.array([[False] * len(CFG.scene.slots), [True] * len(CFG.scene.slots)])
-            & scenes.scene.in_play,
-            position=scenes.scene.position.at[0].set(
-                jnp.asarray([[3.0 + 0.3 * i, 0.0, 1.0] for i in range(3)])
-            ),
-        )
-    )
+    in_play = scenes.scene.in_play & np.array([[False], [True]])
+    aside = jnp.asarray([[3.0 + 0.3 * i, 0.0, 1.0] for i in range(3)])
+    position = scenes.scene.position.at[0].set(aside)
+    placed = scenes.scene.replace(in_play=in_play, position=position)
+    empty = jax.vmap(lambda scene: Env.reset_to(run.program.env, scene))(placed)
     state, metrics = run.chunk(copy(run.states[0].replace(scenes=empty)))
     assert metrics.terminated[0].tolist() == [True, False]
     assert state.replay.items.terminated[0]
@@ -449,17 +433,15 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     monkeypatch.setattr(PrioritisedReplay, "alpha", 0.5)
     monkeypatch.setattr(PrioritisedReplay, "per_epsilon", 0.25)
     monkeypatch.setattr(CSAC, "update", update)
-    monkeypatch.setattr(CSAC, "end_step", lambda self, state, obs: (state, jnp.float32(0.0)))
+    monkeypatch.setattr(CSAC, "update_actor", lambda self, state, obs: (state, jnp.float32(0.0)))
     replay = ring.init(jnp.full(64, 7.0), programs.example(cfg)).replace(size=jnp.int32(64))
     learner_state = actor_critic.LearnerState(None, None, None, None, jnp.int32(0))
     program = Program(cfg, nothing, CSAC(nothing), made)
     key, done = jax.random.key(0), jnp.int32(0)
     _, priority, losses = step.learn(program, key, learner_state, replay, done)
     np.testing.assert_allclose(losses["critic_loss"], np.sum(weights * error), rtol=1e-5)
-    expected = np.full(64, 7.0)
-    expected[: 2 * num : 2] = (
-        np.sqrt(np.abs(error) + 0.25) if sampler == "prioritised" else np.abs(error)
-    )
+    expected, size = np.full(64, 7.0), np.abs(error)
+    expected[: 2 * num : 2] = np.sqrt(size + 0.25) if sampler == "prioritised" else size
     np.testing.assert_allclose(priority, expected, rtol=1e-6)
 
 
@@ -469,9 +451,8 @@ def _opinions() -> tuple[actor_critic.ActorCritic, actor_critic.LearnerState]:
     rng = np.random.default_rng(0)
     blank = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     state = jax.jit(lambda: actor_critic.init(jax.random.key(0), learner))()
-    noise = jax.tree.map(
-        lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype), blank.online
-    )
+    draw = lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype)  # noqa: E731
+    noise = jax.tree.map(draw, blank.online)
     return learner, state.replace(online=noise, target=noise)
 
 
@@ -479,9 +460,7 @@ def _pictures(count: int, seed: int) -> Observation:
     rng, size = np.random.default_rng(seed), CFG.heightmap.size
     height = np.where(rng.random((count, size, size)) < 0.2, 0.05, 0.0).astype(np.float32)
     colour = rng.random((count, size, size, 3)).astype(np.float32)
-    return Observation(
-        colour=jnp.asarray(colour), height=jnp.asarray(height), target=jnp.asarray(height > 0.0)
-    )
+    return Observation(*map(jnp.asarray, (colour, height, height > 0.0)))
 
 
 def test_only_pushes_ask_for_the_best_grasps(monkeypatch: pytest.MonkeyPatch):

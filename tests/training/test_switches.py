@@ -1,4 +1,4 @@
-"""The paper's switches: rewards from what is sensed, actions anywhere, its camera and arm."""
+"""The paper's switches: sensed rewards, actions anywhere, its camera and arm."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from csac_jax.env import Env, Info, State
 from csac_jax.scene import layout, model
 from csac_jax.sim import physics as simulation
 from csac_jax.sim.primitives import Action
-from csac_jax.training import program as programs, step, transitions
+from csac_jax.training import programs, step, transitions
 from csac_jax.vision.heightmap import Observation
 
 LEVELS = jnp.arange(len(Outcome), dtype=jnp.int32)
@@ -29,13 +29,12 @@ def _after(outcome: jax.Array, by_gap: jax.Array) -> State:
 
 
 def _paid(cfg: Config, after: State) -> tuple[np.ndarray, np.ndarray]:
-    """Rewards [T] of grasps, and whether nothing follows them, [T] bool."""
+    """Returns rewards [T] of grasps, and True where nothing follows them, [T] bool."""
     paid = transitions.with_reward_outcome(cfg.reward, after)
     action = Action(jnp.full(TRUE.shape, Primitive.GRASP, jnp.int32), jnp.zeros((len(TRUE), 3)))
     reward, _ = rewards.rewards_of(cfg.reward, transitions.to_action_result(action, paid.info))
-    return np.asarray(reward), np.asarray(
-        transitions.BOOTSTRAPS[cfg.target.bootstrap](paid, paid)[1]
-    )
+    _, terminated = transitions.BOOTSTRAPS[cfg.target.bootstrap](paid, paid)
+    return np.asarray(reward), np.asarray(terminated)
 
 
 @pytest.mark.parametrize("algo", ["csac", "vpg"])
@@ -88,8 +87,8 @@ def test_switches_combine(monkeypatch: pytest.MonkeyPatch):
         return episodic(after, scenes_next)
 
     def logged(**metrics: jax.Array) -> transitions.StepMetrics:
-        own = metrics["outcome"] is sources["logged"]
-        sources["logged"] = "sensed" if own else "truth"
+        same = metrics["outcome"] is sources["logged"]
+        sources["logged"] = "sensed" if same else "truth"
         return step_metrics(**metrics)
 
     step_result, step_metrics = transitions.to_action_result, transitions.StepMetrics

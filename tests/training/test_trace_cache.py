@@ -16,7 +16,7 @@ from csac_jax.config import Config
 from csac_jax.errors import FailedError
 from csac_jax.replay import samplers
 from csac_jax.runtime import host_call
-from csac_jax.training import loop, program as programs, split_step, step, trace_cache
+from csac_jax.training import loop, programs, split_step, step, trace_cache
 from csac_jax.training.step import Program
 from csac_jax.training.transitions import LOSSES
 from tests.training.test_step import assert_same, copy

@@ -26,7 +26,7 @@ def _record(actions: int, success: float = 1.0) -> Record:
 
 
 def _follow(tracker: trackers.Tracker, folder: Path, pause: float = 0.0) -> None:
-    """A run that is stopped and, after a pause, s, resumed; an evaluation on its way."""
+    """Tracks a run that is stopped and, after a pause, s, resumed, with an evaluation."""
     folder.mkdir(parents=True)
     for step, success in ((0, 0.25), (4, 0.75)):
         tracker.begin(RunInfo(CFG, folder, step))
@@ -38,7 +38,7 @@ def _follow(tracker: trackers.Tracker, folder: Path, pause: float = 0.0) -> None
 
 
 def _check(found: Points) -> None:
-    """Every number is there, over actions, and what is None is not."""
+    """Checks that every number is there, over actions, and that no None is."""
     assert found["grasp_success"] == [(8, 0.25), (16, 0.75)]
     assert found["outcomes/lifted"] == [(8, 3.0), (16, 3.0)]
     assert found["eval/grasp_success"] == [(8, 0.5)]
@@ -49,7 +49,7 @@ def _check(found: Points) -> None:
 
 def test_tensorboard(tmp_path: Path):
     """Claim: TensorBoard's files hold every number over actions; a resumed run voids what a killed
-    process wrote after the step that it goes on from."""
+    process wrote after the step that it resumes from."""
     pytest.importorskip("tensorboardX")
     from tensorboardX.proto import event_pb2
 
@@ -72,7 +72,7 @@ def test_tensorboard(tmp_path: Path):
 
 
 def _leveldb_log(content: bytes) -> list[bytes]:
-    """The records of a file in LevelDB's log format, whose own head are the first 7 bytes."""
+    """Reads the records of a file in LevelDB's log format, after a head of 7 bytes."""
     records, at = [b""], 7
     while at + 7 <= len(content):
         if (left := 32768 - at % 32768) < 7:

@@ -12,7 +12,7 @@ from csac_jax.config import Config
 from csac_jax.nets import networks
 from csac_jax.replay import samplers
 from csac_jax.training import sharding
-from csac_jax.training.program import Hyperparams, replace_hyperparams
+from csac_jax.training.programs import Hyperparams, replace_hyperparams
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 from tests.metrics import step_metrics
@@ -22,7 +22,7 @@ CFG = presets.smoke().change(train={"scenes": SCENES, "actions": 12 * SCENES})  
 
 
 def program(cfg: Config = CFG, env: Any = None, *_: Any, **__: Any) -> Program:
-    """Stands in for `program.make`: without environment and networks."""
+    """Stands in for `programs.make`: without environment and networks."""
     bounds = rewards.bounds(cfg.reward, cfg.target.gamma)
     frames = maps.frames(cfg, networks.make(cfg.net))
     learner = CSAC(actor_critic.with_optimisers(cfg, frames, bounds))
@@ -32,7 +32,7 @@ def program(cfg: Config = CFG, env: Any = None, *_: Any, **__: Any) -> Program:
 def init_state(
     program: Program, key: jax.Array, hyperparams: Hyperparams | None = None
 ) -> TrainState:
-    """Stands in for `program.init_state`: scenes [E], networks [3], a ring [4]."""
+    """Stands in for `programs.init_state`: scenes [E], networks [3], a ring [4]."""
     program = replace_hyperparams(program, hyperparams)
     params = jax.random.normal(jax.random.fold_in(key, 1), (3,))
     learner = {

@@ -101,7 +101,7 @@ def init_state(
 
 
 def prepare(program: Program) -> None:
-    """Does ahead what else delays the first step; callable in another thread."""
+    """Prepares what else delays the first step; callable in another thread."""
     simulation.prepare(program.env.physics, program.cfg.train.scenes)
 
 
@@ -130,7 +130,7 @@ def abstract_state(cfg: Config, learner: Learner | None = None, network: Any = N
 
 
 def compile_chunk(program: Program, num_steps: int) -> Any:
-    """Jits a function state -> (state, StepMetrics [T, ...]) of T = `num_steps` training steps.
+    """Returns a jitted function state -> (state, StepMetrics [T, ...]) of T = `num_steps` steps.
 
     The state is donated: the replay is updated in place.
     """
