@@ -19,7 +19,6 @@ from csac_jax import presets
 from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint
 from csac_jax.io.checkpoint import CheckpointError
-from csac_jax.training import programs
 
 CFG = presets.smoke()
 

@@ -349,9 +349,9 @@ def test_every_action_is_stored(run):
     rows = lambda leaf: np.asarray(leaf[:size]).reshape(*shape, *leaf.shape[1:])  # noqa: E731
     items = jax.tree.map(rows, state.replay.items)
     stored = {"reward": items.reward, "primitive": items.action.primitive}
-    for name, values in (stored | {"terminated": items.terminated}).items():
+    for name, column in (stored | {"terminated": items.terminated}).items():
         wanted = np.concatenate([getattr(m, name) for m in metrics])
-        np.testing.assert_array_equal(values, wanted, err_msg=name)
+        np.testing.assert_array_equal(column, wanted, err_msg=name)
     done = np.concatenate([m.terminated | m.truncated for m in metrics])[:-1]
     assert not np.all(done)
     np.testing.assert_array_equal(items.next_obs.height[:-1][~done], items.obs.height[1:][~done])
