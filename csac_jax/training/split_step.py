@@ -26,37 +26,31 @@ def compile_chunk(program: Program, num_steps: int, cached: bool = False) -> Any
     """
     if jax.default_backend() != "cpu" or program.mesh is not None:
         return programs.compile_chunk(program, num_steps)
-    return _Traceable(program, num_steps, cached)
+    return _Split(program, num_steps, cached)
 
 
-class _Traceable(NamedTuple):
-    """A chunk whose halves are traced one by one."""
+class _Split(NamedTuple):
+    """A chunk that is lowered and compiled half by half."""
 
     program: Program
     num_steps: int
     cached: bool
+    act: Any = None  # the first half, lowered
 
-    def lower(self, state: Any) -> "_Lowered":
+    def lower(self, state: Any) -> "_Split":
         """Traces the half that acts; the other one is traced while that compiles."""
         half = trace_cache.jit(self.program, step.act_half, self.cached)
-        return _Lowered(self, compiler.lower(half, state))
-
-
-class _Lowered(NamedTuple):
-    """A chunk whose first half is traced."""
-
-    traceable: _Traceable
-    act: Any
+        return self._replace(act=compiler.lower(half, state))
 
     def compile(self) -> "Chunk":
         """Compiles acting now and learning in a background thread."""
-        (program, num_steps, cached), learning = self.traceable, ThreadPoolExecutor(1)
-        half = trace_cache.jit(program, step.learn_half, cached)
+        learning = ThreadPoolExecutor(1)
+        half = trace_cache.jit(self.program, step.learn_half, self.cached)
         tracing = learning.submit(compiler.lower, half, *self.act.out_info)
         act = self.act.compile()
         learn = learning.submit(tracing.result().compile)
         learning.shutdown(wait=False)
-        return Chunk(program.cfg, num_steps, act, learn)
+        return Chunk(self.program.cfg, self.num_steps, act, learn)
 
 
 class Chunk(NamedTuple):

@@ -1,12 +1,15 @@
-"""Compares training steps of `smoke` on eight virtual devices, a scene each, with one; prints JSON.
+"""Training steps of `smoke` on eight virtual devices; prints JSON.
 
-python -m tests.sweeps.eight_real
+python -m tests.sweeps.eight_real          compares a scene on each device with all on one
+python -m tests.sweeps.eight_real seeds    compiles for a seed on each device, without Shardy
 
 Physics are C's, which take scenes one by one: MJX rounds a batch of one scene otherwise than one of
 eight.
 """
 
+import dataclasses
 import json
+import sys
 from typing import Any
 
 import csac_jax  # noqa: F401  (before JAX)
@@ -16,6 +19,7 @@ import numpy as np
 
 from csac_jax import presets
 from csac_jax.config import Config
+from csac_jax.runtime import compiler
 from csac_jax.sweeps import replicas
 from csac_jax.training import programs, sharding, step
 from tests.sweeps.eight_devices import difference
@@ -54,6 +58,21 @@ def compare(one: tuple[Any, Any], other: tuple[Any, Any]) -> dict[str, Any]:
     }
 
 
+def compile_seeds() -> int:
+    """Returns on how many devices the compiled step runs, by the partitioner before Shardy."""
+    jax.config.update("jax_use_shardy_partitioner", False)  # as jaxlib 0.11 does, see `_guard`
+    cfg = presets.smoke().change(sim={"physics": "c"})
+    seeds = [dataclasses.replace(cfg, seed=k) for k in range(len(jax.devices()))]
+    (group,) = replicas.group_configs(seeds)
+    program = replicas.sweep_program(group, sharding.make(len(seeds)))
+    chunk = compiler.lower(program.compile_chunk(1), program.abstract()).compile()
+    return len(jax.tree.leaves(chunk.output_shardings)[0].device_set)
+
+
 if __name__ == "__main__":
-    made = programs.make(config())
-    print(json.dumps({"devices": len(jax.devices()), **compare(run(made, 1), run(made, SCENES))}))
+    if sys.argv[1:] == ["seeds"]:
+        print(json.dumps({"devices": compile_seeds()}))
+    else:
+        made = programs.make(config())
+        results = compare(run(made, 1), run(made, SCENES))
+        print(json.dumps({"devices": len(jax.devices()), **results}))

@@ -15,6 +15,7 @@ from csac_jax import _guard
 from csac_jax.errors import SettingsError
 from csac_jax.training import sharding
 
+FLAGS = "--xla_backend_optimization_level=0"
 ROOT = Path(csac_jax.__file__).parents[1]
 
 
@@ -48,7 +49,7 @@ def test_eight_devices_are_one(tmp_path: Path):
 def test_seeds_on_eight_devices_compile_without_shardy():
     """Claim: the learner's step compiles with a seed on each device by the partitioner before
     Shardy. It ended the process on a sort whose keys nobody read."""
-    found = _eight("tests.sweeps.eight_by_seeds", flags="--xla_backend_optimization_level=0")
+    found = _eight("tests.sweeps.eight_real", "seeds", flags=FLAGS)
     assert found == {"devices": 8}
 
 
@@ -58,9 +59,7 @@ def test_eight_devices_learn_as_one():
     gives where physics do not round by the batch: scenes and transitions bit for bit, metrics and
     critic to the rounding of sums in another order. 1e-6 is eight times the last bit of 1; eight
     steps take it to one."""
-    found = _eight(
-        "tests.sweeps.eight_real", flags="--xla_backend_optimization_level=0", timeout=1200.0
-    )
+    found = _eight("tests.sweeps.eight_real", flags=FLAGS, timeout=1200.0)
     assert found["devices"] == found["learned"] == 8
     assert found["grasps"] > 0
     assert found["counts"] == found["scenes"] == found["stored"] == 0

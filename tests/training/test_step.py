@@ -182,7 +182,7 @@ def test_what_acts_is_there_first(monkeypatch: pytest.MonkeyPatch):
     half = SimpleNamespace(lower=lambda: SimpleNamespace(compile=learns))
     monkeypatch.setattr(trace_cache, "jit", lambda *_: half)
     act = SimpleNamespace(out_info=(), compile=acts)
-    chunk = split_step._Lowered(split_step._Traceable(mock.Mock(), T, False), act).compile()
+    chunk = split_step._Split(mock.Mock(), T, False, act).compile()
     assert (chunk.act, chunk.learn.done(), threads) == ("acts", False, [threading.main_thread()])
     go_on.set()
     assert chunk.learn.result(60.0) == "learns"
@@ -192,7 +192,7 @@ def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch,
     """Claim: only on a CPU, and on one device, is a chunk two programs."""
 
     def is_split(program: Program) -> bool:
-        return isinstance(split_step.compile_chunk(program, T), split_step._Traceable)
+        return isinstance(split_step.compile_chunk(program, T), split_step._Split)
 
     assert is_split(run.program)
     assert not is_split(dataclasses.replace(run.program, mesh=mock.Mock()))
