@@ -1,7 +1,6 @@
 """`csac-jax sweep`: bad input is one line, exit code 2 and nothing started; settings reach their
 configs."""
 
-import dataclasses
 import itertools
 import json
 import re
@@ -39,13 +38,13 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(signals, "install", signals.Stop)
 
 
-def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
-    code = cli.main(["sweep", *arguments.split()])
+def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: str) -> None:
+    """Runs a sweep that must fail with this code and line, before a folder is made."""
+    assert cli.main(["sweep", *arguments.split()]) == code
     captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1, captured.err
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+    assert message in captured.err
     assert list(Path().iterdir()) == []
-    return code, captured.err
 
 
 @pytest.mark.parametrize(
@@ -55,27 +54,16 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("smoke --seeds 0", "--seeds: at least 1"),
         ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
         ("smok", "unknown preset 'smok'; did you mean smoke?"),
-        (
-            "smoke --vary replay.sampler=uniform,beta --replay.end 1 4",
-            "--replay.end: --replay.sampler uniform has no such setting",
-        ),
-        (
-            "smoke --vary learn.tua=0.1",
-            "vary: 'learn.tua' is no setting; perhaps you meant learn.tau",
-        ),
+        ("smoke --vary replay.sampler=uniform --replay.end 1 4", "uniform has no such setting"),
+        ("smoke --vary learn.tua=0.1", "'learn.tua' is no setting; perhaps you meant learn.tau"),
         ("smoke --vary learn.tau=", "vary learn.tau=: give a setting and its values"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
-        ("smoke --vary learn.tau=0.1,2", "learn.tau: must be above 0, at most 1, not 2.0"),
+        ("smoke --vary learn.tau=0.1,2", "learn.tau: must be at most 1, not 2.0"),
         ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
         ("smoke --vary learn.tau=0.1,0.10", "vary: two settings have the same values"),
         ("smoke --devices 4096", "devices: 4096 asked for, there are "),
-        (
-            "smoke --sim.physics c --devices 2",
-            "--sim.physics: c computes on the host's cores, for one device",
-        ),
+        ("smoke --sim.physics c --devices 2", "--sim.physics: c computes on the host's cores"),
         ("smoke --replay.capacity 65536 --seeds 9999", "lower seeds or raise devices"),
-        ("smoke --seeds -1", "--seeds: at least 1"),
-        ("smoke --seeds 1000000", "seeds: 1 to 10000 runs in all"),
         ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "seeds: 1 to 10000 runs in all"),
         (
             f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary explore.decay={TAUS}",
@@ -90,22 +78,14 @@ def _fails(capsys: pytest.CaptureFixture, arguments: str) -> tuple[int, str]:
         ("--resume x --learn.tau 0.1", "leave all others out"),
         ("--resume x --seeds 5", "leave all others out"),
         ("--resume x --run-dir y", "leave all others out"),
-        ("--resume x --vary learn.tau=0.1", "leave all others out"),
         ("quick --resume x", "leave all others out"),
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
     """Claim: what cannot be swept is one line that names the thing, exit code 2, and no folder is
-    made."""
-    code, line = _fails(capsys, arguments)
-    assert code == 2
-    assert message in line
-
-
-def test_no_sweep_to_resume(capsys: pytest.CaptureFixture):
-    """Claim: a folder without a sweep is one line and exit code 1."""
-    code, line = _fails(capsys, "--resume nowhere")
-    assert (code, "there is no sweep.json in nowhere" in line) == (1, True)
+    made; a folder without a sweep is exit code 1."""
+    _fails(capsys, 2, arguments, message)
+    _fails(capsys, 1, "--resume nowhere", "there is no sweep.json in nowhere")
 
 
 @pytest.mark.parametrize(
@@ -124,8 +104,8 @@ def test_failures(
     code: int,
     message: str,
 ):
-    """Claim: a sweep that fails is one line and an exit code; a folder that someone else has made
-    meanwhile as well."""
+    """Claim: a sweep that fails is one line and an exit code; so is a folder that another
+    process makes meanwhile."""
 
     def fail(*_, **__):
         raise error
@@ -141,39 +121,28 @@ def test_settings_reach_their_configs():
     flags = "--seeds 3 --seed 7 --learn.batch 4 --vary algo=csac,vpg --vary target.gamma=0.1,0.3"
     options, plan = command.read(["smoke", *flags.split()])
     assert (options.seeds, plan.seeds, options.devices, options.shard) == (3, 3, None, "seeds")
-    wanted = []
-    for algo in ("csac", "vpg"):
-        cfg = algorithms.configure(SMOKE, algo)
-        cfg = dataclasses.replace(cfg, seed=7, learn=dataclasses.replace(cfg.learn, batch=4))
-        wanted += [
-            dataclasses.replace(cfg, target=dataclasses.replace(cfg.target, gamma=gamma))
-            for gamma in (0.1, 0.3)
-        ]
-    assert [one.cfg for one in plan.points] == wanted
+    changes = [{"seed": 7, "learn": {"batch": 4}, "target": {"gamma": g}} for g in (0.1, 0.3)]
+    assert [one.cfg for one in plan.points] == [
+        algorithms.configure(SMOKE, algo).change(**change)
+        for algo in ("csac", "vpg")
+        for change in changes
+    ]
     assert plan.points[1].name == "algo=csac,target.gamma=0.3"
     assert [one.cfg.seed for one in runner.runs_of(plan)[:3]] == [7, 8, 9]
 
 
 def test_plan_survives_its_file(tmp_path: Path):
-    """Claim: a resumed sweep has the settings of its folder, with no need of flags."""
-    _, plan = command.read(["smoke", "--seeds", "2", "--vary", "replay.end=1:4,1:12"])
-    (tmp_path / files.SWEEP_PLAN).write_text(runner.plan_text(plan))
+    """Claim: a resumed sweep has the settings of its folder, with no need of flags; one with no
+    number of episodes is refused."""
+    arguments = ["smoke", "--seeds", "2", "--vary", "replay.end=1:4,1:12", "--evaluate", "7"]
+    _, plan = command.read(arguments)
+    path = tmp_path / files.SWEEP_PLAN
+    path.write_text(runner.plan_text(plan))
     assert command.read(["--resume", str(tmp_path)])[1] == plan
-
-
-def test_plans_without_evaluation_are_read(tmp_path: Path):
-    """Claim: a plan written before plans had an evaluation asks for none; one that is no number of
-    episodes is refused."""
-    _, plan = command.read(["smoke", "--evaluate", "7"])
-    content = json.loads(runner.plan_text(plan))
+    content = json.loads(path.read_text())
     del content["sha256"]
-    (tmp_path / files.SWEEP_PLAN).write_text(json.dumps(content))
-    assert command.read(["--resume", str(tmp_path)])[1].episodes == 7
-    del content["episodes"]
-    (tmp_path / files.SWEEP_PLAN).write_text(json.dumps(content))
-    assert command.read(["--resume", str(tmp_path)])[1] == plan._replace(episodes=0)
-    (tmp_path / files.SWEEP_PLAN).write_text(json.dumps({**content, "episodes": "7"}))
-    with pytest.raises(runner.SweepError, match="episodes: 0 to"):
+    path.write_text(json.dumps({**content, "episodes": "7"}))
+    with pytest.raises(runner.SweepError, match="--evaluate: 0 to"):
         command.read(["--resume", str(tmp_path)])
 
 
@@ -294,49 +263,13 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--seeds 0", "bench sweep: --seeds, --steps, --repeats: at least 1"),
-        ("--devices 4096", "bench sweep: devices: 4096 asked for"),
-        ("fats", "bench sweep: unknown preset 'fats'"),
-        (
-            "--learn.batch 8000 --train.learning_starts 8000",
-            "bench sweep: replay.capacity: must hold",
-        ),
-        ("smoke --train.scene 4", "bench sweep: Unrecognized options: --train.scene"),
-    ],
-)
-def test_bad_arguments_of_the_benchmark(
-    capsys: pytest.CaptureFixture, arguments: str, message: str
-):
-    """Claim: what `bench sweep` cannot measure is one line and exit code 2."""
-    assert cli.main(["bench", "sweep", *arguments.split()]) == 2
-    assert message in capsys.readouterr().err
-
-
 @pytest.mark.optax
 def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: `bench sweep` prints a row for each number of seeds, and the run of one seed by
     itself, with where they come from. A small step stands in for the learner's."""
     _with_toys(monkeypatch)
-    assert (
-        cli.main(
-            [
-                "bench",
-                "sweep",
-                "smoke",
-                "--seeds",
-                "1",
-                "3",
-                "--repeats",
-                "1",
-                "--train.scenes",
-                "4",
-            ]
-        )
-        == 0
-    )
+    flags = "smoke --seeds 1 3 --repeats 1 --train.scenes 4"
+    assert cli.main(["bench", "sweep", *flags.split()]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [(row["seeds"], row["devices"]) for row in found["rows"]] == [(1, 1), (3, 1)]
     for row in found["rows"]:
