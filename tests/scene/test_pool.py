@@ -177,9 +177,9 @@ def test_arrangements_are_kept(cache: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
-def test_damaged_cache_is_settled_anew(small: Config, cache: Path, damage: str):
-    """Claim: a cache file that was cut short or changed in any byte is noticed, and its scenes are
-    settled anew."""
+def test_damaged_pool_is_settled_anew(small: Config, cache: Path, monkeypatch, damage: str):
+    """Claim: a file of the cache, or of the package, that was cut short or changed in any byte is
+    noticed, and its scenes are settled anew; a whole one is used."""
     good = pool.settled(small, 0, 4)
     (path,) = cache.rglob("*.npz")
     raw = path.read_bytes()
@@ -194,6 +194,13 @@ def test_damaged_cache_is_settled_anew(small: Config, cache: Path, damage: str):
     path.write_bytes(damaged[len(damaged) // 2])
     _assert_same(good, pool.settled(small, 0, 4))
     assert pool._read(path) is not None
+    monkeypatch.setattr(pool, "shipped", lambda: path.parent)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache / "other"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "_settle", None)  # must not be called
+        _assert_same(good, pool.settled(small, 0, 4))
+    path.write_bytes(raw[:-100])
+    _assert_same(good, pool.settled(small, 0, 4))
 
 
 def test_cache_folder_is_private(small: Config, cache: Path, monkeypatch: pytest.MonkeyPatch):
@@ -322,21 +329,3 @@ def test_shipped_scenes_are_what_settling_gives(cache: Path, monkeypatch: pytest
     for name in ("half_size", "density", "friction", "colour"):
         ours, theirs = (getattr(each, name)[:20][fits] for each in (settled, shipped))
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_damaged_shipped_pool_is_settled(small: Config, cache: Path, monkeypatch):
-    """Claim: a pool that comes with the package is used if it is whole, else the scenes are
-    settled."""
-    wanted = pool.settled(small, pool.TRAIN_STREAM, 4)
-    (cached,) = cache.rglob("*.npz")
-    folder = cache / "shipped"
-    folder.mkdir()
-    monkeypatch.setattr(pool, "shipped", lambda: folder)
-    content = cached.read_bytes()
-    cached.unlink()
-    with monkeypatch.context() as patch:
-        (folder / cached.name).write_bytes(content)
-        patch.setattr(pool, "_settle", None)  # must not be called
-        _assert_same(wanted, pool.settled(small, pool.TRAIN_STREAM, 4))
-    (folder / cached.name).write_bytes(content[:-100])
-    _assert_same(wanted, pool.settled(small, pool.TRAIN_STREAM, 4))
