@@ -65,13 +65,18 @@ def _assert_at_rest(world: model.World, scenes: Scene) -> int:
     return touching
 
 
+def _spy(monkeypatch: pytest.MonkeyPatch, module, name: str, note) -> None:
+    """Calls `note` with the name and the arguments before a function."""
+    original = getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *args: [note(name, *args), original(*args)][1])
+
+
 def test_few_scenes_fall_that_are_not_needed(small: Config, monkeypatch: pytest.MonkeyPatch):
     """Claim: of a round as many scenes fall as are asked for, and at least one on each core; the
     scenes are the first of those of a larger pool."""
-    fallen: list[tuple] = []
-    rest = pool.rest
+    fallen: list[str] = []
     many = pool.settled(small, pool.TRAIN_STREAM, 6)
-    monkeypatch.setattr(pool, "rest", lambda *args: [fallen.append(args), rest(*args)][1])
+    _spy(monkeypatch, pool, "rest", lambda name, *_: fallen.append(name))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     few = pool.settled(small, pool.TRAIN_STREAM, 3)
     assert len(fallen) == 3
@@ -138,17 +143,11 @@ def test_scenes_are_made_on_the_cpu(cache: Path, monkeypatch: pytest.MonkeyPatch
     scenes and arranged ones."""
     devices = {}
 
-    def note(module, name):
-        original = getattr(module, name)
+    def note(name: str, *_) -> None:
+        devices[name] = jax.config.jax_default_device
 
-        def noted(*args):
-            devices[name] = jax.config.jax_default_device
-            return original(*args)
-
-        monkeypatch.setattr(module, name, noted)
-
-    note(model, "scene_fields")
-    note(arrange, "arrangements")
+    for module, name in ((model, "scene_fields"), (arrange, "arrangements")):
+        _spy(monkeypatch, module, name, note)
     pool.scenes(Config(scene=SceneConfig(slots=("box",) * 3, min_blocks=3, arranged=0.5)), 5, 4)
     assert devices == dict.fromkeys(["scene_fields", "arrangements"], jax.devices("cpu")[0])
 
@@ -277,19 +276,9 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 def test_many_blocks_come_to_rest(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: scenes of 24 blocks are found within a few rounds, for they are poured; those of 12
     drop at once, as fewer always did."""
-    falls: list[tuple[str, int]] = []
-
-    def spy(way: str):
-        fall = getattr(pool, way)
-
-        def spied(world, cfg, extent, scene, fields):
-            falls.append((way, int(scene.in_play.sum())))
-            return fall(world, cfg, extent, scene, fields)
-
-        monkeypatch.setattr(pool, way, spied)
-
-    spy("rest")
-    spy("pour")
+    falls: list[tuple] = []
+    for way in ("rest", "pour"):
+        _spy(monkeypatch, pool, way, lambda way, *args: falls.append((way, args[3].in_play.sum())))
     slots = ("box",) * 24
     scenes = pool.settled(Config(scene=SceneConfig(slots=slots, min_blocks=24)), 0, 2)
     assert scenes.in_play.shape == (2, 24)
