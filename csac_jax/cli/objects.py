@@ -1,9 +1,8 @@
 """`csac-jax objects make|import|show`: libraries of objects."""
 
-import contextlib
 import dataclasses
+import shutil
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -117,14 +116,20 @@ def _import(arguments: list[str]) -> int:
         raise BadArgumentsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
     jobs, cache = options.jobs or processes.cores(), Path(f"{options.out}.partial")
     settings = conversion.ImportSettings(options.scale, options.density)
-    with _progress_bar() as on_progress:
+    bar = output.progress()
+    task = bar.add_task("splitting into convex parts", total=None)
+
+    def on_progress(finished: int, total: int, name: str) -> None:
+        bar.update(task, description=name, completed=finished, total=total)
+
+    with bar:
         result = importing.run(paths, settings, jobs, cache, on_progress)
     for line in result.refused:
         print(f"{PROGRAM}: {line}", file=sys.stderr)
     if not result.objects:
         raise FailedError(f"none of {len(paths)} files can be imported; nothing is written")
     _list(library.save(options.out, result.objects).objects)
-    importing.forget(cache)
+    shutil.rmtree(cache, ignore_errors=True)
     for name, share in result.volumes.items():
         if not importing.SOUND[0] <= share <= importing.SOUND[1]:
             print(f"{name}: its parts have {share:.2f} of the mesh's volume; check it")
@@ -134,17 +139,6 @@ def _import(arguments: list[str]) -> int:
     ]
     output.write_result(options.json, {"objects": rows, "refused": result.refused})
     return 0
-
-
-@contextlib.contextmanager
-def _progress_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """Shows a line on a terminal with the latest finished file."""
-    bar = output.progress()
-    task = bar.add_task("splitting into convex parts", total=None)
-    with bar:
-        yield lambda finished, total, name: bar.update(
-            task, description=name, completed=finished, total=total
-        )
 
 
 def _check_new(folder: Path) -> None:

@@ -1,1 +1,1 @@
-"""Objects: rigid bodies of convex parts, kept in libraries. It needs neither MuJoCo nor JAX."""
+"""Rigid bodies of convex parts, in libraries. None needs JAX; `descriptions` needs MuJoCo."""

@@ -57,13 +57,14 @@ def _fraction(name: str) -> float:
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
 
 
-def make(name: str, parts: Sequence[Part], **more: Any) -> Object:
-    """Builds an object of convex parts that do not overlap, its centre of mass at the origin."""
-    return centred(name, parts, solid.joined(map(solid.moments, parts)), **more)
+def make(
+    name: str, parts: Sequence[Part], whole: solid.Moments | None = None, **more: Any
+) -> Object:
+    """Builds an object of convex parts, its centre of mass at the origin.
 
-
-def centred(name: str, parts: Sequence[Part], whole: solid.Moments, **more: Any) -> Object:
-    """Builds an object of these parts, whose integrals are `whole`."""
+    `whole` has the integrals of the body; without it, those of the parts, which must not overlap.
+    """
+    whole = whole or solid.joined(map(solid.moments, parts))
     com = whole.first / whole.volume
     shifted = [solid.moved(part, -com) for part in parts]
     shifted.sort(key=lambda part: -np.square(np.ptp(part.vertices, axis=0)).sum())

@@ -51,7 +51,7 @@ def convert(path: Path, name: str, settings: ImportSettings) -> tuple[Object, fl
         raise ValueError("has no part with a volume")
     share = sum(solid.moments(part).volume for part in parts) / mesh.volume
     source = {"source": path.name, "source_sha256": hashlib.sha256(content).hexdigest()}
-    converted = body.centred(name, parts, _moments(mesh), **settings._asdict(), **source)
+    converted = body.make(name, parts, _moments(mesh), **settings._asdict(), **source)
     if fault := body.faults(converted):
         raise ValueError(fault)
     return converted, float(share)

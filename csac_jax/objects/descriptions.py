@@ -53,7 +53,7 @@ def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
     """Builds the mesh of one geom, m, at its pose."""
     import trimesh
 
-    size, kind = model.geom_size[geom], int(model.geom_type[geom])
+    size, kind, make = model.geom_size[geom], int(model.geom_type[geom]), trimesh.creation
     if kind == _Geom.mjGEOM_MESH:
         number = model.geom_dataid[geom]
         first, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
@@ -61,15 +61,15 @@ def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
         corners, triangles = model.mesh_vert[first:][:count], model.mesh_face[begin:][:faces]
         mesh = trimesh.Trimesh(corners, triangles, process=False)
     elif kind == _Geom.mjGEOM_BOX:
-        mesh = trimesh.creation.box(2.0 * size)
+        mesh = make.box(2.0 * size)
     elif kind == _Geom.mjGEOM_SPHERE:
-        mesh = trimesh.creation.icosphere(3, size[0])
+        mesh = make.icosphere(3, size[0])
     elif kind == _Geom.mjGEOM_ELLIPSOID:
-        mesh = trimesh.creation.icosphere(3, 1.0).apply_scale(size)
+        mesh = make.icosphere(3, 1.0).apply_scale(size)
     elif kind == _Geom.mjGEOM_CYLINDER:
-        mesh = trimesh.creation.cylinder(size[0], 2.0 * size[1])
+        mesh = make.cylinder(size[0], 2.0 * size[1])
     elif kind == _Geom.mjGEOM_CAPSULE:
-        mesh = trimesh.creation.capsule(2.0 * size[1], size[0])
+        mesh = make.capsule(2.0 * size[1], size[0])
     else:
         raise ValueError(f"has a geom of kind {_Geom(kind).name[7:].lower()}; give it a mesh")
     place = np.eye(4)

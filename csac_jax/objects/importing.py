@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import hashlib
 import resource
-import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -158,8 +157,3 @@ def _store(cache: Path, path: Path, settings: ImportSettings, converted: Object)
     folder = _entry(cache, path, settings)
     if not folder.exists():
         library.save(folder, [converted])
-
-
-def forget(cache: Path) -> None:
-    """Removes the cache."""
-    shutil.rmtree(cache, ignore_errors=True)

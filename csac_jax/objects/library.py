@@ -43,7 +43,7 @@ class Library:
     sha256: str  # of the index and of the split, which pools of settled scenes depend on
 
     def number(self, name: str) -> int:
-        """Returns the number of an object. Raises ValueError with some names if there is none."""
+        """Returns the number of an object. Raises ValueError with some names if unknown."""
         names = [member.name for member in self.objects]
         if name not in names:
             some = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")

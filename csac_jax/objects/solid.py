@@ -82,8 +82,8 @@ _DIAGONALS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
 def _merged(planes: np.ndarray, size: float) -> np.ndarray:
     """Keeps one of each plane of the hull's triangles: [T, 4] -> [F, 4]."""
     rounded = (planes / [1, 1, 1, size]).round(_SAME_PLANE)
-    _, kept = np.unique(rounded, axis=0, return_index=True)
-    return planes[np.sort(kept)].astype(np.float32)
+    _, first = np.unique(rounded, axis=0, return_index=True)
+    return planes[np.sort(first)].astype(np.float32)
 
 
 def moments(part: Part) -> Moments:
@@ -97,9 +97,9 @@ def moments(part: Part) -> Moments:
     return Moments(float(sixth.sum()), np.einsum("t,ti->i", sixth, total) / 4.0, second)
 
 
-def joined(every: Iterable[Moments]) -> Moments:
+def joined(solids: Iterable[Moments]) -> Moments:
     """Sums integrals over solids that do not overlap."""
-    volumes, firsts, seconds = zip(*every, strict=True)
+    volumes, firsts, seconds = zip(*solids, strict=True)
     return Moments(sum(volumes), np.sum(firsts, axis=0), np.sum(seconds, axis=0))
 
 

@@ -13,22 +13,22 @@ from csac_jax.objects.body import DENSITY, Object
 from csac_jax.objects.library import Library, LibraryError, Split
 
 CHUNK = 6  # faces, as many as a box has
-NO_FACE = 1e3  # m, offset of a face that is not there: every point lies inside it
+NO_FACE = 1e3  # m, offset of a padding face: every point lies inside it
 _MADE = re.compile(r"(made|mixed):(\d{1,9}):(\d{1,4})")
 
 
 class Tables(NamedTuple):
-    """O objects, P parts of the one with most, C chunks of the one with most. Object frames.
+    """O objects, P most parts of an object, C most chunks of an object. Object frames.
 
-    A chunk is CHUNK faces of one part, the last one of a part filled up: parts have few faces or
-    many, so that a table of all parts by the most faces would be mostly empty.
+    A chunk is CHUNK faces of one part; the last chunk of a part is padded. Parts have few faces or
+    many: a table of parts by faces would be mostly empty.
     """
 
-    normal: np.ndarray  # [O, C, CHUNK, 3] float32 outward unit normals, 0 where there is no face
-    offset: np.ndarray  # [O, C, CHUNK] float32 m, NO_FACE where there is none
-    first: np.ndarray  # [O, C] bool, the chunk begins a part, or there is no such chunk
-    part: np.ndarray  # [O, C] int32, whose faces they are; P where there is no such chunk
-    present: np.ndarray  # [O, P] bool, there is such a part
+    normal: np.ndarray  # [O, C, CHUNK, 3] float32 outward unit normals, 0 for padding
+    offset: np.ndarray  # [O, C, CHUNK] float32 m, NO_FACE for padding
+    first: np.ndarray  # [O, C] bool, the chunk begins a part, or is padding
+    part: np.ndarray  # [O, C] int32, the part it belongs to; P for padding
+    present: np.ndarray  # [O, P] bool, the object has this part
     middle: np.ndarray  # [O, P, 3] float32 m, middle of the part's bounding box
     centre: np.ndarray  # [O, 3] float32 m, middle of the bounding box
     half: np.ndarray  # [O, 3] float32 m, half of the bounding box

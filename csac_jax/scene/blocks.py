@@ -94,7 +94,7 @@ def parts(slots: tuple[SlotKind, ...]) -> Parts:
     """Lists the parts of all slots in order; objects of a library have none here."""
     of_slot = [{"arch": _ARCH, "object": ()}.get(kind, _WHOLE) for kind in slots]
     slot = np.repeat(np.arange(len(slots)), [*map(len, of_slot)])
-    boxes = np.array([part for own in of_slot for part in own], np.float32).reshape(-1, 2, 3)
+    boxes = np.array([part for whole in of_slot for part in whole], np.float32).reshape(-1, 2, 3)
     return Parts(slot, boxes[:, 0], boxes[:, 1])
 
 

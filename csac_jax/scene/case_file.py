@@ -40,8 +40,8 @@ class Entry(BaseModel, extra="forbid", strict=True):
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> Self:
-        given = self.shape is not None, self.object is not None, self.library is not None
-        if given not in ((True, False, False), (False, True, True)):
+        present = [value is not None for value in (self.shape, self.object, self.library)]
+        if present not in ([True, False, False], [False, True, True]):
             raise ValueError('give a "shape", or an "object" and its "library"')
         if sum(value**2 for value in self.quaternion) <= 1e-12:
             raise ValueError('"quaternion" must not be all zero')

@@ -134,11 +134,9 @@ def _check_places(case: Case, extent: float) -> None:
     """Raises ValueError for blocks that overlap, or one outside the square or in the table."""
     placed: list[list[np.ndarray]] = []  # corners of the parts of the blocks so far
     for number, parts in enumerate(_corners(case), 1):
-        try:
-            _check_corners(np.concatenate(parts), extent)
-            _check_overlaps(parts, placed)
-        except ValueError as error:
-            raise ValueError(f"block {number}: {error}") from None
+        fault = _outside(np.concatenate(parts), extent) or _overlapping(parts, placed)
+        if fault:
+            raise ValueError(f"block {number}: {fault}")
         placed.append(parts)
 
 
@@ -162,26 +160,27 @@ def _corners(case: Case) -> list[list[np.ndarray]]:
     return corners
 
 
-def _check_corners(corners: np.ndarray, extent: float) -> None:
-    """Raises ValueError for a block with corners [V, 3] m outside of the allowed volume."""
+def _outside(corners: np.ndarray, extent: float) -> str | None:
+    """Describes how far corners [V, 3] m of a block lie outside of the allowed volume."""
     beyond = np.abs(corners[:, :2]).max() - 0.5 * extent
     below, top = -corners[:, 2].min(), corners[:, 2].max()
     if beyond > _ROUNDING:
-        by = f"{1e3 * beyond:.1f} mm beyond the square of {extent:g} m"
-        raise ValueError(f"reaches {by}; move it inwards")
+        return f"reaches {1e3 * beyond:.1f} mm beyond the square of {extent:g} m; move it inwards"
     if below > MAX_OVERLAP:
-        raise ValueError(f"reaches {1e3 * below:.1f} mm below the table; raise its z by as much")
+        return f"reaches {1e3 * below:.1f} mm below the table; raise its z by as much"
     if top > _HIGHEST:
-        raise ValueError(f"reaches {top:.3f} m above the table; keep it below {_HIGHEST:g} m")
+        return f"reaches {top:.3f} m above the table; keep it below {_HIGHEST:g} m"
+    return None
 
 
-def _check_overlaps(parts: list[np.ndarray], placed: list[list[np.ndarray]]) -> None:
-    """Raises ValueError for a block whose parts overlap those of one placed before."""
+def _overlapping(parts: list[np.ndarray], placed: list[list[np.ndarray]]) -> str | None:
+    """Describes the overlap of a block's parts with those of one placed before."""
     for number, others in enumerate(placed, 1):
         depth = max(overlap(*pair) for pair in itertools.product(parts, others))
         if depth > MAX_OVERLAP:
             by = f"{1e3 * depth:.1f} mm, more than the {1e3 * MAX_OVERLAP:g} mm allowed"
-            raise ValueError(f"overlaps block {number} by {by}; increase their distance")
+            return f"overlaps block {number} by {by}; increase their distance"
+    return None
 
 
 def overlap(one: np.ndarray, two: np.ndarray) -> float:

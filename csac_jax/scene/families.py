@@ -20,8 +20,8 @@ STACKED_GAP = 0.008  # m, widest gap that a block may bridge
 STACK_OFFSET = 0.003  # m, how far off the middle a stacked block may lie
 SUPPORT = 0.015  # m, how far a bridge's deck reaches onto its piers
 WIDE_GAP = 0.040  # m
-SLANTS = (0.7, 1.0)  # of stairs, how much farther along a block begins for each metre sideways:
-# where blocks touch, and where they are WIDE_GAP apart
+# Of stairs: metres farther along per metre sideways, for touching blocks and for a gap of WIDE_GAP.
+SLANTS = (0.7, 1.0)
 FAN_ANGLES = (np.deg2rad(50.0), np.deg2rad(70.0))  # between the ribs of a fan, likewise
 WEDGE_ANGLE = np.deg2rad(40.0)  # between an arm of a wedge and its middle
 
@@ -41,7 +41,7 @@ class Placed(NamedTuple):
     crosswise: jax.Array  # [R] bool, rotated by a quarter turn about z
     target: jax.Array  # [] int32, role of the block that is hardest to reach
     floor: jax.Array | float = 0.0  # [R] m, height of the surface that carries the block
-    yaw: jax.Array | float = 0.0  # [R] rad, besides the quarter turn
+    yaw: jax.Array | float = 0.0  # [R] rad, in addition to the quarter turn
 
 
 class Family(NamedTuple):

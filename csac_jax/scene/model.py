@@ -155,14 +155,14 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     slot_of_body[bodies] = slots
     slot_of_geom = slot_of_body[model.geom_bodyid]
     joints = robots.joint_names(sim, gripper)
-    held = np.flatnonzero(blocks.is_object(scene.slots))
-    library = stock.library(scene) if held.size else None
+    objects_at = np.flatnonzero(blocks.is_object(scene.slots))
+    library = stock.library(scene) if objects_at.size else None
     return World(
         model=model,
         slots=scene.slots,
         parts=blocks.parts(scene.slots),
         block_bodies=bodies,
-        block_geoms=np.flatnonzero((slot_of_geom >= 0) & ~np.isin(slot_of_geom, held)),
+        block_geoms=np.flatnonzero((slot_of_geom >= 0) & ~np.isin(slot_of_geom, objects_at)),
         block_qpos=model.jnt_qposadr[free_joints][:, None] + np.arange(7),
         block_dofs=model.jnt_dofadr[free_joints][:, None] + np.arange(6),
         slot_of_geom=slot_of_geom,
@@ -170,7 +170,9 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         gripper=gripper,
         hand_geoms=np.array([model.geom(name).id for name in robots.hand_geoms(gripper)]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
-        objects=None if library is None else objects.read(model, held, bodies[held], library),
+        objects=None
+        if library is None
+        else objects.read(model, objects_at, bodies[objects_at], library),
     )
 
 
@@ -230,8 +232,8 @@ def scene_fields(world: World, scene: Scene) -> BlockFields:
         fields = fields.replace(pads=_pads(world, scene.fingers))
     if world.objects is None:
         return fields
-    held = (scene.numbers, scene.density, scene.friction)
-    return fields.replace(objects=ObjectFields(*(leaf[world.objects.slots] for leaf in held)))
+    leaves = (scene.numbers, scene.density, scene.friction)
+    return fields.replace(objects=ObjectFields(*(leaf[world.objects.slots] for leaf in leaves)))
 
 
 def _pads(world: World, fingers: Fingers) -> PadFields:
@@ -254,10 +256,10 @@ def _box_fields(world: World, scene: Scene) -> BlockFields:
     part_mass = 8.0 * scene.density[slot] * jnp.prod(half, axis=1)
 
     # An object has no boxes: 1 kg and 1 kg m^2 stand in for 0, which has no inverse.
-    held, num = blocks.is_object(world.slots), len(world.slots)
+    is_object, num = blocks.is_object(world.slots), len(world.slots)
 
     def add(values: jax.Array) -> jax.Array:
-        blank = np.broadcast_to(held, (*values.shape[:0:-1], num)).T.astype(np.float32)
+        blank = np.broadcast_to(is_object, (*values.shape[:0:-1], num)).T.astype(np.float32)
         return jnp.asarray(blank).at[slot].add(values)
 
     mass = add(part_mass)

@@ -50,7 +50,7 @@ def scenes(cfg: Config, stream: int, count: int | None = None) -> Scene:
 
     NumPy leaves [P, N, ...]. The last `scene.arranged` of them are arrangements, or objects of a
     library side by side in the largest square of `scene.drop_extent`. Without a count,
-    `scene.pool` of each number of blocks. Raises SceneError where blocks do not come to rest or
+    `scene.pool` of each number of blocks. Raises SceneError for blocks that do not come to rest or
     allow no arrangement.
     """
     block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks

@@ -26,38 +26,35 @@ def _text(folder: Path, name: str, text: str) -> Path:
     return folder / name
 
 
-def _described(folder: Path, more: str = "") -> tuple[Path, trimesh.Trimesh]:
-    """A URDF of a bent mesh in millimetres, and what it describes."""
-    corner = trimesh.boolean.union(
-        [
-            trimesh.creation.box((60, 20, 20)),
-            trimesh.creation.box((20, 40, 20)).apply_translation((20, 20, 0)),
-        ]
-    )
-    (folder / "meshes").mkdir()
-    corner.export(folder / "meshes" / "corner.obj")
-    path = _text(folder, "a.urdf", _URDF.format(mesh="meshes/corner.obj", more=more))
+@pytest.fixture
+def bent(tmp_path: Path) -> trimesh.Trimesh:
+    """Writes a.urdf, with a bent mesh in millimetres; returns the mesh that it describes."""
+    arm = trimesh.creation.box((20, 40, 20)).apply_translation((20, 20, 0))
+    corner = trimesh.boolean.union([trimesh.creation.box((60, 20, 20)), arm])
+    (tmp_path / "meshes").mkdir()
+    corner.export(tmp_path / "meshes" / "corner.obj")
+    _text(tmp_path, "a.urdf", _URDF.format(mesh="meshes/corner.obj", more=""))
     place = trimesh.transformations.euler_matrix(0.3, 0.0, 1.0)
-    return path, corner.apply_scale(1e-3).apply_transform(place)
+    return corner.apply_scale(1e-3).apply_transform(place)
 
 
-def test_a_urdf_has_the_volume_and_inertia_of_its_mesh(tmp_path: Path):
+def test_a_urdf_has_the_volume_and_inertia_of_its_mesh(bent: trimesh.Trimesh, tmp_path: Path):
     """Claim: what collides in a URDF, where its origin puts it, has trimesh's volume, inertia and
-    size."""
-    path, wanted = _described(tmp_path)
-    one, share = conversion.convert(path, "a", ImportSettings())
-    assert one.volume == pytest.approx(wanted.volume, rel=1e-4)
-    np.testing.assert_allclose(one.inertia, wanted.moment_inertia, rtol=1e-3, atol=1e-12)
-    np.testing.assert_allclose(one.bounds[1] - one.bounds[0], wanted.extents, atol=1e-3)
+    size. A folder with a URDF gives that, not the mesh it names; without one its meshes."""
+    assert importing.files([tmp_path]) == [tmp_path / "a.urdf"]
+    assert importing.files([tmp_path / "meshes"])[0].name == "corner.obj"
+    member, share = conversion.convert(tmp_path / "a.urdf", "a", ImportSettings())
+    assert member.volume == pytest.approx(bent.volume, rel=1e-4)
+    np.testing.assert_allclose(member.inertia, bent.moment_inertia, rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(member.bounds[1] - member.bounds[0], bent.extents, atol=1e-3)
     assert share == pytest.approx(1.0, abs=0.1)
 
 
 def test_geoms_of_an_mjcf_count_once_where_they_overlap(tmp_path: Path):
     """Claim: two boxes that share a third have the closed form of the volume of both."""
     boxes = "".join(f'<geom type="box" size=".015 .01 .01" pos="{x} 0 0"/>' for x in (0, 0.02))
-    path = _text(tmp_path, "a.xml", _MJCF.format(boxes))
-    one, _ = conversion.convert(path, "a", ImportSettings())
-    assert one.volume == pytest.approx(0.05 * 0.02 * 0.02, rel=1e-4)
+    mesh = descriptions.read(_text(tmp_path, "a.xml", _MJCF.format(boxes)))
+    assert mesh.volume == pytest.approx(0.05 * 0.02 * 0.02, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -79,38 +76,22 @@ def test_every_kind_of_geom_has_its_volume(tmp_path: Path, kind: str, size: str,
 
 
 REFUSED = {
-    "plane": ("a.xml", _MJCF.format('<geom type="plane" size="1 1 1"/>'), "kind plane; give it a"),
-    "nothing": ("a.xml", _MJCF.format(""), "has no geom"),
-    "garbage": ("a.urdf", "<robot", "XML|Error"),
-    "elsewhere": (
-        "a.urdf",
-        _URDF.format(mesh="../b.obj", more=""),
-        "lies outside of its folder; move it",
-    ),
-    "missing": ("a.urdf", _URDF.format(mesh="b.obj", more=""), "b.obj"),
+    "plane.xml": (_MJCF.format('<geom type="plane" size="1 1 1"/>'), "kind plane; give it a mesh"),
+    "nothing.xml": (_MJCF.format(""), "has no geom"),
+    "garbage.urdf": ("<robot", "XML|Error"),
+    "outside.urdf": (_URDF.format(mesh="../meshes/corner.obj", more=""), "outside of its folder"),
+    "missing.urdf": (_URDF.format(mesh="b.obj", more=""), "b.obj"),
+    "hinge.urdf": (_URDF.format(mesh="a.obj", more=_HINGE), "an object is one rigid body"),
 }
 
 
+@pytest.mark.usefixtures("bent")
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_description_that_is_no_object_is_named(tmp_path: Path, name: str):
-    """Claim: geoms without a mesh, damaged files and meshes elsewhere are one line."""
-    file, text, message = REFUSED[name]
-    trimesh.creation.box((20, 20, 20)).export(tmp_path / "b.obj")
+    """Claim: geoms without a mesh, damaged files, meshes elsewhere and joints are one line."""
+    text, message = REFUSED[name]
     (tmp_path / "inside").mkdir()
+    trimesh.creation.box((20, 20, 20)).export(tmp_path / "inside" / "a.obj")
     with pytest.raises(ValueError, match=message) as caught:
-        descriptions.read(_text(tmp_path / "inside", file, text))
+        descriptions.read(_text(tmp_path / "inside", name, text))
     assert "\n" not in str(caught.value)
-
-
-def test_joints_that_move_are_refused(tmp_path: Path):
-    """Claim: a description of two bodies that a hinge joins is no object."""
-    path, _ = _described(tmp_path, _HINGE)
-    with pytest.raises(ValueError, match="has 1 joints that move; an object is one rigid body"):
-        descriptions.read(path)
-
-
-def test_meshes_in_a_folder_of_descriptions_are_parts_of_them(tmp_path: Path):
-    """Claim: a folder with a URDF gives that, not the mesh it names; without one its meshes."""
-    path, _ = _described(tmp_path)
-    assert importing.files([tmp_path]) == [path]
-    assert importing.files([tmp_path / "meshes"])[0].name == "corner.obj"

@@ -1,4 +1,4 @@
-"""Blocks of a scene in C MuJoCo, where they lie, and what a model of theirs is made of."""
+"""Scenes in C MuJoCo, for tests: model, state and corners of blocks."""
 
 import jax
 import mujoco
@@ -12,10 +12,8 @@ from csac_jax.scene.layout import Scene
 def in_c(
     world: model.World, scene: Scene, fields: model.BlockFields | None = None, iterations: int = 50
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """One scene of NumPy arrays in C MuJoCo, contacts found, the hand high above, parked blocks
-    without weight."""
-    if fields is None:
-        fields = jax.tree.map(np.asarray, model.scene_fields(world, scene))
+    """Builds one scene and its contacts; the hand high above, parked blocks weightless."""
+    fields = fields or jax.device_get(model.scene_fields(world, scene))
     exact = model.with_blocks(world, fields)
     exact.opt.iterations, exact.opt.ls_iterations = iterations, iterations
     exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
@@ -27,20 +25,20 @@ def in_c(
 
 
 def case_in_c(case: cases.Case) -> tuple[model.World, mujoco.MjModel, mujoco.MjData]:
-    """The blocks of a case in C MuJoCo."""
+    """Builds the blocks of a case."""
     world = model.build(SceneConfig(slots=case.slots, min_blocks=1), SimConfig())
     return world, *in_c(world, case.scene)
 
 
 def model_bytes(exact: mujoco.MjModel) -> bytes:
-    """All of a model."""
+    """Returns all of a model."""
     content = np.zeros(mujoco.mj_sizeModel(exact), np.uint8)
     mujoco.mj_saveModel(exact, None, content)
     return content.tobytes()
 
 
 def corners(exact: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Corners [V, 3] m of a geom in the world."""
+    """Returns corners [V, 3] m of a geom in the world."""
     if exact.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = exact.geom_dataid[geom]
         start = exact.mesh_vertadr[mesh]

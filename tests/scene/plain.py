@@ -15,9 +15,9 @@ PARALLEL = 0.1  # rad, of a closing direction to the normals of two faces
 def open_grasps(
     position: np.ndarray, yaw: np.ndarray, half: np.ndarray, sim: SimConfig
 ) -> np.ndarray:
-    """Whether an antipodal grasp of each block at each of the oracle's yaws is open [n, YAWS]: two
-    faces across, no wider than the hand, and no other block where the fingers go down or close.
+    """Tests if an antipodal grasp of each block at each of the oracle's yaws is open [n, YAWS].
 
+    Open: two faces across, no wider than the hand, no other block where fingers go down or close.
     Args: centres [n, 3] m, yaws [n] rad and half extents [n, 3] m, as the blocks lie. Blocks are
     their bounding boxes. A closing finger is a grid of points at the height of the grasp.
     """
@@ -25,7 +25,7 @@ def open_grasps(
     gripper = grippers.load(sim.gripper)
     tip = np.maximum(top - sim.grasp_depth, gripper.clearance) + 0.002
     widest = gripper.opening[1] - OPENING_ROOM
-    found, angle = np.zeros((len(half), YAWS), bool), np.arange(YAWS) * np.pi / YAWS
+    is_open, angle = np.zeros((len(half), YAWS), bool), np.arange(YAWS) * np.pi / YAWS
     for i in range(len(half)):
         off = (angle - yaw[i] + 0.25 * np.pi) % (0.5 * np.pi) - 0.25 * np.pi
         across = np.round((angle - yaw[i] - off) / (0.5 * np.pi)).astype(int) % 2  # x or y
@@ -37,12 +37,12 @@ def open_grasps(
         for k in np.flatnonzero((top > tip[i]) & (np.arange(len(half)) != i)):
             inside = np.abs((points - position[k, :2]) @ _turn(yaw[k])) < half[k, :2]
             blocked |= inside.all(axis=2).any(axis=1)
-        found[i, fits] = ~blocked
-    return found
+        is_open[i, fits] = ~blocked
+    return is_open
 
 
 def _fingers(gripper: Gripper, face: float) -> np.ndarray:
-    """Points [120, 2] m where fingers that close along x on faces at +-`face` m go."""
+    """Returns points [120, 2] m of fingers that close along x on faces at +-`face` m."""
     thickness, width = gripper.footprint
     outside = gripper.half[1] + 0.5 * gripper.finger[0] + thickness
     along = np.linspace(face + 0.0005, outside, 12)
@@ -56,8 +56,10 @@ def _turn(angle: float) -> np.ndarray:
 
 
 def distance(one: np.ndarray, others: np.ndarray) -> float:
-    """RMS distance in m of centres `one` [n, 3] from as many of `others` [m, 3], matched one to one
-    in the best way, after the best shift and rotation about z, mirrored or not; inf if m < n."""
+    """Computes the RMS distance, m, of centres `one` [n, 3] from as many of `others` [m, 3].
+
+    Best one-to-one match, shift and rotation about z, mirrored or not; inf if m < n.
+    """
     n = len(one)
     orders = np.array(list(itertools.permutations(range(len(others)), n)), int).reshape(-1, n)
     if not len(orders):

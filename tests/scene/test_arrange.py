@@ -163,20 +163,6 @@ def test_each_level_is_harder(drawn: Drawn):
         assert easy > 1.03 * middle > 1.06 * hard, name
 
 
-def test_open_grasps_by_hand():
-    """Claim: a lone cube is open at the yaws of its two pairs of faces; a block 10 mm from one face
-    leaves the other pair; a long block is open across alone."""
-    cube, place = np.full((1, 3), 0.025), np.array([[0.0, 0.0, 0.025]])
-    sim, yaw = SimConfig(), np.zeros(1)
-    lone = plain.open_grasps(place, yaw, cube, sim)
-    assert np.flatnonzero(lone[0]).tolist() == [0, 1, 15, 16, 17, 31]  # 32 yaws over pi
-    pair = np.array([[0.0, 0.0, 0.025], [0.06, 0.0, 0.025]])
-    two = plain.open_grasps(pair, np.zeros(2), np.repeat(cube, 2, 0), sim)
-    assert np.flatnonzero(two[0]).tolist() == [15, 16, 17]
-    long = plain.open_grasps(place, yaw, np.array([[0.05, 0.025, 0.025]]), sim)
-    assert np.flatnonzero(long[0]).tolist() == [15, 16, 17]
-
-
 def test_no_arrangement_is_a_case(drawn: Drawn):
     """Claim: however turned, shifted, mirrored and matched, and whatever the kinds, the centres of
     an arrangement's blocks are 5 mm (RMS) at least from those that `row`, `pinwheel` and `hole`

@@ -19,7 +19,7 @@ def _half(shape: str) -> np.ndarray:
 
 
 def _corners(kind: str, half: np.ndarray) -> np.ndarray:
-    """Corners [V, 3] m: of a box by its size, else as they stand in scenes/blocks.xml."""
+    """Returns corners [V, 3] m: of a box by its size, else those in scenes/blocks.xml."""
     if kind == "box":
         return half * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     root = xml.etree.ElementTree.parse(model.assets() / "blocks.xml").getroot()
@@ -73,12 +73,6 @@ def test_compiler_keeps_the_origin_of_a_mesh(kind: str):
     vertices = compiled.mesh_vert[start : start + compiled.mesh_vertnum[mesh]]
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, compiled.geom_quat[geom])
-    in_body = (
-        vertices @ rotation.reshape(3, 3).T / model.LARGEST
-        + compiled.geom_pos[geom] / model.LARGEST
-    )
-    ours, theirs = (
-        np.array(sorted(map(tuple, points.round(6) + 0.0)))
-        for points in (_corners(kind, None), in_body)
-    )
-    np.testing.assert_allclose(ours, theirs, atol=2e-6)
+    in_body = (vertices @ rotation.reshape(3, 3).T + compiled.geom_pos[geom]) / model.LARGEST
+    sets = (sorted(map(tuple, points.round(6) + 0.0)) for points in (_corners(kind, None), in_body))
+    np.testing.assert_allclose(*sets, atol=2e-6)

@@ -22,13 +22,15 @@ HEAVY = 1500.0  # kg/m^3, of all but the first object
 
 @pytest.fixture(scope="module")
 def cfg(tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """A library that begins with a tiny cube, with which the model is compiled: its frame is the
-    body's and its size small, which holds for no other."""
+    """Makes a library that begins with a tiny cube, with which the model is compiled.
+
+    Its frame is the body's and its size small, which holds for no other object.
+    """
     cube = 0.004 * np.array([*itertools.product((0.0, 1.0), repeat=3)])
     tiny = body.make("tiny", [solid.convex(cube)])
     folder = tmp_path_factory.mktemp("library") / "lib"
-    made = [dataclasses.replace(one, density=HEAVY) for one in families.draw(1, 28)]
-    library.save(folder, [tiny, *made])
+    heavy = [dataclasses.replace(member, density=HEAVY) for member in families.draw(1, 28)]
+    library.save(folder, [tiny, *heavy])
     kinds = ("object", "box", "object", "prism", "object")
     scene = {"slots": kinds, "min_blocks": 5, "objects": str(folder), "split": "all"}
     return Config().change(scene=scene, sim={"physics": "c"})
@@ -40,23 +42,22 @@ def world(cfg: Config) -> model.World:
 
 
 def dropped(cfg: Config, seed: int) -> Scene:
-    """A scene in the air."""
     return pool._drop(cfg.scene, np.random.default_rng(seed), 5)
 
 
 def compiled(cfg: Config, scene: Scene) -> mujoco.MjModel:
-    """A model whose object slots were given the scene's objects before it was compiled."""
+    """Compiles a model with the scene's objects in its slots."""
     spec = model._spec(cfg.scene, cfg.sim, grippers.load("rg2"))
-    known = stock.library(cfg.scene).objects
+    objects = stock.library(cfg.scene).objects
     for slot in SLOTS:
         number = int(scene.object_id[slot])
-        body = spec.body(f"block{slot}")
-        density = float(scene.density[slot]) * known[number].density / 600.0
-        body.mass, inertia = density * known[number].volume, density * known[number].inertia
+        body, member = spec.body(f"block{slot}"), objects[number]
+        density = float(scene.density[slot]) * member.density / 600.0
+        body.mass, inertia = density * member.volume, density * member.inertia
         body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         for part, geom in enumerate(body.geoms):
             geom.friction[0] = scene.friction[slot]
-            if part < len(known[number].parts):
+            if part < len(member.parts):
                 geom.meshname = f"object{number}/{part}"
             else:
                 geom.contype = geom.conaffinity = 0
@@ -64,13 +65,13 @@ def compiled(cfg: Config, scene: Scene) -> mujoco.MjModel:
 
 
 def inertias(exact: mujoco.MjModel) -> np.ndarray:
-    """Inertias [bodies, 3, 3] in the frames of the bodies."""
+    """Returns inertias [bodies, 3, 3] in the frames of the bodies."""
     axes = Rotation.from_quat(exact.body_iquat, scalar_first=True).as_matrix()
     return np.einsum("bij,bj,bkj->bik", axes, exact.body_inertia, axes)
 
 
 def fall(exact: mujoco.MjModel, world: model.World, scene: Scene) -> np.ndarray:
-    """Positions of the objects [T, 3, 7] while they fall."""
+    """Simulates poses of the objects [T, 3, 7] while they fall."""
     data = mujoco.MjData(exact)
     data.qpos[world.robot_qpos[2]] = data.ctrl[2] = model.HAND_PARK_HEIGHT
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
@@ -78,16 +79,15 @@ def fall(exact: mujoco.MjModel, world: model.World, scene: Scene) -> np.ndarray:
         data.qpos[world.block_qpos[slot, :3]] = 0.0, 0.005 * number, 0.09 + 0.17 * number
     # Blocks have other sizes in the compiled model, and the solver has all contacts at once.
     exact.geom_contype[world.block_geoms] = exact.geom_conaffinity[world.block_geoms] = 0
-    seen = []
+    path = []
     for _ in range(300):
         mujoco.mj_step(exact, data)
-        seen.append(data.qpos[world.block_qpos[SLOTS]])
-    return np.array(seen)
+        path.append(data.qpos[world.block_qpos[SLOTS]])
+    return np.array(path)
 
 
 def test_swapped_objects_fall_as_compiled_ones(cfg: Config, world: model.World):
-    """Claim: objects that are written into a model move as those that it is compiled
-    with."""
+    """Claim: objects that are written into a model move as those that it is compiled with."""
     touching = 0
     for seed in range(6):
         scene = dropped(cfg, seed)
@@ -128,12 +128,12 @@ def test_mass_and_inertia_are_the_objects(cfg: Config, world: model.World):
     """Claim: masses and inertias in the model are those of the parts that MuJoCo itself makes."""
     scene = dropped(cfg, 3)
     fields = jax.device_get(model.scene_fields(world, scene))
-    exact, known = model.with_blocks(world, fields), stock.library(cfg.scene).objects
+    exact, objects = model.with_blocks(world, fields), stock.library(cfg.scene).objects
     for slot in SLOTS:
         spec = mujoco.MjSpec()
         body = spec.worldbody.add_body()
         body.add_freejoint()
-        for number, part in enumerate(known[int(scene.object_id[slot])].parts):
+        for number, part in enumerate(objects[int(scene.object_id[slot])].parts):
             mesh = spec.add_mesh(name=f"{number}", uservert=part.vertices.ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
             geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{number}")

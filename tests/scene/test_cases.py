@@ -115,13 +115,10 @@ def _changed(block: int, key: str, value: Any = None) -> dict:
 REFUSED = [
     ("{", "not a JSON file"),
     ("[" * 100_000, "nested too deeply"),
-    ("[]", "not []"),
     (PAIR | {"extra": 1}, "'extra': is not a key"),
     ({"blocks": PAIR["blocks"]}, "'name': is missing"),
     (PAIR | {"name": "two\nlines"}, "'name': "),
-    (PAIR | {"name": 3}, "'name': "),
     (PAIR | {"blocks": []}, "'blocks': "),
-    (PAIR | {"blocks": {}}, "'blocks': "),
     (PAIR | {"blocks": PAIR["blocks"] * 40}, "'blocks': "),
     (PAIR | {"blocks": [3]}, "block 1: "),
     ('{"name": "a", "name": "b", "blocks": []}', "key 'name' is given twice"),
@@ -130,20 +127,16 @@ REFUSED = [
     (_changed(1, "object", "cup"), 'block 2: give a "shape", or an "object" and its "library"'),
     (_changed(1, "tagret", True), "block 2: 'tagret': is not a key"),
     (_changed(1, "shape", "sphere"), "block 2: 'shape': Input should be 'cube', 'cuboid'"),
-    (_changed(0, "shape", ["cube"]), "'cylinder', not ['cube']"),
     (_changed(0, "colour", "x" * 500), "block 1: 'colour': Input should be 'blue'"),
     (_changed(1, "position", [0.1, 0.1]), "block 2: 'position': "),
-    (_changed(1, "position", [0.1, 0.1, "0"]), "block 2: 'position.2': "),
     (_changed(1, "position", [0.1, 0.1, True]), "block 2: 'position.2': "),
     (_changed(1, "position", [0.1, 0.1, float("nan")]), "block 2: 'position.2': "),
     (_changed(1, "position", [0.1, 0.1, 10**400]), "block 2: 'position.2': "),
-    (_changed(1, "position", "here"), "block 2: 'position': "),
     (_changed(1, "quaternion", [1, 0, 0]), "block 2: 'quaternion': "),
     (_changed(1, "quaternion", [0, 0, 0.0, 0]), 'block 2: "quaternion" must not be all zero'),
     (_changed(1, "target", 1), "block 2: 'target': "),
     (_changed(1, "target", True), "block 2: block 1 is the target already"),
     (_changed(0, "position", [0.203, 0.0, 0.025]), "block 1: reaches 4.0 mm beyond the square"),
-    (_changed(0, "position", [0.0, -0.5, 0.025]), "block 1: reaches 301.0 mm beyond"),
     (_changed(0, "position", [0.05, 0.0, 0.022]), "block 1: reaches 3.0 mm below the table"),
     (_changed(0, "position", [0.05, 0.0, 0.48]), "block 1: reaches 0.505 m above the table"),
     (_changed(0, "position", [0.0225, 0.0, 0.025]), "block 2: overlaps block 1 by 2.5 mm"),
@@ -180,32 +173,10 @@ def test_unreadable_file_is_refused_in_one_line(tmp_path: Path):
         assert str(error.value).startswith(f"{tmp_path / name}: ")
 
 
-@pytest.mark.parametrize(
-    ("shape", "height", "second"),
-    [
-        ("cube", 0.025, "cube"),
-        ("cylinder", 0.025, "prism"),
-        ("prism", 0.0243, "prism"),
-        ("half_cylinder", 0.0125, "tile"),
-        ("arch", 0.025, "plank"),
-    ],
-)
-def test_overlap_is_measured_to_the_millimetre(
-    tmp_path: Path, shape: str, height: float, second: str
-):
-    """Claim: two blocks side by side may overlap by 2 mm, no more, whatever their shapes."""
-    other = blocks.SHAPES[second].half_size
-    touching = blocks.SHAPES[shape].half_size[1] + other[1]
-    first = _block(shape, [0.0, 0.0, height])
-    _load(tmp_path, first, _block(second, [0.0, touching - 0.0018, other[2]], "blue"))
-    with pytest.raises(ValueError, match=r"block 2: overlaps block 1 by 2\.[0-9] mm"):
-        _load(tmp_path, first, _block(second, [0.0, touching - 0.0025, other[2]], "blue"))
-
-
 @pytest.mark.parametrize("shape", blocks.SHAPES)
 def test_corners_are_those_of_the_block(tmp_path: Path, shape: str):
     """Claim: a block of any shape, turned or not, may touch the border from inside, and reach no
-    farther; one inside another is refused, however deep."""
+    farther; it may overlap another by 2 mm, no more, and not lie inside it."""
     half = np.array(blocks.SHAPES[shape].half_size)
     border = 0.5 * HeightmapConfig().extent
     for turn, reach in ((0.0, half[0]), (90.0, half[1])):
@@ -217,6 +188,13 @@ def test_corners_are_those_of_the_block(tmp_path: Path, shape: str):
             _load(tmp_path, at[0])
         with pytest.raises(ValueError, match="block 2: overlaps block 1"):
             _load(tmp_path, at[1], at[1])
+    flat = blocks.SHAPES["plank"].half_size  # its side, against a side, edge or end
+    first = _block(shape, [0.0, 0.0, half[2]])
+    second = _block("plank", [0.0, half[1] + flat[1] - 0.0018, flat[2]])
+    _load(tmp_path, first, second)
+    second["position"][1] -= 0.0007
+    with pytest.raises(ValueError, match=r"block 2: overlaps block 1 by 2\.[0-9] mm"):
+        _load(tmp_path, first, second)
 
 
 def test_square_and_target_are_the_callers(tmp_path: Path):

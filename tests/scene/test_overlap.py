@@ -49,11 +49,8 @@ def test_depth_is_that_of_contacts(kinds: tuple):
     rng, compared = np.random.default_rng(0), 0
     for turn in Rotation.random(200, rng=rng):
         data.qpos[world.block_qpos[0]] = [0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]
-        data.qpos[world.block_qpos[1]] = [
-            *rng.uniform(-0.05, 0.05, 2),
-            0.34,
-            *turn.as_quat(scalar_first=True),
-        ]
+        pose = [*rng.uniform(-0.05, 0.05, 2), 0.34, *turn.as_quat(scalar_first=True)]
+        data.qpos[world.block_qpos[1]] = pose
         mujoco.mj_kinematics(exact, data)
         mujoco.mj_collision(exact, data)
         one, two = (placed.corners(exact, data, geom) for geom in world.block_geoms)
@@ -62,7 +59,5 @@ def test_depth_is_that_of_contacts(kinds: tuple):
         assert (depth <= 1e-6) == (deepest == 0.0)
         if 0.0 < depth < 0.01:
             compared += 1
-            assert deepest == pytest.approx(
-                depth, abs=1e-4
-            )  # theirs is found step by step, between meshes
+            assert deepest == pytest.approx(depth, abs=1e-4)  # theirs is iterative between meshes
     assert compared > 20

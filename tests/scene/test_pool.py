@@ -65,13 +65,18 @@ def _assert_at_rest(world: model.World, scenes: Scene) -> int:
     return touching
 
 
+def _spy(monkeypatch: pytest.MonkeyPatch, module, name: str, note) -> None:
+    """Calls `note` with the name and the arguments before a function."""
+    original = getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *args: [note(name, *args), original(*args)][1])
+
+
 def test_few_scenes_fall_that_are_not_needed(small: Config, monkeypatch: pytest.MonkeyPatch):
     """Claim: of a round as many scenes fall as are asked for, and at least one on each core; the
     scenes are the first of those of a larger pool."""
-    fallen: list[tuple] = []
-    rest = pool.rest
+    fallen: list[str] = []
     many = pool.settled(small, pool.TRAIN_STREAM, 6)
-    monkeypatch.setattr(pool, "rest", lambda *args: [fallen.append(args), rest(*args)][1])
+    _spy(monkeypatch, pool, "rest", lambda name, *_: fallen.append(name))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     few = pool.settled(small, pool.TRAIN_STREAM, 3)
     assert len(fallen) == 3
@@ -138,17 +143,11 @@ def test_scenes_are_made_on_the_cpu(cache: Path, monkeypatch: pytest.MonkeyPatch
     scenes and arranged ones."""
     devices = {}
 
-    def note(module, name):
-        original = getattr(module, name)
+    def note(name: str, *_) -> None:
+        devices[name] = jax.config.jax_default_device
 
-        def noted(*args):
-            devices[name] = jax.config.jax_default_device
-            return original(*args)
-
-        monkeypatch.setattr(module, name, noted)
-
-    note(model, "scene_fields")
-    note(arrange, "arrangements")
+    for module, name in ((model, "scene_fields"), (arrange, "arrangements")):
+        _spy(monkeypatch, module, name, note)
     pool.scenes(Config(scene=SceneConfig(slots=("box",) * 3, min_blocks=3, arranged=0.5)), 5, 4)
     assert devices == dict.fromkeys(["scene_fields", "arrangements"], jax.devices("cpu")[0])
 
@@ -177,9 +176,9 @@ def test_arrangements_are_kept(cache: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
-def test_damaged_cache_is_settled_anew(small: Config, cache: Path, damage: str):
-    """Claim: a cache file that was cut short or changed in any byte is noticed, and its scenes are
-    settled anew."""
+def test_damaged_pool_is_settled_anew(small: Config, cache: Path, monkeypatch, damage: str):
+    """Claim: a file of the cache, or of the package, that was cut short or changed in any byte is
+    noticed, and its scenes are settled anew; a whole one is used."""
     good = pool.settled(small, 0, 4)
     (path,) = cache.rglob("*.npz")
     raw = path.read_bytes()
@@ -194,6 +193,13 @@ def test_damaged_cache_is_settled_anew(small: Config, cache: Path, damage: str):
     path.write_bytes(damaged[len(damaged) // 2])
     _assert_same(good, pool.settled(small, 0, 4))
     assert pool._read(path) is not None
+    monkeypatch.setattr(pool, "shipped", lambda: path.parent)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache / "other"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "_settle", None)  # must not be called
+        _assert_same(good, pool.settled(small, 0, 4))
+    path.write_bytes(raw[:-100])
+    _assert_same(good, pool.settled(small, 0, 4))
 
 
 def test_cache_folder_is_private(small: Config, cache: Path, monkeypatch: pytest.MonkeyPatch):
@@ -270,19 +276,9 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 def test_many_blocks_come_to_rest(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: scenes of 24 blocks are found within a few rounds, for they are poured; those of 12
     drop at once, as fewer always did."""
-    falls: list[tuple[str, int]] = []
-
-    def spy(way: str):
-        fall = getattr(pool, way)
-
-        def spied(world, cfg, extent, scene, fields):
-            falls.append((way, int(scene.in_play.sum())))
-            return fall(world, cfg, extent, scene, fields)
-
-        monkeypatch.setattr(pool, way, spied)
-
-    spy("rest")
-    spy("pour")
+    falls: list[tuple] = []
+    for way in ("rest", "pour"):
+        _spy(monkeypatch, pool, way, lambda way, *args: falls.append((way, args[3].in_play.sum())))
     slots = ("box",) * 24
     scenes = pool.settled(Config(scene=SceneConfig(slots=slots, min_blocks=24)), 0, 2)
     assert scenes.in_play.shape == (2, 24)
@@ -322,21 +318,3 @@ def test_shipped_scenes_are_what_settling_gives(cache: Path, monkeypatch: pytest
     for name in ("half_size", "density", "friction", "colour"):
         ours, theirs = (getattr(each, name)[:20][fits] for each in (settled, shipped))
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_damaged_shipped_pool_is_settled(small: Config, cache: Path, monkeypatch):
-    """Claim: a pool that comes with the package is used if it is whole, else the scenes are
-    settled."""
-    wanted = pool.settled(small, pool.TRAIN_STREAM, 4)
-    (cached,) = cache.rglob("*.npz")
-    folder = cache / "shipped"
-    folder.mkdir()
-    monkeypatch.setattr(pool, "shipped", lambda: folder)
-    content = cached.read_bytes()
-    cached.unlink()
-    with monkeypatch.context() as patch:
-        (folder / cached.name).write_bytes(content)
-        patch.setattr(pool, "_settle", None)  # must not be called
-        _assert_same(wanted, pool.settled(small, pool.TRAIN_STREAM, 4))
-    (folder / cached.name).write_bytes(content[:-100])
-    _assert_same(wanted, pool.settled(small, pool.TRAIN_STREAM, 4))

@@ -1,8 +1,10 @@
-"""Arms and grippers put together, and MJCF of one's own that does not fit its numbers."""
+"""Arms and grippers assembled, and MJCF that does not match its numbers or that MJX lacks."""
 
-import json
+import importlib
+import inspect
 import re
 import shutil
+import typing
 from pathlib import Path
 
 import mujoco
@@ -13,6 +15,7 @@ from csac_jax import grippers
 from csac_jax.config import RobotKind, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
 from csac_jax.scene import model
+from csac_jax.sim import mjx_physics
 
 SCENE = SceneConfig(slots=("box",), min_blocks=1)
 
@@ -22,8 +25,7 @@ def _built(gripper: str, robot: RobotKind = "hand", physics: str = "c") -> model
 
 
 def _settled(gripper: str, half: float) -> mujoco.MjData:
-    """The floating hand after a second at the origin with the fingers told to be at this half
-    opening, m."""
+    """Simulates the floating hand for a second with the fingers at this half opening, m."""
     world = _built(gripper)
     data = mujoco.MjData(world.model)
     data.ctrl[2], data.ctrl[4] = 0.5, world.gripper.set_point(half)
@@ -68,12 +70,14 @@ def test_gripper_hangs_at_the_flange(name: str):
     assert data.geom("ur5e/base").xpos[2] - foot.size[1] == pytest.approx(0.0, abs=1e-6)
 
 
-def _mine(folder: Path, file: str, old: str, new: str) -> str:
-    """A folder with the RG2, one thing changed."""
-    shutil.copytree(grippers.load("rg2").folder, folder)
-    text = (folder / file).read_text()
-    assert old in text
-    (folder / file).write_text(text.replace(old, new))
+def _changed(folder: Path, name: str, *changes: tuple[str, str]) -> str:
+    """Copies a gripper with changes to its MJCF."""
+    shutil.copytree(grippers.load(name).folder, folder)
+    text = (folder / grippers.MJCF).read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / grippers.MJCF).write_text(text)
     return str(folder)
 
 
@@ -98,7 +102,7 @@ def test_mjcf_that_does_not_fit_is_one_line(tmp_path: Path, case: str):
     """Claim: MJCF that lacks what the numbers name, has other numbers or does not compile gives one
     line with the file and what is wrong, whatever the robot and physics."""
     old, new, says = UNFIT[case]
-    folder = _mine(tmp_path / "mine", grippers.MJCF, old, new)
+    folder = _changed(tmp_path / "mine", "rg2", (old, new))
     for robot, physics in (("hand", "mjx"), ("ur5", "c")):
         with pytest.raises(SceneError, match=re.escape(says)) as error:
             _built(folder, robot, physics)
@@ -108,10 +112,9 @@ def test_mjcf_that_does_not_fit_is_one_line(tmp_path: Path, case: str):
 
 def test_wide_hand_in_numbers_only_is_refused(tmp_path: Path):
     """Claim: the numbers of one gripper with the MJCF of another are refused, not run wrong."""
-    numbers = json.loads((grippers.load("rg2").folder / grippers.NUMBERS).read_text())
-    numbers["opening"]["open"] = 0.085
-    folder = _mine(tmp_path / "mine", grippers.NUMBERS, "", "")
-    (Path(folder) / grippers.NUMBERS).write_text(json.dumps(numbers))
+    folder = _changed(tmp_path / "mine", "rg2")
+    path = Path(folder, grippers.NUMBERS)
+    path.write_text(path.read_text().replace("0.110}", "0.085}"))
     with pytest.raises(SceneError, match=r"opening when open is 110\.0 mm, by gripper\.json 85\.0"):
         _built(folder)
 
@@ -132,13 +135,43 @@ def test_pads_that_cannot_vary_are_refused(tmp_path: Path, case: str):
     """Claim: where fingers vary, MJCF whose pads are not the largest, or do not lie with their
     inner faces on the fingers' frames, gives one line: pads of an episode would be elsewhere."""
     changes, says = CANNOT_VARY[case]
-    folder = tmp_path / "mine"
-    shutil.copytree(grippers.load("varied").folder, folder)
-    text = (folder / grippers.MJCF).read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / grippers.MJCF).write_text(text)
     with pytest.raises(SceneError, match=re.escape(says)) as error:
-        _built(str(folder))
+        _built(_changed(tmp_path / "mine", "varied", *changes))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('<geom name="palm"', '<geom name="palm" gap="0.01"', "geom_gap"),
+        ('<geom name="palm"', '<geom name="palm" adhesion="1"', "geom_adhesion"),
+        ('joint name="finger_low"', 'joint name="finger_low" stiffness="0 9"', "jnt_stiffnesspoly"),
+        ('<position name="finger"', '<position name="finger" armature="1"', "actuator_armature"),
+        ('type="box"', 'type="ellipsoid"', "collisions not implemented"),
+        ("</mujoco>", '<sensor><user dim="1"/></sensor></mujoco>', "not supported"),
+    ],
+)
+def test_mjcf_that_mjx_cannot_run_is_one_line(tmp_path: Path, old: str, new: str, says: str):
+    """Claim: what MJX would ignore in a gripper's MJCF, or has no code for, is one line with the
+    remedy; C MuJoCo runs it."""
+    folder = _changed(tmp_path / "mine", "rg2", (old, new))
+    sim = SimConfig(gripper=folder, physics="mjx")
+    with pytest.raises(SceneError, match=f"MJX .*{says}.*; .*take sim.physics c") as error:
+        mjx_physics.make(model.build(SCENE, sim), sim)
+    assert "\n" not in str(error.value)
+    _built(folder)
+
+
+def test_shipped_mjcf_has_nothing_that_mjx_ignores():
+    """Claim: worlds of all robots and grippers pass, and MJX's code reads no field that is refused;
+    it would be refused needlessly."""
+    for gripper in grippers.shipped():
+        _built(gripper, "hand", "mjx")
+    for robot in typing.get_args(RobotKind):
+        _built("rg2", robot, "mjx")
+    names = "constraint derivative forward inverse passive scan sensor smooth solver support"
+    modules = [importlib.import_module(f"mujoco.mjx._src.{name}") for name in names.split()]
+    modules.append(importlib.import_module("mujoco.mjx._src.collision_driver"))
+    code = "".join(map(inspect.getsource, modules))
+    assert "m.geom_margin" in code
+    assert not [field for field in model._MJX_IGNORES if f"m.{field}" in code]
