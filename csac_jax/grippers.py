@@ -45,7 +45,7 @@ class FingerSize(NamedTuple):
 
 
 class Fingers(NamedTuple):
-    """What of a gripper may differ between episodes: numbers, or arrays [...], m."""
+    """Sizes of a gripper that may differ between episodes: numbers, or arrays [...], m."""
 
     opening: Any  # between the open pads
     thickness: Any  # of a finger, along the closing

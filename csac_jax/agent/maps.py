@@ -7,6 +7,7 @@ action is trilinear: bilinear in the two frames next to its yaw, linear between 
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -163,11 +164,10 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     if frames.shows_target:
         graspable = _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
     reach = int(np.ceil(frames.push_length / frames.cell))
-    window, padding = (1, 3, reach + 1), ((0, 0), (1, 1), (0, reach))
-    ahead = jax.lax.reduce_window(  # of numbers: ONNX pools no bools
-        under.astype(jnp.float32), -jnp.inf, jax.lax.max, window, (1, 1, 1), padding
-    )
-    return jnp.stack([ahead > 0.0, graspable]) & allowed
+    padded = jnp.pad(under, ((0, 0), (1, 1), (0, reach)))  # shifts: ONNX pools no bools
+    near = padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]
+    shifts = [near[..., shift : shift + frames.side] for shift in range(reach + 1)]
+    return jnp.stack([functools.reduce(operator.or_, shifts), graspable]) & allowed
 
 
 def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:

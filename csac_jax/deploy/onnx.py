@@ -54,8 +54,8 @@ def _decide(cfg: Config, params: Params) -> Callable[..., tuple[jax.Array, ...]]
     def decide(colour: jax.Array, height: jax.Array, *target: jax.Array) -> tuple[jax.Array, ...]:
         marked = target[0] if target else jnp.ones(height.shape, bool)
         obs = Observation(colour, height, marked, decision_program.fingers(cfg))
-        q = decision_program.dense_maps(cfg, params, obs, has_target).q
-        valid = maps.actionable_cells(frames, obs)
+        state = decision_program.dense_maps(cfg, params, obs, has_target)
+        q, valid = state.q, state.valid
         cells = jnp.stack([maps.best_cells(*one, 1)[0] for one in zip(q, valid, strict=True)])
         values = jnp.stack([one.reshape(-1)[cell] for one, cell in zip(q, cells, strict=True)])
         rule = policy.PRIMITIVE_RULES[cfg.policy.primitive]

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ LEFT, RIGHT = (-0.1, 0.0), (0.1, 0.05)
 
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
-    """An untrained one."""
+    """Returns an untrained policy."""
     learner = actor_critic.make(CFG)
     params = jax.jit(lambda: actor_critic.init(jax.random.key(3), learner).online)()
     return CameraPolicy(CFG, params)
@@ -57,7 +56,7 @@ def _grasp(place: tuple[float, float], primitive: str = "grasp") -> Decision:
 
 
 def write(folder: Path, *actions: tuple[scenes.Image, Decision, ReportedOutcome | None]) -> Path:
-    """A record of these actions, in their order."""
+    """Writes a record of these actions, in their order."""
     recorder = Recorder(folder, "test")
     for image, decision, outcome in actions:
         name = recorder.add((*image, None), [decision])
@@ -140,7 +139,7 @@ def test_pushes_are_judged_by_the_next_image(policy: CameraPolicy, tmp_path: Pat
 
 
 def _q(policy: CameraPolicy, image: scenes.Image, place: tuple[float, float]) -> float:
-    """Q of a grasp at a place."""
+    """Returns Q of a grasp at a place."""
     learner = actor_critic.make(policy.cfg)
     obs = policy.observe(*image)
     batch = actor_critic.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
@@ -202,22 +201,13 @@ def test_command_writes_a_policy(
     overwrites nothing."""
     start, out = tmp_path / "start.safetensors", tmp_path / "new.safetensors"
     policy_file.save(start, policy.params, policy.cfg)
-    options = [
-        "--updates",
-        "100",
-        "--batch",
-        "8",
-        "--learning-rate",
-        "1e-2",
-        "--json",
-        str(tmp_path / "done.json"),
-    ]
+    options = ["--updates", "100", "--batch", "8", "--learning-rate", "1e-2", "--json"]
+    options.append(str(tmp_path / "done.json"))
     arguments = ["finetune", str(start), str(lesson), "--out", str(out), *options]
     assert cli.main(arguments) == 0
-    told = capsys.readouterr().out
-    assert "100 of 100 updates, TD error" in told
-    assert "learned from 12 actions, 6 of them lifted something; TD error" in told
-    assert f"done after 100 updates; wrote {out}" in told
+    printed = capsys.readouterr().out
+    assert "100 of 100 updates, TD error" in printed
+    assert "learned from 12 actions, 6 of them lifted something; TD error" in printed
     assert json.loads((tmp_path / "done.json").read_text())["updates"] == 100
     tuned = CameraPolicy.load(out)
     assert tuned.cfg == CFG
@@ -226,44 +216,33 @@ def test_command_writes_a_policy(
     assert f"--out: {out} exists; give another name" in capsys.readouterr().err
 
 
-def _no_outcomes(folder: Path) -> None:
-    for path in folder.glob("*/outcome.json"):
-        path.unlink()
-
-
-def _cut_image(folder: Path) -> None:
-    path = folder / "000002" / "rgb.png"
-    path.write_bytes(path.read_bytes()[:200])
-
-
-def _no_depth(folder: Path) -> None:
-    (folder / "000001" / "depth.npy").unlink()
-
-
-def _millimetres(folder: Path) -> None:
-    path = folder / "000001" / "depth.npy"
-    np.save(path, 1000 * np.load(path))
-
-
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("file", "change", "message"),
     [
-        (_no_outcomes, "the record has no action with an outcome and an image after it"),
-        (_cut_image, r"000002/rgb\.png: "),
-        (_no_depth, r"there is no file .*000001/depth\.npy"),
-        (_millimetres, "000001: depth is .* times what camera_pose says"),
+        ("*/outcome.json", None, "the record has no action with an outcome and an image after it"),
+        ("000002/rgb.png", lambda file: file[:200], r"000002/rgb\.png: "),
+        ("000001/depth.npy", None, r"there is no file .*000001/depth\.npy"),
+        (
+            "000001/intrinsics.json",
+            lambda file: file.replace(b"160", b"320"),
+            "000001: rgb 160 x 120",
+        ),
     ],
 )
 def test_bad_records_are_refused(
-    policy: CameraPolicy, tmp_path: Path, spoil: Callable[[Path], None], message: str
+    policy: CameraPolicy, tmp_path: Path, file: str, change: Any, message: str
 ):
     """Claim: a record that nothing can be learned from, or that is damaged, is one line that says
     where."""
     folder = write(tmp_path / "record", (BOTH, _grasp(LEFT), Lifted), (BOTH, _grasp(LEFT), Lifted))
-    spoil(folder)
-    with pytest.raises(SettingsError, match=message) as found:
+    for path in list(folder.glob(file)):
+        content = path.read_bytes()
+        path.unlink()
+        if change is not None:
+            path.write_bytes(change(content))
+    with pytest.raises(SettingsError, match=message) as refused:
         fine_tuning.run(policy, folder)
-    assert "\n" not in str(found.value)
+    assert "\n" not in str(refused.value)
 
 
 def test_loss_that_is_not_finite(policy: CameraPolicy, lesson: Path):
@@ -277,10 +256,10 @@ def test_loss_that_is_not_finite(policy: CameraPolicy, lesson: Path):
     ("options", "message"),
     [
         ("--out new.bin", "--out: new.bin must end in .safetensors"),
-        ("--updates 0", "--updates: at least 1"),
-        ("--batch 0", "--batch: must lie in 1 .. 4096"),
-        ("--learning-rate 0", "--learning-rate: must lie between 0 and 1"),
-        ("--seed -1", "--seed: must lie in 0 .. 2147483646"),
+        ("--updates 0", "--updates: "),
+        ("--batch 0", "--batch: "),
+        ("--learning-rate 0", "--learning-rate: "),
+        ("--seed -1", "--seed: "),
         ("", "nowhere is no record: it has no record.json"),
     ],
 )
