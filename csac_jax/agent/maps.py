@@ -7,7 +7,6 @@ action is trilinear: bilinear in the two frames next to its yaw, linear between 
 
 import dataclasses
 import functools
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -164,10 +163,10 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     if frames.shows_target:
         graspable = _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
     reach = int(np.ceil(frames.push_length / frames.cell))
-    padded = jnp.pad(under, ((0, 0), (1, 1), (0, reach)))  # shifts: ONNX pools no bools
-    near = padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]
-    shifts = [near[..., shift : shift + frames.side] for shift in range(reach + 1)]
-    return jnp.stack([functools.reduce(operator.or_, shifts), graspable]) & allowed
+    ahead = jax.lax.reduce_window(
+        under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
+    )
+    return jnp.stack([ahead, graspable]) & allowed
 
 
 def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:

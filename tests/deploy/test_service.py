@@ -19,8 +19,12 @@ from csac_jax.deploy import CameraPolicy, record
 from csac_jax.deploy.record import Recorder
 from tests.deploy import image_files, scenes
 
-uvicorn = pytest.importorskip("uvicorn")
+pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi")
+
+import uvicorn  # isort: skip
+
+from csac_jax.deploy import service  # isort: skip
 
 TOKEN = "correct horse battery"
 IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])))
@@ -68,6 +72,10 @@ class Server:
         self._thread.join(10)
 
 
+SOUND = base64.b64decode(BODY["rgb"])
+HUGE = SOUND[:16] + (60000).to_bytes(4, "big") * 2 + SOUND[24:]  # px, by its header
+
+
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
     loaded = CameraPolicy.load("shipped")
@@ -77,8 +85,6 @@ def policy() -> CameraPolicy:
 
 @pytest.fixture(scope="module")
 def server(policy: CameraPolicy) -> Iterator[Server]:
-    from csac_jax.deploy import service
-
     running = Server(service.make(policy, "shipped", TOKEN))
     yield running
     running.stop()
@@ -87,8 +93,6 @@ def server(policy: CameraPolicy) -> Iterator[Server]:
 @pytest.fixture
 def recording(policy: CameraPolicy, tmp_path: Path) -> Iterator[Server]:
     """Starts a service that records into the test's folder."""
-    from csac_jax.deploy import service
-
     running = Server(service.make(policy, "shipped", TOKEN, Recorder(tmp_path, "shipped")))
     yield running
     running.stop()
@@ -196,17 +200,6 @@ def test_token_is_asked_for(server: Server, path: str, token: str):
     assert "Authorization" in answer["detail"]
 
 
-def _huge_png() -> str:
-    """Returns a PNG that claims 60,000 x 60,000 px in its header."""
-    content = bytearray(base64.b64decode(BODY["rgb"]))
-    content[16:24] = (60000).to_bytes(4, "big") * 2
-    return base64.b64encode(bytes(content)).decode()
-
-
-def _cut_png() -> str:
-    return base64.b64encode(base64.b64decode(BODY["rgb"])[:3000]).decode()
-
-
 @pytest.mark.parametrize(
     ("body", "status", "detail"),
     [
@@ -218,8 +211,8 @@ def _cut_png() -> str:
         ({**BODY, "top": 1000}, 400, "top: must lie in 1 .. 64, not 1000"),
         ({**BODY, "rgb": "%%%"}, 400, "rgb: must be a PNG in base64"),
         ({**BODY, "rgb": base64.b64encode(b"GIF89a" * 9).decode()}, 400, "rgb: must be a PNG"),
-        ({**BODY, "rgb": _huge_png()}, 400, "rgb: at most 4096 px a side"),
-        ({**BODY, "rgb": _cut_png()}, 400, "the image is damaged"),
+        ({**BODY, "rgb": base64.b64encode(HUGE).decode()}, 400, "rgb: at most 4096 px a side"),
+        ({**BODY, "rgb": base64.b64encode(SOUND[:3000]).decode()}, 400, "the image is damaged"),
         ({**BODY, "depth": BODY["rgb"]}, 400, "depth: is uint8; give a PNG of 16 bits"),
         ({**BODY, "intrinsics": {"fx": 1}}, 400, "intrinsics: 'width' is missing"),
         ({**BODY, "pose": {"matrix": [[1.0]]}}, 400, "camera_pose: must be a 4 x 4 matrix"),
