@@ -57,7 +57,7 @@ class Fingers(NamedTuple):
         return 0.5 * self.thickness + _FINGER_ROOM, 0.5 * self.width + _FINGER_ROOM
 
     @property
-    def beside(self) -> Any:
+    def finger_offset(self) -> Any:
         """Returns the distance from the middle of the open hand to that of a finger, m."""
         return 0.5 * self.opening + 0.5 * self.thickness
 

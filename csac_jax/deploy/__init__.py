@@ -84,7 +84,7 @@ class CameraPolicy:
         """Returns the `top` best actions, best first; fewer if there is less to act on.
 
         Args: rgb [h, w, 3] uint8; depth [h, w] float, m along the optical axis, 0 or NaN where
-        there is none; intrinsics, an `Intrinsics` or a dict of its fields, for both images;
+        it is missing; intrinsics, an `Intrinsics` or a dict of its fields, for both images;
         camera_pose 4 x 4, camera (x right, y down, z forward) to workspace; target_mask [h, w]
         bool, the object to get. Raises SettingsError for arrays of a wrong form, ViewError for an
         image that does not fit the pose. Warns (DataWarning) if colours seem to be BGR.

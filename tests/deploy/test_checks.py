@@ -111,7 +111,7 @@ def test_no_table():
     rough = (IMAGE.depth * rng.uniform(0.7, 1.0, IMAGE.depth.shape)).astype(np.float32)
     with pytest.raises(ViewError, match=r"no table found .* is 0\.8\d times that of a table"):
         _check(_view(depth=rough))
-    with pytest.raises(ViewError, match="there is none in the workspace, all 0 or NaN"):
+    with pytest.raises(ViewError, match="all of the workspace is 0 or NaN"):
         _check(_view(depth=np.zeros_like(IMAGE.depth)))
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from csac_jax import cli, presets
 from csac_jax.agent import actor_critic, maps
+from csac_jax.agent.learner import Transition
 from csac_jax.config import CameraConfig
 from csac_jax.constants import Outcome
 from csac_jax.deploy import CameraPolicy, experience, fine_tuning, record
@@ -69,6 +70,12 @@ Lifted, Empty, Pushed = (ReportedOutcome(outcome=name) for name in ("lifted", "e
 End = ReportedOutcome(outcome="lifted", ended=True)
 
 
+def _transitions(policy: CameraPolicy, loaded: experience.Experience) -> Transition:
+    program = offline.make(fine_tuning.configure(policy.cfg, Settings(batch=2), 4))
+    state = offline.init(program, policy.params)
+    return experience.transitions(policy, program.learner, state, loaded)
+
+
 def test_transitions_are_those_of_training(policy: CameraPolicy, tmp_path: Path):
     """Claim: an action is stored with the map that it was decided on, the map of the next image,
     its pose, and the reward of eqs. 10 to 15; the end of a scene ends an episode; an action without
@@ -92,9 +99,7 @@ def test_transitions_are_those_of_training(policy: CameraPolicy, tmp_path: Path)
             if wanted is not None:
                 row = jax.tree.map(lambda leaf, n=number: leaf[n], seen)
                 jax.tree.map(np.testing.assert_array_equal, row, heightmap.pack(wanted))
-    program = offline.make(fine_tuning.configure(CFG, Settings(batch=2), 4))
-    learner = offline.init(program, policy.params)
-    done = experience.transitions(policy, program.learner, learner, found)
+    done = _transitions(policy, found)
     np.testing.assert_allclose(done.reward, [2.0, -0.5, 2.0, 2.0], atol=1e-6)
     assert done.terminated.tolist() == [False, False, True, True]
     np.testing.assert_allclose(done.action.pose[:, :2], [RIGHT, LEFT, LEFT, LEFT], atol=1e-6)
@@ -105,47 +110,33 @@ def test_transitions_are_those_of_training(policy: CameraPolicy, tmp_path: Path)
 @pytest.mark.slow
 def test_what_is_learnt_is_what_was_seen(policy: CameraPolicy, tmp_path: Path):
     """Claim: Q of a stored transition is the score that its decision was taken for."""
-    recorder = Recorder(tmp_path, "test")
     decisions = policy.decide(*BOTH, top=3)
-    recorder.add((*BOTH, None), decisions)
+    came = Pushed if decisions[2].primitive == "push" else Empty
+    recorder = Recorder(tmp_path, "test")
+    recorder.post(recorder.add((*BOTH, None), decisions), came.model_copy(update={"number": 3}))
     recorder.add((*ONLY_LEFT, None), [])
-    came = "pushed" if decisions[2].primitive == "push" else "empty"
-    recorder.post("000001", ReportedOutcome(outcome=came, number=3))
-    found = experience.load(policy, record.read(tmp_path))
-    learner = actor_critic.make(CFG)
-    obs = heightmap.unpack(jax.tree.map(jax.numpy.asarray, found.obs))
-    batch = actor_critic.dense_maps(learner, policy.params, obs)
-    state = jax.tree.map(lambda leaf: leaf[0], batch)
-    action = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), found.action)
-    q = maps.read_q(learner.frames, state, action.primitive, action.pose)
-    assert float(q) == pytest.approx(decisions[2].score, abs=1e-3)
+    loaded = experience.load(policy, record.read(tmp_path))
+    obs, action = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), loaded[:2])
+    q = _q(policy, heightmap.unpack(obs), action.primitive, action.pose)
+    assert q == pytest.approx(decisions[2].score, abs=1e-3)
 
 
 def test_pushes_are_judged_by_the_next_image(policy: CameraPolicy, tmp_path: Path):
     """Claim: a push earns as in training: by whether the map has changed, or by the critic."""
-    folder = write(
-        tmp_path,
-        (BOTH, _grasp(RIGHT, "push"), Pushed),
-        (ONLY_LEFT, _grasp(LEFT, "push"), Pushed),
-        (ONLY_LEFT, _grasp(LEFT), None),
-    )
-    cfg = CFG.change(reward={"push_effect": "change"})
-    judge = dataclasses.replace(policy, cfg=cfg)
-    found = experience.load(judge, record.read(folder))
-    program = offline.make(fine_tuning.configure(cfg, Settings(batch=2), 2))
-    learner = offline.init(program, policy.params)
-    done = experience.transitions(judge, program.learner, learner, found)
+    push, other = _grasp(RIGHT, "push"), _grasp(LEFT, "push")
+    last = (ONLY_LEFT, _grasp(LEFT), None)
+    folder = write(tmp_path, (BOTH, push, Pushed), (ONLY_LEFT, other, Pushed), last)
+    judge = dataclasses.replace(policy, cfg=CFG.change(reward={"push_effect": "change"}))
+    done = _transitions(judge, experience.load(judge, record.read(folder)))
     np.testing.assert_allclose(done.reward, [0.5, -0.5], atol=1e-6)
 
 
-def _q(policy: CameraPolicy, image: scenes.Image, place: tuple[float, float]) -> float:
-    """Returns Q of a grasp at a place."""
+def _q(policy: CameraPolicy, obs: Any, primitive: Any, pose: Any) -> float:
+    """Returns Q of an action."""
     learner = actor_critic.make(policy.cfg)
-    obs = policy.observe(*image)
     batch = actor_critic.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
     state = jax.tree.map(lambda leaf: leaf[0], batch)
-    pose = np.array([*place, 0.3], np.float32)
-    return float(maps.read_q(learner.frames, state, np.int32(1), pose))
+    return float(maps.read_q(learner.frames, state, primitive, pose))
 
 
 LESSON = [(BOTH, _grasp(RIGHT), Lifted), (BOTH, _grasp(LEFT), Empty)] * 6 + [
@@ -169,8 +160,9 @@ def test_it_learns_what_works(policy: CameraPolicy, lesson: Path):
     tuned, done = fine_tuning.run(policy, lesson, SETTINGS)
     assert (done.actions, done.lifted, done.updates) == (12, 6, 100)
     assert done.td_error[1] < 0.2 < done.td_error[0]
-    assert abs(_q(tuned, BOTH, RIGHT) - 2.0) < 0.3
-    assert abs(_q(tuned, BOTH, LEFT) + 0.5) < 0.3
+    for place, reward in ((RIGHT, 2.0), (LEFT, -0.5)):
+        pose = np.array([*place, 0.3], np.float32)
+        assert abs(_q(tuned, tuned.observe(*BOTH), np.int32(1), pose) - reward) < 0.3
     assert tuned.cfg == policy.cfg
     jax.tree.map(np.testing.assert_array_equal, before, jax.device_get(policy.params))
 
