@@ -24,7 +24,6 @@ NUMBERS, MJCF = "gripper.json", "gripper.xml"
 FORMAT = 1
 LARGEST = 2**20  # bytes of a file of numbers
 LENGTHS = ("opening", "depth", "finger", "clearance", "radius", "body_radius", "hand_capsule")
-_SAME = ("name", "body", "palm", "pads", "arc_radius", *LENGTHS[:-1])  # in a file and a `Gripper`
 _CAPSULE = ("from", "to", "radius")
 _PALM_ROOM = 0.01  # m, ours: between what is held and the palm
 _FINGER_ROOM = 0.002  # m, ours: on every side of a finger that comes down
@@ -46,7 +45,7 @@ class FingerSize(NamedTuple):
 
 
 class Fingers(NamedTuple):
-    """What of a gripper may differ between episodes: numbers, or arrays [...], m."""
+    """Sizes of a gripper that may differ between episodes: numbers, or arrays [...], m."""
 
     opening: Any  # between the open pads
     thickness: Any  # of a finger, along the closing
@@ -58,35 +57,38 @@ class Fingers(NamedTuple):
         return 0.5 * self.thickness + _FINGER_ROOM, 0.5 * self.width + _FINGER_ROOM
 
     @property
-    def beside(self) -> Any:
+    def finger_offset(self) -> Any:
         """Returns the distance from the middle of the open hand to that of a finger, m."""
         return 0.5 * self.opening + 0.5 * self.thickness
 
 
-@dataclasses.dataclass(frozen=True)
-class Gripper:
-    """A two-finger gripper.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Shared:
+    """The numbers of a gripper that its file has alike."""
 
-    Its tip frame lies between the open tips. z points back to the flange; the fingers close along
-    x.
-    """
-
-    folder: Path
     name: str
     body: str  # root of the MJCF, whose frame is the tip frame
     palm: str  # geom above the fingers
     pads: tuple[str, str]  # geoms that face one another
-    actuator: str
-    set_points: Ends  # of the actuator
-    joints: tuple[str, ...]  # all that it moves; the opening is read from the first
-    positions: tuple[Ends, ...]  # of each joint
+    arc_radius: float | None  # m, of the pads' way; None: a straight line
     opening: Ends  # m, between the pads
     depth: Ends  # m, flange to tips
-    arc_radius: float | None  # m, of the pads' way; None: a straight line
     finger: FingerSize
     clearance: float  # m, least height of the tips above the table
     radius: float  # m, circle about the tool axis that holds the open hand
     body_radius: float  # m, capsule about the gripper's body
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Gripper(_Shared):
+    """A two-finger gripper. Its tip frame lies between the open tips: z points back to the flange,
+    the fingers close along x."""
+
+    folder: Path
+    actuator: str
+    set_points: Ends  # of the actuator
+    joints: tuple[str, ...]  # all that it moves; the opening is read from the first
+    positions: tuple[Ends, ...]  # of each joint
     hand_capsule: tuple[float, float, float]  # m, about palm and fingers: from, to, radius
     varies: tuple[Fingers, Fingers] | None = None  # least and most of an episode's; None: the same
 
@@ -219,7 +221,7 @@ def to_numbers(gripper: Gripper) -> dict[str, Any]:
 
     numbers = {
         "format": FORMAT,
-        **{name: getattr(gripper, name) for name in _SAME},
+        **{field.name: getattr(gripper, field.name) for field in dataclasses.fields(_Shared)},
         "pads": list(gripper.pads),
         "actuator": {"name": gripper.actuator, **ends(gripper.set_points)},
         "joints": dict(zip(gripper.joints, map(ends, gripper.positions), strict=True)),
@@ -246,25 +248,14 @@ class _Ranges(NamedTuple):
     width: tuple[float, float]
 
 
-@dataclasses.dataclass
-class _Numbers:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Numbers(_Shared):
     """The content of a gripper.json, checked by pydantic."""
 
     __pydantic_config__: ClassVar = {"extra": "forbid"}
     format: Literal[1]
-    name: str
-    body: str
-    palm: str
-    pads: tuple[str, str]
     actuator: _Actuator
     joints: dict[str, Ends]
-    opening: Ends
-    depth: Ends
-    arc_radius: float | None
-    finger: FingerSize
-    clearance: float
-    radius: float
-    body_radius: float
     hand_capsule: dict[Literal["from", "to", "radius"], float]
     varies: _Ranges | None = None
     sources: Any = None
@@ -292,7 +283,7 @@ def _from_json(folder: Path, content: str | bytes) -> Gripper:
         positions=tuple(numbers.joints.values()),
         hand_capsule=capsule,
         varies=numbers.varies and tuple(map(Fingers, *numbers.varies)),
-        **{name: getattr(numbers, name) for name in _SAME},
+        **{field.name: getattr(numbers, field.name) for field in dataclasses.fields(_Shared)},
     )
     for message, holds in _rules(gripper):
         if not holds:
@@ -300,19 +291,16 @@ def _from_json(folder: Path, content: str | bytes) -> Gripper:
     return gripper
 
 
-def _rules(gripper: Gripper) -> Iterator[tuple[str, bool]]:
-    """Yields what numbers must be, and whether they are; each may rely on those before it."""
+def _rules(gripper: Gripper) -> Iterator[tuple[str, Any]]:
+    """Yields what numbers must be, and True if they are; each may rely on those before it."""
     half, depth, finger = gripper.half, gripper.depth, gripper.finger
-    numbers = np.array([gripper.set_points, *gripper.positions, (gripper.arc_radius or 0.0, 0.0)])
-    yield (
-        "'actuator', 'joints' and 'arc_radius' must be finite numbers",
-        bool(np.isfinite(numbers).all()),
-    )
+    numbers = [*gripper.set_points, *sum(gripper.positions, ()), gripper.arc_radius or 0.0]
+    yield "'actuator', 'joints' and 'arc_radius' must be finite", np.isfinite(numbers).all()
     words = (gripper.name, gripper.body, gripper.palm, *gripper.pads, gripper.actuator)
     yield "'name', 'body', 'palm', 'pads' and 'actuator.name' must not be empty", all(words)
     for name in LENGTHS:
         lengths = np.array(getattr(gripper, name))
-        yield f"'{name}' must lie in 0 .. 1 m", bool(np.all((lengths >= 0.0) & (lengths <= 1.0)))
+        yield f"'{name}' must lie in 0 .. 1 m", lengths.min() >= 0.0 and lengths.max() <= 1.0
     yield "'joints' must name 1 to 16", 1 <= len(gripper.joints) <= 16
     yield "'opening' must grow from closed", half.closed < half.open
     moves = all(closed != opened for closed, opened in (gripper.set_points, *gripper.positions))
@@ -332,10 +320,10 @@ def _rules(gripper: Gripper) -> Iterator[tuple[str, bool]]:
     yield "'arc_radius', 'opening' and 'depth': the links would turn beyond 90 degrees", turns
 
 
-def _rules_of_ranges(gripper: Gripper, low: Fingers, high: Fingers) -> Iterator[tuple[str, bool]]:
+def _rules_of_ranges(gripper: Gripper, low: Fingers, high: Fingers) -> Iterator[tuple[str, Any]]:
     rising = all(0.0 < least <= most for least, most in zip(low, high, strict=True))
     yield "'varies' must be ranges [least, most] above 0", rising
     yield "'varies.opening' must exceed the closed one", low.opening > gripper.opening.closed
-    largest = high == gripper.fingers
-    yield "the most of 'varies' must be the MJCF's: 'opening.open' and 'finger'", largest
+    same = high == gripper.fingers
+    yield "the most of 'varies' must be the MJCF's: 'opening.open' and 'finger'", same
     yield "'varies' needs pads that close along a line", gripper.arc_radius is None

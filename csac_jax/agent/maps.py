@@ -156,11 +156,10 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     if frames.shows_target:
         graspable = _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
     reach = int(np.ceil(frames.push_length / frames.cell))
-    window, padding = (1, 3, reach + 1), ((0, 0), (1, 1), (0, reach))
-    ahead = jax.lax.reduce_window(  # of numbers: ONNX pools no bools
-        under.astype(jnp.float32), -jnp.inf, jax.lax.max, window, (1, 1, 1), padding
+    ahead = jax.lax.reduce_window(
+        under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
     )
-    return jnp.stack([ahead > 0.0, graspable]) & allowed
+    return jnp.stack([ahead, graspable]) & allowed
 
 
 def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:

@@ -84,14 +84,14 @@ class CameraPolicy:
         """Returns the `top` best actions, best first; fewer if there is less to act on.
 
         Args: rgb [h, w, 3] uint8; depth [h, w] float, m along the optical axis, 0 or NaN where
-        there is none; intrinsics, an `Intrinsics` or a dict of its fields, for both images;
+        it is missing; intrinsics, an `Intrinsics` or a dict of its fields, for both images;
         camera_pose 4 x 4, camera (x right, y down, z forward) to workspace; target_mask [h, w]
         bool, the object to get. Raises SettingsError for arrays of a wrong form, ViewError for an
         image that does not fit the pose. Warns (DataWarning) if colours seem to be BGR.
         """
         if not 1 <= top <= MOST_ALTERNATIVES:
             raise SettingsError(f"top: must lie in 1 .. {MOST_ALTERNATIVES}, not {top}")
-        obs, state = self._dense_maps(rgb, depth, intrinsics, camera_pose, target_mask)
+        obs, state = self._checked_maps(rgb, depth, intrinsics, camera_pose, target_mask)
         decisions: list[Decision] = []
         for _ in range(top):
             choice, state = _choose(self.cfg, state, obs.height)
@@ -104,7 +104,7 @@ class CameraPolicy:
         self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
     ) -> Maps:
         """Returns the maps that decisions about this image follow from."""
-        obs, state = self._dense_maps(rgb, depth, intrinsics, camera_pose, target_mask)
+        obs, state = self._checked_maps(rgb, depth, intrinsics, camera_pose, target_mask)
         return Maps(np.asarray(obs.height), np.asarray(_best_over_yaws(self.cfg, state)))
 
     def observe(
@@ -145,7 +145,7 @@ class CameraPolicy:
         state = _dense_maps(self.cfg, self.params, obs, target is not None)
         jax.block_until_ready(_choose(self.cfg, state, jax.numpy.zeros(rows)))
 
-    def _dense_maps(self, *image: Any) -> tuple[Observation, DenseMaps]:
+    def _checked_maps(self, *image: Any) -> tuple[Observation, DenseMaps]:
         """Returns the observation and the dense maps of an image, once it is checked."""
         cache.enable()
         obs, has_mask = self.observe(*image), image[-1] is not None

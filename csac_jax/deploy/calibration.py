@@ -29,7 +29,7 @@ class Calibration(NamedTuple):
 def seen_points(depth: Any, intrinsics: Any, pixels: Any) -> np.ndarray:
     """Returns the points [n, 3] m in the camera's frame of pixels [n, 2], column and row.
 
-    Args: depth [h, w] m, 0 or NaN where there is none; intrinsics as for `CameraPolicy.decide`.
+    Args: depth [h, w] m, 0 or NaN where it is missing; intrinsics as for `CameraPolicy.decide`.
     Raises SettingsError for pixels outside of the image, or with no depth around them.
     """
     camera, depth = images.Intrinsics.of(intrinsics), np.asarray(depth, np.float64)

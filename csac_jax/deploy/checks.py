@@ -119,7 +119,7 @@ def _depth_ratio(view: CameraView, extent: float) -> float:
     place = expected[..., None] * ray[..., :2] + view.pose[:2, 3]
     here = falling & (depth > 0.0) & np.all(np.abs(place) <= 0.5 * extent, axis=-1)
     if not here.any():
-        raise ViewError("depth: there is none in the workspace, all 0 or NaN; check the camera")
+        raise ViewError("depth: all of the workspace is 0 or NaN; check the camera")
     return float(np.median(depth[here] / expected[here]))
 
 

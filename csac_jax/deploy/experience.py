@@ -97,7 +97,7 @@ def transitions(
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _rewarded(cfg: Config, learner: Learner, state: Any, part: Experience) -> Transition:
-    """Rewards a part; lost blocks and distances are unknown and cost 0."""
+    """Computes the rewards of a part; lost blocks and distances are unknown and cost 0."""
     unknown = jnp.zeros(part.outcome.shape)
     obs, after = heightmap.unpack(part.obs), heightmap.unpack(part.next_obs)
     moved = jax.vmap(heightmap.moved_area, (None, 0, 0))(cfg.heightmap, obs.height, after.height)

@@ -66,7 +66,7 @@ def _adapter() -> pydantic.TypeAdapter[Intrinsics]:
 
 
 def distort(intrinsics: Intrinsics, xy: np.ndarray) -> np.ndarray:
-    """Distorts ideal image points `xy` [..., 2] at depth 1 by Brown's model, as OpenCV."""
+    """Moves ideal image points `xy` [..., 2] at depth 1 as OpenCV's lens (Brown's model)."""
     k1, k2, p1, p2, k3 = np.pad(np.array(intrinsics.distortion), (0, 5))[:5]
     x, y = xy[..., 0], xy[..., 1]
     square = x * x + y * y

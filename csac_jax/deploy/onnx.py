@@ -6,20 +6,25 @@ Arguments and results are those of `stablehlo.from_maps`, and two more results: 
 runtime.
 """
 
+import functools
 import logging
+import operator
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import jax2onnx
+import numpy as np
 from onnx_ir import serde
 from onnx_ir.passes import common
 
 from csac_jax.agent import actor_critic, maps, policy
 from csac_jax.agent.actor_critic import Params
+from csac_jax.agent.maps import Frames
 from csac_jax.config import Config, SmallNet
 from csac_jax.deploy import decision_program, stablehlo
 from csac_jax.errors import SettingsError
+from csac_jax.sim.outcome import BARE
 from csac_jax.sim.primitives import Action
 from csac_jax.vision.heightmap import Observation
 
@@ -48,17 +53,19 @@ def serialize(cfg: Config, params: Params) -> bytes:
 
 
 def _decide(cfg: Config, params: Params) -> Callable[..., tuple[jax.Array, ...]]:
-    """Returns the policy as a function of maps, in operations that jax2onnx knows: without vmap."""
+    """Returns the policy as a function of maps, in operations that jax2onnx knows: no vmap of a
+    gather, no window of bools."""
     frames, has_target = actor_critic.make(cfg).frames, cfg.task.kind == "target"
+    unmasked = cfg.change(policy={"cells": "all"})
+    rule = policy.PRIMITIVE_RULES[cfg.policy.primitive]
 
     def decide(colour: jax.Array, height: jax.Array, *target: jax.Array) -> tuple[jax.Array, ...]:
         marked = target[0] if target else jnp.ones(height.shape, bool)
         obs = Observation(colour, height, marked, decision_program.fingers(cfg))
-        q = decision_program.dense_maps(cfg, params, obs, has_target).q
-        valid = maps.actionable_cells(frames, obs)
+        q = decision_program.dense_maps(unmasked, params, obs, has_target).q
+        valid = _actionable_cells(frames, obs)
         cells = jnp.stack([maps.best_cells(*one, 1)[0] for one in zip(q, valid, strict=True)])
         values = jnp.stack([one.reshape(-1)[cell] for one, cell in zip(q, cells, strict=True)])
-        rule = policy.PRIMITIVE_RULES[cfg.policy.primitive]
         primitive = rule(values, jnp.int32(0))
         pose = maps.cell_pose(frames, cells[primitive])
         can_act = jnp.stack([one.any() for one in valid])[primitive]
@@ -66,3 +73,19 @@ def _decide(cfg: Config, params: Params) -> Callable[..., tuple[jax.Array, ...]]
         return primitive, pose, values[primitive], can_act, stations, q, valid
 
     return decide
+
+
+def _actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
+    """Computes `maps.actionable_cells` by shifts."""
+    allowed = jnp.asarray(frames.inside[None] & frames.reachable)
+    if frames.all_cells:
+        return allowed
+    height = jnp.where(obs.target, obs.height, 0.0) if frames.shows_target else obs.height
+    under, graspable = (maps.cell_heights(frames, top) > BARE for top in (obs.height, height))
+    reach = int(np.ceil(frames.push_length / frames.cell))
+    padded = jnp.pad(under, ((0, 0), (1, 1), (0, reach)))
+    rows = padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]
+    ahead = functools.reduce(
+        operator.or_, [rows[..., shift : shift + frames.side] for shift in range(reach + 1)]
+    )
+    return jnp.stack([ahead, graspable]) & allowed

@@ -2,7 +2,7 @@
 
     DIR/record.json           {"format": 1}
     DIR/000001/rgb.png        depth.npy, intrinsics.json, pose.json, maybe mask.png: the image
-    DIR/000001/decision.json  {"time", "policy", "decisions": as `act --json` has them}
+    DIR/000001/decision.json  {"time", "policy", "decisions": as `csac-jax act` writes them}
     DIR/000001/outcome.json   {"outcome", "number"?: 1, "ended"?: false}, once it is known
 
 An image shows what the action before it led to: a record is of one robot. An entry appears all at
@@ -97,7 +97,7 @@ class Entry(NamedTuple):
 
 
 class Recorder:
-    """A writer of a record, which it makes if there is none."""
+    """A writer of a record. It creates a missing one."""
 
     def __init__(self, folder: Path, policy: str) -> None:
         """Opens a record whose new entries name the `policy`. Raises SettingsError for a folder of

@@ -6,7 +6,7 @@ A file holds a function of plain arrays with the networks in it. From maps, as t
 
 `target` only in the task `target`. From an image of a lens without distortion:
 
-    rgb [h, w, 3] uint8, depth [h, w] float32 m with 0 where there is none,
+    rgb [h, w, 3] uint8, depth [h, w] float32 m, 0 where it is missing,
     lens [4] float32 fx fy cx cy px, pose [4, 4] float32 camera to workspace, mask [h, w] bool
 
 It returns primitive [] int32 (0 push, 1 grasp), pose [3] (x m, y m, yaw rad), score [], valid []

@@ -120,7 +120,7 @@ def _candidates(
     """Scores grasps of targets, leaves [B, ...], at YAWS and `shifts`; n = B YAWS len(shifts)."""
     sim, gripper, cells = cfg.sim, grippers.load(cfg.sim.gripper), cell_centres(cfg.heightmap)
     fingers = layout.fingers(scene, gripper)
-    beside, (along, across_pad) = fingers.beside, fingers.footprint
+    beside, (along, across_pad) = fingers.finger_offset, fingers.footprint
     slots, kind = jnp.arange(len(cfg.scene.slots)), jnp.int32(Primitive.GRASP)
 
     def place(target: GraspTarget, yaw: jax.Array, shift: jax.Array) -> jax.Array:

@@ -181,7 +181,7 @@ def _record(
     cfg: Config,
     image: tuple[np.ndarray, np.ndarray],
     decision: Decision,
-    came: record.Outcome,
+    came: record.ReportedOutcome,
 ) -> None:
     """Adds an image, its decision and what came of it."""
     given = (*image, picture.intrinsics(cfg.camera), _pose(cfg), None)

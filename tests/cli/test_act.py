@@ -1,7 +1,6 @@
 """`csac-jax act`: files in, decisions out as text, JSON and picture; bad files are one line."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -54,31 +53,24 @@ def test_depth_in_metres(given: list[str], tmp_path: Path, capsys: pytest.Captur
     np.testing.assert_allclose(x, y, atol=0.02)
 
 
-def test_mask(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: --mask chooses the object: each half of the image has its own block."""
+def test_mask_and_workspace(given: list[str], tmp_path: Path):
+    """Claim: --mask chooses the object: each half of the image has its own block. --workspace is
+    where the tool's poses are counted from; positions stay."""
+    workspace = np.eye(4)
+    workspace[2, 3] = 0.3
+    (tmp_path / "w.json").write_text(json.dumps({"matrix": workspace.tolist()}))
+    options = ["--mask", "mask.png", "--workspace", "w.json", "--json", "o.json"]
+    files = [str(tmp_path / option) if "." in option else option for option in options]
     for block, keep in enumerate((np.s_[:, :320], np.s_[:, 320:])):
         mask = np.zeros((480, 640), np.uint8)
         mask[keep] = 255
         imageio.imwrite(tmp_path / "mask.png", mask)
-        assert cli.main(["act", *given, "--mask", str(tmp_path / "mask.png")]) == 0
-        x, y = re.findall(r"[xy] ([-+.\d]+)", capsys.readouterr().out)
-        near = np.linalg.norm(POSES[:, :2] - [float(x), float(y)], axis=1).argmin()
-        assert near == block
-
-
-def test_workspace_moves_the_tool(given: list[str], tmp_path: Path):
-    """Claim: --workspace is where the tool's poses are counted from; positions stay."""
-    found = []
-    for height in (0.0, 0.3):
-        pose = np.eye(4)
-        pose[2, 3] = height
-        (tmp_path / "w.json").write_text(json.dumps({"matrix": pose.tolist()}))
-        files = ["--workspace", str(tmp_path / "w.json"), "--json", str(tmp_path / "o.json")]
         assert cli.main(["act", *given, *files]) == 0
-        found.append(json.loads((tmp_path / "o.json").read_text())["decisions"][0])
-    low, high = (np.array(one["waypoints"][0]["tool"]) for one in found)
-    np.testing.assert_allclose(high - low, [[0] * 4, [0] * 4, [0, 0, 0, 0.3], [0] * 4], atol=1e-9)
-    assert found[0]["position"] == found[1]["position"]
+        (decision,) = json.loads((tmp_path / "o.json").read_text())["decisions"]
+        place = decision["position"]
+        assert np.linalg.norm(POSES[:, :2] - place[:2], axis=1).argmin() == block
+        tool = np.array(decision["waypoints"][1]["tool"])
+        np.testing.assert_allclose(tool[:3, 3], np.add(place, [0.0, 0.0, 0.3]), atol=1e-6)
 
 
 def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -89,12 +81,9 @@ def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytes
     first, line = capsys.readouterr().out.splitlines()
     assert line == f"recorded as {record}/000001"
     assert json.loads(out.read_text())["id"] == "000001"
-    kept = {"rgb": "rgb.png", "depth": "depth.npy", "intrinsics": "", "pose": ""}
-    files = [
-        part
-        for name, file in kept.items()
-        for part in (f"--{name}", str(record / "000001" / (file or f"{name}.json")))
-    ]
+    names = ("rgb.png", "depth.npy", "intrinsics.json", "pose.json")
+    paths = [record / "000001" / name for name in names]
+    files = [part for path in paths for part in (f"--{path.stem}", str(path))]
     assert cli.main(["act", "shipped", *files]) == 0
     assert capsys.readouterr().out.splitlines() == [first]
     _ten_times(tmp_path)
@@ -137,7 +126,6 @@ def _ten_times(folder: Path) -> None:
         ("rgb.png", image_files.png(IMAGE.rgb[::2, ::2]), "rgb 320 x 240, depth 640 x 480"),
         ("depth.png", image_files.png(IMAGE.rgb[..., 0]), "depth.png: is uint8; give a PNG of 16"),
         ("pose.json", b"1 0 0 0", "pose.json: Invalid JSON"),
-        ("pose.json", b'{"pose": []}', "pose.json: 'matrix' is missing"),
         ("pose.json", b'{"matrix": [[1, 2], [3]]}', "matrix: must be a 4 x 4 matrix of numbers"),
         ("intrinsics.json", b'{"width": 640}', "intrinsics.json: intrinsics: 'height' is missing"),
     ],
@@ -173,13 +161,9 @@ def test_bad_files_are_one_line(
 def test_bad_options(
     given: list[str], capsys: pytest.CaptureFixture, arguments: list[str], message: str
 ):
-    """Claim: options out of range are refused with exit code 2."""
+    """Claim: options out of range are refused with exit code 2, an unknown policy with 1."""
     assert cli.main(["act", *given, *arguments]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_no_policy(given: list[str], capsys: pytest.CaptureFixture):
-    """Claim: a policy that is not there is one line."""
     assert cli.main(["act", "nowhere", *given[1:]]) == 1
     assert "there is no folder nowhere" in capsys.readouterr().err
 
@@ -193,10 +177,15 @@ def test_nothing_to_act_on(tmp_path: Path, capsys: pytest.CaptureFixture):
 
 
 def test_command_needs_no_mujoco(given: list[str], tmp_path: Path):
-    """Claim: the command decides, draws and writes without MuJoCo installed."""
+    """Claim: the command decides, draws and writes without MuJoCo installed; a run's folder, which
+    needs it, gets one line."""
     start = "import sys; sys.modules['mujoco'] = None; from csac_jax import cli; "
     files = ["--json", str(tmp_path / "o.json"), "--png", str(tmp_path / "o.png")]
     command = [sys.executable, "-c", f"{start}sys.exit(cli.main())", "act", *given, *files]
-    done = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ))
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert " 1 grasp at x " in done.stdout
+    command[4] = str(tmp_path)
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "needs mujoco" in done.stderr

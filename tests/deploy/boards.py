@@ -15,7 +15,7 @@ FINE = 2  # rays along each side of a pixel
 
 
 def take(board: Board, pose: np.ndarray, lens: images.Intrinsics = LENS) -> np.ndarray:
-    """The image [h, w, 3] uint8 of a printed board at `pose` [4, 4], board to camera, in grey."""
+    """Returns the image [h, w, 3] uint8 of a printed board at `pose` [4, 4], board to camera."""
     page = ndimage.gaussian_filter(board.picture().astype(np.float64), 2.0)  # no print is sharper
     big = images.Intrinsics(
         *(FINE * lens.width, FINE * lens.height, FINE * lens.fx, FINE * lens.fy),

@@ -19,7 +19,7 @@ MOST = 4  # blocks of most images
 
 
 class Image(NamedTuple):
-    """What `CameraPolicy.decide` takes."""
+    """The arguments of `CameraPolicy.decide`."""
 
     rgb: np.ndarray  # [h, w, 3] uint8
     depth: np.ndarray  # [h, w] float32 m
@@ -28,7 +28,7 @@ class Image(NamedTuple):
 
 
 def blocks_at(poses: Any, half_size: Any = HALF, colours: Any = None) -> Polytopes:
-    """Boxes on the table at poses [N, 3] m, m, rad; half_size [3] or [N, 3] m; colours [N]."""
+    """Places boxes at poses [N, 3] m, m, rad; half_size [3] or [N, 3] m; colours [N]."""
     poses = np.array(poses, np.float32).reshape(-1, 3)
     half = np.broadcast_to(half_size, (len(poses), 3)).astype(np.float32)
     chosen = np.arange(len(poses)) if colours is None else np.array(colours)
@@ -45,7 +45,7 @@ def _placed(poses: jax.Array, half: jax.Array, palette: jax.Array) -> Polytopes:
 
 
 def pose_of(cfg: CameraConfig = CAMERA) -> np.ndarray:
-    """Camera to workspace [4, 4]."""
+    """Returns the camera's pose [4, 4] in the workspace."""
     eye, pose = camera.make(cfg), np.eye(4)
     pose[:3, :3], pose[:3, 3] = eye.rotation, eye.position
     return pose
@@ -60,7 +60,7 @@ def _rendered(shapes: Polytopes, cfg: CameraConfig) -> Any:
 
 
 def take(shapes: Polytopes, cfg: CameraConfig = CAMERA) -> Image:
-    """The image of blocks on the table; depth is NaN where the camera sees the horizon."""
+    """Renders blocks on the table; depth is NaN where the camera sees the horizon."""
     most = max(MOST, len(shapes.offset))  # the last block several times: one program for all
     padded = jax.tree.map(lambda leaf: leaf[np.arange(most).clip(max=len(leaf) - 1)], shapes)
     distance, surface, valid, lit = jax.device_get(_rendered(padded, cfg))
@@ -72,7 +72,7 @@ def take(shapes: Polytopes, cfg: CameraConfig = CAMERA) -> Image:
 
 
 def random_poses(rng: np.random.Generator, num: int) -> np.ndarray:
-    """Poses [num, 3] of blocks that do not overlap, in the inner half of the workspace."""
+    """Draws poses [num, 3] of blocks that do not overlap, in the inner half of the workspace."""
     poses = np.zeros((0, 3))
     while len(poses) < num:
         new = rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, np.pi])

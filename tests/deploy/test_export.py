@@ -70,8 +70,10 @@ def policy() -> CameraPolicy:
 
 
 @pytest.fixture(scope="module")
-def obs(policy: CameraPolicy) -> Observation:
-    return jax.device_get(policy.observe(*IMAGE))
+def shown(policy: CameraPolicy) -> dict[str, np.ndarray]:
+    """Returns the maps of IMAGE."""
+    obs = jax.device_get(policy.observe(*IMAGE))
+    return {"colour": obs.colour, "height": obs.height}
 
 
 def _assert_close(results: list[Any], cfg: Config, params: Any, *maps: Any, scale: float) -> None:
@@ -82,12 +84,12 @@ def _assert_close(results: list[Any], cfg: Config, params: Any, *maps: Any, scal
         np.testing.assert_allclose(result, value, atol=atol, rtol=0, err_msg=name)
 
 
-def test_stablehlo_of_maps(policy: CameraPolicy, obs: Observation, tmp_path: Path, capsys: Any):
+def test_stablehlo_of_maps(policy: CameraPolicy, shown: Any, tmp_path: Path, capsys: Any):
     """Claim: jax alone computes from maps what the policy does, to 1e-4."""
-    file, maps = tmp_path / "policy.stablehlo", {"colour": obs.colour, "height": obs.height}
-    results = _alone(_BY_JAX, file, "--format", "stablehlo", **maps)
+    file = tmp_path / "policy.stablehlo"
+    results = _alone(_BY_JAX, file, "--format", "stablehlo", **shown)
     assert f"wrote {file}, {file.stat().st_size} bytes" in capsys.readouterr().out
-    _assert_close(results, policy.cfg, policy.params, *maps.values(), scale=1.0)
+    _assert_close(results, policy.cfg, policy.params, *shown.values(), scale=1.0)
 
 
 @pytest.mark.slow
@@ -104,28 +106,27 @@ def test_stablehlo_of_an_image(policy: CameraPolicy, tmp_path: Path):
     np.testing.assert_allclose(results[4][:, :3], places, atol=1e-3)
 
 
-def test_onnx(policy: CameraPolicy, obs: Observation, tmp_path: Path):
+def test_onnx(policy: CameraPolicy, shown: Any, tmp_path: Path):
     """Claim: onnxruntime alone computes Q and the best cell's action as the policy, to 1e-4."""
-    maps = {"colour": obs.colour, "height": obs.height}
-    results = _alone(_BY_ONNXRUNTIME, tmp_path / "policy.onnx", "--format", "onnx", **maps)
+    results = _alone(_BY_ONNXRUNTIME, tmp_path / "policy.onnx", "--format", "onnx", **shown)
     cfg = policy.cfg.change(policy={"place": "argmax"})
-    _assert_close(results, cfg, policy.params, *maps.values(), scale=1.0)
-    state = jax.jit(lambda o: decision_program.dense_maps(cfg, policy.params, o, False))(obs)
-    np.testing.assert_allclose(results[5], state.q, atol=TOLERANCE, rtol=0)
+    _assert_close(results, cfg, policy.params, *shown.values(), scale=1.0)
+    look = jax.jit(lambda obs: decision_program.dense_maps(cfg, policy.params, obs, False))
+    np.testing.assert_allclose(results[5], look(policy.observe(*IMAGE)).q, atol=TOLERANCE, rtol=0)
 
 
 def _random(cfg: Config) -> tuple[Any, Observation]:
-    """Networks that no training gives, and a map with boxes in it, half of them targets."""
-    rng, size = np.random.default_rng(3), cfg.heightmap.size
+    """Draws networks that no training gives, and a map with boxes, half of them targets."""
+    rng, rows = np.random.default_rng(3), (cfg.heightmap.size,) * 2
     blank = actor_critic.abstract_params(cfg)
     params = jax.tree.map(lambda leaf: rng.normal(0.0, 0.2, leaf.shape).astype("f4"), blank)
-    height = rng.uniform(0.0, 0.009, (size, size)).astype(np.float32)  # seen, too low to act on
-    target = np.zeros((size, size), bool)
+    height = rng.uniform(0.0, 0.009, rows).astype(np.float32)  # seen, too low to act on
+    target = np.zeros(rows, bool)
     for number in range(4):
-        row, col = rng.integers(2, size - 10, 2)
+        row, col = rng.integers(2, rows[0] - 10, 2)
         height[row : row + 8, col : col + 6] = rng.uniform(0.02, 0.08)
         target[row : row + 8, col : col + 6] = number % 2 == 0
-    colour = rng.uniform(size=(size, size, 3)).astype(np.float32)
+    colour = rng.uniform(size=(*rows, 3)).astype(np.float32)
     return params, Observation(colour, height, target, decision_program.fingers(cfg))
 
 

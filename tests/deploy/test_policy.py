@@ -1,9 +1,5 @@
-"""From an image to decisions, and without MuJoCo."""
+"""From an image to decisions."""
 
-import json
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -37,7 +33,7 @@ def decisions(policy: CameraPolicy) -> list[Decision]:
 
 
 def _block_under(decision: Decision) -> int | None:
-    """The block whose top holds the place of a decision, worked out in the block's own frame."""
+    """Returns the block whose top holds the place of a decision, by the block's own frame."""
     for number, (x, y, yaw) in enumerate(POSES):
         cos, sin = np.cos(yaw), np.sin(yaw)
         dx, dy = decision.position[0] - x, decision.position[1] - y
@@ -130,11 +126,6 @@ def test_push_waypoints(policy: CameraPolicy):
         np.testing.assert_allclose(stations[:, 4], 0.0)
 
 
-def test_empty_table_has_no_decision(policy: CameraPolicy):
-    """Claim: where there is nothing to act on, there is no decision."""
-    assert policy.decide(*BARE_TABLE, top=3) == []
-
-
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_target_is_grasped(policy: CameraPolicy, number: int):
     """Claim: with a mask, the policy grasps the marked block alone, whichever it is."""
@@ -157,17 +148,13 @@ def test_policy_of_the_target_task_needs_a_mask():
     assert CameraPolicy(cfg, params).decide(*IMAGE, target_mask=mask)
 
 
-@pytest.mark.parametrize("top", [0, 65])
-def test_top_has_bounds(policy: CameraPolicy, top: int):
-    """Claim: a number of decisions out of range is refused."""
-    with pytest.raises(SettingsError, match=r"top: must lie in 1 \.\. 64"):
-        policy.decide(*IMAGE, top=top)
-
-
 def test_misfit_is_refused(policy: CameraPolicy):
-    """Claim: the checks come before a decision."""
+    """Claim: the checks come before a decision; a number of decisions out of range is refused."""
     with pytest.raises(ViewError, match="millimetres"):
         policy.decide(IMAGE.rgb, 1000 * IMAGE.depth, *IMAGE[2:])
+    for top in (0, 65):
+        with pytest.raises(SettingsError, match=r"top: must lie in 1 \.\. 64"):
+            policy.decide(*IMAGE, top=top)
 
 
 def test_report_of_the_empty_table(policy: CameraPolicy):
@@ -182,38 +169,6 @@ def test_report_of_the_empty_table(policy: CameraPolicy):
     assert empty.covered_cm2 == 0.0
     two = policy.check(*scenes.take(scenes.blocks_at(POSES[:2])))
     assert 100.0 <= two.covered_cm2 < 200.0
-
-
-_ALONE = """
-import sys
-sys.modules["mujoco"] = None
-import json
-import numpy as np
-from csac_jax import deploy
-image = np.load(sys.argv[1])
-given = json.loads(sys.argv[2])
-policy = deploy.CameraPolicy.load("shipped")
-print(json.dumps(policy.decide(image["rgb"], image["depth"], given, image["pose"])[0].to_dict()))
-try:
-    deploy.CameraPolicy.load(sys.argv[3])
-except deploy.SettingsError as error:
-    print(error)
-"""
-
-
-def test_decides_without_mujoco(decisions: list[Decision], tmp_path: Path):
-    """Claim: a process without MuJoCo decides alike; a run's folder gets one line."""
-    arrays = {name: getattr(IMAGE, name) for name in ("rgb", "depth", "pose")}
-    np.savez(tmp_path / "image.npz", **arrays)
-    given = json.dumps(IMAGE.intrinsics)
-    command = [sys.executable, "-c", _ALONE, tmp_path / "image.npz", given, tmp_path]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    first, complaint = done.stdout.splitlines()
-    found = json.loads(first)
-    assert found["primitive"] == decisions[0].primitive
-    np.testing.assert_allclose(found["position"], decisions[0].position, atol=1e-5)
-    assert "needs mujoco" in complaint
-    assert "csac-jax export" in complaint
 
 
 def test_net_of_heights_sees_no_colours():

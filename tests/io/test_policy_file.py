@@ -72,7 +72,7 @@ def test_a_policy_brings_its_own_gripper(tmp_path: Path, params: Params):
         remarks["config"] = json.dumps(stored)
 
     _rewrite(path, spoil)
-    with pytest.raises(PolicyFileError, match="'actuator' is missing"):
+    with pytest.raises(PolicyFileError, match="'name' is missing"):
         policy_file.load(path)
 
 
