@@ -16,7 +16,7 @@ from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.evaluation.policies import LearnedPolicy, Policy
 from csac_jax.evaluation.statistics import Band
 from csac_jax.io import files, policy_file
-from csac_jax.report import tables
+from csac_jax.report import result_tables
 
 SEED = 0
 OBJECTS = "made:7:400"  # the library whose held-out shapes suites of objects draw from
@@ -180,7 +180,7 @@ def markdown(results: list[dict[str, Any]]) -> str:
 
 def _shown(bands: Iterable[Band | None]) -> list[str]:
     """A band of each metric, as text."""
-    return [tables.shown(band, metric=m) for band, m in zip(bands, METRICS, strict=True)]
+    return [result_tables.shown(band, metric=m) for band, m in zip(bands, METRICS, strict=True)]
 
 
 def write_table(folder: Path, share: float) -> Path:

@@ -16,7 +16,6 @@ from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.sim.primitives import Action
 from csac_jax.training import step
-from experiments.bench import between_cells
 from tests.agent import toys
 
 pytestmark = pytest.mark.optax
@@ -164,28 +163,6 @@ def test_random_places_lie_anywhere_in_their_cells(learner):
     np.testing.assert_allclose(
         maps.denormalise(frames, place(keys[0]))[:2], frames.xy[centre], atol=1e-6
     )
-
-
-def test_what_counts_as_between_cells(learner):
-    """Claim: `bench between_cells` counts an action more than half a cell along x or y, or half a
-    yaw's step round the circle, from the best cell; and none of another primitive."""
-    frames = learner.frames
-    half, turn = 0.5 * frames.cell, np.pi / len(frames.yaws)
-    cell = np.array([0.02, -0.03, 0.1 * turn])
-    for step_by, far, turned in (
-        ((0.9 * half, -0.9 * half, 0.0), False, False),
-        ((0.0, -1.1 * half, 0.0), True, False),
-        ((0.0, 0.0, -0.9 * turn), False, False),
-        ((1.1 * half, 0.0, -1.1 * turn), True, True),
-    ):
-        pose = cell + step_by
-        pose[2] %= 2.0 * np.pi
-        for primitive in Primitive:
-            action = Action(jnp.int32(primitive), jnp.asarray(pose, jnp.float32))
-            best = Action(jnp.int32(Primitive.GRASP), jnp.asarray(cell, jnp.float32))
-            found = tuple(map(bool, between_cells.moved(learner.cfg, action, best)))
-            same = primitive == Primitive.GRASP
-            assert found == (far and same, turned and same)
 
 
 @pytest.mark.slow

@@ -143,7 +143,6 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval shipped --sensor.kind d415", "sensor.kind: must be none where heightmap.view is"),
         ("eval shipped --camera.size 320 240", "camera.centre: (319.5, 239.5) is not near the"),
         ("play --heightmap.size 60", "heightmap.size: must be a multiple of 8"),
-        ("bench finetune --grasps 0", "bench finetune: --grasps: must be at least 1"),
         ("eval . --seed 2147483647", "--seed: must lie in"),
         (
             "eval shipped --suite nowhere",
