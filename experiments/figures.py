@@ -217,6 +217,9 @@ def _finish(panel: Any) -> None:
 if __name__ == "__main__":
     FIGURES.mkdir(exist_ok=True)
     shown = linked()
+    for path in FIGURES.glob("*.png"):
+        if path.stem not in shown:
+            path.unlink()
     for name, figure in draw():
         if name in shown:
             figures.save(figure, FIGURES / f"{name}.png")

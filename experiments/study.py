@@ -24,6 +24,7 @@ ARCHIVES, PAGE = ROOT / "experiments" / "results" / "study", ROOT / "docs" / "st
 BEGIN = "<!-- The rest is written by `python -m experiments.study`. -->\n"
 FEWER = range(100, 120)  # seeds of all parts but the first in the target task
 TASKS = ("target", "clear", "packed")
+STRATA = ("clear", "target", "packed")  # of part 2; the order decides the bootstrap's draws
 COMPLETION, PUSHES = "completion", "pushes_per_episode"  # of evaluations
 AREA, ACTIONS = "area", "actions to 90 %"  # of training
 POINT = 0.01  # within which methods are equal
@@ -96,8 +97,8 @@ def _laws(law: str, actions: int) -> list[str]:
     """Returns the folders of a law, one per task; at 2,500 actions samplers are those of part 1."""
     if LAWS[law].startswith("2/") and actions == 2500:
         algo = LAWS[law].removeprefix("2/algo=").removesuffix(",")
-        return [f"1-{task}-{algo}-*/*" for task in TASKS]
-    return [f"{LAWS[law]}task={task},train.actions={actions}" for task in TASKS]
+        return [f"1-{task}-{algo}-*/*" for task in STRATA]
+    return [f"{LAWS[law]}task={task},train.actions={actions}" for task in STRATA]
 
 
 def _search() -> dict[str, dict[str, Groups]]:

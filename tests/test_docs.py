@@ -5,7 +5,6 @@ import json
 import re
 import runpy
 import shlex
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -21,6 +20,7 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import parsing, sweep
 from csac_jax.evaluation import suites
 from csac_jax.io import checkpoint, configs
+from experiments import index
 
 ROOT = Path(csac_jax.__file__).parents[1]
 README = ROOT / "README.md"
@@ -29,7 +29,7 @@ ROBOT = ROOT / "docs" / "robot.md"  # its commands make the files of its blocks
 OBJECTS = ROOT / "docs" / "objects.md"  # likewise
 GRIPPERS = ROOT / "docs" / "grippers.md"
 TUTORIAL = ROOT / "docs" / "tutorial" / "first-training.md"
-RECORD = ROOT / "experiments" / "results" / "quick" / "csac_beta" / "seed-0" / "metrics.jsonl"
+RECORD = "quick/csac_beta/seed-0/metrics.jsonl"
 ALL = [README, ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
 PAGES = [page for page in ALL if "```python" in page.read_text() and page not in (ROBOT, OBJECTS)]
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
@@ -70,7 +70,8 @@ def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
     (tmp_path / "runs" / "first").mkdir(parents=True)
-    shutil.copy(RECORD, tmp_path / "runs" / "first")
+    log = index.contents(index.RESULTS / "quick.tar.xz")[RECORD]
+    (tmp_path / "runs" / "first" / "metrics.jsonl").write_bytes(log)
     small = presets.smoke().change(sim={"physics": "auto"})  # as in `quick`
     monkeypatch.setattr(presets, "quick", lambda: small)
     monkeypatch.setattr(presets, "PRESETS", {**presets.PRESETS, "quick": lambda: small})
@@ -294,7 +295,7 @@ def test_readme_has_the_recorded_numbers(policy: str, record: dict[str, str]):
     rows = [row.split("|")[3:6] for row in lines if f"**{policy}**" in row]
     for (name, path), row in zip(record.items(), rows, strict=True):
         said = [[float(number) for number in re.findall(r"[\d.]+", cell)] for cell in row]
-        measured = json.loads((ROOT / "experiments" / "results" / path).read_text())
+        measured = index.record(path)
         parts = measured.get("parts", {name: measured}).values()
         for metric, shown, cell in zip(METRICS, said, row, strict=True):
             per_cent = 100 if "%" in cell else 1
