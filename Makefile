@@ -1,9 +1,8 @@
-# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, NAME, JOBS, VIEWED may be set.
+# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, JOBS, VIEWED may be set.
 PYTHON ?= python3
 PRESET ?= quick
 POLICY ?= learned
 EPISODES ?= 50
-NAME ?= step
 JOBS ?= 2
 RUN ?= $(firstword $(shell ls -1dt runs/*/ 2>/dev/null))
 VIEWED ?= shipped
@@ -52,21 +51,22 @@ format: $(STAMP)  ## rewrite the sources in ruff's format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP)  ## speed of this machine, by benchmark NAME (step); ARGS=smoke for another preset
-	$(BIN)/csac-jax bench $(NAME) $(ARGS)
+bench: $(STAMP)  ## measure this machine by the main benchmarks, into build/bench.md (15 minutes)
+	$(BIN)/python -m experiments.bench $(ARGS)
 
 pictures: $(STAMP)  ## draw the pictures of README and docs (4 minutes)
 	$(BIN)/python -m experiments.pictures
 	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --size 960 720 --png docs/pictures/views.png
 	$(BIN)/csac-jax play --scene pile --objects made:0:200 --policy $(VIEWED) --png docs/pictures/objects.png
 
-figures: $(STAMP)  ## the figures, tables and index of the recorded results
-	$(BIN)/csac-jax report experiments/results --markdown docs/results.md > /dev/null
-	$(BIN)/python -m experiments.records
+figures: $(STAMP)  ## the tables and figures of docs/ that are made from the recorded results
+	$(BIN)/python -m experiments.summary
 	$(BIN)/python -m experiments.study
 	$(BIN)/python -m experiments.figures
 
 docs: $(STAMP)  ## build the site of docs/ into build/docs; no network is needed
+	$(BIN)/csac-jax report experiments/results --markdown build/pages/all-results.md > /dev/null
+	$(BIN)/python -m experiments.index
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "read it: $(BIN)/python -m http.server --directory build/docs"
 

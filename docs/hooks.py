@@ -31,11 +31,20 @@ from csac_jax.section import Section  # noqa: E402
 from csac_jax.training import loop  # noqa: E402
 
 SOURCES = ROOT / "build" / "sources"  # mkdocs.yml names it, too
+PAGES = ROOT / "build" / "pages"
+BUILT = {"All results": "all-results.md", "Records": "records.md"}
 LANGUAGES = {".py": "python", ".json": "json", ".toml": "toml"}
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
 EQUATION = re.compile(r'<(div|span) class="arithmatex">\\([\[(])(.*?)\\[\])]</\1>', re.DOTALL)
 FIELD = re.compile(r"^(    \w+: [^#\n]+?)  # (?!type|noqa)(.+)$", re.MULTILINE)
 WIDTH = 100  # characters of a line of help
+
+
+def on_config(config: Any) -> Any:
+    """Adds the pages that `make docs` wrote before the build: all results, and their index."""
+    pages = [{title: name} for title, name in BUILT.items() if (PAGES / name).exists()]
+    next(item for item in config.nav if "Results" in item)["Results"].extend(pages)
+    return config
 
 
 def on_startup(command: str, dirty: bool) -> None:
@@ -66,6 +75,8 @@ def on_files(files: Any, config: Any) -> Any:
     """Adds a page for each source file outside docs that a page links to."""
     pages = [file for file in files if file.is_documentation_page()]
     linked = {path for page in pages for _, path in _outside(page.src_uri, page.content_string)}
+    for name in filter(lambda name: (PAGES / name).exists(), BUILT.values()):
+        files.append(File.generated(config, name, abs_src_path=str(PAGES / name)))
     for path in sorted(linked):
         if (ROOT / path).is_file() and (text := _as_markdown(ROOT / path)):
             files.append(File.generated(config, _source_page(path), content=text))

@@ -13,14 +13,22 @@ import matplotlib.pyplot as plt
 from matplotlib import cycler, ticker
 from matplotlib.figure import Figure
 
-from csac_jax.report import charts, comparison, curves, results
-from csac_jax.report.results import METRICS
+from csac_jax.report import comparison, figures, results
+from csac_jax.report.comparison import ResultReport
+from csac_jax.report.figures import Chart
+from csac_jax.report.results import Results
+from csac_jax.report.variants import NAMES
 from experiments import study
 
-plt.rcParams["axes.prop_cycle"] = cycler(color=curves.PALETTE)
+plt.rcParams["axes.prop_cycle"] = cycler(color=figures.PALETTE)
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, FIGURES = ROOT / "experiments" / "results", ROOT / "docs" / "figures"
+PAPER = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
+"""Success over the last 200 grasps of 2,500 actions, text to figures 6 and 7 (CSAC sec. 4.3)."""
+PAPER_ACTIONS = 2500
+PAPER_CASES = ({"vpg": 0.60, "csac_beta": 0.90}, {"vpg": 0.70, "csac_beta": 0.80})
+"""Completion and action efficiency, means of the four cases, figure 9 (CSAC sec. 4.4 and 5)."""
 SAMPLERS = {
     "uniform": "uniform",
     "prioritised": "prioritised",
@@ -36,7 +44,7 @@ CURVES = {
 
 
 def linked() -> set[str]:
-    """Names of the figures that README and docs show."""
+    """Returns the names of the figures that README and docs show."""
     documents = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     return {
         name
@@ -45,61 +53,59 @@ def linked() -> set[str]:
     }
 
 
-def figures() -> Iterator[tuple[str, Figure]]:
-    """Name and figure of all that can be drawn."""
+def draw() -> Iterator[tuple[str, Figure]]:
+    """Draws all figures and yields them by name."""
     yield "replay", replay()
     yield from steps()
     yield from sweeps()
     yield "warp-action", warp_action()
-    report = comparison.build(results.read([RESULTS]))
-    yield from ((chart.name, chart.figure) for chart in charts.draw(report))
-    yield "study", differences()
-    for name, path in study.archives().items():
-        part = comparison.build(study.read(path))
-        yield from ((f"study-{name}-{chart.name}", chart.figure) for chart in charts.draw(part))
+    for chart in figures.draw(comparison.build(results.read([RESULTS]))):
+        yield chart.name, _with_paper(chart)
+    for chart in figures.draw(_target()):
+        yield f"study-1-target-{chart.name}", _with_paper(chart)
 
 
-def differences() -> Figure:
-    """What tests the study's hypotheses: a panel for each archive, differences with their intervals
-    and, of shares, the band in which methods are equivalent."""
-    tested = study.tested()
-    rows = [len(gaps) for gaps in tested.values()]
-    figure, panels = plt.subplots(
-        len(rows),
-        figsize=(9, 0.26 * sum(rows) + 0.75 * len(rows)),
-        height_ratios=[1 + count for count in rows],
-        layout="constrained",
+def _target() -> ResultReport:
+    """Groups what part 1 of the study has of the target task."""
+    runs, evaluations = (
+        [one for one in every if one.path.parts[-4].startswith("1-target-")]
+        for every in study.read("1")[:2]
     )
-    for panel, (name, gaps) in zip(panels, tested.items(), strict=True):
-        part = study.PARTS[name]
-        counted = part.by in (study.PUSHES, study.ACTIONS)
-        scale, unit = (1, "") if counted else (100, ", points")
-        places = range(len(gaps), 0, -1)
-        for place, gap in zip(places, gaps, strict=True):
-            value, low, high = (scale * x for x in gap.band[:3] if x is not None)
-            panel.errorbar(value, place, xerr=[[value - low], [high - value]], fmt="o", color="C0")
-        if unit:
-            panel.axvspan(-scale * study.POINT, scale * study.POINT, color="0.9", zorder=0)
-        panel.axvline(0, color="0.5", linewidth=1)
-        panel.set_yticks(list(places), [f"{gap.method} less {gap.less}" for gap in gaps])
-        panel.set(ylim=(0.3, len(gaps) + 0.7), xlabel=f"{METRICS.get(part.by, part.by)}{unit}")
-        panel.set_title(
-            f"{part.title} (hypothesis {part.hypothesis})", fontsize="medium", loc="right"
-        )
-    return figure
+    return comparison.build(Results(runs, evaluations, []))
 
 
-def _read(pattern: str) -> list[dict[str, Any]]:
-    """The records of benchmarks whose path has this pattern."""
-    return [json.loads(path.read_text()) for path in sorted(RESULTS.glob(f"bench/{pattern}.json"))]
+def _with_paper(chart: Chart) -> Figure:
+    """Adds the paper's values to methods on its protocol, and to its four cases."""
+    panels = chart.figure.axes
+    if chart.name in ("methods-paper", "methods-paper_small"):
+        for algo, value in PAPER.items():
+            style: dict[str, Any] = {"color": figures.COLOURS[algo], "markeredgecolor": "black"}
+            panels[0].plot(PAPER_ACTIONS, 100 * value, "D", clip_on=False, **style)
+        panels[0].plot([], [], "wD", markeredgecolor="black", label="paper, 2,500 actions")
+        panels[0].legend(**figures.LEGEND)
+        panels[0].set_ylim(bottom=min(panels[0].get_ylim()[0], 45))
+    if chart.name.startswith("four-cases-cases-"):
+        for panel, values in zip(panels, PAPER_CASES, strict=True):
+            for algo, value in values.items():
+                style = {"color": figures.COLOURS[algo], "linestyle": "--", "linewidth": 1}
+                panel.axhline(100 * value, label=f"paper, {NAMES[algo]}", **style)
+            panel.set_ylim(bottom=min(panel.get_ylim()[0], 50))
+        chart.figure.legends.clear()
+        handles = panels[0].get_legend_handles_labels()
+        chart.figure.legend(*handles, fontsize="small", loc="outside lower center", ncols=3)
+    return chart.figure
+
+
+def _read(bench: str, pattern: str = "") -> list[dict[str, Any]]:
+    """Reads the records of a benchmark whose names match the pattern."""
+    records = json.loads((RESULTS / "bench" / f"{bench}.json").read_text())
+    return [one for name, one in sorted(records.items()) if re.search(pattern, name)]
 
 
 def replay() -> Figure:
-    """Time to draw 64 transitions and replace their priorities, against the ring's capacity."""
-    records = {"2-core CPU, busy": _read("replay/cpu"), "H200": _read("replay/h200-*")}
-    figure, panels = plt.subplots(
-        1, len(records), figsize=(9, 3.4), sharey=True, layout="constrained"
-    )
+    """Draws the time to draw 64 transitions and replace their priorities, against capacity."""
+    records = {"2-core CPU, busy": _read("replay", "^cpu$"), "H200": _read("replay", "^h200-")}
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
     for panel, (device, parts) in zip(panels, records.items(), strict=True):
         rows = [row for part in parts for row in part["capacities"]]
         for name, label in SAMPLERS.items():
@@ -114,17 +120,17 @@ def replay() -> Figure:
 
 
 def steps() -> Iterator[tuple[str, Figure]]:
-    """Time of a training step against what grows, a figure per recorded curve."""
+    """Draws the time of a training step against what grows, a figure per recorded curve."""
     for curve, label in CURVES.items():
         figure, panel = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
         power = 2 if curve == "map" else 1
-        for record in _read(f"step/*-{curve}"):
+        for record in _read("step", f"-{curve}$"):
             points = record["points"]
             sizes, seconds = zip(*((p[curve], p["step_seconds"]) for p in points), strict=True)
             panel.plot(sizes, seconds, "o-", label=_name(record))
-            grown = [seconds[0] * (size / sizes[0]) ** power for size in sizes]
-            proportion = "in proportion" + " to cells" * (power == 2)
-            panel.plot(sizes, grown, ":", color="grey", label=proportion)
+            proportional = [seconds[0] * (size / sizes[0]) ** power for size in sizes]
+            name = "in proportion" + " to cells" * (power == 2)
+            panel.plot(sizes, proportional, ":", color="grey", label=name)
         panel.set(xlabel=label, ylabel="time of a training step, s")
         _plain_logarithms(panel)
         _finish(panel)
@@ -132,11 +138,11 @@ def steps() -> Iterator[tuple[str, Figure]]:
 
 
 def sweeps() -> Iterator[tuple[str, Figure]]:
-    """Time of a step against seeds side by side, and the speed-up by several devices."""
+    """Draws the time of a step against seeds side by side, and the speed-up by several devices."""
     seeds, at = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
     devices, over = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
     most = 1
-    for record in _read("sweep/*"):
+    for record in _read("sweep"):
         rows = record["rows"]
         alone = [row for row in rows if row["devices"] == 1]
         if len(alone) > 1:
@@ -159,9 +165,9 @@ def sweeps() -> Iterator[tuple[str, Figure]]:
 
 
 def warp_action() -> Figure:
-    """Actions a second on Warp, without learning: against scenes, blocks, and parts of objects."""
-    (objects,) = _read("objects/h100")
-    rows = [row for record in _read("warp_action/h100-[0-9bs]*") for row in record["runs"]]
+    """Draws actions a second on Warp against scenes, blocks and convex parts of objects."""
+    (objects,) = _read("objects", "h100")
+    rows = [row for record in _read("warp_action", "^h100-[0-9bs]") for row in record["runs"]]
     per_second = {(row["scenes"], row["blocks"]): row["actions_per_second"] for row in rows}
     milliseconds = {
         objects["mean_parts"][kind]: objects["milliseconds"][f"{kind} action"]
@@ -174,7 +180,7 @@ def warp_action() -> Figure:
             n: rate for (e, n), rate in per_second.items() if e == 2048
         },
         f"convex parts an object, {objects['scenes']:,} scenes": {
-            parts: 1e3 / each for parts, each in milliseconds.items()
+            parts: 1e3 / time for parts, time in milliseconds.items()
         },
     }
     figure, panels = plt.subplots(1, 3, figsize=(11, 3.2), sharey=True, layout="constrained")
@@ -194,7 +200,7 @@ def _name(record: dict[str, Any]) -> str:
 
 
 def _plain_logarithms(panel: Any) -> None:
-    """Logarithmic axes whose ticks show no powers."""
+    """Makes both axes logarithmic, with ticks that show no powers."""
     panel.set_xscale("log", base=2)
     panel.set_yscale("log")
     panel.xaxis.set_major_formatter("{x:g}")
@@ -211,8 +217,11 @@ def _finish(panel: Any) -> None:
 if __name__ == "__main__":
     FIGURES.mkdir(exist_ok=True)
     shown = linked()
-    for name, figure in figures():
+    for path in FIGURES.glob("*.png"):
+        if path.stem not in shown:
+            path.unlink()
+    for name, figure in draw():
         if name in shown:
-            charts.save(figure, FIGURES / f"{name}.png")
+            figures.save(figure, FIGURES / f"{name}.png")
         else:
             plt.close(figure)

@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def still(name: str) -> np.ndarray:
-    """A shipped case with no robot [H, W, 3] uint8, as large as fits."""
+    """Draws a shipped case without the robot [H, W, 3] uint8, as large as fits."""
     case = cases.load(cases.shipped(name))
     scene = SceneConfig(slots=case.slots, min_blocks=len(case.slots))
     world = model.build(scene, SimConfig())
@@ -58,8 +58,8 @@ def still(name: str) -> np.ndarray:
     return _smaller(draw(data))
 
 
-def close_view(positions: np.ndarray) -> Viewpoint:
-    """The view of blocks at `positions` [N, 3] m that they fill."""
+def close_view(positions: np.ndarray) -> View:
+    """Returns the view that blocks at `positions` [N, 3] m fill."""
     middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
     corners = np.stack(np.meshgrid(*(BLOCK,) * 3), axis=-1).reshape(-1, 3)
     offsets = (positions[:, None] - middle + corners).reshape(-1, 3)
@@ -73,27 +73,26 @@ def close_view(positions: np.ndarray) -> Viewpoint:
 
 
 def _smaller(image: np.ndarray) -> np.ndarray:
-    """The mean of each FINER x FINER pixels."""
+    """Averages each FINER x FINER pixels."""
     height, width, _ = image.shape
     parts = image.reshape(height // FINER, FINER, width // FINER, FINER, 3)
     return np.round(parts.mean(axis=(1, 3))).astype(np.uint8)
 
 
 def pinwheel() -> Iterator[tuple[np.ndarray, int]]:
-    """Pictures and their times, ms: the shipped policy takes the pinwheel apart."""
+    """Yields pictures and times, ms: the shipped policy takes the pinwheel apart."""
     return moving(str(cases.shipped("pinwheel")), PINWHEEL, every=2)
 
 
 def pile() -> Iterator[tuple[np.ndarray, int]]:
-    """Pictures and their times, ms: the shipped policy clears thirty blocks, in time lapse."""
+    """Yields pictures and times, ms: the shipped policy clears thirty blocks."""
     return moving("random30", PILE, every=4, hold=3 * FRAME_MS)
 
 
 def moving(
     suite: str, seed: int, every: int, hold: int = END_MS
 ) -> Iterator[tuple[np.ndarray, int]]:
-    """Pictures [H, W, 3] uint8 of an episode with the views of its policy, and their times, ms;
-    `every` so many pictures of the motion one, and its end for `hold`."""
+    """Yields pictures [H, W, 3] uint8 of an episode and times, ms; `hold` for a motion's end."""
     policy = policies.load("shipped")
     cfg = rollout.configured(policy.cfg, "c", "hand")
     (env,) = suites.environments(cfg, suite, 1, seed).values()

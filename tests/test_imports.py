@@ -65,7 +65,6 @@ ONLY_IN = {
     "gymnasium": ("gym.py",),
     "imageio": ("render/media.py", "deploy/image_files.py"),
     "jinja2": ("report/page.py",),
-    "plotly": ("report/page.py",),
     "viser": ("render/viewer.py",),
     "tensorboardX": ("training/trackers.py",),
     "wandb": ("training/trackers.py",),
@@ -311,7 +310,7 @@ def test_checker_sees_a_breach(tmp_path: Path, file: str, source: str, fault: st
         ),
         (
             "cli/a.py",
-            "import tyro, rich\nfrom csac_jax.cli import b\nfrom csac_jax.report import charts",
+            "import tyro, rich\nfrom csac_jax.cli import b\nfrom csac_jax.report import figures",
         ),
         ("scene/a.py", "import mujoco\nfrom pathlib import Path\nprint(Path('x'))"),
         ("api.py", "from rich.console import Console\nfrom csac_jax.report import tables"),

@@ -23,7 +23,7 @@ LINKED = ("stylesheet", "preload", "preconnect", "icon", "manifest", "prefetch",
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the site."""
+    """Builds the site; returns its folder."""
     folder = tmp_path_factory.mktemp("site")
     unreachable = {f"{name}_proxy": "http://127.0.0.1:9" for name in ("http", "https")}
     done = subprocess.run(
@@ -38,7 +38,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class _Loads(HTMLParser):
-    """Collects what a page loads as it opens; links that a reader may follow are none."""
+    """The addresses that a page loads as it opens, without links that a reader may follow."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,7 +57,8 @@ def _is_elsewhere(target: str) -> bool:
 
 
 def test_nothing_is_loaded_from_elsewhere(site: Path):
-    """Claim: no page or style of the site loads a script, style, font or picture from a host."""
+    """Claim: no page or style of the site loads a script, style, font or picture from a host; what
+    pages load is in the site."""
     pages = list(site.rglob("*.html"))
     assert len(pages) > 30
     for page in pages:
@@ -65,47 +66,32 @@ def test_nothing_is_loaded_from_elsewhere(site: Path):
         loads.feed(page.read_text())
         assert len(loads.found) > 3
         assert not [target for target in loads.found if _is_elsewhere(target)], page
+        paths = [target.split("?")[0].split("#")[0] for target in loads.found]
+        for path in paths if page.name != "404.html" else ():
+            assert path.startswith("data:") or (page.parent / path).exists(), (page, path)
     for style in site.rglob("*.css"):
         urls = re.findall(r"""(?:@import\s+|url\()\s*["']?([^"')\s]+)""", style.read_text())
         assert not list(filter(_is_elsewhere, urls)), style
 
 
-def test_loaded_files_are_there(site: Path):
-    """Claim: what pages load is in the site."""
-    for page in site.rglob("*.html"):
-        loads = _Loads()
-        loads.feed(page.read_text())
-        paths = [target.split("?")[0].split("#")[0] for target in loads.found]
-        for path in paths if page.name != "404.html" else ():
-            assert path.startswith("data:") or (page.parent / path).exists(), (page, path)
-
-
-def test_every_setting_is_listed(site: Path):
-    """Claim: the reference has every setting of every section."""
-    text = (site / "reference" / "settings.html").read_text()
-    for section, value in vars(Config()).items():
-        if isinstance(value, Section):
-            for field in dataclasses.fields(value):
-                assert f"<code>{section}.{field.name}</code>" in text
-
-
-def test_every_command_is_shown(site: Path):
-    """Claim: the reference has each command's own help, and the metrics each field of a record."""
-    text = (site / "reference" / "commands.html").read_text()
-    for command in cli.COMMANDS:
-        assert f"usage: csac-jax {command}" in text
-    metrics = (site / "reference" / "metrics.html").read_text()
-    for field in dataclasses.fields(Record):
-        assert f"<code>{field.name}</code>" in metrics
-    assert "completion_reachable" in metrics
-
-
-def test_every_public_name_is_documented(site: Path):
-    """Claim: the API reference has each public name, functions with their arguments."""
-    text = (site / "reference" / "api.html").read_text()
-    for name in {*csac_jax.__all__} - {"deploy"}:
-        assert f'id="csac_jax.{name}"' in text, name
-    assert "init, networks to start from" in text
+def test_references_are_complete(site: Path):
+    """Claim: the reference has every setting, each command's own help, each field of a record and
+    each public name, functions with their arguments."""
+    text = {path.stem: path.read_text() for path in (site / "reference").glob("*.html")}
+    settings = [
+        f"<code>{section}.{field.name}</code>"
+        for section, value in vars(Config()).items()
+        if isinstance(value, Section)
+        for field in dataclasses.fields(value)
+    ]
+    assert not [one for one in settings if one not in text["settings"]]
+    commands = [f"usage: csac-jax {command}" for command in cli.COMMANDS]
+    assert not [one for one in commands if one not in text["commands"]]
+    fields = [f"<code>{field.name}</code>" for field in dataclasses.fields(Record)]
+    assert not [one for one in fields if one not in text["metrics"]]
+    names = [f'id="csac_jax.{name}"' for name in {*csac_jax.__all__} - {"deploy"}]
+    assert not [one for one in (*names, "init, networks to start from") if one not in text["api"]]
+    assert "completion_reachable" in text["metrics"]
 
 
 def test_inserts_and_equations_are_filled_in(site: Path):

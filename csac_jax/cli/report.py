@@ -14,11 +14,11 @@ from csac_jax.io import files
 
 @dataclasses.dataclass(frozen=True)
 class ReportOptions:
-    """Tables of recorded runs and evaluations over their seeds; reads only, needs no JAX."""
+    """Tables of recorded runs and evaluations over their seeds; needs no JAX."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of runs, or of folders of runs, archives of them (.tar.xz), and files that `eval
-    --json` wrote."""
+    """Folders of runs or of folders of runs, archives of them (.tar.xz), and files that `eval
+    --json` wrote. Archives that lie directly in a folder are read, too."""
     out: Path | None = None
     """Folder to write a page to, index.html, with curves and the pictures and videos that lie in
     the folders; needs the extra `report`."""
@@ -26,25 +26,28 @@ class ReportOptions:
     """File to write the tables to, as a page of documentation."""
     json: Path | None = None
     """File to write the numbers to, as JSON."""
+    reference: str | None = None
+    """Algorithm that the others are compared with; by default csac_beta, where it was run."""
 
 
 def run(arguments: list[str]) -> int:
-    """Prints the tables and writes what is asked for; returns the exit code."""
+    """Prints the tables and writes the files that were asked for; returns the exit code."""
     options = parsing.parse(ReportOptions, arguments, "report")
     if not options.runs:
         raise BadArgumentsError(
             "report: give at least one folder of a run or file of `eval --json`"
         )
     if options.out is not None:
-        for module in ("jinja2", "plotly"):
-            check_extra("--out", module, "report")
-    from csac_jax.report import comparison, results, tables
+        check_extra("--out", "jinja2", "report")
+    from csac_jax.report import comparison, result_tables, results
 
     with as_bad_arguments(ValueError):
-        report = comparison.build(results.read(options.runs))
-    if not (report.curves or report.scores):
-        raise FailedError("; ".join(report.notes))
-    text = tables.markdown(report)
+        recorded = results.read(options.runs)
+    if not (recorded.runs or recorded.evaluations):
+        raise FailedError("; ".join(recorded.notes))
+    with as_bad_arguments(ValueError):
+        report = comparison.build(recorded, options.reference)
+    text = result_tables.markdown(report)
     print(text, end="")
     if options.markdown is not None:
         runs = " ".join(map(str, options.runs))
@@ -55,5 +58,5 @@ def run(arguments: list[str]) -> int:
 
         print(*page.write(report, options.runs, options.out), sep="\n")
     if options.json is not None:
-        files.write_json(options.json, tables.as_json(report))
+        files.write_json(options.json, result_tables.as_json(report))
     return 0

@@ -94,11 +94,11 @@ def run(arguments: list[str]) -> int:
 def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) -> None:
     """Prints grasp success of every setting, and writes the result."""
     from csac_jax.evaluation.statistics import Band
-    from csac_jax.report import tables
+    from csac_jax.report import result_tables
 
     for point in result.summary["settings"]:
         band = Band(**point["grasp_success"])
-        success = tables.shown(metric="grasp_success", band=band) if band.n else "unknown"
+        success = result_tables.shown(metric="grasp_success", band=band) if band.n else "unknown"
         print(f"{point['name']}: grasp success {success}, interquartile mean of {band.n} seeds")
     times = {"compile_seconds": result.compile_seconds, "wall_seconds": seconds}
     written = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
@@ -108,13 +108,16 @@ def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) ->
 
 def _write_study(folder: Path) -> None:
     """Writes one table and one figure of the evaluated policies."""
-    from csac_jax.report import charts, comparison, results, study, tables
+    from csac_jax.report import comparison, figures, result_tables, results, study
 
     report = comparison.build(results.read([folder]))
-    table, command = tables.table_text(study.table(report)), f"{PROGRAM} sweep --resume {folder}"
-    text = f"# Study\n\nWritten by `{command}`.\n\n{tables.EXPLAINED}\n\n{table}\n"
+    table, command = (
+        result_tables.table_text(study.table(report)),
+        f"{PROGRAM} sweep --resume {folder}",
+    )
+    text = f"# Study\n\nWritten by `{command}`.\n\n{result_tables.EXPLAINED}\n\n{table}\n"
     files.replace(folder / STUDY, text)
-    charts.save(study.figure(report), (folder / STUDY).with_suffix(".png"))
+    figures.save(figures.study(study.rows(report)), (folder / STUDY).with_suffix(".png"))
     print(f"table and figure: {folder / STUDY}, {(folder / STUDY).with_suffix('.png')}")
 
 

@@ -55,6 +55,18 @@ def difference(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0
     return _bootstrapped((*ours, *theirs), gap, seed)
 
 
+def p_value(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> float:
+    """Returns the two-sided bootstrap p-value of no `difference`, from the same draws.
+
+    Raises ValueError as `difference`.
+    """
+    _check_pair(ours, theirs)
+    draws = _draws((*ours, *theirs), seed)
+    gaps = _mean_iqm(*draws[: len(ours)]) - _mean_iqm(*draws[len(ours) :])
+    rarer = min(np.sum(gaps <= 0.0), np.sum(gaps >= 0.0))
+    return min(2.0 * (1.0 + float(rarer)) / (1.0 + len(gaps)), 1.0)
+
+
 def improvement(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> Band:
     """Estimates the probability that a seed of ours is above one of theirs in a random stratum.
 

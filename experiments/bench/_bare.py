@@ -1,4 +1,4 @@
-"""What physics costs by itself: plain steps from an action's first state with its set-points."""
+"""Physics by itself: plain steps from an action's first state with its set-points."""
 
 import concurrent.futures
 import functools
@@ -25,8 +25,7 @@ AT_ONCE = 128  # scenes; XLA wants gigabytes for thousands
 
 
 def grasping(cfg: Config, env: Env, scenes: int) -> tuple[State, Action, JointTrajectory]:
-    """First states of so many scenes, a grasp in each that the planner takes, and how the robot
-    moves; leaves [E, ...]."""
+    """Returns first states of scenes, planned grasps and joint trajectories; leaves [E, ...]."""
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
     grasp = functools.partial(oracle.grasp, cfg)
     planned = functools.partial(jax.lax.map, lambda row: grasp(*row), batch_size=AT_ONCE)
@@ -35,7 +34,7 @@ def grasping(cfg: Config, env: Env, scenes: int) -> tuple[State, Action, JointTr
 
 
 def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:
-    """How the robot moves in actions chosen from the height maps [E, H, W] m; leaves [E, ...]."""
+    """Plans the joints of actions in height maps [E, H, W] m; leaves [E, ...]."""
 
     def joints(height: jax.Array, action: Action) -> JointTrajectory:
         plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
@@ -46,10 +45,7 @@ def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> Joint
 
 
 def loop(physics: Physics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
-    """As many plain steps as an action has, of scenes and joints with leaves [E, ...].
-
-    A call runs them all.
-    """
+    """Returns a call that runs an action's plain steps of scenes and joints [E, ...]."""
     if isinstance(physics, MjxPhysics):
         return _mjx(physics, scenes, joints)
     if isinstance(physics, WarpPhysics):

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax.config import Config, RobotKind, SensorConfig, SimConfig
-from csac_jax.constants import OUTCOMES, Outcome
-from csac_jax.deploy import CameraPolicy, record
+from csac_jax.constants import OUTCOMES
+from csac_jax.deploy import Policy
 from csac_jax.deploy.decision import Decision
-from csac_jax.deploy.record import Recorder
 from csac_jax.env import Env
 from csac_jax.errors import DataWarning, ViewError
 from csac_jax.evaluation import suites
@@ -32,7 +31,7 @@ COUNTED = (
     *("grasps", "pushes", "refused", "nothing_to_act_on", "out_of_reach", "warnings"),
     *("blocks", "blocks_taken", "blocks_lost", "table_empty", "all_taken", *OUTCOMES),
 )
-"""What is counted: actions, decisions and images, blocks, episodes, grasps by outcome."""
+"""Counters: actions, decisions and images, blocks, episodes, grasps by outcome."""
 MOVED = 0.01  # m, a block that moves less has not changed the scene
 
 
@@ -43,12 +42,11 @@ class Loop(NamedTuple):
     env: Env
     episodes: int
     seed: int
-    recorder: Recorder | None = None  # keeps images, decisions and outcomes
 
 
 def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
-    """Of the policy `source`, see `CameraPolicy.load`, in random10."""
-    policy = CameraPolicy.load(source)
+    """Makes the loop of the policy `source`, see `Policy.load`, in random10."""
+    policy = Policy.load(source)
     clear = policy.cfg.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
     cfg = clear.change(sim={"physics": "c", "robot": robot})
     (env,) = suites.environments(cfg, "random10", episodes, seed).values()
@@ -56,12 +54,12 @@ def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
 
 
 def sensors(kind: Any) -> dict[str, SensorConfig]:
-    """By name, what images are taken with."""
+    """Returns the sensors that images are taken with, by name."""
     return {"clean": SensorConfig(), "noise": SensorConfig(kind=kind)}
 
 
 class Step(NamedTuple):
-    """What the robot did. N = block slots."""
+    """The result of a motion of the robot. N = block slots."""
 
     scene: Scene
     reachable: jax.Array  # [] bool
@@ -72,8 +70,7 @@ class Step(NamedTuple):
 
 
 def set_points(cfg: SimConfig, decision: Decision) -> np.ndarray:
-    """The hand at every substep [1 + T, 5], at first at the approach, as `primitives.Plan.control`:
-    straight from waypoint to waypoint, with a smooth retreat."""
+    """Computes set-points of the hand [1 + T, 5], as `primitives.Plan.control`, from waypoints."""
     stations = np.array(
         [(*point.position, point.yaw, 0.5 * point.opening) for point in decision.waypoints]
     )
@@ -109,7 +106,7 @@ def act(env: Env, scene: Scene, control: jax.Array, is_grasp: jax.Array) -> Step
 
 
 def measure(loop: Loop, errors: SensorConfig) -> dict[str, Any]:
-    """What came of all episodes with images of this sensor."""
+    """Runs all episodes with images of this sensor and counts what happens."""
     counts = collections.Counter(dict.fromkeys(COUNTED, 0))
     seconds: list[float] = []
     for number in range(loop.episodes):
@@ -124,15 +121,6 @@ def measure(loop: Loop, errors: SensorConfig) -> dict[str, Any]:
     }
 
 
-def collect(loop: Loop, errors: SensorConfig, grasps: int) -> dict[str, int]:
-    """Acts in one scene after another until so many grasps were made; what was counted."""
-    counts = collections.Counter(dict.fromkeys(COUNTED, 0))
-    numbers = itertools.cycle(range(loop.episodes))
-    while counts["grasps"] < grasps:
-        _episode(loop, errors, next(numbers), counts, [])
-    return dict(counts)
-
-
 def _episode(
     loop: Loop,
     errors: SensorConfig,
@@ -140,7 +128,7 @@ def _episode(
     counts: collections.Counter[str],
     seconds: list[float],
 ) -> None:
-    """One episode; adds what happened to `counts`, and the time of every decision."""
+    """Runs one episode; adds to `counts` and the time of every decision to `seconds`."""
     env, task = loop.env, loop.env.cfg.task
     scene = _first_scene(loop, number)
     blocks, taken_before = int(scene.in_play.sum()), counts["blocks_taken"]
@@ -155,48 +143,26 @@ def _episode(
         begun = time.perf_counter()
         decision = _decide(loop.policy, env.cfg, image, counts)
         seconds.append(time.perf_counter() - begun)
-        moved, came = False, record.PUSHED
+        moved = False
         if decision is not None:
-            scene, moved, came = _move(env, scene, decision, counts)
+            scene, moved = _move(env, scene, decision, counts)
         unchanged = 0 if moved else unchanged + 1
-        ended = not scene.in_play.any() or unchanged >= task.max_steps_without_change
-        if loop.recorder is not None and decision is not None:
-            ended_by_hand = ended or action == task.max_actions - 1
-            _record(
-                loop.recorder,
-                env.cfg,
-                image,
-                decision,
-                record.ReportedOutcome(outcome=came, number=1, ended=ended_by_hand),
-            )
-        if ended:
+        if not scene.in_play.any() or unchanged >= task.max_steps_without_change:
             break
     studio.close()
     counts["table_empty"] += not scene.in_play.any()
     counts["all_taken"] += counts["blocks_taken"] - taken_before == blocks
 
 
-def _record(
-    recorder: Recorder,
-    cfg: Config,
-    image: tuple[np.ndarray, np.ndarray],
-    decision: Decision,
-    came: record.ReportedOutcome,
-) -> None:
-    """Adds an image, its decision and what came of it."""
-    given = (*image, picture.intrinsics(cfg.camera), _pose(cfg), None)
-    recorder.post(recorder.add(given, [decision]), came)
-
-
 def _pose(cfg: Config) -> np.ndarray:
-    """Where the camera is believed to be [4, 4], camera to workspace."""
+    """Returns the pose that the policy is given [4, 4], camera to workspace."""
     eye, pose = camera.make(cfg.camera), np.eye(4)
     pose[:3, :3], pose[:3, 3] = eye.rotation, eye.position
     return pose
 
 
 def _first_scene(loop: Loop, number: int) -> Scene:
-    """The scene that an episode of `eval` with this seed starts with."""
+    """Returns the scene that an episode of `eval` with this seed starts with."""
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(loop.seed), 0), number)
     row = number * loop.env.scenes.position.shape[0] // loop.episodes
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), loop.env.scenes)
@@ -206,7 +172,7 @@ def _first_scene(loop: Loop, number: int) -> Scene:
 def _photograph(
     cfg: Config, errors: SensorConfig, key: jax.Array, studio: picture.RgbdRenderer, scene: Scene
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colour and depth of a scene as the sensor gives them."""
+    """Renders colour and depth of a scene as the sensor gives them."""
     key_pose, key_image = jax.random.split(key)
     real = sensor.pose(key_pose, errors, camera.make(cfg.camera))
     rgb, depth = studio.image(scene, real)
@@ -224,7 +190,7 @@ def _decide(
     image: tuple[np.ndarray, np.ndarray],
     counts: collections.Counter[str],
 ) -> Decision | None:
-    """The best action; None where the image is refused or shows nothing to act on."""
+    """Returns the best action; None where the image is refused or shows nothing to act on."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DataWarning)
         try:
@@ -239,17 +205,16 @@ def _decide(
 
 def _move(
     env: Env, scene: Scene, decision: Decision, counts: collections.Counter[str]
-) -> tuple[Scene, bool, str]:
-    """The scene after a decision, whether it has changed, and the outcome's name."""
+) -> tuple[Scene, bool]:
+    """Moves the robot; returns the scene, and True if it has changed."""
     is_grasp = decision.primitive == "grasp"
     step = jax.device_get(act(env, scene, set_points(env.cfg.sim, decision), jnp.bool(is_grasp)))
     counts["grasps" if is_grasp else "pushes"] += 1
     if not step.reachable:
         counts["out_of_reach"] += 1
-        return scene, False, OUTCOMES[Outcome.NOTHING] if is_grasp else record.PUSHED
-    came = OUTCOMES[int(step.outcome)] if is_grasp else record.PUSHED
+        return scene, False
     if is_grasp:
-        counts[came] += 1
+        counts[OUTCOMES[int(step.outcome)]] += 1
     counts["blocks_taken"] += int(step.lifted.sum())
     counts["blocks_lost"] += int(step.blocks_lost)
-    return step.scene, bool(step.moved), came
+    return step.scene, bool(step.moved)

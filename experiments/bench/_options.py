@@ -21,8 +21,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
-    """The numbers given for the benchmark `name`, each at least 1, and its switches, whose default
-    is False."""
+    """Parses whole numbers of at least 1, and switches, whose default is False."""
     parser = Parser(prog=f"bench {name}", allow_abbrev=False)
     for option, default in defaults.items():
         if default is False:
@@ -36,13 +35,18 @@ def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
     return options
 
 
+def emit(result: dict[str, Any]) -> None:
+    """Prints a result with device, versions and commit, as JSON."""
+    print(json.dumps(result | provenance.record(), indent=2))
+
+
 def timed(name: str, arguments: list[str], measure: Callable[..., Any], **defaults: int) -> None:
-    """Prints what `measure` finds with these numbers, and how long it took."""
+    """Prints the result of `measure` with these numbers, and its time."""
     options = read(name, arguments, **defaults)
     begun = time.perf_counter()
     result = measure(**options)
     result["seconds"] = time.perf_counter() - begun
-    print(json.dumps(result | provenance.record(), indent=2))
+    emit(result)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,15 +58,13 @@ class _Run:
 
 
 def split(parser: Parser, arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
-    """The preset, `quick` if none stands first, what `parser` knows, and the rest, which are
-    settings."""
+    """Splits arguments into preset, options that `parser` knows, and settings."""
     preset, flags = settings.split(arguments)
     return preset or "quick", *parser.parse_known_args(flags)
 
 
 def config(name: str, preset: str, flags: Sequence[str]) -> Config:
-    """The preset with settings as `csac-jax train` takes them, for the benchmark `name`. Raises
-    BadArgumentsError."""
+    """Builds the config of a preset with settings as `train` takes them."""
     try:
         return settings.parse(_Run, f"bench {name}", settings.base(preset, flags), flags)[1]
     except BadArgumentsError as error:
@@ -70,8 +72,7 @@ def config(name: str, preset: str, flags: Sequence[str]) -> Config:
 
 
 def with_blocks(cfg: Config, num: int) -> Config:
-    """The config with `num` blocks of its kinds in turn, all of them dropped, and contacts to
-    match."""
+    """Returns the config with `num` dropped blocks of its kinds, and contacts to match."""
     slots = cfg.scene.slots
     share = num / len(slots)
     return cfg.change(

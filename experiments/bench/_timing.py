@@ -1,4 +1,4 @@
-"""How long calls take on a busy machine."""
+"""Times of calls on a busy machine."""
 
 import statistics
 import time
@@ -9,10 +9,7 @@ import jax
 
 
 def medians(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Median seconds of every call until its result is there, after one that does not count.
-
-    Each of `repeats` rounds has one call of every kind, so that other load slows all alike.
-    """
+    """Times calls in turn, `repeats` rounds after a first one; returns median seconds of each."""
     for call in calls.values():
         jax.block_until_ready(call())
     seconds: dict[str, list[float]] = {name: [] for name in calls}

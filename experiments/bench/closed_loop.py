@@ -7,13 +7,11 @@ images, then with those that the sensor makes of them. An image that is refused 
 action without change. EPISODES of each (100); the robot is out of the camera's view.
 """
 
-import json
 import time
 
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
 from csac_jax.render import gl
-from csac_jax.runtime import provenance
-from experiments.bench._options import Parser
+from experiments.bench._options import Parser, emit
 
 
 def main(arguments: list[str]) -> None:
@@ -39,4 +37,4 @@ def main(arguments: list[str]) -> None:
     found = {name: _closed_loop.measure(loop, sensor) for name, sensor in sensors.items()}
     seconds = time.perf_counter() - begun
     result = {"options": vars(options), **found, "seconds": seconds}
-    print(json.dumps(result | provenance.record(), indent=2))
+    emit(result)

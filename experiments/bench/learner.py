@@ -14,7 +14,6 @@ its gradients; `actor` the actor's update; `optimiser` a step of Adam and of the
 """
 
 import functools
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -29,25 +28,25 @@ from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, SmallNet
 from csac_jax.nets import dense, networks
 from csac_jax.nets.convolution import conv2d
-from csac_jax.runtime import compiler, provenance
+from csac_jax.runtime import compiler
 from csac_jax.sim.primitives import Action
 from csac_jax.training import programs
 from csac_jax.vision import heightmap
-from experiments.bench._options import Parser, config, split
+from experiments.bench._options import Parser, config, emit, split
 from experiments.bench._timing import medians
 
 PRODUCT = 2048  # side of the matrices whose product is the peak
 
 
 def _layers(net: SmallNet, inputs: int) -> list[tuple[int, int, int, int, int]]:
-    """Channels in and out, kernel, stride and dilation of the trunk's convolutions."""
+    """Lists channels, kernel, stride and dilation of the trunk's convolutions."""
     stem = (inputs, net.stem, 2 * net.stride, net.stride, 1)
     ins = [net.stem + i * net.growth for i in range(len(net.dilations))]
     return [stem, *((i, net.growth, 3, 1, d) for i, d in zip(ins, net.dilations, strict=True))]
 
 
 def _operations(net: SmallNet, inputs: int, cells: int) -> dict[str, float]:
-    """Floating-point operations of one forward pass whose features have cells x cells."""
+    """Counts floating-point operations of a forward pass with cells x cells features."""
     convolutions = sum(2.0 * k * k * i * o for i, o, k, _, _ in _layers(net, inputs))
     features = net.stem + len(net.dilations) * net.growth
     outputs = dense.OUTPUTS * net.subcells**2
@@ -56,7 +55,7 @@ def _operations(net: SmallNet, inputs: int, cells: int) -> dict[str, float]:
 
 
 def _random(shapes: Any) -> Any:
-    """Random maps, images and networks of these shapes."""
+    """Draws maps, images and networks of these shapes."""
     rng = np.random.default_rng(0)
 
     def draw(leaf: jax.ShapeDtypeStruct) -> jax.Array:
@@ -68,7 +67,7 @@ def _random(shapes: Any) -> Any:
 
 
 def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any], float]]:
-    """A call of each part, and the operations of one."""
+    """Compiles each part; returns a call and its operations."""
     nets, net, tables = parts.frames.networks, cfg.net, parts.frames.tables
     assert isinstance(net, SmallNet)
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
@@ -91,7 +90,7 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
     kernels = [jnp.asarray(rng.normal(size=(k, k, i, o)), jnp.float32) for i, o, k, _, _ in layers]
 
     def convolutions(flat: jax.Array, kernels: list[jax.Array]) -> jax.Array:
-        """The trunk's, each on as many channels as there; nothing between them."""
+        """Runs the trunk's convolutions with nothing between them."""
         features = None
         for kernel, (_, _, k, stride, dilation) in zip(kernels, layers, strict=True):
             seen = flat if features is None else features
@@ -151,7 +150,7 @@ def _parts(cfg: Config, parts: ActorCritic) -> dict[str, tuple[Callable[[], Any]
 
 
 def measure(cfg: Config, repeats: int) -> dict[str, Any]:
-    """Seconds, GFLOP/s and share of the peak of every part."""
+    """Measures seconds, GFLOP/s and share of the peak of every part."""
     parts = _parts(cfg, actor_critic.make(cfg))
     matrix = jnp.asarray(np.random.default_rng(2).normal(size=(PRODUCT, PRODUCT)), jnp.float32)
     product = jax.jit(jnp.matmul)
@@ -178,8 +177,4 @@ def main(arguments: list[str]) -> None:
         raise BadArgumentsError("bench learner: --repeats: at least 1")
     if not isinstance(cfg.net, SmallNet):
         raise BadArgumentsError(f"bench learner: {preset} has no small net; give quick or fast")
-    print(
-        json.dumps(
-            {"preset": preset, **measure(cfg, options.repeats), **provenance.record()}, indent=2
-        )
-    )
+    emit({"preset": preset, **measure(cfg, options.repeats)})

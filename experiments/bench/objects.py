@@ -51,7 +51,7 @@ def _configs(folder: Path, kind: PhysicsKind) -> dict[str, Config]:
 
 
 def _calls(cfg: Config, scenes: int) -> dict[str, Callable[[], Any]]:
-    """An action and an observation in settled scenes."""
+    """Returns calls of an action and of an observation in settled scenes."""
     few = pool.settled(cfg, 1, min(scenes, SETTLED), poured=True)
     settled = jax.tree.map(lambda leaf: np.resize(leaf, (scenes, *leaf.shape[1:])), few)
     env = Env(cfg, physics.make(model.build(cfg.scene, cfg.sim), cfg.sim), settled)
@@ -63,7 +63,7 @@ def _calls(cfg: Config, scenes: int) -> dict[str, Callable[[], Any]]:
 
 
 def measure(scenes: int, repeats: int, warp: bool) -> dict[str, Any]:
-    """Milliseconds a scene of each, and their ratio to those of blocks."""
+    """Measures milliseconds a scene, and their ratio to those of blocks."""
     with tempfile.TemporaryDirectory() as folder:
         configs = _configs(Path(folder), "warp" if warp else "c")
         calls = {}

@@ -1,4 +1,4 @@
-"""Does MJX move blocks as C MuJoCo does? Prints JSON.
+"""Compares how MJX and C MuJoCo move blocks; prints JSON.
 
 `csac-jax bench parity [--primitives N] [--poses N] [--warp] [--off]`: N grasps and N pushes in
 piles of 6 and of 10, and N poses of each shape alone. --off puts the grasps of piles at random
@@ -16,7 +16,6 @@ each heap of touching blocks by itself.
 import dataclasses
 import functools
 import gc
-import json
 import time
 from collections.abc import Callable
 from typing import Any
@@ -29,13 +28,12 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.config import Config, PhysicsKind, SceneConfig, SlotKind
 from csac_jax.constants import Outcome, Primitive
-from csac_jax.runtime import provenance
 from csac_jax.scene import blocks, layout, model, pool
 from csac_jax.scene.layout import Scene
 from csac_jax.sim import oracle, outcome, physics as simulation
 from csac_jax.sim.primitives import Action
 from csac_jax.vision import observe
-from experiments.bench._options import read
+from experiments.bench._options import emit, read
 
 BATCH = 64
 STREAM = 9001  # of drops: neither training's nor an evaluation's
@@ -49,7 +47,7 @@ Engine = Callable[[Scene, jax.Array, Action], Any]  # scenes, heights [E, H, W] 
 
 
 def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind = "mjx") -> Config:
-    """Scenes of `in_play` blocks in these slots, with contacts enough for ten."""
+    """Configures scenes of `in_play` blocks with contacts for ten."""
     boxes, meshes = SceneConfig().size_jitter
     jitter = (boxes, 0.0 if physics == "warp" else meshes)
     scene = SceneConfig(slots=slots, min_blocks=in_play, size_jitter=jitter)
@@ -85,7 +83,7 @@ class Bench:
         }
 
     def _engine(self, name: Any, disabled: int = 0) -> Engine:
-        """A physics with these MuJoCo features disabled, in a world of its own."""
+        """Compiles a physics with these MuJoCo features disabled."""
         cfg = dataclasses.replace(self.cfg, sim=dataclasses.replace(self.cfg.sim, physics=name))
         world = model.build(cfg.scene, cfg.sim)
         world.model.opt.disableflags |= disabled
@@ -93,7 +91,7 @@ class Bench:
         return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, cfg)))
 
     def run(self, engines: dict[str, Engine], scenes: Scene, actions: Action) -> dict[str, Any]:
-        """Results of each engine: ends [E, N, 3], outcomes, overflows and failures [E]."""
+        """Runs engines: ends [E, N, 3], outcomes, overflows and failures [E] of each."""
         height = self.heights(scenes)
         result = {}
         for name, engine in engines.items():
@@ -108,7 +106,7 @@ class Bench:
 
 
 def _nudged(scenes: Scene) -> Scene:
-    """The same scenes with each block in play a micrometre aside, in its own direction."""
+    """Moves each block in play by a micrometre, each in its own direction."""
     angle = np.random.default_rng(STREAM).uniform(0.0, 2.0 * np.pi, scenes.position.shape[:2])
     step = (
         NUDGE
@@ -119,7 +117,7 @@ def _nudged(scenes: Scene) -> Scene:
 
 
 def _push(key: jax.Array, scene: Scene) -> Action:
-    """A push through a random block in play, from a random side."""
+    """Draws a push through a random block in play, from a random side."""
     key_slot, key_yaw = jax.random.split(key)
     slot = jax.random.categorical(key_slot, jnp.where(scene.in_play, 0.0, -jnp.inf))
     yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
@@ -128,14 +126,14 @@ def _push(key: jax.Array, scene: Scene) -> Action:
 
 
 def _beside(key: jax.Array, action: Action) -> Action:
-    """The action at another place and yaw, normally distributed about those given."""
+    """Moves an action to a normally distributed place and yaw near it."""
     return action.replace(pose=action.pose + OFF * jax.random.normal(key, (3,)))
 
 
 def piles(
     in_play: int, slots: tuple[SlotKind, ...], count: int, physics: PhysicsKind, off: bool
 ) -> dict[str, Any]:
-    """Grasps and pushes in settled piles."""
+    """Compares grasps and pushes in settled piles."""
     cfg = pile_config(slots, in_play, physics)
     bench = Bench(cfg)
     settled = pool.settled(cfg, STREAM, count)
@@ -174,10 +172,7 @@ def piles(
 def _agreement(
     starts: np.ndarray, grasped: tuple[list, list], pushed: tuple[list, list]
 ) -> dict[str, Any]:
-    """Agreement in grasps and in pushes, each a pair: runs of an engine and of the reference.
-
-    A push has an effect if it moves some block by MOVED.
-    """
+    """Compares grasps and pushes, each a pair: runs of an engine and of the reference."""
     effect, wanted = (np.linalg.norm(run[0] - starts, axis=2).max(axis=1) > MOVED for run in pushed)
     return {
         "grasp_outcome_equal": float(np.mean(grasped[0][1] == grasped[1][1])),
@@ -190,7 +185,7 @@ def _agreement(
 def _distances(
     starts: np.ndarray, pushed: list[np.ndarray], reference: list[np.ndarray]
 ) -> dict[str, float]:
-    """Distance between the engines' ends of the block that the reference moved most, mm."""
+    """Measures the distance between the engines' ends of the block that moved most, mm."""
     moved = np.linalg.norm(reference[0] - starts, axis=2)
     slot = moved.argmax(axis=1)
     rows = np.arange(len(slot))
@@ -208,7 +203,7 @@ def _overflow_share(cfg: Config, *runs: list[np.ndarray]) -> float:
 
 
 def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
-    """Grasps of a single block of every shape, at rest after a fall in a random orientation."""
+    """Compares grasps of a single block of every shape, at rest after a fall."""
     slots: tuple[SlotKind, ...] = ("box", "arch", "prism", "half_cylinder", "cylinder")
     cfg = pile_config(slots, 1, physics)
     bench = Bench(cfg)
@@ -236,7 +231,7 @@ def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
 
 
 def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
-    """`count` scenes of one block of this shape at rest."""
+    """Drops a block of this shape until `count` scenes are at rest."""
     rng = np.random.default_rng([STREAM, list(blocks.SHAPES).index(shape)])
     slot = cfg.scene.slots.index(blocks.SHAPES[shape].kind)
     at_rest: list[Scene] = []
@@ -273,4 +268,4 @@ def main(arguments: list[str]) -> None:
             num, TEN.scene.slots[:num], options["primitives"], physics, bool(options["off"])
         )
     result["seconds"] = time.perf_counter() - begun
-    print(json.dumps(result | provenance.record(), indent=2))
+    emit(result)

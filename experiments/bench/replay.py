@@ -9,7 +9,6 @@ alike, and the median is reported. An item is 21 numbers: the loops time the sam
 copying of images.
 """
 
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -22,7 +21,7 @@ import jax.numpy as jnp
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import BetaReplay, PrioritisedReplay, ReplayConfig, UniformReplay
 from csac_jax.replay import ring, samplers
-from csac_jax.runtime import provenance
+from experiments.bench._options import emit
 
 BATCH = 64
 REPEATS = 31
@@ -39,13 +38,13 @@ Step = Callable[[Any, jax.Array], Any]
 
 
 def _new_errors(slots: jax.Array, items: Any, weights: jax.Array) -> jax.Array:
-    """Stands for the learner: errors [B] that need everything that was drawn."""
+    """Computes errors [B] that need everything that was drawn, in place of a learner."""
     noise = jnp.sin(slots.astype(jnp.float32)) + 0.5 * jnp.cos(3.0 * slots.astype(jnp.float32))
     return noise + 0.0 * (weights + items["reward"] + jnp.sum(items["obs"], axis=-1))
 
 
 def _ours(cfg: ReplayConfig) -> tuple[Any, Step]:
-    """A full ring and its step."""
+    """Makes a full ring and its step."""
     sampler, capacity = samplers.make(cfg), cfg.capacity
     state = ring.init(sampler.init(capacity), ITEM).replace(size=jnp.int32(capacity))
     errors = jnp.exp(jax.random.normal(jax.random.key(0), (capacity,)))
@@ -60,7 +59,7 @@ def _ours(cfg: ReplayConfig) -> tuple[Any, Step]:
 
 
 def _flashbax(capacity: int) -> tuple[Any, Step]:
-    """The same by flashbax, which leaves weights and the floor to its user."""
+    """Makes flashbax's buffer and its step, with weights and the floor."""
     import flashbax
 
     cfg = PrioritisedReplay()
@@ -88,14 +87,13 @@ def _flashbax(capacity: int) -> tuple[Any, Step]:
 
 
 def _sorting(capacity: int, steps: int) -> Callable[[], float]:
-    """The timer of the beta sampler that sorts the ring, however large it is."""
+    """Returns the timer of the beta sampler that sorts a ring of any size."""
     with mock.patch.object(samplers, "SORTED", capacity):  # read as the program is traced
         return _timer(*_ours(BetaReplay(capacity=capacity)), steps)
 
 
 def _timer(state: Any, step: Step, steps: int) -> Callable[[], float]:
-    """A function that runs `steps` steps, going on from the last call's state, and returns the
-    seconds per step."""
+    """Returns a function that runs `steps` more steps and returns the seconds per step."""
 
     def loop(state: Any, key: jax.Array) -> Any:
         return jax.lax.scan(
@@ -118,7 +116,7 @@ def _timer(state: Any, step: Step, steps: int) -> Callable[[], float]:
 
 
 def measure(capacity: int) -> dict[str, Any]:
-    """Median seconds per step for one capacity."""
+    """Measures median seconds per step for one capacity."""
     exact, sorting = capacity <= samplers.SORTED, max(SORTED // capacity, 1)
     timers = {
         "uniform": _timer(*_ours(UniformReplay(capacity=capacity)), STEPS),
@@ -168,4 +166,4 @@ def main(arguments: list[str]) -> None:
         "repeats": REPEATS,
         "capacities": [measure(2**exponent) for exponent in exponents],
     }
-    print(json.dumps(result | provenance.record(), indent=2))
+    emit(result)

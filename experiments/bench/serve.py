@@ -1,4 +1,4 @@
-"""How long decisions take over HTTP, as JSON: `csac-jax bench serve [--requests N] [--clients N]`.
+"""Times decisions over HTTP, as JSON: `csac-jax bench serve [--requests N] [--clients N]`.
 
 Starts `csac-jax serve shipped` in its own process. One client asks again and again, then many at
 once. Times are the client's, from sending the images to having the answer.
@@ -24,7 +24,7 @@ PATIENCE = 300.0  # s, until it has compiled
 
 
 def body() -> bytes:
-    """A request with the images of examples/camera_image.py, 640 x 480 px."""
+    """Builds a request with the images of examples/camera_image.py, 640 x 480 px."""
     with tempfile.TemporaryDirectory() as folder:
         camera_image.main(folder)
         files = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
@@ -36,7 +36,7 @@ def body() -> bytes:
 
 
 def ask(port: int, content: bytes) -> tuple[float, float]:
-    """Seconds of a request, and of them the decision's own; raises for any other answer."""
+    """Sends a request; returns its seconds and the decision's own."""
     begun = time.perf_counter()
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
     connection.request("POST", "/decide", content, {"Content-Type": "application/json"})
@@ -63,14 +63,14 @@ def _until_ready(port: int, process: subprocess.Popen[bytes]) -> None:
 
 
 def _summary(seconds: list[tuple[float, float]]) -> dict[str, float]:
-    """Percentiles, ms."""
+    """Computes percentiles, ms."""
     whole, own = 1e3 * np.array(seconds).T
     levels = {"p50_ms": (whole, 50), "p99_ms": (whole, 99), "decision_p50_ms": (own, 50)}
     return {name: float(np.percentile(values, level)) for name, (values, level) in levels.items()}
 
 
 def measure(requests: int, clients: int, port: int) -> dict[str, Any]:
-    """One client, then `clients` at once, `requests` each time."""
+    """Measures one client, then `clients` at once."""
     command = [sys.executable, "-m", "csac_jax", "serve", "shipped", "--port", str(port)]
     content, begun = body(), time.perf_counter()
     process = subprocess.Popen(command)

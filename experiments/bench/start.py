@@ -1,5 +1,5 @@
-"""How soon a run learns, as JSON: `csac-jax bench start [PRESET] [--runs 5] [--other CHECKOUT]
-[--cores N] [SETTINGS]`.
+"""Times how soon a run learns, as JSON: `csac-jax bench start [PRESET] [--runs 5] [--other
+CHECKOUT] [--cores N] [SETTINGS]`.
 
 Each run is a process of `csac-jax train PRESET SETTINGS` with an empty cache, which goes to its
 end, and another of the same config, stopped at its first action, which finds what the first has
@@ -94,7 +94,7 @@ def measure(
 
 
 def _median(times: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of each part; None if half of the runs never got there."""
+    """Computes the median of each part; None if half of the runs never got there."""
     late = float("inf")
     found = {
         part: statistics.median(late if one[part] is None else one[part] for one in times)
@@ -108,7 +108,7 @@ def _ratio(before: float | None, after: float | None) -> float | None:
 
 
 def _run(train: list[str], seed: int, checkout: Path) -> dict[str, float | None]:
-    """One run with an empty cache and the start of a second one, s."""
+    """Times one run with an empty cache and the start of a second one, s."""
     with tempfile.TemporaryDirectory() as folder:
         first, run_dir = _train(train, seed, checkout, Path(folder), "cold", to_end=True)
         again, _ = _train(train, seed, checkout, Path(folder), "cached", to_end=False)
@@ -129,7 +129,7 @@ def _run(train: list[str], seed: int, checkout: Path) -> dict[str, float | None]
 def _train(
     train: list[str], seed: int, checkout: Path, folder: Path, name: str, to_end: bool
 ) -> tuple[float, Path]:
-    """Seconds to the first action, and the run's folder."""
+    """Trains; returns the seconds to the first action, and the run's folder."""
     run_dir = folder / name
     command = [sys.executable, "-u", "-m", "csac_jax", "train", *train, "--seed", str(seed)]
     without = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}

@@ -11,7 +11,6 @@ what `moves` or rearranges arrays, `exchanges` between GPUs, in which they wait 
 
 import collections
 import dataclasses
-import json
 import re
 import tempfile
 from collections.abc import Iterable
@@ -24,11 +23,11 @@ from jax.sharding import Mesh
 
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.errors import SettingsError
-from csac_jax.runtime import cache, provenance
+from csac_jax.runtime import cache
 from csac_jax.sim import backend
 from csac_jax.sweeps import replicas
-from csac_jax.training import programs, sharding, step
-from experiments.bench._options import Parser, config, split
+from csac_jax.training import sharding, step
+from experiments.bench._options import Parser, config, emit, split
 
 KINDS = {  # the first that a kernel's name holds
     "exchanges": r"nccl|all.?reduce|all.?gather",
@@ -43,7 +42,7 @@ KINDS = {  # the first that a kernel's name holds
 
 
 def kind(kernel: str) -> str:
-    """What a kernel of this name does."""
+    """Returns the kind of a kernel by its name."""
     return next(kind for kind, names in KINDS.items() if re.search(names, kernel.lower()))
 
 
@@ -66,7 +65,7 @@ def table(kernels: Iterable[tuple[str, float, float]]) -> dict[str, Any]:
 
 
 def _traced(folder: Path) -> Iterable[tuple[str, float, float]]:
-    """What the streams of the first GPU did."""
+    """Yields the kernels of the first GPU."""
     (file,) = folder.rglob("*.xplane.pb")
     for plane in ProfileData.from_file(str(file)).planes:
         for line in plane.lines if plane.name.endswith("GPU:0") else ():
@@ -75,7 +74,7 @@ def _traced(folder: Path) -> Iterable[tuple[str, float, float]]:
 
 
 def _compiled(program: step.Program, mesh: Mesh | None, seeds: int) -> tuple[Any, Any]:
-    """The state of a run, or of several seeds, and its compiled step."""
+    """Returns the state of a run, or of several seeds, and its compiled step."""
     if mesh is None and seeds == 1:
         return programs.init(program), programs.compile_chunk(program, 1)
     configs = [dataclasses.replace(program.cfg, seed=seed) for seed in range(seeds)]
@@ -115,4 +114,4 @@ def main(arguments: list[str]) -> None:
             jax.block_until_ready(chunk(state))
         found = table(_traced(Path(folder)))
     sizes = {"preset": preset, "devices": options.devices, "seeds": seeds, "settings": flags}
-    print(json.dumps({**sizes, **found, **provenance.record()}, indent=2))
+    emit({**sizes, **found})

@@ -1,4 +1,4 @@
-"""What seeds side by side cost, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices
+"""Times seeds side by side, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices
 1 ...] [--shard seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [SETTING ...]`,
 PRESET `quick` if none is given, physics the preset's, settings as `csac-jax train` takes them:
 `--train.scenes 64`.
@@ -24,16 +24,15 @@ import jax
 
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
-from csac_jax.runtime import compiler, provenance
+from csac_jax.runtime import compiler
 from csac_jax.sim import backend
 from csac_jax.sweeps import grid, replicas, runner
-from csac_jax.training import programs, sharding, step
-from experiments.bench._options import Parser, config, split
+from csac_jax.training import sharding, step
+from experiments.bench._options import Parser, config, emit, split
 
 
 def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
-    """Seconds of the compilation and, the median, of a call that goes on where the last one
-    ended."""
+    """Times the compilation and repeated calls, each from the state of the last."""
     begun = time.perf_counter()
     chunk = compiler.lower(jitted, state).compile()
     compiled = time.perf_counter() - begun
@@ -54,7 +53,7 @@ def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
 def measure(
     program: step.Program, seeds: int, devices: int, shard: sharding.Shard, steps: int, repeats: int
 ) -> Any:
-    """A row: `seeds` runs on `devices` devices."""
+    """Measures a row: `seeds` runs on `devices` devices."""
     cfg, mesh = program.cfg, sharding.make(devices)
     sharding.check(mesh, shard, seeds, cfg.train.scenes, cfg.learn.batch)
     (group,) = replicas.group_configs([dataclasses.replace(cfg, seed=k) for k in range(seeds)])
@@ -117,9 +116,4 @@ def main(arguments: list[str]) -> None:
         "shard": options.shard,
     }
     sizes |= {"physics": cfg.sim.physics, "settings": flags}
-    print(
-        json.dumps(
-            {"preset": cfg.preset, **sizes, "train": alone, "rows": rows, **provenance.record()},
-            indent=2,
-        )
-    )
+    emit({"preset": cfg.preset, **sizes, "train": alone, "rows": rows})

@@ -1,6 +1,5 @@
-"""Physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--blocks N ...]
-[--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details]
-[--repeatable [STAGE ...]]`.
+"""Times physics on Warp, on a GPU, as JSON: `csac-jax bench warp_action [--scenes E ...] [--blocks
+N ...] [--step MS ...] [--repeats N] [--pool N] [--task clear|target] [--details]`.
 
 For each number of scenes (2048), of blocks (those of the preset `fast`), and for each longest step
 in ms (ours): seconds of an action of the environment (`env`), of physics alone (`physics`), and of
@@ -14,12 +13,11 @@ went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp
 
 --details adds the `calls` of Warp that a scan of two steps makes, which are to be two, and
 milliseconds and launches of each kernel in an action whose substeps are launched one by one: only
-then can Warp time them. --repeatable asks Warp for the same bits in every run, see `_same_bits`.
+then can Warp time them.
 """
 
 import collections
 import itertools
-import json
 import re
 import sys
 import time
@@ -32,15 +30,15 @@ import warp as wp
 
 from csac_jax import env as environment, presets
 from csac_jax.config import Config
-from csac_jax.runtime import cache, provenance
+from csac_jax.runtime import cache
 from csac_jax.sim.primitives import Action
-from experiments.bench import _bare, _same_bits
-from experiments.bench._options import Parser, with_blocks
+from experiments.bench import _bare
+from experiments.bench._options import Parser, emit, with_blocks
 from experiments.bench._timing import medians
 
 
 def _seconds_since_start() -> float:
-    """Of this process, by Linux's clock."""
+    """Returns the age of this process, by Linux's clock."""
     ticks = int(Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[19])
     return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / 100.0
 
@@ -56,7 +54,7 @@ def _config(scenes: int, blocks: int, pool: int, task: str) -> Config:
 
 
 def measure(cfg: Config, longest: float, repeats: int, details: bool) -> dict[str, Any]:
-    """One number of scenes and of blocks, one longest step, ms."""
+    """Times one config with one longest step, ms."""
     from csac_jax.sim import warp_action
 
     scenes = cfg.train.scenes
@@ -85,14 +83,14 @@ def measure(cfg: Config, longest: float, repeats: int, details: bool) -> dict[st
 
 
 def _differing(one: Any, other: Any) -> int:
-    """Leaves that are not equal bit for bit."""
+    """Counts leaves that are not equal bit for bit."""
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return sum(a.tobytes() != b.tobytes() for a, b in pairs)
 
 
 def _calls(env: environment.Env, states: environment.State, actions: Action) -> int:
-    """Calls of Warp in a scan of two steps that keeps what training keeps."""
-    from csac_jax.sim.warp_action import WarpSimulator
+    """Counts the calls of Warp in a scan of two steps."""
+    from csac_jax.sim.warp_action import Simulator
 
     def step(states: environment.State, _: None) -> tuple[environment.State, Any]:
         after = jax.vmap(env.step)(states, actions)
@@ -107,7 +105,7 @@ def _calls(env: environment.Env, states: environment.State, actions: Action) -> 
 
 
 def _kernels(env: environment.Env, joints: Any) -> dict[str, list[float]]:
-    """Milliseconds and launches of each kernel in an action, longest first; none without CUDA."""
+    """Times each kernel in an action: milliseconds and launches, longest first."""
     batch = env.physics.simulator.prepared(len(joints.control))
     batch.restart()
     wp.timing_begin(wp.TIMING_ALL)
@@ -139,11 +137,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--pool", type=int, default=64)
     parser.add_argument("--task", choices=("clear", "target"), default="clear")
     parser.add_argument("--details", action="store_true")
-    parser.add_argument("--repeatable", nargs="*", choices=_same_bits.STAGES)
     options = parser.parse_args(arguments)
     cache.enable()
-    if options.repeatable is not None:
-        _same_bits.ask(options.repeatable or _same_bits.STAGES)
     from csac_jax.sim import warp_action
 
     steps = options.step or [1e3 * warp_action.STEP]
@@ -153,6 +148,4 @@ def main(arguments: list[str]) -> None:
         rows.append(measure(cfg, longest, options.repeats, options.details))
         done = {name: value for name, value in rows[-1].items() if name != "kernels"}
         print(f"{longest} ms: {done}", file=sys.stderr, flush=True)
-    print(
-        json.dumps({"repeatable": options.repeatable, "runs": rows} | provenance.record(), indent=2)
-    )
+    emit({"runs": rows})

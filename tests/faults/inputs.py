@@ -24,7 +24,7 @@ from csac_jax.errors import FailedError
 from csac_jax.io import checkpoint, configs, files, leaves, policy_file
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.io.policy_file import PolicyFileError
-from csac_jax.report import comparison, results, tables
+from csac_jax.report import comparison, result_tables, results
 from csac_jax.runtime import cache
 from csac_jax.scene import cases, layout, pool
 from csac_jax.sweeps import runner
@@ -473,8 +473,8 @@ def _records(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
         def read(own: Path = own) -> None:
             report = comparison.build(results.read([own]))
-            tables.markdown(report)
-            json.dumps(tables.as_json(report))
+            result_tables.markdown(report)
+            json.dumps(result_tables.as_json(report))
             raise _SoundError
 
         for text in _each(tally, rng, -(-tries // len(valid)), _texts(content), own / name):

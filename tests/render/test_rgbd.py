@@ -74,29 +74,6 @@ def test_waypoints_are_followed_as_planned(primitive: Primitive):
     np.testing.assert_allclose(found, wanted, atol=1e-4)
 
 
-def _bench(name: str, *flags: str) -> Any:
-    """A benchmark's JSON; skips without OpenGL."""
-    command = [sys.executable, "-m", "csac_jax", "bench", name, *flags]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
-    if "OpenGL" in done.stderr:
-        pytest.skip("OpenGL works neither by EGL nor by OSMesa")
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-@pytest.mark.slow
-def test_bench_finetune():
-    """Claim: the benchmark records grasps of another gripper, learns from them and compares."""
-    given = "--seeds 1 --grasps 12 --updates 10 --batch 2 --episodes 1"
-    done = _bench("finetune", *given.split())
-    (seed,) = done["seeds"]
-    assert seed["recorded"]["grasps"] >= 12
-    assert seed["learned"]["actions"] >= 12
-    assert seed["learned"]["lifted"] == seed["recorded"]["lifted"]
-    for when in ("before", "after"):
-        assert seed[when]["grasp_success"]["n"] > 0
-
-
 @pytest.mark.slow
 def test_closed_loop():
     """Claim: the benchmark counts grasps, lifts and refusals, clean and with noise, as JSON."""

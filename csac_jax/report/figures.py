@@ -1,0 +1,251 @@
+"""Figures of a report: training curves, suites, performance profiles, a sweep's methods."""
+
+import itertools
+import textwrap
+from collections.abc import Iterator, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from csac_jax.evaluation import statistics
+from csac_jax.evaluation.statistics import Band
+from csac_jax.report.comparison import Curve, ResultReport, Score, grouped
+from csac_jax.report.study import PANELS, StudyRow
+from csac_jax.report.variants import NAMES, Variant, label
+
+PALETTE = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7")
+"""Colours that colour-blind readers can tell apart (Okabe and Ito 2008)."""
+COLOURS = dict(zip(NAMES, PALETTE, strict=False))
+GREY = "#7F7F7F"
+MOST_LINES, MOST_SCORES = 6, 12  # of a panel; of a figure of a suite
+NAME_WIDTH, LEGEND_WIDTH = 36, 56  # characters of a line: right of a panel, below a figure
+LEGEND: dict[str, Any] = {  # right of a panel, where no curve is
+    "loc": "upper left",
+    "bbox_to_anchor": (1.01, 1.02),
+    "title": "method (runs)",
+    "fontsize": "small",
+    "frameon": False,
+}
+SUITE_METRICS = {
+    "completion": "completion",
+    "action_efficiency": "action efficiency (blocks / actions)",
+}
+PROFILED = np.linspace(0.0, 1.0, 101)  # values that a performance profile is drawn over
+MARKERS = "os^DvP*"
+
+
+class Chart(NamedTuple):
+    """A figure of a report."""
+
+    name: str  # of its file
+    title: str
+    figure: Figure
+
+
+def draw(report: ResultReport) -> Iterator[Chart]:
+    """Draws every figure that the report has results for, each preset by itself."""
+    for preset, curves in grouped(report.curves, lambda curve: curve.variant.preset).items():
+        plain = [curve for curve in curves if curve.variant.unchanged]
+        varied = [curve for curve in curves if not curve.variant.unchanged]
+        algorithms = {curve.variant.algo for curve in varied}
+        base = [curve for curve in plain if curve.variant.algo in algorithms]
+        if plain:
+            yield Chart(f"methods-{preset}", f"Training of {preset}: methods", training(plain))
+        if varied:
+            both = [*base, *varied]
+            yield Chart(f"variants-{preset}", f"Training of {preset}: variants", training(both))
+    by_suite = grouped(report.scores, lambda score: (score.suite, score.variant.preset))
+    for (suite, preset), scores in by_suite.items():
+        if len(scores) <= MOST_SCORES and (len(scores) > 1 or len(scores[0].parts) > 1):
+            kind = "four-cases" if suite in ("cases", "target") else "suite"
+            yield Chart(
+                f"{kind}-{suite}-{preset}", f"Suite {suite}, preset {preset}", _suite(scores)
+            )
+        several = [score for score in scores if score.policy == "learned" and score.seeds > 1]
+        if 1 < len(several) <= MOST_SCORES:
+            title = f"Performance profiles, suite {suite}, preset {preset}"
+            yield Chart(f"profiles-{suite}-{preset}", title, _profiles(several))
+
+
+def training(curves: Sequence[Curve]) -> Figure:
+    """Draws success against actions, a line and a band per variant.
+
+    A panel has at most MOST_LINES.
+    """
+    groups = [curves[i : i + MOST_LINES] for i in range(0, len(curves), MOST_LINES)]
+    size = (9.0, 4.2 if len(groups) == 1 else 0.6 + 2.4 * len(groups))
+    figure, panels = plt.subplots(
+        len(groups), figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
+    )
+    lows = []
+    for panel, group in zip(panels.flat, groups, strict=True):
+        algorithms = [curve.variant.algo for curve in group]
+        lows += [_line(panel, curve, _colour(algorithms, i)) for i, curve in enumerate(group)]
+        panel.grid(alpha=0.3)
+        panel.legend(**LEGEND)
+    panels[0, 0].set(xlim=(0, None), ylim=(axis_start(min(lows)), 101))
+    figure.supxlabel("actions", fontsize="medium")
+    figure.supylabel("success over the last 200 grasps, %", fontsize="medium")
+    return figure
+
+
+def _colour(algorithms: Sequence[str], index: int) -> str:
+    """Returns an algorithm's colour for its first variant, else a colour that none of them has."""
+    algo = algorithms[index]
+    if algo in COLOURS and algo not in algorithms[:index]:
+        return COLOURS[algo]
+    spare = [colour for name, colour in COLOURS.items() if name not in algorithms]
+    return [*spare, GREY][index % (len(spare) + 1)]
+
+
+def _line(panel: Axes, curve: Curve, colour: str) -> float:
+    """Draws a variant; returns its lowest value, %."""
+    actions, bands = curve.points()
+    value, low, high = percent(bands)
+    name = f"{_short(curve.variant)} ({len(curve.runs)})"
+    panel.plot(actions, value, color=colour, label=textwrap.fill(name, NAME_WIDTH))
+    if len(curve.runs) > 1:
+        panel.fill_between(actions, low, high, color=colour, alpha=0.15, linewidth=0)
+    return lowest([value, low])
+
+
+def _short(variant: Variant) -> str:
+    return label(variant, preset=False, most=3)
+
+
+def _suite(scores: Sequence[Score]) -> Figure:
+    """Draws completion and action efficiency by part and variant."""
+    figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
+    lows = []
+    for panel, (metric, title) in zip(panels, SUITE_METRICS.items(), strict=True):
+        lows.append(_marks(panel, metric, scores))
+        panel.set(title=title)
+        panel.grid(alpha=0.3, axis="y")
+    panels[0].set(ylabel="%", ylim=(axis_start(min(lows)), 104))
+    _legend_below(figure, panels[0])
+    return figure
+
+
+def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> float:
+    """Draws a mark of each variant in each part and in their mean; returns the lowest value, %."""
+    parts = list(dict.fromkeys(part for score in scores for part in score.parts))
+    ticks = [*parts, "mean"] if len(parts) > 1 else parts
+    places, lows = np.arange(len(ticks)), []
+    for index, score in enumerate(scores):
+        bands = [score.only(part).band(metric) for part in parts]
+        if len(parts) > 1:
+            bands.append(score.band(metric) if len(score.parts) == len(parts) else None)
+        value, low, high = percent(bands)
+        error = np.maximum([value - low, high - value], 0.0)
+        offset = (index + 0.5) * 0.8 / len(scores) - 0.4
+        fmt, style = MARKERS[index % len(MARKERS)], _style(scores, index)
+        panel.errorbar(places + offset, value, error, fmt=fmt, capsize=3, **style)
+        lows.append(lowest([value, low]))
+    panel.set_xticks(places, ticks)
+    panel.set_xlim(-0.5, len(ticks) - 0.5)
+    return min(lows)
+
+
+def _profiles(scores: Sequence[Score]) -> Figure:
+    """Draws the share of the seeds above each value, mean of the parts, arXiv:2108.13264."""
+    figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
+    for panel, (metric, title) in zip(panels, SUITE_METRICS.items(), strict=True):
+        left = 100.0
+        for index, score in enumerate(scores):
+            value, low, high = percent(statistics.profile(score.strata(metric), PROFILED))
+            style = _style(scores, index)
+            panel.plot(100 * PROFILED, value, **style)
+            panel.fill_between(100 * PROFILED, low, high, color=style["color"], alpha=0.15)
+            left = min(left, 100 * PROFILED[np.argmax(value < 100.0)])
+        panel.set(xlabel=f"{title}, %", xlim=(axis_start(left), 100), ylim=(0, 101))
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("seeds above, %")
+    _legend_below(figure, panels[0])
+    return figure
+
+
+def _legend_below(figure: Figure, panel: Axes) -> None:
+    handles = panel.get_legend_handles_labels()
+    figure.legend(*handles, fontsize="small", loc="outside lower center", ncols=3)
+
+
+def _style(scores: Sequence[Score], index: int) -> dict[str, Any]:
+    """Returns name and colour of a variant's marks."""
+    score = scores[index]
+    words = [_short(score.variant) if score.policy == "learned" else score.policy]
+    for field in ("physics", "robot"):
+        if len({getattr(other, field) for other in scores}) > 1:
+            words.append(getattr(score, field))
+    colour = _colour([other.variant.algo for other in scores], index)
+    name = f"{', '.join(words)} ({score.most_runs})"
+    return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
+
+
+def study(rows: Sequence[StudyRow]) -> Figure:
+    """Draws metrics of a sweep's policies against actions: a column per task, a line a method."""
+    by_task = grouped(rows, lambda row: row.task)
+    size, shape = (1.0 + 3.6 * len(by_task), 2.6 * len(PANELS)), (len(PANELS), len(by_task))
+    figure, panels = plt.subplots(
+        *shape, figsize=size, sharex=True, sharey="row", squeeze=False, layout="constrained"
+    )
+    for column, (task, own) in zip(panels.T, by_task.items(), strict=True):
+        for panel, metric in zip(column, PANELS, strict=True):
+            _study_lines(panel, metric, own)
+        column[0].set_title(task)
+        column[-1].set_xlabel("actions of training")
+    for panel, title in zip(panels[:, 0], PANELS.values(), strict=True):
+        panel.set_ylabel(f"{title}, %")
+    _legend_below(figure, panels[0, 0])
+    return figure
+
+
+def _study_lines(panel: Axes, metric: str, rows: Sequence[StudyRow]) -> None:
+    spare = itertools.cycle(PALETTE)
+    for method, own in grouped(rows, lambda row: row.method).items():
+        colour = COLOURS.get(own[0].algo) if "," not in method else None
+        actions = [row.actions for row in own]
+        value, low, high = percent([row.score.band(metric) for row in own])
+        colour = colour or next(spare)
+        panel.plot(actions, value, "o-", color=colour, label=method)
+        panel.fill_between(actions, low, high, color=colour, alpha=0.15, linewidth=0)
+    panel.grid(alpha=0.3)
+
+
+def lowest(values: Any) -> float:
+    """Returns the lowest finite value, %; 100 without any."""
+    finite = np.isfinite(values)
+    return float(np.min(np.asarray(values)[finite], initial=100.0))
+
+
+def axis_start(percentage: float) -> float:
+    """Returns where an axis begins, %: a whole ten a little below the data."""
+    return max(10.0 * np.floor((percentage - 1.0) / 10.0), 0.0)
+
+
+def percent(bands: Sequence[Band | None]) -> np.ndarray:
+    """Returns value, low and high [3, bands], %; NaN where there is none."""
+    rows = [(None, None, None) if band is None else band[:3] for band in bands]
+    return 100 * np.array(rows, float).reshape(-1, 3).T
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a PNG that is the same bytes for the same figure."""
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+def svg(figure: Figure) -> bytes:
+    """Returns the figure as an SVG whose text is text, on a transparent ground."""
+    stream = BytesIO()
+    with plt.rc_context({"svg.fonttype": "none", "svg.hashsalt": "csac_jax"}):
+        figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
+    plt.close(figure)
+    return stream.getvalue()

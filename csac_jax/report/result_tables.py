@@ -1,0 +1,307 @@
+"""The tables of a report. Every number comes from a file that says where it was measured."""
+
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from csac_jax.constants import GRASP_WINDOW
+from csac_jax.evaluation import statistics
+from csac_jax.evaluation.metrics import PER_ACTION, PER_EPISODE
+from csac_jax.evaluation.statistics import Band
+from csac_jax.report.comparison import (
+    Curve,
+    ResultReport,
+    Score,
+    compared,
+    curve_pairs,
+    pairs,
+    seeds_of,
+)
+from csac_jax.report.results import METRICS, RecordedRun
+from csac_jax.report.variants import Json, Variant, label
+
+GOOD = 0.9  # grasp success whose time is reported
+LAST = "final success"
+AREA = "area under the curve"
+SUMMARY = ("method", "runs", LAST, AREA, "training time")  # of the training table
+RATES = {
+    "blocks / action": (("cleared",), ("pushes", "grasps"), "action_efficiency"),
+    "lifted / grasp": (("lifted",), ("grasps",), "grasp_success"),
+    "actions / episode": (("pushes", "grasps"), ("terminated", "truncated"), "actions_per_episode"),
+    "pushes / episode": (("pushes",), ("terminated", "truncated"), "pushes_per_episode"),
+}
+"""Column of the training table -> totals above and below, and the metric with its unit."""
+IMPROVED = tuple(name for name in METRICS if name not in PER_EPISODE)  # more is better
+EXPLAINED = (
+    "Several runs: the interquartile mean and, in brackets, its 95 % interval. The bootstrap draws "
+    "seeds, then the hosts that a seed ran on. "
+    "One run: its value; of an evaluation with the 95 % interval of its episodes. "
+    f"Final success is over the last {GRASP_WINDOW} grasps. "
+    "The area under the curve is the mean of that success over all actions. "
+    "Rates in the training table are over all of training. "
+    "Differences are of interquartile means, in points of per cent. "
+    "P is the probability of improvement: that a seed of one method is above one of the other. "
+    "Lifted / grasps, mean of episodes, is the paper's action efficiency; pushes cost nothing in "
+    "it. `csac_jax/evaluation/metrics.py` defines the metrics. "
+    "A method with many changed settings has the name of its folder; its command stands under "
+    "provenance."
+)
+
+ResultTable = list[dict[str, str]]  # rows; column -> cell
+
+
+def first_good(run: RecordedRun) -> int | None:
+    """Returns the line of a log at which the success of a full window first is GOOD."""
+    good = np.flatnonzero((run.success >= GOOD) & (run.grasps >= GRASP_WINDOW))
+    return int(good[0]) if good.size else None
+
+
+def _time_to_good(run: RecordedRun) -> float | None:
+    line = first_good(run)
+    return None if line is None else float(run.seconds[line])
+
+
+def as_json(report: ResultReport) -> Json:
+    """Returns the report's numbers as plain values."""
+    return {
+        "reference": report.reference,
+        "curves": [_curve_json(curve) for curve in report.curves],
+        "scores": [_score_json(score, part) for score in report.scores for part in score.parts],
+        "training_differences": [
+            {"ours": _named(ours.variant), "theirs": _named(theirs.variant)}
+            | _plain(_training_gaps(ours, theirs))
+            for ours, theirs in curve_pairs(report)
+        ],
+        "differences": [
+            {"ours": _named(ours.variant), "theirs": _named(theirs.variant)}
+            | {"suite": ours.suite, "parts": list(ours.parts), "world": ours.world}
+            | {"metrics": _plain(compared(ours, theirs, statistics.difference, METRICS))}
+            | {"improvement": _plain(compared(ours, theirs, statistics.improvement, IMPROVED))}
+            for ours, theirs in pairs(report)
+        ],
+        "provenance": provenance(report),
+        "notes": report.notes,
+    }
+
+
+def _curve_json(curve: Curve) -> Json:
+    actions, success = curve.points()
+    return _named(curve.variant) | {
+        "seeds": sorted(curve.seeds),
+        "seconds_to_90": [_time_to_good(run) for run in curve.runs],
+        "seconds": [float(run.seconds[-1]) for run in curve.runs],
+        "actions": actions.tolist(),
+        "success": [band._asdict() for band in success],
+        **_plain({"final": statistics.band([curve.final]), "area": statistics.band([curve.area])}),
+        "rates": _plain({name: curve.rate(*of) for name, (*of, _) in RATES.items()}),
+    }
+
+
+def _score_json(score: Score, part: str) -> Json:
+    fields = score._asdict() | {"part": part, "seeds": sorted(seeds_of(score.parts[part]))}
+    del fields["parts"]
+    metrics = _plain({name: score.only(part).band(name) for name in METRICS})
+    return _named(fields.pop("variant")) | fields | {"metrics": metrics}
+
+
+def _named(variant: Variant) -> Json:
+    named = {"preset": variant.preset, "algo": variant.algo}
+    return named | {"changed": dict(variant.changed)}
+
+
+def _plain(bands: Mapping[str, Band | None]) -> Json:
+    return {name: band and band._asdict() for name, band in bands.items()}
+
+
+def tables(report: ResultReport) -> dict[str, ResultTable]:
+    """Builds all tables by title, without those that have no row."""
+    trained = training(report)
+    plain = [row for one, row in zip(report.curves, trained, strict=True) if one.variant.unchanged]
+    titled = {
+        "Summary": [{name: row[name] for name in SUMMARY} for row in plain],
+        "Training": trained,
+        "Evaluation": evaluation(report),
+        "Differences in training": training_differences(report),
+        "Differences": differences(report),
+        "Failures": failures(report),
+        "Provenance": provenance(report),
+    }
+    return {title: table for title, table in titled.items() if table}
+
+
+def training(report: ResultReport) -> ResultTable:
+    """Builds the table of training, a row per variant."""
+    return [_training_row(curve) for curve in report.curves]
+
+
+def _training_row(curve: Curve) -> dict[str, str]:
+    rates = {name: (curve.rate(*sums), metric) for name, (*sums, metric) in RATES.items()}
+    return {
+        "method": label(curve.variant),
+        "runs": str(len(curve.runs)),
+        "seeds": ", ".join(map(str, sorted(set(curve.seeds)))),
+        "actions": _range(curve.ends, ","),
+        LAST: shown(statistics.band([curve.final])),
+        AREA: shown(statistics.band([curve.area])),
+        **{name: shown(band, metric=metric) for name, (band, metric) in rates.items()},
+        "time to 90 %": _times([_time_to_good(run) for run in curve.runs]),
+        "training time": _times([float(run.seconds[-1]) for run in curve.runs]),
+    }
+
+
+def training_differences(report: ResultReport) -> ResultTable:
+    """Builds the table of how far the reference is ahead in training, a row per other variant."""
+    rows = []
+    for ours, theirs in curve_pairs(report):
+        final, area, chance = _training_gaps(ours, theirs).values()
+        names = {"ahead": label(ours.variant), "of": label(theirs.variant)}
+        rows.append(names | {LAST: _difference(final, chance), AREA: shown(area, "+")})
+    return rows
+
+
+def _training_gaps(ours: Curve, theirs: Curve) -> dict[str, Band]:
+    final = [ours.final], [theirs.final]
+    return {
+        "final": statistics.difference(*final),
+        "area": statistics.difference([ours.area], [theirs.area]),
+        "improvement": statistics.improvement(*final),
+    }
+
+
+def _difference(gap: Band | None, chance: Band | None, metric: str = "") -> str:
+    """Formats a difference and the probability of improvement."""
+    p = "" if chance is None else f", P {100 * chance.value:.0f} %"
+    return shown(gap, "+", metric) + p
+
+
+def _times(seconds: Sequence[float | None]) -> str:
+    """Formats the least and the most of some times; not every run need have one."""
+    known = [time for time in seconds if time is not None]
+    some = f" ({len(known)} of {len(seconds)} runs)" if len(known) < len(seconds) else ""
+    return f"{_range(known, '.0f')} s{some}" if known else "-"
+
+
+def _range(values: Sequence[float], spec: str) -> str:
+    return " to ".join(dict.fromkeys(format(end, spec) for end in (min(values), max(values))))
+
+
+def evaluation(report: ResultReport) -> ResultTable:
+    """Builds the table of evaluations: a row per part of a suite, and their mean."""
+    return [_evaluation_row(part) for score in report.scores for part in score.split()]
+
+
+def _evaluation_row(score: Score) -> dict[str, str]:
+    runs = sum(map(len, score.parts.values()))
+    counts = {"runs": str(score.most_runs), "episodes": str(score.episodes * runs)}
+    values = {title: shown(score.band(key), metric=key) for key, title in METRICS.items()}
+    return {"policy": score.name, **_place_cells(score), **counts, **values}
+
+
+def differences(report: ResultReport) -> ResultTable:
+    """Builds the table of how far the reference is ahead, a row per other variant and part."""
+    rows = []
+    for ours, theirs in pairs(report):
+        gaps = compared(ours, theirs, statistics.difference, METRICS)
+        chances = compared(ours, theirs, statistics.improvement, IMPROVED)
+        names = {"ahead": label(ours.variant), "of": label(theirs.variant)}
+        cells = {
+            title: _difference(gaps.get(key), chances.get(key), key)
+            for key, title in METRICS.items()
+        }
+        rows.append(names | _place_cells(ours) | cells)
+    return rows
+
+
+def failures(report: ResultReport) -> ResultTable:
+    """Builds the table of causes of failure, all runs summed: cases, and out of how many."""
+    recorded = [
+        (score.only(part), [one.metrics["failures"] for one in runs])
+        for score in report.scores
+        for part, runs in score.parts.items()
+        if all("failures" in one.metrics for one in runs)
+    ]
+    causes = dict.fromkeys(cause for _, runs in recorded for run in runs for cause in run)
+    return [
+        {"policy": score.name, **_place_cells(score)}
+        | {cause.replace("_", " "): _sum_cases(runs, cause) for cause in causes}
+        for score, runs in recorded
+    ]
+
+
+def _sum_cases(runs: Sequence[Json], cause: str) -> str:
+    shares = [run[cause] for run in runs if cause in run]
+    n = sum(share["n"] for share in shares)
+    cases = sum(round(share["n"] * (share["value"] or 0.0)) for share in shares)
+    return f"{cases} / {n}" if n else "-"
+
+
+def _place_cells(score: Score) -> dict[str, str]:
+    part, *others = score.parts
+    part = f"mean of {len(score.parts)} parts" if others else part
+    part = part if part == score.suite else f"{score.suite}: {part}"
+    return {"part": part, "physics, robot, seed": score.world}
+
+
+def provenance(report: ResultReport) -> ResultTable:
+    """Builds the table of where numbers come from, a row per file."""
+    runs = {run.path: (run.command, run.record) for run in report.results.runs}
+    trained = {run.path.parent: run.config for run in report.results.runs}
+    measured = {
+        one.path: (one.command(trained.get(one.path.parent)), one.record)
+        for one in report.results.evaluations
+    }
+    files = runs | measured
+    root = os.path.commonpath([path.parent for path in files]) if files else ""
+    return [
+        {
+            "file": os.path.relpath(path, root),
+            "settings as a command": command,
+            "device": record.get("device") or "-",
+            "versions": _versions(record) or "-",
+            "commit": str(record.get("commit") or "-")[:10],
+            "wall time": _wall_time(record),
+        }
+        for path, (command, record) in files.items()
+    ]
+
+
+def _versions(record: Json) -> str:
+    versions = (record.get("versions") or {}).items()
+    return ", ".join(f"{name} {n}" for name, n in versions if name in ("python", "jax", "mujoco"))
+
+
+def _wall_time(record: Json) -> str:
+    seconds, whole = record["wall_seconds"], ", whole sweep" * ("settings" in record)
+    return "-" if seconds is None else f"{seconds:.0f} s{whole}"
+
+
+def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
+    """Formats a band as blocks per action, counts per episode or per cent.
+
+    With a sign it is a difference, in points.
+    """
+    if band is None:
+        return "-"
+    if metric in (*PER_ACTION, *PER_EPISODE):
+        scale, digits, unit = 1, 3 if metric in PER_ACTION else 2, ""
+    else:
+        scale, digits, unit = 100, 1, "" if sign else " %"
+    value, *ends = (f"{scale * x:{sign}.{digits}f}" for x in band[:3] if x is not None)
+    return f"{value}{unit} ({' to '.join(ends)})" if ends else f"{value}{unit}"
+
+
+def markdown(report: ResultReport) -> str:
+    """Writes all tables and notes as Markdown."""
+    sections = {title: table_text(table) for title, table in tables(report).items()}
+    if report.notes:
+        sections["Notes"] = "\n".join(f"- {note}" for note in report.notes)
+    return "\n\n".join([EXPLAINED, *(f"## {t}\n\n{text}" for t, text in sections.items())]) + "\n"
+
+
+def table_text(table: Sequence[Mapping[str, str]]) -> str:
+    """Writes a table as Markdown."""
+    rows = [list(table[0]), *(list(row.values()) for row in table)]
+    lines = ["| " + " | ".join(cell.replace("|", "/") for cell in row) + " |" for row in rows]
+    lines.insert(1, "|" + "---|" * len(table[0]))
+    return "\n".join(lines)

@@ -1,0 +1,135 @@
+"""Variants of a method: their names, and the commands that make their runs and evaluations."""
+
+import contextlib
+import dataclasses
+import functools
+import json
+from collections.abc import Iterable
+from typing import Any
+
+from csac_jax import algorithms, presets
+from csac_jax.io import configs
+
+NAMES = {
+    "grasp_only": "Grasping-only",
+    "reactive": "P+G reactive",
+    "vpg": "VPG",
+    "csac": "CSAC",
+    "csac_per": "CSAC-PER",
+    "csac_beta": "CSAC-beta",
+}
+NAMED = ("seed", "preset", "algo", "sim.physics")  # have a place of their own in tables
+HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
+LENGTH = "train."  # settings of a run's length and shape do not make another method
+MOST_CHANGES = 6  # a variant with more is named by its folder
+DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry": 0.0}
+"""Settings that `eval` can change, and their values in configs that lack them."""
+VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance")  # likewise
+
+Json = dict[str, Any]
+Changes = tuple[tuple[str, str], ...]  # dotted settings and their values as text
+
+
+@dataclasses.dataclass(frozen=True, order=True)
+class Variant:
+    """Everything that runs share which differ in their seed alone."""
+
+    preset: str
+    algo: str
+    changed: Changes  # settings that differ from the preset's
+    source: str = dataclasses.field(default="", compare=False)  # name of the folder or file
+
+    @property
+    def unchanged(self) -> bool:
+        """Returns True for the algorithm as the preset has it, whatever the run's length."""
+        return all(name.startswith(LENGTH) for name, _ in self.changed)
+
+
+def variant(config: Json) -> Variant:
+    """Builds the variant of a recorded config. Missing settings count as the preset's."""
+    preset, algo = config.get("preset", ""), configs.algorithm(config)
+    base: Json = {}
+    with contextlib.suppress(ValueError):  # the preset or the algorithm is gone
+        base = _preset_settings(preset, algo)
+    settings = configs.flat(config)
+    with contextlib.suppress(ValueError):  # written by a version with other settings
+        settings = _settings(json.dumps({**config, "seed": 0}))
+    changed = tuple(
+        (name, _text(value))
+        for name, value in settings.items()
+        if value != base.get(name, value) and name not in (*NAMED, *HOST)
+    )
+    return Variant(preset, algo, changed)
+
+
+@functools.cache
+def _preset_settings(preset: str, algo: str) -> Json:
+    return configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
+
+
+@functools.lru_cache(maxsize=64)  # runs of a folder mostly differ in their seed
+def _settings(text: str) -> Json:
+    return configs.flat(configs.to_dict(configs.from_dict(json.loads(text))))
+
+
+def label(variant: Variant, preset: bool = True, most: int | None = None) -> str:
+    """Names a variant with at most `most` of its changes, or by its folder if it has many."""
+    name = NAMES.get(variant.algo, variant.algo)
+    changed = [" ".join(change) for change in variant.changed]
+    if most is None and len(changed) > MOST_CHANGES and variant.source:
+        changed = [variant.source]
+    if most is not None and len(changed) > most:
+        changed[most:] = [f"others ({len(changed) - most})"]
+    return ", ".join([f"{name} ({variant.preset})" if preset else name, *changed])
+
+
+def world(config: Json) -> tuple[str, str]:
+    """Returns physics and robot of a config; the first records name neither."""
+    sim = config.get("sim", {})
+    return sim.get("physics", "mjx"), sim.get("robot", "hand")
+
+
+def train_command(config: Json) -> str:
+    """Returns the command that trains with a recorded config."""
+    made, (physics, _) = variant(config), world(config)
+    command = f"csac-jax train {made.preset} --algo {made.algo} --seed {config.get('seed', 0)}"
+    return f"{command} --sim.physics {physics}{_flags(made.changed)}"
+
+
+def eval_command(policy: str, suite: str, episodes: Any, seed: int, evaluated: Json) -> str:
+    """Returns the command of an evaluation, without `eval_options`."""
+    physics, robot = world(evaluated)
+    asked = f"--policy {policy} --suite {suite} --episodes {episodes} --seed {seed}"
+    return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}"
+
+
+def eval_options(evaluated: Json, trained: Json) -> str:
+    """Returns the options of `eval` for settings that differ from the trained config's."""
+    now, before = ({**DECISION, **configs.flat(one)} for one in (evaluated, trained))
+    options = ""
+    if library := now.get("scene.objects"):
+        options += "" if library == before.get("scene.objects") else f" --objects {library}"
+        split = now.get("scene.split", "")
+        options += "" if split == "held_out" else f" --split {split}"
+    for name in DECISION:
+        if (value := now[name]) != before[name]:
+            text = {True: "on", False: "off"}[value] if isinstance(value, bool) else value
+            options += f" --{name.removeprefix('policy.').replace('_', '-')} {text}"
+    viewed = (name for name in now if name.startswith(VIEW))
+    return options + _flags(
+        (name, _text(now[name])) for name in viewed if now[name] != before.get(name, now[name])
+    )
+
+
+def _text(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _flags(settings: Iterable[tuple[str, str]]) -> str:
+    return "".join(f" {_flag(name, value)}" for name, value in settings)
+
+
+def _flag(name: str, value: str) -> str:
+    section, _, field = name.replace("_", "-").rpartition(".")
+    switch = {"True": field, "False": f"no-{field}"}.get(value)
+    return f"--{section}.{switch}" if switch else f"--{section}.{field} {value}"

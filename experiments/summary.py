@@ -1,0 +1,109 @@
+"""Writes the tables of docs/results.md from the recorded results: `python -m experiments.summary`.
+
+The page built by `make docs` from `csac-jax report experiments/results` has all the others.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from csac_jax.evaluation import statistics
+from csac_jax.report import comparison, result_tables, results
+from csac_jax.report.result_tables import ResultTable, shown
+from csac_jax.report.results import METRICS
+from csac_jax.report.variants import NAMES
+from experiments import study
+from experiments.index import RESULTS
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
+BEGIN = "<!-- The rest is written by `python -m experiments.summary`. -->\n"
+FAMILIES = ("fast", "grippers", "objects", "paper", "quick")
+POLICIES = {
+    "shipped": ("fast/shipped/seed-0", ("random10-c", "random30-c", "packed", "cases-c")),
+    "shipped_clutter": (
+        "fast/clutter/seed-1",
+        ("random10-high", "random30-high", "packed-high", "cases-high"),
+    ),
+    "shipped_camera": ("fast/camera/seed-0", ("random10", "random30", "packed", "cases")),
+    "shipped_grippers": ("grippers/from_shipped_gpu/seed-0", ("rg2", "2f85", "franka_hand")),
+    "shipped_objects": ("objects/gpu_cones/seed-7", ("pile", "objects_packed", "objects10")),
+    "shipped_target": ("objects/gpu_target/seed-0", ("target_objects",)),
+}
+"""Policy -> folder of its run, and its evaluations."""
+TRAINED = {
+    "quick/csac_beta": "`quick`, two CPU cores",
+    "paper/": "`paper`, one H200",
+    "fast/csac_beta": "`fast`, one GPU",
+    "fast/target": "`fast` in the target task, one GPU",
+    "fast/target_grasp_only": "the same, grasping only",
+    "objects/csac_beta": "`objects`, two CPU cores",
+}
+"""Folder of runs -> what was trained."""
+SHOWN = ("completion", "grasp_success", "action_efficiency")
+
+
+def page() -> str:
+    """Returns docs/results.md with the tables of today's records."""
+    head, _, _ = PAGE.read_text().partition(BEGIN)
+    paths = [RESULTS / f"{name}{results.ARCHIVE}" for name in FAMILIES]
+    recorded = results.read(paths)
+    titled = {
+        "Policies that ship": list(_policies(recorded.evaluations)),
+        "Training": list(_trained(recorded.runs)),
+        "Methods in the study": list(_methods()),
+    }
+    sections = (f"\n## {t}\n\n{result_tables.table_text(rows)}\n" for t, rows in titled.items())
+    return head + BEGIN + "".join(sections)
+
+
+def _policies(evaluations: Sequence[results.Evaluation]) -> Iterator[dict[str, str]]:
+    for policy, (folder, names) in POLICIES.items():
+        for name in names:
+            path = f"{folder}/eval-{name}.json"
+            parts = [one for one in evaluations if one.path.as_posix().endswith(f"/{path}")]
+            (score,) = comparison.build(results.Results([], parts, [])).scores
+            place = score.suite if len(parts) == 1 else f"{score.suite}, mean of {len(parts)}"
+            if policy == "shipped_grippers":
+                place = f"{score.suite}, gripper {name}"
+            yield {"policy": f"`{policy}`", "suite": place} | {
+                "episodes": str(score.episodes * len(parts)),
+                **{METRICS[key]: shown(score.band(key), metric=key) for key in SHOWN},
+                "record": f"`{path}`",
+            }
+
+
+def _trained(runs: Sequence[results.RecordedRun]) -> Iterator[dict[str, str]]:
+    for folder, title in TRAINED.items():
+        own = [run for run in runs if _folder(run).startswith(folder) and _fits(run, folder)]
+        report = comparison.build(results.Results(own, [], []))
+        (row,) = result_tables.training(report)
+        columns = ("runs", "actions", *result_tables.SUMMARY[2:4], "time to 90 %", "training time")
+        yield {"preset": title} | {column: row[column] for column in columns}
+
+
+def _folder(run: results.RecordedRun) -> str:
+    return "/".join(run.path.parts[-4:-2])
+
+
+def _fits(run: results.RecordedRun, folder: str) -> bool:
+    return folder.endswith("/") or _folder(run) == folder
+
+
+def _methods() -> ResultTable:
+    """Builds the greedy policies of part 1 by task and method."""
+    rows = []
+    for task in study.TASKS:
+        for algo in NAMES:
+            pattern, seeds = f"1-{task}-{algo}-*/*", range(100, 150)
+            area = study.values(pattern, study.AREA, seeds)
+            names = (*SHOWN, study.PUSHES)
+            bands = {key: statistics.band([study.values(pattern, key, seeds)]) for key in names}
+            rows.append(
+                {"task": task, "method": NAMES[algo], "seeds": str(len(area))}
+                | {METRICS[key]: shown(band, metric=key) for key, band in bands.items()}
+                | {result_tables.AREA: shown(statistics.band([area]))}
+            )
+    return rows
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
