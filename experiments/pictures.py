@@ -58,7 +58,7 @@ def still(name: str) -> np.ndarray:
     return _smaller(draw(data))
 
 
-def close_view(positions: np.ndarray) -> View:
+def close_view(positions: np.ndarray) -> Viewpoint:
     """Returns the view that blocks at `positions` [N, 3] m fill."""
     middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
     corners = np.stack(np.meshgrid(*(BLOCK,) * 3), axis=-1).reshape(-1, 3)

@@ -22,7 +22,6 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import parsing, sweep
 from csac_jax.evaluation import suites
 from csac_jax.io import checkpoint, configs
-from experiments import index
 
 ROOT = Path(csac_jax.__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"

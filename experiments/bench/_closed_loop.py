@@ -14,7 +14,7 @@ import numpy as np
 
 from csac_jax.config import Config, RobotKind, SensorConfig, SimConfig
 from csac_jax.constants import OUTCOMES
-from csac_jax.deploy import Policy
+from csac_jax.deploy import CameraPolicy
 from csac_jax.deploy.decision import Decision
 from csac_jax.env import Env
 from csac_jax.errors import DataWarning, ViewError
@@ -46,7 +46,7 @@ class Loop(NamedTuple):
 
 def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
     """Makes the loop of the policy `source`, see `Policy.load`, in random10."""
-    policy = Policy.load(source)
+    policy = CameraPolicy.load(source)
     clear = policy.cfg.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
     cfg = clear.change(sim={"physics": "c", "robot": robot})
     (env,) = suites.environments(cfg, "random10", episodes, seed).values()

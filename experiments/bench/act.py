@@ -22,7 +22,7 @@ from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
 from csac_jax.runtime import compiler
-from csac_jax.training import step
+from csac_jax.training import programs
 from csac_jax.vision.heightmap import Observation
 from experiments.bench._options import emit, read
 from experiments.bench._timing import medians

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic, policy
+from csac_jax.agent import policy, values
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
 from csac_jax.cli import parsing
@@ -204,7 +204,7 @@ def _rates(cfg: Config, seconds: float) -> dict[str, float]:
 
 def _memory(chunk: Any) -> dict[str, int | None]:
     """Returns the bytes of the program; of two, those of the one that learns."""
-    program = chunk.learn.result() if isinstance(chunk, halves.Chunk) else chunk
+    program = chunk.learn.result() if isinstance(chunk, split_step.Chunk) else chunk
     stats, device = program.memory_analysis(), jax.devices()[0].memory_stats() or {}
     return {
         "state_bytes": stats.argument_size_in_bytes,
@@ -216,8 +216,8 @@ def _memory(chunk: Any) -> dict[str, int | None]:
 
 def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     """Times one config's step and its stages."""
-    program = step.make(cfg)
-    state = step.init(program)
+    program = programs.make(cfg)
+    state = programs.init(program)
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
     seconds = medians(
@@ -255,8 +255,8 @@ def _at(cfg: Config, curve: str, value: int) -> Config:
 
 def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dict[str, Any]:
     """Times one point of a curve: the whole step alone."""
-    program = step.make(cfg)
-    state = step.init(program)
+    program = programs.make(cfg)
+    state = programs.init(program)
     chunk, compiling = _compile(program, state, steps)
     seconds = medians({"whole": _whole(chunk, cfg, state)}, repeats)["whole"] / steps
     return {

@@ -26,7 +26,8 @@ from csac_jax.errors import SettingsError
 from csac_jax.runtime import cache
 from csac_jax.sim import backend
 from csac_jax.sweeps import replicas
-from csac_jax.training import sharding, step
+from csac_jax.training import programs, sharding
+from csac_jax.training.step import Program
 from experiments.bench._options import Parser, config, emit, split
 
 KINDS = {  # the first that a kernel's name holds
@@ -73,7 +74,7 @@ def _traced(folder: Path) -> Iterable[tuple[str, float, float]]:
                 yield event.name, 1e-6 * event.start_ns, 1e-6 * event.end_ns
 
 
-def _compiled(program: step.Program, mesh: Mesh | None, seeds: int) -> tuple[Any, Any]:
+def _compiled(program: Program, mesh: Mesh | None, seeds: int) -> tuple[Any, Any]:
     """Returns the state of a run, or of several seeds, and its compiled step."""
     if mesh is None and seeds == 1:
         return programs.init(program), programs.compile_chunk(program, 1)

@@ -27,7 +27,8 @@ from csac_jax.config import Config
 from csac_jax.runtime import compiler
 from csac_jax.sim import backend
 from csac_jax.sweeps import grid, replicas, runner
-from csac_jax.training import sharding, step
+from csac_jax.training import programs, sharding
+from csac_jax.training.step import Program
 from experiments.bench._options import Parser, config, emit, split
 
 
@@ -51,7 +52,7 @@ def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
 
 
 def measure(
-    program: step.Program, seeds: int, devices: int, shard: sharding.Shard, steps: int, repeats: int
+    program: Program, seeds: int, devices: int, shard: sharding.Shard, steps: int, repeats: int
 ) -> Any:
     """Measures a row: `seeds` runs on `devices` devices."""
     cfg, mesh = program.cfg, sharding.make(devices)

@@ -90,7 +90,7 @@ def _differing(one: Any, other: Any) -> int:
 
 def _calls(env: environment.Env, states: environment.State, actions: Action) -> int:
     """Counts the calls of Warp in a scan of two steps."""
-    from csac_jax.sim.warp_action import Simulator
+    from csac_jax.sim.warp_action import WarpSimulator
 
     def step(states: environment.State, _: None) -> tuple[environment.State, Any]:
         after = jax.vmap(env.step)(states, actions)
