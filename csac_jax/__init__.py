@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from csac_jax.evaluation.policies import Policy
     from csac_jax.io.configs import load_config
     from csac_jax.replay.samplers import Sample, Sampler
-    from csac_jax.sim.primitives import Action
+    from csac_jax.robot.primitives import Action
     from csac_jax.training.callbacks import Callback, Record
     from csac_jax.vision.heightmap import Observation, unpack
 
@@ -74,7 +74,7 @@ _HOMES = {
     "csac_jax.evaluation.policies": ("Policy",),
     "csac_jax.io.configs": ("load_config",),
     "csac_jax.replay.samplers": ("Sample", "Sampler"),
-    "csac_jax.sim.primitives": ("Action",),
+    "csac_jax.robot.primitives": ("Action",),
     "csac_jax.training.callbacks": ("Callback", "Record"),
     "csac_jax.vision.heightmap": ("Observation", "unpack"),
 }

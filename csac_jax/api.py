@@ -17,7 +17,7 @@ from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import monitor, policies, rollout
 from csac_jax.evaluation.monitor import EvalPlan
-from csac_jax.evaluation.policies import LearnedPolicy, Policy
+from csac_jax.evaluation.policies import NetworkPolicy, Policy
 from csac_jax.io import leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
 from csac_jax.runtime import cache, cluster, provenance, signals
@@ -230,7 +230,7 @@ def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], 
         trunk = _checked(weights.read, cfg.net, Path(source))
         return lambda state: actor_critic.with_trunk(state, trunk)
     policy = policies.load(source)
-    assert isinstance(policy, LearnedPolicy)
+    assert isinstance(policy, NetworkPolicy)
     params, wanted = policy.params, actor_critic.abstract_params(cfg)
     only_last = policy.cfg.task.kind != "target" and policy.cfg.net.colour == cfg.net.colour
     if only_last:  # inputs may be missing: colours, heights, gripper and target are in this order

@@ -21,14 +21,15 @@ from csac_jax import grippers
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.grippers import Gripper
-from csac_jax.scene import layout, model, pool
-from csac_jax.scene.layout import Scene
+from csac_jax.robot.primitives import Action
+from csac_jax.scenes import pool
 from csac_jax.sim import backend, outcome, physics as simulation
 from csac_jax.sim.outcome import Trace
 from csac_jax.sim.physics import Physics
-from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap, observe, sensor
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
+from csac_jax.world import model, scene_state
+from csac_jax.world.scene_state import SceneState
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class Info:
 class State:
     """One scene between two actions."""
 
-    scene: Scene
+    scene: SceneState
     obs: Observation
     reward: jax.Array  # [] float32, 1 if the action lifted a wanted block (r2, CSAC eq. 11)
     terminated: jax.Array  # [] bool, no wanted block is left
@@ -87,8 +88,8 @@ class State:
 class _Motion(NamedTuple):
     """One action as physics ran it."""
 
-    before: Scene  # empty where it was invalid
-    after: Scene  # as before where physics diverged
+    before: SceneState  # empty where it was invalid
+    after: SceneState  # as before where physics diverged
     trace: Trace
     surface: jax.Array  # [] m, see `primitives.Plan`
     is_grasp: jax.Array  # [] bool
@@ -99,7 +100,7 @@ class _Motion(NamedTuple):
 class _Removal(NamedTuple):
     """Blocks taken off the table. N = block slots."""
 
-    scene: Scene  # without them
+    scene: SceneState  # without them
     lifted: jax.Array  # [N] bool, in the hand
     lost: jax.Array  # [N] bool, outside the workspace
     success: jax.Array  # [N] bool, lifted and wanted
@@ -111,7 +112,7 @@ class Env:
 
     cfg: Config
     physics: Physics
-    scenes: Scene  # NumPy leaves [P, N, ...], at rest
+    scenes: SceneState  # NumPy leaves [P, N, ...], at rest
     any_yaw: bool = True  # False: `reset` rotates scenes by quarter turns only
     max_failures: int = 0  # failed grasps in a row that truncate an episode; 0: no limit
 
@@ -145,7 +146,7 @@ class Env:
         """Starts an episode in a random scene of the pool, rotated by a random yaw."""
         return self.reset_to(self._sample_scene(key), key)
 
-    def reset_to(self, scene: Scene, key: jax.Array | None = None) -> State:
+    def reset_to(self, scene: SceneState, key: jax.Array | None = None) -> State:
         """Starts an episode in this scene. Raises ValueError if sensor noise lacks its key."""
         no, zero = jnp.zeros((), bool), jnp.zeros((), jnp.float32)
         count = jnp.zeros((), jnp.int32)
@@ -166,7 +167,7 @@ class Env:
         scene = self._sample_scene(key_scene)
         if self.cfg.task.kind == "target":
             same_scene = (state.reward > 0.0) & jnp.any(state.scene.in_play)
-            scene = _select(same_scene, layout.mark_target(key_target, state.scene), scene)
+            scene = _select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
         return self.reset_to(scene, key)
 
     def step(self, state: State, action: Action) -> State:
@@ -181,16 +182,18 @@ class Env:
         removal = self._remove(motion)
         return self._judge(state, action, motion, removal)
 
-    def _validate(self, state: State) -> tuple[Scene, jax.Array]:
+    def _validate(self, state: State) -> tuple[SceneState, jax.Array]:
         """Returns the scene, or an empty one where scene or observation are out of bounds, and
         [] bool, they are within."""
         spec = self.observation_spec
         valid = simulation.healthy(state.scene) & spec.height.contains(state.obs.height)
         valid &= spec.colour.contains(state.obs.colour)
-        blank = layout.parked(self.cfg.scene.slots).replace(fingers=state.scene.fingers)
+        blank = scene_state.parked(self.cfg.scene.slots).replace(fingers=state.scene.fingers)
         return _select(valid, state.scene, blank), valid
 
-    def _move(self, before: Scene, valid: jax.Array, height: jax.Array, action: Action) -> _Motion:
+    def _move(
+        self, before: SceneState, valid: jax.Array, height: jax.Array, action: Action
+    ) -> _Motion:
         """Runs the primitive; undoes it where physics diverged."""
         after, trace, plan = simulation.execute(self.physics, self.cfg, before, height, action)
         finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
@@ -205,9 +208,11 @@ class Env:
         after = motion.after
         lifted = outcome.lifted_blocks(motion.trace, motion.hand_rise)
         lifted = lifted & motion.is_grasp & ~motion.diverged
-        lost = after.in_play & ~layout.inside(after.position, self.cfg.heightmap.extent) & ~lifted
-        success = lifted & layout.is_target(motion.before)
-        return _Removal(layout.park(after, ~lifted & ~lost), lifted, lost, success)
+        lost = (
+            after.in_play & ~scene_state.inside(after.position, self.cfg.heightmap.extent) & ~lifted
+        )
+        success = lifted & scene_state.is_target(motion.before)
+        return _Removal(scene_state.park(after, ~lifted & ~lost), lifted, lost, success)
 
     def _judge(self, state: State, action: Action, motion: _Motion, removal: _Removal) -> State:
         """Observes the scene that is left; counts actions, rewards and ends the episode."""
@@ -216,7 +221,7 @@ class Env:
         moved = heightmap.moved_area(self.cfg.heightmap, state.obs.height, obs.height)
         changed = moved > CHANGE_AREA
         unchanged_steps = jnp.where(changed, 0, state.steps_without_change + 1)
-        terminated = ~jnp.any(scene.in_play & layout.is_target(scene))
+        terminated = ~jnp.any(scene.in_play & scene_state.is_target(scene))
         failed = jnp.where(jnp.any(removal.lifted), 0, state.failed_grasps + 1)
         failed_grasps = jnp.where(motion.is_grasp, failed, state.failed_grasps)
         capped = self._capped(actions, unchanged_steps, failed_grasps)
@@ -244,25 +249,27 @@ class Env:
             capped |= failed_grasps >= self.max_failures
         return capped
 
-    def randomise_pose(self, key: jax.Array, scene: Scene) -> Scene:
+    def randomise_pose(self, key: jax.Array, scene: SceneState) -> SceneState:
         """Rotates a scene by a random yaw; draws the task's target and a varying gripper's
         fingers."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
-        placed = layout.randomise_pose(key, scene, extent, self.any_yaw, has_target)
-        return layout.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
+        placed = scene_state.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+        return scene_state.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
 
-    def _sample_scene(self, key: jax.Array) -> Scene:
+    def _sample_scene(self, key: jax.Array) -> SceneState:
         key_index, key_pose = jax.random.split(key)
         index = jax.random.randint(key_index, (), 0, self.scenes.position.shape[0])
         scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.scenes)
         return self.randomise_pose(key_pose, scene)
 
-    def _observe(self, scene: Scene, root: jax.Array | None, actions: jax.Array) -> Observation:
+    def _observe(
+        self, scene: SceneState, root: jax.Array | None, actions: jax.Array
+    ) -> Observation:
         key = None if root is None else jax.random.fold_in(root, actions)
         obs = observe.observe(self.cfg, scene, key)
         if not self.cfg.net.gripper:
             return obs
-        return obs.replace(fingers=jnp.stack(layout.fingers(scene, self.gripper)))
+        return obs.replace(fingers=jnp.stack(scene_state.fingers(scene, self.gripper)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

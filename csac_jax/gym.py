@@ -24,12 +24,12 @@ from csac_jax import geometry, presets
 from csac_jax.config import CameraConfig, Config
 from csac_jax.constants import OUTCOMES, Primitive
 from csac_jax.env import AutoResetEnv, Env, Info, State, make_env
+from csac_jax.robot.primitives import Action
 from csac_jax.runtime import cache
-from csac_jax.scene.layout import Scene
 from csac_jax.sim import backend
-from csac_jax.sim.primitives import Action
 from csac_jax.vision import camera, observe
 from csac_jax.vision.heightmap import Observation
+from csac_jax.world.scene_state import SceneState
 
 ActionKind = Literal["continuous", "dense"]
 """`continuous`: [4] in -1 .. 1: below 0 a grasp, else a push; x and y of half the workspace; yaw of
@@ -231,7 +231,7 @@ def _infos(info: Info) -> dict[str, Any]:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _picture(cfg: Config, scene: Scene) -> jax.Array:
+def _picture(cfg: Config, scene: SceneState) -> jax.Array:
     """Draws the scene as PICTURE's camera sees it, [h, w, 3] uint8."""
     shapes = observe.scene_shapes(cfg.scene, scene)
     tables = observe.scene_tables(cfg.scene, scene, shapes)

@@ -17,8 +17,8 @@ from scipy import ndimage
 
 from csac_jax import geometry
 from csac_jax.config import CameraConfig
-from csac_jax.scene import blocks
 from csac_jax.vision import camera, observe, raycast
+from csac_jax.world import blocks
 
 POSES = ((0.10, 0.09, 0.4), (-0.10, -0.02, 1.0), (0.05, -0.12, 2.0))  # x m, y m, yaw rad
 HALF = (0.05, 0.025, 0.025)  # m, half sizes of a block

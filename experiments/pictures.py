@@ -19,7 +19,8 @@ from csac_jax.evaluation import policies, rollout, suites  # noqa: E402
 from csac_jax.render import episode, media, picture  # noqa: E402
 from csac_jax.render.picture import Viewpoint  # noqa: E402
 from csac_jax.runtime import cache  # noqa: E402
-from csac_jax.scene import cases, model  # noqa: E402
+from csac_jax.scenes import cases  # noqa: E402
+from csac_jax.world import model  # noqa: E402
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
 SIZE = (960, 720)  # px

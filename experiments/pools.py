@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from csac_jax import presets
-from csac_jax.scene import pool
+from csac_jax.scenes import pool
 
 PRESETS = ("quick",)
 

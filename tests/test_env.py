@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 from csac_jax.agent import rewards
+from csac_jax.baselines import oracle
 from csac_jax.config import Config, SceneConfig, TaskConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import AutoResetEnv, Env, State, make_env
 from csac_jax.errors import SceneError
-from csac_jax.scene import arrange, blocks, layout, model, pool
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import backend, oracle, physics as simulation
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
+from csac_jax.scenes import arrange, pool
+from csac_jax.sim import backend, physics as simulation
+from csac_jax.world import blocks, model, scene_state
+from csac_jax.world.scene_state import SceneState
 
 pytestmark = pytest.mark.mjx
 
@@ -41,7 +43,7 @@ class Lab(NamedTuple):
 
     env: Env
     reset: Callable[[jax.Array], State]
-    reset_to: Callable[[Scene], State]
+    reset_to: Callable[[SceneState], State]
     step: Callable[[State, Action], State]
     oracle: Callable[[State], Action]
     into_step: State  # shapes and dtypes that go into step,
@@ -73,11 +75,11 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     return Lab(env, reset, reset_to, step.lower().compile(), plan, _types(into), _types(out))
 
 
-def _cube(x: float, y: float, target: int = layout.ANY) -> Scene:
+def _cube(x: float, y: float, target: int = scene_state.ANY) -> SceneState:
     """A scene of one cube at (x, y) m; with a target, of a second one far off."""
-    scene = jax.tree.map(jnp.asarray, layout.parked(CONFIG.scene.slots))
+    scene = jax.tree.map(jnp.asarray, scene_state.parked(CONFIG.scene.slots))
     places = jnp.array([[x, y, 0.025], [-0.15, 0.15, 0.025]])
-    in_play = jnp.array([True, target != layout.ANY, False])
+    in_play = jnp.array([True, target != scene_state.ANY, False])
     position = jnp.where(in_play[:, None], scene.position.at[:2].set(places), scene.position)
     return scene.replace(position=position, in_play=in_play, target=jnp.int32(target))
 
@@ -129,7 +131,7 @@ def _at(tree, index: int):
 @pytest.fixture(scope="module")
 def stepped(lab: Lab) -> State:
     """One step of the scenes of `_CASES`."""
-    targets = [_TARGETS.get(name, layout.ANY) for name in _CASES]
+    targets = [_TARGETS.get(name, scene_state.ANY) for name in _CASES]
     places, actions, unchanged, kinds, poses = zip(*_CASES.values(), strict=True)
     first = lab.reset_to(_stack(*(_cube(*p, t) for p, t in zip(places, targets, strict=True))))
     counts = {
@@ -189,7 +191,7 @@ def test_lifted_and_lost_blocks_leave(state_of):
     assert state_of("last chance").obs.height.max() < 0.001
     np.testing.assert_array_equal(state_of("got").scene.in_play, [False, True, False])
     out, wrong = state_of("out"), state_of("wrong")
-    np.testing.assert_array_equal(out.scene.position, layout.parking(3))
+    np.testing.assert_array_equal(out.scene.position, scene_state.parking(3))
     assert out.obs.height.max() < 0.001
     assert wrong.obs.target.any()
     np.testing.assert_array_equal(wrong.obs.target, wrong.obs.height > 0.001)  # the target is left
@@ -299,13 +301,13 @@ def _graspable(height: np.ndarray) -> float:
     return 0.0
 
 
-def _raft(gap: float) -> Scene:
+def _raft(gap: float) -> SceneState:
     """Two cuboids side by side along x, 100 mm square."""
     scene = _cube(0.0, 0.0, 1)
     half = scene.half_size.at[:2].set(jnp.array(blocks.SHAPES["cuboid"].half_size))
     y = 0.5 * gap + 0.025
     position = scene.position.at[:2].set(jnp.array([[0.0, y, 0.025], [0.0, -y, 0.025]]))
-    return scene.replace(half_size=half, position=position, target=jnp.int32(layout.ANY))
+    return scene.replace(half_size=half, position=position, target=jnp.int32(scene_state.ANY))
 
 
 def test_both_levels_of_a_push_are_reached(lab: Lab):
@@ -385,13 +387,13 @@ def test_failed_physics_stays_in_its_scene(lab: Lab):
             _assert_replaced(_at(bad, index), _at(state.scene, index), where)
 
 
-def _assert_replaced(diverged: State, before: Scene, where: str) -> None:
+def _assert_replaced(diverged: State, before: SceneState, where: str) -> None:
     ends = (diverged.truncated, diverged.terminated, diverged.reward)
     assert ends == (True, False, 0.0), where
     assert (diverged.info.cleared, diverged.info.blocks_lost) == (0, 0), where
     for leaf in jax.tree.leaves((diverged.scene, diverged.obs)):
         assert np.isfinite(leaf).all(), where
-    expected = before if where == "action.pose" else layout.parked(CONFIG.scene.slots)
+    expected = before if where == "action.pose" else scene_state.parked(CONFIG.scene.slots)
     jax.tree.map(np.testing.assert_array_equal, diverged.scene, expected)
 
 

@@ -18,17 +18,18 @@ from csac_jax import api, deploy, grippers, presets
 from csac_jax.agent import actor_critic, augment, values
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Transition
+from csac_jax.baselines import oracle
 from csac_jax.cli import main
 from csac_jax.config import Config, PhysicsKind
 from csac_jax.env import Env, State, make_env
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Fingers
 from csac_jax.io import policy_file
-from csac_jax.scene import layout, model
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import oracle, primitives
-from csac_jax.sim.primitives import Action
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
+from csac_jax.world import model, scene_state
+from csac_jax.world.scene_state import SceneState
 
 CONFIG = presets.smoke().change(sim={"physics": "c", "gripper": "varied"}, net={"gripper": True})
 VARIED = grippers.load("varied")
@@ -55,9 +56,9 @@ def _networks(cfg: Config) -> Params:
     return actor_critic.init(jax.random.key(1), actor_critic.make(cfg)).online
 
 
-def _scene(fingers: Fingers = THIN) -> Scene:
+def _scene(fingers: Fingers = THIN) -> SceneState:
     """Nothing on the table."""
-    scene = jax.tree.map(jnp.asarray, layout.parked(CONFIG.scene.slots))
+    scene = jax.tree.map(jnp.asarray, scene_state.parked(CONFIG.scene.slots))
     return scene.replace(fingers=jax.tree.map(jnp.float32, fingers))
 
 

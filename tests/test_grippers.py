@@ -15,7 +15,7 @@ import pytest
 from csac_jax import deploy, grippers
 from csac_jax.deploy import decision, decision_program
 from csac_jax.errors import SettingsError
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 
 RG2 = grippers.load("rg2")
 
@@ -155,7 +155,7 @@ def test_decisions_need_no_mujoco():
         "import jax.numpy as jnp, csac_jax\n"
         "from csac_jax import presets\n"
         "from csac_jax.deploy import decision_program\n"
-        "from csac_jax.sim.primitives import Action\n"
+        "from csac_jax.robot.primitives import Action\n"
         "cfg = presets.smoke().change(sim={'gripper': '2f85'})\n"
         "height = jnp.zeros((cfg.heightmap.size,) * 2)\n"
         "print(float(decision_program.stations(cfg, height, Action.grasp(0.0, 0.0, 0.0))[0, 4]))\n"

@@ -55,7 +55,7 @@ ONLY_IN = {
     "orbax": ("io/checkpoint.py",),
     "tyro": ("cli",),
     "rich": ("training/progress.py", "report", "cli", "api"),
-    "pydantic": ("io", "deploy", "grippers.py", "scene/case_file.py"),
+    "pydantic": ("io", "deploy", "grippers.py", "scenes/case_file.py"),
     "jax2onnx": ("deploy/onnx.py",),
     "cv2": ("deploy/board.py",),
     "fastapi": ("deploy/service.py",),
@@ -76,7 +76,7 @@ ONLY_IN = {
 JIT_IN = (
     *("training", "sweeps", "evaluation", "deploy"),
     *("runtime/compiler.py", "sim/selftest.py"),  # small programs that test this machine
-    "scene/arrange.py",
+    "scenes/arrange.py",
     "agent/maps.py",  # where an arm reaches is a table, computed once
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
     "render/picture.py",  # draws on machines without OpenGL

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import csac_jax
-from csac_jax.scene import cases
+from csac_jax.scenes import cases
 
 ROOT = Path(csac_jax.__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -13,7 +13,7 @@ from csac_jax.agent.learner import Transition, UpdateInfo
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap, rotate
 from csac_jax.vision.heightmap import Observation
 

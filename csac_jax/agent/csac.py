@@ -16,7 +16,7 @@ from csac_jax.config import Config, RewardConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import chunked_vmap
 from csac_jax.nets.chunked_vmap import ALONE, Batching
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision.heightmap import Observation
 
 

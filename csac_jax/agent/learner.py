@@ -13,7 +13,7 @@ from flax import struct
 from csac_jax.agent import rewards
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import RewardConfig
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision.heightmap import Observation, PackedObservation
 
 

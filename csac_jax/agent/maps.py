@@ -20,7 +20,7 @@ from csac_jax.config import Config, HeightmapConfig, PolicyConfig, SimConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.nets.networks import Networks
-from csac_jax.sim import primitives
+from csac_jax.robot import primitives
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation

@@ -10,7 +10,7 @@ from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.cem import CEMResult
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.constants import Primitive
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 
 
 def greedy(

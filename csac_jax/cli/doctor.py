@@ -75,8 +75,8 @@ def _on_warp(cfg: Config) -> Config:
 
 def _build_kernels(cfg: Config) -> dict[str, Any]:
     """Builds Warp's kernels for such a run; returns the seconds for the JSON."""
-    from csac_jax.scene import model
     from csac_jax.sim import physics
+    from csac_jax.world import model
 
     begun = time.perf_counter()
     physics.prepare(physics.make(model.build(cfg.scene, cfg.sim), cfg.sim), cfg.train.scenes)

@@ -85,12 +85,12 @@ def run(arguments: list[str]) -> int:
 def _make(arguments: list[str]) -> int:
     options = parsing.parse(MakeOptions, arguments, "objects make")
     check_seed(options.seed)
-    from csac_jax.objects import families, library
+    from csac_jax.objects import library, shapes
 
     if not 1 <= options.count <= library.MOST_OBJECTS:
         raise BadArgumentsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
     _check_new(options.out)
-    draw = families.draw_mixed if options.mixed else families.draw
+    draw = shapes.draw_mixed if options.mixed else shapes.draw
     made = library.save(options.out, draw(options.seed, options.count)).objects
     _list(made)
     print(f"wrote {options.out}")

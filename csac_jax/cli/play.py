@@ -143,7 +143,7 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
 def _suite(scene: str) -> str:
     """Returns the suite of one part with these scenes. Raises ValueError if there is none."""
     from csac_jax.evaluation import suites
-    from csac_jax.scene import cases
+    from csac_jax.scenes import cases
 
     if scene == "random":
         return suites.IN_DISTRIBUTION

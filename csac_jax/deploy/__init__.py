@@ -185,5 +185,5 @@ def _load_run(path: Path) -> tuple[Config, Params]:
             f"csac-jax export {path} policy.safetensors"
         ) from None
     policy = policies.load(path)
-    assert isinstance(policy, policies.LearnedPolicy)
+    assert isinstance(policy, policies.NetworkPolicy)
     return policy.cfg, policy.params

@@ -15,7 +15,7 @@ from csac_jax.constants import CHANGE_AREA
 from csac_jax.deploy import images
 from csac_jax.deploy.images import CameraView
 from csac_jax.errors import DataWarning, ViewError
-from csac_jax.scene.blocks import COLOURS
+from csac_jax.world.blocks import COLOURS
 
 TABLE_TOLERANCE = 0.008  # m (ours): finger tips go down to 12 mm above z = 0
 SEEN_SHARE = 0.8  # of the workspace's cells (ours)

@@ -14,8 +14,8 @@ from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.errors import SettingsError
-from csac_jax.sim import primitives
-from csac_jax.sim.primitives import Action
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 

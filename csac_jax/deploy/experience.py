@@ -17,7 +17,7 @@ from csac_jax.constants import CHANGE_AREA, OUTCOMES, Outcome, Primitive
 from csac_jax.deploy import CameraPolicy
 from csac_jax.deploy.record import PUSHED, Entry
 from csac_jax.errors import FailedError, SettingsError
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import PackedObservation
 

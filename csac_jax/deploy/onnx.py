@@ -24,8 +24,8 @@ from csac_jax.agent.maps import Frames
 from csac_jax.config import Config, SmallNet
 from csac_jax.deploy import decision_program, stablehlo
 from csac_jax.errors import SettingsError
+from csac_jax.robot.primitives import Action
 from csac_jax.sim.outcome import BARE
-from csac_jax.sim.primitives import Action
 from csac_jax.vision.heightmap import Observation
 
 OPSET = 18

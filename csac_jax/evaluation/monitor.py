@@ -84,7 +84,7 @@ class Monitor(Callback):
 
     def _evaluate(self, record: Record, state: Any) -> None:
         begun, plan = time.time(), self._plan
-        policy = policies.of_state(self._cfg, state.learner, self._network, self._learner)
+        policy = policies.policy_from_state(self._cfg, state.learner, self._network, self._learner)
         table = rollout.evaluate(policy, self._suite)
         score = score_of(table)
         if best := score > self._best:

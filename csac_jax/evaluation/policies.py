@@ -12,15 +12,15 @@ import jax.numpy as jnp
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.agent import actor_critic, antipodal, maps, policy, values
+from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Learner
+from csac_jax.baselines import antipodal, oracle
 from csac_jax.config import Config
 from csac_jax.env import State
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
-from csac_jax.sim import oracle
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.training import programs
 from csac_jax.vision.heightmap import Observation
 
@@ -47,7 +47,7 @@ class PolicyDebug(NamedTuple):
 
 
 @struct.dataclass
-class LearnedPolicy:
+class NetworkPolicy:
     """The greedy policy of trained networks, without exploration. With `policy.primitive rule`,
     which pushes after no visible change, and with `policy.retry`, it needs a State."""
 
@@ -85,7 +85,7 @@ class LearnedPolicy:
 
 
 @struct.dataclass
-class LearnerPolicy:
+class CustomLearnerPolicy:
     """The greedy policy of a custom learner."""
 
     cfg: Config = struct.field(pytree_node=False)
@@ -164,7 +164,7 @@ def _failed(scenes: Observation | State) -> jax.Array:
 def in_world(policy: Policy, cfg: Config) -> Policy:
     """Gives a policy the config of an environment; a custom policy stays as it is."""
     if isinstance(
-        policy, LearnedPolicy | LearnerPolicy | RandomPolicy | GeometricPolicy | OraclePolicy
+        policy, NetworkPolicy | CustomLearnerPolicy | RandomPolicy | GeometricPolicy | OraclePolicy
     ):
         return dataclasses.replace(policy, cfg=cfg)
     return policy
@@ -172,7 +172,7 @@ def in_world(policy: Policy, cfg: Config) -> Policy:
 
 def act(policy: Policy, states: State, keys: jax.Array) -> Action:
     """Chooses actions, leaves [E], of a policy in states, leaves [E, ...], with keys [E]."""
-    if isinstance(policy, LearnedPolicy):
+    if isinstance(policy, NetworkPolicy):
         return policy.batched(states, keys)
     return jax.vmap(policy)(states, keys)
 
@@ -196,22 +196,22 @@ def load(
     """
     path = policy_file.find(source)
     if path.is_file():
-        return LearnedPolicy(*policy_file.load(path))
+        return NetworkPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)
     state, _ = checkpoint.restore(folder, programs.abstract_state(cfg, learner, network), step)
     if learner is None:
         policy_file.check_finite(folder, state.learner.online)
-    return of_state(cfg, state.learner, network, learner)
+    return policy_from_state(cfg, state.learner, network, learner)
 
 
-def of_state(
+def policy_from_state(
     cfg: Config, state: Any, network: Any = None, learner: Learner | None = None
 ) -> Policy:
     """Builds the policy of a learner's state; see `load`."""
     if learner is not None:
-        return LearnerPolicy(cfg, learner, state)
-    return LearnedPolicy(cfg, state.online, network)
+        return CustomLearnerPolicy(cfg, learner, state)
+    return NetworkPolicy(cfg, state.online, network)
 
 
 def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:

@@ -15,15 +15,16 @@ from csac_jax.constants import CHANGE_AREA
 from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
-from csac_jax.evaluation.policies import LearnedPolicy, Policy, PolicyDebug
+from csac_jax.evaluation.policies import NetworkPolicy, Policy, PolicyDebug
 from csac_jax.evaluation.suites import PreparedSuite
 from csac_jax.objects.library import Split
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action, JointTrajectory
 from csac_jax.runtime import compiler
-from csac_jax.scene import layout, stock
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import physics as simulation, primitives
-from csac_jax.sim.primitives import Action, JointTrajectory
+from csac_jax.sim import physics as simulation
 from csac_jax.training import transitions
+from csac_jax.world import object_slots, scene_state
+from csac_jax.world.scene_state import SceneState
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
 PER_CORE = 4  # of them on a CPU: more gain nothing, and the last episodes keep all places busy
@@ -50,7 +51,7 @@ def evaluate(
     metrics}}. Raises ValueError as `suites.prepare`.
     """
     if not isinstance(suite, PreparedSuite):
-        learned = isinstance(policy, LearnedPolicy)
+        learned = isinstance(policy, NetworkPolicy)
         suite = suites.prepare(
             policy.cfg, suite, episodes, seed, physics, robot, objects, split, learned
         )
@@ -60,7 +61,7 @@ def evaluate(
         count = functools.partial(on_progress, name) if on_progress else None
         tables[name] = metrics.summarise(rollout(env, actor, suite.episodes, suite.seed, count))
         if env.cfg.scene.has_objects:
-            tables[name]["scenes_sha256"] = stock.fingerprint(env.cfg.scene, env.scenes)
+            tables[name]["scenes_sha256"] = object_slots.fingerprint(env.cfg.scene, env.scenes)
     return next(iter(tables.values())) if len(tables) == 1 else {"parts": tables}
 
 
@@ -197,7 +198,7 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
     plan = primitives.plan(env.cfg.sim, env.cfg.heightmap, state.obs.height, action, fingers)
     joints = primitives.joint_trajectory(env.cfg.sim, plan)
     after = env.step(state, action)
-    if not isinstance(policy, LearnedPolicy):
+    if not isinstance(policy, NetworkPolicy):
         return StepRecord(state, action, joints, after, after.reward, None)
     key = jax.random.clone(key)  # the debug view is of the same draws
     debug, later = policy.debug(state, key), policy.debug(after, jax.random.clone(key))
@@ -226,7 +227,7 @@ def endings(env: Env, last: State) -> np.ndarray:
     return np.select(held, numbers, ENDINGS.index("no_change_cap")).astype(np.int32)
 
 
-def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: Scene) -> State:
+def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: SceneState) -> State:
     """Builds the first states of the episodes `numbers` [E] in `scenes` [E, ...]."""
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
     placed = jax.vmap(env.randomise_pose)(keys, jax.tree.map(jnp.asarray, scenes))
@@ -246,7 +247,7 @@ def _step(
     running = ~states.done
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(states.actions + 1)
     action = policies.act(policy, states, jax.vmap(jax.random.fold_in)(keys, numbers))
-    cleared = jax.vmap(layout.park)(states.scene, running[:, None] & states.scene.in_play)
+    cleared = jax.vmap(scene_state.park)(states.scene, running[:, None] & states.scene.in_play)
     after = jax.vmap(env.step)(states.replace(scene=cleared), action)
     info, has_target = after.info, env.cfg.task.kind == "target"
     target_lost = (after.terminated & (after.reward == 0.0)).astype(jnp.int32)

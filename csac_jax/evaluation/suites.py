@@ -44,9 +44,10 @@ from csac_jax.config import (
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
 from csac_jax.objects.library import Split
-from csac_jax.scene import arrange, cases, model, pool
-from csac_jax.scene.layout import Scene
+from csac_jax.scenes import arrange, cases, pool
 from csac_jax.sim import backend, physics as simulation
+from csac_jax.world import model
+from csac_jax.world.scene_state import SceneState
 
 IN_DISTRIBUTION = "in_distribution"
 TEN: tuple[SlotKind, ...] = (  # blocks of random10, of all kinds
@@ -190,7 +191,7 @@ def _physics(cfg: Config) -> simulation.Physics:
     return simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
 
 
-def _pool(scene: Scene) -> Scene:
+def _pool(scene: SceneState) -> SceneState:
     """Makes a pool of one scene, leaves [1, N, ...]."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
 

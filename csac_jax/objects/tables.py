@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from csac_jax.objects import families, library, solid
+from csac_jax.objects import library, shapes, solid
 from csac_jax.objects.body import DENSITY, Object
 from csac_jax.objects.library import Library, LibraryError, Split
 
@@ -53,7 +53,7 @@ def _draw(kind: str, seed: str, count: str) -> Library:
     if not 1 <= int(count) <= library.MOST_OBJECTS:
         most = library.MOST_OBJECTS
         raise LibraryError(f"{kind}:{seed}:{count}: 1 to {most} objects can be made")
-    draw = families.draw if kind == "made" else families.draw_mixed
+    draw = shapes.draw if kind == "made" else shapes.draw_mixed
     return library.from_objects(draw(int(seed), int(count)))
 
 

@@ -14,8 +14,8 @@ from csac_jax.evaluation import metrics, rollout
 from csac_jax.evaluation.rollout import StepRecord
 from csac_jax.render import media, panels, picture, viewer
 from csac_jax.render.picture import Viewpoint
-from csac_jax.scene import blocks, layout, model
 from csac_jax.sim import c_physics
+from csac_jax.world import blocks, model, scene_state
 
 VIEWS: dict[RobotKind, Viewpoint] = {
     "hand": Viewpoint(position=(-0.22, -0.5, 0.46), look_at=(0.0, -0.01, 0.05)),
@@ -119,7 +119,7 @@ def summary(env: Env, steps: list[StepRecord]) -> str:
     last = steps[-1].after
     if not last.terminated:
         ending = STOPPED[metrics.ENDINGS[rollout.endings(env, last)]]
-    elif last.scene.target != layout.ANY:
+    elif last.scene.target != scene_state.ANY:
         ending = "the target is taken" if completed(steps) else "the target is lost"
     else:
         ending = "the table is clear" if completed(steps) else "no block is left within reach"
@@ -132,7 +132,7 @@ def summary(env: Env, steps: list[StepRecord]) -> str:
 def completed(steps: list[StepRecord]) -> bool:
     """Returns True if the hand took all blocks that the task asks for."""
     last, (_, lost) = steps[-1].after, totals(steps)
-    got = last.reward > 0 if last.scene.target != layout.ANY else lost == 0
+    got = last.reward > 0 if last.scene.target != scene_state.ANY else lost == 0
     return bool(last.terminated and got)
 
 

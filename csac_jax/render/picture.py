@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 
 from csac_jax.config import CameraConfig
-from csac_jax.scene import blocks, geoms, solids
-from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import BlockFields, World, scene_fields, with_blocks
 from csac_jax.vision import camera
 from csac_jax.vision.camera import Camera
+from csac_jax.world import blocks, geoms, solids
+from csac_jax.world.model import BlockFields, World, scene_fields, with_blocks
+from csac_jax.world.scene_state import SceneState
 
 FLOOR = (0.85, 0.86, 0.88, 1.0)
 SKY = np.ones(4, np.float32)
@@ -38,7 +38,7 @@ class Viewpoint(NamedTuple):
     size: tuple[int, int] = (640, 480)  # width and height, px
 
 
-def coloured(world: World, fields: BlockFields, scene: Scene) -> mujoco.MjModel:
+def coloured(world: World, fields: BlockFields, scene: SceneState) -> mujoco.MjModel:
     """Returns the world's model with the blocks of a scene, of these fields, in their colours."""
     model = with_blocks(world, fields)
     model.geom_rgba[world.block_geoms, :3] = blocks.COLOURS[scene.colour[world.parts.slot]]
@@ -116,7 +116,7 @@ class RgbdRenderer:
     Close it: it holds an OpenGL context.
     """
 
-    def __init__(self, world: World, scene: Scene, size: tuple[int, int]) -> None:
+    def __init__(self, world: World, scene: SceneState, size: tuple[int, int]) -> None:
         scene = jax.device_get(scene)
         self._world = world
         fields = jax.device_get(scene_fields(world, scene))
@@ -132,7 +132,7 @@ class RgbdRenderer:
         self._options.geomgroup[:] = np.arange(6) == _SHOWN
         self._renderer = mujoco.Renderer(model, size[1], size[0])
 
-    def image(self, scene: Scene, eye: Camera) -> tuple[np.ndarray, np.ndarray]:
+    def image(self, scene: SceneState, eye: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Draws the episode's blocks at their poses in `scene`: colour [h, w, 3] uint8 and depth
         [h, w] m, 0 where nothing is hit."""
         pose = np.concatenate([scene.position, scene.quaternion], axis=1)

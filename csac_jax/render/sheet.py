@@ -12,8 +12,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from csac_jax.objects.body import Object
 from csac_jax.render import media
-from csac_jax.scene import blocks
 from csac_jax.vision import camera
+from csac_jax.world import blocks
 
 MOST = 120  # objects on a sheet
 _COLUMNS, _INCHES, _DOTS = 8, 1.5, 90

@@ -19,13 +19,13 @@ import numpy as np
 from mujoco import rollout
 
 from csac_jax.config import SimConfig
+from csac_jax.robot.primitives import JointTrajectory
 from csac_jax.runtime import host_call
-from csac_jax.scene import layout, model
-from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import BlockFields, World
 from csac_jax.sim import model_fields, outcome
 from csac_jax.sim.outcome import Substep, Trace
-from csac_jax.sim.primitives import JointTrajectory
+from csac_jax.world import model, scene_state
+from csac_jax.world.model import BlockFields, World
+from csac_jax.world.scene_state import SceneState
 
 _CALL_SUBSTEPS = 48  # per call of MuJoCo, ours: a longer call repeats more after a fast block
 
@@ -66,7 +66,7 @@ class CPhysics:
         yield simulator
         self._idle.append(simulator)
 
-    def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+    def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Runs one primitive, see `physics.Physics`."""
         fields = model.scene_fields(self.world, scene)
         result = scene, outcome.nothing_seen(len(joints.control), len(self.world.slots))
@@ -77,7 +77,7 @@ class CPhysics:
             moved, substeps = jax.pure_callback(
                 self._run_batch, result, *arguments, vmap_method="broadcast_all"
             )
-        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
+        return scene_state.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
 
     def _run_batch(self, *batch: Any) -> Any:
         """Runs every scene of a batch, whose leading axes are kept. NumPy only: JAX must not run
@@ -91,8 +91,8 @@ class CPhysics:
         )
 
     def _run(
-        self, scene: Scene, fields: BlockFields, joints: JointTrajectory
-    ) -> tuple[Scene, Substep]:
+        self, scene: SceneState, fields: BlockFields, joints: JointTrajectory
+    ) -> tuple[SceneState, Substep]:
         """Runs one scene. Returns it after the primitive, and its substeps, leaves [T, ...]."""
         world = self.world
         substeps = outcome.nothing_seen(len(joints.control), len(world.slots))
@@ -121,7 +121,7 @@ class CSimulator:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # after a warning
         if world.objects is not None:
             self.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-            self.model.opt.sleep_tolerance = layout.STILL
+            self.model.opt.sleep_tolerance = scene_state.STILL
         self.data = mujoco.MjData(self.model)
         self.engine = rollout.Rollout(nthread=0)  # MuJoCo's own loop, run in the calling thread
 
@@ -135,7 +135,7 @@ class Trajectory(NamedTuple):
 
 
 def trajectory(
-    world: World, fields: BlockFields, scene: Scene, joints: JointTrajectory
+    world: World, fields: BlockFields, scene: SceneState, joints: JointTrajectory
 ) -> Trajectory:
     """Simulates one scene of NumPy arrays; returns no substep where the robot cannot follow."""
     if joints.reachable:
@@ -145,7 +145,11 @@ def trajectory(
 
 
 def _rollout(
-    world: World, simulator: CSimulator, scene: Scene, fields: BlockFields, joints: JointTrajectory
+    world: World,
+    simulator: CSimulator,
+    scene: SceneState,
+    fields: BlockFields,
+    joints: JointTrajectory,
 ) -> Trajectory:
     """Simulates one scene. Parked blocks touch nothing and stay where they are."""
     mj_model, parked = simulator.model, ~scene.in_play
@@ -184,12 +188,12 @@ def _simulate(
         (states,), (sensed,) = simulator.engine.rollout(
             mj_model, data, state, control[None, done : done + ahead], initial_warmstart=warm
         )
-        too_fast = (np.abs(states[:, speeds]) > layout.SPEED_LIMIT).any(axis=(1, 2))
+        too_fast = (np.abs(states[:, speeds]) > scene_state.SPEED_LIMIT).any(axis=(1, 2))
         if too_fast[:-1].any():
             ahead = int(np.argmax(too_fast)) + 1
             continue
         state, warm = states[-1], data.qacc_warmstart.copy()
-        state[speeds] = np.clip(state[speeds], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
+        state[speeds] = np.clip(state[speeds], -scene_state.SPEED_LIMIT, scene_state.SPEED_LIMIT)
         parts.append((states, sensed))
         done, ahead = done + len(states), 1 if too_fast[-1] else min(2 * ahead, _CALL_SUBSTEPS)
     all_states, all_sensed = zip(*parts, strict=True)

@@ -9,13 +9,13 @@ import numpy as np
 
 from csac_jax.config import SimConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import layout
-from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import World, scene_fields
+from csac_jax.robot.primitives import JointTrajectory
 from csac_jax.sim import mjx_step, model_fields, outcome
 from csac_jax.sim.outcome import Substep, Trace
-from csac_jax.sim.primitives import JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
+from csac_jax.world import scene_state
+from csac_jax.world.model import World, scene_fields
+from csac_jax.world.scene_state import SceneState
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class MjxPhysics:
     model: mjx.Model
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
 
-    def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+    def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Runs one primitive, see `physics.Physics`.
 
         Matrix products keep float32: a GPU would cut them to 10 bits.
@@ -46,7 +46,7 @@ class MjxPhysics:
         with jax.default_matmul_precision("highest"):
             data, substeps = jax.lax.scan(substep, initial, joints.control)
         moved = model_fields.moved(world, scene, data.qpos, data.qvel)
-        return layout.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
+        return scene_state.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
@@ -61,7 +61,7 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
     return MjxPhysics(world, cfg, mjx_model, mjx.make_data(world.model, impl="jax"))
 
 
-def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
+def scene_model(physics: MjxPhysics, scene: SceneState) -> mjx.Model:
     """Returns the model with this scene's block sizes, masses and frictions."""
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
@@ -77,7 +77,7 @@ def scene_model(physics: MjxPhysics, scene: Scene) -> mjx.Model:
     )
 
 
-def initial_data(physics: MjxPhysics, scene: Scene, joints: JointTrajectory) -> mjx.Data:
+def initial_data(physics: MjxPhysics, scene: SceneState, joints: JointTrajectory) -> mjx.Data:
     """Returns data with the scene's blocks, and the robot at rest at its first set-point."""
     blank = physics.data
     qpos, qvel = model_fields.start(physics.world, scene, joints, blank.qpos, blank.qvel)
@@ -88,7 +88,7 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
     """Holds parked blocks [N] where they were, the others to SPEED_LIMIT."""
     address, dofs = world.block_qpos, world.block_dofs
     qpos = jnp.where(parked[:, None], initial.qpos[address], data.qpos[address])
-    limited = jnp.clip(data.qvel[dofs], -layout.SPEED_LIMIT, layout.SPEED_LIMIT)
+    limited = jnp.clip(data.qvel[dofs], -scene_state.SPEED_LIMIT, scene_state.SPEED_LIMIT)
     qvel = jnp.where(parked[:, None], 0.0, limited)
     return data.replace(qpos=data.qpos.at[address].set(qpos), qvel=data.qvel.at[dofs].set(qvel))
 

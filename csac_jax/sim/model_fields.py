@@ -5,9 +5,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import BlockFields, World
-from csac_jax.sim.primitives import JointTrajectory
+from csac_jax.robot.primitives import JointTrajectory
+from csac_jax.world.model import BlockFields, World
+from csac_jax.world.scene_state import SceneState
 
 Base = Callable[[str], jax.Array]  # name of a model's field -> its values as compiled
 
@@ -41,7 +41,7 @@ def subtree_mass(world: World, mass: jax.Array, base: Base) -> jax.Array:
 
 
 def start(
-    world: World, scene: Scene, joints: JointTrajectory, qpos: jax.Array, qvel: jax.Array
+    world: World, scene: SceneState, joints: JointTrajectory, qpos: jax.Array, qvel: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Returns qpos and qvel with the scene's blocks, the robot at rest at its first set-point."""
     poses = jnp.concatenate([scene.position, scene.quaternion], axis=1)
@@ -49,7 +49,7 @@ def start(
     return qpos, qvel.at[world.block_dofs].set(scene.velocity)
 
 
-def moved(world: World, scene: Scene, qpos: jax.Array, qvel: jax.Array) -> Scene:
+def moved(world: World, scene: SceneState, qpos: jax.Array, qvel: jax.Array) -> SceneState:
     """Returns the scene with its blocks at qpos [nq] and qvel [nv]."""
     pose, velocity = qpos[world.block_qpos], qvel[world.block_dofs]
     return scene.replace(position=pose[:, :3], quaternion=pose[:, 3:], velocity=velocity)

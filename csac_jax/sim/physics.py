@@ -8,18 +8,19 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import Config, SimConfig
-from csac_jax.scene import blocks, layout
-from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import World
-from csac_jax.sim import c_physics, primitives, warp_physics
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action, JointTrajectory, Plan
+from csac_jax.sim import c_physics, warp_physics
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import Action, JointTrajectory, Plan
+from csac_jax.world import blocks, scene_state
+from csac_jax.world.model import World
+from csac_jax.world.scene_state import SceneState
 
 
 class Physics(Protocol):
     """A world in which a robot can be moved."""
 
-    def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+    def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Moves the robot, one set-point per substep. One scene; callers vmap.
 
         Blocks that are not in play stay where they are. Blocks that end up in the hand are still
@@ -59,8 +60,8 @@ def prepare(physics: Physics, scenes: int) -> None:
 
 
 def execute(
-    physics: Physics, cfg: Config, scene: Scene, height: jax.Array, action: Action
-) -> tuple[Scene, Trace, Plan]:
+    physics: Physics, cfg: Config, scene: SceneState, height: jax.Array, action: Action
+) -> tuple[SceneState, Trace, Plan]:
     """Runs one primitive. Nothing moves if the robot cannot follow the whole of it.
 
     Args: height [H, W] m, the map the action was chosen from.
@@ -68,7 +69,7 @@ def execute(
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
     joints = primitives.joint_trajectory(cfg.sim, plan)
     after, trace = physics.run(scene, joints)
-    unmoved = layout.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
+    unmoved = scene_state.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
     choose = functools.partial(jnp.where, joints.reachable)
     after, trace = jax.tree.map(choose, (after, trace), unmoved)
     return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
@@ -80,7 +81,7 @@ def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
     return primitives.joint_trajectory(cfg.sim, plan).reachable
 
 
-def healthy(scene: Scene) -> jax.Array:
+def healthy(scene: SceneState) -> jax.Array:
     """Checks that every entry of a scene lies within its bounds, [] bool.
 
     Bounds, not `isfinite`: physics may explode and stay finite. NaN fails every comparison.
@@ -96,6 +97,6 @@ def healthy(scene: Scene) -> jax.Array:
         jnp.all((scene.density > 0.0) & (scene.density < 1e4)),  # kg/m^3
         jnp.all((scene.friction > 0.0) & (scene.friction < 10.0)),
         jnp.all((scene.colour >= 0) & (scene.colour < len(blocks.COLOURS))),
-        (scene.target >= layout.ANY) & (scene.target < len(scene.colour)),  # ANY is -1
+        (scene.target >= scene_state.ANY) & (scene.target < len(scene.colour)),  # ANY is -1
     )
     return jnp.all(jnp.stack(bounded))

@@ -20,9 +20,9 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from csac_jax.config import SimConfig
-from csac_jax.scene import layout
-from csac_jax.scene.model import World
 from csac_jax.sim import warp_graph
+from csac_jax.world import scene_state
+from csac_jax.world.model import World
 
 STEP = 0.0051  # s, longest physics step; compared with C's in docs/benchmarks/physics-parity.md
 CONE_EFFORT = 8  # iterations of the solver and of a line search by elliptic cones: enough (ours)
@@ -192,7 +192,7 @@ class Batch:
             world.finger_qpos,
             wp.array(world.block_qpos[:, 0], dtype=int),
             wp.array(world.block_dofs[:, 0], dtype=int),
-            wp.array(layout.SPEED_LIMIT, dtype=float),
+            wp.array(scene_state.SPEED_LIMIT, dtype=float),
         ]
         self._qpos = wp.zeros((scenes, world.model.nq), dtype=float)
         self._qvel = wp.zeros((scenes, world.model.nv), dtype=float)

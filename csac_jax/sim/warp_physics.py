@@ -16,13 +16,13 @@ import numpy as np
 
 from csac_jax.config import MESH_KINDS, SimConfig
 from csac_jax.errors import SceneError
-from csac_jax.scene import layout
-from csac_jax.scene.bodies import Bodies, ObjectFields, PartFields
-from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import World, scene_fields
+from csac_jax.robot.primitives import JointTrajectory
 from csac_jax.sim import model_fields
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import JointTrajectory
+from csac_jax.world import scene_state
+from csac_jax.world.model import World, scene_fields
+from csac_jax.world.object_models import Bodies, ObjectFields, PartFields
+from csac_jax.world.scene_state import SceneState
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,10 +37,10 @@ class WarpPhysics:
     def _simulate(self) -> Callable[[dict[str, jax.Array]], dict[str, jax.Array]]:
         return _flat_vmap(lambda inputs: self.simulator(**inputs))
 
-    def run(self, scene: Scene, joints: JointTrajectory) -> tuple[Scene, Trace]:
+    def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Runs one primitive, see `physics.Physics`."""
         world = self.world
-        scene = layout.park(scene, scene.in_play)  # where nothing meets them
+        scene = scene_state.park(scene, scene.in_play)  # where nothing meets them
         arrays = inputs(self, scene, joints)
         results = self._simulate(jax.tree.map(lambda leaf: leaf[None], arrays))
         results = jax.tree.map(lambda leaf: leaf[0], results)
@@ -61,7 +61,9 @@ def make(world: World, cfg: SimConfig) -> WarpPhysics:
     return WarpPhysics(world, warp_action.WarpSimulator(world, cfg))
 
 
-def inputs(physics: WarpPhysics, scene: Scene, joints: JointTrajectory) -> dict[str, jax.Array]:
+def inputs(
+    physics: WarpPhysics, scene: SceneState, joints: JointTrajectory
+) -> dict[str, jax.Array]:
     """Returns a simulator's arguments for a scene whose blocks out of play are parked."""
     world = physics.world
     control = _resampled(joints.control, physics.simulator.substeps)
@@ -88,7 +90,7 @@ def _flat_vmap(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return flat
 
 
-def _model_fields(world: World, scene: Scene) -> dict[str, jax.Array]:
+def _model_fields(world: World, scene: SceneState) -> dict[str, jax.Array]:
     """Returns the model's fields with this scene's block sizes, masses and frictions."""
     model, fields = world.model, scene_fields(world, scene)
     geoms, bodies = world.block_geoms, world.block_bodies

@@ -17,15 +17,15 @@ from csac_jax.config import Config
 from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.samplers import Sampler
+from csac_jax.robot.primitives import Action
 from csac_jax.runtime import compiler
-from csac_jax.scene import layout
 from csac_jax.sim import physics as simulation
-from csac_jax.sim.primitives import Action
 from csac_jax.training import step
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
+from csac_jax.world import scene_state
 
 
 class Hyperparams(NamedTuple):
@@ -124,7 +124,7 @@ def example(cfg: Config) -> Transition:
 def abstract_state(cfg: Config, learner: Learner | None = None, network: Any = None) -> Any:
     """Returns the shapes and dtypes of a run's state; nothing is settled or compiled."""
     no_physics: Any = None
-    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene_state.parked(cfg.scene.slots))
     program = make(cfg, Env(cfg, no_physics, blank), learner, network=network)
     return jax.eval_shape(lambda: init(program))
 

@@ -21,9 +21,9 @@ from jax import export
 
 import csac_jax
 from csac_jax.runtime import compiler, host_call, private_jax, provenance
-from csac_jax.scene import stock
 from csac_jax.training.step import Program
 from csac_jax.training.transitions import StepMetrics
+from csac_jax.world import object_slots
 
 MOST = 64  # files, of some MB each; those unused for longest are deleted
 _UNTRACED = ("cache", "logging")  # parts of names of JAX's settings that leave a trace as it is
@@ -118,7 +118,7 @@ def name(program: Program, half: str, leaves: list[Any], tree: Any) -> str:
         env.physics.world.digest,
         env.gripper,
         (env.any_yaw, env.max_failures),
-        stock.library(cfg.scene).sha256 if cfg.scene.has_objects else "",
+        object_slots.library(cfg.scene).sha256 if cfg.scene.has_objects else "",
         sorted(provenance.versions().items()),
         sorted(settings.items()),
         compiler.options(cfg),

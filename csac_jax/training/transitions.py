@@ -11,8 +11,8 @@ from csac_jax.agent.learner import Learner, Transition
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config, RewardConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
+from csac_jax.robot.primitives import Action
 from csac_jax.sim import physics as simulation
-from csac_jax.sim.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 

@@ -18,8 +18,8 @@ import numpy as np
 from flax import struct
 
 from csac_jax.config import CameraConfig
-from csac_jax.scene.solids import Solids
 from csac_jax.vision import raycast
+from csac_jax.world.solids import Solids
 
 LIGHT = (0.36, 0.48, 0.8)  # unit vector towards the light; oblique, so that slopes differ
 AMBIENT = 0.4  # share of the colour that a face turned away from the light keeps

@@ -17,12 +17,12 @@ import numpy as np
 
 from csac_jax import geometry
 from csac_jax.config import Config, HeightmapConfig, SceneConfig, SensorConfig, SlotKind
-from csac_jax.scene import blocks, layout, stock
-from csac_jax.scene.layout import Scene
 from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
 from csac_jax.vision.camera import Camera
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 from csac_jax.vision.raycast import ObjectShapes, Polytopes, SurfaceHit
+from csac_jax.world import blocks, object_slots, scene_state
+from csac_jax.world.scene_state import SceneState
 
 HIGHEST = 0.25  # m, of the middle of an object that the camera at the side sees whole
 _LIGHT = np.uint32(2**31)  # distinct from a view key's children by `split`
@@ -47,7 +47,7 @@ class Shapes(NamedTuple):
         return 1 + self.blocks.offset.size
 
 
-def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observation:
+def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Observation:
     """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` drawn from
     `key`."""
     shapes = scene_shapes(cfg.scene, scene)
@@ -61,13 +61,13 @@ def observe(cfg: Config, scene: Scene, key: jax.Array | None = None) -> Observat
     return from_pixels(cfg.heightmap, believed, cast_pixels(cfg, believed, shapes), tables)
 
 
-def scene_shapes(cfg: SceneConfig, scene: Scene) -> Shapes:
+def scene_shapes(cfg: SceneConfig, scene: SceneState) -> Shapes:
     """Returns the convex parts of a scene's blocks and objects."""
     objects = _objects(cfg, scene) if cfg.has_objects else None
     return Shapes(polytopes(cfg.slots, scene), objects)
 
 
-def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
+def polytopes(slots: tuple[SlotKind, ...], scene: SceneState) -> Polytopes:
     """Returns the convex parts of a scene's blocks."""
     slot = blocks.parts(slots).slot  # [G], of each convex part
     return Polytopes(
@@ -78,8 +78,8 @@ def polytopes(slots: tuple[SlotKind, ...], scene: Scene) -> Polytopes:
     )
 
 
-def _objects(cfg: SceneConfig, scene: Scene) -> ObjectShapes:
-    known, slot = stock.table(cfg), np.flatnonzero(blocks.is_object(cfg.slots))  # [M]
+def _objects(cfg: SceneConfig, scene: SceneState) -> ObjectShapes:
+    known, slot = object_slots.table(cfg), np.flatnonzero(blocks.is_object(cfg.slots))  # [M]
     number = scene.numbers[slot]
     normal, offset, first, centre = (
         jnp.asarray(leaf)[number]
@@ -107,10 +107,10 @@ def _light(noise: SensorConfig, key: jax.Array | None) -> Any:
 
 
 def scene_tables(
-    cfg: SceneConfig, scene: Scene, shapes: Shapes, light: Any = camera.LIGHT
+    cfg: SceneConfig, scene: SceneState, shapes: Shapes, light: Any = camera.LIGHT
 ) -> SurfaceTables:
     """Returns lit colour and target flag of every surface of a scene, see `surface_tables`."""
-    is_target = layout.is_target(scene)
+    is_target = scene_state.is_target(scene)
     of_blocks = is_target[blocks.parts(cfg.slots).slot]
     tables = surface_tables(shapes.blocks, of_blocks, light)
     if shapes.objects is None:

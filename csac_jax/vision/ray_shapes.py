@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.scene.solids import Kind
+from csac_jax.world.solids import Kind
 
 _PARALLEL = np.float32(1e-30)  # n . d of a plane along the ray, in place of 0
 _ON_PLANE = np.float32(1e-12)  # m, depth of an origin that lies on a plane

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from csac_jax.scene.solids import GeomGroup, Solids
 from csac_jax.vision import ray_shapes
+from csac_jax.world.solids import GeomGroup, Solids
 
 # Rows and columns [h, w] of a grid of rays -> their origin and direction, [h, w, 3] or one for all.
 Ray = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]

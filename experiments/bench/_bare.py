@@ -9,17 +9,19 @@ import jax
 import mujoco
 import numpy as np
 
+from csac_jax.baselines import oracle
 from csac_jax.config import Config
 from csac_jax.env import Env, State
-from csac_jax.scene import model
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import mjx_physics, oracle, primitives
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action, JointTrajectory
+from csac_jax.sim import mjx_physics
 from csac_jax.sim.c_physics import CPhysics
 from csac_jax.sim.mjx_physics import MjxPhysics
 from csac_jax.sim.physics import Physics
-from csac_jax.sim.primitives import Action, JointTrajectory
 from csac_jax.sim.quiet_mjx import mjx
 from csac_jax.sim.warp_physics import WarpPhysics
+from csac_jax.world import model
+from csac_jax.world.scene_state import SceneState
 
 AT_ONCE = 128  # scenes; XLA wants gigabytes for thousands
 
@@ -44,7 +46,7 @@ def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> Joint
     return jax.jit(rows)((height, actions))
 
 
-def loop(physics: Physics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
+def loop(physics: Physics, scenes: SceneState, joints: JointTrajectory) -> Callable[[], Any]:
     """Returns a call that runs an action's plain steps of scenes and joints [E, ...]."""
     if isinstance(physics, MjxPhysics):
         return _mjx(physics, scenes, joints)
@@ -54,8 +56,8 @@ def loop(physics: Physics, scenes: Scene, joints: JointTrajectory) -> Callable[[
     return _c(physics, scenes, joints)
 
 
-def _mjx(physics: MjxPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
-    def one(scene: Scene, joints: JointTrajectory) -> jax.Array:
+def _mjx(physics: MjxPhysics, scenes: SceneState, joints: JointTrajectory) -> Callable[[], Any]:
+    def one(scene: SceneState, joints: JointTrajectory) -> jax.Array:
         its, data = (
             mjx_physics.scene_model(physics, scene),
             mjx_physics.initial_data(physics, scene, joints),
@@ -70,7 +72,7 @@ def _mjx(physics: MjxPhysics, scenes: Scene, joints: JointTrajectory) -> Callabl
     return lambda: compiled(scenes, joints)
 
 
-def _warp(physics: WarpPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
+def _warp(physics: WarpPhysics, scenes: SceneState, joints: JointTrajectory) -> Callable[[], Any]:
     import warp as wp
 
     jax.block_until_ready(jax.jit(jax.vmap(physics.run))(scenes, joints))  # copies them in
@@ -85,7 +87,7 @@ def _warp(physics: WarpPhysics, scenes: Scene, joints: JointTrajectory) -> Calla
     return call
 
 
-def _c(physics: CPhysics, scenes: Scene, joints: JointTrajectory) -> Callable[[], Any]:
+def _c(physics: CPhysics, scenes: SceneState, joints: JointTrajectory) -> Callable[[], Any]:
     world = physics.world
     fields = jax.device_get(jax.vmap(lambda scene: model.scene_fields(world, scene))(scenes))
     rows = jax.device_get((scenes, fields, joints))

@@ -21,11 +21,12 @@ from csac_jax.errors import DataWarning, ViewError
 from csac_jax.evaluation import suites
 from csac_jax.evaluation.metrics import wilson
 from csac_jax.render import picture
-from csac_jax.scene import layout, model
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import outcome, physics as simulation, primitives
-from csac_jax.sim.primitives import Plan
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Plan
+from csac_jax.sim import outcome, physics as simulation
 from csac_jax.vision import camera, sensor
+from csac_jax.world import model, scene_state
+from csac_jax.world.scene_state import SceneState
 
 COUNTED = (
     *("grasps", "pushes", "refused", "nothing_to_act_on", "out_of_reach", "warnings"),
@@ -61,7 +62,7 @@ def sensors(kind: Any) -> dict[str, SensorConfig]:
 class Step(NamedTuple):
     """The result of a motion of the robot. N = block slots."""
 
-    scene: Scene
+    scene: SceneState
     reachable: jax.Array  # [] bool
     lifted: jax.Array  # [N] bool
     blocks_lost: jax.Array  # [] int32
@@ -86,17 +87,17 @@ def set_points(cfg: SimConfig, decision: Decision) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def act(env: Env, scene: Scene, control: jax.Array, is_grasp: jax.Array) -> Step:
+def act(env: Env, scene: SceneState, control: jax.Array, is_grasp: jax.Array) -> Step:
     """Moves the robot along set-points [1 + T, 5]; blocks lifted or lost are taken away."""
     plan = Plan(control[1:], control[0], jnp.float32(1.0))
     joints = primitives.joint_trajectory(env.cfg.sim, plan)
     after, trace = env.physics.run(scene, joints)
     rise = plan.start[2] - jnp.min(plan.control[:, 2])
     lifted = outcome.lifted_blocks(trace, rise) & is_grasp
-    inside = layout.inside(after.position, env.cfg.heightmap.extent)
+    inside = scene_state.inside(after.position, env.cfg.heightmap.extent)
     way = jnp.linalg.norm(after.position - scene.position, axis=1)
     return Step(
-        scene=layout.park(after, ~lifted & inside),
+        scene=scene_state.park(after, ~lifted & inside),
         reachable=joints.reachable & simulation.healthy(after),
         lifted=lifted,
         blocks_lost=jnp.sum(after.in_play & ~inside & ~lifted, dtype=jnp.int32),
@@ -161,7 +162,7 @@ def _pose(cfg: Config) -> np.ndarray:
     return pose
 
 
-def _first_scene(loop: Loop, number: int) -> Scene:
+def _first_scene(loop: Loop, number: int) -> SceneState:
     """Returns the scene that an episode of `eval` with this seed starts with."""
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(loop.seed), 0), number)
     row = number * loop.env.scenes.position.shape[0] // loop.episodes
@@ -170,7 +171,11 @@ def _first_scene(loop: Loop, number: int) -> Scene:
 
 
 def _photograph(
-    cfg: Config, errors: SensorConfig, key: jax.Array, studio: picture.RgbdRenderer, scene: Scene
+    cfg: Config,
+    errors: SensorConfig,
+    key: jax.Array,
+    studio: picture.RgbdRenderer,
+    scene: SceneState,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Renders colour and depth of a scene as the sensor gives them."""
     key_pose, key_image = jax.random.split(key)
@@ -204,8 +209,8 @@ def _decide(
 
 
 def _move(
-    env: Env, scene: Scene, decision: Decision, counts: collections.Counter[str]
-) -> tuple[Scene, bool]:
+    env: Env, scene: SceneState, decision: Decision, counts: collections.Counter[str]
+) -> tuple[SceneState, bool]:
     """Moves the robot; returns the scene, and True if it has changed."""
     is_grasp = decision.primitive == "grasp"
     step = jax.device_get(act(env, scene, set_points(env.cfg.sim, decision), jnp.bool(is_grasp)))

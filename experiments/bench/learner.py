@@ -28,8 +28,8 @@ from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, SmallNet
 from csac_jax.nets import dense, networks
 from csac_jax.nets.convolution import conv2d
+from csac_jax.robot.primitives import Action
 from csac_jax.runtime import compiler
-from csac_jax.sim.primitives import Action
 from csac_jax.training import programs
 from csac_jax.vision import heightmap
 from experiments.bench._options import Parser, config, emit, split

@@ -20,11 +20,12 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.config import Config, PhysicsKind
 from csac_jax.env import Env
-from csac_jax.objects import families, library
-from csac_jax.scene import model, pool, stock
+from csac_jax.objects import library, shapes
+from csac_jax.robot.primitives import Action
+from csac_jax.scenes import pool
 from csac_jax.sim import physics
-from csac_jax.sim.primitives import Action
 from csac_jax.vision import observe
+from csac_jax.world import model, object_slots
 from experiments.bench._options import timed
 from experiments.bench._timing import medians
 
@@ -41,7 +42,7 @@ def _configs(folder: Path, kind: PhysicsKind) -> dict[str, Config]:
         "blocks": blocks,
         "objects": roomy.change(scene={**held, "objects": f"made:0:{SHAPES}"}),
     }
-    made = families.draw(0, SHAPES)
+    made = shapes.draw(0, SHAPES)
     for low, high in PARTS:
         path = folder / f"{low}_to_{high}"
         library.save(path, [one for one in made if low <= len(one.parts) <= high])
@@ -75,7 +76,7 @@ def measure(scenes: int, repeats: int, warp: bool) -> dict[str, Any]:
             kind: int(calls[f"{kind} action"]().info.contact_overflow.sum()) for kind in configs
         }
         parts = {
-            kind: float(stock.table(cfg.scene).present.sum(axis=1).mean())
+            kind: float(object_slots.table(cfg.scene).present.sum(axis=1).mean())
             for kind, cfg in configs.items()
             if cfg.scene.has_objects
         }

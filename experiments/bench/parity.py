@@ -26,13 +26,15 @@ import mujoco
 import numpy as np
 
 from csac_jax import presets
+from csac_jax.baselines import oracle
 from csac_jax.config import Config, PhysicsKind, SceneConfig, SlotKind
 from csac_jax.constants import Outcome, Primitive
-from csac_jax.scene import blocks, layout, model, pool
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import oracle, outcome, physics as simulation
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
+from csac_jax.scenes import pool
+from csac_jax.sim import outcome, physics as simulation
 from csac_jax.vision import observe
+from csac_jax.world import blocks, model, scene_state
+from csac_jax.world.scene_state import SceneState
 from experiments.bench._options import emit, read
 
 BATCH = 64
@@ -43,7 +45,7 @@ NUDGE = 1e-6  # m
 OFF = np.float32([0.012, 0.012, 0.35])  # m, m, rad, standard deviations
 MOVED = 0.01  # m, a push that moves a block by as much has had an effect
 TEN = presets.get("fast")
-Engine = Callable[[Scene, jax.Array, Action], Any]  # scenes, heights [E, H, W] m, actions
+Engine = Callable[[SceneState, jax.Array, Action], Any]  # scenes, heights [E, H, W] m, actions
 
 
 def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind = "mjx") -> Config:
@@ -90,7 +92,9 @@ class Bench:
         engine = simulation.make(world, cfg.sim)
         return jax.jit(jax.vmap(functools.partial(simulation.execute, engine, cfg)))
 
-    def run(self, engines: dict[str, Engine], scenes: Scene, actions: Action) -> dict[str, Any]:
+    def run(
+        self, engines: dict[str, Engine], scenes: SceneState, actions: Action
+    ) -> dict[str, Any]:
         """Runs engines: ends [E, N, 3], outcomes, overflows and failures [E] of each."""
         height = self.heights(scenes)
         result = {}
@@ -105,7 +109,7 @@ class Bench:
         return result
 
 
-def _nudged(scenes: Scene) -> Scene:
+def _nudged(scenes: SceneState) -> SceneState:
     """Moves each block in play by a micrometre, each in its own direction."""
     angle = np.random.default_rng(STREAM).uniform(0.0, 2.0 * np.pi, scenes.position.shape[:2])
     step = (
@@ -116,7 +120,7 @@ def _nudged(scenes: Scene) -> Scene:
     return scenes.replace(position=scenes.position + step.astype(np.float32))
 
 
-def _push(key: jax.Array, scene: Scene) -> Action:
+def _push(key: jax.Array, scene: SceneState) -> Action:
     """Draws a push through a random block in play, from a random side."""
     key_slot, key_yaw = jax.random.split(key)
     slot = jax.random.categorical(key_slot, jnp.where(scene.in_play, 0.0, -jnp.inf))
@@ -230,13 +234,13 @@ def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
     }
 
 
-def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> Scene:
+def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> SceneState:
     """Drops a block of this shape until `count` scenes are at rest."""
     rng = np.random.default_rng([STREAM, list(blocks.SHAPES).index(shape)])
     slot = cfg.scene.slots.index(blocks.SHAPES[shape].kind)
-    at_rest: list[Scene] = []
+    at_rest: list[SceneState] = []
     while len(at_rest) < count:
-        scene = layout.parked(cfg.scene.slots)
+        scene = scene_state.parked(cfg.scene.slots)
         half = scene.half_size.copy()
         position, quaternion = scene.position.copy(), scene.quaternion.copy()
         half[slot] = blocks.SHAPES[shape].half_size

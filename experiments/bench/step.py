@@ -35,9 +35,9 @@ from csac_jax.cli import parsing
 from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, PhysicsKind
 from csac_jax.replay import ring
+from csac_jax.robot.primitives import Action
 from csac_jax.runtime import cache, compiler
 from csac_jax.sim import backend
-from csac_jax.sim.primitives import Action
 from csac_jax.training import programs, split_step, step, transitions
 from csac_jax.vision import heightmap
 from experiments.bench import _bare

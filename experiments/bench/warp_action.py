@@ -30,8 +30,8 @@ import warp as wp
 
 from csac_jax import env as environment, presets
 from csac_jax.config import Config
+from csac_jax.robot.primitives import Action
 from csac_jax.runtime import cache
-from csac_jax.sim.primitives import Action
 from experiments.bench import _bare
 from experiments.bench._options import Parser, emit, with_blocks
 from experiments.bench._timing import medians

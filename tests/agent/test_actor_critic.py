@@ -16,7 +16,7 @@ from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import TargetConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from tests.agent.reference import exact_softmax
 from tests.sections import with_constants

@@ -15,10 +15,10 @@ from csac_jax.agent import augment, maps
 from csac_jax.agent.learner import Transition
 from csac_jax.constants import Primitive
 from csac_jax.nets import networks
-from csac_jax.scene import blocks, layout
-from csac_jax.scene.layout import Scene
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap, observe
+from csac_jax.world import blocks, scene_state
+from csac_jax.world.scene_state import SceneState
 
 FLAGS = list(itertools.product((False, True), repeat=3))
 CFG = presets.smoke()  # four yaws: turning to the nearest cell is exact
@@ -44,13 +44,13 @@ def _turn(flags, transition: Transition) -> Transition:
     return apply_symmetry(transition, *(jnp.array(flag) for flag in flags))
 
 
-def _scene(rotation: Rotation, position: np.ndarray, matrix: np.ndarray = np.eye(3)) -> Scene:  # noqa: B008
+def _scene(rotation: Rotation, position: np.ndarray, matrix: np.ndarray = np.eye(3)) -> SceneState:  # noqa: B008
     """Three blocks in a workspace turned or mirrored by `matrix`: each is its own mirror image in
     its x."""
     body = np.diag([np.linalg.det(matrix), 1.0, 1.0])
     turned = Rotation.from_matrix(matrix @ rotation.as_matrix() @ body)
     half_size = np.stack([blocks.SHAPES[name].half_size for name in ("cuboid", "plank", "prism")])
-    return jax.tree.map(jnp.asarray, layout.parked(CFG.scene.slots)).replace(
+    return jax.tree.map(jnp.asarray, scene_state.parked(CFG.scene.slots)).replace(
         position=jnp.asarray(position @ matrix.T, jnp.float32),
         quaternion=jnp.asarray(turned.as_quat(scalar_first=True), jnp.float32),
         half_size=jnp.asarray(half_size, jnp.float32),
@@ -63,7 +63,7 @@ def _action(primitive: int = 0, pose: np.ndarray = POSE) -> Action:
     return Action(primitive=jnp.int32(primitive), pose=jnp.asarray(pose, jnp.float32))
 
 
-def _transition(scene: Scene) -> Transition:
+def _transition(scene: SceneState) -> Transition:
     obs = look(scene)
     return Transition(obs, _action(), jnp.float32(0.5), obs, jnp.array(True))
 
@@ -108,7 +108,7 @@ def test_colours_turn_too():
     """Claim: blocks that lie flat keep their colours under all eight."""
     flat = Rotation.from_euler("z", [[0.4], [1.1], [2.0]])
 
-    def scene(matrix: np.ndarray) -> Scene:
+    def scene(matrix: np.ndarray) -> SceneState:
         whole = _scene(flat, POSITION, matrix)
         away = whole.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))
         return whole.replace(position=away, in_play=jnp.array([True, True, False]))

@@ -15,7 +15,7 @@ from csac_jax.agent import actor, actor_critic, critic, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.learner import Transition
 from csac_jax.config import DenseNet121
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from tests.sections import with_constants
 

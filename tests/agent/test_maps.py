@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from csac_jax.agent import maps, policy
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
-from csac_jax.sim import primitives
+from csac_jax.robot import primitives
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation

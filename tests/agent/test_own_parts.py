@@ -14,7 +14,7 @@ from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.replay import ring
 from csac_jax.replay.samplers import Sample, Sampler
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.training import programs, step, transitions
 from tests.agent import toys
 

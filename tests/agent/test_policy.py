@@ -13,9 +13,9 @@ from csac_jax.agent import box, maps, policy
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import CEMConfig
 from csac_jax.constants import Primitive
+from csac_jax.robot.primitives import Action
 from csac_jax.runtime import compiler
 from csac_jax.sim.outcome import BARE
-from csac_jax.sim.primitives import Action
 
 KEYS = 20
 

@@ -16,7 +16,7 @@ from csac_jax.agent.learner import Transition
 from csac_jax.config import RewardConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.training import programs
 from csac_jax.vision import heightmap
 from tests.agent import test_rewards

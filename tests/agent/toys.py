@@ -27,7 +27,7 @@ from csac_jax.config import (
 )
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Info, State
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.vision.heightmap import Observation
 from tests.sections import with_constants
 

@@ -25,7 +25,7 @@ from csac_jax.errors import DataWarning
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
-from csac_jax.scene import pool
+from csac_jax.scenes import pool
 from csac_jax.section import Section
 from csac_jax.training import memory
 from csac_jax.training.callbacks import Summary
@@ -153,7 +153,7 @@ def test_long_work_is_logged(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
             warnings.warn("odd file", DataWarning, stacklevel=level)
         return 0
 
-    logger, root = logging.getLogger("csac_jax.scene.pool"), logging.StreamHandler(sys.stderr)
+    logger, root = logging.getLogger("csac_jax.scenes.pool"), logging.StreamHandler(sys.stderr)
     monkeypatch.setattr(logging.getLogger(), "handlers", [root])
     monkeypatch.setitem(cli.COMMANDS, "doctor", work)
     for _ in range(2):

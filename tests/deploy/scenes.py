@@ -9,9 +9,9 @@ import numpy as np
 
 from csac_jax import geometry
 from csac_jax.config import CameraConfig
-from csac_jax.scene import blocks
 from csac_jax.vision import camera, observe, raycast
 from csac_jax.vision.raycast import Polytopes
+from csac_jax.world import blocks
 
 CAMERA = CameraConfig()
 HALF = np.array([0.05, 0.025, 0.025])  # of the blocks, m

@@ -6,7 +6,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.constants import Outcome
 from csac_jax.evaluation import metrics, policies, rollout, suites
-from csac_jax.scene import pool
+from csac_jax.scenes import pool
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
 SMOKE = presets.smoke()

@@ -13,7 +13,7 @@ from csac_jax.agent import actor_critic, csac, policy, values
 from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import policies
-from csac_jax.evaluation.policies import GeometricPolicy, LearnedPolicy, OraclePolicy, RandomPolicy
+from csac_jax.evaluation.policies import GeometricPolicy, NetworkPolicy, OraclePolicy, RandomPolicy
 from csac_jax.io import policy_file
 
 pytestmark = pytest.mark.mjx
@@ -28,11 +28,11 @@ SCENES = 3
 
 
 @pytest.fixture(scope="module")
-def learned() -> LearnedPolicy:
+def learned() -> NetworkPolicy:
     """Networks as they begin."""
     parts = actor_critic.make(CFG)
     params = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(0)).online
-    return LearnedPolicy(CFG, params)
+    return NetworkPolicy(CFG, params)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_mirror_images_reach_the_policy(learned, states):
     look = jax.jit(lambda obs: values.decision_maps(parts, state.online, obs))
     best = jax.vmap(policy.best_action, (0, None, 0, 0))
     expected = best(_keys(), parts, look(states.obs), states.steps_without_change).pose
-    mirrored, plain = (LearnedPolicy(one, state.online) for one in (cfg, off))
+    mirrored, plain = (NetworkPolicy(one, state.online) for one in (cfg, off))
     np.testing.assert_allclose(mirrored.batched(states, _keys()).pose, expected, atol=1e-5)
     agent = csac.CSAC(parts).act(key, state, states.obs, states.steps_without_change)
     np.testing.assert_allclose(agent.pose, expected, atol=1e-5)
@@ -115,7 +115,7 @@ def test_height_bonus_leads_to_the_top(states):
     def distance(pose: jax.Array) -> jax.Array:
         return np.abs(np.asarray(pose)[:, :2] - tops).max(axis=-1)
 
-    plain, high = (LearnedPolicy(one, state.online).batched(states, _keys()) for one in (off, cfg))
+    plain, high = (NetworkPolicy(one, state.online).batched(states, _keys()) for one in (off, cfg))
     near = 1.5 * parts.frames.cell
     assert (distance(plain.pose) > near).all()
     assert (distance(high.pose) < near).all()

@@ -16,10 +16,10 @@ from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
 from csac_jax.evaluation import rollout, suites
 from csac_jax.evaluation.metrics import Episodes
-from csac_jax.evaluation.policies import LearnedPolicy, OraclePolicy, RandomPolicy
-from csac_jax.scene import layout
-from csac_jax.sim.primitives import Action
+from csac_jax.evaluation.policies import NetworkPolicy, OraclePolicy, RandomPolicy
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import observe
+from csac_jax.world import scene_state
 
 pytestmark = pytest.mark.mjx
 
@@ -43,7 +43,7 @@ class Magnet(Env):
     def step(self, state: State, action: Action) -> State:
         off = jnp.linalg.norm(state.scene.position[:, :2] - action.pose[None, :2], axis=1)
         taken = state.scene.in_play & (off < self.reach) & (action.primitive == Primitive.GRASP)
-        scene = layout.park(state.scene, ~taken)
+        scene = scene_state.park(state.scene, ~taken)
         actions, steps_without_change = (
             state.actions + 1,
             jnp.where(jnp.any(taken), 0, state.steps_without_change + 1),
@@ -84,11 +84,11 @@ def _compiled(env: Env):
     return rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
 
 
-def learned_policy(seed: int) -> LearnedPolicy:
+def learned_policy(seed: int) -> NetworkPolicy:
     """Networks as they begin."""
     parts = actor_critic.make(CFG)
     state = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(seed))
-    return LearnedPolicy(CFG, state.online)
+    return NetworkPolicy(CFG, state.online)
 
 
 @pytest.fixture(scope="module")

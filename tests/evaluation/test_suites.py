@@ -12,7 +12,8 @@ import pytest
 from csac_jax import presets
 from csac_jax.config import Config, SensorConfig, TaskConfig
 from csac_jax.evaluation import rollout, suites
-from csac_jax.scene import cases, layout, pool
+from csac_jax.scenes import cases, pool
+from csac_jax.world import scene_state
 
 pytestmark = pytest.mark.mjx
 
@@ -100,8 +101,8 @@ def test_target_is_the_cases_own():
     """Claim: the target task asks for the block that the file marks, the clearing task for any."""
     scene, turned = _varied(TARGET, "hole")
     assert (turned.target == scene.target).all()
-    assert scene.target != layout.ANY
-    assert (_varied(CFG, "hole")[1].target == layout.ANY).all()
+    assert scene.target != scene_state.ANY
+    assert (_varied(CFG, "hole")[1].target == scene_state.ANY).all()
 
 
 @pytest.mark.slow
@@ -142,7 +143,9 @@ def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int
 
     def settled(cfg, stream, count, poured=False):
         asked.append((cfg.scene.slots, cfg.scene.min_blocks, stream, count, poured))
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+        return jax.tree.map(
+            lambda leaf: np.asarray(leaf)[None], scene_state.parked(cfg.scene.slots)
+        )
 
     monkeypatch.setattr(pool, "settled", settled)
     packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))
@@ -161,7 +164,7 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
     """Claim: the suite `target` is the cases and random10, one marked block each, within 5 actions;
     a policy that was trained to clear the table is refused, one that reads the blocks' poses is
     not."""
-    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN))
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene_state.parked(suites.TEN))
     everyone = blank.replace(in_play=np.ones_like(blank.in_play))
     monkeypatch.setattr(pool, "settled", lambda *_, **__: everyone)
     for cfg, learned in ((TARGET, True), (CFG, False)):
@@ -181,7 +184,7 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
 def test_camera_suite(monkeypatch: pytest.MonkeyPatch):
     """Claim: the suite `camera` is the scenes of random10 through ever worse cameras: straight
     down, from the side, with noise, 5 mm off, in other colours; a sensor that is named stays."""
-    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(suites.TEN))
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene_state.parked(suites.TEN))
     monkeypatch.setattr(pool, "settled", lambda *_, **__: blank)
     noisy = CFG.change(heightmap={"view": "oblique"}, sensor={"kind": "azure_kinect"})
     for cfg, kind in ((CFG, "d415"), (noisy, "azure_kinect")):

@@ -26,10 +26,11 @@ from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.io.policy_file import PolicyFileError
 from csac_jax.report import comparison, result_tables, results
 from csac_jax.runtime import cache
-from csac_jax.scene import cases, layout, pool
+from csac_jax.scenes import cases, pool
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepError, SweepPlan
+from csac_jax.world import scene_state
 from tests.faults import harness
 from tests.faults.harness import DAMAGES, Tally, fault
 
@@ -111,7 +112,7 @@ def _plan() -> SweepPlan:
 
 
 def _pool(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
-    path, parked = folder / "pool.npz", layout.parked(CFG.scene.slots)
+    path, parked = folder / "pool.npz", scene_state.parked(CFG.scene.slots)
     rng = np.random.default_rng(0)
     scenes = jax.tree.map(lambda leaf: rng.normal(size=(8, *leaf.shape)).astype(leaf.dtype), parked)
     pool._write(path, scenes)

@@ -22,7 +22,7 @@ from csac_jax.deploy import decision, decision_program
 from csac_jax.errors import DataWarning
 from csac_jax.io import configs, policy_file, weights
 from csac_jax.io.policy_file import PolicyFileError
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 
 CFG = presets.get("smoke")
 BIAS = "actor.params.Dense_0.bias"

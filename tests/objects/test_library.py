@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from csac_jax.objects import families, library, tables
+from csac_jax.objects import library, shapes, tables
 from csac_jax.objects.library import LibraryError
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("library") / "lib"
-    library.save(folder, families.draw(0, 14))
+    library.save(folder, shapes.draw(0, 14))
     return folder
 
 
@@ -30,13 +30,13 @@ def test_a_library_comes_back(made: Path, tmp_path: Path):
     """Claim: what is saved is what is loaded, to the bit but for inertias, which are text. Made
     again, a library has the same bytes. A name gives the object's number."""
     loaded = library.load(made)
-    for one, two in zip(families.draw(0, 14), loaded.objects, strict=True):
+    for one, two in zip(shapes.draw(0, 14), loaded.objects, strict=True):
         assert (one.name, one.family, one.volume) == (two.name, two.family, two.volume)
         np.testing.assert_allclose(one.inertia, two.inertia, rtol=1e-12)
         for mine, other in zip(one.parts, two.parts, strict=True):
             for name in ("vertices", "triangles", "planes"):
                 np.testing.assert_array_equal(getattr(mine, name), getattr(other, name))
-    library.save(tmp_path / "again", families.draw(0, 14))
+    library.save(tmp_path / "again", shapes.draw(0, 14))
     for name in (library.INDEX, library.ARRAYS):
         assert (tmp_path / "again" / name).read_bytes() == (made / name).read_bytes()
     assert loaded.objects[loaded.number("cup-0-2")].family == "cup"
@@ -47,7 +47,7 @@ def test_a_library_comes_back(made: Path, tmp_path: Path):
 def test_nothing_is_overwritten(made: Path):
     """Claim: a folder that exists is left alone, and no draft stays in its parent."""
     with pytest.raises(FileExistsError, match="give another name"):
-        library.save(made, families.draw(1, 2))
+        library.save(made, shapes.draw(1, 2))
     assert [path.name for path in made.parent.iterdir()] == [made.name]
 
 

@@ -15,9 +15,9 @@ EYE = CameraConfig().scaled(0.5)
 
 def scene() -> Any:
     """A cube and, half under it, a prism; leaves NumPy."""
-    from csac_jax.scene import layout
+    from csac_jax.world import scene_state
 
-    empty = layout.parked(CFG.scene.slots)
+    empty = scene_state.parked(CFG.scene.slots)
     kinds = CFG.scene.slots.index("box"), CFG.scene.slots.index("prism")
     empty.position[kinds, :] = [[0.05, 0.06, 0.04], [-0.08, -0.05, 0.0243]]
     empty.quaternion[kinds, :] = [[0.9, 0.1, 0.3, 0.3], [0.9, 0.0, 0.0, 0.435]]
@@ -39,7 +39,7 @@ def main(out_path: str) -> None:
     if gl.choose() is None:
         sys.exit(3)
     from csac_jax.render import picture
-    from csac_jax.scene import model
+    from csac_jax.world import model
 
     studio = picture.RgbdRenderer(model.build(CFG.scene, CFG.sim), scene(), EYE.size)
     colour, depth = studio.image(scene(), eye())

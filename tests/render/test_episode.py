@@ -12,7 +12,7 @@ import pytest
 from csac_jax import cli, presets
 from csac_jax.env import Env
 from csac_jax.render import episode, gl
-from csac_jax.scene import layout
+from csac_jax.world import scene_state
 
 pytestmark = pytest.mark.mjx
 
@@ -58,7 +58,7 @@ def _step(
     blocks_lost: int = 0,
     terminated: bool = False,
     reward: float = 0.0,
-    target: int = layout.ANY,
+    target: int = scene_state.ANY,
     actions: int = 1,
     diverged: bool = False,
     failed: int = 0,

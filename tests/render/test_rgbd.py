@@ -14,10 +14,10 @@ import pytest
 from csac_jax.constants import Primitive
 from csac_jax.deploy import decision
 from csac_jax.deploy.decision_program import Choice, stations
-from csac_jax.scene import blocks
-from csac_jax.sim import primitives
-from csac_jax.sim.primitives import Action
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import camera, observe, raycast
+from csac_jax.world import blocks
 from experiments.bench import _closed_loop
 from tests.render import draw_rgbd
 from tests.render.draw_rgbd import CFG

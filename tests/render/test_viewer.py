@@ -15,7 +15,7 @@ import pytest
 
 from csac_jax import cli, presets
 from csac_jax.render import gl, viewer
-from csac_jax.scene import model
+from csac_jax.world import model
 from tests.render.test_episode import CUBE
 
 pytestmark = pytest.mark.mjx

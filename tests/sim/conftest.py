@@ -13,15 +13,18 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
+from csac_jax.baselines import oracle
 from csac_jax.config import Config, SceneConfig
 from csac_jax.constants import Primitive
 from csac_jax.objects import body, library, solid
-from csac_jax.scene import blocks, layout, model, pool, stock
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import c_physics, oracle, physics as simulation, primitives
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action, JointTrajectory, Plan
+from csac_jax.scenes import pool
+from csac_jax.sim import c_physics, physics as simulation
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import Action, JointTrajectory, Plan
 from csac_jax.vision import observe
+from csac_jax.world import blocks, model, object_slots, scene_state
+from csac_jax.world.scene_state import SceneState
 
 CONFIG = Config(scene=SceneConfig(slots=("box", "box", "prism"), min_blocks=2, settle_time=1.5))
 SETTLED = 40
@@ -30,9 +33,9 @@ _NO_WARP = pytest.mark.skipif(not HAS_WARP, reason="Warp is an extra: pip instal
 WARP = pytest.param("warp", marks=[pytest.mark.slow, _NO_WARP])
 
 
-def place(**shapes: tuple[float, float, float]) -> Scene:
+def place(**shapes: tuple[float, float, float]) -> SceneState:
     """A scene of up to two cubes and a prism at (x, y, yaw) on the table; other slots parked."""
-    scene = layout.parked(CONFIG.scene.slots)
+    scene = scene_state.parked(CONFIG.scene.slots)
     position, quaternion = scene.position.copy(), scene.quaternion.copy()
     slots = {"cube": 0, "other": 1, "prism": 2}
     for name, (x, y, yaw) in shapes.items():
@@ -58,9 +61,9 @@ def bar(folder: Path) -> dict[str, Any]:
     return {"slots": ("object",), "min_blocks": 1, "objects": str(folder / "bar"), "split": "all"}
 
 
-def grasped_bar(cfg: Config) -> tuple[Scene, JointTrajectory]:
+def grasped_bar(cfg: Config) -> tuple[SceneState, JointTrajectory]:
     """The bar on the table, as a block or an object, and the motion of a hand that grasps it."""
-    scene = layout.parked(cfg.scene.slots)
+    scene = scene_state.parked(cfg.scene.slots)
     scene = scene.replace(
         position=np.float32([[0.0, 0.0, BAR[2]]]),
         half_size=BAR[None],
@@ -81,13 +84,15 @@ TWO_OBJECTS = presets.get("quick").change(
 )
 
 
-def thrown_objects(cfg: Config) -> tuple[Scene, JointTrajectory]:
+def thrown_objects(cfg: Config) -> tuple[SceneState, JointTrajectory]:
     """Four scenes of two objects: in two, one falls on the other; in two, both turn and land."""
-    rng, known = np.random.default_rng(0), stock.table(cfg.scene)
+    rng, known = np.random.default_rng(0), object_slots.table(cfg.scene)
     order = np.argsort(known.present.sum(axis=1))
     scenes = []
     for row, pair in enumerate(zip(order[:4], order[-4:], strict=True)):
-        scene = stock.hold(layout.parked(cfg.scene.slots), np.arange(2), np.array(pair), known)
+        scene = object_slots.hold(
+            scene_state.parked(cfg.scene.slots), np.arange(2), np.array(pair), known
+        )
         turns = rng.normal(size=(2, 4))
         above, aside = [[0.0, 0.0, 0.3], [0.005, 0.0, 0.4]], [[-0.15, 0.0, 0.08], [0.15, 0.0, 0.08]]
         falling, thrown = [[0.0] * 6, [0.0, 0.0, -1.5, 0.0, 0.0, 0.0]], rng.normal(0.0, 3.0, (2, 6))
@@ -110,14 +115,14 @@ def stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-def _kicked(speed: float) -> Scene:
+def _kicked(speed: float) -> SceneState:
     scene = place(cube=(0.0, 0.0, 0.0), other=(0.1, 0.1, 0.0))
     kick = np.zeros((3, 6), np.float32)
     kick[0, 0] = speed
     return scene.replace(velocity=scene.velocity + kick)
 
 
-def _spinning() -> Scene:
+def _spinning() -> SceneState:
     """A plank in the air, spinning about all axes like one squeezed from under the hand."""
     scene = place(cube=(0.1, 0.1, 0.0))
     half, position, velocity = scene.half_size.copy(), scene.position.copy(), scene.velocity.copy()
@@ -126,7 +131,7 @@ def _spinning() -> Scene:
     return scene.replace(half_size=half, position=position, velocity=velocity)
 
 
-CASES: dict[str, tuple[Scene, Action]] = {
+CASES: dict[str, tuple[SceneState, Action]] = {
     "nothing": (place(cube=(0.1, 0.1, 0.0)), grasp(-0.1, -0.1)),
     # The window sees the corner of a cube 13 mm off the pads' path.
     "empty": (place(cube=(-0.0205, 0.0275, 0.0)), grasp(0.0125, -0.0055, np.pi / 4)),
@@ -145,10 +150,10 @@ CASES: dict[str, tuple[Scene, Action]] = {
 class Run(NamedTuple):
     """Inputs and results of a batch of primitives, leaves [E, ...]: CASES in order, then others."""
 
-    scene: Scene
+    scene: SceneState
     height: np.ndarray
     action: Action
-    after: Scene
+    after: SceneState
     trace: Trace
     plan: Plan
 
@@ -171,7 +176,7 @@ def _noisy(actions: Action) -> Action:
     return actions.replace(pose=np.asarray(actions.pose) + noise.astype(np.float32))
 
 
-def execute(config: Config, scenes: Scene, actions: Action) -> Run:
+def execute(config: Config, scenes: SceneState, actions: Action) -> Run:
     """Runs actions in scenes, leaves [E, ...], as one batch on the config's engine."""
     physics = simulation.make(model.build(config.scene, config.sim), config.sim)
     height = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))(scenes)
@@ -179,13 +184,15 @@ def execute(config: Config, scenes: Scene, actions: Action) -> Run:
     return jax.tree.map(np.asarray, Run(scenes, height, actions, *run(scenes, height, actions)))
 
 
-def execute_settled(config: Config, count: int, scripted: Sequence[tuple[Scene, Action]]) -> Run:
+def execute_settled(
+    config: Config, count: int, scripted: Sequence[tuple[SceneState, Action]]
+) -> Run:
     """Runs the scripted cases and grasps in `count` settled scenes in MJX, as one batch."""
     config = config.change(sim={"physics": "mjx"})
     per_number = count // (1 + len(config.scene.slots) - config.scene.min_blocks)
     settled = pool.settled(config, pool.TRAIN_STREAM, per_number)
 
-    def plan(scene: Scene) -> Action:
+    def plan(scene: SceneState) -> Action:
         return oracle.grasp(config, scene, observe.observe(config, scene).height)
 
     batches = [(settled, _noisy(jax.jit(jax.vmap(plan))(settled)))]
@@ -239,7 +246,7 @@ def grasped_in_c(c_world: model.World, grasped: Run) -> tuple[np.ndarray, Trace]
     """The same plans in C MuJoCo: ends [E, N, 3] m and traces."""
     engine = c_physics.CPhysics(c_world, CONFIG.sim)
 
-    def one(scene: Scene, plan: Plan) -> tuple[Scene, Trace]:
+    def one(scene: SceneState, plan: Plan) -> tuple[SceneState, Trace]:
         return engine.run(scene, primitives.joint_trajectory(CONFIG.sim, plan))
 
     run = jax.jit(jax.vmap(one))

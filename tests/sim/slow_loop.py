@@ -5,15 +5,15 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from csac_jax.scene import layout, model
-from csac_jax.scene.layout import Scene
-from csac_jax.scene.model import BlockFields, World
+from csac_jax.robot.primitives import JointTrajectory
 from csac_jax.sim.c_physics import Trajectory
-from csac_jax.sim.primitives import JointTrajectory
+from csac_jax.world import model, scene_state
+from csac_jax.world.model import BlockFields, World
+from csac_jax.world.scene_state import SceneState
 
 
 def substeps(
-    world: World, fields: BlockFields, scene: Scene, joints: JointTrajectory
+    world: World, fields: BlockFields, scene: SceneState, joints: JointTrajectory
 ) -> Iterator[mujoco.MjData]:
     """The state after every substep, one and the same object; NumPy throughout."""
     exact = model.with_blocks(world, fields)
@@ -23,7 +23,7 @@ def substeps(
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
     data.qvel[world.block_dofs] = scene.velocity
     fastest = np.full(exact.nv, np.inf)
-    fastest[world.block_dofs] = layout.SPEED_LIMIT
+    fastest[world.block_dofs] = scene_state.SPEED_LIMIT
     parked = world.block_qpos[~scene.in_play]
     waiting = data.qpos[parked]
     for control in joints.control:
@@ -35,7 +35,7 @@ def substeps(
 
 
 def trajectory(
-    world: World, fields: BlockFields, scene: Scene, joints: JointTrajectory
+    world: World, fields: BlockFields, scene: SceneState, joints: JointTrajectory
 ) -> Trajectory:
     """The reference of `c_physics.trajectory` for a plan that the robot can follow."""
     states = [

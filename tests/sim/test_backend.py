@@ -11,9 +11,10 @@ import pytest
 
 from csac_jax import grippers, presets
 from csac_jax.config import Config, PhysicsKind, RobotKind, SceneConfig
-from csac_jax.scene import model
-from csac_jax.sim import backend, kinematics, physics, primitives
-from csac_jax.sim.primitives import Action
+from csac_jax.robot import kinematics, primitives
+from csac_jax.robot.primitives import Action
+from csac_jax.sim import backend, physics
+from csac_jax.world import model
 
 
 def _config(kind: PhysicsKind, mesh_jitter: float = 0.0, scenes: int = 256) -> Config:

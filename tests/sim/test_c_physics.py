@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.scene import layout, model
-from csac_jax.sim import c_physics, primitives
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import JointTrajectory
+from csac_jax.sim import c_physics
 from csac_jax.sim.c_physics import CPhysics, CSimulator, Trajectory
-from csac_jax.sim.primitives import JointTrajectory
-from tests.scene import placed
+from csac_jax.world import model, scene_state
 from tests.sim import conftest, slow_loop
+from tests.world import placed
 
 pytestmark = pytest.mark.mjx
 
@@ -33,7 +34,7 @@ def _assert_equal(ours: Trajectory, theirs: Trajectory) -> None:
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
-def _fields(world: model.World, scene: layout.Scene) -> model.BlockFields:
+def _fields(world: model.World, scene: scene_state.SceneState) -> model.BlockFields:
     return jax.device_get(model.scene_fields(world, scene))
 
 
@@ -74,7 +75,7 @@ def test_trajectory_keeps_parked_blocks_where_they_are(c_world: model.World, pus
     scene, fields, joints = pushed
     recorded = c_physics.trajectory(c_world, fields, scene, joints)
     parked = c_world.block_qpos[1:, :3]
-    wanted = np.broadcast_to(layout.parking(3)[1:], (len(joints.control), 2, 3))
+    wanted = np.broadcast_to(scene_state.parking(3)[1:], (len(joints.control), 2, 3))
     np.testing.assert_array_equal(recorded.qpos[:, parked].astype(np.float32), wanted)
     assert not recorded.qvel[:, c_world.block_dofs[1:]].any()
     _assert_equal(recorded, slow_loop.trajectory(c_world, fields, scene, joints))
@@ -138,7 +139,7 @@ def test_limit_of_speed_is_held_after_every_substep(
     """Claim: MuJoCo's interrupted loop gives the bits of one that limits speed each substep."""
     scene, fields, joints = pushed
     limit = np.array([metres] * 3 + [10.0 * metres] * 3, np.float32)
-    monkeypatch.setattr(layout, "SPEED_LIMIT", limit)
+    monkeypatch.setattr(scene_state, "SPEED_LIMIT", limit)
     wanted = slow_loop.trajectory(c_world, fields, scene, joints)
     at_limit = (np.abs(wanted.qvel[:, c_world.block_dofs[0]]) == limit).any(axis=1)
     assert at_limit.any()

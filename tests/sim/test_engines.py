@@ -10,11 +10,11 @@ import pytest
 from csac_jax import grippers, presets
 from csac_jax.config import PhysicsKind
 from csac_jax.constants import Outcome
-from csac_jax.scene import layout, model
-from csac_jax.scene.layout import Scene
+from csac_jax.robot.primitives import Action
 from csac_jax.sim import outcome, physics as simulation
 from csac_jax.sim.outcome import Trace
-from csac_jax.sim.primitives import Action
+from csac_jax.world import model, scene_state
+from csac_jax.world.scene_state import SceneState
 from tests.sim.conftest import WARP, Run
 
 pytestmark = pytest.mark.mjx
@@ -73,7 +73,7 @@ def test_parked_blocks_never_move(cases: Run):
     parked = ~cases.scene.in_play
     assert parked.sum() > 10
     np.testing.assert_array_equal(cases.after.in_play, cases.scene.in_play)
-    places = np.broadcast_to(layout.parking(3), cases.scene.position.shape)
+    places = np.broadcast_to(scene_state.parking(3), cases.scene.position.shape)
     np.testing.assert_array_equal(cases.after.position[parked], places[parked])
     assert not cases.after.velocity[parked].any()
     sane = np.isfinite(cases.trace.rise).all(axis=1)
@@ -92,7 +92,7 @@ def test_failed_physics_is_flagged_alone(cases: Run):
 def test_fast_spin_does_not_blow_up(cases: Run):
     """Claim: a thin block that spins at 250 rad/s is held to the speed limit."""
     after = cases.case("spinning").after
-    assert (np.abs(after.velocity) <= layout.SPEED_LIMIT).all()
+    assert (np.abs(after.velocity) <= scene_state.SPEED_LIMIT).all()
 
 
 def test_no_contact_was_dropped(cases: Run):
@@ -101,14 +101,14 @@ def test_no_contact_was_dropped(cases: Run):
 
 
 @functools.cache
-def _grasped(gripper: str, physics: PhysicsKind) -> tuple[Scene, Trace, int]:
+def _grasped(gripper: str, physics: PhysicsKind) -> tuple[SceneState, Trace, int]:
     """Grasps the cube: the scene after it, the trace and the outcome."""
     cfg = presets.get("quick").change(
         scene={"slots": ("box",), "min_blocks": 1},
         sim={"gripper": gripper, "physics": physics, "geom_pairs": 4, "contacts": 16},
     )
     engine = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
-    scene = layout.parked(("box",)).replace(
+    scene = scene_state.parked(("box",)).replace(
         position=np.array([[*PLACE, HALF]], np.float32),
         half_size=np.full((1, 3), HALF, np.float32),
         in_play=np.array([True]),

@@ -8,8 +8,9 @@ from mujoco import mjx
 
 from csac_jax import env, presets
 from csac_jax.constants import Primitive
-from csac_jax.sim import mjx_physics, primitives
-from csac_jax.sim.primitives import Action
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action
+from csac_jax.sim import mjx_physics
 
 pytestmark = [pytest.mark.slow, pytest.mark.mjx]
 

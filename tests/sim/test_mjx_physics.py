@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from csac_jax.baselines import oracle
 from csac_jax.config import MESH_KINDS, Config, SceneConfig
-from csac_jax.scene import layout, model
-from csac_jax.sim import mjx_physics, oracle, outcome, physics as simulation
+from csac_jax.sim import mjx_physics, outcome, physics as simulation
+from csac_jax.world import model, scene_state
 
 pytestmark = pytest.mark.mjx
 
@@ -27,7 +28,7 @@ def _outcomes(run, trace=None) -> np.ndarray:
 def test_products_keep_their_precision(config, world):
     """Claim: no matrix product of physics or planner runs at a GPU's reduced precision; MJX itself
     asks for HIGH, three passes of the reduced one, in its box collisions."""
-    scene = jax.tree.map(jnp.asarray, layout.parked(config.scene.slots))
+    scene = jax.tree.map(jnp.asarray, scene_state.parked(config.scene.slots))
     height = jnp.zeros((config.heightmap.size,) * 2)
     engine = mjx_physics.make(world, config.sim)
 
@@ -59,7 +60,7 @@ def test_products_keep_their_precision(config, world):
 def test_healthy_bounds(field: str, slot: int, bad: tuple, good: tuple):
     """Claim: healthy = finite, slower than 20 m/s, within 1 m of the origin if in play, of unit
     quaternion, of a block's size, density, friction and colour."""
-    scene = jax.tree.map(jnp.asarray, layout.parked(("box", "box")))
+    scene = jax.tree.map(jnp.asarray, scene_state.parked(("box", "box")))
     scene = scene.replace(position=jnp.zeros((2, 3)), in_play=jnp.array([True, False]))
     assert simulation.healthy(scene)
     place = (slot, 2) if getattr(scene, field).ndim > 1 else slot
@@ -73,7 +74,7 @@ def test_meshes_are_as_large_as_the_blocks(scale: float):
     """Claim: corners and faces that MJX collides span the block's bounding box at any size."""
     config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=MESH_KINDS, min_blocks=1))
     world = model.build(config.scene, config.sim)
-    scene = layout.parked(config.scene.slots)
+    scene = scene_state.parked(config.scene.slots)
     scene = scene.replace(half_size=scene.half_size * np.float32(scale))
     scaled = mjx_physics.scene_model(mjx_physics.make(world, config.sim), scene)
     for slot, geom in enumerate(world.block_geoms):
@@ -94,7 +95,7 @@ def test_all_that_follows_from_blocks_is_the_scenes():
     slots = ("box", "arch", *MESH_KINDS)
     config = dataclasses.replace(CONFIG, scene=SceneConfig(slots=slots, min_blocks=1))
     world, rng = model.build(config.scene, config.sim), np.random.default_rng(0)
-    scene = layout.parked(slots)
+    scene = scene_state.parked(slots)
     scene = scene.replace(
         half_size=scene.half_size * rng.uniform(0.9, 1.1, (len(slots), 1)).astype(np.float32),
         density=rng.uniform(450.0, 900.0, len(slots)).astype(np.float32),

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from csac_jax.config import Config, SceneConfig, SimConfig
-from csac_jax.scene import layout, model
 from csac_jax.sim import mjx_physics, mjx_step
 from csac_jax.sim.quiet_mjx import mjx
+from csac_jax.world import model, scene_state
 
 pytestmark = pytest.mark.mjx
 
@@ -77,12 +77,12 @@ def world() -> model.World:
 
 
 @pytest.fixture(scope="module")
-def scene() -> layout.Scene:
-    return layout.parked(CONFIG.scene.slots)
+def scene() -> scene_state.SceneState:
+    return scene_state.parked(CONFIG.scene.slots)
 
 
 @pytest.fixture(scope="module")
-def ours(world: model.World, scene: layout.Scene) -> Ends:
+def ours(world: model.World, scene: scene_state.SceneState) -> Ends:
     physics = mjx_physics.make(world, CONFIG.sim)
 
     def one(qpos: jax.Array, ctrl: jax.Array) -> mjx.Data:
@@ -100,7 +100,7 @@ def ours(world: model.World, scene: layout.Scene) -> Ends:
 
 
 @pytest.fixture(scope="module")
-def theirs(world: model.World, scene: layout.Scene) -> Ends:
+def theirs(world: model.World, scene: scene_state.SceneState) -> Ends:
     exact = model.with_blocks(world, jax.device_get(model.scene_fields(world, scene)))
     rows, depths = [], []
     for case in CASES.values():

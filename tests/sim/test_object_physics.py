@@ -7,13 +7,16 @@ import jax
 import numpy as np
 import pytest
 
+from csac_jax.baselines import oracle
 from csac_jax.config import Config
 from csac_jax.env import Env
-from csac_jax.objects import families, library
-from csac_jax.scene import model, pool
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import backend, c_physics, oracle, physics, primitives
+from csac_jax.objects import library, shapes
+from csac_jax.robot import primitives
+from csac_jax.scenes import pool
+from csac_jax.sim import backend, c_physics, physics
 from csac_jax.sim.c_physics import CPhysics
+from csac_jax.world import model
+from csac_jax.world.scene_state import SceneState
 from tests.sim.conftest import TWO_OBJECTS, bar, grasped_bar, thrown_objects
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
@@ -78,7 +81,7 @@ def test_objects_need_a_library():
         dataclasses.replace(CONFIG.scene, slots=("box", "object"), min_blocks=2, arranged=0.5)
 
 
-def _grasp(env: Env, scene: Scene) -> tuple:
+def _grasp(env: Env, scene: SceneState) -> tuple:
     """The scene, its fields, and the joints of the planner's grasp; NumPy."""
     state = jax.jit(env.reset_to)(scene)
     height = state.obs.height
@@ -146,7 +149,7 @@ def test_more_iterations_change_nothing():
 
 def test_heavier_objects_are_another_physics(tmp_path: Path):
     """Claim: programs kept on disk tell libraries of the same shapes and other densities apart."""
-    light = families.draw(3, 2)
+    light = shapes.draw(3, 2)
     keys = []
     for name, density in (("light", 600.0), ("heavy", 1200.0)):
         made = [dataclasses.replace(one, density=density) for one in light]

@@ -15,9 +15,8 @@ from csac_jax import grippers
 from csac_jax.assets import assets
 from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.constants import Primitive
-from csac_jax.scene import robots
-from csac_jax.sim import kinematics, primitives
-from csac_jax.sim.primitives import Action
+from csac_jax.robot import kinematics, mjcf, primitives
+from csac_jax.robot.primitives import Action
 
 SIM, MAP = SimConfig(robot="ur5"), HeightmapConfig()
 RG2 = grippers.load("rg2")
@@ -34,7 +33,7 @@ def _model(with_block: bool = False) -> mujoco.MjModel:
     spec, part = (
         mujoco.MjSpec.from_file(str(assets() / f"{name}.xml")) for name in ("table", "blocks")
     )
-    robots.add(spec, SIM, RG2)
+    mjcf.add(spec, SIM, RG2)
     spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
     if with_block:
         body = spec.worldbody.add_body(name="block")

@@ -14,15 +14,18 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
+from csac_jax.baselines import oracle
 from csac_jax.config import Config, PhysicsKind, SlotKind
 from csac_jax.constants import Outcome
 from csac_jax.errors import SceneError
-from csac_jax.scene import layout, model, pool
-from csac_jax.scene.layout import Scene
-from csac_jax.sim import oracle, physics as simulation, primitives, warp_physics
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import JointTrajectory
+from csac_jax.scenes import pool
+from csac_jax.sim import physics as simulation, warp_physics
 from csac_jax.sim.outcome import Trace, grasp_outcome
-from csac_jax.sim.primitives import JointTrajectory
 from csac_jax.vision import observe
+from csac_jax.world import model, scene_state
+from csac_jax.world.scene_state import SceneState
 from tests.sim.conftest import (
     CASES,
     CONFIG,
@@ -53,10 +56,10 @@ def _config(slots: tuple[SlotKind, ...] = CONFIG.scene.slots) -> Config:
 class Ran(NamedTuple):
     """Inputs of primitives, and their results on Warp and in C; leaves [E, ...]."""
 
-    scene: Scene
+    scene: SceneState
     joints: JointTrajectory
-    warp: tuple[Scene, Trace]
-    c: tuple[Scene, Trace]
+    warp: tuple[SceneState, Trace]
+    c: tuple[SceneState, Trace]
 
 
 def test_missing_warp_is_one_line(monkeypatch: pytest.MonkeyPatch):
@@ -100,7 +103,7 @@ def ran(run_on_warp: Any) -> Ran:
     """The scripted cases of this folder, in a world of a mesh and of boxes."""
     cfg = _config()
     scenes, actions = map(stack, zip(*CASES.values(), strict=True))
-    scenes = jax.tree.map(np.asarray, jax.vmap(lambda scene: layout.park(scene, True))(scenes))
+    scenes = jax.tree.map(np.asarray, jax.vmap(lambda scene: scene_state.park(scene, True))(scenes))
     height = jax.jit(jax.vmap(lambda scene: observe.observe(cfg, scene).height))(scenes)
     plan = jax.vmap(functools.partial(primitives.plan, cfg.sim, cfg.heightmap))(height, actions)
     joints = jax.vmap(functools.partial(primitives.joint_trajectory, cfg.sim))(plan)
@@ -253,9 +256,9 @@ def _at(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def _spinning() -> Scene:
+def _spinning() -> SceneState:
     """Blocks that spin in the air, lighter than the model has them."""
-    scene = layout.parked(SLOTS)
+    scene = scene_state.parked(SLOTS)
     rng, position = np.random.default_rng(0), scene.position + np.float32([0.0, 0.0, 0.5])
     velocity = rng.normal(0.0, [1, 1, 1, 20, 20, 20], (len(SLOTS), 6)).astype(np.float32)
     density = rng.uniform(450.0, 900.0, len(SLOTS)).astype(np.float32)

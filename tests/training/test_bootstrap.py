@@ -9,7 +9,7 @@ from csac_jax import algorithms, presets
 from csac_jax.agent import losses, rewards
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import Info, State
-from csac_jax.sim.primitives import Action
+from csac_jax.robot.primitives import Action
 from csac_jax.training import programs, transitions
 from csac_jax.vision.heightmap import Observation
 from tests.agent import toys

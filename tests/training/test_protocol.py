@@ -8,8 +8,8 @@ from scipy import stats
 
 from csac_jax import presets
 from csac_jax.env import Env, State
-from csac_jax.scene import layout
-from csac_jax.scene.layout import Scene
+from csac_jax.world import scene_state
+from csac_jax.world.scene_state import SceneState
 
 BLOCKS = 10
 
@@ -18,11 +18,11 @@ BLOCKS = 10
 def env() -> Env:
     """The environment of `paper_small` without physics, whose pool is one scene of a grid."""
     cfg = presets.paper_small()
-    scene = jax.tree.map(jnp.asarray, layout.parked(cfg.scene.slots))
+    scene = jax.tree.map(jnp.asarray, scene_state.parked(cfg.scene.slots))
     along = 0.07 * (np.arange(BLOCKS) % 4 - 1.5), 0.07 * (np.arange(BLOCKS) // 4 - 1.0)
     position = np.stack([*along, np.full(BLOCKS, 0.03)], axis=1).astype(np.float32)
     scene = scene.replace(position=jnp.asarray(position), in_play=jnp.ones(BLOCKS, bool))
-    pool: Scene = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
+    pool: SceneState = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
     return Env(cfg, None, pool)
 
 
@@ -30,7 +30,7 @@ def _got(state: State) -> State:
     """The state after the target was lifted off the table."""
     rest = jnp.arange(BLOCKS) != state.scene.target
     over, won = jnp.ones((), bool), jnp.ones((), jnp.float32)
-    return state.replace(scene=layout.park(state.scene, rest), terminated=over, reward=won)
+    return state.replace(scene=scene_state.park(state.scene, rest), terminated=over, reward=won)
 
 
 def test_presets_of_the_paper_ask_for_targets():

@@ -23,8 +23,8 @@ from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env
 from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
+from csac_jax.robot.primitives import Action
 from csac_jax.sim import physics as simulation
-from csac_jax.sim.primitives import Action
 from csac_jax.training import programs, split_step, step, trace_cache, transitions
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics

@@ -10,11 +10,11 @@ from csac_jax.agent import rewards
 from csac_jax.config import Config
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, Info, State
-from csac_jax.scene import layout, model
+from csac_jax.robot.primitives import Action
 from csac_jax.sim import physics as simulation
-from csac_jax.sim.primitives import Action
 from csac_jax.training import programs, step, transitions
 from csac_jax.vision.heightmap import Observation
+from csac_jax.world import model, scene_state
 
 LEVELS = jnp.arange(len(Outcome), dtype=jnp.int32)
 TRUE, SENSED = (leaf.reshape(-1) for leaf in jnp.meshgrid(LEVELS, LEVELS))  # [25], every pair
@@ -70,7 +70,7 @@ def test_switches_combine(monkeypatch: pytest.MonkeyPatch):
         policy={"cells": "all"},
         reward={"source": "sensed"},
     )
-    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], layout.parked(cfg.scene.slots))
+    blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene_state.parked(cfg.scene.slots))
     physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
     program, sources = programs.make(cfg, Env(cfg, physics, blank)), {}
 

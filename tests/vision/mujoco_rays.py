@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac_jax.config import SceneConfig, SimConfig, SlotKind
-from csac_jax.scene import blocks, geoms, layout, model as models, solids
+from csac_jax.world import blocks, geoms, model as models, scene_state, solids
 
 SHAPES = tuple(blocks.SHAPES)
 SLOTS: tuple[SlotKind, ...] = tuple(blocks.SHAPES[name].kind for name in SHAPES)
@@ -31,7 +31,7 @@ class Rays(NamedTuple):
 
 def blocks_and_arm(rng: np.random.Generator) -> Placed:
     """The eight blocks in random poses under and about the UR5 with its hand, on the table."""
-    scene = layout.parked(SLOTS)
+    scene = scene_state.parked(SLOTS)
     half_size = np.array([blocks.SHAPES[name].half_size for name in SHAPES], np.float32)
     # C's search trees follow neither rescaled meshes nor turned inertias
     with pytest.MonkeyPatch.context() as patch:

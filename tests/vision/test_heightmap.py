@@ -11,9 +11,10 @@ from hypothesis import given, settings, strategies as st
 
 from csac_jax import geometry, presets
 from csac_jax.config import Config, HeightmapConfig
-from csac_jax.scene import blocks, model, pool
-from csac_jax.scene.layout import Scene
+from csac_jax.scenes import pool
 from csac_jax.vision import camera, heightmap, observe, raycast
+from csac_jax.world import blocks, model
+from csac_jax.world.scene_state import SceneState
 from tests.vision import mujoco_rays
 from tests.vision.mujoco_rays import Placed
 
@@ -49,7 +50,7 @@ def test_heights_agree_with_mujoco(reference):
     assert obs.target.dtype == jnp.bool_
 
 
-def _settled_pile(rng: np.random.Generator) -> tuple[Config, Scene, Placed]:
+def _settled_pile(rng: np.random.Generator) -> tuple[Config, SceneState, Placed]:
     """Ten settled blocks of all eight shapes, nominal sizes, for both; geom 0 of C is the table."""
     cfg = dataclasses.replace(presets.get("fast"), heightmap=HeightmapConfig(224))
     drops = dataclasses.replace(cfg.scene, size_jitter=(0.0, 0.0))

@@ -11,10 +11,10 @@ import pytest
 
 from csac_jax import geometry
 from csac_jax.config import CameraConfig, Config
-from csac_jax.scene import layout, model, stock
-from csac_jax.scene.layout import Scene
 from csac_jax.vision import camera, observe
 from csac_jax.vision.heightmap import VIEW_HEIGHT
+from csac_jax.world import model, object_slots, scene_state
+from csac_jax.world.scene_state import SceneState
 
 KINDS = ("object", "object", "box", "object", "arch")  # C's rays do not follow scaled meshes
 CONFIG = Config().change(
@@ -29,20 +29,20 @@ def world() -> model.World:
     return model.build(CONFIG.scene, CONFIG.sim)
 
 
-def scattered(rng: np.random.Generator) -> Scene:
+def scattered(rng: np.random.Generator) -> SceneState:
     """A scene with random objects and blocks in random poses over the square."""
     num = len(KINDS)
     quaternion = rng.normal(size=(num, 4))
-    scene = layout.parked(KINDS).replace(
+    scene = scene_state.parked(KINDS).replace(
         position=rng.uniform([-0.2, -0.2, 0.02], [0.2, 0.2, 0.15], (num, 3)).astype(np.float32),
         quaternion=np.float32(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)),
         in_play=np.ones(num, bool),
         colour=rng.permutation(num).astype(np.int32),
     )
-    return stock.drawn(rng, CONFIG.scene, scene)
+    return object_slots.drawn(rng, CONFIG.scene, scene)
 
 
-def in_c(world: model.World, scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def in_c(world: model.World, scene: SceneState) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The scene in C MuJoCo, the hand high above."""
     exact = model.with_blocks(world, jax.device_get(model.scene_fields(world, scene)))
     data = mujoco.MjData(exact)
@@ -99,7 +99,7 @@ def test_camera_at_the_side_agrees_with_mujoco(world: model.World):
     """Claim: the depths that a camera at the side sees of objects are C's; no window cuts one."""
 
     @jax.jit
-    def depths(scene: Scene) -> jax.Array:
+    def depths(scene: SceneState) -> jax.Array:
         shapes = observe.scene_shapes(CONFIG.scene, scene)
         return observe.cast_pixels(CONFIG, camera.make(CONFIG.camera), shapes).distance
 
@@ -114,7 +114,7 @@ def test_camera_at_the_side_agrees_with_mujoco(world: model.World):
 
 def test_windows_are_smaller_than_the_view():
     """Claim: rays meet an object in a window of the image only."""
-    radius = stock.table(CONFIG.scene).radius
+    radius = object_slots.table(CONFIG.scene).radius
     rows, columns = camera.window(CONFIG.camera, CONFIG.heightmap.extent, observe.HIGHEST, radius)
     assert rows * columns < 0.5 * CONFIG.camera.size[0] * CONFIG.camera.size[1]
     assert camera.window(CONFIG.camera, 0.448, 0.25, 10.0) == CONFIG.camera.size[::-1]

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from csac_jax.scene import geoms, solids
-from csac_jax.scene.solids import GeomGroup, Kind, Solids
 from csac_jax.vision import ray_shapes, raycast
+from csac_jax.world import geoms, solids
+from csac_jax.world.solids import GeomGroup, Kind, Solids
 from tests.vision import mujoco_rays
 
 _cast = jax.jit(jax.vmap(raycast.cast_solids, in_axes=(None, None, 0)))

@@ -12,11 +12,11 @@ from scipy.stats import kstest
 from csac_jax import presets
 from csac_jax.config import CameraConfig, Config, HeightmapConfig, SensorConfig
 from csac_jax.env import Env
-from csac_jax.scene import layout
-from csac_jax.scene.layout import Scene
+from csac_jax.robot.primitives import Action
 from csac_jax.sim import outcome
-from csac_jax.sim.primitives import Action
 from csac_jax.vision import camera, heightmap, observe, sensor
+from csac_jax.world import scene_state
+from csac_jax.world.scene_state import SceneState
 
 ERRORS = SensorConfig(depth_noise=(0.001, 0.0014), dropped=0.1, colour=0.05)
 JITTER = dataclasses.replace(ERRORS, pose_noise=(0.005, 0.01))
@@ -100,7 +100,7 @@ class Still:
 
     def run(self, scene, joints):
         seen = outcome.nothing_seen(len(joints.control), len(scene.colour))
-        return layout.park(scene, scene.in_play), outcome.trace_of(presets.smoke().sim, seen)
+        return scene_state.park(scene, scene.in_play), outcome.trace_of(presets.smoke().sim, seen)
 
 
 def _env(**changes) -> Env:
@@ -108,13 +108,13 @@ def _env(**changes) -> Env:
     return Env(dataclasses.replace(cfg, **changes), Still(), _scenes(cfg))
 
 
-def _look(env: Env, scene: Scene) -> heightmap.Observation:
+def _look(env: Env, scene: SceneState) -> heightmap.Observation:
     return jax.jit(lambda scene: observe.observe(env.cfg, scene))(scene)
 
 
-def _scenes(cfg: Config) -> Scene:
+def _scenes(cfg: Config) -> SceneState:
     """A pool of one scene: a cube and a prism."""
-    scene = layout.parked(cfg.scene.slots)
+    scene = scene_state.parked(cfg.scene.slots)
     position = np.array([[0.05, 0.0, 0.025], scene.position[1], [-0.08, 0.06, 0.0243]], np.float32)
     scene = scene.replace(position=position, in_play=np.array([True, False, True]))
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)

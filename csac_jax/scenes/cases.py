@@ -1,0 +1,193 @@
+"""Case files: arrangements written by hand, shipped in `scenes/cases/` or brought by the user.
+
+`case_file` describes the format. Sizes, densities and frictions are nominal.
+"""
+
+import itertools
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy.spatial import ConvexHull, HalfspaceIntersection
+from scipy.spatial.transform import Rotation
+
+from csac_jax.assets import assets
+from csac_jax.config import MESH_KINDS, HeightmapConfig, SlotKind
+from csac_jax.objects import tables
+from csac_jax.objects.library import LibraryError
+from csac_jax.world import blocks, object_slots, scene_state
+from csac_jax.world.scene_state import SceneState
+
+if TYPE_CHECKING:
+    from csac_jax.scenes.case_file import CaseFile, Entry
+
+MAX_OVERLAP = 0.002  # m, between two blocks or with the table
+_HIGHEST = 0.5  # m, that any part of a block may reach
+_ROUNDING = 1e-6  # m, of float32
+
+
+class Case(NamedTuple):
+    """An arrangement read from a file. Its N slots are the file's blocks in order, all in play."""
+
+    name: str
+    slots: tuple[SlotKind, ...]
+    scene: SceneState  # NumPy leaves, at rest
+    objects: str = ""  # library of its objects, as in SceneConfig
+
+
+def names() -> tuple[str, ...]:
+    """Lists the names of the shipped cases."""
+    return tuple(sorted(path.stem for path in (assets() / "cases").glob("*.json")))
+
+
+def shipped(name: str) -> Path:
+    """Returns the file of a shipped case. Raises ValueError with all names for an unknown one."""
+    if name not in names():
+        raise ValueError(f"unknown case '{name}'; choose one of: {', '.join(names())}")
+    return assets() / "cases" / f"{name}.json"
+
+
+def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
+    """Loads a case whose blocks lie inside the square of side `extent` m.
+
+    Raises ValueError, one line with the file, the block (the first is 1) and what to change.
+    """
+    from csac_jax.scenes import case_file
+
+    try:
+        case = _case(case_file.parse(path.read_text(encoding="utf-8")), path.parent)
+        _check_places(case, extent)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, LibraryError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    except RecursionError:
+        raise ValueError(f"{path}: is nested too deeply for a case file") from None
+    return case
+
+
+def require_target(case: Case) -> None:
+    """Raises ValueError unless one block of the case is marked as the one to get."""
+    if case.scene.target == scene_state.ANY:
+        raise ValueError(f"case '{case.name}' marks no target; give one block \"target\": true")
+
+
+def seat(case: Case, slots: tuple[SlotKind, ...]) -> SceneState:
+    """Moves a case to other slots: each block to the first free one of its kind."""
+    places = {kind: [i for i, other in enumerate(slots) if other == kind] for kind in case.slots}
+    seats = [places[kind].pop(0) for kind in case.slots]
+
+    def put(parked: np.ndarray, placed: np.ndarray) -> Any:
+        if parked.ndim == 0:
+            return placed if placed == scene_state.ANY else np.int32(seats[placed])  # the target
+        leaf = parked.copy()
+        leaf[seats] = placed
+        return leaf
+
+    return jax.tree.map(put, scene_state.parked(slots), case.scene)
+
+
+def _case(content: "CaseFile", folder: Path) -> Case:
+    """Builds the case of a file in this folder; `_check_places` must follow."""
+    entries = content.blocks
+    targets = [slot for slot, entry in enumerate(entries) if entry.target]
+    if len(targets) > 1:
+        first, second = targets[0] + 1, targets[1] + 1
+        raise ValueError(f"block {second}: block {first} is the target already; mark only one")
+    quaternions = [np.array(entry.quaternion) for entry in entries]
+    shapes = [blocks.SHAPES[entry.shape] if entry.shape else None for entry in entries]
+    slots: tuple[SlotKind, ...] = tuple(shape.kind if shape else "object" for shape in shapes)
+    half_size = [shape.half_size if shape else blocks.OBJECT_HALF for shape in shapes]
+    colour = [blocks.COLOUR_NAMES.index(entry.colour) for entry in entries]
+    scene = scene_state.parked(slots).replace(
+        position=np.array([entry.position for entry in entries], np.float32),
+        quaternion=np.array([q / np.linalg.norm(q) for q in quaternions], np.float32),
+        half_size=np.array(half_size, np.float32),
+        colour=np.array(colour, np.int32),
+        in_play=np.ones(len(slots), bool),
+        target=np.int32(targets[0] if targets else scene_state.ANY),
+    )
+    case = Case(content.name, slots, scene)
+    return _with_objects(case, entries, folder) if "object" in slots else case
+
+
+def _with_objects(case: Case, entries: list["Entry"], folder: Path) -> Case:
+    """Puts the objects that the entries name into a case."""
+    libraries = {entry.library for entry in entries if entry.library}
+    if len(libraries) > 1:
+        raise ValueError(f"objects of {len(libraries)} libraries; take all from one")
+    (name,) = libraries
+    source = name if name.startswith(("made:", "mixed:")) else str(folder / name)
+    library, slots = tables.find(source, "all"), np.flatnonzero(blocks.is_object(case.slots))
+    numbers = np.array([library.number(entries[slot].object or "") for slot in slots])
+    objects = tables.from_library(library)
+    scene = object_slots.hold(case.scene, slots, numbers, objects)
+    # The origin of an object is its centre of mass.
+    rotation = Rotation.from_quat(scene.quaternion[slots], scalar_first=True)
+    position = scene.position.copy()
+    position[slots] -= rotation.apply(objects.centre[numbers]).astype(np.float32)
+    return Case(case.name, case.slots, scene.replace(position=position), source)
+
+
+def _check_places(case: Case, extent: float) -> None:
+    """Raises ValueError for blocks that overlap, or one outside the square or in the table."""
+    placed: list[list[np.ndarray]] = []  # corners of the parts of the blocks so far
+    for number, parts in enumerate(_corners(case), 1):
+        fault = _outside(np.concatenate(parts), extent) or _overlapping(parts, placed)
+        if fault:
+            raise ValueError(f"block {number}: {fault}")
+        placed.append(parts)
+
+
+def _corners(case: Case) -> list[list[np.ndarray]]:
+    """Computes the corners [V, 3] m in the world of every part of every block."""
+    scene, cube = case.scene, np.array([*itertools.product((-1.0, 1.0), repeat=3)])
+    rotations = Rotation.from_quat(scene.quaternion, scalar_first=True)
+    corners: list[list[np.ndarray]] = [[] for _ in case.slots]
+    for slot, centre, half in zip(*blocks.parts(case.slots), strict=True):
+        if case.slots[slot] in MESH_KINDS:
+            normals, offsets = blocks.FACES[case.slots[slot]]
+            faces = np.column_stack([normals, -offsets])
+            local = HalfspaceIntersection(faces, np.zeros(3)).intersections
+        else:
+            local = scene.half_size[slot] * (centre + half * cube)
+        corners[slot].append(rotations[slot].apply(local) + scene.position[slot])
+    for slot in np.flatnonzero(blocks.is_object(case.slots)):
+        member = tables.find(case.objects, "all").objects[int(scene.numbers[slot])]
+        for part in member.parts:
+            corners[slot].append(rotations[slot].apply(part.vertices) + scene.position[slot])
+    return corners
+
+
+def _outside(corners: np.ndarray, extent: float) -> str | None:
+    """Describes how far corners [V, 3] m of a block lie outside of the allowed volume."""
+    beyond = np.abs(corners[:, :2]).max() - 0.5 * extent
+    below, top = -corners[:, 2].min(), corners[:, 2].max()
+    if beyond > _ROUNDING:
+        return f"reaches {1e3 * beyond:.1f} mm beyond the square of {extent:g} m; move it inwards"
+    if below > MAX_OVERLAP:
+        return f"reaches {1e3 * below:.1f} mm below the table; raise its z by as much"
+    if top > _HIGHEST:
+        return f"reaches {top:.3f} m above the table; keep it below {_HIGHEST:g} m"
+    return None
+
+
+def _overlapping(parts: list[np.ndarray], placed: list[list[np.ndarray]]) -> str | None:
+    """Describes the overlap of a block's parts with those of one placed before."""
+    for number, others in enumerate(placed, 1):
+        depth = max(overlap(*pair) for pair in itertools.product(parts, others))
+        if depth > MAX_OVERLAP:
+            by = f"{1e3 * depth:.1f} mm, more than the {1e3 * MAX_OVERLAP:g} mm allowed"
+            return f"overlaps block {number} by {by}; increase their distance"
+    return None
+
+
+def overlap(one: np.ndarray, two: np.ndarray) -> float:
+    """Computes the shortest shift, m, that separates convex bodies of corners [V, 3] m.
+
+    It is <= 0 for bodies apart. It is the depth of the origin in their Minkowski difference.
+    Contacts of C MuJoCo give the same, but none for two meshes in one place.
+    """
+    difference = (one[:, None] - two[None]).reshape(-1, 3)
+    return -float(ConvexHull(difference).equations[:, 3].max())

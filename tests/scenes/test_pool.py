@@ -1,0 +1,321 @@
+"""Settled scenes in C MuJoCo, and their cache."""
+
+import os
+import stat
+from pathlib import Path
+from typing import ClassVar
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy import stats
+
+from csac_jax import presets
+from csac_jax.config import Config, SceneConfig, SimConfig
+from csac_jax.errors import SceneError
+from csac_jax.scenes import arrange, pool
+from csac_jax.world import blocks, model, scene_state
+from csac_jax.world.scene_state import SceneState, parking
+from tests.world import placed
+
+SCENE = SceneConfig(slots=("box", "arch", "prism", "half_cylinder"), min_blocks=3)
+CONFIG = Config(scene=SCENE)
+EXTENT = CONFIG.heightmap.extent
+COUNT = 24  # of 3 blocks, and as many of 4
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> SceneState:
+    """Settles COUNT scenes of each number of blocks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
+        return pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT)
+
+
+@pytest.fixture
+def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Returns a cache of its own, with small rounds."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(pool, "_ROUND", 8)
+    return tmp_path
+
+
+@pytest.fixture
+def small(cache: Path) -> Config:
+    """Returns one block, so that settling takes no time."""
+    return Config(scene=SceneConfig(slots=("box",), min_blocks=1))
+
+
+def _assert_same(one: SceneState, two: SceneState) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+    dtypes = [[leaf.dtype for leaf in jax.tree.leaves(each)] for each in (one, two)]
+    assert dtypes[0] == dtypes[1]
+
+
+def _assert_at_rest(world: model.World, scenes: SceneState) -> int:
+    """Fails where blocks overlap or move; returns the number of contacts between blocks."""
+    touching = 0
+    for index in range(len(scenes.position)):
+        exact, data = placed.in_c(world, jax.tree.map(lambda leaf, i=index: leaf[i], scenes))
+        assert data.contact.dist.min() > -0.002, f"scene {index}"
+        touching += np.sum(np.isin(data.contact.geom, world.block_geoms).all(axis=1))
+        mujoco.mj_step(exact, data, nstep=round(0.5 / exact.opt.timestep))
+        moved = np.linalg.norm(data.qpos[world.block_qpos[:, :3]] - scenes.position[index], axis=1)
+        assert moved.max() < 0.5 * scene_state.STILL, f"scene {index}: {moved}"
+    return touching
+
+
+def _spy(monkeypatch: pytest.MonkeyPatch, module, name: str, note) -> None:
+    """Calls `note` with the name and the arguments before a function."""
+    original = getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *args: [note(name, *args), original(*args)][1])
+
+
+def test_few_scenes_fall_that_are_not_needed(small: Config, monkeypatch: pytest.MonkeyPatch):
+    """Claim: of a round as many scenes fall as are asked for, and at least one on each core; the
+    scenes are the first of those of a larger pool."""
+    fallen: list[str] = []
+    many = pool.settled(small, pool.TRAIN_STREAM, 6)
+    _spy(monkeypatch, pool, "rest", lambda name, *_: fallen.append(name))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    few = pool.settled(small, pool.TRAIN_STREAM, 3)
+    assert len(fallen) == 3
+    _assert_same(few, jax.tree.map(lambda leaf: leaf[:3], many))
+    assert len(pool.settled(small, pool.TRAIN_STREAM, 1).position) == 1
+    assert len(fallen) == 3 + 2
+
+
+def test_settled_blocks_are_at_rest(scenes: SceneState):
+    """Claim: half a second later no block of a settled scene is farther than its speed allows; none
+    overlaps another or the table by 2 mm."""
+    touching = _assert_at_rest(model.build(SCENE, SimConfig()), scenes)
+    assert touching > 0  # some lie on others, else there was nothing to see
+
+
+def test_settled_blocks_lie_within_the_radius(scenes: SceneState):
+    """Claim: blocks in play lie within extent / 2 of the centre, above the table; the others are
+    parked."""
+    play = scenes.in_play
+    assert np.hypot(*scenes.position[play][:, :2].T).max() <= 0.5 * EXTENT
+    assert scenes.position[play][:, 2].min() > 0.0
+    np.testing.assert_array_equal(play.sum(axis=1), np.repeat([3, 4], COUNT))
+    places = np.broadcast_to(parking(4), scenes.position.shape)
+    np.testing.assert_array_equal(scenes.position[~play], places[~play])
+
+
+def test_no_block_lies_on_the_hand(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: blocks of ten, dropped from up to 1.3 m, all come down to the table: none rests on the
+    waiting hand."""
+    monkeypatch.setattr(pool, "_ROUND", 24)
+    cfg = SceneConfig(slots=("box",) * 10, min_blocks=10)
+    settled = pool.settled(Config(scene=cfg), pool.TRAIN_STREAM, 20)
+    assert settled.position[:, :, 2].max() < 0.3
+
+
+def test_blocks_differ_within_their_ranges(scenes: SceneState):
+    """Claim: a box slot draws each of its shapes, and sizes, densities and frictions spread over
+    their ranges."""
+    scale = scenes.half_size[:, 0, None] / blocks.half_size_choices("box")  # [P, 4, 3]
+    shape = np.argmin(np.ptp(scale, axis=2), axis=1)  # the one that all three axes agree on
+    assert set(shape) == {0, 1, 2, 3}
+    nominal = [blocks.half_size_choices(kind)[0][2] for kind in SCENE.slots[1:]]
+    for drawn, (low, high) in (
+        (scenes.half_size[:, 1:, 2] / nominal, (0.9, 1.1)),
+        (scenes.density, SCENE.density),
+        (scenes.friction, SCENE.friction),
+    ):
+        assert low <= drawn.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < drawn.max() <= high
+
+
+@pytest.mark.slow
+def test_same_arguments_same_scenes(scenes: SceneState, monkeypatch, tmp_path: Path):
+    """Claim: the same arguments give the same scenes, bit for bit, settled anew or read from the
+    cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    _assert_same(scenes, pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT))
+    monkeypatch.setattr(pool, "_settle", None)  # must not be called
+    _assert_same(scenes, pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT))
+
+
+def test_scenes_are_made_on_the_cpu(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: what is stored was computed on the CPU, also where JAX's own device is a GPU: dropped
+    scenes and arranged ones."""
+    devices = {}
+
+    def note(name: str, *_) -> None:
+        devices[name] = jax.config.jax_default_device
+
+    for module, name in ((model, "scene_fields"), (arrange, "arrangements")):
+        _spy(monkeypatch, module, name, note)
+    pool.scenes(Config(scene=SceneConfig(slots=("box",) * 3, min_blocks=3, arranged=0.5)), 5, 4)
+    assert devices == dict.fromkeys(["scene_fields", "arrangements"], jax.devices("cpu")[0])
+
+
+def test_streams_share_no_scene(small: Config):
+    """Claim: training and evaluation draw from pools that have no scene in common, nor has one pool
+    a scene twice."""
+    both = [pool.settled(small, stream, 16).position for stream in (pool.TRAIN_STREAM, 1)]
+    assert len({scene.tobytes() for scenes in both for scene in scenes}) == 32
+
+
+def test_arrangements_are_kept(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: packed scenes, too, are made once; another stream, number or code has its own."""
+    cfg = presets.get("fast").change(scene={"arranged": 1.0, "pool": 6})
+    made = pool.scenes(cfg, 0)
+    monkeypatch.setattr(pool.arrange, "arrangements", None)  # whatever calls it fails
+    _assert_same(made, pool.scenes(cfg, 0))
+    for stream, count in ((1, 6), (0, 5)):
+        with pytest.raises(TypeError):
+            pool.scenes(cfg, stream, count)
+    changed = cache / "families.py"
+    changed.write_text("")
+    monkeypatch.setattr(pool.families, "__file__", str(changed))
+    with pytest.raises(TypeError):
+        pool.scenes(cfg, 0)
+
+
+@pytest.mark.parametrize("damage", ["cut", "emptied", "flipped"])
+def test_damaged_pool_is_settled_anew(small: Config, cache: Path, monkeypatch, damage: str):
+    """Claim: a file of the cache, or of the package, that was cut short or changed in any byte is
+    noticed, and its scenes are settled anew; a whole one is used."""
+    good = pool.settled(small, 0, 4)
+    (path,) = cache.rglob("*.npz")
+    raw = path.read_bytes()
+    damaged = [raw[: len(raw) // 2] if damage == "cut" else b""]
+    if damage == "flipped":
+        flips = [bytes(place) + b"\xff" + bytes(len(raw) - place - 1) for place in range(len(raw))]
+        damaged = [bytes(a ^ b for a, b in zip(raw, flip, strict=True)) for flip in flips[::29]]
+    for content in damaged:
+        path.write_bytes(content)
+        if (read := pool._read(path)) is not None:  # a byte that carries nothing
+            _assert_same(good, read)
+    path.write_bytes(damaged[len(damaged) // 2])
+    _assert_same(good, pool.settled(small, 0, 4))
+    assert pool._read(path) is not None
+    monkeypatch.setattr(pool, "shipped", lambda: path.parent)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache / "other"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "_settle", None)  # must not be called
+        _assert_same(good, pool.settled(small, 0, 4))
+    path.write_bytes(raw[:-100])
+    _assert_same(good, pool.settled(small, 0, 4))
+
+
+def test_cache_folder_is_private(small: Config, cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the cache folder is its owner's alone; where it cannot be written, scenes are settled
+    all the same."""
+    pool.settled(small, 0, 4)
+    (path,) = cache.rglob("*.npz")
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    assert list(path.parent.iterdir()) == [path]  # nothing half-written stays
+    (cache / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache / "file"))
+    assert pool.settled(small, 0, 4).position.shape == (4, 1, 3)
+
+
+def test_settling_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch, small: Config, caplog):
+    """Claim: it counts the scenes of all numbers of blocks, each once, and none of a kept pool."""
+    monkeypatch.setattr(pool, "_LOGGED_EVERY", 0.0)
+    two = small.change(scene={"slots": ("box", "box")})
+    with caplog.at_level("INFO", "csac_jax"):
+        pool.settled(two, 0, 3)
+        pool.settled(two, 0, 3)
+    counts = [line.rpartition(": ")[2] for line in caplog.messages]
+    assert counts == [f"{number} of 6" for number in range(1, 7)]
+
+
+def test_hopeless_configuration_is_one_line(small: Config):
+    """Claim: a configuration whose blocks never come to rest ends with one line that names what to
+    change."""
+
+    class HighDrop(SceneConfig):
+        """Blocks land after 0.45 s."""
+
+        drop_height: ClassVar[float] = 1.0
+
+    falling = HighDrop(slots=("box",), min_blocks=1, settle_time=0.5)
+    with pytest.raises(SceneError, match=r"scene\.settle_time") as error:
+        pool.settled(Config(scene=falling), 0, 4)
+    assert "\n" not in str(error.value)
+
+
+def test_blocks_are_dropped_close_together_or_far_apart():
+    """Claim: each scene has a square of its own in which its blocks are dropped, its side uniform
+    in the range."""
+    cfg = SceneConfig(slots=("box",) * 8, min_blocks=8, drop_extent=(0.1, 0.4))
+    rng = np.random.default_rng(0)
+    reach = np.array([np.abs(pool._drop(cfg, rng, 8).position[:, :2]).max() for _ in range(400)])
+    # The largest of 16 uniform numbers in 0 .. half is 16/17 of half in the mean.
+    assert stats.kstest(reach * 17 / 16, stats.uniform(0.05, 0.15).cdf).statistic < 0.12
+    assert reach.max() <= 0.2
+
+
+PILE = SceneConfig(
+    slots=("box", "arch", "prism") * 4, min_blocks=12, drop_extent=(0.1, 0.1), settle_time=1.0
+)
+
+
+@pytest.mark.slow
+def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: poured blocks are all in play, inside the workspace, at rest, higher than one layer;
+    scenes differ, and the same stream gives the same ones."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    scenes = pool.settled(Config(scene=PILE), 1, 3, poured=True)
+    assert scenes.in_play.shape == (3, 12)
+    assert scenes.in_play.all()
+    assert (np.linalg.norm(scenes.position[..., :2], axis=-1) <= 0.5 * EXTENT).all()
+    assert (scenes.position[..., 2].max(axis=1) > 0.06).all()
+    assert len({scene.tobytes() for scene in scenes.position}) == 3
+    _assert_at_rest(model.build(PILE, SimConfig()), scenes)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+    again = pool.settled(Config(scene=PILE), 1, 3, poured=True)
+    np.testing.assert_array_equal(again.position, scenes.position)
+
+
+def test_many_blocks_come_to_rest(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: scenes of 24 blocks are found within a few rounds, for they are poured; those of 12
+    drop at once, as fewer always did."""
+    falls: list[tuple] = []
+    for way in ("rest", "pour"):
+        _spy(monkeypatch, pool, way, lambda way, *args: falls.append((way, args[3].in_play.sum())))
+    slots = ("box",) * 24
+    scenes = pool.settled(Config(scene=SceneConfig(slots=slots, min_blocks=24)), 0, 2)
+    assert scenes.in_play.shape == (2, 24)
+    assert scenes.in_play.all()
+    assert set(falls) == {("pour", 24)}
+    assert len(falls) <= 6
+    falls.clear()
+    pool.settled(Config(scene=SceneConfig(slots=slots[:12], min_blocks=12)), 0, 1)
+    assert set(falls) == {("rest", 12)}
+
+
+def test_poured_blocks_that_leave_are_dropped_anew():
+    """Claim: where a block of nearly every scene falls outside the workspace, pouring still gives
+    the scene."""
+    cfg = SceneConfig(slots=("box",) * 4, min_blocks=4, drop_extent=(0.448, 0.448), settle_time=1.0)
+    world, rng = model.build(cfg, SimConfig()), np.random.default_rng(0)
+    for _ in range(6):
+        scene = pool._drop(cfg, rng, 4)
+        fields = jax.device_get(model.scene_fields(world, scene))
+        poured = pool.pour(world, cfg, EXTENT, scene, fields)
+        assert poured is not None
+        assert (np.linalg.norm(poured.position[:, :2], axis=1) <= 0.5 * EXTENT).all()
+
+
+def test_shipped_scenes_are_what_settling_gives(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the scenes that `quick` trains in come with the package, and settling gives the same;
+    of another processor, whose last bits differ, nearly all are alike to 2 mm. Where this fails,
+    run `python -m experiments.pools`."""
+    monkeypatch.setattr(pool, "_ROUND", 24)
+    cfg = presets.quick()
+    settled = pool.settled(cfg, pool.TRAIN_STREAM, 20)  # the first of those 1,024
+    monkeypatch.setattr(pool, "_settle", None)  # must not be called
+    shipped = pool.scenes(cfg, pool.TRAIN_STREAM)
+    assert len(shipped.position) == cfg.scene.pool
+    fits = np.abs(settled.position - shipped.position[:20]).max(axis=(1, 2)) < 0.002
+    assert fits.mean() > 0.8
+    for name in ("half_size", "density", "friction", "colour"):
+        ours, theirs = (getattr(each, name)[:20][fits] for each in (settled, shipped))
+        np.testing.assert_array_equal(ours, theirs)

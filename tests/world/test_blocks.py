@@ -1,0 +1,78 @@
+"""The faces of blocks against convex hulls of their corners."""
+
+import xml.etree.ElementTree
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig
+from csac_jax.world import blocks, model
+
+CONVEX = [name for name in blocks.SHAPES if name != "arch"]
+
+
+def _half(shape: str) -> np.ndarray:
+    return np.float32(blocks.SHAPES[shape].half_size)
+
+
+def _corners(kind: str, half: np.ndarray) -> np.ndarray:
+    """Returns corners [V, 3] m: of a box by its size, else those in scenes/blocks.xml."""
+    if kind == "box":
+        return half * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
+    root = xml.etree.ElementTree.parse(model.assets() / "blocks.xml").getroot()
+    vertex = root.find(f"asset/mesh[@name='{kind}']").get("vertex")
+    return np.array(vertex.split(), float).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.9])
+@pytest.mark.parametrize("shape", CONVEX)
+def test_half_spaces_are_those_of_the_hull(shape: str, scale: float):
+    """Claim: a point lies inside a block where n . p <= offset for all its faces, whatever its
+    size."""
+    kind, half = blocks.SHAPES[shape].kind, np.float32(scale) * _half(shape)
+    normals, offsets = map(np.asarray, blocks.half_spaces((kind,), jnp.asarray(half[None])))
+    points = np.random.default_rng(0).uniform(-0.08, 0.08, (4000, 3))
+    hull = ConvexHull(_corners(kind, half) * (1.0 if kind == "box" else scale)).equations
+    depth = (points @ normals[0].T - offsets[0]).max(axis=1)  # of the farthest face: < 0 inside
+    np.testing.assert_allclose(depth, (points @ hull[:, :3].T + hull[:, 3]).max(axis=1), atol=2e-6)
+    present = offsets[0] < blocks.PADDING_OFFSET
+    np.testing.assert_allclose(np.linalg.norm(normals[0], axis=1), present, atol=1e-6)
+
+
+def test_arch_is_a_block_with_a_tunnel():
+    """Claim: the arch is its bounding box less a tunnel along y, 50 mm wide and 25 mm high, open at
+    -z."""
+    half = _half("arch")
+    normals, offsets = map(np.asarray, blocks.half_spaces(("arch",), jnp.asarray(half[None])))
+    points = np.random.default_rng(0).uniform(-0.06, 0.06, (4000, 3))
+    inside = np.any((np.einsum("gfi,pi->pgf", normals, points) <= offsets).all(axis=2), axis=1)
+    tunnel = (np.abs(points[:, 0]) < 0.025) & (points[:, 2] < 0.0)
+    np.testing.assert_array_equal(inside, (np.abs(points) <= half).all(axis=1) & ~tunnel)
+
+
+@pytest.mark.parametrize("shape", CONVEX)
+def test_half_sizes_are_those_of_the_bounding_box(shape: str):
+    """Claim: the origin of a block is the centre of its bounding box, whose half sizes are in the
+    table."""
+    half = _half(shape)
+    corners = _corners(blocks.SHAPES[shape].kind, half)
+    np.testing.assert_allclose(corners.max(axis=0), half, atol=1e-6)
+    np.testing.assert_allclose(corners.min(axis=0), -half, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", MESH_KINDS)
+def test_compiler_keeps_the_origin_of_a_mesh(kind: str):
+    """Claim: a mesh block's pose in physics is that of its bounding box, although MuJoCo moves
+    meshes to their mass."""
+    compiled = model.build(SceneConfig(slots=(kind,), min_blocks=1), SimConfig()).model
+    geom, mesh = compiled.body("block0").geomadr[0], compiled.mesh(f"blocks/{kind}").id
+    start = compiled.mesh_vertadr[mesh]
+    vertices = compiled.mesh_vert[start : start + compiled.mesh_vertnum[mesh]]
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, compiled.geom_quat[geom])
+    in_body = (vertices @ rotation.reshape(3, 3).T + compiled.geom_pos[geom]) / model.LARGEST
+    sets = (sorted(map(tuple, points.round(6) + 0.0)) for points in (_corners(kind, None), in_body))
+    np.testing.assert_allclose(*sets, atol=2e-6)

@@ -1,0 +1,163 @@
+"""The model against MuJoCo's own compiler."""
+
+import re
+import shutil
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from csac_jax import grippers
+from csac_jax.config import RobotKind, SceneConfig, SimConfig
+from csac_jax.errors import SceneError
+from csac_jax.robot import mjcf
+from csac_jax.world import blocks, model, scene_state
+from csac_jax.world.scene_state import SceneState
+from tests.world import placed
+
+SLOTS = ("box", "box", "arch", "prism", "half_cylinder", "cylinder")
+CONFIG = SceneConfig(slots=SLOTS, min_blocks=1)
+BOXES = [name for name, shape in blocks.SHAPES.items() if shape.kind == "box"]
+
+
+@pytest.fixture(scope="module")
+def world() -> model.World:
+    return model.build(CONFIG, SimConfig())
+
+
+def _scene(box: str = "plank", scale: float = 0.9) -> SceneState:
+    """Creates one of each kind, not of nominal size, density or friction."""
+    scene = scene_state.parked(SLOTS)
+    half = scene.half_size.copy()
+    half[:2] = blocks.SHAPES[box].half_size, blocks.SHAPES["tile"].half_size
+    return scene.replace(
+        half_size=half * np.float32(scale),
+        density=np.full_like(scene.density, 800.0),
+        friction=np.linspace(0.5, 1.0, len(SLOTS), dtype=np.float32),
+    )
+
+
+def _compiled(monkeypatch: pytest.MonkeyPatch, scene: SceneState, scale: float) -> mujoco.MjModel:
+    """Compiles the same scene, sizes, densities and frictions written into the spec."""
+    with monkeypatch.context() as patch:
+        patch.setattr(model, "LARGEST", scale)
+        spec = model._spec(CONFIG, SimConfig(), grippers.load("rg2"))
+    for slot in range(len(SLOTS)):
+        for geom in spec.body(f"block{slot}").geoms:
+            geom.density = scene.density[slot]
+            geom.friction[0] = scene.friction[slot]
+            if slot < 2:
+                geom.size = scene.half_size[slot]
+    return spec.compile()
+
+
+def _fields(world: model.World, scene: SceneState) -> model.BlockFields:
+    return jax.device_get(model.scene_fields(world, scene))
+
+
+@pytest.mark.parametrize("box", BOXES)
+def test_block_fields_are_those_of_the_compiler(
+    world: model.World, monkeypatch: pytest.MonkeyPatch, box: str
+):
+    """Claim: scene_fields gives what MuJoCo's compiler derives, for every shape of the set, larger
+    or smaller."""
+    scale = 1.07
+    scene = _scene(box, scale=scale)
+    ours, theirs = _fields(world, scene), _compiled(monkeypatch, scene, scale)
+    bodies, geoms = world.block_bodies, world.block_geoms
+    is_box = theirs.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_BOX
+    pairs = (
+        (ours.size[is_box], theirs.geom_size[geoms[is_box]], 0.0),
+        (ours.rbound, theirs.geom_rbound[geoms], 0.0),
+        (ours.centre, theirs.geom_pos[geoms], 1e-8),
+        (ours.friction, theirs.geom_friction[geoms, 0], 0.0),
+        (ours.mass, theirs.body_mass[bodies], 0.0),
+        (ours.com, theirs.body_ipos[bodies], 1e-8),
+        (np.sort(ours.inertia), np.sort(theirs.body_inertia[bodies]), 0.0),
+        (ours.body_invweight, theirs.body_invweight0[bodies], 0.0),
+        (ours.dof_invweight, theirs.dof_invweight0[world.block_dofs], 0.0),
+    )
+    for mine, reference, atol in pairs:
+        np.testing.assert_allclose(mine, reference, rtol=1e-5, atol=atol)  # float32
+
+
+def test_model_with_blocks_moves_as_a_compiled_one(
+    world: model.World, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: a world given block sizes afterwards moves as one that was compiled with them."""
+    scene = _scene(scale=0.9)
+    ends = []
+    written = model.with_blocks(world, _fields(world, scene))
+    for moved in (written, _compiled(monkeypatch, scene, 0.9)):
+        data = mujoco.MjData(moved)
+        data.qpos[world.block_qpos] = [0.0, 0.0, 0.06, np.cos(0.2), 0.0, np.sin(0.2), 0.0]
+        data.qpos[world.block_qpos[:, 0]] = 0.15 * np.arange(len(SLOTS)) - 0.4
+        data.qvel[world.block_dofs] = [0.3, 0.1, 0.0, 0.5, 1.0, -0.5]
+        mujoco.mj_step(moved, data, nstep=60)  # 0.24 s: fall, tumble, first contacts
+        ends.append(np.concatenate([data.qpos, data.subtree_com[world.block_bodies].ravel()]))
+    np.testing.assert_allclose(*ends, atol=1e-4)
+
+
+def test_with_blocks_writes_into_a_copy(world: model.World):
+    """Claim: with_blocks leaves the world as it is; into a copy of other blocks it writes byte for
+    byte what a new copy has."""
+    before = placed.model_bytes(world.model)
+    earlier = model.with_blocks(world, _fields(world, _scene(scale=0.8)))
+    new = model.with_blocks(world, _fields(world, _scene(scale=0.9)))
+    assert placed.model_bytes(earlier) != placed.model_bytes(new)
+    into = earlier, mujoco.MjData(world.model)
+    assert model.with_blocks(world, _fields(world, _scene(scale=0.9)), into) is earlier
+    assert placed.model_bytes(earlier) == placed.model_bytes(new)
+    assert placed.model_bytes(world.model) == before
+
+
+def test_addresses_name_what_they_say(world: model.World):
+    """Claim: the addresses of a world lead to its blocks, hand joints and pads, in order."""
+    for slot in range(len(SLOTS)):
+        assert world.model.body(world.block_bodies[slot]).name == f"block{slot}"
+        joint = world.model.body(world.block_bodies[slot]).jntadr[0]
+        assert world.block_qpos[slot, 0] == world.model.jnt_qposadr[joint]
+        assert world.block_dofs[slot, 0] == world.model.jnt_dofadr[joint]
+    np.testing.assert_array_equal(
+        world.model.geom_bodyid[world.block_geoms], world.block_bodies[world.parts.slot]
+    )
+    np.testing.assert_array_equal(world.slot_of_geom[world.block_geoms], world.parts.slot)
+    assert np.all(np.delete(world.slot_of_geom, world.block_geoms) == -1)
+    names = ("x", "y", "z", "yaw", "finger_low", "finger_high")
+    for name, qpos in zip(names, world.robot_qpos, strict=True):
+        assert world.model.joint(f"hand/{name}").qposadr[0] == qpos
+    assert world.finger_qpos == world.robot_qpos[4]
+    hand = [world.model.geom(i).name for i in world.hand_geoms]
+    assert hand == ["hand/palm", "hand/pad_low", "hand/pad_high"]
+
+
+@pytest.mark.parametrize(
+    ("robot", "file", "old", "new", "says"),
+    [
+        ("ur5", "ur5.xml", '<joint name="elbow"', '<joint name="e"', "joint 'elbow' is missing"),
+        ("ur5", "ur5.xml", '<site name="flange"', '<site name="f"', "site 'flange' is missing"),
+        ("ur5", "ur5.xml", 'name="elbow" class="shoulder" joint', 'name="e" joint', "must be"),
+        ("hand", "blocks.xml", '<mesh name="prism"', '<mesh name="p"', "mesh 'prism' is missing"),
+        ("hand", "blocks.xml", 'class="block"', 'class="b"', "default class 'block' is missing"),
+        ("hand", "table.xml", "<worldbody>", '<worldbody><body name="block0"/>', "repeated name"),
+        ("hand", "table.xml", "<mujoco", "<mujocoo", "XML parse error"),
+    ],
+)
+def test_names_of_other_mjcf_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robot: RobotKind, file, old, new, says
+):
+    """Claim: MJCF files that lack a name, or do not compile, give one line with the file and the
+    fault."""
+    folder = Path(shutil.copytree(model.assets(), tmp_path / "scenes"))
+    text = (folder / file).read_text()
+    assert old in text
+    (folder / file).write_text(text.replace(old, new))
+    for module in (model, mjcf):
+        monkeypatch.setattr(module, "assets", lambda: folder)
+    for physics in ("c", "mjx"):
+        with pytest.raises(SceneError, match=re.escape(says)) as error:
+            model.build(CONFIG, SimConfig(robot=robot, physics=physics))
+        assert str(error.value).startswith(str(folder))
+        assert "\n" not in str(error.value)
