@@ -49,6 +49,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from csac_jax import _guard
+from csac_jax._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from csac_jax import algorithms, deploy, presets
@@ -62,8 +63,6 @@ if TYPE_CHECKING:
     from csac_jax.robot.primitives import Action
     from csac_jax.training.callbacks import Callback, Record
     from csac_jax.vision.heightmap import Observation, unpack
-
-__version__ = "0.2.0"
 
 _HOMES = {
     "csac_jax": ("algorithms", "deploy", "presets"),

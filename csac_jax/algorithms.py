@@ -16,7 +16,7 @@ Algorithm = Callable[[Config], Config]
 VPG_REWARD = RewardConfig(
     success_bonus=0.0,
     grasp_levels=(0.0, 0.0, 0.0, 0.0, 1.0),
-    push_effect="change",
+    push_label="map_changed",
     push_levels=(0.0, 1.0),
 )
 """Rewards of VPG (arXiv:1803.09956 sec. IV): 1 for a grasp that lifts, 0.5 = Gamma for a push that

@@ -34,12 +34,14 @@ class SceneConfig(Section, section="scene"):
     slot any object of the library."""
     objects: str = ""
     """Library that slots of kind object draw from: a folder; or shapes of this package,
-    made:SEED:COUNT; or mixed:SEED:COUNT with random assemblies among them."""
+    procedural:SEED:COUNT; or procedural+assemblies:SEED:COUNT with random assemblies among them."""
     split: Literal["train", "held_out", "all"] = "train"
     """Objects of the library to draw: those for training, those kept for evaluation, or all."""
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = number(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
-    arranged: float = number(0.0, 0.0, 1.0)  # Share of packed scenes; the others are dropped.
+    packed_fraction: float = number(
+        0.0, 0.0, 1.0
+    )  # Share of packed scenes; the others are dropped.
     size_jitter: Pair = number((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of block sizes between scenes: boxes and arches, and the other kinds.
     The latter are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
@@ -57,8 +59,8 @@ class SceneConfig(Section, section="scene"):
             require(low <= high, f"scene.{name}: low <= high is needed")
         if self.has_objects:
             require(self.objects != "", "scene.objects: slots of kind object need a library")
-            alike = set(self.slots) == {"object"} or self.arranged == 0.0
-            require(alike, "scene.arranged: must be 0 where slots hold objects and blocks")
+            alike = set(self.slots) == {"object"} or self.packed_fraction == 0.0
+            require(alike, "scene.packed_fraction: must be 0 where slots hold objects and blocks")
 
     @property
     def has_objects(self) -> bool:
@@ -203,7 +205,7 @@ class _AnyNet(Section, section="net"):
 
     rotations: int = number(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
     colour: bool = True  # See colours, not heights alone.
-    margin: float = number(0.125, 0.0, 0.5)
+    pad_fraction: float = number(0.125, 0.0, 0.5)
     """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
     head: int = number(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
 
@@ -217,16 +219,18 @@ class SmallNet(_AnyNet):
     dilations: tuple[int, ...] = number((1, 2, 4, 1), 1, 64)  # Dilation of each dense layer, 3 x 3.
     stem: int = number(16, 4)  # Channels of the first convolution.
     stride: Literal[2, 4] = 2  # Input cells per feature cell, each axis; 4: a quarter of the work.
-    subcells: Literal[1, 2, 4] = 1  # Map cells per feature cell, along each axis; at most `stride`.
+    subpixel: Literal[1, 2, 4] = 1  # Map cells per feature cell, along each axis; at most `stride`.
 
     def check(self) -> None:
         require(len(self.dilations) >= 1, "net.dilations: at least one layer")
-        require(self.subcells <= self.stride, f"net.subcells: at most net.stride, {self.stride}")
+        require(self.subpixel <= self.stride, f"net.subpixel: at most net.stride, {self.stride}")
 
     def check_canvas(self, size: int) -> None:
         """Raises SettingsError if the strides do not divide the rotated maps of `size` cells."""
-        side = canvas_size(size, self.margin)
-        require(side % 4 == 0, f"net.margin: rotated maps of {side} cells are not a multiple of 4")
+        side = canvas_size(size, self.pad_fraction)
+        require(
+            side % 4 == 0, f"net.pad_fraction: rotated maps of {side} cells are not a multiple of 4"
+        )
 
 
 class DenseNet121(_AnyNet):
@@ -241,29 +245,31 @@ class DenseNet121(_AnyNet):
     kind: Literal["densenet121"] = "densenet121"  # The paper's network; `small` is ours.
     norm: Literal["group", "batch"] = "group"
     """`batch`, as in the paper, or `group`, which is the same while acting and while learning."""
-    zoom: int = number(1, 1)  # Pixels of the input per cell of the map, along each axis (VPG 2).
+    upsample: int = number(
+        1, 1
+    )  # Pixels of the input per cell of the map, along each axis (VPG 2).
 
     def check(self) -> None:
         largest = self.STRIDE // self.output_stride
-        require(largest % self.zoom == 0, f"net.zoom: must divide {largest}")
+        require(largest % self.upsample == 0, f"net.upsample: must divide {largest}")
 
     def check_canvas(self, size: int) -> None:
         """Raises SettingsError if the strides do not divide the rotated maps of `size` cells."""
-        side, step = canvas_size(size, self.margin), self.STRIDE // self.zoom
+        side, step = canvas_size(size, self.pad_fraction), self.STRIDE // self.upsample
         first = -(-size // step) * step
         sides = [s for s in (first, first + step, first + 2 * step) if s <= 1.5 * size]
         fitting = ", ".join(f"{s / size - 1:.4f} ({s} cells)" for s in sides)
         remedy = f"try {fitting}" if fitting else f"take another heightmap.size than {size}"
         needs = f"DenseNet-121 needs maps of a multiple of {step} cells, not {side}"
-        require(side % step == 0, f"net.margin: {needs}; {remedy}")
+        require(side % step == 0, f"net.pad_fraction: {needs}; {remedy}")
 
 
 NetConfig = SmallNet | DenseNet121
 
 
-def canvas_size(size: int, margin: float) -> int:
+def canvas_size(size: int, pad_fraction: float) -> int:
     """Returns the cells along a side of the rotated maps of a height map of `size` cells."""
-    return round(size * (1 + margin) / 2) * 2
+    return round(size * (1 + pad_fraction) / 2) * 2
 
 
 class CEMConfig(Section, section="cem"):
@@ -290,10 +296,10 @@ class PolicyConfig(Section, section="policy"):
     """Place by the cross-entropy method, between cells and yaws; or the best cell (VPG)."""
     primitive: Literal["argmax", "rule", "grasp"] = "argmax"
     """That of larger value; a push after no visible change, else a grasp (sec. 3.4); a grasp."""
-    cells: Literal["occupied", "all"] = "occupied"
+    action_mask: Literal["occupied", "none"] = "occupied"
     """Cells where actions may begin: those with something to act on (SPOT); or all (CSAC), so that
     a grasp may meet nothing, eq. 15's lowest level."""
-    retry: float = number(0.0, 0.0, 10.0)
+    retry_temperature: float = number(0.0, 0.0, 10.0)
     """Temperature, in units of Q, that each failed grasp in a row adds: the next place is drawn
     about by Boltzmann's law, unless the policy explores. 0: the best place."""
     height_bonus: float = number(0.0, 0.0, 100.0)
@@ -336,26 +342,28 @@ class RewardConfig(Section, section="reward"):
     success_bonus: float = 1.0  # r2 of eq. 11: the hand comes back with a block.
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
-    push_effect: Literal["value", "renewed", "change"] = "value"
+    push_label: Literal["stored", "current_critic", "map_changed"] = "stored"
     """A push is good if the best grasp gains value (eq. 16), judged once as it is made; or judged
     again by the target critic at each replay; or if the map has changed (VPG)."""
     push_levels: Pair = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = number(0.0, 0.0)  # For a block that leaves the workspace (ours).
-    source: Literal["truth", "sensed"] = "truth"
+    outcome_source: Literal["simulator", "sensors"] = "simulator"
     """Source of a grasp's outcome: the simulator's contacts and poses; or the finger gap and the
     change of the height map, as on a robot (sec. 3.3). A push is judged by maps in any case."""
 
     @property
-    def renewed(self) -> bool:
+    def relabels(self) -> bool:
         """Returns whether a push is labelled again by the current critic."""
-        return self.push_effect == "renewed"
+        return self.push_label == "current_critic"
 
     def check(self) -> None:
         rising = list(self.grasp_levels) == sorted(self.grasp_levels)
         require(rising, "reward.grasp_levels: no level may be below the one before it")
-        fits = self.source == "truth" or self.lost_block_penalty == 0.0
+        fits = self.outcome_source == "simulator" or self.lost_block_penalty == 0.0
         name = "reward.lost_block_penalty"
-        require(fits, f"{name}: must be 0 where reward.source is sensed, which cannot see it")
+        require(
+            fits, f"{name}: must be 0 where reward.outcome_source is sensors, which cannot see it"
+        )
 
 
 class ExploreConfig(Section, section="explore"):
@@ -366,7 +374,7 @@ class ExploreConfig(Section, section="explore"):
     noise is clipped at three of them (c of line 13, ours)."""
     epsilon_primitive: Pair = number((0.5, 0.1), 0.0, 1.0)  # Of a random primitive: from, to (VPG).
     epsilon_place: Pair = number((0.5, 0.0), 0.0, 1.0)  # The same of a random place (ours).
-    decay: float = number(0.998, 0.0, 1.0, above=True)
+    epsilon_decay: float = number(0.998, 0.0, 1.0, above=True)
     """Factor of both probabilities per action, until they reach their end (ours; VPG 0.9998)."""
     push_fraction: float = number(0.25, 0.0, 1.0)  # Share of pushes among random primitives (ours).
 
@@ -383,7 +391,9 @@ class LearnConfig(Section, section="learn"):
     lr_final_fraction: float = number(0.05, 0.0, 1.0, above=True)
     """Both step sizes fall linearly to this share of themselves over the run (ours)."""
     batch: int = number(32, 1)  # B, transitions per update (N of Algorithm 1).
-    updates: int = number(2, 1)  # Critic updates per `train.scenes` actions; the actor has one.
+    updates_per_step: int = number(
+        2, 1
+    )  # Critic updates per `train.scenes` actions; the actor has one.
     actor_batch: int = number(0, 0)  # Part of the last batch that the actor learns on; 0: all.
     augment: bool = True  # Show each drawn transition under a random symmetry of the square.
     augment_shift: int = number(0, 0, 64)
@@ -507,10 +517,10 @@ class Config(Section):
         """Raises SettingsError for sections that do not fit one another."""
         may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
         require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
-        episodic = not self.reward.renewed or self.target.bootstrap == "episodic"
+        episodic = not self.reward.relabels or self.target.bootstrap == "episodic"
         ending = "by which a transition ends in the scene that the push left"
         needs = "renewed needs target.bootstrap episodic"
-        require(episodic, f"reward.push_effect: {needs}, {ending}")
+        require(episodic, f"reward.push_label: {needs}, {ending}")
         batch, starts = self.learn.batch, self.train.learning_starts
         early = f"{batch} transitions cannot be drawn after train.learning_starts = {starts}"
         remedy = "raise train.learning_starts or lower learn.batch"

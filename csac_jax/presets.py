@@ -21,7 +21,7 @@ PROTOCOL = TEN_BLOCKS.change(
     scene={"pool": 256},
     task={"kind": "target"},
     sim={"physics": "c"},
-    reward={"push_effect": "renewed"},
+    reward={"push_label": "current_critic"},
     replay={"capacity": 2500},
     train={"scenes": 1, "actions": 2500, "learning_starts": 32, "chunk": 50, "save_every": 10},
 )
@@ -34,7 +34,7 @@ reset in training; 25 is ours. The current critic labels pushes (ours): early la
 """
 SMALL_NET = {
     "stride": 4,
-    "subcells": 4,
+    "subpixel": 4,
     "dilations": (1, 2, 1),
     "stem": 32,
     "growth": 32,
@@ -56,11 +56,11 @@ def quick() -> Config:
         preset="quick",
         scene={"size_jitter": (0.0, 0.0), "density": (600.0, 600.0), "friction": (0.8, 0.8)},
         sim={"physics": "auto"},
-        net=SMALL_NET | {"subcells": 2, "growth": 24, "rotations": 8},
+        net=SMALL_NET | {"subpixel": 2, "growth": 24, "rotations": 8},
         policy={"augment": True},
         target={"gamma": 0.2},
-        explore={"decay": 0.995},
-        learn={"actor_batch": 8, "updates": 1, "learning_rate": 4e-3},
+        explore={"epsilon_decay": 0.995},
+        learn={"actor_batch": 8, "updates_per_step": 1, "learning_rate": 4e-3},
         replay={"end": (1.0, 4.0)},
     )
 
@@ -73,7 +73,12 @@ def fast() -> Config:
     pushes, and blocks that leave cost. Physics is Warp's where it is installed, so meshes are of
     one size. Results: docs/benchmarks/learning-ablations.md.
     """
-    packed = {"pool": 4096, "arranged": 0.75, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)}
+    packed = {
+        "pool": 4096,
+        "packed_fraction": 0.75,
+        "drop_extent": (0.1, 0.25),
+        "size_jitter": (0.1, 0.0),
+    }
     length = {"actions": 655360, "learning_starts": 4096, "chunk": 2, "save_every": 20}
     return TEN_BLOCKS.change(
         preset="fast",
@@ -82,8 +87,14 @@ def fast() -> Config:
         net=SMALL_NET,
         target={"gamma": 0.2},
         reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
-        explore={"epsilon_primitive": (0.5, 0.2), "push_fraction": 0.5, "decay": 0.9998},
-        learn={"batch": 64, "updates": 96, "augment_shift": 8, "critics": 2, "loss": "squared"},
+        explore={"epsilon_primitive": (0.5, 0.2), "push_fraction": 0.5, "epsilon_decay": 0.9998},
+        learn={
+            "batch": 64,
+            "updates_per_step": 96,
+            "augment_shift": 8,
+            "critics": 2,
+            "loss": "squared",
+        },
         replay={"capacity": 65536, "end": (1.0, 4.0)},
         train={"scenes": 4096, **length},
     )
@@ -101,7 +112,7 @@ def objects() -> Config:
         scene={
             "slots": ("object",) * 6,
             "min_blocks": 6,
-            "objects": "made:1:700",
+            "objects": "procedural:1:700",
             "pool": 512,
             "drop_extent": (0.1, 0.3),
             "density": SceneConfig.density,
@@ -111,8 +122,8 @@ def objects() -> Config:
         sim={"clearance": 0.004, "contacts": 128},
         net={"growth": SMALL_NET["growth"]},
         reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
-        explore={"decay": 0.9995},
-        learn={"augment_shift": 8, "updates": 2, "learning_rate": 1e-3},
+        explore={"epsilon_decay": 0.9995},
+        learn={"augment_shift": 8, "updates_per_step": 2, "learning_rate": 1e-3},
         replay={"capacity": 16384},
         train={"actions": 24000, "learning_starts": 128, "chunk": 20, "save_every": 10},
     )
@@ -132,11 +143,15 @@ def grippers() -> Config:
         preset="grippers",
         scene={"pool": 512, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)},
         sim={"physics": "auto", "gripper": "varied"},
-        net=SMALL_NET | {"subcells": 2, "gripper": True},
+        net=SMALL_NET | {"subpixel": 2, "gripper": True},
         target={"gamma": 0.2},
         reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
-        explore={"epsilon_primitive": (0.2, 0.1), "epsilon_place": (0.2, 0.0), "decay": 0.9995},
-        learn={"actor_batch": 8, "augment_shift": 8, "updates": 1, "learning_rate": 5e-4},
+        explore={
+            "epsilon_primitive": (0.2, 0.1),
+            "epsilon_place": (0.2, 0.0),
+            "epsilon_decay": 0.9995,
+        },
+        learn={"actor_batch": 8, "augment_shift": 8, "updates_per_step": 1, "learning_rate": 5e-4},
         replay={"capacity": 16384, "end": (1.0, 4.0)},
         train={"actions": 6080, "learning_starts": 128, "chunk": 20, "save_every": 10},
     )
@@ -154,13 +169,19 @@ def paper() -> Config:
     Result: experiments/results/paper.
     """
     rates = {"learning_rate": 1e-4, "actor_learning_rate": 1e-4, "lr_final_fraction": 1.0}
-    updates = {"batch": 2, "actor_batch": 1, "updates": 1, "augment": False, "tau": 0.005}
+    updates = {"batch": 2, "actor_batch": 1, "updates_per_step": 1, "augment": False, "tau": 0.005}
     return PROTOCOL.change(
         preset="paper",
         heightmap={"size": 224},
-        net={"kind": "densenet121", "norm": "batch", "head": 64, "margin": 0.4286, "zoom": 2},
+        net={
+            "kind": "densenet121",
+            "norm": "batch",
+            "head": 64,
+            "pad_fraction": 0.4286,
+            "upsample": 2,
+        },
         target={"gamma": 0.5},
-        explore={"epsilon_place": (0.0, 0.0), "decay": 0.9998, "push_fraction": 0.5},
+        explore={"epsilon_place": (0.0, 0.0), "epsilon_decay": 0.9998, "push_fraction": 0.5},
         learn={**rates, **updates},
         train={"learning_starts": 8},
     )
@@ -180,7 +201,7 @@ def paper_small() -> Config:
         scene={"size_jitter": (0.1, 0.0)},
         net=SMALL_NET | {"stem": 48, "growth": 64, "head": 96},
         target={"gamma": 0.2},
-        learn={"updates": 1, "augment_shift": 8, "critics": 2, "loss": "squared"},
+        learn={"updates_per_step": 1, "augment_shift": 8, "critics": 2, "loss": "squared"},
     )
 
 
@@ -193,7 +214,7 @@ def smoke() -> Config:
         heightmap={"size": 32},
         net={"rotations": 4, "growth": 4, "dilations": (1, 2), "stem": 4, "head": 4},
         cem={"candidates": 16, "elites": 4, "rounds": 2},
-        learn={"batch": 8, "updates": 1},
+        learn={"batch": 8, "updates_per_step": 1},
         replay={"capacity": 64},
         train={"scenes": 2, "actions": 64, "learning_starts": 8, "chunk": 4, "save_every": 2},
     )

@@ -17,7 +17,7 @@ from csac_jax.evaluation.statistics import Band
 from csac_jax.io import files, policy_file
 from csac_jax.report import suite_table
 
-OBJECTS = "made:7:400"  # the library whose held-out shapes suites of objects draw from
+OBJECTS = "procedural:7:400"  # the library whose held-out shapes suites of objects draw from
 CLEARANCE = "0.004"  # m, of every policy among objects, baselines too
 CSAC = "doi:10.3390/electronics11132065"
 BASELINES = ("geometric", "random", "oracle")

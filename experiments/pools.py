@@ -1,6 +1,6 @@
 """Settles the pools of scenes that come with the package: `python -m experiments.pools`.
 
-Run it again where `tests/scene/test_pool.py` says that a pool is missing: a setting of scenes, a
+Run it again where `tests/scenes/test_pool.py` says that a pool is missing: a setting of scenes, a
 model or MuJoCo has changed, and what was shipped before is no longer read.
 """
 

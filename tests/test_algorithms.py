@@ -102,7 +102,7 @@ def test_unknown_algorithm_names_the_known():
         (lambda: PolicyConfig(primitive="push"), "policy.primitive"),
         (lambda: TargetConfig(value="mean"), "target.value"),
         (lambda: TargetConfig(gamma=1.0), "target.gamma"),
-        (lambda: RewardConfig(push_effect="depth"), "reward.push_effect"),
+        (lambda: RewardConfig(push_label="depth"), "reward.push_label"),
         (lambda: RewardConfig(lost_block_penalty=-1.0), "reward.lost_block_penalty"),
         (lambda: ExploreConfig(push_fraction=1.5), "explore.push_fraction"),
         (lambda: LearnConfig(loss="mse"), "learn.loss"),

@@ -40,7 +40,7 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("scene.slots", [("box", "ball", "box", "box", "box"), ("box",) * 65]),
         ("scene.min_blocks", [0, 6]),
         ("scene.pool", [0]),
-        ("scene.arranged", [-0.1, 1.1]),
+        ("scene.packed_fraction", [-0.1, 1.1]),
         ("scene.size_jitter", [(-0.1, 0.0), (0.3, 0.0), (0.0, 0.3)]),
         ("scene.density", [(50.0, 900.0), (900.0, 450.0), (450.0, 4000.0)]),
         ("scene.friction", [(0.05, 1.0), (1.0, 0.5), (0.5, 2.5)]),
@@ -66,11 +66,11 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("net.stem", [3]),
         ("net.head", [3]),
         ("net.dilations", [(), (1, 0)]),
-        ("net.margin", [-0.125, 0.625]),
+        ("net.pad_fraction", [-0.125, 0.625]),
         ("net.stride", [3]),
-        ("net.subcells", [3]),
+        ("net.subpixel", [3]),
         ("cem.rounds", [0]),
-        ("policy.retry", [-0.1, 11.0]),
+        ("policy.retry_temperature", [-0.1, 11.0]),
         ("policy.height_bonus", [-0.1, 101.0]),
         ("target.gamma", [-0.1]),
         ("target.bootstrap", ["always"]),
@@ -78,7 +78,7 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("explore.epsilon_primitive", [(-0.1, 0.1), (0.5, 1.1)]),
         ("explore.epsilon_place", [(-0.1, 0.0), (1.1, 0.0)]),
         ("explore.push_fraction", [-0.1]),
-        ("explore.decay", [0.0, 1.1]),
+        ("explore.epsilon_decay", [0.0, 1.1]),
         ("explore.noise_std", [-0.1]),
         ("learn.learning_rate", [0.0]),
         ("learn.actor_learning_rate", [0.0]),
@@ -86,7 +86,7 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("learn.lr_final_fraction", [0.0, 1.1]),
         ("learn.augment_shift", [-1, 65]),
         ("learn.batch", [0]),
-        ("learn.updates", [0]),
+        ("learn.updates_per_step", [0]),
         ("learn.tau", [0.0, 1.1]),
         ("replay.rank_by", ["age"]),
         ("replay.capacity", [0, 1, 2**30 + 1, float("nan")]),
@@ -130,16 +130,19 @@ def test_values_out_of_range(name: str, values: list):
         ({"camera.size": (8192, 480)}, "camera.size: must lie"),
         ({"sensor.pose_noise": (0.01, 0.01)}, "sensor.pose_noise: must be 0"),
         ({"sensor.pose_noise": (0.01, 0.0)}, "sensor.pose_noise: must be 0"),
-        ({"net.subcells": 4, "net.stride": 2}, "net.subcells: at most net.stride"),
-        ({"net.kind": "densenet121", "net.zoom": 3, "net.margin": 0.0}, "net.zoom: must divide 8"),
+        ({"net.subpixel": 4, "net.stride": 2}, "net.subpixel: at most net.stride"),
+        (
+            {"net.kind": "densenet121", "net.upsample": 3, "net.pad_fraction": 0.0},
+            "net.upsample: must divide 8",
+        ),
         ({"learn.actor_batch": 33}, "learn.actor_batch: must not exceed learn.batch"),
         ({"policy.primitive": "grasp"}, "explore.push_fraction: must be 0"),
         (
-            {"reward.push_effect": "renewed", "target.bootstrap": "continuing"},
-            "reward.push_effect: renewed needs target.bootstrap episodic",
+            {"reward.push_label": "current_critic", "target.bootstrap": "continuing"},
+            "reward.push_label: renewed needs target.bootstrap episodic",
         ),
         ({"learn.bath": 3}, "learn.bath: unknown setting"),
-        ({"net.zoom": 2}, "net.zoom: unknown setting"),
+        ({"net.upsample": 2}, "net.upsample: unknown setting"),
         ({"bath": 3}, "bath: unknown setting"),
     ],
 )
@@ -162,7 +165,7 @@ def test_settings_that_do_not_go_together(settings: dict, message: str):
         },
         {"sensor.pose_noise": (0.01, 0.0), "heightmap.view": "oblique"},
         {"policy.primitive": "grasp", "explore.push_fraction": 0.0},
-        {"net.kind": "densenet121", "net.norm": "batch", "net.margin": 0.0},
+        {"net.kind": "densenet121", "net.norm": "batch", "net.pad_fraction": 0.0},
     ],
 )
 def test_settings_that_go_together(settings: dict):
@@ -175,7 +178,7 @@ def test_an_alternative_keeps_what_both_have():
     everything."""
     cfg = presets.quick().change(replay={"capacity": 99}, net={"rotations": 8})
     other = cfg.change(
-        replay={"sampler": "prioritised"}, net={"kind": "densenet121", "margin": 0.0}
+        replay={"sampler": "prioritised"}, net={"kind": "densenet121", "pad_fraction": 0.0}
     )
     assert other.replay == PrioritisedReplay(capacity=99)
     assert (other.net.kind, other.net.rotations) == ("densenet121", 8)

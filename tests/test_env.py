@@ -86,10 +86,10 @@ def _cube(x: float, y: float, target: int = scene_state.ANY) -> SceneState:
 
 @pytest.mark.slow
 def test_share_of_arranged_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: `scene.arranged` of a pool's scenes are packed arrangements, the rest dropped."""
+    """Claim: `scene.packed_fraction` of a pool's scenes are packed, the rest dropped."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     scene = {"slots": ("box",) * 3, "min_blocks": 3}
-    shares = {"arranged": 0.0, "pool": 6}, {"arranged": 0.25, "pool": 8}
+    shares = {"packed_fraction": 0.0, "pool": 6}, {"packed_fraction": 0.25, "pool": 8}
     dropped, mixed = (make_env(CONFIG.change(scene=scene | share)).scenes for share in shares)
     np.testing.assert_array_equal(mixed.position[:6], dropped.position)
     packed = arrange.arrangements(CONFIG.change(scene=scene).scene, CONFIG.heightmap.extent, 0, 2)

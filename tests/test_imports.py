@@ -27,11 +27,14 @@ ORDER = (
     ("training",),
     ("io",),
     ("env",),
+    ("baselines",),
     ("replay", "agent"),
     ("nets",),
     ("vision",),
     ("sim",),
-    ("scene",),
+    ("scenes",),
+    ("world",),
+    ("robot",),
     ("objects",),
     ("geometry",),
     ("presets",),
@@ -42,13 +45,13 @@ ORDER = (
     ("grippers",),
     ("constants", "errors", "cache_folder", "assets"),
     ("__init__",),
-    ("_guard",),
+    ("_guard", "_version"),
 )
 RANK = {stage: rank for rank, row in enumerate(ORDER) for stage in row}
 
 # Module -> where it may be imported, as a stage or a file.
 ONLY_IN = {
-    "mujoco": ("scene", "sim", "render", "objects/descriptions.py"),
+    "mujoco": ("world", "scenes", "robot", "sim", "render", "objects/descriptions.py"),
     "flax.linen": ("nets",),
     "flax.nnx": (),
     "optax": ("agent",),
@@ -223,7 +226,7 @@ def test_training_in_c_needs_no_mjx():
     code = (
         "import sys; sys.modules['mujoco.mjx'] = sys.modules['warp'] = None\n"
         "from csac_jax import api, presets\nfrom csac_jax.sim import backend, physics\n"
-        "from csac_jax.scene import model\ncfg = backend.resolve(presets.quick())\n"
+        "from csac_jax.world import model\ncfg = backend.resolve(presets.quick())\n"
         "physics.make(model.build(cfg.scene, cfg.sim), cfg.sim)\n"
         "assert 'scipy.stats' not in sys.modules"
     )
@@ -272,8 +275,8 @@ def test_checker_reads_the_package():
         ("training/loop.py", "import orbax.checkpoint as ocp", "orbax is imported"),
         ("nets/a.py", "import safetensors.numpy", "safetensors is imported"),
         ("agent/a.py", "import jax\n@jax.jit\ndef f(x): return x", "jax.jit is used"),
-        ("scene/a.py", "from jax import jit\nf = jit(abs)", "jax.jit is used"),
-        ("scene/a.py", "import jax as j\nf = j.jit(abs)", "jax.jit is used"),
+        ("world/a.py", "from jax import jit\nf = jit(abs)", "jax.jit is used"),
+        ("world/a.py", "import jax as j\nf = j.jit(abs)", "jax.jit is used"),
         ("sim/a.py", "print(1)", "print is used"),
         ("nets/a.py", "import jax\njax.debug.print('x')", "jax.debug.print is used"),
         ("replay/a.py", "open('x')", "open is used"),
@@ -312,7 +315,7 @@ def test_checker_sees_a_breach(tmp_path: Path, file: str, source: str, fault: st
             "cli/a.py",
             "import tyro, rich\nfrom csac_jax.cli import b\nfrom csac_jax.report import figures",
         ),
-        ("scene/a.py", "import mujoco\nfrom pathlib import Path\nprint(Path('x'))"),
+        ("world/a.py", "import mujoco\nfrom pathlib import Path\nprint(Path('x'))"),
         ("api.py", "from rich.console import Console\nfrom csac_jax.report import tables"),
         ("__init__.py", "if TYPE_CHECKING:\n    from csac_jax import api"),
         ("io/configs.py", "def f():\n    import pydantic\nfrom csac_jax import errors"),

@@ -31,5 +31,5 @@ def test_smoke_learns_and_saves_on_the_way():
     that."""
     cfg = presets.smoke()
     assert cfg.train.learning_starts < cfg.train.actions / 2
-    assert cfg.learn.updates >= 1
+    assert cfg.learn.updates_per_step >= 1
     assert cfg.train.save_every * cfg.train.chunk < cfg.train.steps

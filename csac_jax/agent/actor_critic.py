@@ -69,7 +69,7 @@ def with_optimisers(cfg: Config, frames: Frames, bounds: tuple[Any, Any]) -> Act
         optimiser = optax.chain(clip, optax.adam(schedule))
         return optax.flatten(optimiser) if frames.networks.one_vector else optimiser
 
-    critic_optimiser = adam(cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates)
+    critic_optimiser = adam(cfg.learn.learning_rate, cfg.train.steps * cfg.learn.updates_per_step)
     actor_optimiser = adam(cfg.learn.actor_learning_rate, cfg.train.steps)
     return ActorCritic(cfg, frames, critic_optimiser, actor_optimiser, bounds)
 

@@ -39,11 +39,11 @@ def choose(
     the primitive's greedy pose plus noise: a random primitive still acts where it is best.
     """
     key_explore, key_push, key_place, key_noise = jax.random.split(key, 4)
-    epsilon = probability(*cfg.epsilon_primitive, cfg.decay, actions_taken)
+    epsilon = probability(*cfg.epsilon_primitive, cfg.epsilon_decay, actions_taken)
     primitive_is_random = jax.random.bernoulli(key_explore, epsilon)
     random_primitive = jnp.where(jax.random.bernoulli(key_push, cfg.push_fraction), 0, 1)
     primitive = jnp.where(primitive_is_random, random_primitive, greedy.primitive).astype(jnp.int32)
-    epsilon_place = probability(*cfg.epsilon_place, cfg.decay, actions_taken)
+    epsilon_place = probability(*cfg.epsilon_place, cfg.epsilon_decay, actions_taken)
     place_is_random = jax.random.bernoulli(key_place, epsilon_place)
     noisy = action_noise(key_noise, cfg, greedy.poses[primitive])
     return primitive, jnp.where(place_is_random, places[primitive], noisy)

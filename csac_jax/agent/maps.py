@@ -52,7 +52,7 @@ class Frames:
 def frames(cfg: Config, networks: Networks) -> Frames:
     """Builds the frames of a config's heightmap and net."""
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
-    tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.margin)
+    tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.pad_fraction)
     side, cell = tables.canvas // networks.stride, tables.cell * networks.stride
     resolved = cfg.change(sim={"gripper": grippers.resolve(cfg.sim.gripper)})
     xy, yaws = _cells(rotations, side, cell)
@@ -66,7 +66,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         extent=extent,
         push_length=cfg.sim.push_length,
         shows_target=cfg.task.kind == "target",
-        all_cells=cfg.policy.cells == "all",
+        all_cells=cfg.policy.action_mask == "none",
         xy=xy,
         inside=inside,
         reachable=_reachable(resolved.sim, cfg.heightmap, rotations, side, cell),
@@ -146,8 +146,8 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Returns cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
 
     Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
-    such a surface, of any block, lies within the push's length ahead. With `policy.cells all`:
-    every cell inside the workspace. The robot must reach the cell in each case.
+    such a surface, of any block, lies within the push's length ahead. With `policy.action_mask`
+    none: every cell inside the workspace. The robot must reach the cell in each case.
     """
     allowed = frames.inside[None] & frames.reachable
     if frames.all_cells:

@@ -120,9 +120,9 @@ def after_failures(
 
     So the best cell is a draw from Boltzmann's law, of a temperature that rises with each failure.
     """
-    if learner.cfg.policy.retry == 0.0:
+    if learner.cfg.policy.retry_temperature == 0.0:
         return state
-    temperature = learner.cfg.policy.retry * failed_grasps.astype(jnp.float32)
+    temperature = learner.cfg.policy.retry_temperature * failed_grasps.astype(jnp.float32)
     noise = jax.random.gumbel(jax.random.fold_in(key, len(Primitive)), state.q.shape)
     return state.replace(q=state.q + temperature * noise)
 

@@ -32,9 +32,9 @@ def _eq_16(cfg: RewardConfig, result: ActionResult) -> jax.Array:
 
 
 GOOD_PUSH: dict[str, Callable[[RewardConfig, ActionResult], jax.Array]] = {
-    "value": _eq_16,
-    "renewed": _eq_16,
-    "change": lambda cfg, result: result.changed,  # VPG
+    "stored": _eq_16,
+    "current_critic": _eq_16,
+    "map_changed": lambda cfg, result: result.changed,  # VPG
 }
 
 
@@ -58,8 +58,8 @@ def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
 
 
 def push_effect(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """Returns I_c [] of a push, good or not by `push_effect`."""
-    return push_level(cfg, GOOD_PUSH[cfg.push_effect](cfg, result))
+    """Returns I_c [] of a push, good or not by `push_label`."""
+    return push_level(cfg, GOOD_PUSH[cfg.push_label](cfg, result))
 
 
 def push_level(cfg: RewardConfig, good: jax.Array) -> jax.Array:

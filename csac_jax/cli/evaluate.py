@@ -47,8 +47,7 @@ class EvalOptions:
     """With --out, suites at a time, each on a core of its own; 0 for one per core. One at a time
     has all cores, or the GPU."""
     objects: str | None = None
-    """Library that suites of objects draw from: a folder, or made:SEED:COUNT for our own shapes; by
-    default the policy's."""
+    """Library that suites of objects draw from: a folder, or procedural:SEED:COUNT; by default the policy's."""
     split: Literal["held_out", "train", "all"] = "held_out"
     """Which of its objects."""
     physics: Literal["auto", "mjx", "c"] = "auto"
@@ -61,9 +60,9 @@ class EvalOptions:
     height_bonus: float | None = None
     """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
     train --help-all`; by default as the policy's."""
-    retry: float | None = None
-    """How boldly the policy draws another place after failed grasps, see `policy.retry` of
-    `csac-jax train --help-all`; by default as the policy's."""
+    retry_temperature: float | None = None
+    """Temperature of the draw of another place after failed grasps, see `csac-jax train
+    --help-all`; by default as the policy's."""
     episodes: int | None = None
     """Episodes of every part of a suite; by default 50, with --out the suite's own number."""
     share: float = 1.0

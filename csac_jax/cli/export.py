@@ -35,9 +35,9 @@ class ExportOptions:
     height_bonus: float | None = None
     """Q's increase per metre of the surface under a cell, see `policy.height_bonus` of `csac-jax
     train --help-all`; by default as the policy's."""
-    retry: float | None = None
-    """Temperature of the draw of another place after failed grasps, see `policy.retry` of
-    `csac-jax train --help-all`; by default as the policy's."""
+    retry_temperature: float | None = None
+    """Temperature of the draw of another place after failed grasps, see `csac-jax train
+    --help-all`; by default as the policy's."""
     input: Literal["maps", "image"] = "maps"
     """Input of a program: colour and height map, or (stablehlo) a camera's image and pose."""
     size: tuple[int, int] = (640, 480)

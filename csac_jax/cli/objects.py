@@ -63,7 +63,7 @@ class ShowOptions:
     """Lists the objects of a library, and draws them with --png."""
 
     library: tyro.conf.Positional[str]
-    """The library: a folder, made:SEED:COUNT or mixed:SEED:COUNT."""
+    """The library: a folder, procedural:SEED:COUNT or procedural+assemblies:SEED:COUNT."""
     png: Path | None = None
     """File to write a contact sheet to, with names and sizes: .png, .jpg, .webp or .gif."""
     json: Path | None = None

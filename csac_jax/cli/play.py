@@ -21,7 +21,7 @@ class PlayOptions:
     """Scene: random (dropped blocks), a shipped case by name, a case file, or objects of a library:
     pile, objects_packed, objects10."""
     objects: str | None = None
-    """Library of those objects: a folder, or made:SEED:COUNT for procedural shapes."""
+    """Library of those objects: a folder, or procedural:SEED:COUNT for procedural shapes."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"

@@ -21,9 +21,9 @@ FIRST = {
     "train": ("actions", "scenes", "learning_starts"),
     "task": ("kind",),
     "sim": ("physics",),
-    "scene": ("slots", "arranged"),
+    "scene": ("slots", "packed_fraction"),
     "heightmap": ("view",),
-    "learn": ("learning_rate", "batch", "updates"),
+    "learn": ("learning_rate", "batch", "updates_per_step"),
     "target": ("gamma",),
     "replay": ("sampler",),
     "net": ("kind",),
@@ -171,7 +171,11 @@ def parse_view(
 
 
 def decision(options: Any) -> dict[str, Any]:
-    """Returns the settings of `--augment`, `--height-bonus` and `--retry` in section `policy`."""
+    """Returns the settings of section `policy` that a command's options give."""
     mirrored = None if options.augment is None else options.augment == "on"
-    values = {"augment": mirrored, "height_bonus": options.height_bonus, "retry": options.retry}
+    values = {
+        "augment": mirrored,
+        "height_bonus": options.height_bonus,
+        "retry_temperature": options.retry_temperature,
+    }
     return {name: value for name, value in values.items() if value is not None}

@@ -111,7 +111,7 @@ def _rewarded(cfg: Config, learner: Learner, state: Any, part: Experience) -> Tr
         blocks_lost=jnp.zeros(part.outcome.shape, jnp.int32),
     )
     reward, better = learner.reward(cfg.reward, state, obs, after, result)
-    label = better if cfg.reward.renewed else None
+    label = better if cfg.reward.relabels else None
     end = part.terminated
     if cfg.target.bootstrap == "continuing":  # nothing follows an action without any effect
         end |= ~(result.changed | (part.outcome == Outcome.LIFTED))

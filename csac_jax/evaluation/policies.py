@@ -49,7 +49,7 @@ class PolicyDebug(NamedTuple):
 @struct.dataclass
 class NetworkPolicy:
     """The greedy policy of trained networks, without exploration. With `policy.primitive rule`,
-    which pushes after no visible change, and with `policy.retry`, it needs a State."""
+    which pushes after no visible change, and with `policy.retry_temperature`, it needs a State."""
 
     cfg: Config = struct.field(pytree_node=False)
     params: Params
@@ -101,7 +101,7 @@ class CustomLearnerPolicy:
 
 @struct.dataclass
 class RandomPolicy:
-    """Grasps at a random place, above a block unless `policy.cells` is `all`, at a random yaw."""
+    """Random grasps, above a block unless `policy.action_mask` is `none`."""
 
     cfg: Config = struct.field(pytree_node=False)
 

@@ -153,7 +153,7 @@ def _with_objects(cfg: Config, suite: str, objects: str | None, split: Split) ->
     if not source:
         raise ValueError(
             f"objects: {suite} needs a library; csac-jax objects make --out LIB makes one, or "
-            "give made:0:200"
+            "give procedural:0:200"
         )
     scene = SceneConfig(slots=("object",), min_blocks=1, objects=source, split=split)
     return cfg.change(scene=scene, sim={"physics": "auto"})
@@ -201,7 +201,12 @@ def _case(cfg: Config, path: Path) -> Env:
     if cfg.task.kind == "target":
         cases.require_target(case)
     library = {"objects": case.objects, "split": "all"} if case.objects else {}
-    placed: Any = {"slots": case.slots, "min_blocks": len(case.slots), "arranged": 0.0, **library}
+    placed: Any = {
+        "slots": case.slots,
+        "min_blocks": len(case.slots),
+        "packed_fraction": 0.0,
+        **library,
+    }
     scene = dataclasses.replace(cfg.scene, **placed)
     cfg = _wide(cfg, scene)
     return Env(cfg, _physics(cfg), _pool(case.scene))

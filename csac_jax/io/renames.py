@@ -7,6 +7,16 @@ from collections.abc import Mapping
 from typing import Any
 
 SETTINGS: dict[str, str | None] = {
+    "explore.decay": "explore.epsilon_decay",
+    "learn.updates": "learn.updates_per_step",
+    "net.margin": "net.pad_fraction",
+    "net.subcells": "net.subpixel",
+    "net.zoom": "net.upsample",
+    "policy.cells": "policy.action_mask",
+    "policy.retry": "policy.retry_temperature",
+    "reward.push_effect": "reward.push_label",
+    "reward.source": "reward.outcome_source",
+    "scene.arranged": "scene.packed_fraction",
     "cem.std_estimator": None,
     "learn.target_update_period": None,
     "reward.distance_weight": None,
@@ -15,7 +25,12 @@ SETTINGS: dict[str, str | None] = {
 }
 """Settings by their dotted names; None: the setting is gone, whatever its value."""
 
-VALUES: dict[str, dict[str, str]] = {}
+VALUES: dict[str, dict[str, str]] = {
+    "policy.action_mask": {"all": "none"},
+    "reward.outcome_source": {"truth": "simulator", "sensed": "sensors"},
+    "reward.push_label": {"value": "stored", "renewed": "current_critic", "change": "map_changed"},
+    "scene.objects": {"made:": "procedural:", "mixed:": "procedural+assemblies:"},
+}
 """Values of a setting by its name of today. One that ends with a colon stands for all texts that
 begin with it."""
 

@@ -1,7 +1,7 @@
 """The small dense net: densely connected convolutions with group norm on rotated maps.
 
 Features have 1/`net.stride` of the input's resolution. The last 1 x 1 convolution gives
-`net.subcells`^2 values per cell of them, as sub-pixel convolution (arXiv:1609.05158).
+`net.subpixel`^2 values per cell of them, as sub-pixel convolution (arXiv:1609.05158).
 
 The net sees maps in an action's own frame: a push goes ahead, a grasp closes across. The frame of
 yaw + pi shows the same picture upside down. So each pass gives three maps, push ahead, push back
@@ -70,7 +70,7 @@ class Trunk(nn.Module):
 
 
 class Head(nn.Module):
-    """Two 1 x 1 convolutions: [..., h, w, F] -> [..., s h, s w, outputs], s = subcells."""
+    """Two 1 x 1 convolutions: [..., h, w, F] -> [..., s h, s w, outputs], s = subpixel."""
 
     cfg: SmallNet
     outputs: int = OUTPUTS
@@ -78,8 +78,8 @@ class Head(nn.Module):
     @nn.compact
     def __call__(self, features: jax.Array, train: bool = False) -> jax.Array:
         hidden = nn.relu(nn.Dense(self.cfg.head, dtype=compute_dtype(self.cfg))(features))
-        output = nn.Dense(self.outputs * self.cfg.subcells**2, kernel_init=OUTPUT_INIT)
-        return pixel_shuffle(output(hidden.astype(jnp.float32)), self.cfg.subcells)
+        output = nn.Dense(self.outputs * self.cfg.subpixel**2, kernel_init=OUTPUT_INIT)
+        return pixel_shuffle(output(hidden.astype(jnp.float32)), self.cfg.subpixel)
 
 
 def pixel_shuffle(maps: jax.Array, factor: int) -> jax.Array:
@@ -125,7 +125,7 @@ class GroupNorm(nn.Module):
 class Critic(nn.Module):
     """Q in three maps per frame, and the features that the actor reads; the same with `train`.
 
-    [B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s = subcells.
+    [B, C, C, I] -> Q [B, s h, s h, OUTPUTS], features [B, h, h, F]; h = C / stride, s = subpixel.
     """
 
     cfg: SmallNet

@@ -134,7 +134,7 @@ class TransitionLayer(nn.Module):
 class DenseNetTrunk(nn.Module):
     """DenseNet-121 without its top: [B, H, W, 3] -> [B, H / 32, W / 32, 1024], after the last norm.
 
-    With `cfg.zoom` above 1 each cell stands for 2 x 2 pixels: [B, H / 16, W / 16, 1024].
+    With `cfg.upsample` above 1 each cell stands for 2 x 2 pixels: [B, H / 16, W / 16, 1024].
     """
 
     cfg: DenseNet121
@@ -142,7 +142,7 @@ class DenseNetTrunk(nn.Module):
     @nn.compact
     def __call__(self, maps: jax.Array, train: bool = False) -> jax.Array:
         stem = 2 * self.cfg.block_growth
-        maps = Stem(stem, self.cfg.zoom > 1, compute_dtype(self.cfg), name="conv0")(maps)
+        maps = Stem(stem, self.cfg.upsample > 1, compute_dtype(self.cfg), name="conv0")(maps)
         pieces = [_piece(max_pool(nn.relu(_norm(self.cfg, [_piece(maps)], train, "norm0"))))]
         for i, layers in enumerate(self.cfg.block_layers):
             if i > 0:
@@ -154,7 +154,7 @@ class DenseNetTrunk(nn.Module):
 class DenseNetHead(nn.Module):
     """Twice norm, ReLU and a 1 x 1 convolution, then upsampling (VPG); the last bias is ours.
 
-    [..., h, w, F] -> [..., s h, s w, OUTPUTS] float32, s = 32 / (zoom * output_stride).
+    [..., h, w, F] -> [..., s h, s w, OUTPUTS] float32, s = 32 / (upsample * output_stride).
     """
 
     cfg: DenseNet121
@@ -166,7 +166,7 @@ class DenseNetHead(nn.Module):
         hidden = nn.Dense(cfg.head, use_bias=False, dtype=compute_dtype(cfg), name="conv0")(hidden)
         hidden = nn.relu(_norm(cfg, [_piece(hidden)], train, "norm1")).astype(jnp.float32)
         maps = nn.Dense(OUTPUTS, kernel_init=OUTPUT_INIT, name="conv1")(hidden)
-        return _upsample(maps, DenseNet121.STRIDE // (cfg.zoom * cfg.output_stride))
+        return _upsample(maps, DenseNet121.STRIDE // (cfg.upsample * cfg.output_stride))
 
 
 def _upsample(maps: jax.Array, factor: int) -> jax.Array:
@@ -201,12 +201,12 @@ class DenseNetCritic(nn.Module):
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
     """Splits maps [B, C, C, I] into inputs of the trunks [T, B, z C, z C, 3].
 
-    They are colour and, each repeated three times, the other maps. z = zoom / 2, at least 1: a
+    They are colour and, each repeated three times, the other maps. z = upsample / 2, at least 1: a
     trunk doubles its cells itself. The barrier keeps XLA from rotating the maps once per window.
     """
     inputs = [maps[..., :3]] if cfg.colour else []
     others = range(3 * len(inputs), maps.shape[-1])
     inputs += [jnp.repeat(maps[..., i : i + 1], 3, axis=-1) for i in others]
     stacked = jax.lax.optimization_barrier(jnp.stack(inputs).astype(compute_dtype(cfg)))
-    zoom = max(cfg.zoom // 2, 1)
-    return jnp.repeat(jnp.repeat(stacked, zoom, axis=2), zoom, axis=3)
+    upsample = max(cfg.upsample // 2, 1)
+    return jnp.repeat(jnp.repeat(stacked, upsample, axis=2), upsample, axis=3)

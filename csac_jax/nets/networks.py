@@ -36,7 +36,7 @@ class Networks:
     colour: bool  # the critic sees colours
     height_scale: float = 0.05  # m, becomes 1; a block's height
     colour_scale: Any = (0.5, 1.0)  # mean and standard deviation, of all colours or of each [3]
-    zoom: int = 0  # pixels of the input per cell of the map; 0: all states at a time
+    upsample: int = 0  # pixels of the input per cell of the map; 0: all states at a time
     one_vector: bool = False  # the optimiser sees one vector: a GPU is slow with many small arrays
 
     def inputs(
@@ -77,7 +77,7 @@ class Networks:
         DenseNet-121 gets groups of the pixels of one state at 640 px (ours). So all its calls
         consist of the same products, which XLA tunes one by one, and need the memory of one group.
         """
-        return max(1, round((_FULL / (self.zoom * canvas)) ** 2)) if self.zoom else None
+        return max(1, round((_FULL / (self.upsample * canvas)) ** 2)) if self.upsample else None
 
 
 def make(cfg: NetConfig, critic: Any = None) -> Networks:
@@ -85,11 +85,11 @@ def make(cfg: NetConfig, critic: Any = None) -> Networks:
     if critic is not None:
         return Networks(critic, dense.Head(SmallNet(head=cfg.head)), critic.stride, cfg.colour)
     if isinstance(cfg, SmallNet):
-        stride = cfg.stride // cfg.subcells
+        stride = cfg.stride // cfg.subpixel
         return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour)
     modules = densenet.DenseNetCritic(cfg), densenet.DenseNetHead(cfg)
     scales = densenet.HEIGHT_SCALE, densenet.COLOUR_SCALE
-    return Networks(*modules, cfg.output_stride, cfg.colour, *scales, cfg.zoom, one_vector=True)
+    return Networks(*modules, cfg.output_stride, cfg.colour, *scales, cfg.upsample, one_vector=True)
 
 
 def learned(variables: Any) -> Any:

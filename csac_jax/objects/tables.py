@@ -42,7 +42,8 @@ class Tables(NamedTuple):
 def find(source: str, split: Split) -> Library:
     """Finds the objects of a split: of the library in the folder `source`, or of our own shapes.
 
-    Those are `made:SEED:COUNT`, or `mixed:SEED:COUNT` with assemblies. Raises LibraryError.
+    Those are `procedural:SEED:COUNT`, or `procedural+assemblies:SEED:COUNT` with assemblies.
+    Raises LibraryError.
     """
     made = _MADE.fullmatch(source)
     return _select(_draw(*made.groups()) if made else library.load(Path(source)), split)

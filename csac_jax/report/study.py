@@ -9,7 +9,7 @@ from csac_jax.report.comparison import Curve, ResultReport, Score, seeds_of
 from csac_jax.report.results import METRICS
 from csac_jax.report.variants import label
 
-AXES = ("train.actions", "task.kind", "scene.arranged")  # settings that are columns here
+AXES = ("train.actions", "task.kind", "scene.packed_fraction")  # settings that are columns here
 SCENES = {0.0: "clear", 1.0: "packed"}  # name of the clearing task by the share of packed scenes
 PANELS = {name: METRICS[name] for name in ("grasp_success", "completion", "action_efficiency")}
 """Metrics of the figure, top down, and their titles."""
@@ -37,7 +37,7 @@ def rows(report: ResultReport) -> list[StudyRow]:
 def _row(score: Score, curve: Curve | None) -> StudyRow:
     (first, *_), *_ = score.parts.values()
     scene, task, train = (first.config.get(name, {}) for name in ("scene", "task", "train"))
-    name = SCENES.get(scene.get("arranged", 0.0), "partly packed")
+    name = SCENES.get(scene.get("packed_fraction", 0.0), "partly packed")
     if task.get("kind") == "target":
         name = "target" if name == "clear" else f"target, {name}"
     changed = tuple(change for change in score.variant.changed if change[0] not in AXES)

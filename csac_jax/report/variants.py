@@ -22,7 +22,7 @@ NAMED = ("seed", "preset", "algo", "sim.physics")  # have a place of their own i
 HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
 LENGTH = "train."  # settings of a run's length and shape do not make another method
 MOST_CHANGES = 6  # a variant with more is named by its folder
-DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry": 0.0}
+DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry_temperature": 0.0}
 """Settings that `eval` can change, and their values in configs that lack them."""
 VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance")  # likewise
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from csac_jax import __version__
+from csac_jax._version import __version__
 from csac_jax.errors import DataWarning
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")

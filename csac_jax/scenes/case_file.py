@@ -5,8 +5,8 @@
          "quaternion": [1, 0, 0, 0], "target": true}, ...]}
 
 An object of a library has `"object": "NAME", "library": "LIB"` in place of a shape. LIB is a folder
-relative to that of the file, or made:SEED:COUNT, or mixed:SEED:COUNT. A position is that of the
-centre of the bounding box, m. A quaternion (w, x, y, z) is normalised.
+relative to that of the file, or procedural:SEED:COUNT, or procedural+assemblies:SEED:COUNT. A
+position is that of the centre of the bounding box, m. A quaternion (w, x, y, z) is normalised.
 """
 
 import json

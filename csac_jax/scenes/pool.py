@@ -49,14 +49,14 @@ Fall = Callable[[SceneState, BlockFields], SceneState | None]
 def scenes(cfg: Config, stream: int, count: int | None = None) -> SceneState:
     """Returns at least `count` scenes at rest, as many of each number of blocks.
 
-    NumPy leaves [P, N, ...]. The last `scene.arranged` of them are arrangements, or objects of a
-    library side by side in the largest square of `scene.drop_extent`. Without a count,
+    NumPy leaves [P, N, ...]. The last `scene.packed_fraction` of them are arrangements, or objects
+    of a library side by side in the largest square of `scene.drop_extent`. Without a count,
     `scene.pool` of each number of blocks. Raises SceneError for blocks that do not come to rest or
     allow no arrangement.
     """
     block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     number = cfg.scene.pool if count is None else -(-count // block_counts)
-    arranged = round(cfg.scene.arranged * number)
+    arranged = round(cfg.scene.packed_fraction * number)
     parts = [settled(cfg, stream, number - arranged)] if arranged < number else []
     if arranged and cfg.scene.has_objects:
         widest = cfg.change(scene={"drop_extent": (cfg.scene.drop_extent[1],) * 2})
@@ -80,7 +80,7 @@ def settled(
     that rolls off drops again. If `packed`, objects stand on the table, see `stock.packed`.
     Logs its progress. Raises SceneError where hardly any scene comes to rest.
     """
-    scene = dataclasses.replace(cfg.scene, arranged=0.0)
+    scene = dataclasses.replace(cfg.scene, packed_fraction=0.0)
 
     def settle() -> SceneState:
         world = model.build(scene, dataclasses.replace(cfg.sim, robot="hand", gripper="rg2"))
@@ -285,7 +285,7 @@ def shipped() -> Path:
 
 def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
     """Hashes everything that decides the content of a pool; `how` tells ways to make it apart."""
-    scene = dataclasses.replace(cfg.scene, arranged=0.0)
+    scene = dataclasses.replace(cfg.scene, packed_fraction=0.0)
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     if scene.has_objects:  # the content of a library counts, not its place
         scene = dataclasses.replace(scene, objects=object_slots.library(scene).sha256)

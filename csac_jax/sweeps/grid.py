@@ -18,9 +18,9 @@ BASE = "base"  # name of the only point where nothing is varied
 LONGEST = 120  # characters of a point's name, which is a folder's
 MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
 TASKS: dict[str, dict[str, Any]] = {
-    "clear": {"task.kind": "clear", "scene.arranged": 0.0},
-    "target": {"task.kind": "target", "scene.arranged": 0.0},
-    "packed": {"task.kind": "clear", "scene.arranged": 1.0},
+    "clear": {"task.kind": "clear", "scene.packed_fraction": 0.0},
+    "target": {"task.kind": "target", "scene.packed_fraction": 0.0},
+    "packed": {"task.kind": "clear", "scene.packed_fraction": 1.0},
 }
 """Values of the varied name `task`: a task and its scenes."""
 _OBLIQUE = {"heightmap.view": "oblique"}
@@ -30,7 +30,7 @@ _NOISE = {
     "sensor.pose_noise": (0.001, 0.002),
     "sensor.colour": 0.05,
 }
-_SENSED, _ANYWHERE = {"reward.source": "sensed"}, {"policy.cells": "all"}
+_SENSED, _ANYWHERE = {"reward.outcome_source": "sensors"}, {"policy.action_mask": "none"}
 _UR5 = {"sim.robot": "ur5"}
 SWITCHES: dict[str, dict[str, Any]] = {
     "none": {},

@@ -27,7 +27,7 @@ class OfflineState:
     """The state from step to step."""
 
     key: jax.Array  # [] typed key, root of all randomness, never consumed
-    step: jax.Array  # [] int32, steps done, each of `learn.updates` updates
+    step: jax.Array  # [] int32, steps done, each of `learn.updates_per_step` updates
     learner: Any
     replay: ReplayState
 
@@ -60,7 +60,10 @@ def compile_step(program: Program):
     cfg = program.cfg
 
     def one(state: OfflineState) -> tuple[OfflineState, dict[str, jax.Array]]:
-        key, done = jax.random.fold_in(state.key, state.step), state.step * cfg.learn.updates
+        key, done = (
+            jax.random.fold_in(state.key, state.step),
+            state.step * cfg.learn.updates_per_step,
+        )
         learner, priority, losses = step.learn(program, key, state.learner, state.replay, done)
         replay = state.replay.replace(priority=priority)
         return OfflineState(state.key, state.step + 1, learner, replay), losses

@@ -115,7 +115,7 @@ def example(cfg: Config) -> Transition:
         obs = Observation(colour, jnp.zeros(rows), target, fingers)
         action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
         packed = heightmap.pack(obs)
-        label = jnp.zeros((), bool) if cfg.reward.renewed else None
+        label = jnp.zeros((), bool) if cfg.reward.relabels else None
         return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool), label)
 
     return jax.eval_shape(build)

@@ -107,7 +107,7 @@ def learn(
     Returns: the learner's state, the priorities of the replay [C], the losses by name.
     """
     cfg, learner = program.cfg, program.learner
-    total = max(cfg.train.steps * cfg.learn.updates, 1)
+    total = max(cfg.train.steps * cfg.learn.updates_per_step, 1)
 
     def update(carry: tuple[Any, jax.Array], i: jax.Array) -> Any:
         state, priority = carry
@@ -121,7 +121,7 @@ def learn(
         current = program.sampler.update(current, slots, info.error)
         return (state, current.priority), (info, batch.obs)
 
-    start, numbers = (state, replay.priority), jnp.arange(cfg.learn.updates)
+    start, numbers = (state, replay.priority), jnp.arange(cfg.learn.updates_per_step)
     (state, priority), (info, observations) = jax.lax.scan(update, start, numbers)
 
     # Update the actor once, on (part of) the last batch (lines 22-23).
@@ -159,7 +159,7 @@ def first_to_learn(cfg: Config) -> int:
 
 def updates_done(cfg: Config, step: jax.Array) -> jax.Array:
     """Returns how many updates [] int32 were kept before training step `step` []."""
-    return jnp.maximum(step - first_to_learn(cfg), 0) * cfg.learn.updates
+    return jnp.maximum(step - first_to_learn(cfg), 0) * cfg.learn.updates_per_step
 
 
 def numbered_keys(key: jax.Array, num: int) -> jax.Array:

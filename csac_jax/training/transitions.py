@@ -62,7 +62,7 @@ def remember(
     reward, push_better = learner.reward(cfg.reward, state, before.obs, after.obs, result)
     next_obs, terminated = BOOTSTRAPS[cfg.target.bootstrap](paid, scenes_next)
     obs, next_packed = heightmap.pack(before.obs), heightmap.pack(next_obs)
-    label = push_better if cfg.reward.renewed else None
+    label = push_better if cfg.reward.relabels else None
     return Transition(obs, action, reward, next_packed, terminated, label), push_better
 
 
@@ -94,11 +94,11 @@ def where(condition: jax.Array, yes: Any, no: Any) -> Any:
 
 
 def with_reward_outcome(cfg: RewardConfig, after: environment.State) -> environment.State:
-    """Returns states, leaves [...], with the outcome that is paid for, by `reward.source`.
+    """Returns states, leaves [...], with the outcome that is paid for, by `reward.outcome_source`.
 
     Logs and evaluations keep the outcome of ground truth.
     """
-    if cfg.source == "truth":
+    if cfg.outcome_source == "simulator":
         return after
     return after.replace(info=after.info.replace(outcome=after.info.outcome_by_gap))
 

@@ -80,7 +80,7 @@ def with_blocks(cfg: Config, num: int) -> Config:
             "slots": tuple(slots[i % len(slots)] for i in range(num)),
             "min_blocks": num,
             "pool": min(cfg.scene.pool, 64),
-            "arranged": 0.0,
+            "packed_fraction": 0.0,
         },
         sim={
             "geom_pairs": max(round(share * cfg.sim.geom_pairs), 4),

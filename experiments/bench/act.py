@@ -1,5 +1,5 @@
 """Times the dense Q maps of a state, 2 primitives x 16 yaws, as JSON: `csac-jax bench act
-[--states N] [--zoom N] [--pixels N] [--repeats N]`.
+[--states N] [--upsample N] [--pixels N] [--repeats N]`.
 
 DenseNet-121 over colour and height maps of PIXELS (224) cells, one state and STATES (64) at once,
 each cell ZOOM (1) pixels wide, maps as fine as the height map. Then the small net, one critic, at
@@ -42,12 +42,14 @@ def _canvas(pixels: int, multiple: int) -> int:
     )
 
 
-def _densenet(pixels: int, zoom: int) -> Config:
+def _densenet(pixels: int, upsample: int) -> Config:
     """Returns the preset `paper` for clearing, on maps of `pixels` cells as its height map."""
     paper = presets.paper().change(task={"kind": "clear"})
     try:
-        margin = _canvas(pixels, max(DenseNet121.STRIDE // zoom, 1)) / pixels - 1.0
-        net = FineDenseNet(**dataclasses.asdict(paper.net) | {"margin": margin, "zoom": zoom})
+        margin = _canvas(pixels, max(DenseNet121.STRIDE // upsample, 1)) / pixels - 1.0
+        net = FineDenseNet(
+            **dataclasses.asdict(paper.net) | {"pad_fraction": margin, "upsample": upsample}
+        )
         return dataclasses.replace(paper, heightmap=HeightmapConfig(size=pixels), net=net)
     except ValueError as error:
         raise BadArgumentsError(f"bench act: {error}") from None
@@ -92,7 +94,7 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     return {
         "states": states,
         "pixels_of_a_pass": learner.frames.tables.canvas
-        * (cfg.net.zoom if isinstance(cfg.net, DenseNet121) else 1),
+        * (cfg.net.upsample if isinstance(cfg.net, DenseNet121) else 1),
         "maps": list(dense_maps.out_info.shape),
         "seconds_per_state": seconds / states,
         "compile_seconds": round(compiled, 1),
@@ -133,9 +135,9 @@ def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = read("act", arguments, pixels=224, states=64, zoom=1, repeats=10)
+    options = read("act", arguments, pixels=224, states=64, upsample=1, repeats=10)
     pixels, repeats = options["pixels"], options["repeats"]
-    cfg = _densenet(pixels, options["zoom"])
+    cfg = _densenet(pixels, options["upsample"])
     ours = [_ours(cfg, states, repeats) for states in (1, options["states"])]
     nets = {"default": SmallNet(), "quick": presets.quick().net, "fast": presets.fast().net}
     result = {

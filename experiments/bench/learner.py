@@ -49,7 +49,7 @@ def _operations(net: SmallNet, inputs: int, cells: int) -> dict[str, float]:
     """Counts floating-point operations of a forward pass with cells x cells features."""
     convolutions = sum(2.0 * k * k * i * o for i, o, k, _, _ in _layers(net, inputs))
     features = net.stem + len(net.dilations) * net.growth
-    outputs = dense.OUTPUTS * net.subcells**2
+    outputs = dense.OUTPUTS * net.subpixel**2
     head = 2.0 * (features * net.head + net.head * outputs)
     return {"convolutions": convolutions * cells**2, "head": head * cells**2}
 

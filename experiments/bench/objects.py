@@ -35,12 +35,12 @@ SETTLED = 64  # scenes, then the same again
 
 
 def _configs(folder: Path, kind: PhysicsKind) -> dict[str, Config]:
-    blocks = presets.get("fast").change(scene={"arranged": 0.0}, sim={"physics": kind})
+    blocks = presets.get("fast").change(scene={"packed_fraction": 0.0}, sim={"physics": kind})
     held: dict[str, Any] = {"slots": ("object",) * 10, "split": "all"}
     roomy = blocks.change(sim={"contacts": 3 * blocks.sim.contacts})
     configs = {
         "blocks": blocks,
-        "objects": roomy.change(scene={**held, "objects": f"made:0:{SHAPES}"}),
+        "objects": roomy.change(scene={**held, "objects": f"procedural:0:{SHAPES}"}),
     }
     made = shapes.draw(0, SHAPES)
     for low, high in PARTS:

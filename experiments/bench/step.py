@@ -1,7 +1,7 @@
 """Times the stages of a training step, as JSON: `csac-jax bench step [PRESET] [--physics
 mjx|warp|c|auto] [--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A
 --largest B] [SETTING ...]`, PRESET `quick` if none is given, physics `auto`, settings as `csac-jax
-train` takes them: `--learn.updates 64`.
+train` takes them: `--learn.updates_per_step 64`.
 
 Each stage of `train_step` is compiled by itself. It is timed beside the whole step, a compiled loop
 of STEPS (2) steps as in training, and beside a bare loop of the engine's own steps of the same
@@ -122,7 +122,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     def remember(replay: Any, before: Any, action: Action, after: Any) -> Any:
         packed = heightmap.pack(before.obs), heightmap.pack(after.obs)
         ended = after.terminated
-        label = ended if cfg.reward.renewed else None
+        label = ended if cfg.reward.relabels else None
         transition = Transition(packed[0], action, jnp.zeros(num), packed[1], ended, label)
         return ring.add(replay, transition, ~after.info.physics_diverged)
 
@@ -198,7 +198,7 @@ def _rates(cfg: Config, seconds: float) -> dict[str, float]:
     return {
         "actions_per_second": cfg.train.scenes / seconds,
         "physics_steps_per_second": cfg.train.scenes * cfg.sim.substeps / seconds,
-        "updates_per_second": cfg.learn.updates / seconds,
+        "updates_per_second": cfg.learn.updates_per_step / seconds,
     }
 
 
@@ -333,6 +333,6 @@ def main(arguments: list[str]) -> None:
         ]
         result |= {"curve": options.curve, "points": rows}
     else:
-        result |= {"substeps": cfg.sim.substeps, "updates": cfg.learn.updates}
+        result |= {"substeps": cfg.sim.substeps, "updates": cfg.learn.updates_per_step}
         result |= measure(cfg, options.steps, options.repeats)
     emit(result)

@@ -23,7 +23,7 @@ SIZE = 96
 NETS = {
     "small": SmallNet(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8, margin=0.5),
     "densenet121": with_constants(
-        DenseNet121(rotations=K, head=8, margin=0.5, zoom=2),
+        DenseNet121(rotations=K, head=8, margin=0.5, upsample=2),
         block_layers=(1, 1, 1, 1),
         block_growth=8,
     ),

@@ -207,9 +207,9 @@ def test_nothing_is_valid_outside_of_the_workspace(frames, block):
 
 
 def test_actions_anywhere(cfg, frames, block):
-    """Claim: with `policy.cells all` every cell of the workspace is valid, on a bare table and in
-    the target task too, and random grasps meet bare table, as eq. 15's lowest level asks."""
-    anywhere = cfg.change(policy={"cells": "all"}, task={"kind": "target"})
+    """Claim: with `policy.action_mask none` every cell of the workspace is valid, on a bare table
+    and in the target task too, and random grasps meet bare table, as eq. 15's lowest level asks."""
+    anywhere = cfg.change(policy={"action_mask": "none"}, task={"kind": "target"})
     free = maps.frames(anywhere, networks.make(cfg.net))
     for height in (block.height, jnp.zeros_like(block.height)):
         valid = maps.actionable_cells(free, block.replace(height=height))

@@ -100,7 +100,7 @@ def test_learner_and_sampler_of_ones_own():
     newest = np.asarray(metrics.reward)[np.asarray(metrics.learned), -1]
     assert np.unique(newest).size > 1
     for reward in newest:
-        for _ in range(CFG.learn.updates):
+        for _ in range(CFG.learn.updates_per_step):
             error = reward - value
             value += 0.5 * error
     assert_allclose(last.learner, value, rtol=1e-5)
@@ -127,4 +127,4 @@ def test_network_of_ones_own():
     assert np.all(np.isfinite(metrics.critic_loss))
     moved = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), first.online, last.learner.online)
     assert all(jax.tree.leaves(moved))
-    assert int(last.learner.updates) == CFG.learn.updates * int(np.sum(metrics.learned))
+    assert int(last.learner.updates) == CFG.learn.updates_per_step * int(np.sum(metrics.learned))

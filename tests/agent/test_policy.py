@@ -130,10 +130,10 @@ def test_choice_of_primitive(rule, values, steps_without_change, expected):
 
 @pytest.mark.parametrize("failed", [0, 2])
 def test_retries_follow_boltzmann(cfg, frames, parts, failed):
-    """Claim: after failed grasps a cell is drawn with exp(Q / T), T = failures * `policy.retry`;
+    """Claim: after failed grasps a cell is drawn with exp(Q / T), T = failures x temperature;
     without a failure it is the best one."""
     grasps = algorithms.configure(cfg, "grasp_only")
-    own = parts(grasps.change(policy={"place": "argmax", "retry": 0.25}))
+    own = parts(grasps.change(policy={"place": "argmax", "retry_temperature": 0.25}))
     values, cells = (
         np.array([1.0, 0.8, 0.5, -0.2]),
         np.argwhere(frames.inside)[[5, 500, 1000, 1900]],

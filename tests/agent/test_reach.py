@@ -38,7 +38,7 @@ def test_cells_out_of_reach_are_masked(frames: maps.Frames):
 
 def test_all_cells_leave_out_what_is_out_of_reach(frames: maps.Frames):
     """Claim: so it is where actions may begin anywhere; the floating hand reaches all."""
-    anywhere = FAR.change(policy={"cells": "all"})
+    anywhere = FAR.change(policy={"action_mask": "none"})
     free = maps.frames(anywhere, networks.make(anywhere.net))
     empty = jnp.zeros((FAR.heightmap.size,) * 2)
     obs = Observation(jnp.zeros((*empty.shape, 3)), empty, empty > 0)

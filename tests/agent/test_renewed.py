@@ -42,7 +42,7 @@ class Height(nn.Module):
 @pytest.fixture(scope="module")
 def renewing(cfg) -> ActorCritic:
     """A learner whose critic is `Height`, and that renews labels."""
-    return actor_critic.make(cfg.change(reward={"push_effect": "renewed"}), Height())
+    return actor_critic.make(cfg.change(reward={"push_label": "current_critic"}), Height())
 
 
 def _weighted(learner: ActorCritic, weight: jax.Array | float) -> actor_critic.LearnerState:
@@ -85,12 +85,15 @@ def test_early_label_is_renewed(renewing, observations):
 
 
 def test_stored_label_stays_as_an_option(cfg, observations):
-    """Claim: by `push_effect` value the reward is the stored one, and no label is."""
+    """Claim: by `push_label` value the reward is the stored one, and no label is."""
     learner = actor_critic.make(cfg, Height())
     batch = _batch(observations, False, -0.5).replace(push_better=None)
     assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
     assert programs.example(learner.cfg).push_better is None
-    assert programs.example(cfg.change(reward={"push_effect": "renewed"})).push_better.dtype == bool
+    assert (
+        programs.example(cfg.change(reward={"push_label": "current_critic"})).push_better.dtype
+        == bool
+    )
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from csac_jax.training import transitions
         (policy.CEM_STARTS, CEMConfig, "start"),
         (policy.POSE_SEARCHES, PolicyConfig, "place"),
         (policy.PRIMITIVE_RULES, PolicyConfig, "primitive"),
-        (rewards.GOOD_PUSH, RewardConfig, "push_effect"),
+        (rewards.GOOD_PUSH, RewardConfig, "push_label"),
         (losses.TD_LOSSES, LearnConfig, "loss"),
         (transitions.BOOTSTRAPS, TargetConfig, "bootstrap"),
     ],

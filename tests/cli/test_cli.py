@@ -90,7 +90,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --learn.batch 65", "learn.batch: 65 transitions cannot be drawn"),
         ("train quick --scene.slots box ball", "--scene.slots: 'ball' is not one of: box, arch"),
         ("train quick --replay.sampler best", "replay.sampler: 'best' is not one of: uniform"),
-        ("train quick --net.zoom=2", "--net.zoom=2: --net.kind small has no such setting"),
+        ("train quick --net.upsample=2", "--net.upsample=2: --net.kind small has no such setting"),
         ("train quick --seed -1", "seed: must be at least 0, not -1"),
         ("train smoke --device tpu", "--device: 'tpu' is not one of: cpu, gpu"),
         ("train quick smoke", "unknown arguments: smoke"),
@@ -100,7 +100,10 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --run-dir .", ". exists; give another --run-dir"),
         ("train smoke --sim.physics warp --scene.size-jitter 0.1 0", "warp computes on CUDA"),
         ("train smoke --sim.gripper rg3", "sim.gripper: 'rg3' is neither one of 2f85, franka_hand"),
-        ("train paper --net.margin 0.1", "net.margin: DenseNet-121 needs maps of a multiple of 16"),
+        (
+            "train paper --net.pad_fraction 0.1",
+            "net.pad_fraction: DenseNet-121 needs maps of a multiple of 16",
+        ),
         ("eval", "these arguments are missing: source"),
         ("eval . --policy best", "--policy: 'best' is not one of: learned"),
         ("eval . --episodes 0", "--episodes: at least 1"),
@@ -245,7 +248,7 @@ def test_nothing_to_start_from(
     DenseNet-121."""
     Path("bad.safetensors").write_bytes(b"bad")
     _fails(capsys, 1, f"{command} smoke --init {source}", message)
-    flags = f"--net.kind densenet121 --net.margin 0 --init {source}"
+    flags = f"--net.kind densenet121 --net.pad_fraction 0 --init {source}"
     _fails(capsys, 1 if source == "nothing" else 2, f"{command} smoke {flags}", message)
 
 
@@ -272,8 +275,8 @@ def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
         ),
         ("--replay.sampler=uniform", {"replay": UniformReplay(capacity=SMOKE.replay.capacity)}),
         (
-            "--net.margin 0 --net.kind densenet121 --net.zoom 2",
-            {"net": DenseNet121(rotations=4, head=4, margin=0.0, zoom=2)},
+            "--net.pad_fraction 0 --net.kind densenet121 --net.upsample 2",
+            {"net": DenseNet121(rotations=4, head=4, margin=0.0, upsample=2)},
         ),
         (
             "--algo csac --replay.sampler beta --replay.end 1 5",
@@ -316,7 +319,9 @@ def test_flags_win_over_the_config_file(config_file: Path):
     flags = ["--learn.tau", "0.1", "--algo", "csac", "--seed", "6"]
     assert train.read([*file, *flags])[1] == wanted
     assert train.read([*flags, f"--config={config_file}"])[1] == wanted
-    _, plan = sweep.read([*file, *flags, "--vary", "learn.updates=1,2", "--sim.physics", "mjx"])
+    _, plan = sweep.read(
+        [*file, *flags, "--vary", "learn.updates_per_step=1,2", "--sim.physics", "mjx"]
+    )
     updates = [wanted.change(learn={"updates": n}, sim={"physics": "mjx"}) for n in (1, 2)]
     assert [point.cfg for point in plan.points] == updates
 
@@ -475,7 +480,7 @@ def test_any_policy_sees_through_another_camera(
         ("", {}),
         ("--augment on", {"augment": True}),
         ("--height-bonus 2", {"height_bonus": 2.0}),
-        ("--retry 0.1", {"retry": 0.1}),
+        ("--retry 0.1", {"retry_temperature": 0.1}),
     ],
 )
 def test_eval_changes_how_a_policy_decides(

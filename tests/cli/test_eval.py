@@ -65,10 +65,10 @@ def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str,
     assert evaluate._fitting(options, clear) == (
         *("in_distribution", "random10", "random30", "cases", "packed", "camera"),
     )
-    with_objects = evaluate.EvalOptions("shipped", objects="made:0:20")
+    with_objects = evaluate.EvalOptions("shipped", objects="procedural:0:20")
     assert "pile" in evaluate._fitting(with_objects, clear)
     assert evaluate._fitting(with_objects, target) == ("target", "target_objects")
-    anyone = evaluate.EvalOptions("shipped", policy="random", objects="made:0:20")
+    anyone = evaluate.EvalOptions("shipped", policy="random", objects="procedural:0:20")
     assert {"target", "random10", "pile"} <= set(evaluate._fitting(anyone, clear))
 
 
@@ -95,11 +95,11 @@ def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
 def test_a_suite_is_the_evaluation(tmp_path: Path):
     """Claim: the file of a suite has the numbers of `evaluate`, one at a time or side by side."""
     for jobs in ("1", "2"):
-        flags = ["--suites", "pile", "random10", "--objects", "made:7:40", "--episodes", "2"]
+        flags = ["--suites", "pile", "random10", "--objects", "procedural:7:40", "--episodes", "2"]
         command = ["eval", "shipped", "--policy", "random", *flags, "--physics", "c"]
         assert cli.main([*command, "--jobs", jobs, "--out", str(tmp_path / jobs)]) == 0
         result = json.loads((tmp_path / jobs / "pile.json").read_text())
         policy = policies.make("random", "shipped")
-        table = rollout.evaluate(policy, "pile", 2, 0, "c", objects="made:7:40")
+        table = rollout.evaluate(policy, "pile", 2, 0, "c", objects="procedural:7:40")
         assert {name: result[name] for name in table} == table
         assert {"commit", "versions", "seconds", "config"} <= result.keys()

@@ -36,7 +36,7 @@ def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capt
     """Claim: objects that the hand cannot open for are named."""
     narrow = dataclasses.replace(grippers.load("rg2"), opening=(0.0, 0.03))
     monkeypatch.setattr(grippers, "load", lambda name: narrow)
-    assert cli.main(["objects", "show", "made:0:14"]) == 0
+    assert cli.main(["objects", "show", "procedural:0:14"]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("wider than the hand opens, 30 mm: ")
 
@@ -50,7 +50,7 @@ REFUSED = {
     "make --out x --seed -1": (2, "--seed"),
     "make --out .": (2, "--out: . exists"),
     "show nowhere": (1, "nowhere: no library"),
-    "show made:0:3 --png x.txt": (2, ".png"),
+    "show procedural:0:3 --png x.txt": (2, ".png"),
     "import nowhere --out x": (2, "nowhere does not exist"),
     "import . --out x": (2, "no mesh file"),
     "import . --out x --scale 0": (2, "--scale"),

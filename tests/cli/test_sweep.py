@@ -66,7 +66,7 @@ def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: st
         ("smoke --replay.capacity 65536 --seeds 9999", "lower seeds or raise devices"),
         ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "seeds: 1 to 10000 runs in all"),
         (
-            f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary explore.decay={TAUS}",
+            f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary explore.epsilon_decay={TAUS}",
             "vary: more than 10000 combinations",
         ),
         ("smoke --cluster", "several processes need --run-dir"),
@@ -186,7 +186,7 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
         return metrics.summarise(_episodes(4 if "vpg" in str(folder) else 2 + int(folder.name[-1])))
 
     def environments(cfg: Config, suite: str, *_) -> dict:
-        return {"packed": cfg.scene.arranged == 1.0}
+        return {"packed": cfg.scene.packed_fraction == 1.0}
 
     monkeypatch.setattr(final.policies, "load", lambda folder: folder)
     monkeypatch.setattr(final.suites, "environments", environments)

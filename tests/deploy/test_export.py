@@ -132,13 +132,16 @@ def _random(cfg: Config) -> tuple[Any, Observation]:
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "gripper": {"net": {"gripper": True}, "task": {"kind": "target"}, "sim": {"gripper": "2f85"}},
-    "heights": {"net": {"colour": False, "stride": 4, "subcells": 2, "dilations": (1, 2)}},
-    "mirrored": {"policy": {"augment": True}, "learn": {"critics": 2}, "net": {"subcells": 2}},
-    "anywhere": {"policy": {"cells": "all", "height_bonus": 3.0}, "net": {"growth": 4, "stem": 4}},
+    "heights": {"net": {"colour": False, "stride": 4, "subpixel": 2, "dilations": (1, 2)}},
+    "mirrored": {"policy": {"augment": True}, "learn": {"critics": 2}, "net": {"subpixel": 2}},
+    "anywhere": {
+        "policy": {"action_mask": "none", "height_bonus": 3.0},
+        "net": {"growth": 4, "stem": 4},
+    },
     "grasp": {
         "policy": {"primitive": "grasp"},
         "explore": {"push_fraction": 0.0},
-        "net": {"margin": 0.5},
+        "net": {"pad_fraction": 0.5},
         "learn": {"critics": 2},
     },
 }
@@ -164,7 +167,7 @@ def test_onnx_of_other_nets(name: str):
         scale = max(1.0, float(np.abs(state.q).max()))
         np.testing.assert_allclose(results[5], state.q, atol=TOLERANCE * scale, rtol=0)
         np.testing.assert_array_equal(results[6], state.valid)
-        can_act = bool(height.any()) or cfg.policy.cells == "all"
+        can_act = bool(height.any()) or cfg.policy.action_mask == "none"
         assert bool(results[3]) == can_act
         if can_act:
             _assert_close(results, cfg, params, *maps, scale=scale)
@@ -174,8 +177,8 @@ def test_policy_files(policy: CameraPolicy, tmp_path: Path):
     """Claim: a policy file is written with what --augment, --height-bonus and --retry ask for, else
     as it is; `--average` writes the mean of each number of two policies, and the config of one."""
     copy, mean = tmp_path / "copy.safetensors", tmp_path / "mean.safetensors"
-    asked = ["--augment=on", "--height-bonus=3", "--retry=0.1"]
-    changed = {"augment": True, "height_bonus": 3.0, "retry": 0.1}
+    asked = ["--augment=on", "--height-bonus=3", "--retry_temperature=0.1"]
+    changed = {"augment": True, "height_bonus": 3.0, "retry_temperature": 0.1}
     for options, changes in (([], {}), (asked, changed)):
         copy.unlink(missing_ok=True)
         assert cli.main(["export", "shipped", str(copy), *options]) == 0

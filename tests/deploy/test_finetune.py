@@ -126,7 +126,7 @@ def test_pushes_are_judged_by_the_next_image(policy: CameraPolicy, tmp_path: Pat
     push, other = _grasp(RIGHT, "push"), _grasp(LEFT, "push")
     last = (ONLY_LEFT, _grasp(LEFT), None)
     folder = write(tmp_path, (BOTH, push, Pushed), (ONLY_LEFT, other, Pushed), last)
-    judge = dataclasses.replace(policy, cfg=CFG.change(reward={"push_effect": "change"}))
+    judge = dataclasses.replace(policy, cfg=CFG.change(reward={"push_label": "map_changed"}))
     done = _transitions(judge, experience.load(judge, record.read(folder)))
     np.testing.assert_allclose(done.reward, [0.5, -0.5], atol=1e-6)
 

@@ -16,7 +16,11 @@ SMOKE = presets.smoke()
     ("suite", "objects", "message"),
     [
         ("pile", None, "objects: pile needs a library; csac-jax objects make --out LIB"),
-        ("random10", "made:0:20", "'random10' has no objects of a library; pile, objects_packed"),
+        (
+            "random10",
+            "procedural:0:20",
+            "'random10' has no objects of a library; pile, objects_packed",
+        ),
     ],
 )
 def test_a_library_fits_the_suite(suite: str, objects: str | None, message: str):
@@ -30,7 +34,7 @@ def test_a_pile_ends_after_two_failures(monkeypatch: pytest.MonkeyPatch, tmp_pat
     """Claim: episodes of a pile end empty or after two failures in a row; the result has the
     fingerprint of its scenes."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    prepared = suites.prepare(SMOKE, "pile", 3, 0, "c", objects="made:0:42", split="all")
+    prepared = suites.prepare(SMOKE, "pile", 3, 0, "c", objects="procedural:0:42", split="all")
     env = prepared.parts["pile"]
     assert env.scenes.position.shape == (3, 5, 3)
     episodes = rollout.rollout(env, policies.RandomPolicy(env.cfg), 3, seed=0)

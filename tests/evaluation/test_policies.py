@@ -126,12 +126,12 @@ def test_height_bonus_leads_to_the_top(states):
 
 
 def test_failures_lead_to_other_places(learned, states):
-    """Claim: with `policy.retry` an action after failed grasps is drawn, another one for another
-    key; without failures, or from an observation, it is the best one whatever the setting."""
+    """Claim: with `policy.retry_temperature` an action after failed grasps is drawn, another one for
+    another key; without failures, or from an observation, it is the best one whatever the setting."""
     greedy = CFG.change(policy={"place": "argmax"})
     learned, bold = (
         dataclasses.replace(learned, cfg=cfg)
-        for cfg in (greedy, greedy.change(policy={"retry": 10.0}))
+        for cfg in (greedy, greedy.change(policy={"retry_temperature": 10.0}))
     )
     state, key = _scene(states, 0), jax.random.key
     failed = state.replace(failed_grasps=jnp.int32(3))

@@ -57,7 +57,7 @@ def test_cases_are_the_shipped_files():
 def test_suite_is_the_same_for_every_policy(suite: str):
     """Claim: scenes that are dropped or drawn do not depend on what a policy was trained with."""
     alike = dataclasses.replace(
-        CFG.scene, size_jitter=(0.0, 0.0), density=(600.0, 600.0), arranged=0.5
+        CFG.scene, size_jitter=(0.0, 0.0), density=(600.0, 600.0), packed_fraction=0.5
     )
     (one,), (other,) = (
         suites.prepare(cfg, suite, 2, 0).parts.values()
@@ -148,7 +148,7 @@ def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int
         )
 
     monkeypatch.setattr(pool, "settled", settled)
-    packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, arranged=0.5))
+    packed = dataclasses.replace(CFG, scene=dataclasses.replace(CFG.scene, packed_fraction=0.5))
     (env,) = suites.prepare(packed, suite, EPISODES, 0).parts.values()
     ((slots, least, stream, count, poured),) = asked
     assert (len(slots), least, count, poured) == (blocks, blocks, EPISODES, suite == "random30")

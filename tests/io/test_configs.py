@@ -22,8 +22,8 @@ STORED = Path(__file__).parent / "formats" / "format-2.json"
 SAVED = presets.quick().change(  # as it was when that file was written
     net={"growth": 32, "rotations": 16},
     policy={"augment": False},
-    explore={"decay": 0.998},
-    learn={"updates": 2, "learning_rate": 1e-3},
+    explore={"epsilon_decay": 0.998},
+    learn={"updates_per_step": 2, "learning_rate": 1e-3},
 )
 
 

@@ -99,7 +99,7 @@ def test_finer_maps_lie_where_their_cells_do(stride: int, finer: int):
     """Claim: with s maps' cells per cell of the features, cell (s r + i, s c + j) of output o is
     value (i, j, o) of the features' cell (r, c); with s = stride the maps have the resolution of
     what the net sees."""
-    cfg = dataclasses.replace(COARSE, stride=stride, subcells=finer)
+    cfg = dataclasses.replace(COARSE, stride=stride, subpixel=finer)
     maps, params = np.random.default_rng(0).normal(size=(2, 16, 24, CHANNELS)), _random(cfg)
     got, values = _apply(params, maps, cfg), _numpy_net(params, maps, cfg)  # [2, h, w, s s OUTPUTS]
     assert got.shape == (2, 16 * finer // stride, 24 * finer // stride, dense.OUTPUTS)

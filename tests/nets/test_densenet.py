@@ -173,7 +173,7 @@ def test_number_of_parameters():
 def test_trunks_see_colour_height_and_mask():
     """Claim: a trunk each for colour, height and mask, the latter two three times over."""
     maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
-    zoomed = DenseNet121(zoom=4)
+    zoomed = DenseNet121(upsample=4)
     seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
     assert seen.shape == (3, 2, 8, 8, 3)
     assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
@@ -186,8 +186,10 @@ def test_trunks_see_colour_height_and_mask():
 
 
 def test_a_zoomed_trunk_doubles_its_cells():
-    """Claim: with a zoom a trunk says of maps what one without says of pixels repeated."""
-    nets = (densenet.DenseNetTrunk(dataclasses.replace(TINY, zoom=zoom)) for zoom in (1, 2))
+    """Claim: with a upsample a trunk says of maps what one without says of pixels repeated."""
+    nets = (
+        densenet.DenseNetTrunk(dataclasses.replace(TINY, upsample=upsample)) for upsample in (1, 2)
+    )
     whole, doubling = (jax.jit(net.apply) for net in nets)
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
     variables = random_variables(densenet.DenseNetTrunk(TINY), 0, (1, 64, 64, 3))
@@ -227,14 +229,16 @@ def test_trunks_have_weights_of_their_own():
         assert np.any(after[..., :half] != before[..., :half])
 
 
-@pytest.mark.parametrize(("zoom", "output_stride", "factor"), [(1, 4, 8), (2, 1, 16), (2, 16, 1)])
-def test_head_upsamples(zoom: int, output_stride: int, factor: int):
+@pytest.mark.parametrize(
+    ("upsample", "output_stride", "factor"), [(1, 4, 8), (2, 1, 16), (2, 16, 1)]
+)
+def test_head_upsamples(upsample: int, output_stride: int, factor: int):
     """Claim: maps have the resolution that `output_stride` says; they are bilinear between the
     features' cells, which keep their places, and constant features give a constant map."""
-    cfg = with_constants(DenseNet121(zoom=zoom), output_stride=output_stride)
+    cfg = with_constants(DenseNet121(upsample=upsample), output_stride=output_stride)
     plane = np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None]
     plane = jnp.asarray(plane, jnp.float32)
-    got = np.asarray(densenet._upsample(plane, 32 // (cfg.zoom * cfg.output_stride)))[0, ..., 0]
+    got = np.asarray(densenet._upsample(plane, 32 // (cfg.upsample * cfg.output_stride)))[0, ..., 0]
     assert got.shape == (4 * factor, 5 * factor)
     at = [(np.arange(n * factor) + 0.5) / factor - 0.5 for n in (4, 5)]
     rows, cols = [(a >= 0) & (a <= n - 1) for a, n in zip(at, (4, 5), strict=True)]

@@ -25,7 +25,7 @@ TINY = {
 
 
 def _config(size: int = 224, **net: Any) -> Config:
-    fields = {"kind": "densenet121", "margin": 0.4286, **net}
+    fields = {"kind": "densenet121", "pad_fraction": 0.4286, **net}
     return presets.smoke().change(heightmap={"size": size}, net=fields)
 
 
@@ -37,40 +37,40 @@ SMALL = {"kind": "small"}
     [
         (
             224,
-            {"margin": 0.125},
-            r"net.margin: .* of 32 cells, not 252; try 0.0000 \(224 cells\), 0.",
+            {"pad_fraction": 0.125},
+            r"net.pad_fraction: .* of 32 cells, not 252; try 0.0000 \(224 cells\), 0.",
         ),
         (
             64,
-            {"margin": 0.25},
-            r"net.margin: .* of 32 cells, not 80; try 0.0000 \(64 cells\), 0.500",
+            {"pad_fraction": 0.25},
+            r"net.pad_fraction: .* of 32 cells, not 80; try 0.0000 \(64 cells\), 0.500",
         ),
         (
             40,
-            {"margin": 0.0},
-            "net.margin: .* multiple of 32 cells, not 40; take another heightmap",
+            {"pad_fraction": 0.0},
+            "net.pad_fraction: .* multiple of 32 cells, not 40; take another heightmap",
         ),
         (
             64,
-            {"margin": 0.125, "zoom": 2},
-            "net.margin: .* multiple of 16 cells, not 72; try 0.000",
+            {"pad_fraction": 0.125, "upsample": 2},
+            "net.pad_fraction: .* multiple of 16 cells, not 72; try 0.000",
         ),
-        (224, {"zoom": 3}, "net.zoom: must divide 8"),
-        (224, {"zoom": 16}, "net.zoom: must divide 8"),
+        (224, {"upsample": 3}, "net.upsample: must divide 8"),
+        (224, {"upsample": 16}, "net.upsample: must divide 8"),
         (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: unknown setting"),
         (224, {"norm": "layer"}, "net.norm: 'layer' is not one of: group, batch"),
         (224, {"kind": "offset"}, "net.kind: 'offset' is not one of: small, densenet121"),
         (224, {"stem": 16}, "net.stem: unknown setting"),
         (64, {**SMALL, "norm": "batch"}, "net.norm: unknown setting"),
         (64, {**SMALL, "stride": 3}, "net.stride: 3 is not one of: 2, 4"),
-        (64, {**SMALL, "subcells": 3}, "net.subcells: 3 is not one of: 1, 2, 4"),
-        (64, {**SMALL, "subcells": 4}, "net.subcells: at most net.stride, 2"),
+        (64, {**SMALL, "subpixel": 3}, "net.subpixel: 3 is not one of: 1, 2, 4"),
+        (64, {**SMALL, "subpixel": 4}, "net.subpixel: at most net.stride, 2"),
         (64, {**SMALL, "dilations": ()}, "net.dilations: at least one layer"),
         (64, {"rotations": 5}, "net.rotations: must be even"),
         (
             64,
-            {**SMALL, "margin": 0.22, "stride": 4},
-            "net.margin: rotated maps of 78 cells are not a",
+            {**SMALL, "pad_fraction": 0.22, "stride": 4},
+            "net.pad_fraction: rotated maps of 78 cells are not a",
         ),
     ],
 )
@@ -84,12 +84,12 @@ def test_config_that_no_net_can_have(size: int, net: dict[str, Any], message: st
 def test_suggested_margins_do():
     """Claim: the margins that the complaint names are good ones."""
     for size in (64, 96, 112, 224, 232):
-        for zoom in (1, 2):
+        for upsample in (1, 2):
             with pytest.raises(ValueError, match="try") as raised:
-                _config(size, margin=0.2, zoom=zoom)
+                _config(size, margin=0.2, upsample=upsample)
             for word in str(raised.value).split("try ")[1].split(", "):
                 margin, side = word.split(" (")
-                cfg = _config(size, margin=float(margin), zoom=zoom)
+                cfg = _config(size, margin=float(margin), upsample=upsample)
                 frames = maps.frames(cfg, networks.make(cfg.net))
                 assert frames.tables.canvas == int(side.removesuffix(" cells)"))
 
@@ -98,9 +98,9 @@ def test_suggested_margins_do():
     ("stride", "finer", "cells"), [(2, 1, 2), (2, 2, 1), (4, 1, 4), (4, 2, 2), (4, 4, 1)]
 )
 def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
-    """Claim: a cell of the small net's maps is stride / subcells cells of its input."""
+    """Claim: a cell of the small net's maps is stride / subpixel cells of its input."""
     layers = {"dilations": (1,), "growth": 4}
-    cfg = _config(64, kind="small", margin=0.125, stride=stride, subcells=finer, **layers)
+    cfg = _config(64, kind="small", margin=0.125, stride=stride, subpixel=finer, **layers)
     nets, blank = networks.make(cfg.net), jnp.zeros((1, 72, 72, 4))
     frames = maps.frames(cfg, nets)
     (q, _), _ = jax.eval_shape(nets.critic.init_with_output, jax.random.key(0), blank)
@@ -142,7 +142,7 @@ def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: boo
 def test_states_of_densenet_are_seen_in_groups():
     """Claim: DenseNet-121 sees one state of 640 px at a time, four of 320, and what it says of each
     is what it says of its passes by themselves; the small net sees all at once."""
-    assert networks.make(DenseNet121(zoom=2)).states_at_once(320) == 1
+    assert networks.make(DenseNet121(upsample=2)).states_at_once(320) == 1
     assert networks.make(DenseNet121()).states_at_once(320) == 4
     assert networks.make(SmallNet()).states_at_once(72) is None
     nets = networks.make(TINY["densenet121"])

@@ -107,8 +107,8 @@ def test_a_damaged_file_is_named(copy: Path, name: str, damage: str):
     ("source", "split", "message"),
     [
         ("none", "train", "csac-jax objects make --out"),
-        ("made:0:9999", "all", "1 to 4096"),
-        ("made:0:1", "held_out", "none of the 1 objects is of the split"),
+        ("procedural:0:9999", "all", "1 to 4096"),
+        ("procedural:0:1", "held_out", "none of the 1 objects is of the split"),
     ],
 )
 def test_a_library_that_is_not_there_is_an_error(source: str, split: library.Split, message: str):
@@ -121,7 +121,7 @@ _TABLES = """
 import hashlib
 from csac_jax.objects import tables
 content = hashlib.sha256()
-for leaf in tables.from_library(tables.find("mixed:5:80", "all")):
+for leaf in tables.from_library(tables.find("procedural+assemblies:5:80", "all")):
     content.update(repr(leaf.tobytes() if hasattr(leaf, "tobytes") else leaf).encode())
 print(content.hexdigest())
 """

@@ -86,9 +86,9 @@ def test_shapes_follow_from_the_seed():
 
 
 def test_assemblies_come_between():
-    """Claim: `mixed:SEED:COUNT` is `made:SEED:COUNT / 2` with an assembly after each object; they
-    train, but for some, and no two are alike."""
-    mixed = tables.find("mixed:3:120", "all").objects
+    """Claim: `procedural+assemblies:SEED:COUNT` has an assembly after each object of
+    `procedural:SEED:COUNT / 2`; they train, but for some, and no two are alike."""
+    mixed = tables.find("procedural+assemblies:3:120", "all").objects
     assert [member.name for member in mixed[::2]] == [member.name for member in MADE[:60]]
     assert {member.family for member in mixed[1::2]} == {"assembly"}
     assert 0 < sum(member.held_out for member in mixed[1::2]) < 30
@@ -99,7 +99,7 @@ def test_splits_are_disjoint_and_by_name():
     """Claim: an object is held out by the digest of its name or family, alone or in a library;
     whole families and some objects of every other one are."""
     made, train, held_out = (
-        tables.find("made:0:280", split).objects for split in ("all", "train", "held_out")
+        tables.find("procedural:0:280", split).objects for split in ("all", "train", "held_out")
     )
     names = [{member.name for member in members} for members in (made, train, held_out)]
     assert names[1] | names[2] == names[0]
@@ -112,7 +112,7 @@ def test_splits_are_disjoint_and_by_name():
 def test_tables_hold_every_face():
     """Claim: an object is what lies between two chunks with `first`: a point is inside a part of
     the table just where it is inside one of the object."""
-    source = tables.find("made:0:42", "all")
+    source = tables.find("procedural:0:42", "all")
     table, rng = tables.from_library(source), np.random.default_rng(0)
     for number, member in enumerate(source.objects):
         points = rng.uniform(*member.bounds, (500, 3)).astype(np.float32)

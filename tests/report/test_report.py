@@ -313,7 +313,11 @@ SEEN = {f"camera__{name}": value for name, value in LENS.items()}
         ({"policy__augment": True}, {}, "--augment off"),
         ({}, {"policy__height_bonus": 3.0}, "--height-bonus 3.0"),
         ({"policy__retry": 0.1}, {}, "--retry 0.0"),
-        (OBJECTS | {"scene__objects": "made:1:9"}, OBJECTS | {"scene__objects": "made:2:9"}, None),
+        (
+            OBJECTS | {"scene__objects": "procedural:1:9"},
+            OBJECTS | {"scene__objects": "procedural:2:9"},
+            None,
+        ),
         ({"heightmap__view": "oblique", "sensor__kind": "d415"}, SEEN, None),
         (SEEN, SEEN, ""),
     ],
@@ -339,7 +343,7 @@ def test_options_of_an_evaluation(trained: Any, evaluated: Any, options: str | N
     if evaluated is SEEN:
         assert configs.to_dict(configs.from_dict(before).change(**view)) == seen
     if "scene__objects" in evaluated:
-        assert (asked.objects, asked.split) == ("made:2:9", "all")
+        assert (asked.objects, asked.split) == ("procedural:2:9", "all")
 
 
 def test_missing_things_are_noted(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):

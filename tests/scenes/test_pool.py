@@ -149,7 +149,9 @@ def test_scenes_are_made_on_the_cpu(cache: Path, monkeypatch: pytest.MonkeyPatch
 
     for module, name in ((model, "scene_fields"), (arrange, "arrangements")):
         _spy(monkeypatch, module, name, note)
-    pool.scenes(Config(scene=SceneConfig(slots=("box",) * 3, min_blocks=3, arranged=0.5)), 5, 4)
+    pool.scenes(
+        Config(scene=SceneConfig(slots=("box",) * 3, min_blocks=3, packed_fraction=0.5)), 5, 4
+    )
     assert devices == dict.fromkeys(["scene_fields", "arrangements"], jax.devices("cpu")[0])
 
 
@@ -162,7 +164,7 @@ def test_streams_share_no_scene(small: Config):
 
 def test_arrangements_are_kept(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: packed scenes, too, are made once; another stream, number or code has its own."""
-    cfg = presets.get("fast").change(scene={"arranged": 1.0, "pool": 6})
+    cfg = presets.get("fast").change(scene={"packed_fraction": 1.0, "pool": 6})
     made = pool.scenes(cfg, 0)
     monkeypatch.setattr(pool.arrange, "arrangements", None)  # whatever calls it fails
     _assert_same(made, pool.scenes(cfg, 0))

@@ -79,7 +79,7 @@ def grasped_bar(cfg: Config) -> tuple[SceneState, JointTrajectory]:
 
 
 TWO_OBJECTS = presets.get("quick").change(
-    scene={"slots": ("object",) * 2, "min_blocks": 2, "objects": "made:0:12"},
+    scene={"slots": ("object",) * 2, "min_blocks": 2, "objects": "procedural:0:12"},
     sim={"grasp_phases": (23, 1, 1), "contacts": 96},
 )
 

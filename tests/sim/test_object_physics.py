@@ -20,7 +20,12 @@ from csac_jax.world.scene_state import SceneState
 from tests.sim.conftest import TWO_OBJECTS, bar, grasped_bar, thrown_objects
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
-SCENE = {"slots": ("object",) * 3, "min_blocks": 3, "objects": "made:0:42", "settle_time": 1.0}
+SCENE = {
+    "slots": ("object",) * 3,
+    "min_blocks": 3,
+    "objects": "procedural:0:42",
+    "settle_time": 1.0,
+}
 CONFIG = Config().change(
     scene=SCENE | {"drop_extent": (0.3, 0.3)}, sim={"physics": "c"}, task={"kind": "clear"}
 )
@@ -77,8 +82,10 @@ def test_objects_need_a_library():
     """Claim: objects without a library, and packed scenes of both kinds, are refused by setting."""
     with pytest.raises(ValueError, match=r"scene\.objects: slots of kind object need a library"):
         dataclasses.replace(CONFIG.scene, objects="")
-    with pytest.raises(ValueError, match=r"scene\.arranged: must be 0"):
-        dataclasses.replace(CONFIG.scene, slots=("box", "object"), min_blocks=2, arranged=0.5)
+    with pytest.raises(ValueError, match=r"scene\.packed_fraction: must be 0"):
+        dataclasses.replace(
+            CONFIG.scene, slots=("box", "object"), min_blocks=2, packed_fraction=0.5
+        )
 
 
 def _grasp(env: Env, scene: SceneState) -> tuple:

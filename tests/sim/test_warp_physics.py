@@ -310,7 +310,7 @@ def test_held_objects_hang_as_in_c(tmp_path: Path):
 @needs_warp
 def test_many_objects_fit_on_warp():
     """Claim: Warp takes scenes of more objects than its dense matrices hold."""
-    scene = {"slots": ("object",) * 10, "min_blocks": 10, "objects": "made:0:12"}
+    scene = {"slots": ("object",) * 10, "min_blocks": 10, "objects": "procedural:0:12"}
     cfg = presets.get("objects").change(scene=scene, sim={"physics": "warp"})
     world = model.build(cfg.scene, cfg.sim)
     from csac_jax.sim import warp_action

@@ -25,7 +25,7 @@ OTHER = {
     "explore.noise_std": 0.2,
     "explore.epsilon_primitive": (0.9, 0.2),
     "explore.epsilon_place": (0.8, 0.1),
-    "explore.decay": 0.99,
+    "explore.epsilon_decay": 0.99,
     "explore.push_fraction": 0.6,
     "learn.learning_rate": 3e-3,
     "learn.actor_learning_rate": 2e-3,

@@ -323,7 +323,7 @@ def test_nothing_is_learned_before_the_warm_up(run):
         before, after = (getattr(s.learner.online, name) for s in (run.states[0], run.states[1]))
         assert not equal(before, after), name
     updates = [int(s.learner.updates) for s in run.states]
-    assert updates == [CFG.learn.updates * n for n in (0, 1, 1 + T, 1 + 2 * T)]
+    assert updates == [CFG.learn.updates_per_step * n for n in (0, 1, 1 + T, 1 + 2 * T)]
     assert updates == [int(step.updates_done(CFG, s.step)) for s in run.states]
     assert all(np.all(np.isfinite(m.critic_loss)) for m in run.metrics)
 

@@ -39,10 +39,10 @@ def _paid(cfg: Config, after: State) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("algo", ["csac", "vpg"])
 def test_rewards_follow_their_source(algo: str):
-    """Claim: with `reward.source sensed` a grasp is paid for, and bootstraps, as one whose true
-    outcome is the sensed one; by default what is sensed counts for nothing."""
+    """Claim: with `reward.outcome_source sensors` a grasp is paid for, and bootstraps, as one whose
+    true outcome is the sensed one; by default what is sensed counts for nothing."""
     truth = algorithms.configure(presets.smoke(), algo)
-    sensed = truth.change(reward={"source": "sensed"})
+    sensed = truth.change(reward={"outcome_source": "sensors"})
     for cfg, outcome in ((truth, TRUE), (sensed, SENSED)):
         found, wanted = _paid(cfg, _after(TRUE, SENSED)), _paid(truth, _after(outcome, outcome))
         np.testing.assert_array_equal(found, wanted)
@@ -50,10 +50,10 @@ def test_rewards_follow_their_source(algo: str):
 
 
 def test_what_is_not_sensed_costs_nothing():
-    """Claim: with `reward.source sensed`, a cost of what only the simulator knows is refused."""
-    refused = r"^reward\.lost_block_penalty: must be 0 where reward\.source is"
+    """Claim: with `reward.outcome_source sensors`, a cost that only the simulator knows is refused."""
+    refused = r"^reward\.lost_block_penalty: must be 0 where reward\.outcome_source is"
     with pytest.raises(ValueError, match=refused):
-        presets.smoke().change(reward={"source": "sensed", "lost_block_penalty": 1.0})
+        presets.smoke().change(reward={"outcome_source": "sensors", "lost_block_penalty": 1.0})
 
 
 @pytest.mark.slow
@@ -67,8 +67,8 @@ def test_switches_combine(monkeypatch: pytest.MonkeyPatch):
         sim={"physics": "c", "robot": "ur5"},
         heightmap={"view": "oblique"},
         sensor={"depth_noise": (0.001, 0.0014), "dropped": 0.02, "pose_noise": (0.001, 0.002)},
-        policy={"cells": "all"},
-        reward={"source": "sensed"},
+        policy={"action_mask": "none"},
+        reward={"outcome_source": "sensors"},
     )
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene_state.parked(cfg.scene.slots))
     physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)

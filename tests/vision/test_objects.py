@@ -18,7 +18,7 @@ from csac_jax.world.scene_state import SceneState
 
 KINDS = ("object", "object", "box", "object", "arch")  # C's rays do not follow scaled meshes
 CONFIG = Config().change(
-    scene={"slots": KINDS, "min_blocks": 1, "objects": "made:0:60", "split": "all"},
+    scene={"slots": KINDS, "min_blocks": 1, "objects": "procedural:0:60", "split": "all"},
     sim={"physics": "c"},
     camera=CameraConfig().scaled(0.25),
 )

@@ -206,7 +206,7 @@ def test_an_episode_with_errors_needs_a_key():
         ({"sensor": {"kind": "d400"}}, "sensor.kind: 'd400' is not one of: none, d415"),
         ({"heightmap": {"view": "side"}}, "heightmap.view"),
         ({"heightmap": {"size": 60}}, "heightmap.size"),
-        ({"heightmap": {"size": 80}}, "net.margin"),
+        ({"heightmap": {"size": 80}}, "net.pad_fraction"),
         ({"net": {"rotations": 202}}, "net.rotations: at most 200"),
         ({"net": {"rotations": 15}}, "net.rotations"),
     ],

@@ -18,7 +18,7 @@ from csac_jax.world.scene_state import SceneState
 KINDS = ("object",) * 5
 DROPS = {"min_blocks": 5, "drop_extent": (0.3, 0.3), "settle_time": 1.0}
 CONFIG = Config().change(
-    scene={"slots": KINDS, "objects": "made:0:42", **DROPS}, sim={"physics": "c"}
+    scene={"slots": KINDS, "objects": "procedural:0:42", **DROPS}, sim={"physics": "c"}
 )
 
 
@@ -46,15 +46,15 @@ def test_every_scene_draws_its_own_objects():
     assert not any(member.held_out for member in objects)
     half = object_slots.table(CONFIG.scene).half
     np.testing.assert_array_equal(scene.half_size, half[scene.object_id])
-    few = _drop(0, objects="made:0:2", split="all")
+    few = _drop(0, objects="procedural:0:2", split="all")
     assert sorted(np.bincount(few.object_id)) == [2, 3]
 
 
 @pytest.mark.usefixtures("cache")
 def test_share_of_objects_side_by_side():
-    """Claim: `scene.arranged` of the scenes are objects side by side in the largest square, of
-    which some are drawn again where there is no room; the others are dropped, as without."""
-    wide = dataclasses.replace(CONFIG.scene, drop_extent=(0.1, 0.3), arranged=0.5, pool=4)
+    """Claim: `scene.packed_fraction` of the scenes are objects side by side in the largest square,
+    of which some are drawn again where there is no room; the others are dropped, as without."""
+    wide = dataclasses.replace(CONFIG.scene, drop_extent=(0.1, 0.3), packed_fraction=0.5, pool=4)
     mixed = pool.scenes(CONFIG.change(scene=wide), 0)
     apart = pool.settled(CONFIG, 0, 2, packed=True)
     np.testing.assert_array_equal(mixed.position[2:], apart.position)
