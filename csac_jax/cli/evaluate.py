@@ -47,7 +47,8 @@ class EvalOptions:
     """With --out, suites at a time, each on a core of its own; 0 for one per core. One at a time
     has all cores, or the GPU."""
     objects: str | None = None
-    """Library that suites of objects draw from: a folder, or procedural:SEED:COUNT; by default the policy's."""
+    """Library that suites of objects draw from: a folder, or procedural:SEED:COUNT; by default the
+    policy's."""
     split: Literal["held_out", "train", "all"] = "held_out"
     """Which of its objects."""
     physics: Literal["auto", "mjx", "c"] = "auto"

@@ -66,7 +66,7 @@ def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: st
         ("smoke --replay.capacity 65536 --seeds 9999", "lower seeds or raise devices"),
         ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "seeds: 1 to 10000 runs in all"),
         (
-            f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary explore.epsilon_decay={TAUS}",
+            f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary policy.retry={TAUS}",
             "vary: more than 10000 combinations",
         ),
         ("smoke --cluster", "several processes need --run-dir"),

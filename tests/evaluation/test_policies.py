@@ -126,8 +126,8 @@ def test_height_bonus_leads_to_the_top(states):
 
 
 def test_failures_lead_to_other_places(learned, states):
-    """Claim: with `policy.retry_temperature` an action after failed grasps is drawn, another one for
-    another key; without failures, or from an observation, it is the best one whatever the setting."""
+    """Claim: with `policy.retry_temperature` an action after failed grasps is drawn, another for
+    another key; without failures, or from an observation, it is the best one."""
     greedy = CFG.change(policy={"place": "argmax"})
     learned, bold = (
         dataclasses.replace(learned, cfg=cfg)
