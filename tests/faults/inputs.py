@@ -25,7 +25,7 @@ from csac_jax.io import checkpoint, configs, files, leaves, policy_file
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.io.policy_file import PolicyFileError
 from csac_jax.report import comparison, result_tables, results
-from csac_jax.runtime import cache
+from csac_jax.runtime import private_jax
 from csac_jax.scenes import cases, pool
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
@@ -149,7 +149,7 @@ def _packing() -> Iterator[None]:
     plain = SimpleNamespace(compress=bytes, decompress=bytes)
     module = SimpleNamespace(ZstdCompressor=lambda: plain, ZstdDecompressor=lambda: plain)
     with mock.patch.multiple(compilation_cache, zstd=None, zstandard=module):
-        cache._compress_with_checksum()
+        private_jax.compress_with_checksum()
         yield
 
 

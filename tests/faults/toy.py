@@ -157,7 +157,7 @@ class Reference:
         while len(self.states) <= step:
             self._state, metrics = self._chunk(self._state)
             self.states.append(bits(self._state))
-            progress = loop.Progress(0.0, [])
+            progress = loop.LoopState(0.0, [])
             record = loop.record_chunk(config(), len(self.states), metrics, progress, 1.0)[1]
             self.outcomes.append(record.outcomes)
         return self.states[step]
