@@ -183,8 +183,7 @@ class Env:
         return self._judge(state, action, motion, removal)
 
     def _validate(self, state: State) -> tuple[SceneState, jax.Array]:
-        """Returns the scene, or an empty one where scene or observation are out of bounds, and
-        [] bool, they are within."""
+        """Returns the scene, empty if it or the observation is out of bounds, and [] bool."""
         spec = self.observation_spec
         valid = simulation.healthy(state.scene) & spec.height.contains(state.obs.height)
         valid &= spec.colour.contains(state.obs.colour)
@@ -224,7 +223,10 @@ class Env:
         terminated = ~jnp.any(scene.in_play & scene_state.is_target(scene))
         failed = jnp.where(jnp.any(removal.lifted), 0, state.failed_grasps + 1)
         failed_grasps = jnp.where(motion.is_grasp, failed, state.failed_grasps)
-        capped = self._capped(actions, unchanged_steps, failed_grasps)
+        task = self.cfg.task
+        capped = (actions >= task.max_actions) | (unchanged_steps >= task.max_steps_without_change)
+        if self.max_failures:
+            capped |= failed_grasps >= self.max_failures
         info = _info(action, motion, removal, moved, changed)
         return State(
             scene=scene,
@@ -239,19 +241,8 @@ class Env:
             noise_key=state.noise_key,
         )
 
-    def _capped(
-        self, actions: jax.Array, unchanged_steps: jax.Array, failed_grasps: jax.Array
-    ) -> jax.Array:
-        """Returns [] bool, a count has reached its cap."""
-        task = self.cfg.task
-        capped = (actions >= task.max_actions) | (unchanged_steps >= task.max_steps_without_change)
-        if self.max_failures:
-            capped |= failed_grasps >= self.max_failures
-        return capped
-
     def randomise_pose(self, key: jax.Array, scene: SceneState) -> SceneState:
-        """Rotates a scene by a random yaw; draws the task's target and a varying gripper's
-        fingers."""
+        """Rotates a scene at random; draws the task's target and a varying gripper's fingers."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
         placed = scene_state.randomise_pose(key, scene, extent, self.any_yaw, has_target)
         return scene_state.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
@@ -283,11 +274,10 @@ class AutoResetEnv:
         return self.env.reset(key)
 
     def step(self, key: jax.Array, state: State, action: Action) -> tuple[State, State]:
-        """Returns the state to act in next, and the state after the action: carry and output of
-        scan.
+        """Returns the state to act in next, and the state after the action: carry, output of scan.
 
-        The second has reward, done, info and, where done, the terminal observation. The first is
-        the second, or where done the first state of the next episode.
+        The second has reward, info and, where done, the terminal observation; the first is then
+        the first state of the next episode.
         """
         after = self.env.step(state, action)
         return _select(after.done, self.env.auto_reset(key, after), after), after

@@ -47,8 +47,7 @@ class Interface:
 
     @classmethod
     def make(cls, config: str | Config, actions: ActionKind, scenes: int) -> "Interface":
-        """Makes the interface of a config or a preset's name, for so many scenes. Raises ValueError
-        for unknown names and for no scene, and as `make_env` does."""
+        """Makes the interface of a config or preset. Raises ValueError for bad arguments."""
         if scenes < 1:
             raise ValueError(f"num_envs: must be at least 1, not {scenes}")
         if actions not in ("continuous", "dense"):
@@ -106,8 +105,7 @@ class Interface:
 
 
 class ClutterEnv(gymnasium.Env[Any, Any]):
-    """One scene. `info` has the action's effects: `outcome` of a grasp, `cleared`, `blocks_lost`,
-    `physics_diverged`."""
+    """One scene. `info`: outcome of a grasp, cleared, blocks_lost, physics_diverged."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012  (Gymnasium's way)
 
@@ -146,16 +144,14 @@ class ClutterEnv(gymnasium.Env[Any, Any]):
         return self.interface.observation(after.obs), float(after.reward), *ends, info
 
     def render(self) -> np.ndarray | None:
-        """Renders the scene from the side, [480, 640, 3] uint8, by our own rays; None without a
-        mode. Raises ResetNeeded before the first reset."""
+        """Renders [480, 640, 3] uint8 from the side by our rays; None without a mode."""
         if self.render_mode is None:
             return None
         return np.asarray(_picture(self.interface.env.cfg, _ready(self.state).scene))
 
 
 class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
-    """A batch of scenes, each replaced in the step in which it ends; `final_obs` has its last
-    observation."""
+    """A batch of scenes, each replaced in the step in which it ends, see `final_obs`."""
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  (Gymnasium's way)
 

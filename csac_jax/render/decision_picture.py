@@ -48,8 +48,7 @@ def _draw_image(cfg: Config, axes: Axes, view: CameraView, decisions: list[Decis
 
 
 def paths(decision: Decision, half_finger: float) -> list[np.ndarray]:
-    """Returns lines [n, 3] m of a decision: the way of a push; of a grasp the way down, the gap and
-    both fingers, whose half width is `half_finger` m."""
+    """Returns lines [n, 3] m: a push's way; a grasp's descent, gap and fingers, `half_finger` m."""
     places = np.array([waypoint.position for waypoint in decision.waypoints])
     if decision.primitive == Primitive.PUSH.name.lower():
         return [places[:3]]

@@ -111,10 +111,7 @@ def _ray_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
 
 
 class RgbdRenderer:
-    """Colour and depth images of the blocks of one episode by OpenGL, without the robot.
-
-    Close it: it holds an OpenGL context.
-    """
+    """RGBD images of an episode's blocks by OpenGL, without the robot. Close it after use."""
 
     def __init__(self, world: World, scene: SceneState, size: tuple[int, int]) -> None:
         scene = jax.device_get(scene)
@@ -133,8 +130,7 @@ class RgbdRenderer:
         self._renderer = mujoco.Renderer(model, size[1], size[0])
 
     def image(self, scene: SceneState, eye: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Draws the episode's blocks at their poses in `scene`: colour [h, w, 3] uint8 and depth
-        [h, w] m, 0 where nothing is hit."""
+        """Draws blocks as in `scene`: colour [h, w, 3] uint8, depth [h, w] m, 0 without a hit."""
         pose = np.concatenate([scene.position, scene.quaternion], axis=1)
         self._data.qpos[self._world.block_qpos] = pose
         mujoco.mj_kinematics(self._model, self._data)

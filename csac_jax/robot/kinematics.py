@@ -271,9 +271,7 @@ def joint_targets(arm: Arm, q_start: jax.Array, control: jax.Array) -> tuple[jax
     Args: q_start [6] rad; control [T, 4 or more] as in `primitives.Plan`, for the tip frame.
     Returns: joint angles [T, 6] rad; [] bool, True if the branch reaches every set-point.
     """
-    poses = jax.vmap(top_down)(control[:, :3], control[:, 3])
-    solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)  # [T, 8, 6], [T, 8]
-    valid = valid & jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
+    solutions, valid = _clear_branches(arm, jax.vmap(top_down)(control[:, :3], control[:, 3]))
     joints, good, motion = jax.vmap(_follow, (None, 1, 1))(q_start, solutions, valid)  # by branch
     reached = jnp.sum(good, axis=1)
     branch = jnp.argmin(jnp.where(reached == jnp.max(reached), motion, jnp.inf))
@@ -283,10 +281,14 @@ def joint_targets(arm: Arm, q_start: jax.Array, control: jax.Array) -> tuple[jax
 def reaches(arm: Arm, tips: jax.Array, yaw: jax.Array) -> jax.Array:
     """Returns [] bool, one branch reaches all places `tips` [T, 3] m of a hand that points down at
     `yaw` [] rad, with the arm clear at each. The way between them is not checked."""
-    poses = jax.vmap(top_down, (0, None))(tips, yaw)
-    solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)  # [T, 8, 6], [T, 8]
-    clear_at = jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
-    return jnp.any(jnp.all(valid & clear_at, axis=0))
+    _, valid = _clear_branches(arm, jax.vmap(top_down, (0, None))(tips, yaw))
+    return jnp.any(jnp.all(valid, axis=0))
+
+
+def _clear_branches(arm: Arm, poses: TipPose) -> tuple[jax.Array, jax.Array]:
+    """Solves for poses, leaves [T, ...]: [T, 8, 6] rad, and [T, 8] bool, valid and clear."""
+    solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)
+    return solutions, valid & jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
 
 
 def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, ...]:

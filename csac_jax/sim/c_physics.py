@@ -80,8 +80,7 @@ class CPhysics:
         return scene_state.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
 
     def _run_batch(self, *batch: Any) -> Any:
-        """Runs every scene of a batch, whose leading axes are kept. NumPy only: JAX must not run
-        inside a callback."""
+        """Runs a batch of scenes and keeps its axes. NumPy only: JAX must not run in a callback."""
         batch = jax.tree.map(np.asarray, batch)
         axes = batch[-1].reachable.shape
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], batch) for i in np.ndindex(axes)]

@@ -28,10 +28,7 @@ class MjxPhysics:
     data: mjx.Data  # blank state whose arrays fix shapes and dtypes
 
     def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
-        """Runs one primitive, see `physics.Physics`.
-
-        Matrix products keep float32: a GPU would cut them to 10 bits.
-        """
+        """Runs one primitive; matrix products keep float32, which a GPU would cut to 10 bits."""
         world, model = self.world, scene_model(self, scene)
         initial = initial_data(self, scene, joints)
 
@@ -94,8 +91,7 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
 
 
 def _touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """Returns which of palm and pads touches which block, [3, N] bool, and [] bool, contacts may be
-    missing because all slots are in use."""
+    """Returns [3, N] bool, palm or pad touches block, and [] bool, all contact slots are in use."""
     active, pair = data._impl.contact.dist < 0.0, data._impl.contact.geom  # [C], [C, 2]
     is_pad = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1)
     is_hand = is_pad & active[None]  # [3, C]

@@ -325,8 +325,7 @@ class WarpSimulator:
         return dict(zip(self._results, results, strict=True))
 
     def prepared(self, scenes: int) -> Batch:
-        """Returns the batch of so many scenes on the current device; kernels are built for minutes
-        the first time."""
+        """Returns the batch of so many scenes on the current device; builds its kernels once."""
         key = (wp.get_device().alias, scenes)
         with _ONE_AT_A_TIME:
             if key not in self.batches:

@@ -115,8 +115,7 @@ def window(cfg: CameraConfig, extent: float, highest: float, radius: float) -> t
 
 
 def shade(colour: jax.Array, normal: jax.Array, light: Any = LIGHT) -> jax.Array:
-    """Shades colours [S, 3], 0 .. 1, of surfaces with unit normals [S, 3]; `light` [3] is the unit
-    vector towards the light."""
+    """Shades colours [S, 3], 0 .. 1, by unit normals [S, 3]; `light` [3] is towards the light."""
     x, y, z = light
     cosine = normal[:, 0] * x + normal[:, 1] * y + normal[:, 2] * z  # [S]
     return (AMBIENT + (1.0 - AMBIENT) * jnp.maximum(cosine, 0.0))[:, None] * colour

@@ -46,8 +46,7 @@ class DepthCamera(NamedTuple):
 
 
 def _stereo(width: int, view_deg: float, baseline: float) -> DepthCamera:
-    """Makes a stereo camera of the D400 series with images of `width` px and a horizontal field of
-    view; `baseline` in m. Its window has 7 px a side (ours)."""
+    """Makes a D400 camera of `width` px, a field of view, a baseline in m; window 7 px (ours)."""
     focal = 0.5 * width / math.tan(math.radians(0.5 * view_deg))
     disparity = focal * baseline  # px, at a depth of 1 m
     return DepthCamera(

@@ -48,8 +48,7 @@ class Shapes(NamedTuple):
 
 
 def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Observation:
-    """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` drawn from
-    `key`."""
+    """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` by `key`."""
     shapes = scene_shapes(cfg.scene, scene)
     tables = scene_tables(cfg.scene, scene, shapes, _light(cfg.sensor, key))
     if cfg.heightmap.view == "ortho":
@@ -230,8 +229,7 @@ def from_pixels(
 def oblique_noisy(
     key: jax.Array, cfg: Config, shapes: Shapes, tables: SurfaceTables, believed: Camera
 ) -> Observation:
-    """Observes with sensor noise; the real camera stands a little off the `believed` one. Flying
-    pixels are left out, as in `deploy`."""
+    """Observes with sensor noise and without flying pixels; the real camera is a little off."""
     key_pose, key_depth, key_colour = jax.random.split(key, 3)
     real = sensor.pose(key_pose, cfg.sensor, believed)
     hits = cast_pixels(cfg, real, shapes)

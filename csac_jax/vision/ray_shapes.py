@@ -64,8 +64,7 @@ def clip(
     face: jax.Array,
     first: jax.Array | int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cuts the part from `enter` to `leave` of a ray by more half-spaces, numbered from `first`;
-    `face` is the one at which it enters. All []; see `enter_half_spaces`."""
+    """Cuts a ray's part from `enter` to `leave` by half-spaces, numbered from `first`. All []."""
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
         inverse = 1.0 / jnp.where(speed == 0.0, _PARALLEL, speed)
@@ -91,8 +90,7 @@ def ray_plane(size: jax.Array, origin: Vector, direction: Vector) -> RayHit:
 
 
 def _slab(half: jax.Array, origin: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Returns where a line enters and leaves |x| <= half along one axis, all []; it enters later
-    than it leaves if it misses, and a parallel one inside does so at -+inf."""
+    """Returns entry and exit [] of |x| <= half on an axis: crossed if missed, -+inf if parallel."""
     parallel = ~(jnp.abs(direction) > 0.0)
     inverse = 1.0 / jnp.where(parallel, 1.0, direction)
     middle, reach = -origin * inverse, half * jnp.abs(inverse)
@@ -102,8 +100,7 @@ def _slab(half: jax.Array, origin: jax.Array, direction: jax.Array) -> tuple[jax
 
 
 def _ball(radius: jax.Array, origin: Vector, direction: Vector) -> tuple[jax.Array, jax.Array]:
-    """Returns the same as `_slab` for points within `radius` [] m: a sphere of three axes, or the
-    endless cylinder about z of two."""
+    """Returns entry and exit [] of a ball of `radius` m; of two axes, of the endless tube about z."""
     square = dot(direction, direction)
     parallel = ~(square > 0.0)
     safe = jnp.where(parallel, 1.0, square)

@@ -59,8 +59,7 @@ class Hit:
 
 
 class SurfaceHit(NamedTuple):
-    """First hit of one ray: surface 0 is the table, 1 + g F + f is face f of geom g; those of
-    objects follow, object by object."""
+    """First hit of one ray. Surfaces: 0 the table, 1 + g F + f face f of geom g, then objects."""
 
     distance: jax.Array  # [] in lengths of the ray's direction; infinite where not valid
     surface: jax.Array  # [] int32; 0 where not valid

@@ -53,8 +53,7 @@ def rotate(tables: RotationTables, maps: jax.Array, k: Any = slice(None)) -> jax
 
 
 def to_cell(canvas: int, cell_size: float, yaw: jax.Array, xy: jax.Array) -> jax.Array:
-    """Converts workspace points `xy` [..., 2] m to (row, col) [..., 2], in cells of `cell_size` m,
-    in the frame rotated by `yaw` [] rad."""
+    """Converts points `xy` [..., 2] m to (row, col) [..., 2] in the frame rotated by `yaw` []."""
     return geometry.rotate2d(-yaw, xy)[..., ::-1] / cell_size + 0.5 * (canvas - 1)
 
 

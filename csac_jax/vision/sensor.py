@@ -22,8 +22,7 @@ _SRGB = 2.2  # exponent from a colour level to light, about that of sRGB
 
 
 def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
-    """Returns the root key of the noise of an episode reset with `key`, None without noise. Raises
-    ValueError for noise without a key."""
+    """Returns an episode's root key of noise, or None. Raises ValueError for a missing key."""
     if not cfg.active:
         return None
     if key is None:
@@ -110,8 +109,7 @@ def light(key: jax.Array, cfg: SensorConfig) -> jax.Array:
 
 
 def colour(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> jax.Array:
-    """Changes white balance and brightness of colours [H, W, 3] in 0 .. 1: one random gain per
-    channel, and one of all."""
+    """Changes white balance and brightness of colours [H, W, 3] in 0 .. 1 by random gains."""
     if cfg.colour == 0.0 and cfg.light == 0.0:
         return exact
     gain = 1.0 + cfg.colour * jax.random.normal(key, (3,))
