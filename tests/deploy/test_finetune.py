@@ -118,7 +118,7 @@ def test_what_is_learnt_is_what_was_seen(policy: Policy, tmp_path: Path):
     batch = values.dense_maps(learner, policy.params, obs)
     state = jax.tree.map(lambda leaf: leaf[0], batch)
     action = jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[0]), found.action)
-    q = maps.read_q(learner.frames, state, action.primitive, action.pose)
+    q = maps.read(learner.frames, state.q, action.primitive, action.pose)
     assert float(q) == pytest.approx(decisions[2].score, abs=1e-3)
 
 
@@ -146,7 +146,7 @@ def _q(policy: Policy, image: scenes.Image, place: tuple[float, float]) -> float
     batch = values.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
     state = jax.tree.map(lambda leaf: leaf[0], batch)
     pose = np.array([*place, 0.3], np.float32)
-    return float(maps.read_q(learner.frames, state, np.int32(1), pose))
+    return float(maps.read(learner.frames, state.q, np.int32(1), pose))
 
 
 LESSON = [(BOTH, _grasp(RIGHT), Lifted), (BOTH, _grasp(LEFT), Empty)] * 6 + [
