@@ -136,7 +136,7 @@ def _q(policy: CameraPolicy, obs: Any, primitive: Any, pose: Any) -> float:
     learner = actor_critic.make(policy.cfg)
     batch = values.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
     state = jax.tree.map(lambda leaf: leaf[0], batch)
-    return float(maps.read_q(learner.frames, state, primitive, pose))
+    return float(maps.read(learner.frames, state.q, primitive, pose))
 
 
 LESSON = [(BOTH, _grasp(RIGHT), Lifted), (BOTH, _grasp(LEFT), Empty)] * 6 + [
