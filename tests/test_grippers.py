@@ -1,4 +1,4 @@
-"""The numbers of grippers: closed forms, and files of one's own."""
+"""The numbers of grippers: closed forms, and the user's files."""
 
 import json
 import re

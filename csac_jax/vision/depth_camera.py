@@ -107,7 +107,7 @@ def supported(depth: jax.Array, focal: Any) -> jax.Array:
     """Returns [h, w] bool, SUPPORT or more of a pixel's eight neighbours have its depth: a pixel
     with a depth that does not fly.
 
-    Args: depth [h, w] m, 0 where there is none; focal, px.
+    Args: depth [h, w] m, 0 without a depth; focal, px.
     """
     reach = depth * jnp.maximum(NEAR, 3.0 / focal)
     padded, size = jnp.pad(depth, 1), depth.shape

@@ -100,7 +100,7 @@ def _slab(half: jax.Array, origin: jax.Array, direction: jax.Array) -> tuple[jax
 
 
 def _ball(radius: jax.Array, origin: Vector, direction: Vector) -> tuple[jax.Array, jax.Array]:
-    """Returns entry and exit [] of a ball of `radius` m; of two axes, of an endless tube about z."""
+    """Returns entry and exit [] of a ball of `radius` m; for two axes, of z's endless tube."""
     square = dot(direction, direction)
     parallel = ~(square > 0.0)
     safe = jnp.where(parallel, 1.0, square)

@@ -51,8 +51,8 @@ def image(
 ) -> tuple[jax.Array, jax.Array]:
     """Adds sensor errors to an image of any renderer; errors of pose and lens are in `pose`.
 
-    Args: rgb [h, w, 3] uint8; depth [h, w] m along the optical axis, 0 or NaN where there is none.
-    Returns: the same; depth 0 where there is none.
+    Args: rgb [h, w, 3] uint8; depth [h, w] m along the optical axis, 0 or NaN without one.
+    Returns: the same; depth 0 without one.
     """
     key_depth, key_colour = jax.random.split(key)
     exact, valid = depth.astype(jnp.float32), depth > 0.0

@@ -136,7 +136,7 @@ def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tupl
 
 
 def test_long_text_stays_in_sight():
-    """Claim: a text too long for one line goes on in the next."""
+    """Claim: a text too long for one line continues in the next."""
     short, long = (panels.text_line("word " * count, 600, HEIGHT) < 255 for count in (8, 24))
     lines = [_runs(image.any(axis=(1, 2))) for image in (short, long)]
     assert lines == [1, 2]

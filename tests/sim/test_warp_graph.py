@@ -6,7 +6,7 @@ import pytest
 
 
 def test_a_step_allocates_once():
-    """Claim: steps work in the arrays of the first one, which begin anew as they are asked for."""
+    """Claim: steps reuse the arrays of the first one, which start as requested."""
     wp = pytest.importorskip("warp")
 
     from csac_jax.sim import warp_graph
