@@ -11,9 +11,8 @@ is bare / env.
 went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp's pool held so far.
 `bits_differ` is the number of leaves in which a second run of the same action differs.
 
---details adds the `calls` of Warp that a scan of two steps makes, which are to be two, and
-milliseconds and launches of each kernel in an action whose substeps are launched one by one: only
-then can Warp time them.
+--details adds milliseconds and launches of each kernel in an action whose substeps are launched one
+by one: only then can Warp time them.
 """
 
 import collections
@@ -31,7 +30,6 @@ import warp as wp
 from csac_jax import env as environment, presets
 from csac_jax.config import Config
 from csac_jax.runtime import cache
-from csac_jax.sim.primitives import Action
 from experiments.bench import _bare
 from experiments.bench._options import Parser, emit, with_blocks
 from experiments.bench._timing import medians
@@ -78,7 +76,7 @@ def measure(cfg: Config, longest: float, repeats: int, details: bool) -> dict[st
     row |= {"overflows": int(first.info.contact_overflow.sum())}
     row |= {"diverged": int(first.info.physics_diverged.sum())}
     if details:
-        row |= {"calls": _calls(env, states, actions), "kernels": _kernels(env, joints)}
+        row["kernels"] = _kernels(env, joints)
     return row
 
 
@@ -86,22 +84,6 @@ def _differing(one: Any, other: Any) -> int:
     """Counts leaves that are not equal bit for bit."""
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return sum(a.tobytes() != b.tobytes() for a, b in pairs)
-
-
-def _calls(env: environment.Env, states: environment.State, actions: Action) -> int:
-    """Counts the calls of Warp in a scan of two steps."""
-    from csac_jax.sim.warp_action import Simulator
-
-    def step(states: environment.State, _: None) -> tuple[environment.State, Any]:
-        after = jax.vmap(env.step)(states, actions)
-        return after, after.info
-
-    with mock.patch.object(
-        Simulator, "prepared", autospec=True, side_effect=Simulator.prepared
-    ) as counted:
-        scan = jax.jit(lambda states: jax.lax.scan(step, states, length=2))
-        jax.block_until_ready(scan(states))
-    return counted.call_count
 
 
 def _kernels(env: environment.Env, joints: Any) -> dict[str, list[float]]:

@@ -185,7 +185,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
         ("bench closed_loop --episodes 0", "bench closed_loop: --episodes: must be at least 1"),
         ("bench closed_loop --robot ur3", "argument --robot: invalid choice: 'ur3'"),
-        ("bench soak --actions 0", "bench soak: --actions: must be at least 1"),
+        ("bench objects --scenes 0", "bench objects: --scenes: must be at least 1"),
         (
             "bench act --pixels 40",
             "bench act: net.margin: DenseNet-121 needs maps of a multiple of 32 cells, not 40",
