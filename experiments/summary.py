@@ -3,6 +3,7 @@
 The page built by `make docs` from `csac-jax report experiments/results` has all the others.
 """
 
+import fnmatch
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -31,13 +32,13 @@ POLICIES = {
 """Policy -> folder of its run, and its evaluations."""
 TRAINED = {
     "quick/csac_beta": "`quick`, two CPU cores",
-    "paper/": "`paper`, one H200",
+    "paper/*": "`paper`, one H200",
     "fast/csac_beta": "`fast`, one GPU",
     "fast/target": "`fast` in the target task, one GPU",
     "fast/target_grasp_only": "the same, grasping only",
     "objects/csac_beta": "`objects`, two CPU cores",
 }
-"""Folder of runs -> what was trained."""
+"""Pattern of folders of runs -> what was trained."""
 SHOWN = ("completion", "grasp_success", "action_efficiency")
 
 
@@ -73,19 +74,11 @@ def _policies(evaluations: Sequence[results.Evaluation]) -> Iterator[dict[str, s
 
 def _trained(runs: Sequence[results.RecordedRun]) -> Iterator[dict[str, str]]:
     for folder, title in TRAINED.items():
-        own = [run for run in runs if _folder(run).startswith(folder) and _fits(run, folder)]
+        own = [run for run in runs if fnmatch.fnmatch("/".join(run.path.parts[-4:-2]), folder)]
         report = comparison.build(results.Results(own, [], []))
         (row,) = result_tables.training(report)
         columns = ("runs", "actions", *result_tables.SUMMARY[2:4], "time to 90 %", "training time")
         yield {"preset": title} | {column: row[column] for column in columns}
-
-
-def _folder(run: results.RecordedRun) -> str:
-    return "/".join(run.path.parts[-4:-2])
-
-
-def _fits(run: results.RecordedRun, folder: str) -> bool:
-    return folder.endswith("/") or _folder(run) == folder
 
 
 def _methods() -> ResultTable:

@@ -11,9 +11,8 @@ is bare / env.
 went into settling and reading N (64) scenes. `warp_bytes` is the most that Warp's pool held so far.
 `bits_differ` is the number of leaves in which a second run of the same action differs.
 
---details adds the `calls` of Warp that a scan of two steps makes, which are to be two, and
-milliseconds and launches of each kernel in an action whose substeps are launched one by one: only
-then can Warp time them.
+--details adds milliseconds and launches of each kernel in an action whose substeps are launched one
+by one: only then can Warp time them.
 """
 
 import collections
@@ -78,7 +77,7 @@ def measure(cfg: Config, longest: float, repeats: int, details: bool) -> dict[st
     row |= {"overflows": int(first.info.contact_overflow.sum())}
     row |= {"diverged": int(first.info.physics_diverged.sum())}
     if details:
-        row |= {"calls": _calls(env, states, actions), "kernels": _kernels(env, joints)}
+        row["kernels"] = _kernels(env, joints)
     return row
 
 
@@ -88,6 +87,7 @@ def _differing(one: Any, other: Any) -> int:
     return sum(a.tobytes() != b.tobytes() for a, b in pairs)
 
 
+<<<<<<< HEAD
 def _calls(env: environment.Env, states: environment.State, actions: Action) -> int:
     """Counts the calls of Warp in a scan of two steps."""
     from csac_jax.sim.warp_action import WarpSimulator
@@ -104,6 +104,8 @@ def _calls(env: environment.Env, states: environment.State, actions: Action) -> 
     return counted.call_count
 
 
+=======
+>>>>>>> refs/heads/records
 def _kernels(env: environment.Env, joints: Any) -> dict[str, list[float]]:
     """Times each kernel in an action: milliseconds and launches, longest first."""
     batch = env.physics.simulator.prepared(len(joints.control))
