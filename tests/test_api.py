@@ -161,7 +161,7 @@ def test_weights_that_cannot_be_read_are_refused(tmp_path: Path):
     if it holds none."""
     path = tmp_path / "densenet121.safetensors"
     path.write_bytes(b"no tensors")
-    cfg = SMOKE.change(net=DenseNet121(rotations=4, margin=0.0))
+    cfg = SMOKE.change(net=DenseNet121(rotations=4, pad_fraction=0.0))
     with pytest.raises(SettingsError, match=f"{path} cannot be read") as caught:
         api.initial_networks(cfg, path)
     assert "\n" not in str(caught.value)

@@ -29,7 +29,6 @@ import warp as wp
 
 from csac_jax import env as environment, presets
 from csac_jax.config import Config
-from csac_jax.robot.primitives import Action
 from csac_jax.runtime import cache
 from experiments.bench import _bare
 from experiments.bench._options import Parser, emit, with_blocks
@@ -87,25 +86,6 @@ def _differing(one: Any, other: Any) -> int:
     return sum(a.tobytes() != b.tobytes() for a, b in pairs)
 
 
-<<<<<<< HEAD
-def _calls(env: environment.Env, states: environment.State, actions: Action) -> int:
-    """Counts the calls of Warp in a scan of two steps."""
-    from csac_jax.sim.warp_action import WarpSimulator
-
-    def step(states: environment.State, _: None) -> tuple[environment.State, Any]:
-        after = jax.vmap(env.step)(states, actions)
-        return after, after.info
-
-    with mock.patch.object(
-        WarpSimulator, "prepared", autospec=True, side_effect=WarpSimulator.prepared
-    ) as counted:
-        scan = jax.jit(lambda states: jax.lax.scan(step, states, length=2))
-        jax.block_until_ready(scan(states))
-    return counted.call_count
-
-
-=======
->>>>>>> refs/heads/records
 def _kernels(env: environment.Env, joints: Any) -> dict[str, list[float]]:
     """Times each kernel in an action: milliseconds and launches, longest first."""
     batch = env.physics.simulator.prepared(len(joints.control))

@@ -121,30 +121,8 @@ def run_dir(tmp_path: Path) -> Path:
         ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
         ("doctor --build", "--build: only warp has kernels to build, and sim.physics is c here"),
         ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
-<<<<<<< HEAD
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),
         ("bench step --learn.tau 2", "bench step: learn.tau: must be at most 1"),
-        ("benchmark --share 0", "--share: above 0, at most 1"),
-        ("benchmark --suites piles", "--suites: 'piles' is not one of: "),
-        ("benchmark --suites target --policies shipped", "--policies: none of them can act in"),
-        ("benchmark --out /dev/null", "--out: /dev/null is a file; give a folder"),
-=======
-        ("bench closed_loop --episodes 0", "bench closed_loop: --episodes: must be at least 1"),
-        ("bench closed_loop --robot ur3", "argument --robot: invalid choice: 'ur3'"),
-        ("bench objects --scenes 0", "bench objects: --scenes: must be at least 1"),
-        (
-            "bench act --pixels 40",
-            "bench act: net.margin: DenseNet-121 needs maps of a multiple of 32 cells, not 40",
-        ),
-        ("bench act --zoom 64", "bench act: net.zoom: must divide 32"),
-        (
-            "train paper --net.margin 0.1",
-            "net.margin: DenseNet-121 needs maps of a multiple of 16 cells, not 246",
-        ),
-        ("bench parity --poses x", "bench parity: argument --poses: invalid int value: 'x'"),
-        ("bench replay 12", "bench replay: give two exponents of 2"),
-        ("bench replay 14 12", "bench replay: exponents must lie in 6 .. 24"),
->>>>>>> refs/heads/records
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
@@ -294,7 +272,7 @@ def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
         ("--replay.sampler=uniform", {"replay": UniformReplay(capacity=SMOKE.replay.capacity)}),
         (
             "--net.pad_fraction 0 --net.kind densenet121 --net.upsample 2",
-            {"net": DenseNet121(rotations=4, head=4, margin=0.0, upsample=2)},
+            {"net": DenseNet121(rotations=4, head=4, pad_fraction=0.0, upsample=2)},
         ),
         (
             "--algo csac --replay.sampler beta --replay.end 1 5",

@@ -17,9 +17,11 @@ from csac_jax.nets import dense, densenet, networks
 from tests.sections import with_constants
 
 TINY = {
-    "small": SmallNet(margin=0.5, rotations=4),
+    "small": SmallNet(pad_fraction=0.5, rotations=4),
     "densenet121": with_constants(
-        DenseNet121(margin=0.5, rotations=4, head=8), block_layers=(1, 1, 1, 1), block_growth=4
+        DenseNet121(pad_fraction=0.5, rotations=4, head=8),
+        block_layers=(1, 1, 1, 1),
+        block_growth=4,
     ),
 }
 
@@ -86,10 +88,10 @@ def test_suggested_margins_do():
     for size in (64, 96, 112, 224, 232):
         for upsample in (1, 2):
             with pytest.raises(ValueError, match="try") as raised:
-                _config(size, margin=0.2, upsample=upsample)
+                _config(size, pad_fraction=0.2, upsample=upsample)
             for word in str(raised.value).split("try ")[1].split(", "):
                 margin, side = word.split(" (")
-                cfg = _config(size, margin=float(margin), upsample=upsample)
+                cfg = _config(size, pad_fraction=float(margin), upsample=upsample)
                 frames = maps.frames(cfg, networks.make(cfg.net))
                 assert frames.tables.canvas == int(side.removesuffix(" cells)"))
 
@@ -100,7 +102,7 @@ def test_suggested_margins_do():
 def test_cells_of_the_small_nets_maps(stride: int, finer: int, cells: int):
     """Claim: a cell of the small net's maps is stride / subpixel cells of its input."""
     layers = {"dilations": (1,), "growth": 4}
-    cfg = _config(64, kind="small", margin=0.125, stride=stride, subpixel=finer, **layers)
+    cfg = _config(64, kind="small", pad_fraction=0.125, stride=stride, subpixel=finer, **layers)
     nets, blank = networks.make(cfg.net), jnp.zeros((1, 72, 72, 4))
     frames = maps.frames(cfg, nets)
     (q, _), _ = jax.eval_shape(nets.critic.init_with_output, jax.random.key(0), blank)

@@ -31,7 +31,7 @@ class Tiny(DenseNet121):
     block_growth: ClassVar[int] = 4
 
 
-TINY = Tiny(rotations=4, margin=0.0, head=8, upsample=2)
+TINY = Tiny(rotations=4, pad_fraction=0.0, head=8, upsample=2)
 
 
 class Still(Env):
