@@ -322,7 +322,10 @@ def variant(config: Json) -> Variant:
 @functools.cache
 def _preset_settings(preset: str, algo: str) -> Json:
     """Settings by their dotted names. Raises ValueError if one of the names is unknown."""
-    return configs.flat(configs.to_dict(algorithms.configure(presets.get(preset), algo)))
+    cfg = presets.get(preset)
+    if algo in algorithms.ALGORITHMS:  # one that is gone is described by its settings
+        cfg = algorithms.configure(cfg, algo)
+    return configs.flat(configs.to_dict(cfg))
 
 
 @functools.lru_cache(maxsize=64)  # ours: a folder's runs mostly differ in their seed
