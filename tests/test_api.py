@@ -337,7 +337,7 @@ def test_runs_of_a_sweep_start_from_a_policy(sweeps: Sweeps, tmp_path: Path, mon
         ({"vary": {"learn.bath": (1,)}}, r"'learn\.bath' is no setting"),
         ({"vary": {"learn": (1,)}}, r"'learn' is no setting"),
         ({"vary": {"seed": (1, 2)}}, r"leave seed out"),
-        ({"vary": {"learn.tau": (2.0,)}}, r"^learn\.tau: must be above 0"),
+        ({"vary": {"learn.tau": (2.0,)}}, r"^learn\.tau: must be at most 1"),
         ({"vary": {"algo": ("dqn",)}}, r"unknown algorithm 'dqn'"),
         ({"devices": 10_000}, r"devices: 10000 asked for"),
     ],

@@ -302,14 +302,14 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.table import Table
 
     from csac_jax.evaluation.statistics import Band
-    from csac_jax.report import tables
+    from csac_jax.report import result_tables
 
     caption = "in brackets: 95 % interval; action_efficiency: blocks per action"
     table = Table("metric", "value", "n", title=title, caption=caption)
     for name, entry in {**summary, **summary.get("failures", {})}.items():
         if isinstance(entry, dict) and "value" in entry:
             band = Band(**entry) if entry["n"] else None
-            table.add_row(name, tables.shown(metric=name, band=band), str(entry["n"]))
+            table.add_row(name, result_tables.shown(metric=name, band=band), str(entry["n"]))
     console = Console(highlight=False)
     console.print(table)
     for name in ("outcomes", "counts"):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report import tables
+from csac_jax.report import result_tables
 
 METRICS = ("grasp_success", "completion", "declutter_rate", "action_efficiency")
 TITLES = ("grasp success", "completion", "objects taken", "objects per action")
@@ -27,7 +27,7 @@ def rows(results: Iterable[dict[str, Any]]) -> list[Row]:
 
 def shown(bands: Iterable[Band | None]) -> list[str]:
     """Formats a band of each of METRICS; a dash where there is none."""
-    return [tables.shown(band, metric=name) for band, name in zip(bands, METRICS, strict=True)]
+    return [result_tables.shown(band, metric=name) for band, name in zip(bands, METRICS, strict=True)]
 
 
 def markdown(table: Iterable[Row]) -> str:

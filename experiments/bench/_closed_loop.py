@@ -50,7 +50,7 @@ def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
     policy = CameraPolicy.load(source)
     clear = policy.cfg.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
     cfg = clear.change(sim={"physics": "c", "robot": robot})
-    (env,) = suites.environments(cfg, "random10", episodes, seed).values()
+    (env,) = suites.prepare(cfg, "random10", episodes, seed).parts.values()
     return Loop(policy, env, episodes, seed)
 
 

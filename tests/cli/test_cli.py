@@ -78,14 +78,10 @@ def run_dir(tmp_path: Path) -> Path:
         ("trian quick", "'trian'; did you mean train? choose one of: train, sweep, eval, play"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
         ("train --config no.toml", "no.toml"),
-        ("train smoke --log nothing", "--log: 'nothing' is not one of: tensorboard"),
         ("train smoke --eval-suite cases", "--eval-suite: give it with --eval-every N"),
-        ("train smoke --eval-every -1", "--eval-every, --eval-episodes: at least 1"),
         ("train quik", "unknown preset 'quik'; did you mean quick? choose one of: smoke, quick"),
         ("train quick --learn.bath 3", "--learn.bath 3; perhaps you meant --learn.batch; see csac"),
-        ("train quick --preset smoke", "--preset"),
         ("train quick --learn.batch", "--learn.batch: a value is missing"),
-        ("train quick --learn.batch many", "--learn.batch: invalid literal for int"),
         ("train quick --learn.tau 2", "learn.tau: must be at most 1, not 2.0"),
         ("train quick --learn.batch 65", "learn.batch: 65 transitions cannot be drawn"),
         ("train quick --scene.slots box ball", "--scene.slots: 'ball' is not one of: box, arch"),
@@ -95,7 +91,6 @@ def run_dir(tmp_path: Path) -> Path:
         ("train smoke --device tpu", "--device: 'tpu' is not one of: cpu, gpu"),
         ("train quick smoke", "unknown arguments: smoke"),
         ("train quick --algo csac_bta", "unknown algorithm 'csac_bta'; did you mean csac_beta?"),
-        ("train quick --algo=", "unknown algorithm ''"),
         ("train quick --algo", "--algo: a value is missing"),
         ("train quick --run-dir .", ". exists; give another --run-dir"),
         ("train smoke --sim.physics warp --scene.size-jitter 0.1 0", "warp computes on CUDA"),
@@ -105,22 +100,17 @@ def run_dir(tmp_path: Path) -> Path:
             "net.pad_fraction: DenseNet-121 needs maps of a multiple of 16",
         ),
         ("eval", "these arguments are missing: source"),
-        ("eval . --policy best", "--policy: 'best' is not one of: learned"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval . --seed 2147483647", "--seed: must lie in"),
         ("eval shipped --which worst", "--which: 'worst' is neither best, last nor a step"),
         ("eval shipped --sensor.kind d400", "--sensor.kind: 'd400' is not one of: none, d415"),
         ("eval shipped --sensor.kind d415", "sensor.kind: must be none where heightmap.view is"),
-        ("eval shipped --camera.size 320 240", "camera.centre: (319.5, 239.5) is not near the"),
         ("eval shipped --sim.gripper rg3", "sim.gripper: 'rg3' is neither one of 2f85, franka_"),
         ("eval shipped --suite nowhere", "'nowhere' is neither a case file nor one of: in_distr"),
         ("play --heightmap.size 60", "heightmap.size: must be a multiple of 8"),
         ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
-        ("doctor --fix", "unknown arguments: --fix"),
         ("doctor --preset", "--preset: a value is missing"),
-        ("doctor --preset slow", "unknown preset 'slow'; choose one of: smoke, quick"),
         ("doctor --build", "--build: only warp has kernels to build, and sim.physics is c here"),
-        ("doctor --preset quick --learn.bath 2", "perhaps you meant --learn.batch"),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),
         ("bench step --learn.tau 2", "bench step: learn.tau: must be at most 1"),
     ],
@@ -318,7 +308,7 @@ def test_flags_win_over_the_config_file(config_file: Path):
     _, plan = sweep.read(
         [*file, *flags, "--vary", "learn.updates_per_step=1,2", "--sim.physics", "mjx"]
     )
-    updates = [wanted.change(learn={"updates": n}, sim={"physics": "mjx"}) for n in (1, 2)]
+    updates = [wanted.change(learn={"updates_per_step": n}, sim={"physics": "mjx"}) for n in (1, 2)]
     assert [point.cfg for point in plan.points] == updates
 
 
