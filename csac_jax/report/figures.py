@@ -27,6 +27,7 @@ COLOURS = dict(zip(NAMES, PALETTE, strict=False))
 GREY = "#7F7F7F"
 MOST_LINES, MOST_SCORES = 6, 12  # of a panel; of a figure of a suite
 NAME_WIDTH, LEGEND_WIDTH = 36, 56  # characters of a line: right of a panel, below a figure
+LONGEST = 100  # characters of a name
 LEGEND: dict[str, Any] = {  # right of a panel, where no curve is
     "loc": "upper left",
     "bbox_to_anchor": (1.01, 1.02),
@@ -118,7 +119,7 @@ def _line(panel: Axes, curve: Curve, colour: str) -> float:
 
 
 def _short(variant: Variant) -> str:
-    return label(variant, preset=False, most=3)
+    return textwrap.shorten(label(variant, preset=False, most=3), LONGEST, placeholder=" ...")
 
 
 def _suite(scores: Sequence[Score]) -> Figure:
