@@ -27,7 +27,9 @@ def rows(results: Iterable[dict[str, Any]]) -> list[Row]:
 
 def shown(bands: Iterable[Band | None]) -> list[str]:
     """Formats a band of each of METRICS; a dash where there is none."""
-    return [result_tables.shown(band, metric=name) for band, name in zip(bands, METRICS, strict=True)]
+    return [
+        result_tables.shown(band, metric=name) for band, name in zip(bands, METRICS, strict=True)
+    ]
 
 
 def markdown(table: Iterable[Row]) -> str:

@@ -34,7 +34,10 @@ def assert_share(event: np.ndarray, expected: float) -> None:
 def test_shares_of_primitives_and_places(taken):
     """Claim: pushes have probability eps push_fraction, random places their own eps."""
     cfg = ExploreConfig(
-        epsilon_primitive=(0.5, 0.1), epsilon_place=(0.5, 0.02), epsilon_decay=0.998, push_fraction=0.25
+        epsilon_primitive=(0.5, 0.1),
+        epsilon_place=(0.5, 0.02),
+        epsilon_decay=0.998,
+        push_fraction=0.25,
     )
     primitives, poses = choices(cfg, taken)
     assert_share(primitives == 0, max(0.1, 0.5 * 0.998**taken) * 0.25)
