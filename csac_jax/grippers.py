@@ -117,10 +117,7 @@ class Gripper(_Shared):
 
     @property
     def angles(self) -> Ends:
-        """Returns the links' angles from straight ahead, rad.
-
-        Their arc has `arc_radius`; its chord leads from the closed pad to the open one.
-        """
+        """Returns the links' angles from straight ahead, rad; their arc has `arc_radius`."""
         assert self.arc_radius is not None
         across, back = self.half[1] - self.half[0], self.depth[0] - self.depth[1]
         middle = math.atan2(back, across)
@@ -172,10 +169,9 @@ def shipped() -> list[str]:
 
 
 def load(source: "str | Gripper") -> Gripper:
-    """Returns the gripper of a name or a folder; a gripper is returned as it is.
+    """Returns the gripper of a name or a folder, which is read at each call; a gripper as it is.
 
-    A folder is read at each call: nothing of it is kept. Raises SettingsError for a source that is
-    no gripper, and for numbers that are missing, unknown or out of range.
+    Raises SettingsError for a source that is no gripper, and for numbers that are wrong.
     """
     if isinstance(source, Gripper):
         return source
@@ -183,8 +179,7 @@ def load(source: "str | Gripper") -> Gripper:
 
 
 def resolve(source: "str | Gripper") -> "str | Gripper":
-    """Replaces the folder of a gripper by the gripper, so that it is read once and travels with its
-    config; the name of a shipped one stays. Raises SettingsError as `load`."""
+    """Replaces the folder of a gripper by the gripper, so that it travels with its config."""
     return source if source in shipped() else load(source)
 
 
@@ -208,8 +203,7 @@ def _from_folder(folder: Path) -> Gripper:
 
 
 def from_numbers(folder: Path, numbers: dict[str, Any]) -> Gripper:
-    """Builds a gripper from the content of a gripper.json; physics and pictures alone need the
-    folder. Raises ValueError for numbers that are missing, unknown or out of range."""
+    """Builds a gripper from the content of a gripper.json. Raises ValueError for wrong numbers."""
     return _from_json(folder, json.dumps(numbers))
 
 
@@ -269,7 +263,6 @@ def _adapter() -> Any:
 
 
 def _from_json(folder: Path, content: str | bytes) -> Gripper:
-    """Builds a gripper from JSON. Raises ValueError, one line that names the key."""
     try:
         numbers = _adapter().validate_json(content, strict=True)
     except ValueError as error:
@@ -292,7 +285,7 @@ def _from_json(folder: Path, content: str | bytes) -> Gripper:
 
 
 def _rules(gripper: Gripper) -> Iterator[tuple[str, Any]]:
-    """Yields what numbers must be, and True if they are; each may rely on those before it."""
+    """Yields what numbers must be, and if they are; each may rely on those before it."""
     half, depth, finger = gripper.half, gripper.depth, gripper.finger
     numbers = [*gripper.set_points, *sum(gripper.positions, ()), gripper.arc_radius or 0.0]
     yield "'actuator', 'joints' and 'arc_radius' must be finite", np.isfinite(numbers).all()

@@ -49,21 +49,14 @@ class Object:
     def held_out(self) -> bool:
         """Returns True for an object kept for evaluation: decided by digests, never by hand."""
         names = (self.source_sha256 or self.name, self.family)
-        return any(_fraction(name) < HELD_OUT for name in names if name)
-
-
-def _fraction(name: str) -> float:
-    """Hashes a name to a number in 0 .. 1."""
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
+        digests = (hashlib.sha256(name.encode()).digest() for name in names if name)
+        return any(int.from_bytes(d[:8], "big") / 2**64 < HELD_OUT for d in digests)
 
 
 def make(
     name: str, parts: Sequence[Part], whole: solid.Moments | None = None, **more: Any
 ) -> Object:
-    """Builds an object of convex parts, its centre of mass at the origin.
-
-    `whole` has the integrals of the body; without it, those of the parts, which must not overlap.
-    """
+    """Builds an object of convex parts, which must not overlap unless `whole` has its integrals."""
     whole = whole or solid.joined(map(solid.moments, parts))
     com = whole.first / whole.volume
     shifted = [solid.moved(part, -com) for part in parts]

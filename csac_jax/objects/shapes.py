@@ -1,8 +1,7 @@
 """Our own shapes: families of objects, each drawn from random numbers as convex parts.
 
-The parts of an object touch and do not overlap. The hand, which opens to 110 mm, can grasp each:
-a wider object has a thin wall, an arm or a handle. Round cross-sections are polygons, so that
-objects come to rest. z is up as the object stands.
+The parts of an object touch and do not overlap. A hand that opens to 110 mm can grasp each. Round
+cross-sections are polygons, so that objects come to rest. z is up as the object stands.
 """
 
 import itertools
@@ -28,7 +27,6 @@ def _circle(radius: float, sides: int = _ROUND) -> np.ndarray:
 
 
 def _frustum(low: np.ndarray, high: np.ndarray, bottom: float, top: float) -> Part:
-    """Builds the hull of two polygons [n, 2], one at each height."""
     ends = (np.column_stack([xy, np.full(len(xy), z)]) for xy, z in ((low, bottom), (high, top)))
     return solid.convex(np.concatenate([*ends]))
 
@@ -46,9 +44,8 @@ def _wall(
     inner: tuple[float, float], outer: tuple[float, float], bottom: float, top: float, sides: int
 ) -> list[Part]:
     """Builds the parts of a ring; radii at the bottom and at the top."""
-    radii = zip(inner, outer, strict=True)
+    radii, parts = zip(inner, outer, strict=True), []
     rings = [[_circle(inside, sides), _circle(outside, sides)] for inside, outside in radii]
-    parts = []
     for i in range(sides):
         edge = np.array([i, (i + 1) % sides])
         low, high = (np.concatenate([ring[0][edge], ring[1][edge[::-1]]]) for ring in rings)

@@ -115,7 +115,7 @@ def _changed(block: int, key: str, value: Any = None) -> dict:
 
 REFUSED = [
     ("{", "not a JSON file"),
-    ("[" * 100_000, "nested too deeply"),
+    ("[" * 100_000, "maximum recursion"),
     (PAIR | {"extra": 1}, "'extra': is not a key"),
     ({"blocks": PAIR["blocks"]}, "'name': is missing"),
     (PAIR | {"name": "two\nlines"}, "'name': "),

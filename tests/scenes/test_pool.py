@@ -171,9 +171,9 @@ def test_arrangements_are_kept(cache: Path, monkeypatch: pytest.MonkeyPatch):
     for stream, count in ((1, 6), (0, 5)):
         with pytest.raises(TypeError):
             pool.scenes(cfg, stream, count)
-    changed = cache / "families.py"
+    changed = cache / "packings.py"
     changed.write_text("")
-    monkeypatch.setattr(pool.families, "__file__", str(changed))
+    monkeypatch.setattr(pool.packings, "__file__", str(changed))
     with pytest.raises(TypeError):
         pool.scenes(cfg, 0)
 
