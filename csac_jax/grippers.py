@@ -81,8 +81,7 @@ class _Shared:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Gripper(_Shared):
-    """A two-finger gripper. Its tip frame lies between the open tips: z points back to the flange,
-    the fingers close along x."""
+    """A two-finger gripper. Tip frame: between the open tips, z to the flange, closing along x."""
 
     folder: Path
     actuator: str
@@ -147,7 +146,6 @@ class Gripper(_Shared):
         return self.arc_radius * (xp.cos(self._along(half, xp)) - math.cos(self.angles[1]))
 
     def _between(self, ends: Ends, half: Any, xp: Any) -> Any:
-        """Interpolates between `ends` in step with the pads' way."""
         low, high = self._way
         return ends[0] + (self._along(half, xp) - low) * ((ends[1] - ends[0]) / (high - low))
 
@@ -191,9 +189,8 @@ def _shipped(name: str) -> Gripper:
 def _from_folder(folder: Path) -> Gripper:
     path = folder / NUMBERS
     if not path.is_file():
-        known = ", ".join(shipped())
-        fault = f"'{folder}' is neither one of {known} nor a folder with a {NUMBERS}"
-        raise SettingsError(f"sim.gripper: {fault}")
+        neither = f"sim.gripper: '{folder}' is neither one of {', '.join(shipped())}"
+        raise SettingsError(f"{neither} nor a folder with a {NUMBERS}")
     if path.stat().st_size > LARGEST:
         raise SettingsError(f"{path}: is larger than 1 MiB")
     try:

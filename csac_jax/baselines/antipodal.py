@@ -42,10 +42,9 @@ class Weights:
 def grasp(
     key: Array, cfg: Config, height: Array, wanted: Array, failures: Array, weights: Weights
 ) -> Action:
-    """Returns the best antipodal grasp of a height map, within the robot's reach.
+    """Returns the best antipodal grasp of a map `height` [H, W] m, within the robot's reach.
 
-    Args: height [H, W] m; wanted [H, W] bool, where the middle of the hand may be; failures [],
-    actions in a row that lifted nothing.
+    Args: wanted [H, W] bool, where the hand may be; failures [], actions that lifted nothing.
     """
     yaws = np.arange(YAWS) * np.pi / YAWS
     places = _places(cfg, yaws)  # [K, S, S, 2] m
@@ -88,7 +87,8 @@ def _scores(cfg: Config, gripper: Gripper, maps: Array, weights: Weights) -> Arr
     top = _window(_window(maps, -1, reach), -2, reach)
     depth = grasp_depth(cfg.sim, gripper)
     tip = jnp.maximum(top - depth, lowest(cfg.sim, gripper))
-    hand = Hand(gripper, cell, reach, tip, jnp.maximum(top - tip, 1e-4))
+    inner = int(gripper.half[1] / cell)
+    hand = Hand(gripper, cell, reach, tip, jnp.maximum(top - tip, 1e-4), inner)
     edges, filled, tilts, free = zip(*(_profile(hand, maps, way) for way in (1, -1)), strict=True)
     width = sum(edges)
     between = [_covered(hand, _shifted(maps, -2, row)) for row in range(-reach, reach + 1)]
@@ -109,11 +109,7 @@ class Hand(NamedTuple):
     reach: int  # rows that a finger covers on either side
     tip: Array  # [K, S, S] m, how high the tips are
     below: Array  # [K, S, S] m, the same below the surface, above 0
-
-    @property
-    def inner(self) -> int:
-        """Returns the cells from the middle to an open finger."""
-        return int(self.gripper.half[1] / self.cell)
+    inner: int  # cells from the middle to an open finger
 
 
 def _covered(hand: Hand, maps: Array) -> Array:
@@ -163,11 +159,9 @@ def _aside(hand: Hand, maps: Array) -> Array:
 
 
 def _shifted(maps: Array, axis: int, cells: int) -> Array:
-    """Shifts by `cells` along `axis`: each takes the value ahead. Maps are 0 at their rims."""
-    return jnp.roll(maps, -cells, axis)
+    return jnp.roll(maps, -cells, axis)  # each takes the value ahead; maps are 0 at their rims
 
 
 def _window(maps: Array, axis: int, reach: int) -> Array:
-    """Returns the highest value within `reach` cells along `axis`."""
     shifted = [_shifted(maps, axis, cells) for cells in range(-reach, reach + 1)]
     return jnp.max(jnp.stack(shifted), axis=0)

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import hashlib
+import itertools
 import resource
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -100,9 +101,8 @@ def _convert(
     pool = ProcessPoolExecutor(number, get_context("spawn"), resource.setrlimit, limit)
     with contextlib.ExitStack() as stack:
         stack.callback(pool.shutdown, cancel_futures=True)
-        tasks = {
-            pool.submit(conversion.convert, path, names[path], settings): path for path in paths
-        }
+        submit = pool.submit
+        tasks = {submit(conversion.convert, path, names[path], settings): path for path in paths}
         for task in as_completed(tasks):
             if isinstance(task.exception(), BrokenProcessPool):
                 unfinished.append(tasks[task])
@@ -116,11 +116,8 @@ def _names(paths: list[Path]) -> dict[Path, str]:
     names: dict[Path, str] = {}
     for path in paths:
         stem = "".join(c if c.isprintable() else "_" for c in path.stem)[:90] or "object"
-        name, number = stem, 1
-        while name in names.values():
-            number += 1
-            name = f"{stem}-{number}"
-        names[path] = name
+        choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
+        names[path] = next(name for name in choices if name not in names.values())
     return names
 
 

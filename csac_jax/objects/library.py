@@ -98,11 +98,11 @@ def _pack(objects: Iterable[Object]) -> bytes:
     return file.getvalue()
 
 
+_TEXTS, _SIZES = ("name", "family", "source", "source_sha256"), ("scale", "volume", "density")
+
+
 def _digest(entries: Any, arrays: bytes) -> str:
     return hashlib.sha256(json.dumps(entries).encode() + arrays).hexdigest()
-
-
-_TEXTS, _SIZES = ("name", "family", "source", "source_sha256"), ("scale", "volume", "density")
 
 
 def _entry(member: Object) -> dict[str, Any]:
@@ -190,7 +190,7 @@ def _parts(packed: bytes) -> list[Part]:
 
 
 def _object(entry: dict[str, Any], parts: list[Part]) -> Object:
-    """Builds the object of an entry, and takes its parts off the end of `parts`."""
+    """Builds the object of an entry; its parts are taken off the end of `parts`."""
     count = int(entry["parts"])
     if not 1 <= count <= min(body.MOST_PARTS, len(parts)):
         raise ValueError(f"1 to {body.MOST_PARTS} parts an object, not {count}")

@@ -33,13 +33,10 @@ class DHParameters(NamedTuple):
     radii: tuple[float, ...]  # of the capsules along `_chain`, pedestal to wrist 2
 
 
-_RADII = (0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045)  # of both (ur_description)
-ARMS = {  # sources: scenes/README.md
-    "ur5": DHParameters(
-        0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165, _RADII
-    ),
-    "ur5e": DHParameters(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007, _RADII),
-}
+_RADII = (0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045)  # of both; sources: scenes/README.md
+_UR5 = 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165
+_UR5E = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007
+ARMS = {"ur5": DHParameters(*_UR5, _RADII), "ur5e": DHParameters(*_UR5E, _RADII)}
 
 
 class Arm(NamedTuple):
@@ -182,10 +179,9 @@ def _wrist(x: Array, y: Array, z: Array, sign: Array) -> tuple[Array, ...]:
 
 
 def _elbow(links: DHParameters, ahead: Array, up: Array, sign: Array) -> tuple[Array, ...]:
-    """Solves for shoulder lift and elbow [] with wrist 1 `ahead` and `up` [] m of the shoulder.
+    """Solves for shoulder lift and elbow q3 [] with wrist 1 `ahead` and `up` [] m of the shoulder.
 
-    With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3),
-    cos^2(q3 / 2) = (r^2 - (a2 - a3)^2) / (4 a2 a3).
+    With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3), cos^2 likewise.
     """
     a2, a3, square = links.a2, links.a3, ahead**2 + up**2
     sin2 = ((a2 + a3) ** 2 - square) / (4.0 * a2 * a3)
@@ -204,10 +200,7 @@ _ABOVE_TABLE = slice(2, 8)  # not the hand, whose height is the planner's choice
 
 
 def _chain(arm: Arm, q: Array) -> Array:
-    """Returns points [10, 3] m along the arm; capsules run from each to the next.
-
-    The last two capsules are wrist 3 with the gripper's body, and open fingers.
-    """
+    """Returns points [10, 3] m along the arm, ends of capsules; the last two are the gripper's."""
     links, (near, far, _) = arm.links, arm.hand_capsule
     (shoulder, elbow, wrist1, wrist2, wrist3), side, _, down = _frames(arm, q)
     foot = jnp.array([arm.base[0], arm.base[1], 0.0])
@@ -218,10 +211,7 @@ def _chain(arm: Arm, q: Array) -> Array:
 
 
 def _segment_distance(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
-    """Returns the distance [] m of the segments `p0` `p1` and `q0` `q1` [3] m, neither a point.
-
-    See Ericson, Real-Time Collision Detection, 5.1.9.
-    """
+    # Neither segment is a point. Ericson, Real-Time Collision Detection, 5.1.9.
     u, v, w = p1 - p0, q1 - q0, p0 - q0
     uu, uv, vv, uw, vw = _dot(u, u), _dot(u, v), _dot(v, v), _dot(u, w), _dot(v, w)
     cross = uu * vv - uv**2
@@ -234,10 +224,7 @@ def _segment_distance(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
 
 
 def clearance(arm: Arm, q: Array) -> tuple[Array, Array]:
-    """Returns the least distances [] m at `q` [6] rad, from arm to table and between links.
-
-    The fingers may touch the table. Links are capsules, which overlap where it is negative.
-    """
+    """Returns the least distances [] m at `q` [6] rad, from arm to table and between links."""
     chain = _chain(arm, q)
     radii = np.array([*arm.links.radii, arm.body_radius, arm.hand_capsule[2]], np.float32)
     start, end = chain[:-1], chain[1:]

@@ -1,6 +1,7 @@
 """Robots as MJCF, checked against the gripper's numbers: a hand on four drives, or an arm."""
 
-from collections.abc import Callable, Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,24 +67,23 @@ def add(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
 
 def read(path: Path) -> mujoco.MjSpec:
     """Reads an MJCF file. Raises SceneError."""
-    return _parse(path, mujoco.MjSpec.from_file)
+    with errors_of(path):
+        return mujoco.MjSpec.from_file(str(path))
 
 
 def _compile(path: Path) -> mujoco.MjModel:
     """Compiles a file alone: `attach` drops elements that refer to missing ones."""
-    return _parse(path, mujoco.MjModel.from_xml_path)
+    with errors_of(path):
+        return mujoco.MjModel.from_xml_path(str(path))
 
 
-def _parse(path: Path, parse: Callable[[str], Any]) -> Any:
+@contextlib.contextmanager
+def errors_of(path: Path) -> Iterator[None]:
+    """Turns MuJoCo's errors in the block into SceneErrors of one line with the file."""
     try:
-        return parse(str(path))
+        yield
     except ValueError as error:
-        raise one_line(path, error) from None
-
-
-def one_line(path: Path, error: ValueError) -> SceneError:
-    """Formats an error of MuJoCo about a file."""
-    return SceneError(f"{path}: {' '.join(str(error).split())}")
+        raise SceneError(f"{path}: {' '.join(str(error).split())}") from None
 
 
 def require(path: Path, kind: str, required: Iterable[str], elements: Iterable[Any]) -> None:

@@ -19,7 +19,6 @@ from csac_jax.world import blocks, scene_state
 from csac_jax.world.scene_state import SceneState
 
 Rectangle = tuple[Array, Array, Array]  # centre [2] m, yaw [] rad, half sides [2] m
-
 MIN_ARRANGED = 4  # blocks in an arrangement
 GAPS = (0.001, 0.040)  # m between packed neighbours: at level 1, and the widest at level 0
 LOOSE_GAP = 0.015  # m, least distance of a loose block from any other
@@ -115,14 +114,9 @@ def pack(
         blank = jnp.zeros((len(slots), *values.shape[1:]), values.dtype)
         return blank.at[row].set(values, mode="drop")
 
-    packed = Blocks(
-        centre=by_slot(centre),
-        yaw=by_slot(jnp.where(crosswise, np.float32(0.5 * np.pi), 0.0) + yaw),
-        on_side=by_slot(on_side),
-        half_size=sizes[0].at[row].set(half, mode="drop"),
-        half_lying=sizes[0].at[row].set(half_lying, mode="drop"),
-        placed=by_slot(used),
-    )
+    yaw = jnp.where(crosswise, np.float32(0.5 * np.pi), 0.0) + yaw
+    half, lying = (sizes[0].at[row].set(size, mode="drop") for size in (half, half_lying))
+    packed = Blocks(by_slot(centre), by_slot(yaw), by_slot(on_side), half, lying, by_slot(used))
     return packed, slot[target]
 
 
@@ -189,7 +183,7 @@ def _free_place(key: Array, border: float, now: Blocks, half: Array) -> tuple[Ar
     yaw = jax.random.uniform(key_yaw, (_TRIES,), jnp.float32, 0.0, 2.0 * np.pi)
     room = border - _half_aligned(yaw, jnp.broadcast_to(half, (_TRIES, 3)))
     xy = jax.random.uniform(key_xy, (_TRIES, 2), jnp.float32, -1.0, 1.0) * room
-    to_each = jax.vmap(rectangle_gap, (None, 0))
+    to_each = jax.vmap(_rectangle_gap, (None, 0))
     from_all = jax.vmap(to_each, ((0, 0, None), None))
     gap = from_all((xy, yaw, half[:2]), (now.centre[:, :2], now.yaw, now.half_lying[:, :2]))
     free = jnp.all((gap >= LOOSE_GAP) | ~now.placed[None], axis=1)  # [tries]
@@ -197,7 +191,7 @@ def _free_place(key: Array, border: float, now: Blocks, half: Array) -> tuple[Ar
     return jnp.any(free), xy[first], yaw[first]
 
 
-def rectangle_gap(one: Rectangle, two: Rectangle) -> Array:
+def _rectangle_gap(one: Rectangle, two: Rectangle) -> Array:
     """Computes the gap [] m of two rectangles along their best separating axis; < 0: overlap."""
     (xy, yaw, half), (other_xy, other_yaw, other_half) = one, two
     # Normals of all sides.

@@ -34,7 +34,7 @@ TRAIN_STREAM = 0  # evaluation takes others
 _VERSION = 5  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _ROUND = 128  # scenes dropped per round
-_MOST_DROPPED = 12  # blocks that drop all at once: of 20, hardly a scene stays in the workspace
+_MOST_DROPPED = 12  # blocks that drop all at once: of 20, hardly any stay in the workspace
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
 _DRAWS = 20  # of objects, for which there must be room side by side
@@ -89,7 +89,7 @@ def settled(
         for number in numbers:
             drop = functools.partial(_stand if packed else _drop, scene, rng, number)
             pouring = poured or (number > _MOST_DROPPED and not packed)
-            fall = functools.partial(pour if pouring else rest, world, scene, cfg.heightmap.extent)
+            fall = functools.partial(pour if pouring else rest, world, cfg)
             for fallen in _settle(world, drop, fall, count, costly=pouring or packed):
                 done.append(fallen)
                 if time.monotonic() - logged_at >= _LOGGED_EVERY:
@@ -204,34 +204,30 @@ def _falling(world: World, scene: SceneState, fields: BlockFields) -> mujoco.MjD
     return data
 
 
-def rest(
-    world: World, cfg: SceneConfig, extent: float, scene: SceneState, fields: BlockFields
-) -> SceneState | None:
+def rest(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> SceneState | None:
     """Drops all blocks; None if one is not at rest then or left the workspace."""
     data = _falling(world, scene, fields)
     data.model.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
-    mujoco.mj_step(data.model, data, nstep=round(cfg.settle_time / data.model.opt.timestep))
-    return _at_rest(world, extent, scene, data)
+    mujoco.mj_step(data.model, data, nstep=round(cfg.scene.settle_time / data.model.opt.timestep))
+    return _at_rest(world, cfg, scene, data)
 
 
-def pour(
-    world: World, cfg: SceneConfig, extent: float, scene: SceneState, fields: BlockFields
-) -> SceneState | None:
+def pour(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> SceneState | None:
     """Drops blocks one after another, lowest first; those that roll off, again. See `rest`."""
     data = _falling(world, scene, fields)
     num, pause = len(scene.in_play), round(_PAUSE / data.model.opt.timestep)
     waiting = [int(slot) for slot in np.argsort(scene.position[:, 2]) if scene.in_play[slot]]
     rng = np.random.default_rng(np.abs(scene.position * 1e6).astype(np.uint64).ravel())
-    half = 0.5 * rng.uniform(*cfg.drop_extent)
+    half = 0.5 * rng.uniform(*cfg.scene.drop_extent)
     pinned = np.ones(num, bool)  # waiting in the air
-    places, quiet, still = scene_state.parking(num), 0.0, round(cfg.settle_time / _PAUSE)
+    places, quiet, still = scene_state.parking(num), 0.0, round(cfg.scene.settle_time / _PAUSE)
     for _ in range(max(_MAX_PAUSES * len(waiting), 2 * len(waiting) + still)):
         if waiting:
             slot = waiting.pop(0)
             top = data.qpos[world.block_qpos[~pinned, 2]].max(initial=0.0)
             pinned[slot], quiet = False, 0.0
             xy = rng.uniform(-half, half, 2)
-            data.qpos[world.block_qpos[slot, :3]] = [*xy, top + cfg.drop_height]
+            data.qpos[world.block_qpos[slot, :3]] = [*xy, top + cfg.scene.drop_height]
             data.qvel[world.block_dofs[slot]] = 0.0
         for _ in range(0, pause, _PIN_EVERY):
             data.qpos[world.block_qpos[pinned, :3]] = places[pinned]
@@ -239,21 +235,21 @@ def pour(
             mujoco.mj_step(data.model, data, nstep=_PIN_EVERY)
         quiet += _PAUSE
         radius = np.linalg.norm(data.qpos[world.block_qpos[:, :2]], axis=1)
-        outside = ~pinned & (radius > 0.5 * extent)
+        outside = ~pinned & (radius > 0.5 * cfg.heightmap.extent)
         waiting += [int(slot) for slot in np.flatnonzero(outside)]
         pinned |= outside
-        if not waiting and quiet >= cfg.settle_time:
-            return _at_rest(world, extent, scene, data)
+        if not waiting and quiet >= cfg.scene.settle_time:
+            return _at_rest(world, cfg, scene, data)
     return None
 
 
 def _at_rest(
-    world: World, extent: float, scene: SceneState, data: mujoco.MjData
+    world: World, cfg: Config, scene: SceneState, data: mujoco.MjData
 ) -> SceneState | None:
     pose = data.qpos[world.block_qpos].astype(np.float32)
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
-    ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * extent
+    ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * cfg.heightmap.extent
     ok &= (speed.max(axis=1) < scene_state.STILL) & (position[:, 2] > 0.0)
     ok &= np.isfinite(pose).all(axis=1)
     if not np.all(ok | ~scene.in_play):

@@ -140,19 +140,16 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     Raises SceneError for MJCF that lacks a named element, does not compile, or that MJX ignores.
     """
     gripper = grippers.load(sim.gripper)
-    try:
+    with mjcf.errors_of(assets()):
         model = _spec(scene, sim, gripper).compile()
-    except ValueError as error:
-        raise mjcf.one_line(assets(), error) from None
     for field in _MJX_IGNORES if sim.physics == "mjx" else ():  # `put_model` raises for others
         if np.any(operator.attrgetter(field)(model)):
             raise SceneError(f"MJX ignores {field}; leave it at 0, or take sim.physics c")
     _align_inertia(model)
-    slots = np.arange(len(scene.slots))
-    bodies = np.array([model.body(f"block{slot}").id for slot in slots])
+    bodies = np.array([model.body(f"block{slot}").id for slot in range(len(scene.slots))])
     free_joints = model.body_jntadr[bodies]
     slot_of_body = np.full(model.nbody, -1)
-    slot_of_body[bodies] = slots
+    slot_of_body[bodies] = np.arange(len(bodies))
     slot_of_geom = slot_of_body[model.geom_bodyid]
     joints = mjcf.joint_names(sim, gripper)
     objects_at, bodies_of = np.flatnonzero(blocks.is_object(scene.slots)), None
@@ -229,7 +226,7 @@ def scene_fields(world: World, scene: SceneState) -> BlockFields:
 
 
 def _pads(world: World, fingers: Fingers) -> PadFields:
-    """Computes the pads of these fingers; whatever the size, their inner faces stay in place."""
+    """Computes pads of these sizes; their inner faces stay in place."""
     model, pads = world.model, world.hand_geoms[1:]
     length = jnp.full(2, model.geom_size[pads, 2], jnp.float32)
     half = (jnp.full(2, 0.5 * side) for side in (fingers.thickness, fingers.width))
