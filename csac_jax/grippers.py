@@ -1,7 +1,4 @@
-"""A gripper as numbers: what planning, judging and drawing need of it, without its MJCF.
-
-    GRIPPER/gripper.json   the numbers, see `Gripper`; docs/grippers.md explains each
-    GRIPPER/gripper.xml    its MJCF, which only physics and pictures read
+"""A gripper as numbers, GRIPPER/gripper.json; only physics and pictures read its MJCF.
 
 Two pads face one another. They close along a straight line, or stay parallel and move on an arc, as
 a parallelogram of links moves them; then the tips come lower as they close.

@@ -44,11 +44,8 @@ class GraspCandidates(NamedTuple):
 def grasp(cfg: Config, scene: SceneState, height: Array, failures: Array | int = 0) -> Action:
     """Plans the best grasp: room for both fingers, faces square to the pads, a high, narrow block.
 
-    Grasps out of the robot's reach are left out. With a target, the best grasp is the target's,
-    else that of the block nearest to it. Each of several `failures` [] in a row moves to another
-    block, then to another grasp of it.
-
-    Args: height [H, W] m.
+    With a target, it is the target's, else that of the block nearest to it. Each of several
+    `failures` [] in a row moves to another block, then to another grasp of it. `height` [H, W] m.
     """
     parts = [_of_blocks(cfg, scene, height)]
     if cfg.scene.has_objects:

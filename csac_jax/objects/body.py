@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from csac_jax.objects import solid
-from csac_jax.objects.solid import Part
+from csac_jax.objects.solid import Moments, Part
 
 HELD_OUT = 0.2  # share of the names
 MOST_PARTS = 32
@@ -53,9 +53,7 @@ class Object:
         return any(int.from_bytes(d[:8], "big") / 2**64 < HELD_OUT for d in digests)
 
 
-def make(
-    name: str, parts: Sequence[Part], whole: solid.Moments | None = None, **more: Any
-) -> Object:
+def make(name: str, parts: Sequence[Part], whole: Moments | None = None, **more: Any) -> Object:
     """Builds an object of convex parts, which must not overlap unless `whole` has its integrals."""
     whole = whole or solid.joined(map(solid.moments, parts))
     com = whole.first / whole.volume

@@ -39,11 +39,8 @@ def convert(path: Path, name: str, settings: ImportSettings) -> tuple[Object, fl
     content, mesh = read(path)
     mesh = _closed(mesh, settings.scale)
     coacd.set_log_level("error")
-    hulls = coacd.run_coacd(
-        coacd.Mesh(mesh.vertices, mesh.faces), threshold=_THRESHOLD, max_convex_hull=_PARTS
-    )
-    parts = []
-    for corners, _ in hulls:
+    whole, parts = coacd.Mesh(mesh.vertices, mesh.faces), []
+    for corners, _ in coacd.run_coacd(whole, threshold=_THRESHOLD, max_convex_hull=_PARTS):
         with contextlib.suppress(ValueError):  # a part without volume
             parts.append(solid.simplified(corners))
     if not parts:

@@ -106,8 +106,7 @@ def _digest(entries: Any, arrays: bytes) -> str:
 
 
 def _entry(member: Object) -> dict[str, Any]:
-    values = {name: getattr(member, name) for name in (*_TEXTS, "scale")}
-    return values | {
+    return {name: getattr(member, name) for name in (*_TEXTS, "scale")} | {
         "size": np.ptp(member.bounds, axis=0).tolist(),
         "volume": member.volume,
         "density": member.density,
@@ -135,8 +134,7 @@ def load(folder: Path) -> Library:
         raise LibraryError(f"{missing}; csac-jax objects make --out {folder} makes one") from None
     except _DAMAGE as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        damaged = f"{folder}: damaged library of objects: {reason}"
-        raise LibraryError(f"{damaged}; make it again") from None
+        raise LibraryError(f"{folder}: damaged library: {reason}; make it again") from None
 
 
 def _bytes(path: Path) -> bytes:
@@ -148,8 +146,7 @@ def _bytes(path: Path) -> bytes:
 def _read(folder: Path, index: bytes) -> list[Object]:
     content = json.loads(index)
     if content["format"] != FORMAT:
-        stored = str(content["format"])[:20]
-        raise ValueError(f"format {stored} is unknown, this version reads {FORMAT}")
+        raise ValueError(f"format {content['format']} is unknown, this version reads {FORMAT}")
     packed, entries = _bytes(folder / ARRAYS), content["objects"]
     if _digest(entries, packed) != content["sha256"]:
         raise ValueError(f"the digest in {INDEX} is not that of the files")
@@ -182,9 +179,7 @@ def _parts(packed: bytes) -> list[Part]:
             raise ValueError(f"{name} does not fit the counts, or is not finite")
         rows.append(np.split(array, ends[:-1]))
     parts = [Part(*arrays) for arrays in zip(*rows, strict=True)]
-    if any(part.triangles.min() < 0 for part in parts) or any(
-        part.triangles.max() >= len(part.vertices) for part in parts
-    ):
+    if not all(0 <= p.triangles.min() <= p.triangles.max() < len(p.vertices) for p in parts):
         raise ValueError("triangles name corners that do not exist")
     return parts[::-1]
 

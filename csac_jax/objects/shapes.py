@@ -88,10 +88,7 @@ def cup(rng: Generator) -> list[Part]:
 
 
 def superquadric(rng: Generator) -> list[Part]:
-    """Draws a superquadric as the hull of 34 of its points; convex, as e and f lie below 2.
-
-    (|x/a|^(2/e) + |y/b|^(2/e))^(e/f) + |z/c|^(2/f) = 1, Barr 1981.
-    """
+    """Draws a superquadric, (|x/a|^(2/e) + |y/b|^(2/e))^(e/f) + |z/c|^(2/f) = 1, Barr 1981."""
     half, (east, north) = rng.uniform(0.015, 0.04, 3), rng.uniform(0.25, 1.3, 2)
     around = np.pi * (np.arange(8) + 0.5) / 4.0
     up, across = np.meshgrid(np.radians([-54.0, -18.0, 18.0, 54.0]), around)
@@ -211,10 +208,7 @@ def brick(rng: Generator) -> list[Part]:
 
 
 def assembly(rng: Generator) -> list[Part]:
-    """Draws an assembly: one to three storeys of slanted, tapered or straight blocks.
-
-    One or two stand on the one below. The last storey may be a wall along the outline below it.
-    """
+    """Draws an assembly: one to three storeys of one or two blocks, the last perhaps a wall."""
     storeys = int(rng.integers(1, 4))
     parts: list[Part] = []
     below = np.zeros((1, 2))
@@ -258,10 +252,7 @@ def _fence(rng: Generator, outline: np.ndarray, bottom: float, top: float) -> li
 
 
 def _footprint(rng: Generator, reach: float) -> np.ndarray:
-    """Draws a rectangle or a convex polygon of 3 to 7 corners [n, 2] around the origin.
-
-    Its corners lie at most `reach` m from the origin along each axis, and at least _THIN.
-    """
+    """Draws a convex polygon of 3 to 7 corners [n, 2], _THIN to `reach` m from the origin."""
     half = np.maximum(reach * rng.uniform(0.1, 1.0, 2), _THIN)
     if rng.integers(2):
         return half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])

@@ -1,10 +1,8 @@
 """Convex parts, and the mass and inertia of what they make up.
 
-Integrals over a polyhedron are sums over its triangles: each spans a tetrahedron with the origin,
-whose integrals of 1, x and x y are closed forms (Tonon 2005, J. Math. Stat. 1, 8-11).
-
-Products use `einsum`: BLAS, which `@` calls, rounds differently on each kind of processor. A pile
-of falling bodies amplifies a last bit, so machines would settle different piles.
+Integrals over a polyhedron are sums over the tetrahedra of its triangles with the origin (Tonon
+2005, J. Math. Stat. 1, 8-11). Products use `einsum`: BLAS, which `@` calls, rounds differently on
+each kind of processor, and a pile of falling bodies amplifies a last bit.
 """
 
 import dataclasses
@@ -106,9 +104,9 @@ def inertia(solid: Moments) -> np.ndarray:
 
 
 def principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Computes principal moments [n, 3] of inertias [n, 3, 3] and their axes [n, 3, 3].
+    """Computes principal moments [n, 3] of inertias [n, 3, 3] and their axes, right-handed columns.
 
-    Axes are columns, right-handed. Cyclic Jacobi rotations, Golub and Van Loan, sec. 8.5.
+    Cyclic Jacobi rotations, Golub and Van Loan, sec. 8.5.
     """
     left, axes = np.array(inertia, np.float64), np.tile(np.eye(3), (len(inertia), 1, 1))
     for i, j in 5 * ((0, 1), (0, 2), (1, 2)):

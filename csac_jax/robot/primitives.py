@@ -89,7 +89,6 @@ def plan(
     end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
     closed = gripper.half[0]
     opening = jnp.where(is_grasp, 0.5 * fingers.opening, closed)
-
     phases = jnp.where(is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases))
     descend, act, lift = phases  # [T] each
     z = high + (low - high) * descend + (high - low) * lift

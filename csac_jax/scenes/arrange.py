@@ -49,9 +49,7 @@ def arrange(key: Array, cfg: SceneConfig, extent: float, level: Array) -> SceneS
     """
     least = 2.0 * (RADIUS + _MARGIN)
     if extent < least:
-        raise ValueError(
-            f"heightmap.extent: arrangements need at least {least:g} m, not {extent:g}"
-        )
+        raise ValueError(f"heightmap.extent: packing needs at least {least:g} m, not {extent:g}")
     possible = packings.available(cfg.slots).values()
     key_sizes, key_family, key_pack, key_place, key_loose, key_looks = jax.random.split(key, 6)
     sizes = draw_sizes(key_sizes, cfg)

@@ -1,7 +1,4 @@
-"""Case files: arrangements written by hand, shipped in `scenes/cases/` or brought by the user.
-
-`case_file` describes the format. Sizes, densities and frictions are nominal.
-"""
+"""Case files, see `case_file`: arrangements written by hand, of nominal sizes and materials."""
 
 import itertools
 from pathlib import Path
@@ -49,10 +46,8 @@ def shipped(name: str) -> Path:
 
 
 def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
-    """Loads a case whose blocks lie inside the square of side `extent` m.
-
-    Raises ValueError, one line with the file, the block (the first is 1) and what to change.
-    """
+    """Loads a case whose blocks lie inside the square of side `extent` m. Raises ValueError, one
+    line with the file, the block (the first is 1) and what to change."""
     from csac_jax.scenes import case_file
 
     try:
@@ -109,10 +104,9 @@ def _case(content: "CaseFile", folder: Path) -> Case:
 
 
 def _with_objects(case: Case, entries: list["CaseBlock"], folder: Path) -> Case:
-    libraries = {entry.library for entry in entries if entry.library}
-    if len(libraries) > 1:
-        raise ValueError(f"objects of {len(libraries)} libraries; take all from one")
-    (name,) = libraries
+    name, *others = {entry.library for entry in entries if entry.library}
+    if others:
+        raise ValueError(f"objects of {1 + len(others)} libraries; take all from one")
     source = name if tables.PROCEDURAL.fullmatch(name) else str(folder / name)
     library, slots = tables.find(source, "all"), np.flatnonzero(blocks.is_object(case.slots))
     numbers = np.array([library.number(entries[slot].object or "") for slot in slots])

@@ -196,12 +196,9 @@ def _place_corner(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places two blocks in an L, one in its corner, one beyond that along either leg."""
     crosswise = _is_role(1)
     leg, high = _half_xy(half, crosswise)[1], jnp.maximum(half[2, 1], half[3, 1])
-    x = jnp.stack(
-        [half[0, 0], -gap - leg[0], half[2, 0], 2.0 * half[2, 0] + gap + half[3, 0], half[4, 0]]
-    )
-    y = jnp.stack(
-        [-half[0, 1], leg[1], gap + half[2, 1], gap + half[3, 1], 2.0 * (gap + high) + half[4, 1]]
-    )
+    beyond = 2.0 * half[2, 0] + gap + half[3, 0], 2.0 * (gap + high) + half[4, 1]
+    x = jnp.stack([half[0, 0], -gap - leg[0], half[2, 0], beyond[0], half[4, 0]])
+    y = jnp.stack([-half[0, 1], leg[1], gap + half[2, 1], gap + half[3, 1], beyond[1]])
     return Placed(jnp.stack([x, y], axis=1), crosswise, jnp.int32(2))
 
 

@@ -130,7 +130,7 @@ def _settle(
         drops = [drop() for _ in range(num)]
         fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
-        for scene in _first_at_rest(fall, list(zip(drops, rows, strict=True)), missing):
+        for scene in _first_at_rest(fall, drops, rows, missing):
             missing -= 1
             yield scene
         dropped += num
@@ -140,18 +140,16 @@ def _settle(
             raise SceneError(f"{settled} in the workspace; {remedy}")
 
 
-def _first_at_rest(
-    fall: Fall, drops: list[tuple[SceneState, BlockFields]], count: int
-) -> Iterator[SceneState]:
+def _first_at_rest(fall: Fall, drops: list, fields: list, count: int) -> Iterator[SceneState]:
     """Yields the first `count` of these scenes that come to rest; few others fall."""
     with ThreadPoolExecutor() as threads:
         while drops and count:
             some = max(count, len(os.sched_getaffinity(0)))
-            fallen, drops = threads.map(fall, *zip(*drops[:some], strict=True)), drops[some:]
-            for scene in fallen:
+            for scene in threads.map(fall, drops[:some], fields[:some]):
                 if scene is not None and count:
                     count -= 1
                     yield scene
+            drops, fields = drops[some:], fields[some:]
 
 
 def _stack(scenes: list[SceneState]) -> SceneState:
@@ -209,7 +207,7 @@ def rest(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> S
     data = _falling(world, scene, fields)
     data.model.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
     mujoco.mj_step(data.model, data, nstep=round(cfg.scene.settle_time / data.model.opt.timestep))
-    return _at_rest(world, cfg, scene, data)
+    return _rested(world, cfg, scene, data)
 
 
 def pour(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> SceneState | None:
@@ -239,13 +237,11 @@ def pour(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> S
         waiting += [int(slot) for slot in np.flatnonzero(outside)]
         pinned |= outside
         if not waiting and quiet >= cfg.scene.settle_time:
-            return _at_rest(world, cfg, scene, data)
+            return _rested(world, cfg, scene, data)
     return None
 
 
-def _at_rest(
-    world: World, cfg: Config, scene: SceneState, data: mujoco.MjData
-) -> SceneState | None:
+def _rested(world: World, cfg: Config, scene: SceneState, data: mujoco.MjData) -> SceneState | None:
     pose = data.qpos[world.block_qpos].astype(np.float32)
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]

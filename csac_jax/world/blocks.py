@@ -125,8 +125,7 @@ FACES = {
 def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Computes the faces of every part in its block's frame: inside, n . p <= offset for all.
 
-    Args: half_size [N, 3] m. Returns: normals [G, F, 3], outward unit vectors, 0 for padding;
-    offsets [G, F] m. G as in `parts`.
+    Returns: outward unit normals [G, F, 3], 0 for padding; offsets [G, F] m.
     """
     slot, centre, half = parts(slots)
     normals = np.zeros((len(slot), MAX_FACES, 3), np.float32)

@@ -123,8 +123,7 @@ def randomise_pose(
 ) -> SceneState:
     """Rotates a scene by a random yaw; with `has_target` it keeps its target or gets one.
 
-    The yaw is a multiple of 90 degrees unless `any_yaw` and every block stays within the square of
-    side `extent` m.
+    Without `any_yaw`, or where a block would leave the square of `extent` m, by quarter turns.
     """
     key_yaw, key_target = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)

@@ -26,10 +26,9 @@ def _height(*surfaces: tuple[float, float, float, float]) -> jnp.ndarray:
     return jnp.asarray(height)
 
 
-def _plan(
-    primitive: Primitive, height: jnp.ndarray, x: float = 0.0, y: float = 0.0, yaw: float = 0.0
-) -> Plan:
-    action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
+def _plan(primitive: Primitive, height: jnp.ndarray, *pose: float) -> Plan:
+    place = jnp.array(pose or [0.0, 0.0, 0.0], jnp.float32)
+    action = Action(primitive=jnp.int32(primitive), pose=place)
     return primitives.plan(SIM, MAP, height, action)
 
 
@@ -44,7 +43,7 @@ def _plan(
 )
 def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
     """Claim: tips go to grasp_depth or push_depth below the top, never below the clearance."""
-    plan = _plan(primitive, _height((0.0, 0.0, 0.05, top)), yaw=0.3)
+    plan = _plan(primitive, _height((0.0, 0.0, 0.05, top)), 0.0, 0.0, 0.3)
     z = np.asarray(plan.control[:, Z])
     assert plan.surface == pytest.approx(top)
     assert z.min() == pytest.approx(low, abs=1e-6)

@@ -26,9 +26,8 @@ KEYS = 200  # of arrangements, the same at every level
 EACH = 7  # keys of each family whose arrangements are simulated
 COUNT = EACH * len(packings.FAMILIES)
 LEVELS = (0.0, 0.5, 1.0)
-MANY = SceneConfig(
-    slots=("box",) * 6 + ("arch", "arch", "prism", "prism", "cylinder", "cylinder"), min_blocks=5
-)
+PAIRS = ("arch", "arch", "prism", "prism", "cylinder", "cylinder")
+MANY = SceneConfig(slots=("box",) * 6 + PAIRS, min_blocks=5)
 BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_jitter=(0.25, 0.25))
 # The usual square, and the smallest.
 EXTENT = {MANY: HeightmapConfig().extent, BOXES: 2.0 * (arrange.RADIUS + 0.001)}
@@ -66,10 +65,9 @@ def _many(cfg: SceneConfig, extent: float, keys: jax.Array, levels: jax.Array) -
 def _names(cfg: SceneConfig, keys: jax.Array) -> np.ndarray:
     """Returns the families that `arrange` draws with these keys."""
     names = np.array(list(packings.available(cfg.slots)))
-    number = jax.vmap(
-        lambda key: jax.random.randint(jax.random.split(key, 6)[1], (), 0, len(names))
-    )
-    return names[np.asarray(number(keys))]
+    drawn = jax.vmap(lambda key: jax.random.split(key, 6)[1])(keys)
+    number = jax.vmap(lambda key: jax.random.randint(key, (), 0, len(names)))
+    return names[np.asarray(number(drawn))]
 
 
 def _measured(world: model.World, scene: SceneState, fields: model.BlockFields) -> tuple:
@@ -135,9 +133,7 @@ def test_every_family_settles(drawn: Drawn):
     np.testing.assert_array_equal(drawn.scenes.position[out], places[out])
 
 
-def _open_grasps(
-    position: np.ndarray, yaw: np.ndarray, half: np.ndarray, sim: SimConfig
-) -> np.ndarray:
+def _open_grasps(position: np.ndarray, yaw: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Tests if an antipodal grasp of each block at each of the oracle's yaws is open [n, YAWS].
 
     Open: two faces across, no wider than the hand, no other block where fingers go down or close.
@@ -145,7 +141,7 @@ def _open_grasps(
     their bounding boxes. A closing finger is a grid of points at the height of the grasp.
     """
     top = position[:, 2] + half[:, 2]
-    gripper = grippers.load(sim.gripper)
+    sim, gripper = SimConfig(), grippers.load(SimConfig().gripper)
     tip = np.maximum(top - sim.grasp_depth, gripper.clearance) + 0.002
     widest = gripper.opening[1] - OPENING_ROOM
     is_open, angle = np.zeros((len(half), YAWS), bool), np.arange(YAWS) * np.pi / YAWS
@@ -186,7 +182,7 @@ def _open_share(scenes: SceneState, row: tuple[int, int]) -> float:
     turn = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     yaw, on_side = np.arctan2(turn[:, 1, 0], turn[:, 0, 0]), np.abs(turn[:, 2, 2]) < 0.5
     lying = np.where(on_side[:, None], half[:, [0, 2, 1]], half)
-    grasps = _open_grasps(position, yaw, lying, SimConfig())
+    grasps = _open_grasps(position, yaw, lying)
     return grasps[scenes.in_play[:, row[1]].all(axis=0)[there]].mean()
 
 
@@ -314,9 +310,8 @@ def test_key_decides():
     keys, levels = jax.random.split(jax.random.key(1), 8), jnp.linspace(0.0, 1.0, 8)
     batch, again = (_many(cfg, 0.448, keys, levels) for _ in range(2))
     jax.tree.map(np.testing.assert_array_equal, batch, again)
-    alone = jax.device_get(
-        jax.jit(arrange.arrange, static_argnums=(1, 2))(keys[3], cfg, 0.448, levels[3])
-    )
+    single = jax.jit(arrange.arrange, static_argnums=(1, 2))
+    alone = jax.device_get(single(keys[3], cfg, 0.448, levels[3]))
     row = jax.tree.map(lambda leaf: leaf[3], batch)
     jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), alone, row)
     types = (

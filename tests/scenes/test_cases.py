@@ -23,10 +23,8 @@ SHIPPED = ("hole", "pinwheel", "ridge", "row")
 FLAT = [1, 0, 0, 0]
 
 
-def _block(
-    shape: str, position: list[float], colour: str = "red", quaternion: Any = FLAT, **more: Any
-) -> dict:
-    return {"shape": shape, "colour": colour, "position": position, "quaternion": quaternion} | more
+def _block(shape: str, position: list, colour: str = "red", turn: Any = FLAT, **more: Any) -> dict:
+    return {"shape": shape, "colour": colour, "position": position, "quaternion": turn} | more
 
 
 PAIR = {
@@ -209,9 +207,8 @@ def _with_object(tmp_path: Path, **changes: object) -> Path:
 def test_a_case_names_objects(tmp_path: Path):
     """Claim: an object of a library in the file's folder stands at its place: the middle of its
     bounding box, not its centre of mass, is where the case says."""
-    case = cases.load(
-        _with_object(tmp_path, quaternion=[0.5, 0.5, 0.5, 0.5], position=[0, 0.1, 0.04])
-    )
+    turned = _with_object(tmp_path, quaternion=[0.5, 0.5, 0.5, 0.5], position=[0, 0.1, 0.04])
+    case = cases.load(turned)
     assert case.slots == ("object", "box")
     assert case.objects == str(tmp_path / "lib")
     corners = np.concatenate(cases._corners(case)[0])

@@ -212,9 +212,8 @@ def test_blocks_are_dropped_close_together_or_far_apart():
     assert reach.max() <= 0.2
 
 
-PILE = SceneConfig(
-    slots=("box", "arch", "prism") * 4, min_blocks=12, drop_extent=(0.1, 0.1), settle_time=1.0
-)
+KINDS = ("box", "arch", "prism") * 4
+PILE = SceneConfig(slots=KINDS, min_blocks=12, drop_extent=(0.1, 0.1), settle_time=1.0)
 
 
 @pytest.mark.slow
