@@ -53,11 +53,6 @@ class Fingers(NamedTuple):
         """Returns half the sides of the floor a finger needs, along the closing and across, m."""
         return 0.5 * self.thickness + _FINGER_ROOM, 0.5 * self.width + _FINGER_ROOM
 
-    @property
-    def finger_offset(self) -> Any:
-        """Returns the distance from the middle of the open hand to that of a finger, m."""
-        return 0.5 * self.opening + 0.5 * self.thickness
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Shared:

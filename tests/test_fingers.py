@@ -205,8 +205,7 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
     """Claim: networks without the last inputs, gripper and target, are a start: Q is the same for
     all fingers, and the nets still see the gripper. Those that lack another input are refused."""
     blind = presets.smoke().change(sim={"physics": "c"})
-    params = _networks(blind)
-    path = tmp_path / "policy.safetensors"
+    params, path = _networks(blind), tmp_path / "policy.safetensors"
     policy_file.save(path, params, blind)
     for cfg in (CONFIG, CONFIG.change(task={"kind": "target"})):
         start: Any = api.initial_networks(cfg, path)

@@ -115,7 +115,8 @@ def _candidates(
     """Scores grasps of targets, leaves [B, ...], at YAWS and `shifts`; n = B YAWS len(shifts)."""
     sim, gripper, cells = cfg.sim, grippers.load(cfg.sim.gripper), cell_centres(cfg.heightmap)
     fingers = scene_state.fingers(scene, gripper)
-    beside, (along, across_pad) = fingers.finger_offset, fingers.footprint
+    beside = 0.5 * fingers.opening + 0.5 * fingers.thickness  # m, to the middle of a finger
+    along, across_pad = fingers.footprint
     slots, kind = jnp.arange(len(cfg.scene.slots)), jnp.int32(Primitive.GRASP)
 
     def place(target: GraspTarget, yaw: Array, shift: Array) -> Array:

@@ -116,20 +116,19 @@ def _import(arguments: list[str]) -> int:
         def on_progress(finished: int, total: int, name: str) -> None:
             bar.update(task, description=name, completed=finished, total=total)
 
-        result = importing.run(paths, settings, jobs, cache, on_progress)
-    for line in result.refused:
+        converted, refused = importing.run(paths, settings, jobs, cache, on_progress)
+    for line in refused:
         print(f"{PROGRAM}: {line}", file=sys.stderr)
-    if not result.objects:
+    if not converted:
         raise FailedError(f"none of {len(paths)} files can be imported; nothing is written")
-    _list(library.save(options.out, result.objects).objects)
+    _list(library.save(options.out, [member for member, _ in converted]).objects)
     shutil.rmtree(cache, ignore_errors=True)
-    for name, share in result.volumes.items():
+    for member, share in converted:
         if not importing.SOUND[0] <= share <= importing.SOUND[1]:
-            print(f"{name}: its parts have {share:.2f} of the mesh's volume; check it")
-    print(f"wrote {options.out}; {len(result.refused)} of {len(paths)} files left out")
-    shares = ({"parts_volume": result.volumes[member.name]} for member in result.objects)
-    rows = [_row(member) | share for member, share in zip(result.objects, shares, strict=True)]
-    output.write_result(options.json, {"objects": rows, "refused": result.refused})
+            print(f"{member.name}: its parts have {share:.2f} of the mesh's volume; check it")
+    print(f"wrote {options.out}; {len(refused)} of {len(paths)} files left out")
+    rows = [_row(member) | {"parts_volume": share} for member, share in converted]
+    output.write_result(options.json, {"objects": rows, "refused": refused})
     return 0
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from csac_jax.objects import solid
 from csac_jax.objects.solid import Moments, Part
@@ -43,7 +44,10 @@ class Object:
     @property
     def narrowest(self) -> float:
         """Returns the least width, m, between parallel planes, one along a face of the hull."""
-        return solid.narrowest(self.parts)
+        points = np.concatenate([part.vertices for part in self.parts])
+        hull = ConvexHull(points)
+        along = np.einsum("fi,ni->fn", hull.equations[:, :3], points[hull.vertices])
+        return float(np.ptp(along, axis=1).min())
 
     @property
     def held_out(self) -> bool:

@@ -10,7 +10,6 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
 
 from csac_jax.objects import conversion, descriptions, library, solid
 from csac_jax.objects.body import Object
@@ -23,14 +22,6 @@ SOUND = (0.9, 1.15)  # volume of the parts / volume of the mesh; others deserve 
 _MEMORY = 2**33  # bytes that one worker may ask for
 
 Converted = tuple[Object, float]  # with the volume of its parts / volume of the mesh
-
-
-class ImportResult(NamedTuple):
-    """Objects made of files, and the files that gave none."""
-
-    objects: list[Object]
-    volumes: dict[str, float]  # by name: volume of the parts / volume of the mesh
-    refused: list[str]  # one line each, with the file
 
 
 def files(paths: list[Path]) -> list[Path]:
@@ -60,8 +51,11 @@ def run(
     jobs: int,
     cache: Path,
     on_progress: Callable[[int, int, str], None],  # finished, all, name of the latest
-) -> ImportResult:
-    """Converts files in `jobs` processes; the folder `cache` keeps finished objects."""
+) -> tuple[list[Converted], list[str]]:
+    """Converts files in `jobs` processes; the folder `cache` keeps finished objects.
+
+    Returns: the objects; of each file that gave none, one line.
+    """
     names, refused = _names(paths), dict[Path, str]()
     cached = {path: _cached(cache, path, names[path], settings) for path in paths}
     done = {path: entry for path, entry in cached.items() if entry is not None}
@@ -82,10 +76,8 @@ def run(
     for path in unfinished:  # a crash ends all processes of a pool: now each file in its own
         if _convert([path], 1, names, settings, finish):
             refused[path] = f"{path}: CoACD crashed or ran out of memory; mend or reduce its mesh"
-    entries = [done[path] for path in paths if path in done]
-    volumes = {converted.name: share for converted, share in entries}
     lines = [refused[path] for path in paths if path in refused]
-    return ImportResult([converted for converted, _ in entries], volumes, lines)
+    return [done[path] for path in paths if path in done], lines
 
 
 def _convert(

@@ -129,11 +129,3 @@ def moved(part: Part, shift: np.ndarray) -> Part:
     along = offsets + np.einsum("fi,i->f", normals, np.asarray(shift, np.float32))
     vertices = (part.vertices + shift).astype(np.float32)
     return Part(vertices, part.triangles, np.column_stack([normals, along]))
-
-
-def narrowest(parts: Iterable[Part]) -> float:
-    """Computes the least distance, m, of a face of the common hull from the corner opposite."""
-    points = np.concatenate([part.vertices for part in parts])
-    hull = ConvexHull(points)
-    along = np.einsum("fi,ni->fn", hull.equations[:, :3], points[hull.vertices])
-    return float(np.ptp(along, axis=1).min())

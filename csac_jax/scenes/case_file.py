@@ -67,9 +67,9 @@ def parse(text: str) -> CaseFile:
         raise ValueError(_BLOCK.sub(_block, first_fault(error))) from None
 
 
-def _block(found: re.Match) -> str:
-    quote = "'" if found[2] == "." else ""
-    return f"block {int(found[1]) + 1}: {quote}"
+def _block(match: re.Match) -> str:
+    quote = "'" if match[2] == "." else ""
+    return f"block {int(match[1]) + 1}: {quote}"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -122,9 +122,10 @@ def test_the_command_writes_what_it_can(tmp_path: Path, capsys: pytest.CaptureFi
     importing.run([folder / "a.stl"], settings, 1, partial, lambda *_: None)
     (entry,) = partial.iterdir()
     before = entry.stat().st_mtime_ns
-    result = importing.run(importing.files([folder]), settings, 2, partial, lambda *_: None)
-    assert [member.name for member in result.objects] == ["a", "b"]
-    assert len(result.refused) == 1
+    paths = importing.files([folder])
+    converted, refused = importing.run(paths, settings, 2, partial, lambda *_: None)
+    assert [member.name for member, _ in converted] == ["a", "b"]
+    assert len(refused) == 1
     assert entry.stat().st_mtime_ns == before
     assert cli.main(["objects", "import", str(folder), "--out", str(out), "--jobs", "1"]) == 0
     assert not partial.exists()

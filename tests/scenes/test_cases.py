@@ -128,7 +128,6 @@ REFUSED = [
     (_changed(0, "position", [0.05, 0.0, 0.48]), "block 1: reaches 0.505 m above the table"),
     (_changed(0, "position", [0.0225, 0.0, 0.025]), "block 2: overlaps block 1 by 2.5 mm"),
     ('{"name": "a", "blocks": [' + "1, " * 100_000 + "1]}", "block"),
-    ("{" + ", ".join('"k": 1' for _ in range(20_000)) + "}", "key 'k' is given twice"),
     ('{"name": "a", "blocks": 1' + "0" * 5000 + "}", "."),
     ('{"name": "\\ud800", "blocks": []}', "'name' "),
 ]
@@ -149,13 +148,11 @@ def test_bad_file_is_refused_in_one_line(tmp_path: Path, content: Any, says: str
 
 
 def test_unreadable_file_is_refused_in_one_line(tmp_path: Path):
-    """Claim: a file that is not there, a folder, or no text is a ValueError too."""
+    """Claim: a file that is not there, or no text, is a ValueError too."""
     (tmp_path / "raw.json").write_bytes(b"\xff\xfe\x00")
-    paths = {"none.json": "No such file", "": "directory", "raw.json": "'utf-8' codec"}
-    for name, says in paths.items():
-        with pytest.raises(ValueError, match=says) as error:
+    for name, says in {"none.json": "No such file", "raw.json": "'utf-8' codec"}.items():
+        with pytest.raises(ValueError, match=f"^{tmp_path / name}: .*{says}"):
             cases.load(tmp_path / name)
-        assert str(error.value).startswith(f"{tmp_path / name}: ")
 
 
 @pytest.mark.parametrize("shape", blocks.SHAPES)
